@@ -1,0 +1,1 @@
+"""firmware_sim: a simulated Crazyflie that answers CRTP on udp://. Shares no code with crazyem."""
