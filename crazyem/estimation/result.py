@@ -1,0 +1,80 @@
+"""What the estimator says: values with standard deviations, intervals, and whether the data support them at all."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+PARAMETER_UNITS = {
+    "mass": "kg",
+    "Ixx": "kg m^2",
+    "Iyy": "kg m^2",
+    "Izz": "kg m^2",
+    "motor_time_constant": "s",
+}
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """One parameter: value, standard deviation, 95 % interval, and `identifiable` with the reason if it is not."""
+
+    value: float
+    sd: float
+    ci95: tuple[float, float]
+    unit: str
+    identifiable: bool
+    reason: str = ""
+
+    @property
+    def relative_sd(self) -> float:
+        """sd / value, or infinity where the value is zero."""
+        return abs(self.sd / self.value) if self.value else float("inf")
+
+    def to_json(self) -> dict[str, Any]:
+        """The summary's form (an interface: names are fixed)."""
+        return {
+            "value": self.value,
+            "sd": self.sd,
+            "ci95": list(self.ci95),
+            "unit": self.unit,
+            "identifiable": self.identifiable,
+            "reason": self.reason,
+        }
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """All parameters at one time.
+
+    Attributes:
+        time: s on the drone's clock of the newest sample used.
+        parameters: mass, Ixx, Iyy, Izz, motor_time_constant -> ParameterEstimate.
+        noise: name -> scale; continuous intensities of thrust [N sqrt(s)] and torque [N m sqrt(s)], and the
+            standard deviations of the measurements (SI).
+        samples: samples in the window now.
+        updates: number of updates so far, this one included.
+        converged: whether the score test was passed.
+    """
+
+    time: float
+    parameters: Mapping[str, ParameterEstimate]
+    noise: Mapping[str, float] = field(default_factory=dict)
+    samples: int = 0
+    updates: int = 0
+    converged: bool = False
+
+    def __getitem__(self, name: str) -> ParameterEstimate:
+        return self.parameters[name]
+
+    def to_json(self) -> dict[str, Any]:
+        """The `estimates` object of the summary JSON."""
+        return {name: p.to_json() for name, p in self.parameters.items()}
+
+    def __str__(self) -> str:
+        lines = [f"{'parameter':<20} {'value':>12} {'sd':>10}  {'95 % interval':<27} unit"]
+        for name, p in self.parameters.items():
+            note = "" if p.identifiable else f"   not identifiable: {p.reason}"
+            lines.append(
+                f"{name:<20} {p.value:>12.5g} {p.sd:>10.2g}  [{p.ci95[0]:.5g}, {p.ci95[1]:.5g}]".ljust(74)
+                + f"{p.unit}{note}"
+            )
+        return "\n".join(lines)

@@ -1,0 +1,107 @@
+"""The narrow interface every link to a drone offers: what it logs, what it takes, and an honest account of losses."""
+
+import queue
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """A log variable: `group.name` and its storage type (uint8_t, int16_t, float, ...)."""
+
+    name: str
+    ctype: str
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Variables that travel in one packet, all sampled at the same firmware time."""
+
+    identifier: int
+    variables: tuple[Variable, ...]
+    period_ms: int
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One log packet: raw firmware values (firmware units) in the order of the block's variables.
+
+    Attributes:
+        block: identifier of the block.
+        firmware_time_ms: firmware clock, ms, unwrapped from its 24 bits.
+        host_time: s since the epoch when the host received it.
+        values: one number per variable.
+    """
+
+    block: int
+    firmware_time_ms: int
+    host_time: float
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LinkLost:
+    """Put into the packet queue, once, when the drone is gone; `reason` is one sentence."""
+
+    reason: str
+    host_time: float
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterWrite:
+    """What became of a parameter write: `echoed` is the value the drone confirmed, None if no echo came in time."""
+
+    name: str
+    value: float
+    echoed: float | None
+    verified: bool
+    host_time: float
+
+
+@dataclass(frozen=True, slots=True)
+class LinkStatistics:
+    """Packets by fate. `lost` is inferred from the firmware stamps against the block's period."""
+
+    received: int = 0
+    lost: int = 0
+    late: int = 0
+    per_block: Mapping[int, tuple[int, int, int]] = field(default_factory=dict)
+
+
+class Link(Protocol):
+    """A drone on the other end. Every call has a timeout of our own; none waits for ever."""
+
+    uri: str
+    packets: "queue.SimpleQueue[Packet | LinkLost]"
+
+    def connect(self, timeout: float = 15.0) -> None: ...  # raises LinkError
+    def close(self) -> None: ...
+    @property
+    def log_variables(self) -> Mapping[str, str]: ...  # name -> C type
+    @property
+    def parameters(self) -> Mapping[str, str]: ...
+    def subscribe(self, variables: Sequence[str], rate_hz: float) -> tuple[Block, ...]: ...
+    def read_parameter(self, name: str, timeout: float = 2.0) -> float: ...
+    def write_parameter(self, name: str, value: float, timeout: float = 1.0) -> ParameterWrite: ...
+    def statistics(self) -> LinkStatistics: ...
+
+    # flying
+    def arm(self, armed: bool) -> None: ...
+    def take_off(self, height: float, duration: float) -> None: ...
+    def land(self, height: float, duration: float) -> None: ...
+    def go_to(
+        self, x: float, y: float, z: float, yaw: float, duration: float, relative: bool = False
+    ) -> None: ...
+    def send_full_state(
+        self,
+        position: Sequence[float],
+        velocity: Sequence[float],
+        acceleration: Sequence[float],
+        quaternion: Sequence[float],
+        body_rate: Sequence[float],
+    ) -> None: ...
+    def send_position(self, x: float, y: float, z: float, yaw: float) -> None: ...
+    def send_hover(self, vx: float, vy: float, yaw_rate: float, z: float) -> None: ...
+    def release_setpoints(self) -> None: ...  # "notify stop": hand back to the high-level commander
+    def stop(self) -> None: ...  # motors off now
