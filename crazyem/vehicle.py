@@ -1,0 +1,212 @@
+"""A drone's nominal constants: a TOML file <-> one frozen dataclass, SI units throughout.
+
+File format (all SI; `presets/*.toml` are examples):
+
+    name = "cf2"
+    mass = 0.029                      # kg
+    inertia = [1.66e-5, 1.67e-5, 2.93e-5]  # kg m^2: Ixx, Iyy, Izz, optionally followed by Ixy, Ixz, Iyz (matrix elements)
+    arm = 0.0325                      # m, rotor offset along body x and y (one number, or [x, y])
+    thrust_curve = [c0, c1, c2, c3]   # N per rotor, polynomial in motor volts, constant first; or
+    rotor_constant = 3.7e-8           # N/(rad/s)^2, thrust of one rotor over its speed squared
+    torque_per_thrust = 0.00699       # m, yaw torque of a rotor over its thrust
+    motor_time_constant = 0.05        # s, first-order lag of rotor thrust
+    thrust_max = 0.12                 # N per rotor
+    battery_compensated = true        # the firmware compensates the battery voltage
+    [effects.NAME]                    # fitted effects, parameter = value
+"""
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from crazyem.errors import FileFormatError, UsageError
+
+GRAVITY = 9.81  # m/s^2, as the firmware has it
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """Nominal constants of one drone (SI). A vehicle without rotor data takes thrust and torque as its inputs.
+
+    Attributes:
+        name: what it is called.
+        mass: kg.
+        inertia: Ixx, Iyy, Izz [kg m^2] about the body axes (x forward, y left, z up).
+        inertia_products: Ixy, Ixz, Iyz [kg m^2], elements of the inertia matrix.
+        arm: rotor offset along body x and y [m].
+        thrust_curve: polynomial of one rotor's thrust [N] in motor volts, constant first; empty if unknown.
+        rotor_constant: thrust over squared rotor speed [N/(rad/s)^2], or None.
+        torque_per_thrust: yaw torque of a rotor over its thrust [m].
+        motor_time_constant: first-order lag of rotor thrust [s].
+        thrust_max: of one rotor [N].
+        battery_compensated: whether the firmware scales commands by battery voltage.
+        effects: fitted effects, name -> parameter -> value.
+    """
+
+    name: str
+    mass: float
+    inertia: tuple[float, float, float]
+    inertia_products: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    arm: tuple[float, float] = (0.0, 0.0)
+    thrust_curve: tuple[float, ...] = ()
+    rotor_constant: float | None = None
+    torque_per_thrust: float = 0.0
+    motor_time_constant: float = 0.0
+    thrust_max: float = math.inf
+    battery_compensated: bool = True
+    effects: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def to_toml(self) -> str:
+        """The vehicle as the text of a vehicle file; reading it back gives an equal vehicle."""
+        inertia = self.inertia + (self.inertia_products if any(self.inertia_products) else ())
+        lines = [f"name = {_quote(self.name)}", f"mass = {self.mass!r}", f"inertia = {list(inertia)!r}"]
+        lines.append(f"arm = {list(self.arm)!r}")
+        if self.thrust_curve:
+            lines.append(f"thrust_curve = {list(self.thrust_curve)!r}")
+        if self.rotor_constant is not None:
+            lines.append(f"rotor_constant = {self.rotor_constant!r}")
+        lines.append(f"torque_per_thrust = {self.torque_per_thrust!r}")
+        lines.append(f"motor_time_constant = {self.motor_time_constant!r}")
+        lines.append(f"thrust_max = {self.thrust_max!r}")  # TOML knows inf
+        lines.append(f"battery_compensated = {str(self.battery_compensated).lower()}")
+        for name, parameters in self.effects.items():
+            lines += ["", f"[effects.{_quote(name)}]"]
+            lines += [f"{_quote(key)} = {_toml_value(value)}" for key, value in parameters.items()]
+        return "\n".join(lines) + "\n"
+
+
+def preset_names() -> list[str]:
+    """Names of the shipped vehicles."""
+    folder = resources.files("crazyem") / "presets"
+    return sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml"))
+
+
+def load_vehicle(name_or_path: str | Path) -> Vehicle:
+    """Read a shipped preset by name, or a vehicle file by path (anything that ends in .toml or names a file).
+
+    Raises:
+        UsageError: no preset and no file of that name.
+        FileFormatError: the file is not a vehicle file; the message names the key.
+    """
+    text = str(name_or_path)
+    if text in preset_names():
+        source = (resources.files("crazyem") / "presets" / f"{text}.toml").read_text()
+        return parse_vehicle(source, where=f"preset {text}")
+    path = Path(text)
+    if not path.is_file():
+        raise UsageError(f"unknown vehicle '{text}': no such file, and the presets are {', '.join(preset_names())}")
+    try:
+        source = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileFormatError(f"{path}: cannot be read as a vehicle file ({error})") from None
+    return parse_vehicle(source, where=str(path))
+
+
+def parse_vehicle(source: str, *, where: str = "vehicle") -> Vehicle:
+    """Vehicle from the text of a vehicle file; `where` names it in errors (FileFormatError)."""
+    try:
+        data = tomllib.loads(source)
+    except tomllib.TOMLDecodeError as error:
+        raise FileFormatError(f"{where}: not valid TOML: {error}") from None
+    known = {
+        "name", "mass", "inertia", "arm", "thrust_curve", "rotor_constant", "torque_per_thrust",
+        "motor_time_constant", "thrust_max", "battery_compensated", "effects",
+    }  # fmt: skip
+    for key in data:
+        if key not in known:
+            raise FileFormatError(f"{where}: unknown key '{key}' (known: {', '.join(sorted(known))})")
+    for key in ("name", "mass", "inertia"):
+        if key not in data:
+            raise FileFormatError(f"{where}: key '{key}' is missing")
+    if not isinstance(data["name"], str):
+        raise FileFormatError(f"{where}: key 'name' must be a text")
+    inertia = _numbers(data, "inertia", where, lengths=(3, 6))
+    moments, products = (inertia[0], inertia[1], inertia[2]), (inertia + (0.0,) * 3)[3:6]
+    _check_inertia(moments, products, where)
+    arm = _numbers(data, "arm", where, lengths=(1, 2)) if "arm" in data else (0.0,)
+    curve = _numbers(data, "thrust_curve", where, lengths=range(2, 10)) if "thrust_curve" in data else ()
+    has_rotors = "thrust_curve" in data or "rotor_constant" in data
+    if has_rotors:
+        for key in ("arm", "torque_per_thrust"):
+            if key not in data:
+                raise FileFormatError(f"{where}: key '{key}' is missing (the vehicle has rotors)")
+    if not isinstance(data.get("battery_compensated", True), bool):
+        raise FileFormatError(f"{where}: key 'battery_compensated' must be true or false")
+    effects = data.get("effects", {})
+    if not isinstance(effects, dict) or not all(isinstance(v, dict) for v in effects.values()):
+        raise FileFormatError(f"{where}: key 'effects' must hold tables [effects.NAME]")
+    return Vehicle(
+        name=data["name"],
+        mass=_positive(data, "mass", where),
+        inertia=moments,
+        inertia_products=(products[0], products[1], products[2]),
+        arm=(arm[0], arm[-1]),
+        thrust_curve=curve,
+        rotor_constant=_positive(data, "rotor_constant", where) if "rotor_constant" in data else None,
+        torque_per_thrust=_positive(data, "torque_per_thrust", where) if has_rotors else 0.0,
+        motor_time_constant=_number(data, "motor_time_constant", where, 0.0, low=0.0, high=1.0),
+        thrust_max=_positive(data, "thrust_max", where) if "thrust_max" in data else math.inf,
+        battery_compensated=data.get("battery_compensated", True),
+        effects=effects,
+    )
+
+
+def _check_inertia(moments: tuple[float, ...], products: tuple[float, ...], where: str) -> None:
+    import numpy as np
+
+    xx, yy, zz = moments
+    xy, xz, yz = products
+    if min(moments) <= 0:
+        raise FileFormatError(f"{where}: key 'inertia' must be positive, got {list(moments)}")
+    if max(moments) > sum(moments) / 2 * (1 + 1e-9):
+        raise FileFormatError(f"{where}: key 'inertia' breaks the triangle inequality: {list(moments)}")
+    if np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])[0] <= 0:
+        raise FileFormatError(f"{where}: key 'inertia' is not a positive definite matrix")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
+
+
+def _number(
+    data: Mapping[str, Any], key: str, where: str, default: float | None = None, *, low: float, high: float = math.inf
+) -> float:
+    value = data.get(key, default)
+    if not _is_number(value) or not low <= value <= high:
+        raise FileFormatError(f"{where}: key '{key}' must be a number in [{low:g}, {high:g}], got {value!r}")
+    return float(value)
+
+
+def _positive(data: Mapping[str, Any], key: str, where: str) -> float:
+    value = data.get(key)
+    if not _is_number(value) or value <= 0:
+        raise FileFormatError(f"{where}: key '{key}' must be a positive number, got {value!r}")
+    return float(value)
+
+
+def _numbers(data: Mapping[str, Any], key: str, where: str, *, lengths: Any) -> tuple[float, ...]:
+    value = data[key]
+    values = value if isinstance(value, list) else [value]
+    if len(values) not in lengths or not all(_is_number(v) and math.isfinite(v) for v in values):
+        wanted = " or ".join(str(n) for n in lengths)
+        raise FileFormatError(f"{where}: key '{key}' must hold {wanted} finite numbers, got {value!r}")
+    return tuple(float(v) for v in values)
+
+
+def _quote(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + "".join(c if ord(c) >= 32 and ord(c) != 127 else f"\\u{ord(c):04x}" for c in escaped) + '"'
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return _quote(value)
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
+    return repr(value)
