@@ -1,4 +1,4 @@
-"""Reference trajectories as pure functions of time: hover, figure 8, and the excitation that makes inertia observable."""
+"""Reference trajectories as pure functions of time: hover, figure 8, and the excitation that shows inertia."""
 
 import math
 from collections.abc import Callable
