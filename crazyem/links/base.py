@@ -5,39 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from crazyem.signals.packet import Block, Packet, Variable
 
-@dataclass(frozen=True, slots=True)
-class Variable:
-    """A log variable: `group.name` and its storage type (uint8_t, int16_t, float, ...)."""
-
-    name: str
-    ctype: str
-
-
-@dataclass(frozen=True, slots=True)
-class Block:
-    """Variables that travel in one packet, all sampled at the same firmware time."""
-
-    identifier: int
-    variables: tuple[Variable, ...]
-    period_ms: int
-
-
-@dataclass(frozen=True, slots=True)
-class Packet:
-    """One log packet: raw firmware values (firmware units) in the order of the block's variables.
-
-    Attributes:
-        block: identifier of the block.
-        firmware_time_ms: firmware clock, ms, unwrapped from its 24 bits.
-        host_time: s since the epoch when the host received it.
-        values: one number per variable.
-    """
-
-    block: int
-    firmware_time_ms: int
-    host_time: float
-    values: tuple[float, ...]
+__all__ = ["Block", "Link", "LinkLost", "LinkStatistics", "Packet", "ParameterWrite", "Variable"]
 
 
 @dataclass(frozen=True, slots=True)

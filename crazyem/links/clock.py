@@ -1,0 +1,134 @@
+"""Firmware stamps and host clock: unwrapping 24 bits, counting what never arrived, relating the two clocks."""
+
+import math
+from dataclasses import dataclass
+
+STAMP_MODULUS = 1 << 24  # ms; the firmware sends the low 24 bits of its millisecond counter: wraps at 16777.216 s
+_HALF = STAMP_MODULUS // 2
+
+
+class StampUnwrapper:
+    """Continuous firmware time from 24-bit stamps, whatever order they arrive in.
+
+    All blocks of a drone share one clock, so one unwrapper serves them all. A stamp is placed within half a wrap
+    (8388 s) of the newest stamp seen, so packets may be lost or reordered by hours before it errs.
+    """
+
+    def __init__(self) -> None:
+        self._newest: int | None = None
+
+    def unwrap(self, stamp: int) -> int:
+        """Unwrapped time [ms] of a stamp [ms]; the first stamp is returned as it is."""
+        if self._newest is None:
+            self._newest = int(stamp)
+            return self._newest
+        step = (int(stamp) - self._newest + _HALF) % STAMP_MODULUS - _HALF
+        time = self._newest + step
+        self._newest = max(self._newest, time)
+        return time
+
+
+class LossCounter:
+    """What became of one block's packets, from their stamps alone: the protocol has no sequence numbers.
+
+    The firmware's timer keeps an exact mean period while single packets come late by up to a few periods. Every stamp
+    is therefore assigned to a slot of a grid whose phase follows the earliest stamps; slots that stay empty between
+    the first and the newest packet are the lost packets.
+    """
+
+    def __init__(self, period_ms: int) -> None:
+        self.period_ms = int(period_ms)
+        self.received = 0
+        self.late = 0
+        self._anchor = 0.0
+        self._first = 0
+        self._last = 0
+        self._newest_ms = -math.inf
+
+    def count(self, firmware_time_ms: int, *, late: bool = False) -> None:
+        """Account for a packet stamped `firmware_time_ms` (unwrapped); `late` if the host got it with delay."""
+        if self.received == 0:
+            self._anchor = float(firmware_time_ms)
+        slot = round((firmware_time_ms - self._anchor) / self.period_ms)
+        # A stamp before its slot's time shows that the packets so far were the delayed ones: move the grid.
+        self._anchor = min(self._anchor, firmware_time_ms - slot * self.period_ms)
+        self.received += 1
+        if late or firmware_time_ms < self._newest_ms:
+            self.late += 1
+        self._newest_ms = max(self._newest_ms, firmware_time_ms)
+        self._first = min(self._first, slot)
+        self._last = max(self._last, slot)
+
+    @property
+    def lost(self) -> int:
+        """Packets that should have come between the first and the newest and did not."""
+        return max(0, self._last - self._first + 1 - self.received) if self.received else 0
+
+
+@dataclass(frozen=True, slots=True)
+class ClockFit:
+    """Host time [s since the epoch] = offset + rate * firmware time [s], for packets with the least delay.
+
+    Attributes:
+        offset: s.
+        rate: host seconds per firmware second (1 for a real drone, 1/speed for an accelerated simulator).
+        delay: median delay of the packets over the least-delayed ones, s.
+        packets: how many packets the fit rests on.
+    """
+
+    offset: float
+    rate: float
+    delay: float
+    packets: int
+
+    def to_host(self, firmware_time_ms: float) -> float:
+        """Host time [s] at which a stamp [ms] would arrive with the least delay."""
+        return self.offset + self.rate * firmware_time_ms / 1000.0
+
+
+class ClockRelation:
+    """Fits the host clock against the firmware clock through the least-delayed packet of every second.
+
+    Queues and schedulers only ever delay a packet, so the lower edge of (host - firmware) is the clock relation and
+    the rest is delay. Memory is bounded: one candidate a second, the newest `seconds` of them.
+    """
+
+    def __init__(self, seconds: int = 600) -> None:
+        self._seconds = seconds
+        self._origin: tuple[float, float] | None = None
+        self._bins: dict[int, tuple[float, float]] = {}  # second of firmware time -> (firmware, host) from the origin
+        self._newest = (0.0, 0.0)
+        self._packets = 0
+
+    def add(self, firmware_time_ms: int, host_time: float) -> None:
+        """Take note of a packet: unwrapped stamp [ms] and arrival [s since the epoch]."""
+        firmware = firmware_time_ms / 1000.0
+        if self._origin is None:
+            self._origin = (firmware, host_time)
+        x, y = firmware - self._origin[0], host_time - self._origin[1]
+        self._packets += 1
+        if x > self._newest[0]:
+            self._newest = (x, y)
+        rate = self._newest[1] / self._newest[0] if self._newest[0] > 1.0 else 1.0
+        key = math.floor(x)
+        best = self._bins.get(key)
+        if best is None or y - rate * x < best[1] - rate * best[0]:
+            self._bins[key] = (x, y)
+            while len(self._bins) > self._seconds:
+                self._bins.pop(next(iter(self._bins)))
+
+    def fit(self) -> ClockFit | None:
+        """The relation so far, or None before the first packet. The rate is 1 until three seconds have been seen."""
+        if self._origin is None:
+            return None
+        points = list(self._bins.values())
+        n = len(points)
+        mean_x = sum(p[0] for p in points) / n
+        mean_y = sum(p[1] for p in points) / n
+        spread = sum((p[0] - mean_x) ** 2 for p in points)
+        rate = 1.0
+        if n >= 3 and spread > 0.0:
+            rate = sum((p[0] - mean_x) * (p[1] - mean_y) for p in points) / spread
+        residuals = sorted(p[1] - mean_y - rate * (p[0] - mean_x) for p in points)
+        offset = self._origin[1] + mean_y + residuals[0] - rate * (mean_x + self._origin[0])
+        return ClockFit(offset, rate, residuals[n // 2] - residuals[0], self._packets)

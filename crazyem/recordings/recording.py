@@ -1,0 +1,135 @@
+"""A flight read from a file: arrays of signals in the order in which the estimator must see them, and what was odd."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.errors import DataError
+from crazyem.signals.sample import SIGNALS, Sample
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SignalArray:
+    """All samples of one signal.
+
+    Attributes:
+        time: (n,) s on the clock of the source.
+        value: (n, c) SI, NaN where missing.
+        order: (n,) position of each sample in the processing order of the whole recording.
+        host_time: (n,) s since the epoch, NaN where unknown.
+        marked: (n,) True where a NaN is ours (interpolated stretch, sensor says "missing"), not the file's.
+    """
+
+    time: NDArray[np.float64]
+    value: NDArray[np.float64]
+    order: NDArray[np.int64]
+    host_time: NDArray[np.float64]
+    marked: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened in the flight: a push, a setpoint, a remark.
+
+    Attributes:
+        time: s since the epoch (host clock).
+        kind: "setpoint", "parameter_write", "estimate" or "log".
+        data: its fields by name.
+    """
+
+    time: float
+    kind: str
+    data: Mapping[str, object]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """A flight as signals.
+
+    Attributes:
+        path: the file, as given.
+        source: which reader and mapping produced it, e.g. "mcap" or "csv:nanobench".
+        signals: arrays by signal name (keys of `crazyem.signals.sample.SIGNALS`).
+        metadata: run configuration and the like: section -> key -> text.
+        notices: one sentence for each thing a user should know about the file.
+        events: what else happened, by time.
+    """
+
+    path: str
+    source: str
+    signals: Mapping[str, SignalArray]
+    metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    notices: tuple[str, ...] = ()
+    events: tuple[Event, ...] = ()
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last sample, on the clock of the source."""
+        times = [array.time for array in self.signals.values() if array.time.size]
+        return float(max(t.max() for t in times) - min(t.min() for t in times)) if times else 0.0
+
+    def __len__(self) -> int:
+        return sum(array.time.size for array in self.signals.values())
+
+    def samples(self) -> Iterator[Sample]:
+        """Every sample, in the order in which it was (or would have been) processed live."""
+        names = [name for name in self.signals if self.signals[name].time.size]
+        if not names:
+            return
+        arrays = [self.signals[name] for name in names]
+        order = np.concatenate([a.order for a in arrays])
+        which = np.concatenate([np.full(a.order.size, i) for i, a in enumerate(arrays)])
+        row = np.concatenate([np.arange(a.order.size) for a in arrays])
+        place = np.argsort(order, kind="stable")
+        times = [a.time.tolist() for a in arrays]
+        hosts = [a.host_time.tolist() for a in arrays]
+        values = [[tuple(v) for v in a.value.tolist()] for a in arrays]
+        for i, k in zip(which[place].tolist(), row[place].tolist(), strict=True):
+            yield Sample(names[i], times[i][k], values[i][k], hosts[i][k])
+
+    def check(self, required: Iterable[str]) -> None:
+        """Raise DataError if a required signal is absent or holds NaN that was in the file itself."""
+        for name in required:
+            array = self.signals.get(name)
+            if array is None or array.time.size == 0:
+                raise DataError(f"{self.path}: the recording has no {name}, which the estimator needs.")
+            bad = ~np.isfinite(array.value).all(axis=1) & ~array.marked
+            if bad.any():
+                first = float(array.time[int(np.argmax(bad))])
+                raise DataError(
+                    f"{self.path}: {name} is not a number in {int(bad.sum())} of {bad.size} samples, "
+                    f"first at t = {first:.3f} s."
+                )
+            if not np.isfinite(array.time).all():
+                raise DataError(f"{self.path}: {name} has samples without a time.")
+
+
+def collect(samples: Iterable[tuple[Sample, bool]]) -> dict[str, SignalArray]:
+    """Arrays from samples in processing order, each with its `marked` flag."""
+    times: dict[str, list[float]] = {}
+    values: dict[str, list[tuple[float, ...]]] = {}
+    orders: dict[str, list[int]] = {}
+    hosts: dict[str, list[float]] = {}
+    marks: dict[str, list[bool]] = {}
+    for order, (sample, marked) in enumerate(samples):
+        name = sample.signal
+        if name not in times:
+            times[name], values[name], orders[name], hosts[name], marks[name] = [], [], [], [], []
+        times[name].append(sample.time)
+        values[name].append(sample.value)
+        orders[name].append(order)
+        hosts[name].append(sample.host_time)
+        marks[name].append(marked)
+    return {
+        name: SignalArray(
+            np.array(times[name], float),
+            np.array(values[name], float).reshape(len(times[name]), SIGNALS[name][0]),
+            np.array(orders[name], np.int64),
+            np.array(hosts[name], float),
+            np.array(marks[name], bool),
+        )
+        for name in SIGNALS
+        if name in times
+    }
