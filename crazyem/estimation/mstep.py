@@ -1,0 +1,153 @@
+"""M-step: mass, inertia and rotor time constant that maximise the expected complete-data log-likelihood.
+
+With the noise intensities profiled out it is, for N steps (paper's eq. 107 and appendix in their correct, joint form),
+
+    Q = N log m - N/2 log S_F + N sum_i log I_i - N/2 sum_i log S_i + log prior,
+    S_F = sum E[(m a - F(tau))^2] dt,   S_i = sum E[(I_i alpha_i + (I_k - I_j) w_j w_k - M_i(tau))^2] dt,
+
+F and M being linear in tau around the value they were made with. Every S is a quadratic form c' A c in a vector c that
+is linear in the parameters, with A the sums of kernels.py, so Newton's method in the logarithms of the parameters costs
+microseconds; logarithms also rule out sign flips.
+"""
+
+import numpy as np
+from numba import njit
+
+from crazyem.estimation.kernels import AXIS, COUNT, MASS
+
+MAX_STEP = 1.0  # largest change of a logarithm in one Newton step
+
+
+@njit(cache=True, nogil=True)
+def _unpack(sums, base, n, out):
+    at = base
+    for i in range(n):
+        for j in range(i, n):
+            out[i, j] = sums[at]
+            out[j, i] = sums[at]
+            at += 1
+
+
+@njit(cache=True, nogil=True)
+def objective(theta, sums, free, centre, precision, gradient, hessian, squares):
+    """-Q at theta (5,), with its gradient and Hessian in the logarithms; squares (4,) receives S_F, S_x, S_y, S_z."""
+    count = sums[COUNT]
+    a = np.zeros((4, 4))
+    c = np.zeros(4)
+    dc = np.zeros((4, 5))
+    ac = np.zeros(4)
+    for i in range(5):
+        gradient[i] = 0.0
+        for j in range(5):
+            hessian[i, j] = 0.0
+    value = 0.0
+    grad = np.zeros(5)
+    for term in range(4):
+        dc[:, :] = 0.0
+        if term == 0:
+            n = 3
+            _unpack(sums, MASS, 3, a)
+            c[0], c[1], c[2] = theta[0], -1.0, -theta[4]
+            dc[0, 0] = 1.0
+            dc[2, 4] = -1.0
+            value -= count * np.log(theta[0])
+        else:
+            n = 4
+            i = term - 1
+            j = (i + 1) % 3
+            k = (i + 2) % 3
+            _unpack(sums, AXIS + 10 * i, 4, a)
+            c[0], c[1], c[2], c[3] = theta[1 + i], theta[1 + k] - theta[1 + j], -1.0, -theta[4]
+            dc[0, 1 + i] = 1.0
+            dc[1, 1 + k] = 1.0
+            dc[1, 1 + j] = -1.0
+            dc[3, 4] = -1.0
+            value -= count * np.log(theta[1 + i])
+        gradient[term] -= count
+        s = 0.0
+        for p in range(n):
+            ac[p] = 0.0
+            for q in range(n):
+                ac[p] += a[p, q] * c[q]
+            s += c[p] * ac[p]
+        s = max(s, 1e-300)
+        squares[term] = s
+        value += 0.5 * count * np.log(s)
+        for u in range(5):
+            grad[u] = 0.0
+            for p in range(n):
+                grad[u] += dc[p, u] * ac[p]
+            grad[u] *= 2.0 * theta[u]
+            gradient[u] += 0.5 * count * grad[u] / s
+        for u in range(5):
+            hessian[u, u] += 0.5 * count * grad[u] / s
+            for v in range(5):
+                h = 0.0
+                for p in range(n):
+                    for q in range(n):
+                        h += dc[p, u] * a[p, q] * dc[q, v]
+                hessian[u, v] += 0.5 * count * (2.0 * h * theta[u] * theta[v] / s - grad[u] * grad[v] / (s * s))
+    for u in range(5):
+        if free[u]:
+            d = np.log(theta[u] / centre[u])
+            value += 0.5 * precision[u] * d * d
+            gradient[u] += precision[u] * d
+            hessian[u, u] += precision[u]
+        else:
+            gradient[u] = 0.0
+            for v in range(5):
+                hessian[u, v] = 0.0
+                hessian[v, u] = 0.0
+            hessian[u, u] = 1.0
+    return value
+
+
+@njit(cache=True, nogil=True)
+def maximise(theta, sums, free, centre, precision, iterations, squares):
+    """Newton's method with Levenberg damping from theta (5,: m, Ixx, Iyy, Izz, tau), in place.
+
+    Args:
+        theta: start, replaced by the maximiser.
+        sums: statistics summed over the window.
+        free: (5,) which parameters may move.
+        centre, precision: (5,) log-normal prior: centre, and 1/sd^2 of the logarithm.
+        iterations: at most so many Newton steps.
+        squares: (4,) receives the residual sums S_F, S_x, S_y, S_z at the result.
+    """
+    gradient = np.empty(5)
+    hessian = np.empty((5, 5))
+    trial = np.empty(5)
+    g2 = np.empty(5)
+    h2 = np.empty((5, 5))
+    value = objective(theta, sums, free, centre, precision, gradient, hessian, squares)
+    damping = 0.0
+    for _ in range(iterations):
+        size = 0.0
+        for attempt in range(12):
+            damped = hessian.copy()
+            for u in range(5):
+                # far from the optimum the profile is not convex: keep the diagonal at the information it must have
+                damped[u, u] += damping + (max(0.0, -hessian[u, u]) if attempt else 0.0)
+            step = np.linalg.solve(damped, -gradient)
+            down = 0.0
+            size = 0.0
+            for u in range(5):
+                step[u] = min(MAX_STEP, max(-MAX_STEP, step[u]))
+                down += step[u] * gradient[u]
+                size = max(size, abs(step[u]))
+                trial[u] = theta[u] * np.exp(step[u])
+            new = objective(trial, sums, free, centre, precision, g2, h2, squares)
+            if down < 0.0 and new <= value + 1e-9:
+                for u in range(5):
+                    theta[u] = trial[u]
+                value = new
+                gradient[:] = g2
+                hessian[:, :] = h2
+                damping = 0.0 if damping < 1e-3 * sums[COUNT] else 0.1 * damping
+                break
+            damping = max(10.0 * damping, 0.05 * sums[COUNT] + 1.0)
+        else:
+            break
+        if size < 1e-7:
+            break
+    objective(theta, sums, free, centre, precision, gradient, hessian, squares)

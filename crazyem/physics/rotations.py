@@ -1,0 +1,82 @@
+"""Quaternions (x, y, z, w; body to world) and rotation vectors, in plain numpy, for the core that must stay exact.
+
+>>> import numpy as np
+>>> q = quaternion_from_rotation_vector(np.array([0.0, 0.0, np.pi / 2]))
+>>> np.round(rotation_matrix(q) @ np.array([1.0, 0.0, 0.0]), 12)
+array([0., 1., 0.])
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def skew(a: ArrayLike) -> NDArray:
+    """Matrix of the cross product, skew(a) @ b = a x b. a: (3,) -> (3, 3)."""
+    x, y, z = np.asarray(a, float)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def quaternion_product(p: ArrayLike, q: ArrayLike) -> NDArray:
+    """Hamilton product p * q, scalar last. p, q: (..., 4) -> (..., 4)."""
+    px, py, pz, pw = np.moveaxis(np.asarray(p, float), -1, 0)
+    qx, qy, qz, qw = np.moveaxis(np.asarray(q, float), -1, 0)
+    return np.stack(
+        [
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+            pw * qw - px * qx - py * qy - pz * qz,
+        ],
+        axis=-1,
+    )
+
+
+def quaternion_conjugate(q: ArrayLike) -> NDArray:
+    """Inverse of a unit quaternion. q: (..., 4) -> (..., 4)."""
+    return np.asarray(q, float) * np.array([-1.0, -1.0, -1.0, 1.0])
+
+
+def quaternion_from_rotation_vector(phi: ArrayLike) -> NDArray:
+    """Exponential map. phi: (..., 3) rad -> (..., 4)."""
+    phi = np.asarray(phi, float)
+    angle = np.linalg.norm(phi, axis=-1, keepdims=True)
+    half_sinc = 0.5 * np.sinc(angle / (2 * np.pi))  # sin(angle / 2) / angle
+    return np.concatenate([half_sinc * phi, np.cos(angle / 2)], axis=-1)
+
+
+def rotation_vector_from_quaternion(q: ArrayLike) -> NDArray:
+    """Logarithm, the shorter way round. q: (..., 4) -> (..., 3) rad."""
+    q = np.asarray(q, float)
+    q = np.where(q[..., 3:] < 0, -q, q)
+    sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[..., 3:])
+    return q[..., :3] * np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0)
+
+
+def rotation_matrix(q: ArrayLike) -> NDArray:
+    """Body to world. q: (..., 4) -> (..., 3, 3)."""
+    x, y, z, w = np.moveaxis(np.asarray(q, float), -1, 0)
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], -1),
+            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], -1),
+            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        -2,
+    )
+
+
+def quaternion_from_euler(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> NDArray:
+    """R = Rz(yaw) Ry(pitch) Rx(roll), right-handed, rad. (...,) each -> (..., 4)."""
+    cr, sr = np.cos(np.asarray(roll) / 2), np.sin(np.asarray(roll) / 2)
+    cp, sp = np.cos(np.asarray(pitch) / 2), np.sin(np.asarray(pitch) / 2)
+    cy, sy = np.cos(np.asarray(yaw) / 2), np.sin(np.asarray(yaw) / 2)
+    return np.stack(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ],
+        axis=-1,
+    )
