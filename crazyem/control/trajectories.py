@@ -74,6 +74,11 @@ def hover(*, position: Vector, yaw: float = 0.0, duration: float = 20.0) -> Traj
     return Trajectory("hover", duration, lambda t: reference)
 
 
+def after_hover(trajectory: Trajectory, *, seconds: float) -> Trajectory:
+    """The same trajectory after `seconds` of hover at its start."""
+    return Trajectory(trajectory.name, trajectory.duration + seconds, lambda t: trajectory.at(t - seconds))
+
+
 def figure8(
     *,
     position: Vector,
@@ -178,7 +183,6 @@ def excite(
     vertical: float = 0.5,
     angular: float = 4.5,
     ramp: float = 1.5,
-    lead_in: float = 0.0,
 ) -> Trajectory:
     """Hover with multisines on all four axes: the manoeuvre that makes mass, inertia and rotor lag observable.
 
@@ -190,9 +194,7 @@ def excite(
         vertical: rms acceleration along world z, m/s^2.
         angular: rms yaw acceleration, rad/s^2 (0.02..0.04 rad of yaw).
         ramp: s to reach full amplitude, and to stop again.
-        lead_in: s of plain hover first.
     """
-    active = max(duration - lead_in, 1e-3)
     sines = (
         _Multisine.of(EXCITE_X, lateral, 0.3),
         _Multisine.of(EXCITE_Y, lateral, 1.9),
@@ -201,8 +203,8 @@ def excite(
     )
 
     def at(t: float) -> Reference:
-        t = min(max(t - lead_in, 0.0), active)
-        w = window(t, duration=active, ramp=ramp)
+        t = min(max(t, 0.0), duration)
+        w = window(t, duration=duration, ramp=ramp)
         # Product rule: (w q)' = w'q + w q', and so on.
         p, v, a, j = zip(*(_product(w, s.derivatives(t)) for s in sines))
         return Reference(

@@ -1,5 +1,6 @@
 """The guard: what reaches a controller and what does not, and the write order; no drone needed."""
 
+import itertools
 import math
 
 import pytest
@@ -57,7 +58,7 @@ def test_good_estimates_arrive_slew_limited_and_scaled():
     assert last["ctrlLee.KR_x"] == pytest.approx(0.007 * (2.0 + 2.1) / (1.66 + 1.67))
     assert last["ctrlLee.KR_x"] == last["ctrlLee.KR_y"]
     assert last["ctrlLee.Kw_z"] == pytest.approx(0.002 * 3.6 / 2.93)
-    gaps = [b.time - a.time for a, b in zip(decisions, decisions[1:])]
+    gaps = [b.time - a.time for a, b in itertools.pairwise(decisions)]
     assert min(gaps) >= Limits().interval
     assert len(decisions) <= 4  # then the deadband keeps quiet
 

@@ -1,0 +1,202 @@
+"""A running estimate over an open link: packets in, samples through the pipeline, everything recorded on the way.
+
+Threads: one receives (records, keeps clock and telemetry; cheap, so flying is never blind), one estimates, one writes
+parameters. Setpoints have a thread of their own (stream.py). None of them waits for another.
+"""
+
+import math
+import queue
+import threading
+from collections.abc import Callable, Sequence
+
+from crazyem.errors import CrazyemError, DataError, LinkError, UsageError
+from crazyem.estimation.result import Estimate
+from crazyem.links.base import Block, Link, LinkLost, Packet
+from crazyem.live.clock import FirmwareClock
+from crazyem.live.guard import Guard, Limits
+from crazyem.live.history import History
+from crazyem.live.pipeline import Estimator, Pipeline
+from crazyem.live.push import Pusher, push_target, read_originals
+from crazyem.live.recorder import Recorder
+from crazyem.live.telemetry import Telemetry
+from crazyem.signals.sample import Sample
+from crazyem.signals.vocabulary import IMU_BLOCK, MOTOR_BLOCK, ROTOR_SPEED_BLOCK, STATE_BLOCK, decoders
+from crazyem.vehicle import Vehicle
+
+RATE = 100.0  # Hz
+SETPOINT = tuple(f"ctrltargetZ.{a}" for a in "xyz")
+WRENCH = tuple(f"ctrlLee.{n}" for n in ("thrustSi", "torquex", "torquey", "torquez"))
+
+
+def block_plan(available: Sequence[str]) -> list[tuple[str, ...]]:
+    """Blocks to log, of what the drone offers, each within 26 bytes; the estimator's needs first.
+
+    State with the active setpoint (22 bytes, so that tracking errors compare one instant), motors with voltage and
+    flight state (12, 20 with rotor speeds), gyro and accelerometer (24), commanded wrench under Lee (16).
+
+    Raises:
+        UsageError: naming a variable the estimator cannot do without.
+    """
+    names = set(available)
+    for needed in (*STATE_BLOCK, *MOTOR_BLOCK):
+        if needed not in names:
+            raise UsageError(f"the drone has no log variable {needed}, which the estimator needs.")
+    motors = MOTOR_BLOCK + (ROTOR_SPEED_BLOCK if names.issuperset(ROTOR_SPEED_BLOCK) else ())
+    plan = [STATE_BLOCK + tuple(v for v in SETPOINT if names.issuperset(SETPOINT)), motors]
+    plan.extend(extra for extra in (IMU_BLOCK, WRENCH) if names.issuperset(extra))
+    return plan
+
+
+class Session:
+    """Estimates from an open link until closed.
+
+    Args:
+        link: connected.
+        vehicle: nominal constants.
+        estimator: fed from one thread.
+        recorder: or None.
+        on_estimate: called in the estimator's thread with every estimate.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        *,
+        vehicle: Vehicle,
+        estimator: Estimator,
+        recorder: Recorder | None = None,
+        on_estimate: Callable[[Estimate], None] | None = None,
+    ) -> None:
+        self.link = link
+        self.vehicle = vehicle
+        self.recorder = recorder
+        self.history = History()
+        self.clock = FirmwareClock()
+        self.telemetry = Telemetry()
+        self.lost: LinkLost | None = None
+        self.failure: CrazyemError | None = None
+        self.pusher: Pusher | None = None
+        self._on_estimate = on_estimate
+        self.pipeline = Pipeline(estimator, history=self.history, on_estimate=self._estimated)
+        self.blocks: tuple[Block, ...] = ()
+        self._samples: queue.SimpleQueue[list[Sample] | None] = queue.SimpleQueue()
+        self._stop = threading.Event()
+        self._closed = False
+        self._threads: list[threading.Thread] = []
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """The newest estimate."""
+        return self.history.estimates[-1] if self.history.estimates else None
+
+    def start(self) -> None:
+        """Subscribe and let packets flow."""
+        plan = block_plan(tuple(self.link.log_variables))
+        blocks: list[Block] = []
+        # Threads first: packets of the first block must not pile up behind the set-up of the last.
+        for variables in plan:
+            blocks.extend(self.link.subscribe(variables, RATE))
+        self.blocks = tuple(blocks)
+        if self.recorder is not None:
+            self.recorder.blocks(self.blocks)
+        self._decoders = decoders(self.blocks)
+        self._names = {b.identifier: tuple(v.name for v in b.variables) for b in self.blocks}
+        for target, name in ((self._receive, "crazyem-receive"), (self._estimate, "crazyem-estimate")):
+            thread = threading.Thread(target=target, name=name, daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def push_to_controller(self, limits: Limits | None = None) -> str:
+        """Let the guard push to the controller that runs now; returns a sentence if there is anything to say."""
+        controller, note = push_target(self.link)
+        self.history.notice(note)
+        if controller is None:
+            return note
+        nominal = dict(zip(("mass", "Ixx", "Iyy", "Izz"), (self.vehicle.mass, *self.vehicle.inertia)))
+        guard = Guard(controller, nominal=nominal, originals=read_originals(self.link, controller), limits=limits)
+        on_write = self.recorder.parameter_write if self.recorder is not None else None
+        self.pusher = Pusher(self.link, guard, history=self.history, on_write=on_write)
+        self.pipeline.push = self.pusher.submit
+        self.pipeline.guard = guard
+        return note
+
+    def raise_if_failed(self) -> None:
+        """Raise what went wrong in a thread, or that the drone is lost."""
+        if self.failure is not None:
+            raise self.failure
+        if self.lost is not None:
+            raise LinkError(self.lost_sentence())
+
+    def lost_sentence(self) -> str:
+        """One sentence about a lost drone."""
+        reason = self.lost.reason.rstrip(".") if self.lost else "no packets arrive"
+        tail = f"; the recording {self.recorder.path} is intact up to there" if self.recorder is not None else ""
+        return f"the drone at {self.link.uri} was lost: {reason}{tail}."
+
+    def close(self) -> None:
+        """Stop receiving, let the estimator finish what has arrived, end the writes. Does not close the link."""
+        if self._closed:
+            return
+        self._closed = True
+        self._stop.set()
+        for thread in self._threads:
+            thread.join(timeout=30.0)
+        if self.pusher is not None:
+            self.pusher.close()
+
+    def _estimated(self, estimate: Estimate) -> None:
+        if self.recorder is not None:
+            self.recorder.estimate(estimate)
+        if self._on_estimate is not None:
+            self._on_estimate(estimate)
+
+    def _receive(self) -> None:
+        try:
+            while not self._stop.is_set():
+                try:
+                    item = self.link.packets.get(timeout=0.1)
+                except queue.Empty:
+                    continue
+                if isinstance(item, LinkLost):
+                    self.lost = item
+                    break
+                self._packet(item)
+        except CrazyemError as error:
+            self.failure = error
+        except Exception as error:  # a fault of ours must reach the flight as well: it has to land
+            self.failure = CrazyemError(f"receiving failed: {error!r}")
+        finally:
+            self._samples.put(None)
+
+    def _packet(self, packet: Packet) -> None:
+        self.clock.observe(packet.firmware_time_ms / 1000.0)
+        names = self._names.get(packet.block)
+        if names is None:
+            return  # a block of somebody else's
+        if self.recorder is not None:
+            self.recorder.packet(packet)
+        if "supervisor.info" in names:
+            info = packet.values[names.index("supervisor.info")]
+            self.telemetry.info = int(info) if math.isfinite(info) else None
+        for name, value in zip(names, packet.values):
+            if not math.isfinite(value):
+                if self.failure is None:
+                    self.failure = DataError(
+                        f"log variable {name} is {value} at t = {packet.firmware_time_ms / 1000:.3f} s; "
+                        "the estimator stopped."
+                    )
+                return
+        samples = self._decoders[packet.block].decode(packet)
+        for sample in samples:
+            self.telemetry.take(sample)
+        self._samples.put(samples)
+
+    def _estimate(self) -> None:
+        try:
+            while (samples := self._samples.get()) is not None:
+                for sample in samples:
+                    self.pipeline.sample(sample)
+        except CrazyemError as error:
+            self.failure = self.failure or error
+        except Exception as error:
+            self.failure = self.failure or CrazyemError(f"estimating failed: {error!r}")

@@ -1,0 +1,122 @@
+"""Starts and stops the simulated firmware as a process of its own; nothing but its address comes back."""
+
+import atexit
+import contextlib
+import queue
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+
+from crazyem.errors import CrazyemError, FileFormatError
+
+READY = re.compile(r"(udp://\S+)")
+START_TIMEOUT = 180.0  # s; the first start on a machine compiles the plant's kernels
+
+
+class Simulator:
+    """`python -m firmware_sim` on a free port of this host, for the length of a `with` block.
+
+    Args:
+        scenario: the truth, a file only the simulator reads; None for its defaults.
+        seed: of every noise in it.
+        speed: firmware seconds per second.
+        truth: CSV file for the true state, or None.
+        command: what to start instead (tests).
+
+    Raises:
+        FileFormatError: it refused its scenario (its own sentence).
+        CrazyemError: it did not start.
+    """
+
+    def __init__(
+        self,
+        *,
+        scenario: str | Path | None = None,
+        seed: int = 0,
+        speed: float = 1.0,
+        truth: str | Path | None = None,
+        command: Sequence[str] | None = None,
+        timeout: float = START_TIMEOUT,
+    ) -> None:
+        self.uri = ""
+        self.timeout = timeout
+        self._scenario = scenario
+        self._command = list(command) if command else [sys.executable, "-m", "firmware_sim"]
+        self._command += ["--port", "0", "--seed", str(seed), "--speed", f"{speed:g}"]
+        if scenario is not None:
+            self._command += ["--scenario", str(scenario)]
+        if truth is not None:
+            self._command += ["--truth", str(truth)]
+        self._process: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> "Simulator":
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def start(self) -> str:
+        """Start, wait until it answers, return its URI."""
+        # A session of its own: Ctrl-C in the terminal must land the drone, not kill the firmware under it.
+        process = subprocess.Popen(
+            self._command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        )
+        self._process = process
+        atexit.register(self.stop)
+        lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        errors: list[str] = []
+
+        def read_out() -> None:
+            for line in process.stdout or ():
+                lines.put(line)
+            lines.put(None)
+
+        def read_errors() -> None:
+            errors.extend(line.strip() for line in process.stderr or () if line.strip())
+
+        threads = [threading.Thread(target=f, daemon=True) for f in (read_out, read_errors)]
+        for thread in threads:
+            thread.start()
+        while True:
+            try:
+                line = lines.get(timeout=self.timeout)
+            except queue.Empty:
+                self.stop()
+                raise CrazyemError(f"the simulator did not get ready within {self.timeout:g} s.") from None
+            if line is None:
+                code = process.wait()
+                threads[1].join(timeout=1.0)
+                self.stop()
+                reason = errors[-1].removeprefix("firmware_sim: ") if errors else f"exit code {code}"
+                if self._scenario is not None and Path(str(self._scenario)).name in reason:
+                    raise FileFormatError(reason)
+                raise CrazyemError(f"the simulator did not start: {reason}")
+            found = READY.search(line)
+            if found:
+                self.uri = found.group(1)
+                return self.uri
+
+    def stop(self) -> None:
+        """End the process; safe to call twice."""
+        atexit.unregister(self.stop)
+        process, self._process = self._process, None
+        if process is None:
+            return
+        if process.poll() is None:
+            process.terminate()
+            try:
+                process.wait(timeout=5.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        for stream in (process.stdout, process.stderr):
+            if stream is not None:
+                with contextlib.suppress(OSError, ValueError):
+                    stream.close()

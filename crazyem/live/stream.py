@@ -1,0 +1,69 @@
+"""Streams full-state setpoints at a steady rate of the firmware's clock, in a thread nothing else can delay."""
+
+import threading
+import time
+from collections.abc import Callable
+
+from crazyem.control.trajectories import Reference, Trajectory
+from crazyem.links.base import Link
+from crazyem.live.clock import FirmwareClock
+
+PERIOD = 0.01  # s of firmware time
+SHORTEST = 0.001  # s of host time; below this a fast simulator gets setpoints further apart
+
+
+class SetpointStream:
+    """Sends `trajectory` from `start()` until `stop()`; holds its end point after its duration.
+
+    Args:
+        on_setpoint: called with (firmware time [s], reference) after each setpoint (recording).
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        trajectory: Trajectory,
+        clock: FirmwareClock,
+        *,
+        on_setpoint: Callable[[float, Reference], None] | None = None,
+    ) -> None:
+        self.link = link
+        self.trajectory = trajectory
+        self.clock = clock
+        self.on_setpoint = on_setpoint
+        self.sent = 0
+        self.failure: Exception | None = None
+        self.began = float("nan")
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="crazyem-setpoints", daemon=True)
+
+    def start(self) -> None:
+        """Begin; the trajectory's time 0 is now, on the firmware's clock."""
+        self.began = self.clock.now()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Send no more; returns when the thread has ended."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(timeout=2.0)
+
+    @property
+    def elapsed(self) -> float:
+        """s of firmware time since the start."""
+        return self.clock.now() - self.began
+
+    def _run(self) -> None:
+        due = time.monotonic()
+        try:
+            while not self._stop.is_set():
+                firmware = self.clock.now()
+                r = self.trajectory.at(firmware - self.began)
+                self.link.send_full_state(r.position, r.velocity, r.acceleration, r.quaternion, (0.0, 0.0, r.yaw_rate))
+                self.sent += 1
+                if self.on_setpoint is not None:
+                    self.on_setpoint(firmware, r)
+                due = max(due + max(PERIOD / max(self.clock.rate, 1e-3), SHORTEST), time.monotonic() - 0.05)
+                self._stop.wait(max(due - time.monotonic(), 0.0))
+        except Exception as error:
+            self.failure = error

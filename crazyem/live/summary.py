@@ -1,0 +1,130 @@
+"""The summary of a flight, a replay or a watch: JSON for programs (names are an interface), text for people."""
+
+import json
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from crazyem.errors import UsageError
+from crazyem.estimation.result import Estimate
+from crazyem.live.history import History
+
+
+def build_summary(
+    *,
+    log: str | None,
+    vehicle: str,
+    estimate: Estimate,
+    history: History,
+    update_seconds: Sequence[float],
+    received: int,
+    lost: int,
+    extra: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The summary object.
+
+    Args:
+        log: path of the recording, or None.
+        estimate: the final one.
+        update_seconds: cost of each update, s.
+        received, lost: log packets (live) or samples (foreign recordings).
+        extra: further keys, such as the controller, the seed or the URI.
+    """
+    ms = 1e3 * np.asarray(update_seconds, dtype=float)
+    rms, height = history.before_and_after()
+    return {
+        "log": log,
+        "vehicle": vehicle,
+        "estimates": estimate.to_json(),
+        "pushes": [p.to_json() for p in history.pushes],
+        "updates": estimate.updates,
+        "update_ms": {
+            "median": float(np.median(ms)) if ms.size else None,
+            "p99": float(np.percentile(ms, 99)) if ms.size else None,
+        },
+        "samples": {"received": received, "lost": lost},
+        "tracking_rms_m": rms,
+        "height_error_m": height,
+        "noise": dict(estimate.noise),
+        "converged": estimate.converged,
+        **(extra or {}),
+        "notices": list(history.notices),
+    }
+
+
+def _finite(value: Any) -> Any:
+    """JSON knows no NaN and no infinity: they become null."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    return value
+
+
+def write_json(summary: Mapping[str, Any], path: str) -> None:
+    """Write the summary to a file, or to standard output for '-'.
+
+    Raises:
+        UsageError: the file cannot be written.
+    """
+    text = json.dumps(_finite(summary), indent=2, allow_nan=False) + "\n"
+    if path == "-":
+        sys.stdout.write(text)
+        return
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as e:
+        raise UsageError(f"cannot write {path}: {e.strerror}.") from None
+
+
+def check_writable(path: str | None) -> None:
+    """Find out before the flight, not after it, that a result cannot be written.
+
+    Raises:
+        UsageError: no such folder, or it is a folder.
+    """
+    if path is None or path == "-":
+        return
+    target = Path(path)
+    if target.is_dir() or not target.resolve().parent.is_dir():
+        raise UsageError(f"cannot write {path}: no such folder, or it is a folder.")
+
+
+def text_summary(summary: Mapping[str, Any], estimate: Estimate) -> str:
+    """A few lines for the terminal."""
+    lines = [str(estimate)]
+    pushes = summary["pushes"]
+    if pushes:
+        unverified = sum(not p["verified"] for p in pushes)
+        lines.append(f"pushes: {len(pushes)} parameter writes, {unverified} not confirmed")
+    received, lost = summary["samples"]["received"], summary["samples"]["lost"]
+    ms = summary["update_ms"]
+    cost = f", {ms['median']:.2f} ms each (99 %: {ms['p99']:.2f} ms)" if ms["median"] is not None else ""
+    lines.append(f"updates: {summary['updates']}{cost}; packets: {received} received, {lost} lost")
+    for key, label in (("height_error_m", "mean height error"), ("tracking_rms_m", "tracking error, rms")):
+        before, after = summary[key]["before_push"], summary[key]["after_push"]
+        if before is not None:
+            then = f", {after:+.3f} m after pushing" if after is not None else ""
+            lines.append(f"{label}: {before:+.3f} m{then}")
+    lines += [f"note: {n}" for n in summary["notices"]]
+    return "\n".join(lines)
+
+
+def live_line(phase: str, seconds: float, estimate: Estimate | None, *, lost: int, pushes: int) -> str:
+    """One line per second: phase, mass and inertia with 95 % half widths, losses, pushes."""
+    head = f"{phase:<12.12} {seconds:6.1f} s"
+    if estimate is None:
+        return f"{head}  no estimate yet"
+    parts = []
+    for name, unit, scale in (("mass", "g", 1e3), ("Ixx", "", 1e6), ("Iyy", "", 1e6), ("Izz", "e-6 kg m2", 1e6)):
+        p = estimate[name]
+        half = (p.ci95[1] - p.ci95[0]) / 2
+        mark = "" if p.identifiable else "?"
+        parts.append(f"{name} {p.value * scale:.2f}+-{min(half * scale, 999):.2f}{mark}{' ' + unit if unit else ''}")
+    return f"{head}  {'  '.join(parts)}  lost {lost}  pushes {pushes}"

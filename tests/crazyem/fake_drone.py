@@ -1,0 +1,182 @@
+"""A drone made of a few lines for testing the flight loop: it is where it is told to be, on a clock that runs fast."""
+
+import queue
+import struct
+import threading
+import time
+
+from crazyem.errors import LinkError
+from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
+from crazyem.links.base import Block, LinkLost, LinkStatistics, Packet, ParameterWrite, Variable
+from crazyem.live.session import SETPOINT, WRENCH
+from crazyem.live.telemetry import ARMED, AUTO_ARM, CAN_ARM, CAN_FLY, FLYING
+from crazyem.signals.vocabulary import IMU_BLOCK, MOTOR_BLOCK, STATE_BLOCK, compress_quaternion
+
+LEVEL = float(compress_quaternion((0.0, 0.0, 0.0, 1.0)))
+SAG = 0.3  # m below the wanted height until the believed mass is right
+TRUTH = {"mass": 0.036, "Ixx": 2.0e-5, "Iyy": 2.1e-5, "Izz": 3.6e-5, "motor_time_constant": 0.06}
+
+
+def float32(value):
+    return struct.unpack("<f", struct.pack("<f", value))[0]
+
+
+class FakeLink:
+    """A Link; `speed` firmware seconds pass per second."""
+
+    def __init__(self, *, speed=20.0, controllers=(1, 5, 6), lose_echo_after=None, lost_at=None, nan_at=None):
+        self.uri = "fake://0"
+        self.packets = queue.SimpleQueue()
+        self.speed = speed
+        self.controllers = controllers
+        self.lose_echo_after = lose_echo_after
+        self.lost_at = lost_at
+        self.nan_at = nan_at
+        self.log_variables = dict.fromkeys((*STATE_BLOCK, *SETPOINT, *MOTOR_BLOCK, *IMU_BLOCK, *WRENCH), "float")
+        self.values = {
+            "stabilizer.controller": 1.0, "stabilizer.estimator": 2.0, "ctrlLee.mass": 0.029,
+            "ctrlLee.J_x": 1.657e-5, "ctrlLee.J_y": 1.666e-5, "ctrlLee.J_z": 2.926e-5,
+            "ctrlLee.KR_x": 0.007, "ctrlLee.KR_y": 0.007, "ctrlLee.KR_z": 0.008,
+            "ctrlLee.Kw_x": 0.00115, "ctrlLee.Kw_y": 0.00115, "ctrlLee.Kw_z": 0.002,
+        }  # fmt: skip
+        self.calls = []
+        self.blocks = []
+        self.height = 0.0
+        self.wanted = (0.2, 0.1, 0.0)
+        self.low_level = False
+        self.motors = False
+        self.armed = True
+        self.last_setpoint = 0.0
+        self.writes = 0
+        self.fm = 1000
+        self._landing = False
+        self._stop = threading.Event()
+        self._thread = None
+
+    parameters = property(lambda self: dict.fromkeys(self.values, "float"))
+
+    def connect(self, timeout=15.0):
+        pass
+
+    def close(self):
+        self._stop.set()
+        if self._thread:
+            self._thread.join()
+
+    def subscribe(self, variables, rate_hz):
+        block = Block(len(self.blocks), tuple(Variable(v, "float") for v in variables), int(1000 / rate_hz))
+        self.blocks.append(block)
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, daemon=True)
+            self._thread.start()
+        return (block,)
+
+    def read_parameter(self, name, timeout=2.0):
+        return self.values[name]
+
+    def write_parameter(self, name, value, timeout=1.0):
+        self.writes += name.startswith("ctrl")
+        if self.lose_echo_after is not None and self.writes > self.lose_echo_after:
+            return ParameterWrite(name, value, None, False, time.time())
+        if name != "stabilizer.controller" or value in self.controllers:
+            self.values[name] = float32(value)
+        return ParameterWrite(name, value, float32(value), True, time.time())
+
+    def statistics(self):
+        return LinkStatistics(received=self.fm // 10, lost=0)
+
+    def arm(self, armed):
+        self.calls.append("arm")
+        self.armed = armed
+
+    def take_off(self, height, duration):
+        self.calls.append("take_off")
+        if not self.low_level:
+            self.wanted, self.motors, self._landing = (*self.wanted[:2], height), True, False
+
+    def land(self, height, duration):
+        self.calls.append("land")
+        if not self.low_level:
+            self.wanted, self._landing = (*self.wanted[:2], height), True
+
+    def go_to(self, *a, **k):
+        raise AssertionError
+
+    def send_full_state(self, position, velocity, acceleration, quaternion, body_rate):
+        self.calls.append("setpoint")
+        if self.lost_at is not None and self.fm > self.lost_at:
+            raise LinkError("gone")
+        self.low_level, self.wanted, self.last_setpoint = True, tuple(position), self.fm
+
+    send_position = send_hover = go_to
+
+    def release_setpoints(self):
+        self.calls.append("release")
+        self.low_level = False
+
+    def stop(self):
+        self.calls.append("stop")
+        self.motors = False
+
+    def _run(self):
+        while not self._stop.is_set():
+            self.fm += 10
+            if self.lost_at is not None and self.fm > self.lost_at:
+                self.packets.put(LinkLost("the link closed.", time.time()))
+                return
+            sag = SAG * (0.036 - self.values["ctrlLee.mass"]) / 0.007
+            goal = max(0.0, self.wanted[2] - sag) if self.motors else 0.0
+            self.height += 0.05 * (goal - self.height)
+            if self._landing and self.height < 0.02:
+                self.motors = False
+            for block in tuple(self.blocks):
+                values = tuple(self.value(v.name) for v in block.variables)
+                self.packets.put(Packet(block.identifier, self.fm, time.time(), values))
+            time.sleep(0.01 / self.speed)
+
+    def value(self, name):
+        if self.nan_at is not None and self.fm > self.nan_at and name == "acc.z":
+            return float("nan")
+        info = CAN_ARM | AUTO_ARM | CAN_FLY | (ARMED if self.armed else 0) | (FLYING if self.motors else 0)
+        fixed = {
+            "stateEstimateZ.x": 1e3 * self.wanted[0], "stateEstimateZ.y": 1e3 * self.wanted[1],
+            "stateEstimateZ.z": 1e3 * self.height, "stateEstimateZ.quat": LEVEL,
+            "ctrltargetZ.x": 1e3 * self.wanted[0], "ctrltargetZ.y": 1e3 * self.wanted[1],
+            "ctrltargetZ.z": 1e3 * self.wanted[2], "supervisor.info": float(info), "pm.vbatMV": 3900.0, "acc.z": 1.0,
+        }  # fmt: skip
+        return fixed.get(name, 0.0)
+
+
+class FakeEstimator:
+    """Says the truth after `after` samples in the air, wider before."""
+
+    def __init__(self, *, every=4, error=None):
+        self.airborne = False
+        self.update_seconds = []
+        self.every = every
+        self.error = error
+        self.n = 0
+        self.updates = 0
+        self.time = 0.0
+
+    def feed(self, sample):
+        if sample.signal == "flying":
+            self.airborne = sample.value[0] > 0
+        if sample.signal != "position" or not self.airborne:
+            return None
+        self.n += 1
+        self.time = sample.time
+        if self.error and self.n > 300:
+            raise self.error
+        return None if self.n % self.every else self.finish()
+
+    def finish(self):
+        self.updates += 1
+        self.update_seconds.append(1e-4)
+        sd = 0.3 / max(self.n, 1)
+        return Estimate(
+            self.time,
+            {n: ParameterEstimate(v, sd * v, (v * (1 - 1.96 * sd), v * (1 + 1.96 * sd)), PARAMETER_UNITS[n], self.n > 50)
+             for n, v in TRUTH.items()},
+            samples=self.n, updates=self.updates, converged=True,
+        )  # fmt: skip
