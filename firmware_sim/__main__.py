@@ -1,0 +1,84 @@
+"""Command line of the simulator: `python -m firmware_sim`, or the console script `firmware-sim`."""
+
+import argparse
+import contextlib
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from firmware_sim.errors import FirmwareSimError, ServerError
+from firmware_sim.firmware import Firmware
+from firmware_sim.server import Server, bind
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < 1000.0:
+        raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1000")
+    return value
+
+
+def _port(text: str) -> int:
+    value = int(text)
+    if not 0 <= value <= 65535:
+        raise argparse.ArgumentTypeError(f"{text} is not a UDP port")
+    return value
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="firmware_sim", description="A simulated Crazyflie that answers on udp://.")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
+    parser.add_argument("--port", type=_port, default=19850, help="UDP port, 0 for any free one (default %(default)s)")
+    parser.add_argument("--scenario", type=Path, help="TOML file: the true drone, and what its firmware believes")
+    parser.add_argument("--seed", type=int, default=0, help="of every random number (default %(default)s)")
+    parser.add_argument(
+        "--speed", type=_positive, default=1.0, help="firmware seconds per second (default %(default)s)"
+    )
+    parser.add_argument("--truth", type=Path, help="write the true motion to this CSV file, 100 rows per second")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the simulator until SIGINT or SIGTERM; 0 then, 2 after a mistake of the user, told in one sentence."""
+    arguments = _parser().parse_args(argv)
+    try:
+        _run(arguments)
+    except FirmwareSimError as error:
+        print(f"firmware_sim: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    if arguments.seed < 0:
+        raise FirmwareSimError(f"--seed must not be negative, it is {arguments.seed}")
+    with contextlib.ExitStack() as stack:
+        sock = stack.enter_context(contextlib.closing(bind(arguments.host, arguments.port)))
+        from firmware_sim.flight import Flight  # here: compiled code takes a while to load, a port in use should not
+        from firmware_sim.scenario import load_scenario
+
+        scenario = load_scenario(arguments.scenario)
+        truth = None
+        if arguments.truth:
+            try:
+                truth = stack.enter_context(arguments.truth.open("w", encoding="utf-8"))
+            except OSError as error:
+                raise ServerError(f"cannot write {arguments.truth}: {error.strerror}") from None
+        flight = Flight(scenario, arguments.seed)
+        firmware = Firmware(flight, platform=scenario.platform, seed=arguments.seed, parameters=scenario.parameters)
+        firmware.advance(1)  # compiles what is not compiled yet, before the clock starts
+        server = Server(firmware, sock, speed=arguments.speed, truth=truth)
+
+        def stop(_signal: int, _frame: object) -> None:
+            server.stopping = True
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, stop)
+        host, port = sock.getsockname()
+        print(f"firmware_sim: udp://{host}:{port} platform {scenario.platform} seed {arguments.seed}", flush=True)
+        server.run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,228 @@
+"""The firmware as one object: the flight, the commander and the services behind the CRTP ports, one millisecond at a time.
+
+Knows no sockets and no real time: `receive` takes a packet, `advance` lets time pass, `outbox` holds what goes out.
+"""
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+
+from firmware_sim import tables, wire
+from firmware_sim.commander.arbiter import HIGH_LEVEL, Arbiter
+from firmware_sim.commander.decode import RpytDecoder
+from firmware_sim.commander.supervisor import PERIOD as SUPERVISOR_PERIOD
+from firmware_sim.commander.supervisor import Supervisor
+from firmware_sim.errors import ScenarioError
+from firmware_sim.services import console, link
+from firmware_sim.services import supervisor as supervisor_port
+from firmware_sim.services.high_level import PERIOD as HIGH_LEVEL_PERIOD
+from firmware_sim.services.high_level import HighLevelService
+from firmware_sim.services.localisation import LocalisationService
+from firmware_sim.services.log import DATA, LogService
+from firmware_sim.services.memory import MemoryService
+from firmware_sim.services.param import ParamService
+from firmware_sim.services.platform import FIRMWARE_VERSION, PlatformService
+from firmware_sim.services.setpoint import SetpointService
+from firmware_sim.tables import Slot
+
+# Parameters that clients expect and that describe hardware this drone does not have, or has no more than one value for.
+_FIXED_PARAMETERS = {
+    "system.selftestPassed": 1.0,
+    "imu_sensors.HMC5883L_SIM": 1.0,
+    "imu_sensors.MS5611_SIM": 1.0,
+    "firmware.revision0": float(0x2A18FC29),
+    "firmware.revision1": 0.0,
+    "firmware.modified": 1.0,
+    "memTst.resetW": 0.0,
+    # cfclient cannot do without the deck group: no decks attached.
+    **{
+        f"deck.{name}": 0.0
+        for name in (
+            "bcZRanger",
+            "bcZRanger2",
+            "bcFlow",
+            "bcFlow2",
+            "bcLighthouse4",
+            "bcLoco",
+            "bcDWM1000",
+            "bcLedRing",
+        )
+    },
+}
+_FLIGHT_MODES = {
+    "flightmode.althold": 0.0,
+    "flightmode.poshold": 0.0,
+    "flightmode.posSet": 0.0,
+    "flightmode.yawMode": 2.0,
+    "flightmode.stabModeRoll": 1.0,
+    "flightmode.stabModePitch": 1.0,
+    "flightmode.stabModeYaw": 0.0,
+}
+
+
+class FlightLike(Protocol):
+    """What the firmware needs of a flight (flight.Flight; tests bring their own)."""
+
+    tick: int
+    log: dict[str, Slot]
+    param: dict[str, Slot]
+    param_defaults: dict[str, float]
+    setpoint: np.ndarray
+    motors_allowed: bool
+    armed: bool
+
+    def parameter_written(self, name: str) -> None:
+        """A parameter of the flight has been written."""
+
+    def external_position(self, position: np.ndarray) -> None:
+        """A position fix from outside, m, world."""
+
+    def external_pose(self, position: np.ndarray, quaternion: np.ndarray) -> None:
+        """A pose from outside, m, world; quaternion x, y, z, w, body to world."""
+
+    def step(self) -> None:
+        """One millisecond."""
+
+
+class Firmware:
+    """A drone that has booted at tick 0. platform: "cf2" or "cf21bl"; parameters: boot values that replace defaults.
+
+    Raises ScenarioError when a boot value names no parameter.
+    """
+
+    def __init__(self, flight: FlightLike, *, platform: str, seed: int, parameters: Mapping[str, float] | None = None):
+        self.flight = flight
+        self.outbox: deque[tuple[bytes, bool]] = deque()  # datagram, and whether it may be dropped
+        self._console: list[str] = []
+        auto_arm = platform != "cf21bl"
+        self.supervisor = Supervisor(
+            flight.log, flight.param, auto_arm=auto_arm, clock=self._tick, console=self._console.append
+        )
+        self.high_level = HighLevelService(flight.log, self._tick)
+        self.arbiter = Arbiter(low_level=self.high_level.planner.disable, relaxed=self.high_level.tell_state)
+        own_log = tables.slots({"crtp.rxRate": 0.0, "crtp.txRate": 0.0, "memTst.errCntW": 0.0})
+        own_param = tables.slots({**_FIXED_PARAMETERS, **_FLIGHT_MODES})
+        log = {**own_log, **self.supervisor.log, **flight.log}
+        param = {**own_param, **self.supervisor.param, **self.high_level.param, **flight.param}
+        # A parameter that the flight has too must be the flight's everywhere.
+        self.supervisor.param, self.high_level.param = param, param
+        self._rates = (own_log["crtp.rxRate"], own_log["crtp.txRate"])
+        self._packets = [0, 0]  # received and sent since the last update of the rates
+
+        defaults = {name: float(array[index]) for name, (array, index) in param.items()} | flight.param_defaults
+        self.log = LogService(tables.log_table(log), seed)
+        self.param = ParamService(tables.param_table(param), defaults, self._written)
+        self.memory = MemoryService(self.high_level.memory, own_log["memTst.errCntW"])
+        self.platform = PlatformService(platform, self.supervisor)
+        self.localisation = LocalisationService(flight.external_position, flight.external_pose, self.supervisor)
+        mode = {name.split(".")[1]: slot for name, slot in param.items() if name.startswith("flightmode.")}
+        self.setpoints = SetpointService(self.arbiter, RpytDecoder(lambda name: float(mode[name][0][mode[name][1]])))
+        for name, value in (parameters or {}).items():
+            item = self.param.table.by_name.get(name)
+            if item is None:
+                raise ScenarioError(f"the scenario sets the parameter {name}, which this firmware does not have")
+            self.param.set(item, value)
+        self._say("SYS: ----------------------------\n")
+        self._say(f"SYS: {platform} is up and running!\n")
+        self._say(f"SYS: {FIRMWARE_VERSION}\n")
+        self._say("SYS: Crazyflie firmware simulator: no drone here\n")
+
+    # Packets.
+
+    def receive(self, packet: wire.Packet) -> None:
+        """Handle one packet from the client; its replies are put in the outbox, exactly once and in order."""
+        self._packets[0] += 1
+        for channel, data in self._dispatch(packet):
+            self._send(wire.encode(packet.port, channel, data))
+        self._flush_console()
+
+    def _dispatch(self, packet: wire.Packet) -> list[tuple[int, bytes]]:
+        port, channel, data = packet
+        tick, allowed = self.flight.tick, self.supervisor.can_fly
+        if port == wire.LINK:
+            return link.handle(channel, data)
+        if port == wire.PARAM:
+            return self.param.handle(channel, data)
+        if port == wire.LOG:
+            return self.log.handle(channel, data, tick)
+        if port == wire.SETPOINT_GENERIC:
+            return self.setpoints.handle_generic(channel, data, tick, allowed=allowed)
+        if port == wire.SETPOINT:
+            return self.setpoints.handle_rpyt(channel, data, tick, allowed=allowed)
+        if port == wire.SETPOINT_HIGH_LEVEL:
+            return self.high_level.handle(channel, data)
+        if port == wire.LOCALISATION:
+            return self.localisation.handle(channel, data)
+        if port == wire.SUPERVISOR:
+            return supervisor_port.handle(self.supervisor, channel, data)
+        if port == wire.MEMORY:
+            return self.memory.handle(channel, data)
+        if port == wire.PLATFORM:
+            return self.platform.handle(channel, data)
+        return []
+
+    def _send(self, datagram: bytes, *, droppable: bool = False) -> None:
+        self._packets[1] += 1
+        self.outbox.append((datagram, droppable))
+
+    def _say(self, text: str) -> None:
+        self._console.append(text)
+
+    def _flush_console(self) -> None:
+        """Console text goes out after the replies, and only once there is a client to hear it."""
+        for text in self._console:
+            for chunk in console.split(text):
+                self._send(wire.encode(wire.CONSOLE, 0, chunk))
+        self._console.clear()
+
+    def _written(self, name: str) -> None:
+        if name == "memTst.resetW":
+            array, index = (
+                self.log.table.by_name["memTst.errCntW"].array,
+                self.log.table.by_name["memTst.errCntW"].index,
+            )
+            array[index] = 0.0
+        if name in self.flight.param:
+            self.flight.parameter_written(name)
+
+    # Time.
+
+    def _tick(self) -> int:
+        return self.flight.tick
+
+    def next_event(self) -> int:
+        """The tick [ms] before which nothing leaves the firmware by itself."""
+        tick = self.flight.tick
+        event = (tick // HIGH_LEVEL_PERIOD + 1) * HIGH_LEVEL_PERIOD
+        due = self.log.next_due()
+        return event if due is None else max(min(event, due), tick + 1)
+
+    def advance(self, milliseconds: int) -> None:
+        """Let time pass: commander and supervisor at their rates, the flight every millisecond, log blocks when due."""
+        flight = self.flight
+        end = flight.tick + milliseconds
+        while flight.tick < end:
+            tick = flight.tick
+            if tick % SUPERVISOR_PERIOD == 0:
+                self._supervise(tick)
+            if tick % HIGH_LEVEL_PERIOD == 0:
+                setpoint = self.high_level.setpoint()
+                if setpoint is not None:
+                    self.arbiter.offer(setpoint, HIGH_LEVEL, tick)
+            flight.setpoint[:] = self.supervisor.override(self.arbiter.setpoint)
+            flight.motors_allowed, flight.armed = self.supervisor.motors_allowed, self.supervisor.armed
+            for _ in range(min(end, self.next_event()) - tick):
+                flight.step()
+            for data in self.log.samples(flight.tick):
+                self._send(wire.encode(wire.LOG, DATA, data), droppable=True)
+
+    def _supervise(self, tick: int) -> None:
+        self.supervisor.planner_bits = self.high_level.info_bits
+        self.supervisor.update(self.arbiter.stamp)
+        self.high_level.block(not self.supervisor.can_fly)
+        if tick % 1000 == 0:
+            for n, (array, index) in enumerate(self._rates):
+                array[index] = self._packets[n]
+            self._packets = [0, 0]

@@ -1,0 +1,148 @@
+"""The UDP server: one client at a time, real time (or a multiple of it), and nothing but CRTP datagrams.
+
+Replies are never dropped, because cflib asks only once; log packets are, when the socket would block.
+"""
+
+import contextlib
+import selectors
+import socket
+import time
+from collections import deque
+from typing import TextIO
+
+from firmware_sim import wire
+from firmware_sim.errors import ServerError
+from firmware_sim.firmware import Firmware
+
+_BUFFER = 1 << 20  # bytes, both ways: a client reads its whole table of contents in bursts
+_MAX_BEHIND = 0.25  # s of host time; when the host stalls for longer, the drone's time stands still instead of racing
+_CHUNK = 20  # ms of firmware time between two looks at the socket
+_TRUTH_PERIOD = 10  # ms between rows of the truth file
+
+Address = tuple[str, int]
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """A bound, non-blocking UDP socket; port 0 picks a free one. Raises ServerError in one sentence."""
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
+        sock.setsockopt(socket.SOL_SOCKET, option, _BUFFER)
+    try:
+        sock.bind((host, port))
+    except (OSError, OverflowError) as error:
+        sock.close()
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise ServerError(f"cannot listen on udp://{host}:{port}: {reason}") from None
+    sock.setblocking(False)
+    return sock
+
+
+class TruthWriter:
+    """Writes rows of the flight's truth (t, position, ...) as CSV, 100 rows a second of firmware time."""
+
+    def __init__(self, file: TextIO, firmware: Firmware):
+        self._file, self._flight = file, firmware.flight
+        self.next_row = self._flight.tick + 1  # tick of the next row
+        self._file.write(",".join(self._flight.truth_header) + "\n")  # type: ignore[attr-defined]
+
+    def update(self) -> None:
+        """Write a row if one is due."""
+        if self._flight.tick >= self.next_row:
+            self.next_row = self._flight.tick - self._flight.tick % _TRUTH_PERIOD + _TRUTH_PERIOD
+            row = self._flight.truth_row()  # type: ignore[attr-defined]
+            self._file.write(",".join(f"{value:.9g}" for value in row) + "\n")
+
+
+class Server:
+    """Runs a firmware behind a bound socket. speed: firmware seconds per second of host time."""
+
+    def __init__(self, firmware: Firmware, sock: socket.socket, *, speed: float = 1.0, truth: TextIO | None = None):
+        self.firmware, self._sock, self._speed = firmware, sock, speed
+        self.client: Address | None = None
+        self.dropped = 0  # log packets
+        self._pending: deque[bytes] = deque()  # replies the socket had no room for
+        self._truth = TruthWriter(truth, firmware) if truth else None
+        self.stopping = False
+
+    def run(self) -> None:
+        """Serve until `stopping` is set (a signal handler does)."""
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._sock, selectors.EVENT_READ)
+            zero, epoch = self.firmware.flight.tick, time.monotonic()  # this tick belongs to this time
+            while not self.stopping:
+                target = zero + (time.monotonic() - epoch) * 1000.0 * self._speed
+                behind = int(target) - self.firmware.flight.tick
+                if behind > 1000.0 * _MAX_BEHIND * self._speed + _CHUNK:
+                    zero, epoch, behind = self.firmware.flight.tick, time.monotonic(), 0
+                if behind > 0:
+                    self._advance(min(behind, _CHUNK))
+                self._receive_all()
+                self._transmit()
+                if behind > _CHUNK:
+                    continue
+                due = epoch + (self.firmware.next_event() - zero) / (1000.0 * self._speed)
+                wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if self._pending else 0)
+                selector.modify(self._sock, wanted)
+                selector.select(max(due - time.monotonic(), 0.0))
+
+    def _advance(self, milliseconds: int) -> None:
+        if self._truth is None:
+            self.firmware.advance(milliseconds)
+            return
+        end = self.firmware.flight.tick + milliseconds
+        while self.firmware.flight.tick < end:
+            self.firmware.advance(min(end, self._truth.next_row) - self.firmware.flight.tick)
+            self._truth.update()
+
+    def _receive_all(self) -> None:
+        """Handle every datagram that has arrived, at most a burst at a time so that the flight goes on."""
+        for _ in range(256):
+            try:
+                datagram, sender = self._sock.recvfrom(2048)
+            except BlockingIOError:
+                return
+            except OSError:  # an ICMP error of a client that has gone
+                continue
+            if datagram == wire.SCAN_PROBE:
+                with contextlib.suppress(OSError):
+                    self._sock.sendto(wire.SCAN_PROBE, sender)  # a scan must not steal the session
+                continue
+            packet = wire.decode(datagram)
+            if packet is None or packet.is_null or datagram in wire.IGNORED:
+                continue
+            if sender != self.client:
+                self._adopt(sender)
+            self.firmware.receive(packet)
+            self._transmit()
+
+    def _adopt(self, sender: Address) -> None:
+        """A new client: there is no hello and no goodbye, its first packet makes it the client."""
+        self.client = sender
+        self.firmware.outbox.clear()  # log packets for the old client
+        self._pending.clear()
+
+    def _transmit(self) -> None:
+        outbox = self.firmware.outbox
+        if self.client is None:
+            outbox.clear()
+            return
+        while self._pending and self._put(self._pending[0]):
+            self._pending.popleft()
+        while outbox:
+            datagram, droppable = outbox.popleft()
+            if self._pending or not self._put(datagram):
+                if droppable:
+                    self.dropped += 1
+                else:
+                    self._pending.append(datagram)
+
+    def _put(self, datagram: bytes) -> bool:
+        """Send one datagram; False when the socket has no room now."""
+        assert self.client is not None
+        try:
+            self._sock.sendto(datagram, self.client)
+        except BlockingIOError:
+            return False
+        except OSError:  # the client's host cannot be reached: as good as lost in the air
+            return True
+        return True

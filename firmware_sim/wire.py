@@ -1,0 +1,50 @@
+"""CRTP packets on the wire: one packet per UDP datagram, `[header][0..30 data bytes]`, no checksum.
+
+header = port << 4 | 0b11 << 2 | channel. Source: crazyflie-firmware docs/functional-areas/crtp, cflib/crtp/crtpstack.py.
+"""
+
+from typing import NamedTuple
+
+MAX_DATA = 30  # bytes after the header
+
+# Ports.
+CONSOLE, PARAM, SETPOINT, MEMORY, LOG, LOCALISATION, SETPOINT_GENERIC, SETPOINT_HIGH_LEVEL = 0, 2, 3, 4, 5, 6, 7, 8
+SUPERVISOR, PLATFORM, LINK = 9, 13, 15
+
+PROTOCOL_VERSION = 12
+
+# errno values as newlib numbers them (what the firmware puts on the wire).
+ENOENT, EIO, E2BIG, ENOEXEC, ENOMEM, EACCES, EBUSY, EEXIST, EINVAL = 2, 5, 7, 8, 12, 13, 16, 17, 22
+
+SCAN_PROBE = b"\xff"
+IGNORED = (b"\xf3", b"\xf4")  # hello and goodbye of older forks of cflib: no session begins or ends with them
+
+
+class Packet(NamedTuple):
+    """One CRTP packet: port 0..15, channel 0..3, at most 30 data bytes."""
+
+    port: int
+    channel: int
+    data: bytes
+
+    @property
+    def is_null(self) -> bool:
+        """True for link-layer null packets (port 15, channel 3), which carry nothing and make nobody the client."""
+        return self.port == LINK and self.channel == 3
+
+
+def encode(port: int, channel: int, data: bytes) -> bytes:
+    """The datagram of a packet. Raises ValueError on a port, channel or length that CRTP cannot carry."""
+    if not 0 <= port <= 15 or not 0 <= channel <= 3:
+        raise ValueError(f"CRTP has no port {port} channel {channel}")
+    if len(data) > MAX_DATA:
+        raise ValueError(f"a CRTP packet carries at most {MAX_DATA} bytes, not {len(data)}")
+    return bytes((port << 4 | 0x0C | channel,)) + data
+
+
+def decode(datagram: bytes) -> Packet | None:
+    """The packet in a datagram, or None when it is not CRTP (empty, or too long). The two link bits are ignored."""
+    if not 1 <= len(datagram) <= MAX_DATA + 1:
+        return None
+    header = datagram[0]
+    return Packet(header >> 4, header & 0x03, datagram[1:])
