@@ -110,7 +110,8 @@ def _read_wide(
 
 def _held(time: NDArray[np.float64], values: NDArray[np.float64], source: SignalColumns) -> NDArray[np.float64]:
     """1 where any column exceeded the threshold within the last `hold` seconds, else 0."""
-    on = (values > source.above).any(axis=1)
+    threshold = 0.0 if source.above is None else source.above
+    on = (values > threshold).any(axis=1)
     last_on = np.maximum.accumulate(np.where(on, time, -math.inf))
     return (time - last_on <= source.hold).astype(float)
 
@@ -220,4 +221,4 @@ def _host_samples(
 
 
 def _period(stamps: list[int]) -> int:
-    return int(round(float(np.median(np.diff(stamps))))) if len(stamps) > 1 else 0
+    return round(float(np.median(np.diff(stamps)))) if len(stamps) > 1 else 0

@@ -1,6 +1,7 @@
 """Our own recordings (MCAP); the reader arrives with the writer."""
 
 from pathlib import Path
+
 from crazyem.recordings.recording import Recording
 
 

@@ -1,5 +1,6 @@
 """From recorded log packets to signals: what a reader of any packet-based format needs."""
 
+import math
 from collections.abc import Iterable, Iterator
 
 from crazyem.recordings.recording import SignalArray, collect
@@ -30,9 +31,9 @@ def signals_from_packets(
             decoder = table.get(item.block)
             if decoder is None:
                 continue
-            sound = all(v == v for v in item.values)
+            sound = not any(map(math.isnan, item.values))
             for sample in decoder.decode(item):
                 if sample.signal not in skip:
-                    yield sample, sound and any(v != v for v in sample.value)
+                    yield sample, sound and any(map(math.isnan, sample.value))
 
     return collect(decoded())

@@ -85,7 +85,7 @@ def _scalar_first(values: Values) -> Values:
 
 def _compressed(values: Values) -> Values:
     code = values[0]
-    return (_NAN,) * 4 if code != code else decompress_quaternion(int(code))
+    return (_NAN,) * 4 if math.isnan(code) else decompress_quaternion(int(code))
 
 
 def _legacy_euler(values: Values) -> Values:
@@ -103,7 +103,7 @@ def _rpm(values: Values) -> Values:
 
 def _flying_bit(values: Values) -> Values:
     info = values[0]
-    return (_NAN,) if info != info else (float((int(info) >> 4) & 1),)
+    return (_NAN,) if math.isnan(info) else (float((int(info) >> 4) & 1),)
 
 
 @dataclass(frozen=True, slots=True)
