@@ -1,4 +1,4 @@
-"""The firmware as one object: the flight, the commander and the services behind the CRTP ports, one millisecond at a time.
+"""The firmware as one object: the flight, the commander and the services behind the CRTP ports.
 
 Knows no sockets and no real time: `receive` takes a packet, `advance` lets time pass, `outbox` holds what goes out.
 """

@@ -198,7 +198,7 @@ def unpack(data: bytes, kind: str) -> float:
 def fetch(value: float, stored: str, fetched: str) -> bytes:
     """A log value converted from its storage type to the type a client asked for, as log.c does it.
 
-    float to whole number: C truncation to int32, then the low bytes (1013.25 as i8 is 0xF5); whole number to float: exact.
+    float to whole number: C truncation to int32, then the low bytes (1013.25 as i8 is 0xF5); to float: exact.
     """
     if fetched in {"float", "fp16"}:
         if stored not in {"float", "fp16"}:

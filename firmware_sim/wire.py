@@ -1,6 +1,6 @@
 """CRTP packets on the wire: one packet per UDP datagram, `[header][0..30 data bytes]`, no checksum.
 
-header = port << 4 | 0b11 << 2 | channel. Source: crazyflie-firmware docs/functional-areas/crtp, cflib/crtp/crtpstack.py.
+header = port << 4 | 0b11 << 2 | channel. Source: crazyflie-firmware docs/functional-areas/crtp, cflib crtpstack.py.
 """
 
 from typing import NamedTuple

@@ -31,7 +31,7 @@ class PlannerState(IntEnum):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Pieces flown one after the other from time begin [s], turned by `turn` [rad] about the origin, then shifted [m]."""
+    """Pieces flown one after the other from begin [s], turned by `turn` [rad] about the origin, then shifted [m]."""
 
     pieces: tuple[Piece, ...]
     begin: float
@@ -182,8 +182,9 @@ class Planner:
         sideways: bool = False,
         clockwise: bool = False,
     ) -> int:
-        """A spiral about a point beside (or, sideways, ahead of) the drone: angle [rad, at most a turn], radii [m], ascent [m].
+        """A spiral about a point beside (or, sideways, ahead of) the drone.
 
+        angle [rad, at most a turn], radii at start and end [m], ascent [m].
         One polynomial between the exact states at both ends: r(t) and phi(t) linear in time, yaw following phi.
         """
         if duration <= 0.0:
@@ -226,13 +227,13 @@ class Planner:
         relative_position: bool = False,
         relative_yaw: bool = False,
     ) -> int:
-        """Fly uploaded pieces; timescale > 1 is slower; relative: from the last setpoint (and, turned, from its yaw)."""
+        """Fly uploaded pieces; timescale > 1 is slower; relative: from the last setpoint (and its yaw)."""
         flown = [stretched(piece, timescale) for piece in pieces]
         if backwards:
             flown = [reversed_piece(piece) for piece in reversed(flown)]
         trajectory = Trajectory(tuple(flown), time)
         if relative_position:
-            # As in the firmware, the shift is computed before the turn, and the turn is about the origin of the trajectory.
+            # As in the firmware: the shift is computed before the turn, which is about the origin of the trajectory.
             begin = trajectory.at(time)
             shift = tuple(a - b for a, b in zip(self.last.position, begin.position, strict=True))
             turn = wrap(self.last.yaw - begin.yaw) if relative_yaw else 0.0

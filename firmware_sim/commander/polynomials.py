@@ -1,7 +1,8 @@
 """Polynomial trajectories: seventh-order segments in x, y, z and yaw, and what a drone does on them.
 
-A polynomial is 8 coefficients, constant first. Positions in m (world), yaw in rad, time in s. Plain Python: one evaluation
-per 10 ms needs no arrays. Source: crazyflie-firmware pptraj.c, pptraj_compressed.c; flatness after Mellinger and Kumar 2011.
+A polynomial is 8 coefficients, constant first. Positions in m (world), yaw in rad, time in s. Plain Python: one
+evaluation per 10 ms needs no arrays. Source: crazyflie-firmware pptraj.c, pptraj_compressed.c; flatness after Mellinger
+and Kumar 2011.
 """
 
 import math
@@ -16,7 +17,7 @@ Polynomial = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Where a trajectory is: position, velocity, acceleration, jerk [m .. m/s^3, world], yaw [rad], body rates [rad/s]."""
+    """Where a trajectory is: position .. jerk [m .. m/s^3, world], yaw [rad], body rates omega [rad/s]."""
 
     position: Vector
     velocity: Vector
@@ -150,9 +151,11 @@ def _bezier(control: list[float], duration: float) -> Polynomial:
 
 
 def unpack_compressed(memory: bytes, offset: int) -> list[Piece]:
-    """Pieces of a compressed trajectory: start (x, y, z in mm, yaw in 0.1 deg, int16), then pieces of a header byte with two
-    bits of storage type for each coordinate (constant, linear, cubic or degree 7 Bezier), a duration in ms (uint16), and
-    the control points; a duration of zero ends it. Raises ValueError when the memory ends first.
+    """Pieces of a compressed trajectory.
+
+    Start (x, y, z in mm, yaw in 0.1 deg, int16), then for each piece a header byte with two bits of storage type per
+    coordinate (constant, linear, cubic or degree 7 Bezier), a duration in ms (uint16), and the control points; a
+    duration of zero ends it. Raises ValueError when the memory ends first.
     """
     scales = (0.001, 0.001, 0.001, math.radians(0.1))
     try:

@@ -203,7 +203,7 @@ class Supervisor:
     def _transition(self, tick: int, flying: bool, age: int) -> State:
         state, inside = self.state, tick - self._entered
         emergency = self._emergency(tick)
-        if state == State.NOT_INITIALISED or state == State.RESET:
+        if state in {State.NOT_INITIALISED, State.RESET}:
             return State.CHECKS_NOT_PASSED
         if state == State.FREE_FALL:
             return State.LOCKED

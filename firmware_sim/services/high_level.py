@@ -1,6 +1,6 @@
 """Port 8, the high-level commander: decodes commands for the planner and turns its goals into setpoints.
 
-Source: crazyflie-firmware crtp_commander_high_level.c. Every command is answered with 4 bytes: its first three, and an error.
+Source: crazyflie-firmware crtp_commander_high_level.c. Each command is answered with its first bytes and an error.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Port 6, localisation: external positions and poses for the onboard estimator, and the old emergency stop. No replies."""
+"""Port 6, localisation: external positions and poses for the onboard estimator, old emergency stop. No replies."""
 
 import struct
 from collections.abc import Callable

@@ -41,7 +41,7 @@ class ParamService:
         self._written(item.name)
 
     def _write(self, data: bytes) -> bytes:
-        """Echo the whole payload; a read-only parameter gets no reply at all. No size or range check, as in the firmware."""
+        """Echo the whole payload; a read-only parameter gets no reply at all. No size or range check."""
         item = self.table.get(int.from_bytes(data[:2], "little"))
         if item is None:
             return data[:2] + bytes((ENOENT,))
