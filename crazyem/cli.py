@@ -1,0 +1,85 @@
+"""The command line: parses, calls one function per command, turns errors into one sentence and an exit code."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from crazyem.errors import CrazyemError
+
+
+def _positive_integer(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not positive")
+    return value
+
+
+def _speed(text: str) -> float:
+    value = float(text)
+    if not 0.05 <= value <= 100:
+        raise argparse.ArgumentTypeError("a speed is between 0.05 and 100")
+    return value
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    top = argparse.ArgumentParser(
+        prog="crazyem", description="Online estimates of a Crazyflie's mass and inertia, pushed to its controller."
+    )
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def common(name: str, text: str, *, vehicle: str | None) -> argparse.ArgumentParser:
+        p = commands.add_parser(name, help=text, description=text)
+        p.add_argument("--vehicle", default=vehicle, metavar="NAME|FILE", help="preset or vehicle file (default: cf2)")
+        p.add_argument("--window", type=_positive_integer, default=800, help="newest samples used (default: 800)")
+        p.add_argument("--every", type=_positive_integer, default=4, help="samples per update (default: 4)")
+        p.add_argument("--json", metavar="FILE", help="summary for programs; - for standard output")
+        p.add_argument("--plot", metavar="FILE.png", help="summary plot (default: beside the recording or summary)")
+        return p
+
+    fly = common("fly", "fly a drone, or a simulated firmware, and push what is learnt", vehicle="cf2")
+    fly.add_argument("uri", nargs="?", metavar="URI", help="the drone; without it firmware_sim is started")
+    fly.add_argument("--controller", choices=("lee", "lqg"), default="lee")
+    fly.add_argument(
+        "--trajectory", nargs="+", default=["hover"], metavar="NAME", help="hover, figure8, excite, or waypoints FILE"
+    )
+    fly.add_argument("--duration", type=float, default=20.0, metavar="S", help="of the trajectory (default: 20)")
+    fly.add_argument("--no-push", action="store_true", help="estimate only, write no parameters")
+    fly.add_argument("--record", metavar="FILE.mcap", help="record everything")
+    fly.add_argument("--scenario", metavar="FILE", help="the simulator's truth (only the simulator reads it)")
+    fly.add_argument("--seed", type=int, help="of the simulator's noise (default: 0)")
+    fly.add_argument("--speed", type=_speed, metavar="X", help="of the simulator, times real time (default: 1)")
+
+    replay = common("replay", "run the estimator over a recording", vehicle=None)
+    replay.add_argument("file", metavar="FILE", help="our MCAP, or a CSV (plain or gzip) of a known layout")
+
+    watch = common("watch", "estimate without commanding", vehicle="cf2")
+    watch.add_argument("uri", metavar="URI")
+    watch.add_argument("--duration", type=float, metavar="S", help="s until it ends by itself")
+    watch.add_argument("--record", metavar="FILE.mcap", help="record everything")
+    return top
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    arguments, rest = parser().parse_known_args(argv)
+    if rest:
+        parser().error(f"unrecognized arguments: {' '.join(rest)}")
+    # In `fly --trajectory hover URI` the option has swallowed the URI.
+    if arguments.command == "fly" and arguments.uri is None and "://" in arguments.trajectory[-1]:
+        arguments.uri = arguments.trajectory.pop()
+    try:
+        if arguments.command == "fly":
+            from crazyem.commands import fly as command
+        elif arguments.command == "replay":
+            from crazyem.commands import replay as command  # type: ignore[no-redef]
+        else:
+            from crazyem.commands import watch as command  # type: ignore[no-redef]
+        return command.run(arguments)
+    except CrazyemError as error:
+        sentence = str(error)
+        print(f"crazyem: {sentence}{'' if sentence.endswith('.') else '.'}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("crazyem: interrupted.", file=sys.stderr)
+        return 130

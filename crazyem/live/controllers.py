@@ -19,6 +19,7 @@ class Controller:
         inertia: parameters that hold the believed principal inertia [kg m^2], empty if it takes none.
         attitude_gains: for each axis, (proportional, derivative) gain parameters in absolute N m/rad and N m s/rad
             that have to be scaled with the inertia, empty if gains are per unit of inertia already.
+        wrench: log group of its commanded thrust and torque, "" if it logs none in SI units.
         note: what a user has to know about pushing to it.
     """
 
@@ -27,6 +28,7 @@ class Controller:
     mass: str = ""
     inertia: tuple[str, ...] = ()
     attitude_gains: tuple[tuple[str, str], ...] = ()
+    wrench: str = ""
     note: str = ""
 
     @property
@@ -44,8 +46,9 @@ LEE = Controller(
     mass="ctrlLee.mass",
     inertia=tuple(f"ctrlLee.J_{a}" for a in AXES),
     attitude_gains=tuple((f"ctrlLee.KR_{a}", f"ctrlLee.Kw_{a}") for a in AXES),
+    wrench="ctrlLee",
 )
-LQG = Controller("lqg", 6, mass="ctrlLqg.mass", inertia=tuple(f"ctrlLqg.J_{a}" for a in AXES))
+LQG = Controller("lqg", 6, mass="ctrlLqg.mass", inertia=tuple(f"ctrlLqg.J_{a}" for a in AXES), wrench="ctrlLqg")
 MELLINGER = Controller(
     "mellinger",
     2,

@@ -119,8 +119,8 @@ class Flight:
         """Take off, fly, land. Whatever happens, the drone is brought down before this returns or raises.
 
         Raises:
-            FlightInterruptedError: the user landed it. MotorsCutError: the user cut the motors. LinkError: the drone is gone.
-            CrazyemError: anything else that ended the flight early (it has landed).
+            FlightInterruptedError: the user landed it. MotorsCutError: the user cut the motors.
+            LinkError: the drone is gone. CrazyemError: anything else that ended the flight early (it has landed).
         """
         try:
             self._prepare()
@@ -181,15 +181,15 @@ class Flight:
         self._wait(lambda: stream.elapsed >= self.plan.baseline, math.inf)
         self._enter(path.name)
         self._mark("push_enabled", stream.began + self.plan.baseline)
-        self.session.pipeline.push_enabled = True
+        self.session.pipeline.push_from = stream.began + self.plan.baseline
         self._wait(lambda: stream.elapsed >= path.duration, math.inf)
-        self.session.pipeline.push_enabled = False
+        self.session.pipeline.push_until = self.session.clock.newest
         self._mark("trajectory_end", stream.began + path.duration)
 
     def _land(self) -> None:
         """Hand back to the high-level commander, land, and make sure that it has."""
         self._enter("landing")
-        self.session.pipeline.push_enabled = False
+        self.session.pipeline.push_until = -math.inf
         if self._stream is not None:
             self._stream.stop()
             self._stream = None

@@ -32,7 +32,8 @@ class History:
     """Grows while a session runs.
 
     Attributes:
-        track: rows of time [s], position xyz [m], setpoint xyz [m] (NaN where unknown).
+        track: rows of time [s], position xyz [m].
+        setpoints: rows of time [s], active setpoint xyz [m].
         estimates: every estimate, in order.
         pushes: every parameter write by the guard.
         marks: phase -> time on the drone's clock [s]: trajectory_start, trajectory_end, push_enabled.
@@ -40,12 +41,12 @@ class History:
     """
 
     track: list[tuple[float, ...]] = field(default_factory=list)
+    setpoints: list[tuple[float, ...]] = field(default_factory=list)
     estimates: list[Estimate] = field(default_factory=list)
     pushes: list[Push] = field(default_factory=list)
     marks: dict[str, float] = field(default_factory=dict)
     notices: list[str] = field(default_factory=list)
     losses: list[tuple[float, int]] = field(default_factory=list)
-    _setpoint: tuple[float, ...] = (math.nan,) * 3
 
     def notice(self, sentence: str) -> None:
         """Keep a sentence once."""
@@ -55,13 +56,23 @@ class History:
     def take(self, sample: Sample) -> None:
         """Keep a sample if it is of the track."""
         if sample.signal == "setpoint_position":
-            self._setpoint = sample.value
+            self.setpoints.append((sample.time, *sample.value))
         elif sample.signal == "position":
-            self.track.append((sample.time, *sample.value, *self._setpoint))
+            self.track.append((sample.time, *sample.value))
 
     def track_array(self) -> np.ndarray:
-        """Track as an array, shape (n, 7)."""
-        return np.array(self.track, dtype=float).reshape(-1, 7)
+        """Time, position and setpoint, shape (n, 7); the setpoint is interpolated onto the positions' times.
+
+        The two travel in packets of different instants; NaN where no setpoint is known.
+        """
+        track = np.array(self.track, dtype=float).reshape(-1, 4)
+        out = np.full((len(track), 7), np.nan)
+        out[:, :4] = track
+        wanted = np.array(self.setpoints, dtype=float).reshape(-1, 4)
+        if len(wanted):
+            for k in (1, 2, 3):
+                out[:, 3 + k] = np.interp(track[:, 0], wanted[:, 0], wanted[:, k], left=np.nan)
+        return out
 
     def _error(self) -> tuple[np.ndarray, np.ndarray]:
         """Time and position error (position - setpoint), shape (n,) and (n, 3), during the trajectory."""

@@ -4,7 +4,8 @@ Nothing here reads a clock or a random number, and nothing that is pushed comes 
 same order give the same estimates, live or replayed.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from crazyem.estimation.result import Estimate
@@ -16,8 +17,10 @@ from crazyem.signals.sample import Sample
 class Estimator(Protocol):
     """What the pipeline needs of an estimator (crazyem.estimation.online.OnlineEstimator)."""
 
-    airborne: bool
-    update_seconds: list[float]
+    @property
+    def airborne(self) -> bool: ...
+    @property
+    def update_seconds(self) -> Sequence[float]: ...
 
     def feed(self, sample: Sample) -> Estimate | None: ...
     def finish(self) -> Estimate: ...
@@ -48,7 +51,8 @@ class Pipeline:
         self.guard = guard
         self.push = push
         self.on_estimate = on_estimate
-        self.push_enabled = False
+        self.push_from = math.inf  # s on the drone's clock; estimates of this time and later may be pushed
+        self.push_until = math.inf
         self.decision: Decision | None = None
         self.samples = 0
 
@@ -62,7 +66,10 @@ class Pipeline:
         self.history.estimates.append(estimate)
         if self.guard is not None:
             self.decision = self.guard.consider(
-                estimate, estimate.time, airborne=self.estimator.airborne, enabled=self.push_enabled
+                estimate,
+                estimate.time,
+                airborne=self.estimator.airborne,
+                enabled=self.push_from <= estimate.time <= self.push_until,
             )
             if self.decision.writes and self.push is not None:
                 self.push(self.decision)

@@ -20,31 +20,34 @@ from crazyem.live.push import Pusher, push_target, read_originals
 from crazyem.live.recorder import Recorder
 from crazyem.live.telemetry import Telemetry
 from crazyem.signals.sample import Sample
-from crazyem.signals.vocabulary import IMU_BLOCK, MOTOR_BLOCK, ROTOR_SPEED_BLOCK, STATE_BLOCK, decoders
+from crazyem.signals.vocabulary import MOTOR_BLOCK, ROTOR_SPEED_BLOCK, STATE_BLOCK, decoders
 from crazyem.vehicle import Vehicle
 
 RATE = 100.0  # Hz
-SETPOINT = tuple(f"ctrltargetZ.{a}" for a in "xyz")
-WRENCH = tuple(f"ctrlLee.{n}" for n in ("thrustSi", "torquex", "torquey", "torquez"))
+STATE = STATE_BLOCK + tuple(f"stateEstimateZ.rate{a}" for a in ("Roll", "Pitch", "Yaw"))
+EXTRA = tuple(f"acc.{a}" for a in "xyz") + tuple(f"ctrltargetZ.{a}" for a in "xyz")
+WRENCH = ("thrustSi", "torquex", "torquey", "torquez")
 
 
-def block_plan(available: Sequence[str]) -> list[tuple[str, ...]]:
+def block_plan(available: Sequence[str], *, wrench: str = "ctrlLee") -> list[tuple[str, ...]]:
     """Blocks to log, of what the drone offers, each within 26 bytes; the estimator's needs first.
 
-    State with the active setpoint (22 bytes, so that tracking errors compare one instant), motors with voltage and
-    flight state (12, 20 with rotor speeds), gyro and accelerometer (24), commanded wrench under Lee (16).
+    The whole rigid state of one instant (22 bytes), motors with voltage and flight state (12, or 20 with rotor
+    speeds), accelerometer and active setpoint (18), commanded wrench (16). Body rates come in the state block, in
+    steps of 1 mrad/s, rather than as gyro.* in a packet of another instant: blocks are not sampled together, and one
+    sample of everything is worth more to the estimator than two halves.
 
     Raises:
         UsageError: naming a variable the estimator cannot do without.
     """
     names = set(available)
-    for needed in (*STATE_BLOCK, *MOTOR_BLOCK):
+    for needed in (*STATE, *MOTOR_BLOCK):
         if needed not in names:
             raise UsageError(f"the drone has no log variable {needed}, which the estimator needs.")
     motors = MOTOR_BLOCK + (ROTOR_SPEED_BLOCK if names.issuperset(ROTOR_SPEED_BLOCK) else ())
-    plan = [STATE_BLOCK + tuple(v for v in SETPOINT if names.issuperset(SETPOINT)), motors]
-    plan.extend(extra for extra in (IMU_BLOCK, WRENCH) if names.issuperset(extra))
-    return plan
+    commanded = tuple(f"{wrench}.{n}" for n in WRENCH)
+    optional = (tuple(v for v in extra if v in names) for extra in (EXTRA, commanded))
+    return [STATE, motors, *(extra for extra in optional if extra)]
 
 
 class Session:
@@ -55,6 +58,7 @@ class Session:
         vehicle: nominal constants.
         estimator: fed from one thread.
         recorder: or None.
+        wrench: log group of the controller whose commanded thrust and torque are recorded.
         on_estimate: called in the estimator's thread with every estimate.
     """
 
@@ -65,6 +69,7 @@ class Session:
         vehicle: Vehicle,
         estimator: Estimator,
         recorder: Recorder | None = None,
+        wrench: str = "ctrlLee",
         on_estimate: Callable[[Estimate], None] | None = None,
     ) -> None:
         self.link = link
@@ -76,6 +81,7 @@ class Session:
         self.lost: LinkLost | None = None
         self.failure: CrazyemError | None = None
         self.pusher: Pusher | None = None
+        self._wrench = wrench
         self._on_estimate = on_estimate
         self.pipeline = Pipeline(estimator, history=self.history, on_estimate=self._estimated)
         self.blocks: tuple[Block, ...] = ()
@@ -91,7 +97,7 @@ class Session:
 
     def start(self) -> None:
         """Subscribe and let packets flow."""
-        plan = block_plan(tuple(self.link.log_variables))
+        plan = block_plan(tuple(self.link.log_variables), wrench=self._wrench)
         blocks: list[Block] = []
         # Threads first: packets of the first block must not pile up behind the set-up of the last.
         for variables in plan:

@@ -8,9 +8,9 @@ import time
 from crazyem.errors import LinkError
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
 from crazyem.links.base import Block, LinkLost, LinkStatistics, Packet, ParameterWrite, Variable
-from crazyem.live.session import SETPOINT, WRENCH
+from crazyem.live.session import EXTRA, STATE, WRENCH
 from crazyem.live.telemetry import ARMED, AUTO_ARM, CAN_ARM, CAN_FLY, FLYING
-from crazyem.signals.vocabulary import IMU_BLOCK, MOTOR_BLOCK, STATE_BLOCK, compress_quaternion
+from crazyem.signals.vocabulary import MOTOR_BLOCK, compress_quaternion
 
 LEVEL = float(compress_quaternion((0.0, 0.0, 0.0, 1.0)))
 SAG = 0.3  # m below the wanted height until the believed mass is right
@@ -32,7 +32,7 @@ class FakeLink:
         self.lose_echo_after = lose_echo_after
         self.lost_at = lost_at
         self.nan_at = nan_at
-        self.log_variables = dict.fromkeys((*STATE_BLOCK, *SETPOINT, *MOTOR_BLOCK, *IMU_BLOCK, *WRENCH), "float")
+        self.log_variables = dict.fromkeys((*STATE, *MOTOR_BLOCK, *EXTRA, *(f"ctrlLee.{n}" for n in WRENCH)), "float")
         self.values = {
             "stabilizer.controller": 1.0, "stabilizer.estimator": 2.0, "ctrlLee.mass": 0.029,
             "ctrlLee.J_x": 1.657e-5, "ctrlLee.J_y": 1.666e-5, "ctrlLee.J_z": 2.926e-5,
@@ -174,9 +174,8 @@ class FakeEstimator:
         self.updates += 1
         self.update_seconds.append(1e-4)
         sd = 0.3 / max(self.n, 1)
-        return Estimate(
-            self.time,
-            {n: ParameterEstimate(v, sd * v, (v * (1 - 1.96 * sd), v * (1 + 1.96 * sd)), PARAMETER_UNITS[n], self.n > 50)
-             for n, v in TRUTH.items()},
-            samples=self.n, updates=self.updates, converged=True,
-        )  # fmt: skip
+        parameters = {}
+        for name, value in TRUTH.items():
+            ci = (value * (1 - 1.96 * sd), value * (1 + 1.96 * sd))
+            parameters[name] = ParameterEstimate(value, sd * value, ci, PARAMETER_UNITS[name], self.n > 50)
+        return Estimate(self.time, parameters, samples=self.n, updates=self.updates, converged=True)

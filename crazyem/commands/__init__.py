@@ -1,0 +1,1 @@
+"""One file per command: each takes parsed arguments, does the work, returns an exit code."""

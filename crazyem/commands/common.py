@@ -1,0 +1,137 @@
+"""What the commands share: results to files and terminal, and errors that wait until those are written."""
+
+import argparse
+import sys
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from crazyem.errors import CrazyemError
+from crazyem.estimation.result import Estimate
+from crazyem.live.history import History
+from crazyem.live.pipeline import Pipeline
+from crazyem.live.summary import build_summary, live_line, text_summary, write_json
+from crazyem.vehicle import Vehicle
+
+
+def say(line: str) -> None:
+    """Progress goes to standard error, so that `--json -` leaves standard output to the summary."""
+    print(line, file=sys.stderr, flush=True)
+
+
+class LiveLine:
+    """Prints a line each second about a session."""
+
+    def __init__(self, session: Any) -> None:
+        self.session = session
+
+    def __call__(self, phase: str, seconds: float) -> None:
+        history: History = self.session.history
+        lost = self.session.link.statistics().lost
+        history.losses.append((self.session.clock.newest, lost))
+        say(live_line(phase, seconds, self.session.estimate, lost=lost, pushes=len(history.pushes)))
+
+
+def plot_path(arguments: argparse.Namespace, *others: str | None) -> str:
+    """--plot, or a PNG beside the recording or the summary, or crazyem.png here."""
+    if arguments.plot:
+        return str(arguments.plot)
+    for other in others:
+        if other and other != "-":
+            name = Path(other).name
+            for suffix in (".csv.gz", ".csv", ".mcap", ".json"):
+                name = name.removesuffix(suffix)
+            return str(Path(other).with_name(f"{name}.png"))
+    return "crazyem.png"
+
+
+def report(
+    arguments: argparse.Namespace,
+    *,
+    pipeline: Pipeline,
+    vehicle: Vehicle,
+    log: str | None,
+    plot: str,
+    title: str,
+    received: int,
+    lost: int,
+    extra: Mapping[str, Any],
+    notices: Iterable[str] = (),
+) -> Estimate:
+    """Final estimate, summary on the terminal, JSON and plot.
+
+    Raises:
+        DataError: nothing was flown that could be estimated from.
+    """
+    from crazyem.live.plot import write_plot
+
+    history = pipeline.history
+    for sentence in notices:
+        history.notice(sentence)
+    estimate = pipeline.finish()
+    summary = build_summary(
+        log=log,
+        vehicle=vehicle.name,
+        estimate=estimate,
+        history=history,
+        update_seconds=pipeline.estimator.update_seconds,
+        received=received,
+        lost=lost,
+        extra={**extra, "plot": plot},
+    )
+    text = text_summary(summary, estimate)
+    if arguments.json == "-":
+        say(text)
+    else:
+        print(text, flush=True)
+    write_plot(plot, history, vehicle, title=title)
+    if arguments.json:
+        write_json(summary, arguments.json)
+    say(f"plot: {plot}" + (f"   summary: {arguments.json}" if arguments.json not in (None, "-") else ""))
+    return estimate
+
+
+def raise_after(error: BaseException | None) -> None:
+    """Raise what ended a flight, once its results are on disk."""
+    if error is not None:
+        raise error
+
+
+def new_estimator(vehicle: Vehicle, arguments: argparse.Namespace) -> Any:
+    """The estimator with the window of the command line."""
+    from crazyem.estimation.online import OnlineEstimator
+
+    return OnlineEstimator(vehicle, window=arguments.window, every=arguments.every)
+
+
+def warm_up(vehicle: Vehicle) -> None:
+    """Compile the kernels before anything flies: a first compilation holds Python for seconds, setpoints included."""
+    import math
+
+    from crazyem.estimation.online import OnlineEstimator
+    from crazyem.signals.sample import Sample
+
+    begun = time.monotonic()
+    estimator = OnlineEstimator(vehicle, window=100, every=4)
+    hover = 0.5
+    try:
+        for i in range(160):
+            t = 0.01 * i
+            s = 0.01 * math.sin(7 * t)
+            for name, value in (
+                ("flying", (1.0,)),
+                ("voltage", (3.9,)),
+                ("motor_command", (hover + s, hover - s, hover + 2 * s, hover - 2 * s)),
+                ("position", (s, -s, 1.0 + s)),
+                ("velocity", (7 * s, 7 * s, s)),
+                ("attitude", (s, s, s, math.sqrt(1 - 3 * s * s))),
+                ("body_rate", (s, s, s)),
+                ("specific_force", (s, s, 9.81)),
+            ):
+                estimator.feed(Sample(name, t, value))
+        estimator.finish()
+    except CrazyemError:
+        pass  # nonsense data may be refused; compiling was the point
+    if time.monotonic() - begun > 3.0:
+        say(f"compiled the estimator in {time.monotonic() - begun:.0f} s (once per installation)")

@@ -1,0 +1,98 @@
+"""Estimates for an existing cflib script, from its own open Crazyflie object, without owning the flight."""
+
+import math
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any
+
+from crazyem.errors import DataError
+from crazyem.estimation.result import Estimate
+from crazyem.live.session import Session
+from crazyem.vehicle import Vehicle, load_vehicle
+
+
+class Attachment:
+    """Runs beside a flight until closed; a context manager.
+
+    Attributes:
+        session: everything underneath (history, pushes, clock).
+    """
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """The newest estimate, None before the first (the drone has to fly)."""
+        self.session.raise_if_failed()
+        return self.session.estimate
+
+    def wait(self, parameters: Sequence[str] = ("mass",), *, timeout: float = 30.0) -> Estimate:
+        """Block until all of `parameters` are identifiable; returns that estimate.
+
+        Raises:
+            DataError: not within `timeout` seconds, with the reason.
+        """
+        until = time.monotonic() + timeout
+        while time.monotonic() < until:
+            estimate = self.estimate
+            if estimate is not None and all(estimate[p].identifiable for p in parameters):
+                return estimate
+            time.sleep(0.02)
+        estimate = self.estimate
+        why = "the drone has not flown" if estimate is None else ""
+        if estimate is not None:
+            why = "; ".join(f"{p}: {estimate[p].reason}" for p in parameters if not estimate[p].identifiable)
+        raise DataError(f"no identifiable {' and '.join(parameters)} within {timeout:g} s ({why}).")
+
+    def close(self) -> None:
+        """Remove our log blocks; the Crazyflie object stays open and the flight is not touched."""
+        self.session.close()
+        self.session.link.close()
+
+    def __enter__(self) -> "Attachment":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def attach(
+    cf: Any, vehicle: str | Vehicle = "cf2", *, push: bool = False, window: int = 800, every: int = 4
+) -> Attachment:
+    """Estimate mass and inertia of a drone that a script already talks to.
+
+        with crazyem.attach(cf, vehicle="cf2") as drone:
+            ...  # fly as before
+            print(drone.estimate)
+
+    Args:
+        cf: an open, connected cflib Crazyflie (`scf.cf` of a SyncCrazyflie).
+        vehicle: preset name, path of a vehicle file, or a Vehicle.
+        push: let the guard write mass and inertia to the controller that runs, if it takes them.
+        window, every: newest samples used, samples per update.
+
+    Raises:
+        UsageError: unknown vehicle, not connected, or a log variable is missing. LinkError: no answer.
+    """
+    from crazyem.commands.common import warm_up
+    from crazyem.estimation.online import OnlineEstimator
+    from crazyem.links.crazyflie import CrazyflieLink
+
+    model = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    warm_up(model)
+    link = CrazyflieLink.from_crazyflie(cf)
+    session = Session(link, vehicle=model, estimator=OnlineEstimator(model, window=window, every=every))
+    try:
+        session.start()
+        if push:
+            session.push_to_controller()
+            session.pipeline.push_from = -math.inf
+    except BaseException:
+        session.close()
+        link.close()
+        raise
+    return Attachment(session)
