@@ -75,7 +75,7 @@ def landed(link):
 
 def test_a_whole_flight_pushes_and_lands():
     link = fake.FakeLink()
-    run = Run(link, plan())
+    run = Run(link, plan(hover))
     run()
     assert order(link) == ["release", "take_off", "setpoint", "release", "land", "stop"]
     assert landed(link)
