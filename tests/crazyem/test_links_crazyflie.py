@@ -1,0 +1,234 @@
+"""The link against a bare-socket Crazyflie that loses what it is told to lose: nothing may hang, nothing may lie."""
+
+import contextlib
+import struct
+import time
+
+import pytest
+
+from crazyem.errors import LinkError, UsageError
+from crazyem.links import open_link
+from crazyem.links.base import LinkLost, Packet
+from crazyem.links.crazyflie import CrazyflieLink
+
+NAMES = ("stateEstimateZ.x", "stateEstimateZ.y", "stateEstimateZ.z", "pm.vbat")
+
+
+@contextlib.contextmanager
+def connected(peer):
+    link = CrazyflieLink(peer.uri)
+    link.connect(10.0)
+    try:
+        yield link
+    finally:
+        link.close()
+
+
+def collect(link, count, seconds=5.0):
+    packets, deadline = [], time.monotonic() + seconds
+    while len(packets) < count and time.monotonic() < deadline:
+        item = link.packets.get(timeout=seconds)
+        packets.append(item)
+        if isinstance(item, LinkLost):
+            break
+    return packets
+
+
+def test_tables_and_log_data(fake_peer):
+    with connected(fake_peer) as link:
+        assert dict(link.log_variables) == dict(zip(NAMES, ["int16_t"] * 3 + ["float"], strict=True))
+        assert link.parameters["ctrlLee.mass"] == "float"
+        (block,) = link.subscribe(NAMES, 100.0)
+        packets = collect(link, 20)
+    assert [v.name for v in block.variables] == list(NAMES)
+    assert all(isinstance(p, Packet) for p in packets)
+    assert [p.values for p in packets] == [(n,) * 4 for n in range(20)]
+    assert [p.firmware_time_ms for p in packets] == [10 * n for n in range(20)]
+
+
+def test_stamps_are_unwrapped_and_lost_packets_counted(fake_peer):
+    fake_peer.first_stamp = (1 << 24) - 100
+    fake_peer.skip = lambda number: number in (5, 6, 12)
+    with connected(fake_peer) as link:
+        link.subscribe(NAMES, 100.0)
+        packets = collect(link, 30)
+        statistics = link.statistics()
+    assert packets[-1].firmware_time_ms - packets[0].firmware_time_ms == 10 * 32
+    assert statistics.lost == 3
+    assert statistics.received >= 30
+    assert statistics.per_block[0] == (statistics.received, 3, statistics.late)
+
+
+def test_write_is_verified_by_its_echo(fake_peer):
+    with connected(fake_peer) as link:
+        write = link.write_parameter("ctrlLee.mass", 0.034)
+        assert write.verified
+        assert write.echoed == struct.unpack("<f", struct.pack("<f", 0.034))[0]
+        assert link.read_parameter("ctrlLee.mass") == write.echoed
+        assert link.write_parameter("fake.byte", 200).verified
+
+
+def test_one_lost_echo_is_healed_by_sending_again(fake_peer):
+    lost = []
+    fake_peer.lose = lambda request: request[0] & 0xF3 == 0x22 and not lost and (lost.append(request) or True)
+    with connected(fake_peer) as link:
+        assert link.write_parameter("ctrlLee.mass", 0.03, timeout=2.0).verified
+        assert lost
+
+
+def test_lost_echoes_leave_the_write_unverified_and_the_link_usable(fake_peer):
+    with connected(fake_peer) as link:
+        fake_peer.lose = lambda request: request[0] & 0xF3 == 0x22
+        write = link.write_parameter("ctrlLee.mass", 0.034, timeout=0.4)
+        assert not write.verified
+        assert write.echoed is None
+        assert "did not confirm ctrlLee.mass" in link.parameter_fault
+        fake_peer.lose = lambda request: False
+        assert link.write_parameter("ctrlLee.mass", 0.035).verified
+        assert link.parameter_fault == ""
+
+
+def test_an_echo_with_another_value_is_not_a_confirmation(fake_peer):
+    with connected(fake_peer) as link:
+        answer = fake_peer._answer
+        fake_peer._answer = lambda r: [r[:3] + struct.pack("<f", 9.0)] if r[0] & 0xF3 == 0x22 else answer(r)
+        write = link.write_parameter("ctrlLee.mass", 0.034, timeout=0.4)
+        assert not write.verified
+        assert write.echoed == 9.0
+
+
+def test_unanswered_read_is_an_error(fake_peer):
+    with connected(fake_peer) as link:
+        fake_peer.lose = lambda request: request[0] & 0xF3 == 0x21
+        with pytest.raises(LinkError, match=r"did not answer a read of ctrlLee\.mass"):
+            link.read_parameter("ctrlLee.mass", timeout=0.3)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("fake.nothing", 1.0, "no parameter"),
+        ("nonsense", 1.0, "no parameter"),
+        ("fake.fixed", 1.0, "read-only"),
+        ("fake.byte", 256.0, "cannot hold"),
+        ("fake.byte", 0.5, "whole number"),
+        ("ctrlLee.mass", 1e300, "cannot hold"),
+    ],
+)
+def test_writes_that_cannot_be_made(fake_peer, name, value, message):
+    with connected(fake_peer) as link, pytest.raises(UsageError, match=message):
+        link.write_parameter(name, value)
+
+
+# header and first data byte of a request, and what the message calls it
+LOSSES = [
+    (b"\xfd\x00", "Nothing answers"),
+    (b"\xdd\x00", "its protocol version"),
+    (b"\x5d\x05", "the log reset"),
+    (b"\x5c\x02\x02", "the table of log variables"),
+    (b"\x4c\x01", "the list of memories"),
+    (b"\x2c\x02\x01", "the table of parameters"),
+    (b"\x2d\x01", "a parameter's value"),
+]
+
+
+@pytest.mark.parametrize(("prefix", "message"), LOSSES)
+def test_a_reply_lost_while_connecting_is_an_error_not_a_hang(fake_peer, monkeypatch, prefix, message):
+    monkeypatch.setattr("crazyem.links.connecting.SILENCE_LIMIT", 0.4)
+    fake_peer.lose = lambda request: bytes([request[0] | 0x0C]) + request[1 : len(prefix)] == prefix
+    link = CrazyflieLink(fake_peer.uri)
+    with pytest.raises(LinkError, match=message) as caught:
+        link.connect(10.0)
+    assert fake_peer.uri in str(caught.value)
+    fake_peer.lose = lambda request: False
+    link.connect(10.0)  # the same object can try again
+    link.close()
+
+
+def test_nothing_listens(fake_peer):
+    fake_peer.close()
+    with pytest.raises(LinkError, match="Nothing answers at udp"):
+        CrazyflieLink(fake_peer.uri).connect(5.0)
+
+
+def test_lost_create_reply_is_asked_for_again(fake_peer):
+    lost = []
+    with connected(fake_peer) as link:
+        fake_peer.lose = lambda r: bytes([r[0] | 0x0C, r[1]]) == b"\x5d\x06" and not lost and (lost.append(r) or True)
+        link.subscribe(NAMES, 100.0)
+        assert collect(link, 3)[-1].values
+        assert lost
+
+
+def test_unknown_variable_names_itself(fake_peer):
+    with connected(fake_peer) as link, pytest.raises(UsageError, match=r'"pm\.vbut".*did you mean "pm\.vbat"'):
+        link.subscribe(["pm.vbut"], 10.0)
+
+
+@pytest.mark.parametrize("how", ["silent", "gone"])
+def test_a_lost_drone_is_reported_once(fake_peer, monkeypatch, how):
+    monkeypatch.setattr("crazyem.links.crazyflie.SILENT_AFTER", 0.5)
+    with connected(fake_peer) as link:
+        link.subscribe(NAMES, 100.0)
+        if how == "silent":
+            fake_peer.silent = True
+        else:
+            fake_peer.close()
+        items = collect(link, 10_000)
+        assert isinstance(items[-1], LinkLost)
+        assert link.packets.empty()
+        with pytest.raises(LinkError):
+            link.send_position(0.0, 0.0, 1.0, 0.0)
+        with pytest.raises(LinkError):
+            link.write_parameter("ctrlLee.mass", 0.03)
+
+
+def test_closing_hands_back_only_if_it_commanded(fake_peer):
+    with connected(fake_peer) as link:
+        link.send_position(0.0, 0.0, 1.0, 0.0)
+    time.sleep(0.05)
+    headers = [bytes([r[0] | 0x0C]) + r[1:2] for r in fake_peer.requests if r[0] >> 4 != 15][-2:]
+    assert headers == [b"\x3c\x00", b"\x7d\x00"]  # zero setpoint, then "notify stop": the next take-off works
+    fake_peer.requests.clear()
+    with connected(fake_peer):
+        pass
+    assert not [r for r in fake_peer.requests if r[0] >> 4 in (3, 7)]  # an observer sends no setpoint
+
+
+def test_setpoint_outside_the_wire_format(fake_peer):
+    with connected(fake_peer) as link, pytest.raises(UsageError, match="does not fit the wire"):
+        link.send_full_state((40.0, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 0, 1), (0, 0, 0))
+
+
+def test_riding_on_an_open_crazyflie(fake_peer):
+    from cflib.crazyflie import Crazyflie
+    from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
+
+    with connected(fake_peer):  # initialises cflib's drivers
+        pass
+    with SyncCrazyflie(fake_peer.uri, cf=Crazyflie(rw_cache=None)) as sync:
+        sync.wait_for_params()
+        link = CrazyflieLink.from_crazyflie(sync.cf)
+        link.subscribe(NAMES, 100.0)
+        assert collect(link, 5)[-1].values
+        assert link.write_parameter("ctrlLee.mass", 0.031).verified
+        assert float(sync.cf.param.get_value("ctrlLee.mass")) == pytest.approx(0.031, rel=1e-6)
+        link.close()
+        assert sync.cf.is_connected()
+        assert sync.cf.log.log_blocks == []
+    with pytest.raises(UsageError, match="not connected"):
+        CrazyflieLink.from_crazyflie(sync.cf)
+
+
+@pytest.mark.parametrize(
+    ("uri", "message"),
+    [
+        ("nonsense", "not a link URI"),
+        ("ftp://x", "no link for ftp"),
+        ("udp://127.0.0.1", "needs a host and a port"),
+        ("udp://127.0.0.1:99999", "needs a host and a port"),
+    ],
+)
+def test_uris_that_name_no_link(uri, message):
+    with pytest.raises(UsageError, match=message):
+        open_link(uri)
