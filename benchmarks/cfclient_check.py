@@ -83,16 +83,18 @@ def check(uri: str, seconds: float, timeout: float) -> list[str]:
     connected, data = threading.Event(), threading.Event()
     window.cf.fully_connected.add_callback(lambda _uri: connected.set())
     window.batteryUpdatedSignal.connect(lambda *_args: data.set())
+    for tab in window.loaded_tab_toolboxes.values():  # all there are, not only those a new user sees
+        window._tab_toolbox_show_as_tab(tab)
     wait(lambda: False, 1.0)  # the window's first scan
     window._connectivity_manager.set_interfaces([uri], 0)
     begin = time.monotonic()
     window._connect()
     if not wait(connected.is_set, timeout):
         return [*troubles, f"not fully connected within {timeout:g} s"]
-    print(f"fully connected in {time.monotonic() - begin:.2f} s, {len(window.cf.log.toc.toc)} log groups")
-    for index in range(window.tabs.count()) if hasattr(window, "tabs") else []:
-        window.tabs.setCurrentIndex(index)
-        wait(lambda: False, 0.1)
+    print(f"fully connected in {time.monotonic() - begin:.2f} s, {window.tab_widget.count()} tabs")
+    for index in range(window.tab_widget.count()):
+        window.tab_widget.setCurrentIndex(index)
+        wait(lambda: False, 0.2)
     if not wait(data.is_set, 5.0):
         troubles.append("the battery log block gave no data")
     echoed = threading.Event()

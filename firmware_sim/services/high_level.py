@@ -19,6 +19,7 @@ from firmware_sim.wire import EBUSY, ENOEXEC
 PERIOD = 10  # ms
 GROUP_MASK, TAKEOFF_V1, LAND_V1, STOP, GO_TO_V1, START_V1, DEFINE, TAKEOFF, LAND = 0, 1, 2, 3, 4, 5, 6, 7, 8
 TAKEOFF_VELOCITY, LAND_VELOCITY, SPIRAL, GO_TO, START = 9, 10, 11, 12, 13
+_COMMANDS = set(range(14))
 MAX_TRAJECTORIES = 10
 POLY4D, COMPRESSED = 0, 1
 
@@ -109,6 +110,8 @@ class HighLevelService:
             return 0
         if command == DEFINE:
             return self._define(data)
+        if command not in _COMMANDS:
+            return ENOEXEC
         if self.blocked:
             return EBUSY
         group = data[0] if data else 0
@@ -132,9 +135,7 @@ class HighLevelService:
             return self.planner.spiral(
                 angle, (r0, r1), ascent, duration, time, sideways=bool(sideways), clockwise=bool(clockwise)
             )
-        if command in {START_V1, START}:
-            return self._start(command, data, time)
-        return ENOEXEC
+        return self._start(command, data, time)
 
     def _vertical(self, command: int, data: bytes, time: float) -> int:
         landing = command in {LAND_V1, LAND, LAND_VELOCITY}

@@ -1,0 +1,100 @@
+"""CRTP packets and the tables: bytes as the real firmware and cflib put them on the wire."""
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from firmware_sim import tables, wire
+
+
+@given(st.integers(0, 15), st.integers(0, 3), st.binary(max_size=30))
+def test_packets_survive_the_wire_with_and_without_the_link_bits(port, channel, data):
+    datagram = wire.encode(port, channel, data)
+    assert datagram[0] & 0x0C == 0x0C
+    assert wire.decode(datagram) == (port, channel, data)
+    assert wire.decode(bytes((datagram[0] & 0xF3,)) + data) == (port, channel, data)
+
+
+def test_what_is_no_packet():
+    assert wire.decode(b"") is None
+    assert wire.decode(bytes(32)) is None
+    assert wire.decode(b"\xff").is_null
+    assert not wire.decode(b"\xfc\x00").is_null
+    for port, channel, data in ((16, 0, b""), (0, 4, b""), (0, 0, bytes(31))):
+        with pytest.raises(ValueError, match="CRTP"):
+            wire.encode(port, channel, data)
+
+
+def test_fetching_a_log_variable_as_another_type_converts_as_c_does():
+    assert tables.fetch(1013.25, "float", "i8") == b"\xf5"  # measured on the real firmware
+    assert tables.fetch(-1.9, "float", "i16") == struct.pack("<h", -1)
+    assert tables.fetch(70000.0, "float", "u16") == struct.pack("<H", 70000 - 65536)
+    assert tables.fetch(1e12, "float", "i32") == struct.pack("<i", 2**31 - 1)
+    assert tables.fetch(float("nan"), "float", "u8") == b"\0"
+    assert tables.fetch(40000.0, "u16", "float") == struct.pack("<f", 40000.0)
+    assert tables.fetch(200.0, "u8", "i8") == b"\xc8"
+    assert tables.fetch(0.5, "float", "fp16") == struct.pack("<e", 0.5)
+    assert tables.fetch(1e9, "float", "fp16") == struct.pack("<e", float("inf"))
+    assert tables.fetch(4294967295.0, "u32", "u32") == b"\xff" * 4
+
+
+@given(st.sampled_from(["u8", "u16", "u32", "i8", "i16", "i32"]), st.data())
+def test_whole_numbers_survive_packing(kind, data):
+    dtype = np.dtype({"u": "uint", "i": "int"}[kind[0]] + kind[1:])
+    limits = np.iinfo(dtype)
+    value = data.draw(st.integers(int(limits.min), int(limits.max)))
+    packed = tables.pack(float(value), kind)
+    assert packed == np.array(value, dtype=dtype).tobytes()
+    assert tables.unpack(packed, kind) == value
+
+
+@given(st.floats(-1e30, 1e30))
+def test_floats_are_rounded_to_single_precision(value):
+    assert tables.unpack(tables.pack(value, "float"), "float") == float(np.float32(value))
+
+
+def test_a_short_write_fills_up_with_zeros():
+    assert tables.unpack(b"\x01", "u16") == 1.0
+
+
+def slots(*names):
+    return tables.slots(dict.fromkeys(names, 0.0))
+
+
+def test_types_and_flags_follow_the_firmware():
+    log = tables.log_table(slots("pm.vbat", "gyro.x", "pm.vbatMV", "motor.m1", "motor.m1req", "stateEstimateZ.quat"))
+    assert [(item.name, item.type_byte) for item in log.items] == [
+        ("pm.vbat", 7),
+        ("pm.vbatMV", 2),  # groups are contiguous
+        ("gyro.x", 7),
+        ("motor.m1", 2),
+        ("motor.m1req", 6),
+        ("stateEstimateZ.quat", 3),
+    ]
+    param = tables.param_table(
+        slots("ctrlLee.mass", "ctrlMel.mass", "stabilizer.controller", "deck.bcFlow", "powerDist.idleThrust")
+    )
+    assert {item.name: item.type_byte for item in param.items} == {
+        "ctrlLee.mass": 0x06,  # not persistent
+        "ctrlMel.mass": 0x16,
+        "stabilizer.controller": 0x08,
+        "deck.bcFlow": 0x48,
+        "powerDist.idleThrust": 0x1A,
+    }
+
+
+def test_checksums_tell_tables_apart():
+    one, same, other = (
+        tables.log_table(slots("a.b", "a.c")),
+        tables.log_table(slots("a.b", "a.c")),
+        tables.log_table(slots("a.b", "a.d")),
+    )
+    assert one.crc == same.crc != other.crc
+    assert tables.log_table({}).crc != tables.param_table({}).crc
+    assert one.crc == zlib.crc32(b"log\x07a\0b\0\x07a\0c\0")
+    with pytest.raises(ValueError, match="too long"):
+        tables.log_table(slots("averylonggroup.averylongname"))
