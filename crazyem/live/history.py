@@ -77,7 +77,8 @@ class History:
     def _error(self) -> tuple[np.ndarray, np.ndarray]:
         """Time and position error (position - setpoint), shape (n,) and (n, 3), during the trajectory."""
         track = self.track_array()
-        start, end = self.marks.get("trajectory_start", -math.inf), self.marks.get("trajectory_end", math.inf)
+        # Without marks (somebody else's flight) nobody knows when the setpoint was meant to be followed.
+        start, end = self.marks.get("trajectory_start", math.inf), self.marks.get("trajectory_end", math.inf)
         keep = (track[:, 0] >= start) & (track[:, 0] <= end) & np.isfinite(track[:, 4:]).all(axis=1)
         return track[keep, 0], track[keep, 1:4] - track[keep, 4:7]
 

@@ -1,0 +1,168 @@
+"""The command line: options, exit codes, and one clear sentence for everything a user can get wrong."""
+
+import json
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from crazyem.cli import main, parser
+from crazyem.commands.fly import trajectory_maker
+from crazyem.errors import UsageError
+
+NANOBENCH = "nanobench/B3_figure8_medium_rep1.csv.gz"
+
+
+@pytest.fixture
+def free_port():
+    """A UDP port nobody listens on."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
+def fails(capsys, *argv, code=None):
+    """Run, expect an error exit, return its one sentence."""
+    got = main([str(a) for a in argv])
+    assert got != 0
+    if code is not None:
+        assert got == code
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("crazyem: ")]
+    assert len(lines) == 1
+    assert "Traceback" not in lines[0]
+    assert lines[0].endswith(".")
+    return lines[0]
+
+
+def test_help_is_quick_and_imports_nothing_heavy():
+    script = (
+        "import sys, crazyem.cli as c\n"
+        "try: c.main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "assert not {'numba', 'cflib', 'matplotlib', 'scipy'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert all(word in done.stdout for word in ("fly", "replay", "watch"))
+
+
+def test_options_named_in_the_interface_exist():
+    given = parser().parse_args(
+        [
+            "fly",
+            "--vehicle",
+            "cf2",
+            "--controller",
+            "lqg",
+            "--trajectory",
+            "waypoints",
+            "f.csv",
+            "--duration",
+            "5",
+            "--no-push",
+            "--record",
+            "a.mcap",
+            "--scenario",
+            "s.toml",
+            "--seed",
+            "3",
+            "--speed",
+            "2",
+            "--json",
+            "-",
+            "--plot",
+            "p.png",
+        ]
+    )
+    assert given.trajectory == ["waypoints", "f.csv"]
+    assert given.no_push
+    assert parser().parse_args(["fly", "udp://127.0.0.1:1", "--trajectory", "hover"]).uri == "udp://127.0.0.1:1"
+    given = parser().parse_args(["replay", "f.mcap", "--vehicle", "cf2", "--window", "400", "--every", "2"])
+    assert (given.window, given.every) == (400, 2)
+    assert parser().parse_args(["watch", "udp://127.0.0.1:1"]).uri
+
+
+def test_nothing_at_the_uri(capsys, free_port):
+    said = fails(capsys, "fly", f"udp://127.0.0.1:{free_port}", "--trajectory", "hover", code=4)
+    assert f"udp://127.0.0.1:{free_port}" in said
+
+
+def test_uri_after_the_trajectory_is_still_the_uri(capsys, free_port):
+    assert "Nothing answers" in fails(capsys, "fly", "--trajectory", "hover", f"udp://127.0.0.1:{free_port}", code=4)
+
+
+def test_reply_lost_while_connecting(capsys, fake_peer):
+    fake_peer.lose = lambda request: request[:2] == b"\x5c\x02" and request[2] == 1
+    assert "reply was lost" in fails(capsys, "watch", fake_peer.uri, code=4)
+
+
+def test_unknown_log_variable_is_named(capsys, fake_peer):
+    assert "no log variable stateEstimateZ.vx" in fails(capsys, "watch", fake_peer.uri, code=2)
+
+
+@pytest.mark.parametrize(
+    ("argv", "says"),
+    [
+        (["fly", "--vehicle", "nimbus"], "unknown vehicle 'nimbus'"),
+        (["fly", "--trajectory", "loop"], "unknown trajectory 'loop'"),
+        (["fly", "--trajectory", "waypoints"], "needs one FILE"),
+        (["fly", "--duration", "0"], "--duration"),
+        (["fly", "--window", "3"], "window of 3"),
+        (["fly", "--json", "no/such/folder/x.json"], "cannot write"),
+        (["fly", "udp://127.0.0.1:1", "--seed", "1"], "leave out the URI"),
+        (["fly", "carrier-pigeon://1"], "carrier-pigeon"),
+        (["watch", "nonsense"], "nonsense"),
+        (["replay", "none.mcap"], "none.mcap"),
+    ],
+)
+def test_wrong_usage_is_one_sentence(capsys, argv, says):
+    assert says in fails(capsys, *argv, code=2)
+
+
+def test_a_vehicle_file_with_a_mistake_names_the_key(capsys, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('name = "x"\nmass = "heavy"\ninertia = [1e-5, 1e-5, 1e-5]\n')
+    said = fails(capsys, "fly", "--vehicle", path, code=3)
+    assert "mine.toml" in said
+    assert "'mass'" in said
+
+
+@pytest.mark.parametrize("content", [b"", b"hello\n", b"\x89MCAP0\r\n rubbish", b"\x00" * 500, b"a,b\n1,2\n"])
+def test_a_file_that_is_no_recording(capsys, tmp_path, content):
+    path = tmp_path / "notes.txt"
+    path.write_bytes(content)
+    assert "notes.txt" in fails(capsys, "replay", path, code=3)
+
+
+def test_replay_of_a_real_recording(capsys, tmp_path, shared_recordings):
+    out = tmp_path / "r.json"
+    assert main(["replay", str(shared_recordings / NANOBENCH), "--vehicle", "cf2", "--json", str(out)]) == 0
+    summary = json.loads(out.read_text())
+    assert set(summary["estimates"]) == {"mass", "Ixx", "Iyy", "Izz", "motor_time_constant"}
+    assert {"value", "sd", "ci95", "unit", "identifiable", "reason"} <= set(summary["estimates"]["mass"])
+    assert any("thrust scale" in n for n in summary["notices"])
+    assert (tmp_path / "r.png").stat().st_size > 10_000
+    assert "mass" in capsys.readouterr().out
+
+
+def test_nan_in_a_recording_is_named(capsys, tmp_path, shared_recordings):
+    import gzip
+
+    lines = gzip.decompress((shared_recordings / NANOBENCH).read_bytes()).decode().splitlines()
+    header = lines[0].split(",")
+    fields = lines[400].split(",")
+    fields[next(i for i, n in enumerate(header) if "vbat" in n.lower())] = "nan"
+    lines[400] = ",".join(fields)
+    path = tmp_path / "damaged.csv"
+    path.write_text("\n".join(lines) + "\n")
+    said = fails(capsys, "replay", path, "--vehicle", "cf2", code=5)
+    assert "voltage is not a number" in said
+
+
+def test_trajectory_maker_reads_the_waypoints_at_once(tmp_path):
+    path = tmp_path / "w.csv"
+    path.write_text("x,y,z\n1,0,1\n")
+    assert trajectory_maker(["waypoints", str(path)], 5.0)((0, 0, 1), 0.0).duration > 2
+    with pytest.raises(UsageError):
+        trajectory_maker(["hover", "extra"], 5.0)
