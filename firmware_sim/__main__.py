@@ -47,6 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except FirmwareSimError as error:
         print(f"firmware_sim: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:  # before the server runs
+        return 130
     return 0
 
 

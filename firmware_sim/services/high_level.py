@@ -60,9 +60,15 @@ class HighLevelService:
 
     def setpoint(self) -> np.ndarray | None:
         """The setpoint of the plan; null (motors off) when idle, None when a client's setpoints have taken over."""
-        goal = self.planner.goal(self._clock() / 1000.0)
-        if goal is not None:
-            return setpoint_of(goal)
+        try:
+            goal = self.planner.goal(self._clock() / 1000.0)
+            setpoint = None if goal is None else setpoint_of(goal)
+        except (ValueError, ArithmeticError):  # infinite yaw, overflow
+            setpoint = np.full(sp.SIZE, np.nan)
+        if setpoint is not None:
+            if np.isfinite(setpoint).all():
+                return setpoint
+            self.planner.disable()  # as the firmware does with an invalid evaluation
         self.tell_state()
         return sp.null_setpoint() if self.planner.state == PlannerState.IDLE else None
 
@@ -95,8 +101,8 @@ class HighLevelService:
             return []
         try:
             error = self._command(data[0], data[1:])
-        except (struct.error, ValueError):  # too short, or a trajectory that reaches past the memory
-            error = ENOEXEC
+        except (struct.error, IndexError, ValueError, ArithmeticError):
+            error = ENOEXEC  # too short, a trajectory that reaches past the memory, or numbers that lead nowhere
         return [(channel, data[:3].ljust(3, b"\0") + bytes((error,)))]
 
     def _get(self, name: str) -> float:

@@ -22,7 +22,7 @@ class LocalisationService:
         pose: Callable[[np.ndarray, np.ndarray], None],
         supervisor: Supervisor,
     ):
-        self._position, self._pose, self._supervisor = position, pose, supervisor
+        self._accept_position, self._accept_pose, self._supervisor = position, pose, supervisor
 
     def handle(self, channel: int, data: bytes) -> list[tuple[int, bytes]]:
         """Consume a packet on the localisation port; a packet of the wrong length is ignored."""
@@ -36,6 +36,15 @@ class LocalisationService:
         elif channel == GENERIC and data:
             self._generic(data[0], data[1:])
         return []
+
+    def _position(self, position: np.ndarray) -> None:
+        if np.isfinite(position).all():
+            self._accept_position(position)
+
+    def _pose(self, position: np.ndarray, quaternion: np.ndarray) -> None:
+        norm = float(np.linalg.norm(quaternion))
+        if np.isfinite(position).all() and np.isfinite(norm) and norm > 0.5:
+            self._accept_pose(position, quaternion / norm)
 
     def _generic(self, kind: int, data: bytes) -> None:
         if kind == POSE and len(data) >= 28:

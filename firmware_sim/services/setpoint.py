@@ -2,6 +2,8 @@
 
 import struct
 
+import numpy as np
+
 from firmware_sim.commander.arbiter import CRTP, Arbiter
 from firmware_sim.commander.decode import RpytDecoder, decode_generic
 
@@ -20,7 +22,7 @@ class SetpointService:
         if channel == 0 and len(data) >= 14 and allowed:
             roll, pitch, yaw_rate, thrust = struct.unpack_from("<fffH", data)
             setpoint = self._rpyt.decode(roll, pitch, yaw_rate, thrust, disabled=self._arbiter.disabled)
-            self._arbiter.offer(setpoint, CRTP, tick)
+            self._offer(setpoint, tick)
         return []
 
     def handle_generic(self, channel: int, data: bytes, tick: int, *, allowed: bool) -> list[tuple[int, bytes]]:
@@ -31,5 +33,10 @@ class SetpointService:
         elif channel == SETPOINT and data and allowed:
             setpoint = decode_generic(data[0], data[1:])
             if setpoint is not None:
-                self._arbiter.offer(setpoint, CRTP, tick)
+                self._offer(setpoint, tick)
         return []
+
+    def _offer(self, setpoint: np.ndarray, tick: int) -> None:
+        """The firmware would fly into NaN; a simulator ignores what is not a number."""
+        if np.isfinite(setpoint).all():
+            self._arbiter.offer(setpoint, CRTP, tick)
