@@ -1,0 +1,25 @@
+"""The controllers' working memory: one flat array, `memory`; each name is an index or the first of several."""
+
+# What the running controller asks for (control_t of the firmware)
+MODE = 0  # 0 legacy (PWM units), 1 force and torque (N, N m)
+WRENCH = 1  # thrust N, torque x y z N m
+LEGACY = 5  # thrust, roll, pitch, yaw in PWM units
+RUNNING = 9  # the controller that ran last, to reset integrals on a switch
+REQUEST = 10  # motors 1..4 after battery compensation, before capping
+# Lee
+LEE_I_POS = 16
+LEE_I_ATT = 19
+# LQG
+LQG_ALPHA = 24  # rad/s^2, angular acceleration the rotors should be giving by now
+LQG_GAIN_POS = 28  # K of [p, v]
+LQG_GAIN_ATT = 30  # roll and pitch: K of [angle, rate, angular acceleration]
+LQG_GAIN_YAW = 33
+# Mellinger
+MEL_I_POS = 36
+MEL_I_ATT = 39
+MEL_PREV = 42  # previous body rate and previous desired rate
+# PID
+PID_STATE = 48
+MEMORY_SIZE = 112
+
+LEGACY_MODE, FORCE_TORQUE_MODE = 0.0, 1.0

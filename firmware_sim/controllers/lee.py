@@ -1,0 +1,119 @@
+"""Controller 5, Lee's geometric tracking controller as in controller_lee.c, at 500 Hz. Thrust in N, torque in N m.
+
+F_d = a_d + g e3 + Kd e_v + Kp e_p + Ki int e_p;  thrust = mass F_d . R e3
+M = -KR e_R - Kw (w - w_r) - KI int e_R + w x J w, with w_r from the setpoint's jerk and yaw rate.
+Two differences: an axis under velocity control has no position error (the firmware pulls it towards 0), and without
+a position to hold the attitude setpoint is followed.
+"""
+
+import math
+
+import numpy as np
+
+from firmware_sim.commander import setpoint as sp
+from firmware_sim.controllers import layout as mem
+from firmware_sim.controllers import parameters as pm
+from firmware_sim.controllers import variables as lv
+from firmware_sim.controllers.attitude import align, angles, desired_yaw, from_angles, position_error, rotation_error
+from firmware_sim.kernel import kernel
+from firmware_sim.plant import layout as at
+from firmware_sim.plant.ground import GRAVITY
+from firmware_sim.plant.quaternion import matrix, roll_pitch_yaw
+
+DT = 0.002  # s
+MANUAL_THRUST = 0.07 * 9.81  # N at full stick (70 g, controller_lee.c)
+
+
+@kernel
+def reset(memory):
+    """Forget both integrals."""
+    for i in range(3):
+        memory[mem.LEE_I_POS + i] = 0.0
+        memory[mem.LEE_I_ATT + i] = 0.0
+
+
+@kernel
+def lee_step(setpoint, estimate, sensor, param, memory, log):
+    """One controller step: writes memory[WRENCH] and the ctrlLee.* variables."""
+    memory[mem.MODE] = mem.FORCE_TORQUE_MODE
+    out = mem.WRENCH
+    R, D = np.empty((3, 3)), np.empty((3, 3))
+    force, eR, w, wr = np.zeros(3), np.empty(3), np.empty(3), np.zeros(3)
+    matrix(estimate, at.E_QUAT, R)
+    yaw = desired_yaw(setpoint, estimate, DT)
+    if setpoint[sp.MODE_X] + setpoint[sp.MODE_Y] + setpoint[sp.MODE_Z] > 0.0:
+        for i in range(3):
+            e_pos, e_vel = position_error(setpoint, estimate, i, yaw)
+            limit = abs(param[pm.LEE_KP_LIMIT])
+            e_pos = min(max(e_pos, -limit), limit)
+            limit = abs(param[pm.LEE_KD_LIMIT])
+            e_vel = min(max(e_vel, -limit), limit)
+            limit = abs(param[pm.LEE_KPI_LIMIT])
+            memory[mem.LEE_I_POS + i] = min(max(memory[mem.LEE_I_POS + i] + DT * e_pos, -limit), limit)
+            force[i] = (
+                setpoint[sp.AX + i]
+                + param[pm.LEE_KD + i] * e_vel
+                + param[pm.LEE_KP + i] * e_pos
+                + param[pm.LEE_KPI + i] * memory[mem.LEE_I_POS + i]
+            )
+            log[lv.LEE_ERROR + i] = e_pos
+            log[lv.LEE_ERROR + 3 + i] = e_vel
+        force[2] += GRAVITY
+        thrust = param[pm.LEE_MASS] * (force[0] * R[0, 2] + force[1] * R[1, 2] + force[2] * R[2, 2])
+        if thrust < 0.01:
+            reset(memory)
+        if thrust <= 0.0:
+            force[0], force[1], force[2] = 0.0, 0.0, 1.0
+        align(force, yaw, D)
+    else:
+        if setpoint[sp.THRUST] < 1000.0:
+            for i in range(4):
+                memory[out + i] = 0.0
+                log[lv.LEE_OUT + i] = 0.0
+            reset(memory)
+            return
+        thrust = setpoint[sp.THRUST] / 65535.0 * MANUAL_THRUST
+        from_angles(math.radians(setpoint[sp.ROLL]), -math.radians(setpoint[sp.PITCH]), yaw, D)
+    memory[out] = thrust
+    rotation_error(D, R, eR)
+    desired_rate(setpoint, param, thrust, R, D, wr)
+    J = pm.LEE_J
+    for i in range(3):
+        w[i] = sensor[at.GYRO + i]
+        memory[mem.LEE_I_ATT + i] += DT * eR[i]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        gyroscopic = w[j] * param[J + k] * w[k] - w[k] * param[J + j] * w[j]
+        memory[out + 1 + i] = (
+            -param[pm.LEE_KR + i] * eR[i]
+            - param[pm.LEE_KW + i] * (w[i] - wr[i])
+            - param[pm.LEE_KI + i] * memory[mem.LEE_I_ATT + i]
+            + gyroscopic
+        )
+        log[lv.LEE_OMEGA + i] = w[i]
+        log[lv.LEE_OMEGA + 3 + i] = wr[i]
+    for i in range(4):
+        log[lv.LEE_OUT + i] = memory[out + i]
+    roll, pitch, heading = roll_pitch_yaw(estimate, at.E_QUAT)
+    log[lv.LEE_RPY], log[lv.LEE_RPY + 1], log[lv.LEE_RPY + 2] = roll, pitch, heading
+    roll, pitch, heading = angles(D)
+    log[lv.LEE_RPY + 3], log[lv.LEE_RPY + 4], log[lv.LEE_RPY + 5] = roll, pitch, heading
+
+
+@kernel
+def desired_rate(setpoint, param, thrust, R, D, wr):
+    """wr (3, rad/s, body): the body rate the wanted rotation D turns with, from jerk and yaw rate, seen from R."""
+    along = 0.0
+    hx, hy = 0.0, 0.0
+    if thrust > 1e-6:
+        for i in range(3):
+            along += D[i, 2] * setpoint[sp.JX + i]
+        for i in range(3):
+            h = param[pm.LEE_MASS] / thrust * (setpoint[sp.JX + i] - along * D[i, 2])
+            hx += h * D[i, 0]
+            hy += h * D[i, 1]
+    rate = math.radians(setpoint[sp.RATE_YAW]) * D[2, 2]
+    for i in range(3):
+        wr[i] = 0.0
+        for k in range(3):
+            wr[i] += R[k, i] * (D[k, 0] * -hy + D[k, 1] * hx + D[k, 2] * rate)

@@ -1,0 +1,66 @@
+"""One millisecond of the whole drone: sense, estimate, control, drive the motors, move the body, publish."""
+
+import numpy as np
+
+from firmware_sim.controllers import layout as mem
+from firmware_sim.controllers import parameters as pm
+from firmware_sim.controllers.externalise import (
+    log_battery,
+    log_control,
+    log_estimate,
+    log_rotor_speed,
+    log_setpoint,
+)
+from firmware_sim.controllers.lee import lee_step
+from firmware_sim.controllers.lee import reset as lee_reset
+from firmware_sim.controllers.power_distribution import motors_step
+from firmware_sim.kernel import kernel
+from firmware_sim.plant import layout as at
+from firmware_sim.plant.battery import battery_step
+from firmware_sim.plant.effects import external
+from firmware_sim.plant.onboard_estimate import estimate_step
+from firmware_sim.plant.rigid_body import body_step
+from firmware_sim.plant.rotors import lag, wrench
+from firmware_sim.plant.sensors import sensors_step
+
+DT = 1e-3  # s
+
+
+@kernel
+def control_step(setpoint, estimate, sensor, param, memory, log, tick):
+    """Run the selected controller at its rate; a newly selected one starts without integrals."""
+    which = param[pm.CONTROLLER]
+    if memory[mem.RUNNING] != which:
+        memory[mem.RUNNING] = which
+        lee_reset(memory)
+    if tick % 2 == 0:
+        lee_step(setpoint, estimate, sensor, param, memory, log)
+
+
+@kernel
+def plant_step(truth, state, noise):
+    """Move rotors, battery and body on by one millisecond under the present PWM."""
+    mean, u, force, torque = np.empty(4), np.empty(4), np.empty(3), np.empty(3)
+    lag(truth, state, DT, mean)
+    wrench(truth, mean, 0, u)
+    external(state, truth, noise, force, torque)
+    body_step(truth, state, u, force, torque, noise, DT)
+    battery_step(truth, state, DT)
+
+
+@kernel
+def tick_step(
+    truth, board, state, sensor, estimate, P, setpoint, param, memory, log, union_float, union_short, noise, tick, flags
+):
+    """One millisecond. flags: bit 0 motors allowed by the supervisor, bit 1 armed."""
+    sensors_step(truth, state, sensor, noise, tick)
+    estimate_step(truth, state, sensor, estimate, P, param, noise, tick)
+    control_step(setpoint, estimate, sensor, param, memory, log, tick)
+    motors_step(board, state, sensor, param, memory, log, (flags & 1) != 0, (flags & 2) != 0)
+    plant_step(truth, state, noise)
+    log_estimate(sensor, estimate, P, log)
+    log_battery(sensor, log)
+    log_setpoint(setpoint, log)
+    log_control(memory, param, log, union_float, union_short)
+    if board[at.B_BRUSHLESS] > 0.0:
+        log_rotor_speed(truth, state, log)

@@ -1,0 +1,82 @@
+"""The log variables that flight control and state estimation provide, in one float64 array, in the firmware's units.
+
+Each constant is the index of the first of a run of variables; the order within a run is the order of the names here.
+"""
+
+_XYZ = ("x", "y", "z")
+
+
+def _run(group: str, *names: str) -> list[str]:
+    return [f"{group}.{name}" for name in names]
+
+
+COMMON: list[str] = [
+    *_run("stateEstimate", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "roll", "pitch", "yaw"),
+    *_run("stateEstimate", "qx", "qy", "qz", "qw"),
+    *_run("stateEstimateZ", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "quat"),
+    *_run("stateEstimateZ", "rateRoll", "ratePitch", "rateYaw"),
+    *_run("gyro", *_XYZ),
+    *_run("acc", *_XYZ),
+    *_run("motor", "m1", "m2", "m3", "m4", "m1req", "m2req", "m3req", "m4req"),
+    *_run("pm", "vbat", "vbatMV", "state", "batteryLevel"),
+    *_run("ctrlLee", "KR_x", "KR_y", "KR_z", "Kw_x", "Kw_y", "Kw_z"),
+    *_run("ctrlLee", "Kpos_Px", "Kpos_Py", "Kpos_Pz", "Kpos_Dx", "Kpos_Dy", "Kpos_Dz"),
+    *_run("ctrlLee", "thrustSi", "torquex", "torquey", "torquez", "rpyx", "rpyy", "rpyz", "rpydx", "rpydy", "rpydz"),
+    *_run("ctrlLee", "error_posx", "error_posy", "error_posz", "error_velx", "error_vely", "error_velz"),
+    *_run("ctrlLee", "omegax", "omegay", "omegaz", "omegarx", "omegary", "omegarz"),
+    *_run("ctrlLqg", "thrustSi", "torquex", "torquey", "torquez", "rpydx", "rpydy", "rpydz"),
+    *_run("ctrlLqg", "accx", "accy", "accz", "angaccx", "angaccy", "angaccz"),
+    *_run("ctrlMel", "cmd_thrust", "cmd_roll", "cmd_pitch", "cmd_yaw", "r_roll", "r_pitch", "r_yaw", "accelz"),
+    *_run("ctrlMel", "zdx", "zdy", "zdz", "i_err_x", "i_err_y", "i_err_z"),
+    *_run("controller", "cmd_thrust", "cmd_roll", "cmd_pitch", "cmd_yaw", "r_roll", "r_pitch", "r_yaw", "accelz"),
+    *_run("controller", "actuatorThrust", "roll", "pitch", "yaw", "rollRate", "pitchRate", "yawRate", "ctr_yaw"),
+    *_run("stabilizer", "roll", "pitch", "yaw", "thrust"),
+    *_run("ctrltarget", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "roll", "pitch", "yaw", "thrust"),
+    *_run("ctrltarget", "mode_x", "mode_y", "mode_z", "mode_roll", "mode_pitch", "mode_yaw", "mode_quat"),
+    *_run("ctrltargetZ", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az"),
+    *_run("kalman", "stateX", "stateY", "stateZ", "statePX", "statePY", "statePZ", "stateD0", "stateD1", "stateD2"),
+    *_run("kalman", "varX", "varY", "varZ", "varPX", "varPY", "varPZ", "varD0", "varD1", "varD2"),
+    *_run("kalman", "q0", "q1", "q2", "q3"),
+    *_run("locSrv", "x", "y", "z", "qx", "qy", "qz", "qw"),
+    *_run("ext_pos", "X", "Y", "Z"),
+]
+BRUSHLESS: list[str] = _run("motor", "m1_rpm", "m2_rpm", "m3_rpm", "m4_rpm")
+
+ALL = tuple(COMMON + BRUSHLESS)
+INDEX = {name: i for i, name in enumerate(ALL)}
+
+
+def names(platform: str) -> tuple[str, ...]:
+    """Log variables of a platform; rotor speeds only where the speed controllers report them (cf21bl)."""
+    return ALL if platform == "cf21bl" else tuple(COMMON)
+
+
+EST = INDEX["stateEstimate.x"]
+EST_RPY = INDEX["stateEstimate.roll"]
+EST_Q = INDEX["stateEstimate.qx"]
+ESTZ = INDEX["stateEstimateZ.x"]
+ESTZ_QUAT = INDEX["stateEstimateZ.quat"]
+ESTZ_RATE = INDEX["stateEstimateZ.rateRoll"]
+GYRO = INDEX["gyro.x"]
+ACC = INDEX["acc.x"]
+MOTOR = INDEX["motor.m1"]
+MOTOR_REQ = INDEX["motor.m1req"]
+PM = INDEX["pm.vbat"]
+LEE_GAINS = INDEX["ctrlLee.KR_x"]
+LEE_OUT = INDEX["ctrlLee.thrustSi"]
+LEE_RPY = INDEX["ctrlLee.rpyx"]
+LEE_ERROR = INDEX["ctrlLee.error_posx"]
+LEE_OMEGA = INDEX["ctrlLee.omegax"]
+LQG_OUT = INDEX["ctrlLqg.thrustSi"]
+LQG_RPYD = INDEX["ctrlLqg.rpydx"]
+LQG_ACC = INDEX["ctrlLqg.accx"]
+MEL = INDEX["ctrlMel.cmd_thrust"]
+PID = INDEX["controller.cmd_thrust"]
+PID_CTR_YAW = INDEX["controller.ctr_yaw"]
+STABILIZER = INDEX["stabilizer.roll"]
+TARGET = INDEX["ctrltarget.x"]
+TARGETZ = INDEX["ctrltargetZ.x"]
+KALMAN = INDEX["kalman.stateX"]
+LOC = INDEX["locSrv.x"]
+EXT_POS = INDEX["ext_pos.X"]
+RPM = INDEX["motor.m1_rpm"]

@@ -1,0 +1,138 @@
+"""The flight: everything between the commander's setpoint and the log variables, one millisecond at a time.
+
+Owns the arrays that the compiled tick works on and shows them by name. Knows no packets and no real time.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from firmware_sim.commander import setpoint as sp
+from firmware_sim.controllers import layout as mem
+from firmware_sim.controllers import parameters, variables
+from firmware_sim.controllers import variables as lv
+from firmware_sim.controllers.tick import tick_step
+from firmware_sim.plant import layout as at
+from firmware_sim.plant.noise import NoiseSource
+from firmware_sim.plant.rotors import wrench
+from firmware_sim.plant.sensors import ACC_CUTOFF, settle
+from firmware_sim.scenario import Scenario
+
+DEFAULT_CONTROLLER = 5
+CONTROLLERS = (5,)
+
+
+class Flight:
+    """A drone with its flight controller. scenario: what is true; seed: of all noise (the same seed, the same flight)."""
+
+    truth_header = [
+        *("t", "px", "py", "pz", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "wx", "wy", "wz"),
+        *("F", "Mx", "My", "Mz", "pwm1", "pwm2", "pwm3", "pwm4", "vbat"),
+    ]
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        self.tick = 0
+        self.setpoint = sp.null_setpoint()
+        self.motors_allowed = True
+        self.armed = scenario.platform != "cf21bl"
+        self._noise = NoiseSource(seed)
+        self._truth = scenario.truth()
+        self._board = scenario.board()
+        self.state = scenario.start_state()
+        self._sensor = np.zeros(at.SENSOR_SIZE)
+        self._estimate = np.zeros(at.ESTIMATE_SIZE)
+        self._P = np.zeros((9, 9))
+        self._memory = np.zeros(mem.MEMORY_SIZE)
+        self._log = np.zeros(len(variables.ALL))
+        self._union = np.zeros(1, dtype=np.float32)
+        self._union_short = self._union.view(np.int16)
+        self.param_defaults = parameters.defaults(scenario.platform)
+        self._param = np.array([self.param_defaults[name] for name in parameters.NAMES])
+        self.log = {name: (self._log, variables.INDEX[name]) for name in variables.names(scenario.platform)}
+        self.param = {name: (self._param, i) for name, i in parameters.INDEX.items()}
+        self._controller = float(DEFAULT_CONTROLLER)
+        self._start_up()
+        for name, value in scenario.parameters.items():
+            if name in self.param:
+                self._param[self.param[name][1]] = value
+                self.parameter_written(name)
+
+    def _start_up(self) -> None:
+        """Sensors settled and calibrated, estimate at its place: as after a boot on level ground."""
+        biases = self._noise.boot(3)
+        self._sensor[at.BIAS : at.BIAS + 3] = biases * self._truth[at.GYRO_BIAS : at.GYRO_BIAS + 3]
+        for i in range(3):
+            settle(self._sensor, at.ACCEL_FILTER + 2 * i, self.state[at.ACC + i], ACC_CUTOFF)
+        self._sensor[at.VBAT] = self._sensor[at.VBAT_FILTERED] = self.state[at.VOLTS]
+        self._estimate[at.E_QUAT] = 1.0
+        self._estimate[at.E_RESET] = 1.0
+
+    def parameter_written(self, name: str) -> None:
+        """Tell the flight that a parameter has been written: some take effect or are corrected at once."""
+        if name == "stabilizer.controller":
+            index = parameters.CONTROLLER
+            wanted = int(self._param[index])
+            if wanted == 0:
+                self._controller = float(DEFAULT_CONTROLLER)
+            elif wanted in CONTROLLERS:
+                self._controller = float(wanted)
+            self._param[index] = self._controller
+        elif name == "stabilizer.estimator":
+            self._param[parameters.INDEX[name]] = 2.0  # the only one there is
+        elif name == "kalman.resetEstimation" and self._param[parameters.INDEX[name]] != 0.0:
+            self._estimate[at.E_RESET] = 1.0
+            self._param[parameters.INDEX[name]] = 0.0  # the firmware clears it when the reset is done
+
+    def external_position(self, position: Sequence[float] | np.ndarray) -> None:
+        """A position fix from outside: m, world; used at the next step. Values that are not finite are dropped."""
+        p = np.asarray(position, dtype=float)
+        self._log[lv.EXT_POS : lv.EXT_POS + 3] = p
+        self._log[lv.LOC : lv.LOC + 3] = p
+        if np.all(np.isfinite(p)):
+            self._estimate[at.E_EXT] = 1.0
+            self._estimate[at.E_EXT_POS : at.E_EXT_POS + 3] = p
+
+    def external_pose(self, position: Sequence[float] | np.ndarray, quaternion: Sequence[float] | np.ndarray) -> None:
+        """A pose from outside: m, world; quaternion x, y, z, w, body to world (normalised here)."""
+        self.external_position(position)
+        q = np.asarray(quaternion, dtype=float)
+        self._log[lv.LOC + 3 : lv.LOC + 7] = q
+        norm = float(np.linalg.norm(q))
+        if self._estimate[at.E_EXT] > 0.0 and np.isfinite(norm) and norm > 1e-3:
+            self._estimate[at.E_EXT] = 2.0
+            self._estimate[at.E_EXT_QUAT : at.E_EXT_QUAT + 4] = np.roll(q / norm, 1)
+
+    def step(self) -> None:
+        """One millisecond."""
+        row = self._noise.prepare(self.tick)
+        tick_step(
+            self._truth,
+            self._board,
+            self.state,
+            self._sensor,
+            self._estimate,
+            self._P,
+            self.setpoint,
+            self._param,
+            self._memory,
+            self._log,
+            self._union,
+            self._union_short,
+            self._noise.rows[row],
+            self.tick,
+            int(self.motors_allowed) | int(self.armed) << 1,
+        )
+        self.tick += 1
+
+    def truth_row(self) -> list[float]:
+        """What is true now, as truth_header names it: s, m, m/s, -, rad/s, N, N m, PWM 0..65535, V."""
+        u: Any = np.empty(4)
+        wrench(self._truth, self.state, at.ROTOR, u)
+        return [
+            self.tick * 1e-3,
+            *self.state[: at.ROTOR].tolist(),
+            *u.tolist(),
+            *self.state[at.PWM : at.PWM + 4].tolist(),
+            float(self.state[at.VOLTS]),
+        ]

@@ -1,0 +1,24 @@
+"""`kernel`: numba's njit for this package, with a cache that notices edits in any file, not only in the function's own.
+
+Numba stamps a cached function with the modification time of the file it is written in. Our kernels call kernels of
+other files and read index constants of other files, so an edit there would silently leave old machine code in use.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from numba import njit
+
+_ROOT = Path(__file__).parent
+_SOURCES = sorted(p for folder in ("plant", "controllers", "commander") for p in (_ROOT / folder).rglob("*.py"))
+_STAMP = tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in _SOURCES)
+
+
+def kernel(function: Any) -> Any:
+    """Compile `function` (explicit loops over flat arrays), cached on disk and without the interpreter lock."""
+    dispatcher = njit(cache=True, nogil=True)(function)
+    try:
+        dispatcher._cache._cache_file._source_stamp = _STAMP
+    except AttributeError:  # private to numba; without it caching still works, only less watchful
+        pass
+    return dispatcher

@@ -1,0 +1,51 @@
+"""Rotors: motor command and battery voltage to thrust, first-order lag, and the sum of four rotors as force and torque.
+
+Motors: M1 front right, M2 back right, M3 back left, M4 front left (x forward, y left, z up).
+"""
+
+import math
+
+from firmware_sim.kernel import kernel
+from firmware_sim.plant import layout as at
+
+
+@kernel
+def steady_thrust(truth, pwm, volts):
+    """Thrust in N that one rotor settles at: polynomial in motor volts (duty times battery volts), 0 for command 0."""
+    if pwm <= 0.0:
+        return 0.0
+    v = pwm / 65535.0 * volts
+    f = 0.0
+    for i in range(5, -1, -1):
+        f = f * v + truth[at.CURVE + i]
+    return min(max(f, 0.0), truth[at.THRUST_MAX])
+
+
+@kernel
+def lag(truth, state, dt, mean):
+    """Advance the four rotor thrusts by dt (exact for a held command); `mean` gets each one's average over the step.
+
+    The rigid body is integrated with the average: the exact impulse, so the error of holding it is of second order.
+    """
+    tau = truth[at.MOTOR_TAU]
+    for i in range(4):
+        goal = steady_thrust(truth, state[at.PWM + i], state[at.VOLTS])
+        f = state[at.ROTOR + i]
+        if tau <= 0.0:
+            state[at.ROTOR + i] = goal
+            mean[i] = goal
+        else:
+            keep = math.exp(-dt / tau)
+            state[at.ROTOR + i] = goal + (f - goal) * keep
+            mean[i] = goal + (f - goal) * (1.0 - keep) * tau / dt
+
+
+@kernel
+def wrench(truth, f, o, out):
+    """out = [F N, Mx, My, Mz N m] of the four thrusts f[o:o+4]."""
+    d, k = truth[at.ARM], truth[at.TORQUE_PER_THRUST]
+    f1, f2, f3, f4 = f[o], f[o + 1], f[o + 2], f[o + 3]
+    out[0] = f1 + f2 + f3 + f4
+    out[1] = d * (-f1 - f2 + f3 + f4)
+    out[2] = d * (-f1 + f2 + f3 - f4)
+    out[3] = k * (-f1 + f2 - f3 + f4)

@@ -1,0 +1,283 @@
+"""The scenario: what is true about the simulated drone, from a TOML file. Never visible to the firmware's tables.
+
+Every key is listed in docs/firmware_sim.md with its default; a wrong one raises ScenarioError naming file and key.
+"""
+
+import math
+import tomllib
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from firmware_sim.errors import ScenarioError
+from firmware_sim.plant import layout as at
+from firmware_sim.plant.battery import open_circuit
+from firmware_sim.plant.ground import GRAVITY
+from firmware_sim.plant.platforms import PLATFORMS, SQRT_HALF, Platform
+
+
+def key(default: Any, low: float, high: float, sizes: tuple[int, ...] = (0,)) -> Any:
+    """A field of a section: default (None: the platform's), range of each number, allowed lengths (0: one number)."""
+    return field(default=default, metadata={"low": low, "high": high, "sizes": sizes})
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """The body and its rotors. kg, kg m^2 about the centre of mass in body axes, m, N, s."""
+
+    mass: float = key(None, 1e-3, 5.0)
+    inertia: tuple[float, ...] = key(None, -1.0, 1.0, (3, 6))  # Ixx, Iyy, Izz [, Ixy, Ixz, Iyz]
+    arm: float = key(None, 5e-3, 1.0)  # rotor offset along body x and along body y
+    thrust_curve: tuple[float, ...] = key(None, -100.0, 100.0, (1, 2, 3, 4, 5, 6))
+    torque_per_thrust: float = key(None, 0.0, 1.0)
+    thrust_max: float = key(None, 1e-3, 100.0)  # per rotor
+    motor_time_constant: float = key(0.05, 0.0, 1.0)
+    rotor_constant: float = key(None, 1e-12, 1.0)  # N/(rad/s)^2
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Process noise of the stochastic differential equation, per root second."""
+
+    thrust: float = key(1e-3, 0.0, 1.0)  # N sqrt(s)
+    torque: float | tuple[float, ...] = key(5e-6, 0.0, 1.0, (0, 3))  # N m sqrt(s)
+
+
+@dataclass(frozen=True)
+class Battery:
+    """One cell. A h, ohm, W/N^1.5 per rotor, W, V."""
+
+    capacity: float = key(None, 1e-3, 100.0)
+    charge: float = key(1.0, 0.0, 1.0)  # fraction at boot
+    resistance: float = key(0.12, 0.0, 10.0)
+    power_coefficient: float = key(None, 0.0, 1e4)
+    electronics_power: float = key(0.4, 0.0, 100.0)
+    noise: float = key(0.003, 0.0, 1.0)  # sd of a measurement
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Inertial sensors; densities per root hertz (BMI088 datasheet), bias sd per axis left after calibration."""
+
+    gyro_noise: float = key(math.radians(0.014), 0.0, 1.0)  # rad/s/sqrt(Hz)
+    gyro_bias: float = key(math.radians(0.02), 0.0, 1.0)  # rad/s
+    gyro_bias_walk: float = key(math.radians(0.002), 0.0, 1.0)  # rad/s/sqrt(s)
+    accelerometer_noise: float = key(190e-6 * GRAVITY, 0.0, 10.0)  # m/s^2/sqrt(Hz)
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """Position (and attitude) fixes that reach the onboard estimate without a host."""
+
+    positioning: str = field(default="pose", metadata={"choices": ("pose", "position", "none")})
+    rate: float = key(100.0, 1.0, 1000.0)  # Hz
+    position_noise: float = key(0.001, 0.0, 1.0)  # m
+    attitude_noise: float = key(0.005, 0.0, 1.0)  # rad
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the drone stands or hangs at boot."""
+
+    position: tuple[float, ...] = key((0.0, 0.0, 0.0), -30.0, 30.0, (3,))
+    velocity: tuple[float, ...] = key((0.0, 0.0, 0.0), -30.0, 30.0, (3,))
+    yaw: float = key(0.0, -math.pi, math.pi)
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The flat floor."""
+
+    height: float = key(0.0, -1e6, 30.0)
+    friction: float = key(0.6, 0.0, 10.0)
+
+
+_SECTIONS: dict[str, type] = {
+    "vehicle": Vehicle,
+    "noise": Noise,
+    "battery": Battery,
+    "sensors": Sensors,
+    "estimator": Estimator,
+    "start": Start,
+    "ground": Ground,
+}
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A whole scenario; without arguments the default: a cf2 with 2.1+ propellers that weighs what it should."""
+
+    platform: str = "cf2"
+    vehicle: Vehicle = field(default_factory=Vehicle)
+    noise: Noise = field(default_factory=Noise)
+    battery: Battery = field(default_factory=Battery)
+    sensors: Sensors = field(default_factory=Sensors)
+    estimator: Estimator = field(default_factory=Estimator)
+    start: Start = field(default_factory=Start)
+    ground: Ground = field(default_factory=Ground)
+    parameters: dict[str, float] = field(default_factory=dict)
+
+    def inertia(self) -> np.ndarray:
+        """Inertia matrix (3, 3), kg m^2, body axes."""
+        values = self.vehicle.inertia or PLATFORMS[self.platform].inertia
+        xx, yy, zz, xy, xz, yz = (*values, 0.0, 0.0, 0.0)[:6]
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+    def truth(self) -> np.ndarray:
+        """The plant's constants as the compiled code reads them (plant/layout.py)."""
+        c, v, platform = np.zeros(at.TRUTH_SIZE), self.vehicle, PLATFORMS[self.platform]
+        J = self.inertia()
+        c[at.MASS] = _or(v.mass, platform.mass)
+        c[at.INERTIA : at.INERTIA + 9] = J.ravel()
+        c[at.INERTIA_INV : at.INERTIA_INV + 9] = np.linalg.inv(J).ravel()
+        c[at.ARM] = _or(v.arm, SQRT_HALF * platform.arm_length)
+        curve = _or(v.thrust_curve, platform.curve)
+        c[at.CURVE : at.CURVE + len(curve)] = curve
+        c[at.TORQUE_PER_THRUST] = _or(v.torque_per_thrust, platform.torque_per_thrust)
+        c[at.THRUST_MAX] = _or(v.thrust_max, platform.rotor_thrust_limit)
+        c[at.MOTOR_TAU] = v.motor_time_constant
+        c[at.ROTOR_CONSTANT] = _or(v.rotor_constant, platform.rotor_constant)
+        c[at.NOISE_THRUST] = self.noise.thrust
+        c[at.NOISE_TORQUE : at.NOISE_TORQUE + 3] = self.noise.torque
+        c[at.CAPACITY] = 3600.0 * _or(self.battery.capacity, platform.capacity)
+        c[at.RESISTANCE] = self.battery.resistance
+        c[at.POWER_COEFFICIENT] = _or(self.battery.power_coefficient, platform.power_coefficient)
+        c[at.ELECTRONICS_POWER] = self.battery.electronics_power
+        c[at.VBAT_NOISE] = self.battery.noise
+        c[at.FLOOR] = self.ground.height
+        c[at.FRICTION] = self.ground.friction
+        c[at.CONTACT_FREQUENCY], c[at.CONTACT_DAMPING] = _contact_frequency(c[at.MASS], c[at.ARM], J), 0.7
+        c[at.GYRO_NOISE] = self.sensors.gyro_noise
+        c[at.GYRO_BIAS : at.GYRO_BIAS + 3] = self.sensors.gyro_bias
+        c[at.GYRO_WALK] = self.sensors.gyro_bias_walk
+        c[at.ACC_NOISE] = self.sensors.accelerometer_noise
+        c[at.FIX_KIND] = ("none", "position", "pose").index(self.estimator.positioning)
+        c[at.FIX_PERIOD] = max(1, round(1000.0 / self.estimator.rate))
+        c[at.FIX_POSITION] = self.estimator.position_noise
+        c[at.FIX_ATTITUDE] = self.estimator.attitude_noise
+        return c
+
+    def board(self) -> np.ndarray:
+        """The constants compiled into the platform's firmware, whatever is true."""
+        b, platform = np.zeros(at.BOARD_SIZE), PLATFORMS[self.platform]
+        b[at.B_ARM] = SQRT_HALF * platform.arm_length
+        b[at.B_TORQUE_PER_THRUST] = platform.torque_per_thrust
+        b[at.B_THRUST_MIN], b[at.B_THRUST_MAX] = platform.thrust_min, platform.thrust_max
+        b[at.B_CURVE : at.B_CURVE + 4] = platform.curve
+        b[at.B_REQUIRE_ARMING] = b[at.B_BRUSHLESS] = float(platform.brushless)
+        return b
+
+    def start_state(self) -> np.ndarray:
+        """The plant's state at boot: rotors still, battery rested."""
+        x = np.zeros(at.STATE_SIZE)
+        x[at.POS : at.POS + 3], x[at.VEL : at.VEL + 3] = self.start.position, self.start.velocity
+        x[at.QUAT], x[at.QUAT + 3] = math.cos(self.start.yaw / 2), math.sin(self.start.yaw / 2)
+        x[at.CHARGE] = 3600.0 * _or(self.battery.capacity, PLATFORMS[self.platform].capacity) * self.battery.charge
+        x[at.VOLTS] = open_circuit(self.battery.charge)
+        standing = self.start.position[2] <= self.ground.height
+        x[at.FEET] = 4.0 if standing else 0.0
+        if standing:
+            x[at.POS + 2] = self.ground.height
+            x[at.ACC + 2] = GRAVITY
+        return x
+
+
+def _or(value: Any, default: Any) -> Any:
+    return default if value is None else value
+
+
+def _contact_frequency(mass: float, arm: float, J: np.ndarray) -> float:
+    """Stiffness of the floor in rad/s: 120 at most, and below 400 for the fastest mode of rocking (1 ms steps)."""
+    rocking = max(1.0, mass * arm * arm / float(np.linalg.eigvalsh(J)[0]))
+    return min(120.0, 400.0 / math.sqrt(rocking))
+
+
+def load_scenario(path: Path | None) -> Scenario:
+    """Read a scenario file; None gives the default. Raises ScenarioError with one sentence naming file and key."""
+    if path is None:
+        return Scenario()
+    try:
+        with open(path, "rb") as file:
+            table = tomllib.load(file)
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{path}: not a TOML file ({error})") from error
+    return parse_scenario(table, str(path))
+
+
+def parse_scenario(table: dict[str, Any], source: str) -> Scenario:
+    """Check a scenario's table and build it; source names the file in messages. Raises ScenarioError."""
+    platform = table.get("platform", "cf2")
+    if platform not in PLATFORMS:
+        raise ScenarioError(f"{source}: platform must be one of {', '.join(PLATFORMS)}, not {platform!r}")
+    scenario = Scenario(platform=platform)
+    for name, value in table.items():
+        if name == "platform":
+            continue
+        if not isinstance(value, dict):
+            raise ScenarioError(f"{source}: unknown key {name}")
+        if name == "parameters":
+            scenario = replace(scenario, parameters=_parameters(value, source))
+        elif name in _SECTIONS:
+            scenario = replace(scenario, **{name: _section(_SECTIONS[name], name, value, source)})
+        else:
+            raise ScenarioError(f"{source}: unknown section [{name}]")
+    _check_body(scenario, PLATFORMS[platform], source)
+    return scenario
+
+
+def _section(kind: type, name: str, table: dict[str, Any], source: str) -> Any:
+    known = {f.name: f for f in fields(kind)}
+    values = {}
+    for entry, value in table.items():
+        where = f"{source}: {name}.{entry}"
+        if entry not in known:
+            raise ScenarioError(f"{where} is not a key of a scenario (known: {', '.join(known)})")
+        rule = known[entry].metadata
+        if "choices" in rule:
+            if value not in rule["choices"]:
+                raise ScenarioError(f"{where} must be one of {', '.join(rule['choices'])}, not {value!r}")
+            values[entry] = value
+        else:
+            values[entry] = _numbers(value, where, rule["low"], rule["high"], rule["sizes"])
+    return kind(**values)
+
+
+def _numbers(value: Any, where: str, low: float, high: float, sizes: tuple[int, ...]) -> float | tuple[float, ...]:
+    if isinstance(value, list):
+        if len(value) not in sizes or len(value) == 0:
+            wanted = " or ".join("one number" if n == 0 else f"{n} numbers" for n in sizes)
+            raise ScenarioError(f"{where} must be {wanted}, not a list of {len(value)}")
+        return tuple(_number(v, where, low, high) for v in value)
+    if 0 not in sizes:
+        raise ScenarioError(f"{where} must be a list of {' or '.join(map(str, sizes))} numbers")
+    return _number(value, where, low, high)
+
+
+def _number(value: Any, where: str, low: float, high: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ScenarioError(f"{where} must be a number, not {value!r}")
+    if not low <= value <= high:
+        raise ScenarioError(f"{where} must lie between {low:g} and {high:g}, not {value!r}")
+    return float(value)
+
+
+def _parameters(table: dict[str, Any], source: str) -> dict[str, float]:
+    """Boot values of firmware parameters: "group.name" = number, quoted or as nested tables."""
+    flat: dict[str, Any] = {}
+    for name, value in table.items():
+        flat.update({f"{name}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {name: value})
+    return {name: _number(v, f'{source}: parameters."{name}"', -1e9, 1e9) for name, v in flat.items()}
+
+
+def _check_body(scenario: Scenario, platform: Platform, source: str) -> None:
+    """An inertia matrix no body can have, or rotors that cannot turn, are errors of the file."""
+    if scenario.vehicle.inertia is not None:
+        principal = np.linalg.eigvalsh(scenario.inertia())
+        if principal[0] < 1e-9:
+            raise ScenarioError(f"{source}: vehicle.inertia is not positive definite")
+        if principal[2] > (principal[0] + principal[1]) * 1.000001:
+            raise ScenarioError(f"{source}: vehicle.inertia breaks the triangle inequality, no body has it")
