@@ -55,7 +55,7 @@ def write_plot(path: str | Path, history: History, vehicle: Vehicle, *, title: s
             if limits:
                 low, high = min(limits), max(limits)
                 margin = 0.6 * (high - low) + 0.02 * abs(high)
-                axis.set_ylim(low - margin, high + margin)
+                axis.set_ylim(max(low - margin, 0.0), high + margin)
             axis.set_ylabel(label)
             axis.grid(alpha=0.3)
             if len(names) > 1:

@@ -107,11 +107,14 @@ def text_summary(summary: Mapping[str, Any], estimate: Estimate) -> str:
     ms = summary["update_ms"]
     cost = f", {ms['median']:.2f} ms each (99 %: {ms['p99']:.2f} ms)" if ms["median"] is not None else ""
     lines.append(f"updates: {summary['updates']}{cost}; packets: {received} received, {lost} lost")
-    for key, label in (("height_error_m", "mean height error"), ("tracking_rms_m", "tracking error, rms")):
+    for key, label, sign in (
+        ("height_error_m", "mean height error", "+"),
+        ("tracking_rms_m", "tracking error, rms", ""),
+    ):
         before, after = summary[key]["before_push"], summary[key]["after_push"]
         if before is not None:
-            then = f", {after:+.3f} m after pushing" if after is not None else ""
-            lines.append(f"{label}: {before:+.3f} m{then}")
+            then = f", {after:{sign}.3f} m after pushing" if after is not None else ""
+            lines.append(f"{label}: {before:{sign}.3f} m{then}")
     lines += [f"note: {n}" for n in summary["notices"]]
     return "\n".join(lines)
 
