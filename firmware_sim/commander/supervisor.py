@@ -19,7 +19,8 @@ _STOP_WATCHDOG = 1000  # ms between notifications once the first has come
 _FREE_FALL = 0.1  # g
 _TILTED, _TILTED_TIME = 0.5, 1000  # acc.z below this [g] for that long [ms] is a tumble
 _UPSIDE_DOWN, _UPSIDE_DOWN_TIME = -0.2, 100
-_SPUN_UP_TIME, _SPUN_UP_LOW, _SPUN_UP_HIGH = 200, 1000, 3500  # ms in this range of rpm
+# ms in this range of rpm. The firmware's limit is 3500; the thrust curve extrapolated down to idle gives some more.
+_SPUN_UP_TIME, _SPUN_UP_LOW, _SPUN_UP_HIGH = 200, 1000, 4000
 
 
 class State(IntEnum):
@@ -233,7 +234,8 @@ class Supervisor:
                 return State.CHECKS_NOT_PASSED
             return State.FLYING if flying else state
         if state == State.LANDED:
-            if not self.armed or self._auto_arm or inside > self._get("supervisor.landedTimeout"):
+            timeout = not self._auto_arm and inside > self._get("supervisor.landedTimeout")
+            if not self.armed or timeout:
                 return State.RESET
             return State.FLYING if flying else state
         # Flying, or levelling out.

@@ -15,6 +15,7 @@ DELETE, START, STOP, RESET, CREATE, APPEND, START_MS = 2, 3, 4, 5, 6, 7, 8
 
 # Delays of the firmware's timer and worker tasks, measured on the real firmware at 100 Hz x 4 blocks: the mean period
 # is exact, most samples are on time, the worst was 16 ms late.
+_MAX_PHASE = 10  # ms
 _LATE_PROBABILITY, _LATE_MEAN, _LATE_MAX = 0.02, 3.0, 16
 
 
@@ -114,11 +115,21 @@ class LogService:
             return ENOENT
         block.period = period
         if period:
-            block.nominal = tick + period
+            block.nominal = tick + period + self._phase(period, tick)
             block.due = block.nominal + self._delay(period)
         else:
             block.nominal = block.due = tick  # one shot
         return 0
+
+    def _phase(self, period: int, tick: int) -> int:
+        """Up to 10 ms until the timer runs, so that no two blocks are sampled at the same instant.
+
+        Over radio the starts of blocks are some ms apart; on a loopback they may come within the same millisecond.
+        """
+        span = min(period, _MAX_PHASE)
+        taken = {block.nominal % period for block in self.blocks.values() if block.nominal is not None}
+        free = [phase for phase in range(span) if (tick + phase) % period not in taken] or list(range(span))
+        return free[int(self._random.integers(len(free)))]
 
     def _delay(self, period: int) -> int:
         """How many ms late the next sample is taken; never as late as the following one."""

@@ -165,13 +165,15 @@ def test_log_data_mean_period_is_exact_and_stamps_are_24_bit(client, start):
     client.firmware.flight.tick = 0xFFFF00
     began = client.flight.tick
     assert client.ask(5, 1, start)[0][2] == 0
-    client.firmware.advance(20 * 500 + 19)
+    client.firmware.advance(20 * 500 + 10 + 16)
     packets = [p.data for p in client.outgoing() if p[:2] == (5, 2)]
-    assert len(packets) == 500
+    assert len(packets) in {500, 501}
+    packets = packets[:500]
     stamps = np.array([int.from_bytes(data[1:4], "little") for data in packets])
     elapsed = (stamps - began) % 2**24
     lateness = elapsed - 20 * np.arange(1, 501)
-    assert lateness.min() == 0
+    assert 0 <= lateness.min() < 10  # the phase
+    lateness -= lateness.min()
     assert 0 < lateness.max() <= 16
     assert (lateness > 0).mean() < 0.1
     assert packets[0][4:] == struct.pack("<ff", 4.1, 0.0)
@@ -184,7 +186,6 @@ def test_blocks_have_their_own_phase(client):
     for number in range(2):
         client.create(number, ["pm.vbat"])
         client.ask(5, 1, bytes((3, number, 1)))
-        client.firmware.advance(3)
     client.firmware.advance(200)
     stamps = {0: [], 1: []}
     for packet in client.outgoing():
