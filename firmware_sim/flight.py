@@ -4,13 +4,13 @@ Owns the arrays that the compiled tick works on and shows them by name. Knows no
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from firmware_sim.commander import setpoint as sp
 from firmware_sim.controllers import layout as mem
-from firmware_sim.controllers import parameters, variables
+from firmware_sim.controllers import lqg_design, parameters, variables
 from firmware_sim.controllers import variables as lv
 from firmware_sim.controllers.tick import tick_step
 from firmware_sim.plant import layout as at
@@ -20,13 +20,13 @@ from firmware_sim.plant.sensors import ACC_CUTOFF, settle
 from firmware_sim.scenario import Scenario
 
 DEFAULT_CONTROLLER = 5
-CONTROLLERS = (5,)
+CONTROLLERS = (5, 6)
 
 
 class Flight:
-    """A drone with its flight controller. scenario: what is true; seed: of all noise (the same seed, the same flight)."""
+    """A drone with its flight controller. scenario: what is true; seed: of all noise (same seed, same flight)."""
 
-    truth_header = [
+    truth_header: ClassVar[list[str]] = [
         *("t", "px", "py", "pz", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "wx", "wy", "wz"),
         *("F", "Mx", "My", "Mz", "pwm1", "pwm2", "pwm3", "pwm4", "vbat"),
     ]
@@ -52,6 +52,7 @@ class Flight:
         self.log = {name: (self._log, variables.INDEX[name]) for name in variables.names(scenario.platform)}
         self.param = {name: (self._param, i) for name, i in parameters.INDEX.items()}
         self._controller = float(DEFAULT_CONTROLLER)
+        self._design_lqg()
         self._start_up()
         for name, value in scenario.parameters.items():
             if name in self.param:
@@ -68,6 +69,13 @@ class Flight:
         self._estimate[at.E_QUAT] = 1.0
         self._estimate[at.E_RESET] = 1.0
 
+    def _design_lqg(self) -> None:
+        """New gains from the weights; weights that have no solution leave the old gains."""
+        weights = {n: float(self._param[parameters.INDEX[f"ctrlLqg.{n}"]]) for n in parameters.LQG_WEIGHTS}
+        gains = lqg_design.design(**weights)
+        if gains is not None:
+            self._memory[mem.LQG_GAIN_POS : mem.LQG_GAIN_POS + 8] = gains
+
     def parameter_written(self, name: str) -> None:
         """Tell the flight that a parameter has been written: some take effect or are corrected at once."""
         if name == "stabilizer.controller":
@@ -78,6 +86,8 @@ class Flight:
             elif wanted in CONTROLLERS:
                 self._controller = float(wanted)
             self._param[index] = self._controller
+        elif name.startswith("ctrlLqg.") and name.split(".")[1] in parameters.LQG_WEIGHTS:
+            self._design_lqg()
         elif name == "stabilizer.estimator":
             self._param[parameters.INDEX[name]] = 2.0  # the only one there is
         elif name == "kalman.resetEstimation" and self._param[parameters.INDEX[name]] != 0.0:

@@ -4,6 +4,7 @@ Numba stamps a cached function with the modification time of the file it is writ
 other files and read index constants of other files, so an edit there would silently leave old machine code in use.
 """
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,7 @@ _STAMP = tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in _SOURCE
 
 def kernel(function: Any) -> Any:
     """Compile `function` (explicit loops over flat arrays), cached on disk and without the interpreter lock."""
-    dispatcher = njit(cache=True, nogil=True)(function)
-    try:
+    dispatcher: Any = njit(cache=True, nogil=True)(function)
+    with contextlib.suppress(AttributeError):  # private to numba; without it caching works, only less watchful
         dispatcher._cache._cache_file._source_stamp = _STAMP
-    except AttributeError:  # private to numba; without it caching still works, only less watchful
-        pass
     return dispatcher

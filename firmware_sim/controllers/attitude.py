@@ -44,7 +44,10 @@ def position_error(setpoint, estimate, axis, yaw):
 
 @kernel
 def align(force, yaw, D):
-    """D (3x3): rotation whose z axis is along `force` and whose x axis points towards yaw [rad]; identity for no force."""
+    """D (3x3): rotation whose z axis is along `force` and whose x axis points towards yaw [rad].
+
+    No force gives the upright attitude.
+    """
     n = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
     zx, zy, zz = 0.0, 0.0, 1.0
     if n > 1e-9:
@@ -96,3 +99,25 @@ def angles(D):
         math.asin(min(1.0, max(-1.0, -D[2, 0]))),
         math.atan2(D[1, 0], D[0, 0]),
     )
+
+
+@kernel
+def desired_rate(setpoint, mass, thrust, R, D, wr):
+    """wr (3, rad/s, body): the body rate the wanted rotation D turns with, from jerk and yaw rate, seen from R.
+
+    Thrust [N] over mass [kg] is the acceleration along body z (Mellinger and Kumar 2011, h_omega).
+    """
+    along = 0.0
+    hx, hy = 0.0, 0.0
+    if thrust > 1e-6:
+        for i in range(3):
+            along += D[i, 2] * setpoint[sp.JX + i]
+        for i in range(3):
+            h = mass / thrust * (setpoint[sp.JX + i] - along * D[i, 2])
+            hx += h * D[i, 0]
+            hy += h * D[i, 1]
+    rate = math.radians(setpoint[sp.RATE_YAW]) * D[2, 2]
+    for i in range(3):
+        wr[i] = 0.0
+        for k in range(3):
+            wr[i] += R[k, i] * (D[k, 0] * -hy + D[k, 1] * hx + D[k, 2] * rate)

@@ -82,7 +82,7 @@ def log_setpoint(setpoint, log):
 
 @kernel
 def log_control(memory, param, log, union_float, union_short):
-    """What control_t's union shows: the PWM thrust in legacy mode, else torque y (and bytes of torque x) by accident."""
+    """What control_t's union shows: the PWM thrust in legacy mode, else torque y (and half of torque x) by accident."""
     for i in range(6):
         log[lv.LEE_GAINS + i] = param[(pm.LEE_KR if i < 3 else pm.LEE_KW - 3) + i]
         log[lv.LEE_GAINS + 6 + i] = param[(pm.LEE_KP if i < 3 else pm.LEE_KD - 3) + i]

@@ -14,7 +14,15 @@ from firmware_sim.commander import setpoint as sp
 from firmware_sim.controllers import layout as mem
 from firmware_sim.controllers import parameters as pm
 from firmware_sim.controllers import variables as lv
-from firmware_sim.controllers.attitude import align, angles, desired_yaw, from_angles, position_error, rotation_error
+from firmware_sim.controllers.attitude import (
+    align,
+    angles,
+    desired_rate,
+    desired_yaw,
+    from_angles,
+    position_error,
+    rotation_error,
+)
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.ground import GRAVITY
@@ -76,7 +84,7 @@ def lee_step(setpoint, estimate, sensor, param, memory, log):
         from_angles(math.radians(setpoint[sp.ROLL]), -math.radians(setpoint[sp.PITCH]), yaw, D)
     memory[out] = thrust
     rotation_error(D, R, eR)
-    desired_rate(setpoint, param, thrust, R, D, wr)
+    desired_rate(setpoint, param[pm.LEE_MASS], thrust, R, D, wr)
     J = pm.LEE_J
     for i in range(3):
         w[i] = sensor[at.GYRO + i]
@@ -98,22 +106,3 @@ def lee_step(setpoint, estimate, sensor, param, memory, log):
     log[lv.LEE_RPY], log[lv.LEE_RPY + 1], log[lv.LEE_RPY + 2] = roll, pitch, heading
     roll, pitch, heading = angles(D)
     log[lv.LEE_RPY + 3], log[lv.LEE_RPY + 4], log[lv.LEE_RPY + 5] = roll, pitch, heading
-
-
-@kernel
-def desired_rate(setpoint, param, thrust, R, D, wr):
-    """wr (3, rad/s, body): the body rate the wanted rotation D turns with, from jerk and yaw rate, seen from R."""
-    along = 0.0
-    hx, hy = 0.0, 0.0
-    if thrust > 1e-6:
-        for i in range(3):
-            along += D[i, 2] * setpoint[sp.JX + i]
-        for i in range(3):
-            h = param[pm.LEE_MASS] / thrust * (setpoint[sp.JX + i] - along * D[i, 2])
-            hx += h * D[i, 0]
-            hy += h * D[i, 1]
-    rate = math.radians(setpoint[sp.RATE_YAW]) * D[2, 2]
-    for i in range(3):
-        wr[i] = 0.0
-        for k in range(3):
-            wr[i] += R[k, i] * (D[k, 0] * -hy + D[k, 1] * hx + D[k, 2] * rate)

@@ -60,10 +60,27 @@ _CF2: dict[str, float] = {
     "ctrlLee.Kpos_Iy": 0.0,
     "ctrlLee.Kpos_Iz": 0.0,
     "ctrlLee.Kpos_I_limit": 2.0,
+    # LQG: what it believes, and the weights of its cost (lqg_design.py)
+    "ctrlLqg.mass": 0.029,
+    "ctrlLqg.J_x": 1.657171e-5,
+    "ctrlLqg.J_y": 1.6655602e-5,
+    "ctrlLqg.J_z": 2.9261652e-5,
+    "ctrlLqg.tau": 0.05,
+    "ctrlLqg.q_pos": 50.0,
+    "ctrlLqg.q_vel": 4.0,
+    "ctrlLqg.r_acc": 1.0,
+    "ctrlLqg.q_att": 100.0,
+    "ctrlLqg.q_rate": 0.1,
+    "ctrlLqg.r_ang": 1e-3,
+    "ctrlLqg.q_yaw": 25.0,
+    "ctrlLqg.q_yawrate": 0.1,
+    "ctrlLqg.r_yaw": 1e-3,
+    "ctrlLqg.acc_limit": 9.0,
 }
 
 _CF21BL: dict[str, float] = {
     "ctrlLee.mass": 0.0393,
+    "ctrlLqg.mass": 0.0393,
     "powerDist.idleThrust": 7000,
 }
 
@@ -72,7 +89,7 @@ INDEX = {name: i for i, name in enumerate(NAMES)}
 
 
 def defaults(platform: str) -> dict[str, float]:
-    """Parameter values at boot of a platform ("cf2" or "cf21bl"), before a scenario changes what the firmware believes."""
+    """Parameter values at boot of a platform ("cf2", "cf21bl"), before a scenario changes what is believed."""
     return _CF2 | (_CF21BL if platform == "cf21bl" else {})
 
 
@@ -102,3 +119,8 @@ LEE_KD = INDEX["ctrlLee.Kpos_Dx"]
 LEE_KD_LIMIT = INDEX["ctrlLee.Kpos_D_limit"]
 LEE_KPI = INDEX["ctrlLee.Kpos_Ix"]
 LEE_KPI_LIMIT = INDEX["ctrlLee.Kpos_I_limit"]
+LQG_MASS = INDEX["ctrlLqg.mass"]
+LQG_J = INDEX["ctrlLqg.J_x"]
+LQG_TAU = INDEX["ctrlLqg.tau"]
+LQG_ACC_LIMIT = INDEX["ctrlLqg.acc_limit"]
+LQG_WEIGHTS = ("tau", "q_pos", "q_vel", "r_acc", "q_att", "q_rate", "r_ang", "q_yaw", "q_yawrate", "r_yaw")

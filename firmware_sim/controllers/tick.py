@@ -1,5 +1,7 @@
 """One millisecond of the whole drone: sense, estimate, control, drive the motors, move the body, publish."""
 
+import math
+
 import numpy as np
 
 from firmware_sim.controllers import layout as mem
@@ -13,6 +15,8 @@ from firmware_sim.controllers.externalise import (
 )
 from firmware_sim.controllers.lee import lee_step
 from firmware_sim.controllers.lee import reset as lee_reset
+from firmware_sim.controllers.lqg import lqg_step
+from firmware_sim.controllers.lqg import reset as lqg_reset
 from firmware_sim.controllers.power_distribution import motors_step
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
@@ -24,6 +28,7 @@ from firmware_sim.plant.rotors import lag, wrench
 from firmware_sim.plant.sensors import sensors_step
 
 DT = 1e-3  # s
+LEE, LQG = 5.0, 6.0  # stabilizer.controller
 
 
 @kernel
@@ -33,8 +38,15 @@ def control_step(setpoint, estimate, sensor, param, memory, log, tick):
     if memory[mem.RUNNING] != which:
         memory[mem.RUNNING] = which
         lee_reset(memory)
+        lqg_reset(memory)
     if tick % 2 == 0:
-        lee_step(setpoint, estimate, sensor, param, memory, log)
+        if which == LQG:
+            lqg_step(setpoint, estimate, sensor, param, memory, log)
+        else:
+            lee_step(setpoint, estimate, sensor, param, memory, log)
+    for i in range(mem.MEMORY_SIZE):  # a setpoint or gain that is not a number must not poison the integrals
+        if not math.isfinite(memory[i]):
+            memory[i] = 0.0
 
 
 @kernel

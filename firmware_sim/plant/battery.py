@@ -1,4 +1,4 @@
-"""One lithium-polymer cell: open-circuit voltage from the charge left, sagging under the load of rotors and electronics.
+"""One lithium-polymer cell: open-circuit voltage from the charge left, sag under the load of rotors and electronics.
 
 A rotor's shaft power grows as thrust^1.5 (momentum theory); the coefficient lumps the motor's efficiency.
 """
@@ -9,7 +9,7 @@ from firmware_sim.plant import layout as at
 
 @kernel
 def open_circuit(soc):
-    """Open-circuit voltage in V for a state of charge 0..1: 3.0 V empty, 3.7 V at 20 %, 4.2 V full, steep near empty."""
+    """Open-circuit voltage in V for a state of charge 0..1: 3.0 V empty, 3.7 V at 20 %, 4.2 V full."""
     soc = min(max(soc, 0.0), 1.0)
     if soc < 0.2:
         return 3.0 + 0.7 * (soc / 0.2) ** 0.5

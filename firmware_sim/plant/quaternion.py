@@ -59,8 +59,8 @@ def roll_pitch_yaw(q, o):
 
 @kernel
 def compress(w, x, y, z):
-    """The firmware's 32-bit smallest-three form (quatcompress.h): index of the largest of x, y, z, w in bits 30-31, then
-    for the other three in order a sign and 9 bits of magnitude with scale 511 sqrt(2)."""
+    """The firmware's 32-bit smallest-three form (quatcompress.h): index of the largest of x, y, z, w in bits 30-31,
+    then for the other three in order a sign and 9 bits of magnitude with scale 511 sqrt(2)."""
     q = (x, y, z, w)
     largest = 0
     for i in range(1, 4):

@@ -1,4 +1,4 @@
-"""Inertial sensors as the firmware hands them on: noise of a BMI088, a slow gyro bias, second-order Butterworth filters.
+"""Inertial sensors as the firmware hands them on: noise of a BMI088, slow gyro bias, second-order Butterworth filters.
 
 Gyro 80 Hz, accelerometer 30 Hz, both at 1 kHz (sensors_bmi088_bmp3xx.c, filter.c).
 """

@@ -1,0 +1,91 @@
+"""Controller 6 (out of tree): flatness reference and LQR on the onboard estimate, after Zhao, section IX, at 500 Hz.
+
+t = a_d + g e3 + K_v e_v + K_p e_p;  F = m t . R e3 (eq. 11 and 83 joined: equal when the attitude follows, and without
+the 1/(cos cos) of eq. 83); wanted attitude from t and yaw (flatness);
+M = J u + w x J w (eq. 84), u = K [angle error, rate error, -angular acceleration]. m and J are beliefs (ctrlLqg.*), so
+thrust and torque scale with them; the angular acceleration is that of rotors with lag ctrlLqg.tau.
+"""
+
+import math
+
+import numpy as np
+
+from firmware_sim.commander import setpoint as sp
+from firmware_sim.controllers import layout as mem
+from firmware_sim.controllers import parameters as pm
+from firmware_sim.controllers import variables as lv
+from firmware_sim.controllers.attitude import (
+    align,
+    angles,
+    desired_rate,
+    desired_yaw,
+    from_angles,
+    position_error,
+    rotation_error,
+)
+from firmware_sim.controllers.lee import DT, MANUAL_THRUST
+from firmware_sim.kernel import kernel
+from firmware_sim.plant import layout as at
+from firmware_sim.plant.ground import GRAVITY
+from firmware_sim.plant.quaternion import matrix
+
+
+@kernel
+def reset(memory):
+    """Rotors at rest."""
+    for i in range(3):
+        memory[mem.LQG_ALPHA + i] = 0.0
+
+
+@kernel
+def lqg_step(setpoint, estimate, sensor, param, memory, log):
+    """One controller step: writes memory[WRENCH] and the ctrlLqg.* variables."""
+    memory[mem.MODE] = mem.FORCE_TORQUE_MODE
+    out = mem.WRENCH
+    R, D = np.empty((3, 3)), np.empty((3, 3))
+    t, eR, wr, Jw, u = np.zeros(3), np.empty(3), np.zeros(3), np.empty(3), np.empty(3)
+    matrix(estimate, at.E_QUAT, R)
+    yaw = desired_yaw(setpoint, estimate, DT)
+    mass = param[pm.LQG_MASS]
+    if setpoint[sp.MODE_X] + setpoint[sp.MODE_Y] + setpoint[sp.MODE_Z] > 0.0:
+        for i in range(3):
+            e_pos, e_vel = position_error(setpoint, estimate, i, yaw)
+            t[i] = setpoint[sp.AX + i] + memory[mem.LQG_GAIN_POS] * e_pos + memory[mem.LQG_GAIN_POS + 1] * e_vel
+        limit = abs(param[pm.LQG_ACC_LIMIT])
+        size = math.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2)
+        if size > limit:
+            for i in range(3):
+                t[i] *= limit / size
+        for i in range(3):
+            log[lv.LQG_ACC + i] = t[i]
+        t[2] += GRAVITY
+        thrust = max(mass * (t[0] * R[0, 2] + t[1] * R[1, 2] + t[2] * R[2, 2]), 0.0)
+        align(t, yaw, D)
+    else:
+        if setpoint[sp.THRUST] < 1000.0:
+            for i in range(4):
+                memory[out + i] = 0.0
+                log[lv.LQG_OUT + i] = 0.0
+            reset(memory)
+            return
+        thrust = setpoint[sp.THRUST] / 65535.0 * MANUAL_THRUST
+        from_angles(math.radians(setpoint[sp.ROLL]), -math.radians(setpoint[sp.PITCH]), yaw, D)
+    memory[out] = thrust
+    rotation_error(D, R, eR)
+    desired_rate(setpoint, mass, thrust, R, D, wr)
+    keep = math.exp(-DT / max(param[pm.LQG_TAU], 1e-4))
+    for i in range(3):
+        K = mem.LQG_GAIN_YAW if i == 2 else mem.LQG_GAIN_ATT
+        alpha = memory[mem.LQG_ALPHA + i]
+        u[i] = -memory[K] * eR[i] - memory[K + 1] * (sensor[at.GYRO + i] - wr[i]) - memory[K + 2] * alpha
+        memory[mem.LQG_ALPHA + i] = u[i] + (alpha - u[i]) * keep
+        Jw[i] = param[pm.LQG_J + i] * sensor[at.GYRO + i]
+        log[lv.LQG_ACC + 3 + i] = u[i]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        gyroscopic = sensor[at.GYRO + j] * Jw[k] - sensor[at.GYRO + k] * Jw[j]
+        memory[out + 1 + i] = param[pm.LQG_J + i] * u[i] + gyroscopic
+    for i in range(4):
+        log[lv.LQG_OUT + i] = memory[out + i]
+    roll, pitch, heading = angles(D)
+    log[lv.LQG_RPYD], log[lv.LQG_RPYD + 1], log[lv.LQG_RPYD + 2] = roll, pitch, heading
