@@ -298,6 +298,14 @@ def test_uploaded_trajectory(client):
     client.firmware.advance(1200)
     assert client.flight.setpoint[[sp.X, sp.Z]] == pytest.approx([2.0, 0.5])
 
+    compressed = struct.pack("<4h", 0, 0, 500, 0) + struct.pack("<BHh", 0x01, 1000, 300) + bytes(3)
+    client.ask(4, 2, struct.pack("<BI", 0, 1000) + compressed)
+    high_level(client, "<BBBBIB", 6, 2, 1, 1, 1000, 1)
+    assert high_level(client, "<BBBBBBf", 13, 0, 0, 0, 0, 2, 2.0)[0][3] == 8  # compressed ones do not stretch
+    assert high_level(client, "<BBBBBBf", 13, 0, 0, 0, 0, 2, 1.0)[0][3] == 0
+    client.firmware.advance(510)
+    assert client.flight.setpoint[[sp.X, sp.Z]] == pytest.approx([0.15, 0.5], abs=0.003)
+
 
 def test_a_closing_link_locks_the_high_level_out_until_a_notice(client):
     client.ask(3, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, 0))
@@ -382,6 +390,26 @@ def test_scenario_parameters_are_boot_values():
     assert client.ask(2, 3, b"\x08" + lee) == [b"\x08" + lee + b"\x00" + struct.pack("<f", 0.029)]
     with pytest.raises(ScenarioError, match=r"ctrlLee\.mas,"):
         Client(parameters={"ctrlLee.mas": 0.05})
+
+
+def test_the_same_seed_is_the_same_flight():
+    """Down to the bytes of every log packet; another seed gives another flight."""
+    from firmware_sim.flight import Flight
+    from firmware_sim.scenario import load_scenario
+
+    def packets(seed):
+        firmware = Firmware(Flight(load_scenario(None), seed), platform="cf2", seed=seed)
+        firmware.advance(200)
+        index = [item.name for item in firmware.log.table.items].index("stateEstimate.x")
+        for data in (struct.pack("<BBBH", 6, 1, 7, index), b"\x03\x01\x01"):
+            firmware.receive(wire.Packet(wire.LOG, 1, data))
+        firmware.receive(wire.Packet(wire.SETPOINT_HIGH_LEVEL, 0, struct.pack("<BBff?f", 7, 0, 0.5, 0.0, True, 1.0)))
+        firmware.advance(2000)
+        assert firmware.supervisor.flying
+        return list(firmware.outbox)
+
+    assert packets(3) == packets(3)
+    assert packets(3) != packets(4)
 
 
 @settings(max_examples=300, deadline=None)

@@ -1,7 +1,9 @@
 """CRTP packets and the tables: bytes as the real firmware and cflib put them on the wire."""
 
+import json
 import struct
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_sim import tables, wire
+from firmware_sim.firmware import Firmware
+from firmware_sim.flight import Flight
+from firmware_sim.scenario import load_scenario
 
 
 @given(st.integers(0, 15), st.integers(0, 3), st.binary(max_size=30))
@@ -85,6 +90,28 @@ def test_types_and_flags_follow_the_firmware():
         "deck.bcFlow": 0x48,
         "powerDist.idleThrust": 0x1A,
     }
+
+
+REAL = {"uint8_t": "u8", "uint16_t": "u16", "uint32_t": "u32", "int8_t": "i8", "int16_t": "i16", "int32_t": "i32"}
+
+
+@pytest.mark.parametrize("platform", ["cf2", "cf21bl"])
+def test_every_name_that_the_real_firmware_has_is_of_its_type(platform, tmp_path):
+    path = Path(__file__).parents[3] / "shared" / "facts" / "toc_head.json"
+    if not path.exists():
+        pytest.skip("the dump of the real tables of contents is not at hand")
+    real = json.loads(path.read_text())
+    scenario_file = tmp_path / "scenario.toml"
+    scenario_file.write_text(f'platform = "{platform}"\n')
+    scenario = load_scenario(scenario_file)
+    firmware = Firmware(Flight(scenario, 0), platform=platform, seed=0)
+    for kind, table in (("log", firmware.log.table), ("param", firmware.param.table)):
+        known = [item for item in table.items if item.name in real[kind]]
+        wrong = [i.name for i in known if i.kind != REAL.get(real[kind][i.name], real[kind][i.name])]
+        assert not wrong
+        assert len(known) > 50
+        ours = {item.name.split(".")[0] for item in table.items} - {name.split(".")[0] for name in real[kind]}
+        assert ours <= {"ctrlLqg", "deck", "crtp"}  # nothing invented but the out-of-tree controller
 
 
 def test_checksums_tell_tables_apart():
