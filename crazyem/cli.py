@@ -28,16 +28,18 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def common(name: str, text: str, *, vehicle: str | None) -> argparse.ArgumentParser:
+    def common(name: str, text: str, *, recorded: bool = False) -> argparse.ArgumentParser:
+        # A replay without options repeats the flight with what the recording says it was flown with.
+        vehicle, window, every = (None, None, None) if recorded else ("cf2", 800, 4)
         p = commands.add_parser(name, help=text, description=text)
         p.add_argument("--vehicle", default=vehicle, metavar="NAME|FILE", help="preset or vehicle file (default: cf2)")
-        p.add_argument("--window", type=_positive_integer, default=800, help="newest samples used (default: 800)")
-        p.add_argument("--every", type=_positive_integer, default=4, help="samples per update (default: 4)")
+        p.add_argument("--window", type=_positive_integer, default=window, help="newest samples used (default: 800)")
+        p.add_argument("--every", type=_positive_integer, default=every, help="samples per update (default: 4)")
         p.add_argument("--json", metavar="FILE", help="summary for programs; - for standard output")
         p.add_argument("--plot", metavar="FILE.png", help="summary plot (default: beside the recording or summary)")
         return p
 
-    fly = common("fly", "fly a drone, or a simulated firmware, and push what is learnt", vehicle="cf2")
+    fly = common("fly", "fly a drone, or a simulated firmware, and push what is learnt")
     fly.add_argument("uri", nargs="?", metavar="URI", help="the drone; without it firmware_sim is started")
     fly.add_argument("--controller", choices=("lee", "lqg"), default="lee")
     fly.add_argument(
@@ -50,10 +52,10 @@ def parser() -> argparse.ArgumentParser:
     fly.add_argument("--seed", type=int, help="of the simulator's noise (default: 0)")
     fly.add_argument("--speed", type=_speed, metavar="X", help="of the simulator, times real time (default: 1)")
 
-    replay = common("replay", "run the estimator over a recording", vehicle=None)
+    replay = common("replay", "run the estimator over a recording", recorded=True)
     replay.add_argument("file", metavar="FILE", help="our MCAP, or a CSV (plain or gzip) of a known layout")
 
-    watch = common("watch", "estimate without commanding", vehicle="cf2")
+    watch = common("watch", "estimate without commanding")
     watch.add_argument("uri", metavar="URI")
     watch.add_argument("--duration", type=float, metavar="S", help="s until it ends by itself")
     watch.add_argument("--record", metavar="FILE.mcap", help="record everything")

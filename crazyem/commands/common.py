@@ -9,8 +9,10 @@ from typing import Any
 
 from crazyem.errors import CrazyemError
 from crazyem.estimation.result import Estimate
+from crazyem.links.base import LinkStatistics
 from crazyem.live.history import History
 from crazyem.live.pipeline import Pipeline
+from crazyem.live.recorder import Recorder
 from crazyem.live.summary import build_summary, live_line, text_summary, write_json
 from crazyem.vehicle import Vehicle
 
@@ -90,6 +92,14 @@ def report(
         write_json(summary, arguments.json)
     say(f"plot: {plot}" + (f"   summary: {arguments.json}" if arguments.json not in (None, "-") else ""))
     return estimate
+
+
+def close_recorder(recorder: Recorder, statistics: LinkStatistics, history: History) -> None:
+    """Finish the recording, with the account of lost packets in it; say so if it is not whole."""
+    counts = {"received": statistics.received, "lost": statistics.lost, "late": statistics.late}
+    recorder.metadata("statistics", {k: str(v) for k, v in counts.items()})
+    recorder.close()
+    history.notice(recorder.failure)
 
 
 def raise_after(error: BaseException | None) -> None:

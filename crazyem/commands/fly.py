@@ -7,7 +7,16 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from crazyem.commands.common import LiveLine, new_estimator, plot_path, raise_after, report, say, warm_up
+from crazyem.commands.common import (
+    LiveLine,
+    close_recorder,
+    new_estimator,
+    plot_path,
+    raise_after,
+    report,
+    say,
+    warm_up,
+)
 from crazyem.control.trajectories import Trajectory, Vector, excite, figure8, hover
 from crazyem.control.waypoints import read_waypoints, waypoints
 from crazyem.errors import CrazyemError, UsageError
@@ -127,6 +136,8 @@ def _fly(arguments: argparse.Namespace, *, plan: FlightPlan, vehicle: Any, uri: 
             session.history.notice(str(e))
         session.close()
         statistics = link.statistics()
+        if recorder is not None:
+            close_recorder(recorder, statistics, session.history)
         extra = {k: configuration[k] for k in ("uri", "controller", "trajectory", "seed")}
         try:
             report(

@@ -66,6 +66,10 @@ def run(arguments: argparse.Namespace) -> int:
         check_writable(path)
     recording = open_recording(arguments.file)
     vehicle = vehicle_of(recording, arguments.vehicle)
+    configured = recording.metadata.get("configuration", {})
+    for name, default in (("window", "800"), ("every", "4")):
+        if getattr(arguments, name) is None:
+            setattr(arguments, name, int(configured.get(name, default)))
     recording.check(required_signals(recording, vehicle))
     history = History()
     take_events(recording, history)
@@ -90,7 +94,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def packet_counts(recording: Recording) -> tuple[int, int]:
-    """Samples in the recording, and those among them that carry nothing (lost on the way to it)."""
+    """Log packets received and lost, as counted in flight; of a foreign file samples, and those that carry nothing."""
+    counted = recording.metadata.get("statistics", {})
+    if "received" in counted:
+        return int(counted["received"]), int(counted["lost"])
     total = sum(a.time.size for a in recording.signals.values())
     marked = sum(int(a.marked.sum()) for a in recording.signals.values())
     return total, marked

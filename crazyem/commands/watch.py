@@ -5,7 +5,16 @@ import contextlib
 import math
 import time
 
-from crazyem.commands.common import LiveLine, new_estimator, plot_path, raise_after, report, say, warm_up
+from crazyem.commands.common import (
+    LiveLine,
+    close_recorder,
+    new_estimator,
+    plot_path,
+    raise_after,
+    report,
+    say,
+    warm_up,
+)
 from crazyem.commands.fly import interrupts
 from crazyem.errors import CrazyemError
 from crazyem.links import open_link
@@ -46,6 +55,8 @@ def run(arguments: argparse.Namespace) -> int:
             session.history.notice(str(e))
         session.close()
         statistics = link.statistics()
+        if recorder is not None:
+            close_recorder(recorder, statistics, session.history)
         try:
             report(
                 arguments,

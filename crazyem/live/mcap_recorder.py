@@ -1,5 +1,6 @@
-"""The session's recorder: our MCAP format (crazyem.recordings.writer)."""
+"""Opens the session's recorder: our MCAP format, with the run's configuration and vehicle file in it."""
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +12,28 @@ from crazyem.vehicle import Vehicle
 def open_recorder(
     path: str | None, *, configuration: Mapping[str, Any], vehicle: Vehicle, link: Link
 ) -> Recorder | None:
-    """A recorder for `path`, None without one."""
+    """A recorder for `path`, None without one.
+
+    Args:
+        configuration: of the run; values are stored as JSON.
+        vehicle: its file's text is stored, so that a replay starts from the same constants.
+
+    Raises:
+        UsageError: the file cannot be created.
+    """
     if path is None:
         return None
-    raise NotImplementedError
+    from crazyem.recordings.writer import RecordingWriter
+
+    return RecordingWriter(
+        path,
+        metadata={
+            "configuration": {k: json.dumps(v) for k, v in configuration.items()},
+            "vehicle": {"name": vehicle.name, "toml": vehicle.to_toml()},
+            "drone": {
+                "uri": link.uri,
+                "log_variables": " ".join(sorted(link.log_variables)),
+                "parameters": " ".join(sorted(link.parameters)),
+            },
+        },
+    )

@@ -119,8 +119,12 @@ class Session:
         if controller is None:
             return note
         nominal = dict(zip(("mass", "Ixx", "Iyy", "Izz"), (self.vehicle.mass, *self.vehicle.inertia)))
-        guard = Guard(controller, nominal=nominal, originals=read_originals(self.link, controller), limits=limits)
-        on_write = self.recorder.parameter_write if self.recorder is not None else None
+        originals = read_originals(self.link, controller)
+        guard = Guard(controller, nominal=nominal, originals=originals, limits=limits)
+        on_write = None
+        if self.recorder is not None:
+            on_write = self.recorder.parameter_write
+            self.recorder.metadata("parameters_at_connect", {k: repr(v) for k, v in originals.items()})
         self.pusher = Pusher(self.link, guard, history=self.history, on_write=on_write)
         self.pipeline.push = self.pusher.submit
         self.pipeline.guard = guard

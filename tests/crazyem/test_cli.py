@@ -77,6 +77,7 @@ def test_options_named_in_the_interface_exist():
     )
     assert given.trajectory == ["waypoints", "f.csv"]
     assert given.no_push
+    assert (given.window, given.every) == (800, 4)
     assert parser().parse_args(["fly", "udp://127.0.0.1:1", "--trajectory", "hover"]).uri == "udp://127.0.0.1:1"
     given = parser().parse_args(["replay", "f.mcap", "--vehicle", "cf2", "--window", "400", "--every", "2"])
     assert (given.window, given.every) == (400, 2)

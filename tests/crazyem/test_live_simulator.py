@@ -1,0 +1,128 @@
+"""End to end over the real link: the command line flies the simulated firmware in a process of its own."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from crazyem.cli import main
+from crazyem.recordings import open_recording
+
+PAYLOAD = """
+[vehicle]
+mass = 0.036
+inertia = [2.0e-5, 2.1e-5, 3.6e-5]
+motor_time_constant = 0.060
+[parameters]
+"ctrlLee.mass" = 0.029
+"""
+
+
+@pytest.fixture
+def payload(tmp_path):
+    path = tmp_path / "payload.toml"
+    path.write_text(PAYLOAD)
+    return str(path)
+
+
+def start(*arguments, cwd):
+    """The command as a user starts it."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "crazyem", *map(str, arguments)], cwd=cwd, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(Path.cwd())},
+    )  # fmt: skip
+
+
+def wait_for(process, word, seconds=90.0):
+    """Read standard error until a line holds `word`; the lines so far."""
+    lines = []
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        line = process.stderr.readline()
+        lines.append(line)
+        if word in line:
+            return lines
+        if not line and process.poll() is not None:
+            break
+    raise AssertionError(f"no '{word}' in {''.join(lines)}")
+
+
+def test_a_flight_learns_its_mass_pushes_it_and_replays_bit_for_bit(tmp_path, payload, capsys):
+    out, log = tmp_path / "f.json", tmp_path / "f.mcap"
+    code = main(["fly", "--trajectory", "hover", "--duration", "9", "--scenario", payload, "--speed", "4",
+                 "--record", str(log), "--json", str(out)])  # fmt: skip
+    assert code == 0
+    summary = json.loads(out.read_text())
+    assert summary["estimates"]["mass"]["value"] == pytest.approx(0.036, rel=0.01)
+    assert summary["pushes"]
+    assert all(p["verified"] for p in summary["pushes"])
+    assert summary["height_error_m"]["before_push"] == pytest.approx(-0.34, abs=0.04)
+    assert abs(summary["height_error_m"]["after_push"]) < 0.03
+    assert (tmp_path / "f.png").exists()
+    assert re.search(r"hovering .* mass 3[56]", capsys.readouterr().err)
+
+    again = tmp_path / "r.json"
+    assert main(["replay", str(log), "--json", str(again)]) == 0
+    replayed = json.loads(again.read_text())
+    assert replayed["estimates"] == summary["estimates"]  # bit for bit
+    assert replayed["updates"] == summary["updates"]
+    assert replayed["samples"] == summary["samples"]
+    assert replayed["tracking_rms_m"]["before_push"] == pytest.approx(
+        summary["tracking_rms_m"]["before_push"], rel=0.01
+    )
+
+    recorded = [e.data for e in open_recording(log).events if e.kind == "estimate"]
+    assert len(recorded) == summary["updates"] - 1  # the final one is made after the recording is closed
+
+
+def test_bad_scenario_is_one_sentence_naming_the_key(tmp_path, capsys):
+    path = tmp_path / "odd.toml"
+    path.write_text("[vehicle]\nmas = 1\n")
+    assert main(["fly", "--scenario", str(path), "--duration", "2"]) != 0
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "odd.toml" in said
+    assert "mas" in said
+
+
+def test_drone_lost_in_flight_leaves_a_readable_recording(tmp_path, simulator):
+    drone = simulator("--speed", "3")
+    process = start("fly", drone.uri, "--duration", "30", "--record", "lost.mcap", "--json", "lost.json", cwd=tmp_path)
+    wait_for(process, "hover ")
+    drone.kill()
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 4
+    assert "Traceback" not in errors
+    assert "was lost" in errors.strip().splitlines()[-1]
+    recording = open_recording(tmp_path / "lost.mcap")
+    assert recording.duration > 5
+    assert any("lost" in n for n in json.loads((tmp_path / "lost.json").read_text())["notices"])
+
+
+def test_interrupt_lands_and_still_reports(tmp_path, simulator):
+    drone = simulator("--speed", "4", "--truth", str(tmp_path / "truth.csv"))
+    process = start("fly", drone.uri, "--duration", "60", "--json", "cut.json", cwd=tmp_path)
+    wait_for(process, "hover ")
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "landed on request" in errors
+    assert json.loads((tmp_path / "cut.json").read_text())["updates"] > 0
+    drone.stop()
+    last = (tmp_path / "truth.csv").read_text().strip().splitlines()[-1].split(",")
+    assert abs(float(last[3])) < 0.1  # on the floor
+
+
+def test_watch_estimates_what_somebody_else_flies(tmp_path, simulator):
+    """`watch` sees an idle drone: nothing identifiable, and it says why."""
+    drone = simulator()
+    assert main(["watch", drone.uri, "--duration", "2", "--json", str(tmp_path / "w.json")]) == 0
+    summary = json.loads((tmp_path / "w.json").read_text())
+    assert not summary["estimates"]["mass"]["identifiable"]
+    assert "ground" in summary["estimates"]["mass"]["reason"]
+    assert summary["pushes"] == []
