@@ -178,7 +178,7 @@ def shut(crazyflie: Any, *, hand_back: bool = False, cut_motors: bool = False) -
 
 def _take_link(crazyflie: Any) -> Any:
     """Take the driver out of the object, not in the middle of a send: a sender would die holding cflib's lock."""
-    lock = getattr(crazyflie, "_send_lock", None)
+    lock: Any = getattr(crazyflie, "_send_lock", None)
     held = lock is not None and lock.acquire(timeout=0.5)
     try:
         link, crazyflie.link = crazyflie.link, None

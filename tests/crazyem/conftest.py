@@ -1,4 +1,4 @@
-"""Fixtures of the crazyem tests: the simulator as its own process, and a bare-socket Crazyflie that can lose replies."""
+"""Fixtures of the crazyem tests: the simulator as its own process, and a bare-socket Crazyflie that loses replies."""
 
 import contextlib
 import os
@@ -112,7 +112,7 @@ class FakePeer:
     def __init__(self) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(("127.0.0.1", 0))
-        self.uri = "udp://127.0.0.1:%d" % self.socket.getsockname()[1]
+        self.uri = f"udp://127.0.0.1:{self.socket.getsockname()[1]}"
         self.lose: Callable[[bytes], bool] = lambda request: False
         self.skip: Callable[[int], bool] = lambda number: False  # log packets that never leave
         self.silent = False

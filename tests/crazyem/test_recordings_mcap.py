@@ -1,0 +1,304 @@
+"""Our MCAP files: bit for bit what was delivered, in order, readable after a kill, harmless when broken."""
+
+import contextlib
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from crazyem.errors import CrazyemError, FileFormatError, UsageError
+from crazyem.estimation.result import Estimate, ParameterEstimate
+from crazyem.links.base import ParameterWrite
+from crazyem.recordings import open_recording
+from crazyem.recordings.schemas import BlockCodec
+from crazyem.recordings.writer import RecordingWriter
+from crazyem.signals.packet import Block, Packet, Variable
+from crazyem.signals.vocabulary import decoders
+
+
+def block(identifier, *names, ctype="float"):
+    return Block(identifier, tuple(Variable(n, ctype) for n in names), 10)
+
+
+STATE = block(0, *(f"stateEstimate.{n}" for n in ("x", "y", "z")), *(f"stateEstimate.q{n}" for n in "xyzw"))
+IMU = block(1, "gyro.x", "gyro.y", "gyro.z", "acc.x", "acc.y", "acc.z")
+WIDE = block(2, "pm.vbat", *(f"g.v{i}" for i in range(25)), ctype="uint8_t")  # field numbers beyond one-byte tags
+BLOCKS = (STATE, IMU, WIDE)
+
+
+@dataclass(frozen=True)
+class Reference:
+    position: tuple = (0.1, 0.2, 0.3)
+    velocity: tuple = (1.0, 2.0, 3.0)
+    acceleration: tuple = (0.0, -0.0, 5e-324)
+    yaw: float = 0.4
+    yaw_rate: float = 0.5
+
+
+def flight(count):
+    """Packets whose firmware times are not in order across blocks, as on a real link."""
+    packets = []
+    for k in range(count):
+        for b, lag in ((1, 3), (0, 0), (2, 11)):
+            values = tuple(math.sin(k * 7.1 + i + b) * 10.0 ** (i - 3) for i in range(len(BLOCKS[b].variables)))
+            packets.append(Packet(b, 1000 + 10 * k - lag, 1.7e9 + 0.01 * k + lag * 1e-4, values))
+    return packets
+
+
+def write(path, packets, **metadata):
+    with RecordingWriter(path, metadata) as writer:
+        writer.blocks(BLOCKS)
+        for packet in packets:
+            writer.packet(packet)
+    assert writer.failure == ""
+
+
+def live(packets):
+    table = decoders(BLOCKS)
+    return [sample for packet in packets for sample in table[packet.block].decode(packet)]
+
+
+def test_samples_come_back_bit_for_bit_and_in_order(tmp_path):
+    packets = flight(50)
+    path = tmp_path / "flight.mcap"
+    write(path, packets, run={"seed": "1"}, vehicle={"toml": 'name = "cf2"\n'})
+    recording = open_recording(path)
+    assert list(recording.samples()) == live(packets)
+    assert recording.metadata["run"] == {"seed": "1"}
+    assert recording.metadata["vehicle"] == {"toml": 'name = "cf2"\n'}
+    assert recording.metadata["crazyem"]["format"] == "1"
+    assert recording.notices == ()
+    assert recording.source == "mcap"
+    assert recording.duration == pytest.approx(0.49 + 0.011)
+    recording.check(["position", "body_rate", "voltage"])
+
+
+numbers = st.floats(width=64, allow_nan=True, allow_infinity=True)
+
+
+@given(
+    st.integers(-(2**62), 2**62),
+    st.floats(0, 2e9),
+    st.lists(numbers, min_size=26, max_size=26).map(tuple),
+)
+def test_every_number_survives_the_codec(stamp, host_time, values):
+    packet = Packet(2, stamp, host_time, values)
+    back = BlockCodec(WIDE).decode(BlockCodec(WIDE).encode(packet))
+    assert repr(back) == repr(packet)  # repr: NaN equals itself, and -0.0 differs from 0.0
+
+
+def test_any_protobuf_decoder_reads_a_block():
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+    codec = BlockCodec(WIDE)
+    pool = descriptor_pool.DescriptorPool()
+    for file in descriptor_pb2.FileDescriptorSet.FromString(codec.schema_data()).file:
+        pool.Add(file)
+    message = message_factory.GetMessageClass(pool.FindMessageTypeByName(codec.schema_name))
+    decoded = message.FromString(codec.encode(Packet(2, -5, 1.5, tuple(float(i) for i in range(26)))))
+    assert decoded.firmware_time_ms == -5
+    assert decoded.host_time == 1.5
+    assert decoded.pm_vbat == 0.0
+    assert decoded.g_v24 == 25.0
+
+
+def test_the_stock_mcap_reader_decodes_every_channel(tmp_path):
+    from mcap.reader import make_reader
+    from mcap_protobuf.decoder import DecoderFactory
+
+    path = tmp_path / "flight.mcap"
+    write_everything(path)
+    topics = {}
+    with path.open("rb") as stream:
+        for schema, channel, _, message in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            topics[channel.topic] = (schema.name, message)
+    assert {topic: name for topic, (name, _) in topics.items()} == {
+        "/log/0": "crazyem.log.Block0",
+        "/log/1": "crazyem.log.Block1",
+        "/log/2": "crazyem.log.Block2",
+        "/pose": "foxglove.PoseInFrame",
+        "/tf": "foxglove.FrameTransform",
+        "/setpoint": "crazyem.Setpoint",
+        "/parameter_write": "crazyem.ParameterWrite",
+        "/estimate": "crazyem.Estimate",
+        "/events": "foxglove.Log",
+    }
+    pose = topics["/pose"][1]
+    assert pose.frame_id == "world"
+    assert pose.timestamp.seconds == 1_700_000_000
+    assert topics["/events"][1].level == 2
+
+
+def write_everything(path):
+    parameters = {
+        "mass": ParameterEstimate(0.034, 1e-4, (0.0338, 0.0342), "kg", True),
+        "Ixx": ParameterEstimate(2e-5, 1.0, (-1.0, 1.0), "kg m^2", False, "no excitation"),
+    }
+    with RecordingWriter(path) as writer:
+        writer.blocks(BLOCKS)
+        for packet in flight(10):
+            writer.packet(packet)
+        writer.setpoint(1.25, Reference())
+        writer.parameter_write(ParameterWrite("ctrlLee.mass", 0.034, None, False, 1.7e9 + 1))
+        writer.estimate(Estimate(2.5, parameters, samples=800, updates=7, converged=True))
+        writer.event("landed", "WARNING")
+        writer.event("over")
+
+
+def test_events_come_back(tmp_path):
+    path = tmp_path / "flight.mcap"
+    write_everything(path)
+    events = {event.kind: event.data for event in open_recording(path).events}
+    assert events["setpoint"]["position_z"] == 0.3
+    assert events["setpoint"]["acceleration_z"] == 5e-324
+    assert events["setpoint"]["time"] == 1.25
+    assert events["parameter_write"]["name"] == "ctrlLee.mass"
+    assert math.isnan(events["parameter_write"]["echoed"])
+    assert events["parameter_write"]["verified"] is False
+    assert [p["name"] for p in events["estimate"]["parameters"]] == ["mass", "Ixx"]
+    assert events["estimate"]["parameters"][1]["reason"] == "no excitation"
+    assert events["log"]["message"] == "over"
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    path = tmp_path_factory.mktemp("mcap") / "small.mcap"
+    packets = flight(40)
+    with RecordingWriter(path) as writer:
+        writer.blocks(BLOCKS)
+        for k, packet in enumerate(packets):
+            writer.packet(packet)
+            if k % 30 == 29:
+                writer._put(writer._writer.flush)  # several chunks
+    return path, path.read_bytes(), live(packets)
+
+
+def test_truncated_anywhere_gives_a_prefix_or_one_clear_error(small, tmp_path):
+    _, data, expected = small
+    path = tmp_path / "cut.mcap"
+    lengths = []
+    for size in [*range(0, len(data), 41), *range(len(data) - 300, len(data))]:
+        path.write_bytes(data[:size])
+        try:
+            recording = open_recording(path)
+        except FileFormatError:
+            lengths.append(0)
+            continue
+        samples = list(recording.samples())
+        assert samples == expected[: len(samples)]
+        lengths.append(len(samples))
+    assert lengths == sorted(lengths)
+    assert lengths[-1] == len(expected)
+    assert len(set(lengths)) > 4  # chunk by chunk
+
+
+def test_a_cut_file_says_so(small, tmp_path):
+    _, data, _ = small
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(data[: len(data) // 2])
+    assert any("ends in the middle" in notice for notice in open_recording(path).notices)
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_damaged_bytes_never_raise_anything_else(small, tmp_path, data):
+    _, content, _ = small
+    broken = bytearray(content)
+    for _ in range(data.draw(st.integers(1, 8))):
+        broken[data.draw(st.integers(0, len(broken) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path / "broken.mcap"
+    path.write_bytes(bytes(broken))
+    with contextlib.suppress(CrazyemError):
+        list(open_recording(path).samples())
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.sampled_from(
+        [b"", b"\x89MCAP0\r\n", b"\x1f\x8b", b"\x1f\x8b\x08\x00", b"t,px,", b"host_t,block,fw_ms,name,value\n"]
+    ),
+    st.binary(max_size=300),
+)
+def test_random_bytes_are_no_recording(tmp_path, start, rest):
+    path = tmp_path / "noise"
+    path.write_bytes(start + rest)
+    with pytest.raises(CrazyemError) as caught:
+        open_recording(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_mcap_of_somebody_else(tmp_path):
+    from mcap.writer import Writer
+
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("x.Y", "jsonschema", b"{}")
+        channel = writer.register_channel("/x", "json", schema)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    with pytest.raises(FileFormatError, match="holds no log blocks"):
+        open_recording(path)
+
+
+def test_files_that_are_not_there(tmp_path):
+    with pytest.raises(UsageError, match="no such file"):
+        open_recording(tmp_path / "nothing.mcap")
+    with pytest.raises(UsageError, match="is a directory"):
+        open_recording(tmp_path)
+    with pytest.raises(UsageError, match="cannot be written"):
+        RecordingWriter(tmp_path / "no" / "folder.mcap")
+
+
+def test_a_full_disk_stops_the_recording_not_the_flight(tmp_path, monkeypatch):
+    with pytest.raises(UsageError, match="No space left"):
+        RecordingWriter("/dev/full")
+
+    def full():
+        raise OSError(28, "No space left on device")
+
+    writer = RecordingWriter(tmp_path / "flight.mcap")
+    monkeypatch.setattr(writer._writer, "finish", full)
+    writer.blocks(BLOCKS)
+    for packet in flight(20):
+        writer.packet(packet)
+    writer.close()
+    assert "recording stopped" in writer.failure
+
+
+def test_a_killed_process_leaves_its_flight_readable(tmp_path):
+    path = tmp_path / "killed.mcap"
+    program = f"""
+import sys, time
+sys.path.insert(0, {os.getcwd()!r})
+from crazyem.recordings.writer import RecordingWriter
+from crazyem.signals.packet import Block, Packet, Variable
+writer = RecordingWriter({str(path)!r})
+writer.blocks((Block(0, (Variable("pm.vbat", "float"),), 10),))
+for k in range(100_000):
+    writer.packet(Packet(0, 10 * k, 1.7e9 + 0.01 * k, (4.0,)))
+    print(k, flush=True)
+    time.sleep(0.01)
+"""
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    sent = 0
+    deadline = time.monotonic() + 1.8
+    for line in process.stdout:
+        sent = int(line)
+        if time.monotonic() > deadline:
+            break
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    recording = open_recording(path)
+    assert recording.signals["voltage"].time.size >= sent - 100  # at most the last second
+    assert recording.notices
