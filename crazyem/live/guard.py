@@ -32,9 +32,9 @@ class Limits:
     inertia_agreement: float = 0.08
     agreement_time: float = 0.5
     slew: float = 0.15
-    interval: float = 0.3
+    interval: float = 0.5
     mass_deadband: float = 0.002
-    inertia_deadband: float = 0.02
+    inertia_deadband: float = 0.03
 
     def of(self, name: str, kind: str) -> float:
         """A scalar limit for a parameter."""

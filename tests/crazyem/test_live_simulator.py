@@ -126,3 +126,37 @@ def test_watch_estimates_what_somebody_else_flies(tmp_path, simulator):
     assert not summary["estimates"]["mass"]["identifiable"]
     assert "ground" in summary["estimates"]["mass"]["reason"]
     assert summary["pushes"] == []
+
+
+def test_three_lines_give_an_existing_cflib_script_estimates(simulator):
+    """The script owns the Crazyflie object and the flight; we ride along and leave it open."""
+    import cflib.crtp
+    from cflib.crazyflie import Crazyflie
+    from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
+
+    import crazyem
+
+    cflib.crtp.init_drivers()
+    drone = simulator("--speed", "4")
+    with SyncCrazyflie(drone.uri, cf=Crazyflie(ro_cache=None, rw_cache=None)) as scf:
+        scf.wait_for_params()
+        scf.cf.param.set_value("stabilizer.controller", "5")
+        with crazyem.attach(scf.cf, vehicle="cf2") as drone_estimates:
+            scf.cf.commander.send_notify_setpoint_stop()
+            scf.cf.high_level_commander.takeoff(1.0, 2.0)
+            estimate = drone_estimates.wait(["mass"], timeout=20.0)
+            assert estimate["mass"].value == pytest.approx(0.029, rel=0.03)
+            assert drone_estimates.session.history.pushes == []
+        assert scf.cf.is_connected()
+        assert not [b for b in scf.cf.log.log_blocks if b.started]
+        scf.cf.high_level_commander.land(0.0, 1.0)
+
+
+def test_attaching_to_a_closed_crazyflie_is_refused():
+    from cflib.crazyflie import Crazyflie
+
+    import crazyem
+    from crazyem.errors import UsageError
+
+    with pytest.raises(UsageError, match="not connected"):
+        crazyem.attach(Crazyflie(), vehicle="cf2")
