@@ -101,7 +101,7 @@ class Firmware:
             flight.log, flight.param, auto_arm=auto_arm, clock=self._tick, console=self._console.append
         )
         self.high_level = HighLevelService(flight.log, self._tick)
-        self.arbiter = Arbiter(low_level=self.high_level.planner.disable, relaxed=self.high_level.tell_state)
+        self.arbiter = Arbiter(low_level=self.high_level.planner.stop, relaxed=self.high_level.tell_state)
         own_log = tables.slots({"crtp.rxRate": 0.0, "crtp.txRate": 0.0, "memTst.errCntW": 0.0})
         own_param = tables.slots({**_FIXED_PARAMETERS, **_FLIGHT_MODES})
         log = {**own_log, **self.supervisor.log, **flight.log}

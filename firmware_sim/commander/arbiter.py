@@ -1,7 +1,8 @@
 """Who commands the drone: setpoints with priorities (crazyflie-firmware commander.c).
 
 Any low-level setpoint locks the high-level commander out until the client notifies that its stream has stopped. cflib
-sends a zero setpoint when it closes a link, so the next client's take-off has no effect before such a notice.
+sends a zero setpoint when it closes a link, so the next client's take-off has no effect before such a notice. A
+client's setpoint also stops the planner: a notice in flight with no command after it stops the motors.
 """
 
 from collections.abc import Callable

@@ -111,7 +111,7 @@ class Planner:
         self.state = PlannerState.IDLE
 
     def disable(self) -> None:
-        """A low-level setpoint took over: forget the plan and give no setpoints."""
+        """An evaluation was not a number: forget the plan and give no setpoints."""
         self.state = PlannerState.DISABLED
 
     @property

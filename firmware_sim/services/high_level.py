@@ -59,7 +59,7 @@ class HighLevelService:
     # Setpoints, 100 Hz.
 
     def setpoint(self) -> np.ndarray | None:
-        """The setpoint of the plan; null (motors off) when idle, None when a client's setpoints have taken over."""
+        """The setpoint of the plan; null (motors off) when idle, None when there is nothing to say."""
         try:
             goal = self.planner.goal(self._clock() / 1000.0)
             setpoint = None if goal is None else setpoint_of(goal)
