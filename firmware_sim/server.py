@@ -50,7 +50,10 @@ class TruthWriter:
         if self._flight.tick >= self.next_row:
             self.next_row = self._flight.tick - self._flight.tick % _TRUTH_PERIOD + _TRUTH_PERIOD
             row = self._flight.truth_row()  # type: ignore[attr-defined]
-            self._file.write(",".join(f"{value:.9g}" for value in row) + "\n")
+            try:
+                self._file.write(",".join(f"{value:.9g}" for value in row) + "\n")
+            except OSError as error:
+                raise ServerError(f"cannot write the truth file: {error.strerror}") from None
 
 
 class Server:
