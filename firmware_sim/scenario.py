@@ -15,7 +15,7 @@ from firmware_sim.errors import ScenarioError
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.battery import open_circuit
 from firmware_sim.plant.ground import GRAVITY
-from firmware_sim.plant.platforms import PLATFORMS, SQRT_HALF, Platform
+from firmware_sim.plant.platforms import PLATFORMS, SQRT_HALF
 
 
 def key(default: Any, low: float, high: float, sizes: tuple[int, ...] = (0,)) -> Any:
@@ -148,7 +148,7 @@ class Scenario:
         c[at.VBAT_NOISE] = self.battery.noise
         c[at.FLOOR] = self.ground.height
         c[at.FRICTION] = self.ground.friction
-        c[at.CONTACT_FREQUENCY], c[at.CONTACT_DAMPING] = _contact_frequency(c[at.MASS], c[at.ARM], J), 0.7
+        c[at.CONTACT_FREQUENCY : at.CONTACT_FREQUENCY + 3] = _contact(c[at.MASS], c[at.ARM], J)
         c[at.GYRO_NOISE] = self.sensors.gyro_noise
         c[at.GYRO_BIAS : at.GYRO_BIAS + 3] = self.sensors.gyro_bias
         c[at.GYRO_WALK] = self.sensors.gyro_bias_walk
@@ -188,10 +188,14 @@ def _or(value: Any, default: Any) -> Any:
     return default if value is None else value
 
 
-def _contact_frequency(mass: float, arm: float, J: np.ndarray) -> float:
-    """Stiffness of the floor in rad/s: 120 at most, and below 400 for the fastest mode of rocking (1 ms steps)."""
+def _contact(mass: float, arm: float, J: np.ndarray) -> tuple[float, float, float]:
+    """The floor's stiffness [rad/s], damping ratio and stick [1/s], no faster than 1 ms steps can follow.
+
+    A foot feels the body's inertia about the opposite edge, so rocking is faster than heaving by `rocking`.
+    """
     rocking = max(1.0, mass * arm * arm / float(np.linalg.eigvalsh(J)[0]))
-    return min(120.0, 400.0 / math.sqrt(rocking))
+    frequency = min(120.0, 400.0 / math.sqrt(rocking))
+    return frequency, min(0.7, 250.0 / (frequency * rocking)), min(frequency, 400.0 / rocking)
 
 
 def load_scenario(path: Path | None) -> Scenario:
@@ -211,21 +215,23 @@ def load_scenario(path: Path | None) -> Scenario:
 def parse_scenario(table: dict[str, Any], source: str) -> Scenario:
     """Check a scenario's table and build it; source names the file in messages. Raises ScenarioError."""
     platform = table.get("platform", "cf2")
-    if platform not in PLATFORMS:
+    if not isinstance(platform, str) or platform not in PLATFORMS:
         raise ScenarioError(f"{source}: platform must be one of {', '.join(PLATFORMS)}, not {platform!r}")
     scenario = Scenario(platform=platform)
     for name, value in table.items():
         if name == "platform":
             continue
+        if name not in _SECTIONS and name != "parameters":
+            raise ScenarioError(
+                f"{source}: {name} is not part of a scenario (known: {', '.join(_SECTIONS)}, parameters)"
+            )
         if not isinstance(value, dict):
-            raise ScenarioError(f"{source}: unknown key {name}")
+            raise ScenarioError(f"{source}: {name} must be a section [{name}]")
         if name == "parameters":
             scenario = replace(scenario, parameters=_parameters(value, source))
-        elif name in _SECTIONS:
-            scenario = replace(scenario, **{name: _section(_SECTIONS[name], name, value, source)})
         else:
-            raise ScenarioError(f"{source}: unknown section [{name}]")
-    _check_body(scenario, PLATFORMS[platform], source)
+            scenario = replace(scenario, **{name: _section(_SECTIONS[name], name, value, source)})
+    _check_body(scenario, source)
     return scenario
 
 
@@ -273,8 +279,8 @@ def _parameters(table: dict[str, Any], source: str) -> dict[str, float]:
     return {name: _number(v, f'{source}: parameters."{name}"', -1e9, 1e9) for name, v in flat.items()}
 
 
-def _check_body(scenario: Scenario, platform: Platform, source: str) -> None:
-    """An inertia matrix no body can have, or rotors that cannot turn, are errors of the file."""
+def _check_body(scenario: Scenario, source: str) -> None:
+    """An inertia matrix no body can have is an error of the file."""
     if scenario.vehicle.inertia is not None:
         principal = np.linalg.eigvalsh(scenario.inertia())
         if principal[0] < 1e-9:

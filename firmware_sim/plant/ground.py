@@ -42,7 +42,7 @@ def contact(truth, p, v, R, w, force, torque):
             continue
         touching += 1
         speed = math.sqrt(vx * vx + vy * vy)
-        slip = m4 * wc  # viscous below the Coulomb limit: sticks without a stiff spring
+        slip = m4 * truth[at.CONTACT_STICK]  # viscous below the Coulomb limit: sticks without a stiff spring
         if slip * speed > truth[at.FRICTION] * fz:
             slip = truth[at.FRICTION] * fz / speed
         fx, fy = -slip * vx, -slip * vy

@@ -39,16 +39,17 @@ VBAT_NOISE = 38  # V, sd of one measurement
 FLOOR = 39  # m
 CONTACT_FREQUENCY = 40  # rad/s
 CONTACT_DAMPING = 41  # ratio
-FRICTION = 42  # Coulomb coefficient
-GYRO_NOISE = 43  # rad/s/sqrt(Hz)
-GYRO_BIAS = 44  # rad/s left after the start-up calibration, x y z
-GYRO_WALK = 47  # rad/s/sqrt(s)
-ACC_NOISE = 48  # m/s^2/sqrt(Hz)
-FIX_KIND = 49  # 0 none, 1 position, 2 position and attitude
-FIX_PERIOD = 50  # ms
-FIX_POSITION = 51  # m, sd
-FIX_ATTITUDE = 52  # rad, sd
-TRUTH_SIZE = 53
+CONTACT_STICK = 42  # 1/s, viscous friction below the Coulomb limit
+FRICTION = 43  # Coulomb coefficient
+GYRO_NOISE = 44  # rad/s/sqrt(Hz)
+GYRO_BIAS = 45  # rad/s left after the start-up calibration, x y z
+GYRO_WALK = 48  # rad/s/sqrt(s)
+ACC_NOISE = 49  # m/s^2/sqrt(Hz)
+FIX_KIND = 50  # 0 none, 1 position, 2 position and attitude
+FIX_PERIOD = 51  # ms
+FIX_POSITION = 52  # m, sd
+FIX_ATTITUDE = 53  # rad, sd
+TRUTH_SIZE = 54
 
 # board: compile-time constants of the firmware (platform_defaults_*.h)
 B_ARM = 0  # m, rotor offset along x and y: 0.707106781 ARM_LENGTH

@@ -13,6 +13,9 @@ from firmware_sim.plant import layout as at
 from firmware_sim.plant.ground import GRAVITY, contact
 from firmware_sim.plant.quaternion import matrix, normalise
 
+SPEED_LIMIT = 100.0  # m/s
+RATE_LIMIT = 200.0  # rad/s
+
 
 @kernel
 def derivative(truth, x, u, force, torque, dx, R, f, t):
@@ -92,7 +95,9 @@ def body_step(truth, state, u, force, torque, noise, dt):
         V = at.INERTIA_INV
         for i in range(3):
             x[10 + i] += truth[V + 3 * i] * w[0] + truth[V + 3 * i + 1] * w[1] + truth[V + 3 * i + 2] * w[2]
-    for i in range(3):
+    for i in range(3):  # far beyond what such a drone survives; keeps absurd scenarios finite
+        x[3 + i] = min(max(x[3 + i], -SPEED_LIMIT), SPEED_LIMIT)
+        x[10 + i] = min(max(x[10 + i], -RATE_LIMIT), RATE_LIMIT)
         w[i] = (x[3 + i] - before[i]) / dt
     w[2] += GRAVITY
     for i in range(3):

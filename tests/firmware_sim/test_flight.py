@@ -1,0 +1,249 @@
+"""Whole flights: closed loops that must hold height, scenarios that must not break, tables that must be live."""
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from firmware_sim.commander import setpoint as sp
+from firmware_sim.flight import Flight
+from firmware_sim.plant import layout as at
+from firmware_sim.scenario import parse_scenario
+
+HEAVY = {"mass": 0.036, "inertia": [2.0e-5, 2.1e-5, 3.6e-5], "motor_time_constant": 0.06}
+POSITION, ROTOR = slice(at.POS, at.POS + 3), slice(at.ROTOR, at.ROTOR + 4)
+
+
+def boot(table: dict | None = None, seed: int = 0, **parameters: float) -> Flight:
+    """A flight with parameters written as a client would (names with __ for the dot)."""
+    flight = Flight(parse_scenario(table or {}, "test"), seed)
+    flight.armed = True
+    for name, value in parameters.items():
+        write(flight, name.replace("__", "."), value)
+    return flight
+
+
+def write(flight: Flight, name: str, value: float) -> None:
+    array, index = flight.param[name]
+    array[index] = value
+    flight.parameter_written(name)
+
+
+def read(flight: Flight, name: str) -> float:
+    array, index = flight.log[name]
+    return float(array[index])
+
+
+def hold(flight: Flight, position: tuple[float, float, float], seconds: float, ramp: float = 2.0) -> np.ndarray:
+    """Go to a position (m, rising over `ramp` s) and stay; returns the true state every 10 ms."""
+    s = flight.setpoint
+    s[sp.MODE_X : sp.MODE_Z + 1] = s[sp.MODE_YAW] = sp.ABSOLUTE
+    start = s[sp.Z]
+    states = []
+    for n in range(int(seconds * 1000)):
+        s[sp.X], s[sp.Y] = position[:2]
+        s[sp.Z] = start + (position[2] - start) * min(1.0, n / (1000 * ramp))
+        flight.step()
+        if n % 10 == 0:
+            states.append(flight.state.copy())
+    return np.array(states)
+
+
+@pytest.mark.parametrize("controller", [5, 6])
+@pytest.mark.parametrize("platform", ["cf2", "cf21bl"])
+def test_holds_position(platform: str, controller: int) -> None:
+    flight = boot({"platform": platform}, stabilizer__controller=controller)
+    end = hold(flight, (0.3, -0.2, 1.0), 7.0)[-200:]
+    assert end[:, POSITION].mean(axis=0) == pytest.approx([0.3, -0.2, 1.0], abs=0.02)
+    assert end[:, POSITION].std(axis=0).max() < 0.02
+    weight = flight._truth[at.MASS] * 9.81
+    assert end[:, ROTOR].sum(axis=1).mean() == pytest.approx(weight, rel=0.01)
+
+
+def test_a_mass_believed_too_low_hangs_low_until_it_is_corrected() -> None:
+    flight = boot({"vehicle": HEAVY}, stabilizer__controller=5, ctrlLee__mass=0.029)
+    low = hold(flight, (0, 0, 1.0), 7.0)[-300:, at.POS + 2].mean() - 1.0
+    assert low == pytest.approx(-9.81 * (0.036 / 0.029 - 1) / 7, abs=0.01)  # Kpos_Pz = 7
+    write(flight, "ctrlLee.mass", 0.036)
+    assert abs(hold(flight, (0, 0, 1.0), 4.0)[-200:, at.POS + 2].mean() - 1.0) < 0.01
+
+
+def test_same_seed_same_flight_and_another_seed_another() -> None:
+    a, b, c = (hold(boot(seed=s), (0, 0, 0.5), 2.0) for s in (3, 3, 4))
+    assert np.array_equal(a, b)
+    assert not np.array_equal(a, c)
+
+
+def test_lands_and_stays() -> None:
+    flight = boot()
+    hold(flight, (0, 0, 0.4), 3.0)
+    hold(flight, (0, 0, -0.1), 3.0)
+    flight.motors_allowed = False
+    for _ in range(1000):
+        flight.step()
+    assert flight.state[at.ASLEEP] == 1.0
+    assert abs(flight.state[at.POS + 2]) < 1e-3
+    assert [read(flight, f"motor.m{i}") for i in range(1, 5)] == [0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("controller", [5, 6])
+@pytest.mark.parametrize(
+    "beliefs",
+    [
+        {"mass": 0.001, "J_x": 1e-4, "J_y": 2e-4, "J_z": 1e-4},
+        {"mass": 1.0},
+        {"mass": -0.03},
+        {"J_x": -1e-4, "J_y": 1.0},
+        {"mass": float("nan"), "J_z": float("inf")},
+    ],
+)
+def test_absurd_beliefs_crash_but_do_not_break(controller: int, beliefs: dict) -> None:
+    group = {5: "ctrlLee", 6: "ctrlLqg"}[controller]
+    flight = boot(None, 0, stabilizer__controller=controller, **{f"{group}__{k}": v for k, v in beliefs.items()})
+    assert np.all(np.isfinite(hold(flight, (0, 0, 1.0), 4.0)))
+
+
+def test_cold_start_beliefs_corrected_in_time_fly_under_lqg() -> None:
+    flight = boot(
+        stabilizer__controller=6, ctrlLqg__mass=0.001, ctrlLqg__J_x=1e-4, ctrlLqg__J_y=2e-4, ctrlLqg__J_z=1e-4
+    )
+    hold(flight, (0, 0, 0.5), 1.0)
+    write(flight, "ctrlLqg.mass", 0.029)
+    end = hold(flight, (0, 0, 0.5), 5.0)[-100:]
+    assert end[:, at.POS + 2].mean() == pytest.approx(0.5, abs=0.02)
+
+
+def test_setpoints_that_are_not_numbers_pass() -> None:
+    flight = boot(stabilizer__controller=5)
+    hold(flight, (0, 0, 0.5), 2.0)
+    flight.setpoint[sp.X] = float("nan")
+    for _ in range(20):
+        flight.step()
+    end = hold(flight, (0, 0, 0.5), 5.0)[-100:]
+    assert end[:, POSITION].mean(axis=0) == pytest.approx([0, 0, 0.5], abs=0.05)
+
+
+scenarios = st.fixed_dictionaries(
+    {
+        "platform": st.sampled_from(["cf2", "cf21bl"]),
+        "vehicle": st.fixed_dictionaries(
+            {
+                "mass": st.floats(1e-3, 5.0),
+                "inertia": st.tuples(*[st.floats(1e-6, 1e-3)] * 2).map(lambda v: [*v, max(v)]),
+                "arm": st.floats(5e-3, 1.0),
+                "motor_time_constant": st.floats(0.0, 1.0),
+                "torque_per_thrust": st.floats(0.0, 1.0),
+            }
+        ),
+        "noise": st.fixed_dictionaries({"thrust": st.floats(0, 0.1), "torque": st.floats(0, 1e-3)}),
+        "battery": st.fixed_dictionaries({"charge": st.floats(0, 1), "resistance": st.floats(0, 10)}),
+        "estimator": st.fixed_dictionaries({"positioning": st.sampled_from(["pose", "position", "none"])}),
+        "start": st.fixed_dictionaries(
+            {"position": st.lists(st.floats(-1, 3), min_size=3, max_size=3), "yaw": st.floats(-3, 3)}
+        ),
+    }
+)
+
+
+@settings(
+    max_examples=40,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],  # shrinking flights takes minutes
+)
+@given(table=scenarios, controller=st.sampled_from([1, 2, 5, 6]), seed=st.integers(0, 1000))
+def test_no_scenario_gives_what_is_not_a_number(table: dict, controller: int, seed: int) -> None:
+    flight = boot(table, seed, stabilizer__controller=controller)
+    states = hold(flight, (0, 0, 1.0), 1.0, ramp=0.3)
+    assert np.all(np.isfinite(states))
+    assert all(np.isfinite(array[index]) for array, index in flight.log.values())
+
+
+def test_onboard_estimate_error_is_small_and_correlated() -> None:
+    flight = boot(stabilizer__controller=5)
+    hold(flight, (0, 0, 1.0), 3.0)
+    error = []
+    for n in range(10_000):
+        flight.step()
+        if n % 10 == 0:
+            error.append([read(flight, f"stateEstimate.{a}") - flight.state[at.POS + i] for i, a in enumerate("xyz")])
+    e = np.array(error) - np.mean(error, axis=0)
+    sd = e.std(axis=0)
+    lag_one = (e[1:] * e[:-1]).mean(axis=0) / sd**2
+    assert np.all((sd > 5e-5) & (sd < 2e-3))  # better than one fix of 1 mm in most, never perfect
+    assert np.all(lag_one > 0.5)  # not white: 10 ms apart
+
+
+def test_tables_are_live_and_consistent() -> None:
+    flight = boot({"vehicle": HEAVY}, stabilizer__controller=5, ctrlLee__mass=0.036)
+    hold(flight, (0, 0, 1.0), 4.0)
+    assert read(flight, "stateEstimateZ.z") == int(1000 * read(flight, "stateEstimate.z"))
+    assert read(flight, "stateEstimateZ.az") == pytest.approx(9810 * (read(flight, "stateEstimate.az") + 1), abs=1)
+    gyro_y = read(flight, "gyro.y")
+    assert read(flight, "stateEstimateZ.ratePitch") == pytest.approx(-1000 * np.radians(gyro_y), abs=1)
+    assert read(flight, "ctrlLee.omegay") == pytest.approx(np.radians(gyro_y), abs=0.05)
+    assert read(flight, "stabilizer.thrust") == read(flight, "ctrlLee.torquey")  # the firmware's union
+    assert read(flight, "pm.vbatMV") == int(1000 * read(flight, "pm.vbat"))
+    assert 0.9 < read(flight, "acc.z") < 1.1
+    assert read(flight, "ctrlLee.thrustSi") == pytest.approx(0.036 * 9.81, rel=0.1)
+    quaternion = [read(flight, f"stateEstimate.{q}") for q in ("qw", "qx", "qy", "qz")]
+    pitch = np.degrees(np.arcsin(2 * (quaternion[0] * quaternion[2] - quaternion[1] * quaternion[3])))
+    assert read(flight, "stateEstimate.pitch") == pytest.approx(-pitch, abs=1e-9)  # legacy sign
+
+
+def test_external_pose_positions_a_drone_that_has_no_fixes() -> None:
+    flight = boot({"estimator": {"positioning": "none"}}, stabilizer__controller=5)
+    s = flight.setpoint
+    s[sp.MODE_X : sp.MODE_Z + 1] = s[sp.MODE_YAW] = sp.ABSOLUTE
+    for n in range(6000):
+        s[sp.Z] = min(1.0, n / 2000)
+        if n % 10 == 0:
+            q = flight.state[at.QUAT : at.QUAT + 4]
+            flight.external_pose(flight.state[POSITION], np.roll(q, -1))
+        flight.step()
+    assert flight.state[POSITION] == pytest.approx([0, 0, 1], abs=0.05)
+    assert read(flight, "ext_pos.Z") == read(flight, "locSrv.z") == pytest.approx(flight.state[at.POS + 2], abs=0.05)
+    flight.external_position([float("nan")] * 3)
+    flight.step()
+    assert np.isfinite(read(flight, "stateEstimate.x"))
+
+
+def test_parameters_show_what_really_runs() -> None:
+    flight = boot()
+
+    def written(name: str, value: float) -> float:
+        write(flight, name, value)
+        return float(flight.param[name][0][flight.param[name][1]])
+
+    assert written("stabilizer.controller", 6) == 6
+    assert written("stabilizer.controller", 77) == 6  # invalid: unchanged
+    assert written("stabilizer.controller", 0) == flight.param_defaults["stabilizer.controller"]
+    assert written("stabilizer.estimator", 0) == 2
+    assert written("kalman.resetEstimation", 1) == 0
+
+
+def test_the_truth_is_in_no_table() -> None:
+    secret = {"vehicle": {**HEAVY, "mass": 0.0365432, "motor_time_constant": 0.0612345}}
+    flight = boot(secret)
+    hold(flight, (0, 0, 1.0), 1.0)
+    shown = [float(a[i]) for a, i in [*flight.log.values(), *flight.param.values()]]
+    hidden = [0.0365432, 0.0612345, 2.0e-5, 2.1e-5, 3.6e-5]
+    assert not any(v == pytest.approx(h, rel=1e-6) for v in shown for h in hidden)
+
+
+def test_truth_row_matches_its_header() -> None:
+    flight = boot()
+    hold(flight, (0, 0, 0.5), 2.0)
+    row = dict(zip(flight.truth_header, flight.truth_row(), strict=True))
+    assert row["t"] == pytest.approx(2.0)
+    assert row["F"] == pytest.approx(flight.state[ROTOR].sum())
+    assert row["qw"] > 0.9
+    assert row["pwm1"] == read(flight, "motor.m1")
+
+
+def test_rotor_speeds_only_on_the_brushless_platform() -> None:
+    assert "motor.m1_rpm" not in boot().log
+    flight = boot({"platform": "cf21bl"})
+    hold(flight, (0, 0, 1.0), 4.0)
+    rpm = np.array([read(flight, f"motor.m{i}_rpm") for i in range(1, 5)])
+    assert (3.72e-8 * (rpm * np.pi / 30) ** 2).sum() == pytest.approx(0.0393 * 9.81, rel=0.1)

@@ -1,0 +1,125 @@
+"""The rigid body against closed forms, conservation laws and the statistics of its noise."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_sim.controllers.tick import plant_step
+from firmware_sim.plant import layout as at
+from firmware_sim.plant.noise import NoiseSource
+from firmware_sim.plant.quaternion import compress
+from firmware_sim.plant.rotors import lag, wrench
+from firmware_sim.scenario import Scenario, parse_scenario
+
+QUIET = {"noise": {"thrust": 0.0, "torque": 0.0}, "ground": {"height": -1000.0}}
+STILL = np.zeros(at.NOISE_WIDTH)
+
+
+def airborne(table: dict | None = None) -> tuple[np.ndarray, np.ndarray, Scenario]:
+    """Constants and start state of a drone that hangs in the air without noise."""
+    scenario = parse_scenario({**QUIET, **(table or {})}, "test")
+    return scenario.truth(), scenario.start_state(), scenario
+
+
+def rotation(q: np.ndarray) -> np.ndarray:
+    """Rotation matrix of q = w, x, y, z by the sandwich product, written out independently of the package."""
+    w, v = q[0], q[1:4]
+    K = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.eye(3) + 2 * w * K + 2 * K @ K
+
+
+def test_free_fall_is_a_parabola() -> None:
+    truth, x, _ = airborne()
+    x[at.VEL : at.VEL + 3] = 1.0, -2.0, 3.0
+    for _ in range(1000):
+        plant_step(truth, x, STILL)
+    assert x[at.POS : at.POS + 3] == pytest.approx([1.0, -2.0, 3.0 - 0.5 * 9.81], abs=1e-9)
+    assert x[at.ACC : at.ACC + 3] == pytest.approx([0, 0, 0], abs=1e-9)
+
+
+def test_free_rotation_conserves_energy_and_angular_momentum() -> None:
+    truth, x, scenario = airborne({"vehicle": {"inertia": [2e-5, 1.5e-5, 3e-5, 2e-6, -1e-6, 3e-6]}})
+    J = scenario.inertia()
+    x[at.OMEGA : at.OMEGA + 3] = 8.0, -5.0, 3.0
+    omega = x[at.OMEGA : at.OMEGA + 3]
+    energy, momentum = omega @ J @ omega, rotation(x[at.QUAT : at.QUAT + 4]) @ J @ omega
+    for _ in range(3000):
+        plant_step(truth, x, STILL)
+    assert omega @ J @ omega == pytest.approx(energy, rel=1e-6)
+    assert rotation(x[at.QUAT : at.QUAT + 4]) @ J @ omega == pytest.approx(momentum, rel=1e-6)
+    assert np.linalg.norm(x[at.QUAT : at.QUAT + 4]) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_rotor_lag_is_exact_whatever_the_step() -> None:
+    truth, x, _ = airborne({"vehicle": {"thrust_curve": [0.05], "motor_time_constant": 0.06}})
+    x[at.PWM : at.PWM + 4] = 30000
+    mean, impulse = np.empty(4), 0.0
+    for _ in range(60):
+        lag(truth, x, 1e-3, mean)
+        impulse += 1e-3 * mean[0]
+    assert x[at.ROTOR] == pytest.approx(0.05 * (1 - np.exp(-1.0)), rel=1e-12)
+    assert impulse == pytest.approx(0.05 * 0.06 * np.exp(-1.0), rel=1e-12)  # integral of 1 - exp(-t/tau) up to tau
+
+
+def test_no_thrust_without_command_and_none_beyond_the_rotor_limit() -> None:
+    truth, x, _ = airborne({"vehicle": {"motor_time_constant": 0.0, "thrust_max": 0.1}})
+    mean = np.empty(4)
+    x[at.PWM : at.PWM + 4] = 0, 1, 30000, 65535
+    lag(truth, x, 1e-3, mean)
+    v = 30000 / 65535 * 4.2
+    curve = (-0.02476537915958403, 0.06523793527519485, -0.026792504967750107, 0.006776789303971145)
+    assert mean == pytest.approx([0.0, 0.0, np.polynomial.polynomial.polyval(v, curve), 0.1], rel=1e-12)
+
+
+def test_wrench_of_each_rotor() -> None:
+    truth, _, _ = airborne({"vehicle": {"arm": 0.03, "torque_per_thrust": 0.006}})
+    positions = [(0.03, -0.03), (-0.03, -0.03), (-0.03, 0.03), (0.03, 0.03)]  # M1 front right, ..., M4 front left
+    spin = [-1, 1, -1, 1]
+    for i in range(4):
+        f, u = np.zeros(4), np.empty(4)
+        f[i] = 0.2
+        wrench(truth, f, 0, u)
+        x, y = positions[i]
+        assert u == pytest.approx([0.2, y * 0.2, -x * 0.2, spin[i] * 0.006 * 0.2])
+
+
+def test_process_noise_has_the_stated_intensity() -> None:
+    truth, x, _ = airborne({"noise": {"thrust": 2e-3, "torque": [1e-6, 2e-6, 3e-6]}})
+    rng, seconds, runs = np.random.default_rng(1), 0.02, 800
+    end = np.empty((runs, 4))
+    for n in range(runs):
+        y = x.copy()
+        for _ in range(int(seconds * 1000)):
+            plant_step(truth, y, rng.standard_normal(at.NOISE_WIDTH))
+        end[n] = [y[at.VEL + 2], *y[at.OMEGA : at.OMEGA + 3]]
+    J = truth[[at.INERTIA, at.INERTIA + 4, at.INERTIA + 8]]
+    sd = np.array([2e-3 / truth[at.MASS], *(np.array([1e-6, 2e-6, 3e-6]) / J)]) * np.sqrt(seconds)
+    assert end.std(axis=0) == pytest.approx(sd, rel=0.1)  # standard error 2.5 %
+    assert np.abs(end.mean(axis=0) - [-9.81 * seconds, 0, 0, 0]).max() < 4 * sd.max() / np.sqrt(runs)
+
+
+def test_noise_depends_on_seed_and_tick_only() -> None:
+    a, b, other = NoiseSource(7), NoiseSource(7), NoiseSource(8)
+    forward = [a.rows[a.prepare(t)].copy() for t in range(3000)]
+    for t in (2999, 17, 1024, 0):  # any order
+        assert np.array_equal(b.rows[b.prepare(t)], forward[t])
+    assert not np.array_equal(other.rows[other.prepare(0)], forward[0])
+    assert not np.array_equal(forward[0], forward[1024])
+    assert np.std(forward) == pytest.approx(1.0, abs=0.01)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: sum(v * v for v in q) > 0.01))
+def test_compressed_quaternion_comes_back(values: list[float]) -> None:
+    q = np.array(values) / np.linalg.norm(values)  # x, y, z, w
+    packed = int(compress(q[3], q[0], q[1], q[2]))
+    assert 0 <= packed < 2**32
+    largest, out = packed >> 30, np.zeros(4)
+    for i in (3, 2, 1, 0):  # unpacked as cflib does it: last packed first
+        if i != largest:
+            out[i] = (packed & 0x1FF) / 511 / np.sqrt(2) * (-1 if packed >> 9 & 1 else 1)
+            packed >>= 10
+    out[largest] = np.sqrt(max(0.0, 1 - out @ out))
+    assert abs(out @ q) == pytest.approx(1.0, abs=3e-6)  # 0.16 degrees and no axis mixed up
+    assert min(np.abs(out - q).max(), np.abs(out + q).max()) < 2.5e-3
