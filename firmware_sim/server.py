@@ -15,7 +15,9 @@ from firmware_sim.errors import ServerError
 from firmware_sim.firmware import Firmware
 
 _BUFFER = 1 << 20  # bytes, both ways: a client reads its whole table of contents in bursts
-_MAX_BEHIND = 0.25  # s of host time; when the host stalls for longer, the drone's time stands still instead of racing
+# When the host stalls, the drone's time may fall behind by that much and catches up; beyond, it stands still instead of
+# racing. Kept below the 500 ms after which the setpoint watchdog takes a client for dead.
+_MAX_BEHIND_HOST, _MAX_BEHIND_FIRMWARE = 250.0, 300.0  # ms of host time, ms of firmware time
 _CHUNK = 20  # ms of firmware time between two looks at the socket
 _TRUTH_PERIOD = 10  # ms between rows of the truth file
 
@@ -71,11 +73,12 @@ class Server:
         """Serve until `stopping` is set (a signal handler does)."""
         with selectors.DefaultSelector() as selector:
             selector.register(self._sock, selectors.EVENT_READ)
+            most = min(_MAX_BEHIND_HOST * self._speed, _MAX_BEHIND_FIRMWARE) + _CHUNK
             zero, epoch = self.firmware.flight.tick, time.monotonic()  # this tick belongs to this time
             while not self.stopping:
                 target = zero + (time.monotonic() - epoch) * 1000.0 * self._speed
                 behind = int(target) - self.firmware.flight.tick
-                if behind > 1000.0 * _MAX_BEHIND * self._speed + _CHUNK:
+                if behind > most:
                     zero, epoch, behind = self.firmware.flight.tick, time.monotonic(), 0
                 if behind > 0:
                     self._advance(min(behind, _CHUNK))
