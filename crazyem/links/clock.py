@@ -1,6 +1,7 @@
 """Firmware stamps and host clock: unwrapping 24 bits, counting what never arrived, relating the two clocks."""
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 STAMP_MODULUS = 1 << 24  # ms; the firmware sends the low 24 bits of its millisecond counter: wraps at 16777.216 s
@@ -31,38 +32,39 @@ class StampUnwrapper:
 class LossCounter:
     """What became of one block's packets, from their stamps alone: the protocol has no sequence numbers.
 
-    The firmware's timer keeps an exact mean period while single packets come late by up to a few periods. Every stamp
-    is therefore assigned to a slot of a grid whose phase follows the earliest stamps; slots that stay empty between
-    the first and the newest packet are the lost packets.
+    The firmware's timer keeps an exact mean period, while single packets are stamped late by up to a few periods.
+    Periods elapsed since the first packet minus packets since then is therefore the number lost, plus the lateness
+    of the newest packet, minus the lateness of the first, in periods. The minimum over the last few packets removes
+    the second term; the least value ever seen is the third.
     """
+
+    _SETTLING = 10  # packets; longer than any burst of late ones seen
 
     def __init__(self, period_ms: int) -> None:
         self.period_ms = int(period_ms)
         self.received = 0
         self.late = 0
-        self._anchor = 0.0
         self._first = 0
-        self._last = 0
-        self._newest_ms = -math.inf
+        self._newest = 0
+        self._missing: deque[float] = deque(maxlen=self._SETTLING)
+        self._least = 0.0
 
     def count(self, firmware_time_ms: int, *, late: bool = False) -> None:
         """Account for a packet stamped `firmware_time_ms` (unwrapped); `late` if the host got it with delay."""
         if self.received == 0:
-            self._anchor = float(firmware_time_ms)
-        slot = round((firmware_time_ms - self._anchor) / self.period_ms)
-        # A stamp before its slot's time shows that the packets so far were the delayed ones: move the grid.
-        self._anchor = min(self._anchor, firmware_time_ms - slot * self.period_ms)
-        self.received += 1
-        if late or firmware_time_ms < self._newest_ms:
+            self._first = self._newest = firmware_time_ms
+        if late or firmware_time_ms < self._newest:
             self.late += 1
-        self._newest_ms = max(self._newest_ms, firmware_time_ms)
-        self._first = min(self._first, slot)
-        self._last = max(self._last, slot)
+        self._newest = max(self._newest, firmware_time_ms)
+        missing = (self._newest - self._first) / self.period_ms - self.received
+        self.received += 1
+        self._missing.append(missing)
+        self._least = min(self._least, missing)
 
     @property
     def lost(self) -> int:
-        """Packets that should have come between the first and the newest and did not."""
-        return max(0, self._last - self._first + 1 - self.received) if self.received else 0
+        """Packets that should have come between the first and the newest and did not (the newest few excepted)."""
+        return round(min(self._missing) - self._least) if self._missing else 0
 
 
 @dataclass(frozen=True, slots=True)

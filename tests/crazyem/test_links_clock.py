@@ -1,0 +1,93 @@
+"""Stamps and clocks: unwrapping, loss accounting and clock relation against flights whose answer is known."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crazyem.links.clock import STAMP_MODULUS, ClockRelation, LossCounter, StampUnwrapper
+
+
+@given(st.integers(0, STAMP_MODULUS - 1), st.lists(st.integers(-4_000_000, 8_000_000), max_size=60))
+def test_unwrapping_follows_jumps_and_reordering(start, steps):
+    """Any stamp within half a wrap of the newest comes back right, backwards or forwards."""
+    unwrapper = StampUnwrapper()
+    assert unwrapper.unwrap(start) == start
+    newest = start
+    for step in steps:
+        time = newest + step
+        assert unwrapper.unwrap(time % STAMP_MODULUS) == time
+        newest = max(newest, time)
+
+
+def firmware_stamps(rng, count, period, jitter):
+    """As the firmware makes them: a timer on an exact grid, a worker that is late now and then and never reorders."""
+    ideal = 1234 + period * np.arange(count)
+    delay = np.where(rng.random(count) < 0.05, rng.integers(0, jitter + 1, count), rng.integers(0, 2, count))
+    return np.maximum.accumulate(ideal + delay)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([10, 20, 100]), st.floats(0.0, 0.3))
+def test_losses_are_counted_exactly_under_jitter(seed, period, share):
+    rng = np.random.default_rng(seed)
+    stamps = firmware_stamps(rng, 400, period, 16)
+    kept = rng.random(400) >= share
+    kept[:12] = kept[-12:] = True
+    counter = LossCounter(period)
+    for stamp in stamps[kept]:
+        counter.count(int(stamp))
+    assert counter.received == kept.sum()
+    assert counter.lost == 400 - kept.sum()
+    assert counter.late == 0
+
+
+def test_nothing_is_called_lost_on_the_way_when_nothing_is():
+    rng = np.random.default_rng(3)
+    counter = LossCounter(10)
+    for stamp in firmware_stamps(rng, 3000, 10, 25):
+        counter.count(int(stamp))
+        assert counter.lost == 0
+
+
+def test_a_packet_overtaken_is_late_not_lost():
+    counter = LossCounter(10)
+    for stamp in (0, 10, 30, 20, 40, 50, 60, 70, 80):
+        counter.count(stamp)
+    assert (counter.received, counter.lost, counter.late) == (9, 0, 1)
+
+
+@pytest.mark.parametrize("rate", [1.0, 1.00003, 0.1])
+def test_clock_relation_finds_offset_and_rate(rate):
+    rng = np.random.default_rng(1)
+    relation = ClockRelation()
+    assert relation.fit() is None
+    firmware = 10 * np.arange(6000) + 777
+    host = 1.7e9 + rate * firmware / 1000.0 + 0.002 + rng.exponential(0.003, firmware.size) * rate
+    for f, h in zip(firmware, host, strict=True):
+        relation.add(int(f), float(h))
+    fit = relation.fit()
+    assert fit.rate == pytest.approx(rate, abs=3e-5 * rate)
+    assert fit.to_host(30_000) == pytest.approx(1.7e9 + rate * 30.0 + 0.002, abs=1.5e-3 * rate)
+    assert fit.packets == 6000
+
+
+def test_real_blocks_lose_what_their_stamps_say(shared_recordings):
+    """The real firmware's stamps: 22 s at 100 Hz; the file itself shows which slots are empty."""
+    import csv
+    import gzip
+
+    path = shared_recordings / "real_firmware" / "lee_34g_mass_pushed_midflight.csv.gz"
+    stamps = {}
+    with gzip.open(path, "rt") as stream:
+        for row in csv.DictReader(stream):
+            if row["block"] != "ref":
+                stamps.setdefault(row["block"], {})[row["host_t"]] = int(row["fw_ms"])
+    for packets in stamps.values():
+        times = list(packets.values())
+        counter = LossCounter(10)
+        unwrapper = StampUnwrapper()
+        for stamp in times:
+            counter.count(unwrapper.unwrap(stamp))
+        elapsed = (times[-1] - times[0]) / 10 + 1
+        assert counter.lost == pytest.approx(elapsed - len(times), abs=3)
