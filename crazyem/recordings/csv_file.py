@@ -84,11 +84,11 @@ def _read_wide(
     for packet in dict.fromkeys(s.packet for s in signals.values() if s.packet):
         members = dict.fromkeys(c for s in signals.values() if s.packet == packet for c in s.columns)
         straight[packet] = interpolated_rows(time, np.column_stack([columns[c] for c in members]))
-        share = 100.0 * straight[packet].mean()
         if straight[packet].any():
+            share = 100.0 * straight[packet].mean()
             notices.append(
-                f"{share:.1f} % of the {packet} samples lie on straight lines drawn across lost packets; "
-                "they are treated as missing."
+                f"{share:.1f} % of the {packet} samples lie on straight lines drawn across lost packets "
+                f"(the longest {_longest(time, straight[packet]):.2f} s); they are treated as missing."
             )
 
     arrays = {}
@@ -106,6 +106,12 @@ def _read_wide(
             value = _held(time, np.column_stack([columns[c] for c in source.columns]), source)[:, None]
         arrays[name] = SignalArray(time, value, (rows * len(names) + place).astype(np.int64), clock, marked)
     return arrays, {"csv": {"mapping": mapping.name, "start_time": repr(float(clock[0])) if clock.size else ""}}
+
+
+def _longest(time: NDArray[np.float64], rows: NDArray[np.bool_]) -> float:
+    """Duration of the longest run of True [s]."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], rows, [False]]).astype(np.int8)))
+    return float(max((time[last - 1] - time[first] for first, last in zip(edges[::2], edges[1::2])), default=0.0))
 
 
 def _held(time: NDArray[np.float64], values: NDArray[np.float64], source: SignalColumns) -> NDArray[np.float64]:
