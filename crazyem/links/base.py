@@ -40,7 +40,10 @@ class LinkStatistics:
 
 
 class Link(Protocol):
-    """A drone on the other end. Every call has a timeout of our own; none waits for ever."""
+    """A drone on the other end. Every call has a timeout of our own; none waits for ever.
+
+    Units are SI throughout: m, m/s, m/s^2, rad, rad/s, s; world z up, body FLU, quaternions x y z w.
+    """
 
     uri: str
     packets: "queue.SimpleQueue[Packet | LinkLost]"

@@ -1,6 +1,7 @@
 """A Crazyflie over unmodified cflib: everything with a time limit, losses counted, a lost drone reported once."""
 
 import contextlib
+import math
 import queue
 import struct
 import threading
@@ -363,12 +364,12 @@ class CrazyflieLink:
             ) from error
 
     def send_position(self, x: float, y: float, z: float, yaw: float) -> None:
-        """Position setpoint: x, y, z [m, world], yaw [deg] as on the wire."""
-        self._command().commander.send_position_setpoint(x, y, z, yaw)
+        """Position setpoint: x, y, z [m, world], yaw [rad] (degrees on the wire)."""
+        self._command().commander.send_position_setpoint(x, y, z, math.degrees(yaw))
 
     def send_hover(self, vx: float, vy: float, yaw_rate: float, z: float) -> None:
-        """Hover setpoint: vx, vy [m/s, body], yaw rate [deg/s] as on the wire, z [m, world]."""
-        self._command().commander.send_hover_setpoint(vx, vy, yaw_rate, z)
+        """Hover setpoint: vx, vy [m/s, body], yaw rate [rad/s] (degrees per second on the wire), z [m, world]."""
+        self._command().commander.send_hover_setpoint(vx, vy, math.degrees(yaw_rate), z)
 
     def release_setpoints(self) -> None:
         """ "Notify stop": low-level setpoints have ended, the high-level commander may act again."""
