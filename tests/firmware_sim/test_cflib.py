@@ -216,8 +216,8 @@ def test_full_state_flight_and_what_closing_in_flight_does():
                 time.sleep(0.005)
             assert height(cf) == pytest.approx(0.7, abs=0.1)
         with connected(uri) as cf:  # closing sent a zero setpoint: the motors are off, and then the supervisor locked
-            wait_until(lambda: not cf.supervisor.can_fly)
-            assert cf.supervisor.is_locked
+            wait_until(lambda: cf.supervisor.is_locked)
+            assert not cf.supervisor.can_fly
 
 
 @pytest.mark.slow
