@@ -19,8 +19,8 @@ from firmware_sim.plant.rotors import wrench
 from firmware_sim.plant.sensors import ACC_CUTOFF, settle
 from firmware_sim.scenario import Scenario
 
-DEFAULT_CONTROLLER = 5
-CONTROLLERS = (5, 6)
+DEFAULT_CONTROLLER = 1  # PID, as in the firmware
+CONTROLLERS = (1, 2, 5, 6)
 
 
 class Flight:

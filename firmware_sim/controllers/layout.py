@@ -17,9 +17,12 @@ LQG_GAIN_YAW = 33
 # Mellinger
 MEL_I_POS = 36
 MEL_I_ATT = 39
-MEL_PREV = 42  # previous body rate and previous desired rate
+MEL_PREV = 42  # rate error of the last step
 # PID
-PID_STATE = 48
-MEMORY_SIZE = 112
+PID_STATE = 48  # twelve regulators of four
+PID_ATTITUDE = 96  # wanted roll, pitch, yaw, deg
+PID_THRUST = 99
+PID_MODES = 100  # the setpoint's seven modes at the last step
+MEMORY_SIZE = 108
 
 LEGACY_MODE, FORCE_TORQUE_MODE = 0.0, 1.0

@@ -5,7 +5,7 @@ All live in one float64 array that compiled code reads each step. `ctrlLqg` is o
 """
 
 _CF2: dict[str, float] = {
-    "stabilizer.controller": 5,
+    "stabilizer.controller": 1,
     "stabilizer.estimator": 2,
     "stabilizer.stop": 0,
     "powerDist.idleThrust": 0,
@@ -76,12 +76,101 @@ _CF2: dict[str, float] = {
     "ctrlLqg.q_yawrate": 0.1,
     "ctrlLqg.r_yaw": 1e-3,
     "ctrlLqg.acc_limit": 9.0,
+    # Mellinger
+    "ctrlMel.mass": 0.029,
+    "ctrlMel.massThrust": 132000.0,
+    "ctrlMel.kp_xy": 0.4,
+    "ctrlMel.kd_xy": 0.2,
+    "ctrlMel.ki_xy": 0.05,
+    "ctrlMel.i_range_xy": 2.0,
+    "ctrlMel.kp_z": 1.25,
+    "ctrlMel.kd_z": 0.4,
+    "ctrlMel.ki_z": 0.05,
+    "ctrlMel.i_range_z": 0.4,
+    "ctrlMel.kR_xy": 70000.0,
+    "ctrlMel.kR_z": 60000.0,
+    "ctrlMel.kw_xy": 20000.0,
+    "ctrlMel.kw_z": 12000.0,
+    "ctrlMel.ki_m_xy": 0.0,
+    "ctrlMel.ki_m_z": 500.0,
+    "ctrlMel.i_range_m_xy": 1.0,
+    "ctrlMel.i_range_m_z": 1500.0,
+    "ctrlMel.kd_omega_rp": 200.0,
+    # PID: the gains of its twelve regulators stand together and in this order
+    "pid_attitude.roll_kp": 6.0,
+    "pid_attitude.roll_ki": 3.0,
+    "pid_attitude.roll_kd": 0.0,
+    "pid_attitude.roll_kff": 0.0,
+    "pid_attitude.pitch_kp": 6.0,
+    "pid_attitude.pitch_ki": 3.0,
+    "pid_attitude.pitch_kd": 0.0,
+    "pid_attitude.pitch_kff": 0.0,
+    "pid_attitude.yaw_kp": 6.0,
+    "pid_attitude.yaw_ki": 1.0,
+    "pid_attitude.yaw_kd": 0.35,
+    "pid_attitude.yaw_kff": 0.0,
+    "pid_rate.roll_kp": 250.0,
+    "pid_rate.roll_ki": 500.0,
+    "pid_rate.roll_kd": 2.5,
+    "pid_rate.roll_kff": 0.0,
+    "pid_rate.pitch_kp": 250.0,
+    "pid_rate.pitch_ki": 500.0,
+    "pid_rate.pitch_kd": 2.5,
+    "pid_rate.pitch_kff": 0.0,
+    "pid_rate.yaw_kp": 120.0,
+    "pid_rate.yaw_ki": 16.7,
+    "pid_rate.yaw_kd": 0.0,
+    "pid_rate.yaw_kff": 0.0,
+    "posCtlPid.xKp": 2.0,
+    "posCtlPid.xKi": 0.0,
+    "posCtlPid.xKd": 0.0,
+    "posCtlPid.xKff": 0.0,
+    "posCtlPid.yKp": 2.0,
+    "posCtlPid.yKi": 0.0,
+    "posCtlPid.yKd": 0.0,
+    "posCtlPid.yKff": 0.0,
+    "posCtlPid.zKp": 2.0,
+    "posCtlPid.zKi": 0.5,
+    "posCtlPid.zKd": 0.0,
+    "posCtlPid.zKff": 0.0,
+    "velCtlPid.vxKp": 25.0,
+    "velCtlPid.vxKi": 1.0,
+    "velCtlPid.vxKd": 0.0,
+    "velCtlPid.vxKFF": 0.0,
+    "velCtlPid.vyKp": 25.0,
+    "velCtlPid.vyKi": 1.0,
+    "velCtlPid.vyKd": 0.0,
+    "velCtlPid.vyKFF": 0.0,
+    "velCtlPid.vzKp": 25.0,
+    "velCtlPid.vzKi": 15.0,
+    "velCtlPid.vzKd": 0.0,
+    "velCtlPid.vzKFF": 0.0,
+    "pid_attitude.yawMaxDelta": 0.0,
+    "pid_attitude.attFiltEn": 0,
+    "pid_attitude.attFiltCut": 15.0,
+    "pid_rate.rateFiltEn": 0,
+    "pid_rate.omxFiltCut": 30.0,
+    "pid_rate.omyFiltCut": 30.0,
+    "pid_rate.omzFiltCut": 30.0,
+    "posCtlPid.thrustBase": 36000,
+    "posCtlPid.thrustMin": 20000,
+    "posCtlPid.rLimit": 20.0,
+    "posCtlPid.pLimit": 20.0,
+    "posCtlPid.xVelMax": 1.0,
+    "posCtlPid.yVelMax": 1.0,
+    "posCtlPid.zVelMax": 1.0,
 }
 
 _CF21BL: dict[str, float] = {
     "ctrlLee.mass": 0.0393,
     "ctrlLqg.mass": 0.0393,
     "powerDist.idleThrust": 7000,
+    "ctrlMel.mass": 0.0393,
+    "pid_rate.roll_kp": 200.0,
+    "pid_rate.pitch_kp": 200.0,
+    "pid_rate.roll_ki": 400.0,
+    "pid_rate.pitch_ki": 400.0,
+    "posCtlPid.thrustBase": 30000,
 }
 
 NAMES = tuple(_CF2)
@@ -119,6 +208,22 @@ LEE_KD = INDEX["ctrlLee.Kpos_Dx"]
 LEE_KD_LIMIT = INDEX["ctrlLee.Kpos_D_limit"]
 LEE_KPI = INDEX["ctrlLee.Kpos_Ix"]
 LEE_KPI_LIMIT = INDEX["ctrlLee.Kpos_I_limit"]
+MEL_MASS = INDEX["ctrlMel.mass"]
+MEL_MASS_THRUST = INDEX["ctrlMel.massThrust"]
+MEL_XY = INDEX["ctrlMel.kp_xy"]  # kp, kd, ki, range
+MEL_Z = INDEX["ctrlMel.kp_z"]
+MEL_KR = INDEX["ctrlMel.kR_xy"]  # xy, z
+MEL_KW = INDEX["ctrlMel.kw_xy"]
+MEL_KI_M = INDEX["ctrlMel.ki_m_xy"]
+MEL_RANGE_M = INDEX["ctrlMel.i_range_m_xy"]
+MEL_KD_OMEGA = INDEX["ctrlMel.kd_omega_rp"]
+PID_GAINS = INDEX["pid_attitude.roll_kp"]  # twelve times kp, ki, kd, kff
+PID_YAW_LEAD = INDEX["pid_attitude.yawMaxDelta"]
+PID_ATT_FILTER = INDEX["pid_attitude.attFiltEn"]  # then the cut-off
+PID_RATE_FILTER = INDEX["pid_rate.rateFiltEn"]  # then three cut-offs
+PID_THRUST_BASE = INDEX["posCtlPid.thrustBase"]  # then the least thrust
+PID_R_LIMIT = INDEX["posCtlPid.rLimit"]  # roll, pitch
+PID_VEL_MAX = INDEX["posCtlPid.xVelMax"]  # x, y, z
 LQG_MASS = INDEX["ctrlLqg.mass"]
 LQG_J = INDEX["ctrlLqg.J_x"]
 LQG_TAU = INDEX["ctrlLqg.tau"]

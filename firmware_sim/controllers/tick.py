@@ -17,6 +17,10 @@ from firmware_sim.controllers.lee import lee_step
 from firmware_sim.controllers.lee import reset as lee_reset
 from firmware_sim.controllers.lqg import lqg_step
 from firmware_sim.controllers.lqg import reset as lqg_reset
+from firmware_sim.controllers.mellinger import mellinger_step
+from firmware_sim.controllers.mellinger import reset as mellinger_reset
+from firmware_sim.controllers.pid import pid_step
+from firmware_sim.controllers.pid import reset as pid_reset
 from firmware_sim.controllers.power_distribution import motors_step
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
@@ -28,7 +32,7 @@ from firmware_sim.plant.rotors import lag, wrench
 from firmware_sim.plant.sensors import sensors_step
 
 DT = 1e-3  # s
-LEE, LQG = 5.0, 6.0  # stabilizer.controller
+PID, MELLINGER, LEE, LQG = 1.0, 2.0, 5.0, 6.0  # stabilizer.controller
 
 
 @kernel
@@ -39,8 +43,14 @@ def control_step(setpoint, estimate, sensor, param, memory, log, tick):
         memory[mem.RUNNING] = which
         lee_reset(memory)
         lqg_reset(memory)
+        mellinger_reset(memory)
+        pid_reset(estimate, memory)
     if tick % 2 == 0:
-        if which == LQG:
+        if which == PID:
+            pid_step(setpoint, estimate, sensor, param, memory, log, tick)
+        elif which == MELLINGER:
+            mellinger_step(setpoint, estimate, sensor, param, memory, log)
+        elif which == LQG:
             lqg_step(setpoint, estimate, sensor, param, memory, log)
         else:
             lee_step(setpoint, estimate, sensor, param, memory, log)

@@ -30,6 +30,12 @@ COMMON: list[str] = [
     *_run("ctrlMel", "zdx", "zdy", "zdz", "i_err_x", "i_err_y", "i_err_z"),
     *_run("controller", "cmd_thrust", "cmd_roll", "cmd_pitch", "cmd_yaw", "r_roll", "r_pitch", "r_yaw", "accelz"),
     *_run("controller", "actuatorThrust", "roll", "pitch", "yaw", "rollRate", "pitchRate", "yawRate", "ctr_yaw"),
+    # The parts of the twelve PID regulators, in the order of their gains (parameters.py), then targets.
+    *[f"pid_attitude.{a}_out{p}" for a in ("roll", "pitch", "yaw") for p in ("P", "I", "D", "FF")],
+    *[f"pid_rate.{a}_out{p}" for a in ("roll", "pitch", "yaw") for p in ("P", "I", "D", "FF")],
+    *[f"posCtl.{a}{p}" for a in ("X", "Y", "Z", "VX", "VY", "VZ") for p in ("p", "i", "d", "ff")],
+    *_run("posCtl", "targetVX", "targetVY", "targetVZ", "targetX", "targetY", "targetZ"),
+    *_run("posCtl", "bodyVX", "bodyVY", "bodyX", "bodyY"),
     *_run("stabilizer", "roll", "pitch", "yaw", "thrust"),
     *_run("ctrltarget", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "roll", "pitch", "yaw", "thrust"),
     *_run("ctrltarget", "mode_x", "mode_y", "mode_z", "mode_roll", "mode_pitch", "mode_yaw", "mode_quat"),
@@ -73,6 +79,8 @@ LQG_ACC = INDEX["ctrlLqg.accx"]
 MEL = INDEX["ctrlMel.cmd_thrust"]
 PID = INDEX["controller.cmd_thrust"]
 PID_CTR_YAW = INDEX["controller.ctr_yaw"]
+PID_PARTS = INDEX["pid_attitude.roll_outP"]
+PID_TARGETS = INDEX["posCtl.targetVX"]
 STABILIZER = INDEX["stabilizer.roll"]
 TARGET = INDEX["ctrltarget.x"]
 TARGETZ = INDEX["ctrltargetZ.x"]
