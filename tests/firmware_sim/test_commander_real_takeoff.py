@@ -39,7 +39,8 @@ def test_takeoff_follows_the_real_firmware(tmp_path):
     path = tmp_path / "scenario.toml"
     path.write_text("[vehicle]\nmass = 0.034\nmotor_time_constant = 0.03\n")
     scenario = load_scenario(path)
-    firmware = Firmware(Flight(scenario, 1), platform="cf2", seed=1, parameters={"ctrlLee.mass": 0.029})
+    believed = {"stabilizer.controller": 5.0, "ctrlLee.mass": 0.029}
+    firmware = Firmware(Flight(scenario, 1), platform="cf2", seed=1, parameters=believed)
     firmware.advance(1000)
     takeoff = struct.pack("<BBff?f", 7, 0, 1.0, 0.0, True, 2.5)
     firmware.receive(wire.Packet(wire.SETPOINT_HIGH_LEVEL, 0, takeoff))
