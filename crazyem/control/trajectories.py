@@ -140,11 +140,13 @@ def _chain(f: float, f1: float, f2: float, f3: float, dp: float, ddp: float, ddd
 # Lines of the excitation [Hz]. No two axes share a line, none is a multiple of another within the band, and the spacing
 # (0.13 Hz and more) is resolved by a window of 8 s, so that the axes are uncorrelated in every window.
 # Lateral: full-state setpoints carry no jerk, so the Lee controller turns acceleration into tilt and torque only around
-# and above its attitude bandwidth (about 1 Hz); its lightly damped rotor-lag resonance is near 5 Hz.
-EXCITE_X = (1.71, 2.33, 3.07, 3.97, 4.87)
-EXCITE_Y = (1.57, 2.11, 2.83, 3.67, 4.57)
-EXCITE_Z = (0.53, 0.83, 1.21, 1.87)
-EXCITE_YAW = (1.31, 1.97, 2.57, 3.29)
+# and above its attitude bandwidth (about 1 Hz), the more the closer to its lightly damped resonance with the rotor lag
+# near 5 Hz, where noise alone excites enough. Weights falling with the frequency spread the torque over
+# the lines: inertia, rotor lag and delay can be told apart only over a range of frequencies.
+EXCITE_X = (1.17, 1.71, 2.33, 3.03, 3.97)
+EXCITE_Y = (1.07, 1.57, 2.17, 2.83, 3.67)
+EXCITE_Z = (0.53, 0.83, 1.27, 1.87)
+EXCITE_YAW = (0.97, 1.43, 2.01, 2.93)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,12 +158,14 @@ class _Multisine:
     phase: tuple[float, ...]
 
     @classmethod
-    def of(cls, lines: tuple[float, ...], rms: float, turn: float) -> "_Multisine":
+    def of(cls, lines: tuple[float, ...], rms: float, turn: float, *, slope: float = 0.0) -> "_Multisine":
+        """`rms` of the second derivative, shared among the lines in proportion to frequency to the power of `slope`."""
         n = len(lines)
-        peak = rms * math.sqrt(2 / n)
+        weights = [f**slope for f in lines]
+        scale = rms * math.sqrt(2 / sum(w * w for w in weights))
         rates = tuple(2 * math.pi * f for f in lines)
         phases = tuple(turn - math.pi * i * (i + 1) / n for i in range(n))
-        return cls(tuple(peak / w**2 for w in rates), rates, phases)
+        return cls(tuple(scale * k / w**2 for k, w in zip(weights, rates)), rates, phases)
 
     def derivatives(self, t: float) -> tuple[float, float, float, float]:
         q = dq = ddq = dddq = 0.0
@@ -179,7 +183,7 @@ def excite(
     position: Vector,
     yaw: float = 0.0,
     duration: float = 20.0,
-    lateral: float = 0.30,
+    lateral: float = 0.45,
     vertical: float = 0.5,
     angular: float = 4.5,
     ramp: float = 1.5,
@@ -189,15 +193,15 @@ def excite(
     Position, velocity, acceleration and yaw are exact derivatives of each other, so feedback and feed-forward agree.
 
     Args:
-        lateral: rms acceleration along world x and along y, m/s^2. 0.3 gives 1.5e-4..3e-4 N m of roll and pitch torque
-            under the Lee controller with its default gains (torque = KR * tilt, tilt = a / g, amplified near 5 Hz).
+        lateral: rms acceleration along world x and along y, m/s^2. Gives about 2e-4 N m of roll and pitch torque under
+            the Lee controller with its default gains. More costs height: thrust lost to tilt grows with its square.
         vertical: rms acceleration along world z, m/s^2.
-        angular: rms yaw acceleration, rad/s^2 (0.02..0.04 rad of yaw).
+        angular: rms yaw acceleration, rad/s^2 (0.05 rad of yaw, 2e-4 N m of torque).
         ramp: s to reach full amplitude, and to stop again.
     """
     sines = (
-        _Multisine.of(EXCITE_X, lateral, 0.3),
-        _Multisine.of(EXCITE_Y, lateral, 1.9),
+        _Multisine.of(EXCITE_X, lateral, 0.3, slope=-0.5),
+        _Multisine.of(EXCITE_Y, lateral, 1.9, slope=-0.5),
         _Multisine.of(EXCITE_Z, vertical, 0.9),
         _Multisine.of(EXCITE_YAW, angular, 2.6),
     )

@@ -46,20 +46,20 @@ def test_derivatives_match_finite_differences_and_ends_rest(name, tmp_path):
 @given(st.floats(0, 1))
 def test_smooth_step_is_symmetric_and_monotone(x):
     v, d, _, _ = smooth_step(x)
-    assert 0 <= v <= 1
+    assert 0 <= v <= 1 + 1e-12
     assert d >= 0
     assert v + smooth_step(1 - x)[0] == pytest.approx(1, abs=1e-9)
 
 
 def test_excitation_has_the_asked_power_and_uncorrelated_axes():
-    trajectory = excite(position=HOME, duration=30.0, lateral=0.3, vertical=0.5)
+    trajectory = excite(position=HOME, duration=30.0, lateral=0.45, vertical=0.5)
     t = np.arange(2.0, 28.0, 0.01)
     refs = [trajectory.at(x) for x in t]
     a = np.array([r.acceleration for r in refs])
     yaw = np.array([r.yaw for r in refs])
-    np.testing.assert_allclose(a.std(axis=0), [0.3, 0.3, 0.5], rtol=0.05)
-    assert 0.01 < yaw.std() < 0.05
-    assert np.abs(a).max() < 2.0
+    np.testing.assert_allclose(a.std(axis=0), [0.45, 0.45, 0.5], rtol=0.07)
+    assert 0.01 < yaw.std() < 0.1
+    assert np.abs(a).max() < 3.0
     for start in range(0, len(t) - 800, 200):  # every estimator window of 8 s
         c = np.corrcoef(a[start : start + 800].T)
         assert np.abs(c - np.eye(3)).max() < 0.2
