@@ -62,6 +62,17 @@ def test_holds_position(platform: str, controller: int) -> None:
     assert end[:, ROTOR].sum(axis=1).mean() == pytest.approx(weight, rel=0.01)
 
 
+def test_motors_hover_at_the_voltage_of_the_thrust_curve() -> None:
+    flight = boot(stabilizer__controller=5)
+    end = hold(flight, (0, 0, 1.0), 8.0)[-400:]
+    curve = np.polynomial.Polynomial(
+        [-0.02476537915958403, 0.06523793527519485, -0.026792504967750107, 0.006776789303971145]
+    )
+    roots = (curve - 0.029 * 9.81 / 4).roots()
+    volts = end[:, at.PWM : at.PWM + 4].mean(axis=1) / 65535 * end[:, at.VOLTS]
+    assert volts.mean() == pytest.approx(roots[np.abs(roots.imag) < 1e-9].real[0], rel=0.005)
+
+
 def test_a_mass_believed_too_low_hangs_low_until_it_is_corrected() -> None:
     flight = boot({"vehicle": HEAVY}, stabilizer__controller=5, ctrlLee__mass=0.029)
     low = hold(flight, (0, 0, 1.0), 7.0)[-300:, at.POS + 2].mean() - 1.0
