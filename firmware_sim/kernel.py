@@ -16,8 +16,11 @@ _STAMP = tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in _SOURCE
 
 
 def kernel(function: Any) -> Any:
-    """Compile `function` (explicit loops over flat arrays), cached on disk and without the interpreter lock."""
-    dispatcher: Any = njit(cache=True, nogil=True)(function)
+    """Compile `function` (explicit loops over flat arrays): cached on disk, without the interpreter lock.
+
+    Division by zero gives infinity as in C, not an exception.
+    """
+    dispatcher: Any = njit(cache=True, nogil=True, error_model="numpy")(function)
     with contextlib.suppress(AttributeError):  # private to numba; without it caching works, only less watchful
         dispatcher._cache._cache_file._source_stamp = _STAMP
     return dispatcher

@@ -22,7 +22,7 @@ PREDICT_EVERY = 10  # ms
 @kernel
 def estimate_step(truth, state, sensor, estimate, P, param, noise, tick):
     """One millisecond: integrate the sensors, every 10th the covariance, and take the fixes that are due."""
-    if estimate[at.E_RESET] > 0.0 or not math.isfinite(estimate[at.E_POS]):
+    if estimate[at.E_RESET] > 0.0 or not healthy(estimate, P):
         estimate[at.E_RESET] = 0.0
         restart(state, estimate, P)
     integrate(sensor, estimate, 1e-3)
@@ -50,6 +50,17 @@ def estimate_step(truth, state, sensor, estimate, P, param, noise, tick):
             attitude_update(estimate, P, estimate, at.E_EXT_QUAT, param[pm.EXT_QUAT_SD])
         estimate[at.E_EXT] = 0.0
     bound(estimate, param)
+
+
+@kernel
+def healthy(estimate, P):
+    """False once a parameter that is not a number has got into the filter: it then starts again."""
+    total = 0.0
+    for i in range(9):
+        total += P[i, i]
+    for i in range(at.E_QUAT + 4):
+        total += estimate[i]
+    return math.isfinite(total)
 
 
 @kernel

@@ -6,6 +6,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from firmware_sim.commander import setpoint as sp
+from firmware_sim.controllers import parameters
 from firmware_sim.flight import Flight
 from firmware_sim.plant import layout as at
 from firmware_sim.scenario import parse_scenario
@@ -161,6 +162,7 @@ def test_lands_and_stays() -> None:
         {"mass": 0.001, "J_x": 1e-4, "J_y": 2e-4, "J_z": 1e-4},
         {"mass": 1.0},
         {"mass": -0.03},
+        {"mass": 0.0, "J_x": 0.0},
         {"J_x": -1e-4, "J_y": 1.0},
         {"mass": float("nan"), "J_z": float("inf")},
     ],
@@ -225,6 +227,35 @@ def test_no_scenario_gives_what_is_not_a_number(table: dict, controller: int, se
     states = hold(flight, (0, 0, 1.0), 1.0, ramp=0.3)
     assert np.all(np.isfinite(states))
     assert all(np.isfinite(array[index]) for array, index in flight.log.values())
+
+
+@settings(
+    max_examples=40,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],
+)
+@given(
+    values=st.dictionaries(
+        st.sampled_from(parameters.NAMES),
+        st.sampled_from([0.0, -1.0, 1e-9, 1e9, float("nan"), float("inf"), -float("inf")]),
+        min_size=1,
+        max_size=6,
+    ),
+    controller=st.sampled_from([1, 2, 5, 6]),
+)
+def test_no_parameter_breaks_the_simulation(values: dict, controller: int) -> None:
+    flight = boot(stabilizer__controller=controller)
+    hold(flight, (0, 0, 0.5), 0.5, ramp=0.3)
+    for name, value in values.items():
+        if name not in ("stabilizer.controller", "stabilizer.estimator", "kalman.resetEstimation"):  # integers
+            write(flight, name, value)
+    assert np.all(np.isfinite(hold(flight, (0, 0, 0.5), 0.5)))
+    for name in values:
+        write(flight, name, flight.param_defaults[name])
+    hold(flight, (0, 0, 0.5), 0.1)
+    shown = {name: array[index] for name, (array, index) in flight.log.items()}
+    assert not [name for name, value in shown.items() if not np.isfinite(value)]
 
 
 def test_onboard_estimate_error_is_small_and_correlated() -> None:
