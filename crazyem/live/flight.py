@@ -177,14 +177,14 @@ class Flight:
         self._stream = stream = SetpointStream(self.link, path, self.session.clock, on_setpoint=record)
         self._enter("hovering")
         stream.start()
-        self._mark("trajectory_start", stream.began)
+        self._mark("trajectory_start", self.session.clock.newest)
         self._wait(lambda: stream.elapsed >= self.plan.baseline, math.inf)
         self._enter(path.name)
-        self._mark("push_enabled", stream.began + self.plan.baseline)
-        self.session.pipeline.push_from = stream.began + self.plan.baseline
+        self._mark("push_enabled", self.session.clock.newest)
+        self.session.pipeline.push_from = self.session.clock.newest
         self._wait(lambda: stream.elapsed >= path.duration, math.inf)
         self.session.pipeline.push_until = self.session.clock.newest
-        self._mark("trajectory_end", stream.began + path.duration)
+        self._mark("trajectory_end", self.session.clock.newest)
 
     def _land(self) -> None:
         """Hand back to the high-level commander, land, and make sure that it has."""

@@ -58,8 +58,8 @@ def test_every_push_is_verified_and_the_height_error_goes(flights):
 
 
 @pytest.mark.slow
-def test_nothing_is_pushed_that_hover_cannot_tell(tmp_path):
-    """A hover of a minute: mass arrives, intervals of inertia are wide and hold."""
+def test_hover_is_honest_about_inertia(tmp_path):
+    """In hover the intervals of inertia are wide, and hold."""
     covered, total = 0, 0
     for seed in range(3):
         path = tmp_path / f"{seed}.json"

@@ -160,3 +160,19 @@ def test_simulator_address_is_taken_from_its_ready_line():
     script = "import time; print('firmware_sim: udp://127.0.0.1:4711 platform cf2', flush=True); time.sleep(60)"
     with Simulator(command=command(script)) as simulator:
         assert simulator.uri == "udp://127.0.0.1:4711"
+
+
+def test_clock_absorbs_a_stall_without_freezing_or_jumping():
+    """The firmware loses 0.5 s while the host's clock goes on, as a simulator does that was denied the processor."""
+    clock = FirmwareClock()
+    host, firmware, answers = 0.0, 0.0, []
+    for i in range(2000):
+        host += 0.01
+        if not 800 <= i < 850:
+            firmware += 0.01
+            clock.observe(firmware, host)
+        answers.append((host, clock.now(host)))
+    rates = np.diff([a for _, a in answers[300:]]) / 0.01
+    assert rates.min() > 0.7
+    assert rates.max() < 1.3
+    assert answers[-1][1] == pytest.approx(firmware, abs=0.02)
