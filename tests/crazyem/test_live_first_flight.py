@@ -16,56 +16,37 @@ SCENARIO = Path(__file__).resolve().parents[2] / "firmware_sim" / "scenarios" / 
 SEEDS = range(20)
 
 
-@pytest.fixture(scope="module")
-def flights(tmp_path_factory):
-    """Summaries of all flights; one flight after the other, two at once would disturb each other's timing."""
-    folder = tmp_path_factory.mktemp("flights")
-    out = []
-    for seed in SEEDS:
-        path = folder / f"{seed}.json"
-        code = main(["fly", "--trajectory", "excite", "--duration", "20", "--scenario", str(SCENARIO), "--speed", "2",
-                     "--seed", str(seed), "--json", str(path)])  # fmt: skip
-        assert code == 0
-        out.append(json.loads(path.read_text()))
-    return out
+def fly(seed, trajectory, duration, path):
+    """One flight's summary. At twice real time: faster, a busy machine starts to disturb the flight."""
+    code = main(["fly", "--trajectory", trajectory, "--duration", str(duration), "--scenario", str(SCENARIO),
+                 "--speed", "2", "--seed", str(seed), "--json", str(path)])  # fmt: skip
+    assert code == 0
+    return json.loads(path.read_text())
 
 
 @pytest.mark.slow
-def test_every_estimate_is_close(flights):
-    worst = {n: max(abs(f["estimates"][n]["value"] / t - 1) for f in flights) for n, t in TRUTH.items()}
-    print("largest errors:", {n: f"{100 * w:.2f} %" for n, w in worst.items()})
-    assert all(worst[n] <= LIMIT[n] for n in TRUTH)
-
-
-@pytest.mark.slow
-def test_intervals_cover(flights):
-    covered = {}
-    for name, truth in TRUTH.items():
-        covered[name] = sum(
-            f["estimates"][name]["ci95"][0] <= truth <= f["estimates"][name]["ci95"][1] for f in flights
-        )
-    print("covered:", covered)
-    assert all(n >= 18 for n in covered.values())
-
-
-@pytest.mark.slow
-def test_every_push_is_verified_and_the_height_error_goes(flights):
-    for flight in flights:
-        assert flight["pushes"]
-        assert all(p["verified"] for p in flight["pushes"])
-        assert flight["height_error_m"]["before_push"] == pytest.approx(-0.34, abs=0.03)
-        assert abs(flight["height_error_m"]["after_push"]) < 0.02
+def test_twenty_flights_find_the_payload_and_fly_with_it(tmp_path):
+    flights = [fly(seed, "excite", 20, tmp_path / f"{seed}.json") for seed in SEEDS]
+    errors = {n: [f["estimates"][n]["value"] / t - 1 for f in flights] for n, t in TRUTH.items()}
+    intervals = {n: [f["estimates"][n]["ci95"] for f in flights] for n in TRUTH}
+    covered = {n: sum(low <= TRUTH[n] <= high for low, high in pairs) for n, pairs in intervals.items()}
+    for n, e in errors.items():
+        print(f"{n}: worst {100 * max(map(abs, e)):.2f} %, covered {covered[n]} of {len(flights)}")
+    for f in flights:
+        assert f["pushes"]
+        assert all(p["verified"] for p in f["pushes"])
+        assert f["height_error_m"]["before_push"] == pytest.approx(-0.34, abs=0.03)
+        assert abs(f["height_error_m"]["after_push"]) < 0.02
+    assert {n: max(map(abs, e)) <= LIMIT[n] for n, e in errors.items()} == dict.fromkeys(TRUTH, True)
+    assert {n: c >= 0.9 * len(flights) for n, c in covered.items()} == dict.fromkeys(TRUTH, True)
 
 
 @pytest.mark.slow
 def test_hover_is_honest_about_inertia(tmp_path):
     """In hover the intervals of inertia are wide, and hold."""
     covered, total = 0, 0
-    for seed in range(3):
-        path = tmp_path / f"{seed}.json"
-        assert main(["fly", "--trajectory", "hover", "--duration", "15", "--scenario", str(SCENARIO), "--speed", "2",
-                     "--seed", str(seed), "--json", str(path)]) == 0  # fmt: skip
-        estimates = json.loads(path.read_text())["estimates"]
+    for seed in range(4):
+        estimates = fly(seed, "hover", 15, tmp_path / f"{seed}.json")["estimates"]
         for name in ("Ixx", "Iyy", "Izz"):
             low, high = estimates[name]["ci95"]
             covered += low <= TRUTH[name] <= high
