@@ -74,6 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     history = History()
     take_events(recording, history)
     pipeline = Pipeline(new_estimator(vehicle, arguments), history=history)
+    pipeline.estimate_until = history.marks.get("estimate_end", pipeline.estimate_until)
     replay(recording, pipeline)
     if not any(e.samples for e in history.estimates):
         raise DataError(f"{recording.path}: nothing in this recording was flown (no samples off the ground).")

@@ -190,6 +190,7 @@ class Flight:
         """Hand back to the high-level commander, land, and make sure that it has."""
         self._enter("landing")
         self.session.pipeline.push_until = -math.inf
+        self.session.end_estimates()
         if self._stream is not None:
             self._stream.stop()
             self._stream = None

@@ -53,6 +53,7 @@ class Pipeline:
         self.on_estimate = on_estimate
         self.push_from = math.inf  # s on the drone's clock; estimates of this time and later may be pushed
         self.push_until = math.inf
+        self.estimate_until = math.inf  # s; later samples (the landing) belong to the track, not to the estimate
         self.decision: Decision | None = None
         self.samples = 0
 
@@ -60,7 +61,7 @@ class Pipeline:
         """One sample further; the estimate if one is due."""
         self.samples += 1
         self.history.take(sample)
-        estimate = self.estimator.feed(sample)
+        estimate = self.estimator.feed(sample) if sample.time <= self.estimate_until else None
         if estimate is None:
             return None
         self.history.estimates.append(estimate)

@@ -86,6 +86,7 @@ class Session:
         self.pipeline = Pipeline(estimator, history=self.history, on_estimate=self._estimated)
         self.blocks: tuple[Block, ...] = ()
         self._samples: queue.SimpleQueue[list[Sample] | None] = queue.SimpleQueue()
+        self._end_wanted = False
         self._stop = threading.Event()
         self._closed = False
         self._threads: list[threading.Thread] = []
@@ -129,6 +130,20 @@ class Session:
         self.pipeline.push = self.pusher.submit
         self.pipeline.guard = guard
         return note
+
+    def end_estimates(self) -> None:
+        """Keep what comes from now on out of the estimate: a landing excites little and ends near the ground.
+
+        The receiving thread draws the line between two packets and records it, so that a replay draws the same.
+        """
+        self._end_wanted = True
+
+    def _draw_end(self) -> None:
+        until = self.clock.newest  # of the packets before this one; later packets may still carry older stamps
+        self.pipeline.estimate_until = until
+        self.history.marks["estimate_end"] = until
+        if self.recorder is not None:
+            self.recorder.event(f"mark estimate_end {until!r}")
 
     def raise_if_failed(self) -> None:
         """Raise what went wrong in a thread, or that the drone is lost."""
@@ -179,6 +194,8 @@ class Session:
             self._samples.put(None)
 
     def _packet(self, packet: Packet) -> None:
+        if self._end_wanted and self.pipeline.estimate_until == math.inf and math.isfinite(self.clock.newest):
+            self._draw_end()
         self.clock.observe(packet.firmware_time_ms / 1000.0)
         names = self._names.get(packet.block)
         if names is None:
