@@ -19,14 +19,19 @@ from crazyem.vehicle import GRAVITY
 FASTMATH = {"contract", "reassoc", "nsz"}  # lets dot products use vector registers; NaN keeps its meaning
 
 # Layout of a statistics row.
-MASS = 0  # 6: upper triangle of z z', z = (a, F0, dF/dtau)
-AXIS = 6  # 3 x 10: upper triangle of z z', z = (alpha_i, gyroscopic product, M0_i, dM_i/dtau)
-LATERAL = 36  # 2: squared lateral specific force
-COUNT = 38  # 1: steps
-RESIDUAL = 39  # 4: squared measurement residuals of position, velocity, attitude, body rate
-MEASURED = 43  # 4: how many scalars went into each
-TORQUE = 47  # 3: squared mean torque about each axis, for the account of excitation
-SIZE = 50
+MASS = 0  # 10: upper triangle of z z', z = (a, F0, dF/dtau, dF/ddelay)
+AXIS = 10  # 3 x 15: upper triangle of z z', z = (alpha_i, gyroscopic product, M0_i, dM_i/dtau, dM_i/ddelay)
+AXIS_SIZE = 15
+COUNT = 55  # 1: steps
+IMPULSE = 56  # 6: squared impulses over dt, by body axis: specific force, angular acceleration
+RESIDUAL = 62  # 4: squared measurement residuals of position, velocity, attitude, body rate
+MEASURED = 66  # 4: how many scalars went into each
+IMPULSE_SEEN = 70  # 6: squared share of each impulse's variance that the data resolve
+RESIDUAL_SEEN = 76  # 4: the same for the measurement noise
+SIZE = 80
+
+PARAMETERS = 6  # mass, Ixx, Iyy, Izz, time constant (all by their logarithms), delay (in units of DELAY_UNIT)
+DELAY_UNIT = 1e-3  # s
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH)
@@ -196,6 +201,7 @@ def forward(first, last, restart, time, kind, y, thrust, torque, mass, inertia, 
         else:
             dt = time[k] - time[k - 1]
             h = 0.5 * dt
+            bridge = dt * dt / 12.0  # what white noise does to position and attitude between its values at both ends
             w = xf[k - 1, 10:13]
             b = blocks[k]
             # mean
@@ -262,10 +268,9 @@ def forward(first, last, restart, time, kind, y, thrust, torque, mass, inertia, 
                     cov[3 + i, 3 + j] += v
                     cov[i, 3 + j] += h * v
                     cov[3 + i, j] += h * v
-                    cov[i, j] += h * h * v
+                    cov[i, j] += (h * h + bridge) * v
                     cov[6 + i, 6 + j] += (
-                        h
-                        * h
+                        (h * h + bridge)
                         * dt
                         * (jr[i, 0] * jr[j, 0] * q[3] + jr[i, 1] * jr[j, 1] * q[4] + jr[i, 2] * jr[j, 2] * q[5])
                     )
@@ -336,8 +341,8 @@ def _outer(out, base, z, n, weight):
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH)
-def backward(first, last, time, kind, usable, thrust, torque, thrust_tau, torque_tau, tau, mass, inertia, inverse, q, r,
-             xf, pf, gain, s, e, blocks, middle, stats, moments):  # fmt: skip
+def backward(first, last, time, kind, usable, thrust, torque, thrust_tau, torque_tau, thrust_delay, torque_delay,
+             tau, delay, mass, inertia, inverse, q, r, xf, pf, gain, s, e, blocks, middle, stats, moments):  # fmt: skip
     """Smoother over samples last-1 down to first, information beyond `last` being none; fills statistics rows.
 
     Row k holds the step that ends at k (k > first, not a break, usable) and the measurements at k. `moments` (n, 12)
@@ -350,7 +355,7 @@ def backward(first, last, time, kind, usable, thrust, torque, thrust_tau, torque
     tmp = np.empty((12, 12))
     tra = np.empty((12, 12))
     lk = np.empty(12)
-    z = np.empty(4)
+    z = np.empty(5)
     alpha = np.empty(3)
     rate = np.empty(3)
     u = np.empty(6)
@@ -381,6 +386,7 @@ def backward(first, last, time, kind, usable, thrust, torque, thrust_tau, torque
                 resvar = r[i] - r[i] * r[i] * (inv + klk)
                 row[RESIDUAL + i // 3] += res * res + max(resvar, 0.0)
                 row[MEASURED + i // 3] += 1.0
+                row[RESIDUAL_SEEN + i // 3] += (r[i] * (inv + klk)) ** 2
             lam[i, 0] -= adj
             for j in range(12):
                 big[i, j] -= lk[j]
@@ -448,9 +454,10 @@ def backward(first, last, time, kind, usable, thrust, torque, thrust_tau, torque
             continue
         # statistics of the step
         z[0] = mom[2]
-        z[1] = thrust[k] - thrust_tau[k] * tau
+        z[1] = thrust[k] - thrust_tau[k] * tau - thrust_delay[k] * delay
         z[2] = thrust_tau[k]
-        _outer(row, MASS, z, 3, dt)
+        z[3] = thrust_delay[k]
+        _outer(row, MASS, z, 4, dt)
         row[MASS] += var[2] / dt
         for i in range(3):
             j = (i + 1) % 3
@@ -461,13 +468,14 @@ def backward(first, last, time, kind, usable, thrust, torque, thrust_tau, torque
             known = inertia[i, j] * mom[3 + j] + inertia[i, m] * mom[3 + m]
             known += rate[j] * (inertia[m, i] * rate[i] + inertia[m, j] * rate[j])
             known -= rate[m] * (inertia[j, i] * rate[i] + inertia[j, m] * rate[m])
-            z[2] = torque[k, i] - torque_tau[k, i] * tau - known
+            z[2] = torque[k, i] - torque_tau[k, i] * tau - torque_delay[k, i] * delay - known
             z[3] = torque_tau[k, i]
-            _outer(row, AXIS + 10 * i, z, 4, dt)
-            row[AXIS + 10 * i] += var[3 + i] / dt
-            row[TORQUE + i] = dt * torque[k, i] ** 2
-        for i in range(2):
-            row[LATERAL + i] = (u[i] * u[i] + var[i]) / dt
+            z[4] = torque_delay[k, i]
+            _outer(row, AXIS + AXIS_SIZE * i, z, 5, dt)
+            row[AXIS + AXIS_SIZE * i] += var[3 + i] / dt
+        for i in range(6):
+            row[IMPULSE + i] = (u[i] * u[i] + var[i]) / dt
+            row[IMPULSE_SEEN + i] = (1.0 - var[i] / (q[i] * dt)) ** 2
         row[COUNT] = 1.0
 
 
@@ -482,26 +490,26 @@ def total(first, last, stats, out):
 
 
 @njit(cache=True, nogil=True, fastmath=FASTMATH)
-def sensitivities(first, last, time, kind, usable, thrust, torque, thrust_tau, torque_tau, theta, inertia, inverse,
-                  xf, gain, s, e, blocks, middle, score):  # fmt: skip
-    """Derivatives of the innovations with respect to the logarithms of mass, Ixx, Iyy, Izz, time constant.
+def sensitivities(first, last, time, kind, usable, thrust, torque, thrust_tau, torque_tau, thrust_delay,
+                  torque_delay, theta, inertia, inverse, xf, gain, s, e, blocks, middle, score):  # fmt: skip
+    """Derivatives of the innovations with respect to the six parameters (logarithms, DELAY_UNIT).
 
     With the noise intensities in units of acceleration as free nuisance parameters the gains do not depend on these
-    five (up to the state-dependence of the Jacobian), so each sensitivity is a 12-vector carried along the filter.
+    (up to the state-dependence of the Jacobian), so each sensitivity is a 12-vector carried along the filter.
 
     Returns:
-        Fisher information (5, 5); `score` (n, 5) receives each sample's contribution to the score.
+        Fisher information (6, 6); `score` (n, 6) receives each sample's contribution to the score.
     """
-    d = np.zeros((12, 5))
-    d2 = np.zeros((12, 5))
-    info = np.zeros((5, 5))
+    d = np.zeros((12, PARAMETERS))
+    d2 = np.zeros((12, PARAMETERS))
+    info = np.zeros((PARAMETERS, PARAMETERS))
     alpha = np.empty(3)
     for k in range(first, last):
-        for a in range(5):
+        for a in range(PARAMETERS):
             score[k, a] = 0.0
         if kind[k] == 1 or k == first:
             for i in range(12):
-                for a in range(5):
+                for a in range(PARAMETERS):
                     d[i, a] = 0.0
             continue
         dt = time[k] - time[k - 1]
@@ -509,23 +517,25 @@ def sensitivities(first, last, time, kind, usable, thrust, torque, thrust_tau, t
         w = xf[k - 1, 10:13]
         _apply(blocks[k], dt, d, d2)
         for i in range(12):
-            for a in range(5):
+            for a in range(PARAMETERS):
                 d[i, a] = d2[i, a]
         if usable[k]:
             _angular_acceleration(w, torque[k], inertia, inverse, alpha)
             for i in range(3):
                 v = -dt * middle[k, i, 2] * thrust[k] / theta[0]
-                t = dt * middle[k, i, 2] * thrust_tau[k] / theta[0] * theta[4]
                 d[3 + i, 0] += v
                 d[i, 0] += h * v
-                d[3 + i, 4] += t
-                d[i, 4] += h * t
-                t = 0.0
-                for j in range(3):
-                    t += inverse[i, j] * torque_tau[k, j]
-                t *= dt * theta[4]
-                d[9 + i, 4] += t
-                d[6 + i, 4] += h * t
+                for a in range(4, 6):
+                    f = theta[4] if a == 4 else DELAY_UNIT
+                    t = f * dt * middle[k, i, 2] * (thrust_tau[k] if a == 4 else thrust_delay[k]) / theta[0]
+                    d[3 + i, a] += t
+                    d[i, a] += h * t
+                    t = 0.0
+                    for j in range(3):
+                        t += inverse[i, j] * (torque_tau[k, j] if a == 4 else torque_delay[k, j])
+                    t *= dt * f
+                    d[9 + i, a] += t
+                    d[6 + i, a] += h * t
             for a in range(3):  # d(I^-1 (M - w x I w)) / d log I_aa = -I^-1 (e_a I_a alpha_a + w x e_a I_a w_a)
                 b = (a + 1) % 3
                 c = (a + 2) % 3
@@ -539,16 +549,16 @@ def sensitivities(first, last, time, kind, usable, thrust, torque, thrust_tau, t
                 continue
             inv = 1.0 / s[k, i]
             g = gain[k, i]
-            for a in range(5):
+            for a in range(PARAMETERS):
                 da = d[i, a]
                 score[k, a] += da * e[k, i] * inv
-                for b in range(5):
+                for b in range(PARAMETERS):
                     info[a, b] += da * d[i, b] * inv
-            for a in range(5):
+            for a in range(PARAMETERS):
                 da = d[i, a]
                 for j in range(12):
                     d2[j, a] = g[j] * da
             for j in range(12):
-                for a in range(5):
+                for a in range(PARAMETERS):
                     d[j, a] -= d2[j, a]
     return info

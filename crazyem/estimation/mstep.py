@@ -3,9 +3,9 @@
 With the noise intensities profiled out it is, for N steps (paper's eq. 107 and appendix in their correct, joint form),
 
     Q = N log m - N/2 log S_F + N sum_i log I_i - N/2 sum_i log S_i + log prior,
-    S_F = sum E[(m a - F(tau))^2] dt,   S_i = sum E[(I_i alpha_i + (I_k - I_j) w_j w_k - M_i(tau))^2] dt,
+    S_F = sum E[(m a - F)^2] dt,   S_i = sum E[(I_i alpha_i + (I_k - I_j) w_j w_k - M_i)^2] dt,
 
-F and M being linear in tau around the value they were made with. Every S is a quadratic form c' A c in a vector c that
+F and M being linear in tau and in the delay around the values they were made with. Every S is a quadratic form c' A c in a vector c that
 is linear in the parameters, with A the sums of kernels.py, so Newton's method in the logarithms of the parameters costs
 microseconds; logarithms also rule out sign flips.
 """
@@ -13,9 +13,10 @@ microseconds; logarithms also rule out sign flips.
 import numpy as np
 from numba import njit
 
-from crazyem.estimation.kernels import AXIS, COUNT, MASS
+from crazyem.estimation.kernels import AXIS, AXIS_SIZE, COUNT, DELAY_UNIT, MASS, PARAMETERS
 
-MAX_STEP = 1.0  # largest change of a logarithm in one Newton step
+MAX_STEP = 1.0  # largest change of a logarithm (or of the delay, in ms) in one Newton step
+DELAY = 5  # index of the one parameter that is not taken by its logarithm
 
 
 @njit(cache=True, nogil=True)
@@ -30,38 +31,43 @@ def _unpack(sums, base, n, out):
 
 @njit(cache=True, nogil=True)
 def objective(theta, sums, free, centre, precision, gradient, hessian, squares):
-    """-Q at theta (5,), with its gradient and Hessian in the logarithms; squares (4,) receives S_F, S_x, S_y, S_z."""
+    """-Q at theta (6,), its gradient and Hessian (logarithms; delay in ms); squares (4,) receives S_F, S_x, S_y, S_z."""
     count = sums[COUNT]
-    a = np.zeros((4, 4))
-    c = np.zeros(4)
-    dc = np.zeros((4, 5))
-    ac = np.zeros(4)
-    for i in range(5):
+    a = np.zeros((5, 5))
+    c = np.zeros(5)
+    dc = np.zeros((5, PARAMETERS))
+    ac = np.zeros(5)
+    for i in range(PARAMETERS):
         gradient[i] = 0.0
-        for j in range(5):
+        for j in range(PARAMETERS):
             hessian[i, j] = 0.0
     value = 0.0
-    grad = np.zeros(5)
+    grad = np.zeros(PARAMETERS)
+    scale = np.empty(PARAMETERS)
+    for u in range(PARAMETERS):
+        scale[u] = theta[u] if u != DELAY else DELAY_UNIT
     for term in range(4):
         dc[:, :] = 0.0
         if term == 0:
-            n = 3
-            _unpack(sums, MASS, 3, a)
-            c[0], c[1], c[2] = theta[0], -1.0, -theta[4]
+            n = 4
+            _unpack(sums, MASS, 4, a)
+            c[0], c[1], c[2], c[3] = theta[0], -1.0, -theta[4], -theta[5]
             dc[0, 0] = 1.0
             dc[2, 4] = -1.0
+            dc[3, 5] = -1.0
             value -= count * np.log(theta[0])
         else:
-            n = 4
+            n = 5
             i = term - 1
             j = (i + 1) % 3
             k = (i + 2) % 3
-            _unpack(sums, AXIS + 10 * i, 4, a)
-            c[0], c[1], c[2], c[3] = theta[1 + i], theta[1 + k] - theta[1 + j], -1.0, -theta[4]
+            _unpack(sums, AXIS + AXIS_SIZE * i, 5, a)
+            c[0], c[1], c[2], c[3], c[4] = theta[1 + i], theta[1 + k] - theta[1 + j], -1.0, -theta[4], -theta[5]
             dc[0, 1 + i] = 1.0
             dc[1, 1 + k] = 1.0
             dc[1, 1 + j] = -1.0
             dc[3, 4] = -1.0
+            dc[4, 5] = -1.0
             value -= count * np.log(theta[1 + i])
         gradient[term] -= count
         s = 0.0
@@ -73,29 +79,30 @@ def objective(theta, sums, free, centre, precision, gradient, hessian, squares):
         s = max(s, 1e-300)
         squares[term] = s
         value += 0.5 * count * np.log(s)
-        for u in range(5):
+        for u in range(PARAMETERS):
             grad[u] = 0.0
             for p in range(n):
                 grad[u] += dc[p, u] * ac[p]
-            grad[u] *= 2.0 * theta[u]
+            grad[u] *= 2.0 * scale[u]
             gradient[u] += 0.5 * count * grad[u] / s
-        for u in range(5):
-            hessian[u, u] += 0.5 * count * grad[u] / s
-            for v in range(5):
+        for u in range(PARAMETERS):
+            if u != DELAY:
+                hessian[u, u] += 0.5 * count * grad[u] / s
+            for v in range(PARAMETERS):
                 h = 0.0
                 for p in range(n):
                     for q in range(n):
                         h += dc[p, u] * a[p, q] * dc[q, v]
-                hessian[u, v] += 0.5 * count * (2.0 * h * theta[u] * theta[v] / s - grad[u] * grad[v] / (s * s))
-    for u in range(5):
+                hessian[u, v] += 0.5 * count * (2.0 * h * scale[u] * scale[v] / s - grad[u] * grad[v] / (s * s))
+    for u in range(PARAMETERS):
         if free[u]:
-            d = np.log(theta[u] / centre[u])
+            d = np.log(theta[u] / centre[u]) if u != DELAY else (theta[u] - centre[u]) / DELAY_UNIT
             value += 0.5 * precision[u] * d * d
             gradient[u] += precision[u] * d
             hessian[u, u] += precision[u]
         else:
             gradient[u] = 0.0
-            for v in range(5):
+            for v in range(PARAMETERS):
                 hessian[u, v] = 0.0
                 hessian[v, u] = 0.0
             hessian[u, u] = 1.0
@@ -104,41 +111,41 @@ def objective(theta, sums, free, centre, precision, gradient, hessian, squares):
 
 @njit(cache=True, nogil=True)
 def maximise(theta, sums, free, centre, precision, iterations, squares):
-    """Newton's method with Levenberg damping from theta (5,: m, Ixx, Iyy, Izz, tau), in place.
+    """Newton's method with Levenberg damping from theta (6,: m, Ixx, Iyy, Izz, tau, delay), in place.
 
     Args:
         theta: start, replaced by the maximiser.
         sums: statistics summed over the window.
-        free: (5,) which parameters may move.
-        centre, precision: (5,) log-normal prior: centre, and 1/sd^2 of the logarithm.
+        free: (6,) which parameters may move.
+        centre, precision: (6,) prior: centre, and 1/sd^2 of the logarithm (of the delay in DELAY_UNIT).
         iterations: at most so many Newton steps.
         squares: (4,) receives the residual sums S_F, S_x, S_y, S_z at the result.
     """
-    gradient = np.empty(5)
-    hessian = np.empty((5, 5))
-    trial = np.empty(5)
-    g2 = np.empty(5)
-    h2 = np.empty((5, 5))
+    gradient = np.empty(PARAMETERS)
+    hessian = np.empty((PARAMETERS, PARAMETERS))
+    trial = np.empty(PARAMETERS)
+    g2 = np.empty(PARAMETERS)
+    h2 = np.empty((PARAMETERS, PARAMETERS))
     value = objective(theta, sums, free, centre, precision, gradient, hessian, squares)
     damping = 0.0
     for _ in range(iterations):
         size = 0.0
         for attempt in range(12):
             damped = hessian.copy()
-            for u in range(5):
+            for u in range(PARAMETERS):
                 # far from the optimum the profile is not convex: keep the diagonal at the information it must have
                 damped[u, u] += damping + (max(0.0, -hessian[u, u]) if attempt else 0.0)
             step = np.linalg.solve(damped, -gradient)
             down = 0.0
             size = 0.0
-            for u in range(5):
+            for u in range(PARAMETERS):
                 step[u] = min(MAX_STEP, max(-MAX_STEP, step[u]))
                 down += step[u] * gradient[u]
                 size = max(size, abs(step[u]))
-                trial[u] = theta[u] * np.exp(step[u])
+                trial[u] = theta[u] * np.exp(step[u]) if u != DELAY else theta[u] + DELAY_UNIT * step[u]
             new = objective(trial, sums, free, centre, precision, g2, h2, squares)
             if down < 0.0 and new <= value + 1e-9:
-                for u in range(5):
+                for u in range(PARAMETERS):
                     theta[u] = trial[u]
                 value = new
                 gradient[:] = g2

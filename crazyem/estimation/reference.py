@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.physics.rigid_body import State, angular_acceleration, step, step_jacobians
+from crazyem.physics.rigid_body import State, angular_acceleration, bridge_covariance, step, step_jacobians
 from crazyem.physics.rotations import quaternion_conjugate, quaternion_product, rotation_vector_from_quaternion
 
 
@@ -66,7 +66,7 @@ def extended_kalman_filter(
             dt = time[k] - time[k - 1]
             phi, g = step_jacobians(filtered[-1], thrust[k], torque[k], dt=dt, mass=mass, inertia=inertia)
             x = step(filtered[-1], thrust[k], torque[k], dt=dt, mass=mass, inertia=inertia)
-            cov = phi @ pf[k - 1] @ phi.T + g @ np.diag(q * dt) @ g.T
+            cov = phi @ pf[k - 1] @ phi.T + g @ np.diag(q * dt) @ g.T + bridge_covariance(g, q, dt=dt)
             transitions[k], noises[k] = phi, g
         predicted.append(x)
         pp[k] = cov

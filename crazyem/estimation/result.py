@@ -10,6 +10,7 @@ PARAMETER_UNITS = {
     "Iyy": "kg m^2",
     "Izz": "kg m^2",
     "motor_time_constant": "s",
+    "input_delay": "s",
 }
 
 

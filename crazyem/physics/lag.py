@@ -1,7 +1,14 @@
 """First-order rotor lag, exact for a command that is piecewise linear in time: tau dy/dt = u - y.
 
 The lag is linear and the same for all rotors, so it acts on thrust and torque directly. What a step of the rigid body
-needs is the mean of y over the step, and its derivative with respect to tau (for estimating tau).
+needs is the mean of y over the step, and its derivatives with respect to tau and to a delay of the command (for
+estimating both). A millisecond of delay that nobody models reads as several per cent of inertia.
+
+A logged command is known only at its stamps, and in closed loop the next one already answers to the disturbance of the
+present step. To interpolate towards it is to let the step's own noise into its input: on hover data logged at 100 Hz that
+reads as 5 ms of delay and 16 % of inertia. So the mean of a step uses only commands stamped before the step began,
+continued by the prediction that the past allows (a linear one, fitted to the same commands: an innovation must be
+orthogonal to what predicts it); the lag itself is carried on along the commands as they then came (CAUSAL).
 """
 
 import numpy as np
@@ -9,80 +16,185 @@ from numba import njit
 
 STEP = 1e-3  # relative change of tau for the central difference
 
+# What lies between two stamps.
+LINEAR = 0  # a straight line: measured rotor speeds
+HOLD = 1  # the earlier value: a controller that acts once per stamp, without lag
+CAUSAL = 2  # a straight line, but a step's mean knows no later stamp than its start: commands with rotor lag
+
+ORDER = 3  # of the linear prediction
+_AHEAD = 64  # most commands known or predicted inside one step
+
 
 @njit(cache=True, nogil=True)
-def lagged_means(times, commands, first, last, nodes, node_first, node_last, tau, state, mean, mean_tau):
-    """Means of the lagged command between nodes.
-
-    Args:
-        times: (n,) s, stamps of the commands, increasing.
-        commands: (n, 4) F [N] and M [N m] commanded at those stamps; linear in between, held beyond the last.
-        first, last: range of commands to use; times[first] must not be after the start time in `state`.
-        nodes: (m,) s, increasing.
-        node_first, node_last: fill rows node_first..node_last-1, row k being the step that ends at nodes[k].
-        tau: s; 0 means no lag.
-        state: (13,) lagged values for tau, tau (1 + STEP) and tau (1 - STEP), 4 each, then their time [s]; updated in
-            place, so that a later call goes on from the last node.
-        mean: (m, 4) receives the means.
-        mean_tau: (m, 4) receives d mean / d tau [1/s].
-
-    Returns:
-        Index of the last command at or before the last node: the `first` of a later call.
-    """
-    i = first
-    t = state[12]
-    acc = np.empty(12)
-    u0 = np.empty(4)
-    u1 = np.empty(4)
-    while i + 1 < last and times[i + 1] <= t:
-        i += 1
-    _interpolate(times, commands, i, last, t, u0)
-    for k in range(node_first, node_last):
-        begin = t
-        for c in range(12):
-            acc[c] = 0.0
-        while t < nodes[k]:
-            end = nodes[k]
-            if i + 1 < last and times[i + 1] < end:
-                end = times[i + 1]
-            _interpolate(times, commands, i, last, end, u1)
-            h = end - t
-            for v in range(3):
-                tv = tau * (1.0 + STEP * (v if v < 2 else -1))
-                decay = np.exp(-h / tv) if tv > 0 else 0.0
-                for c in range(4):
-                    slope = (u1[c] - u0[c]) / h
-                    y0 = state[4 * v + c]
-                    if tv > 0:
-                        y1 = u1[c] - slope * tv + (y0 - u0[c] + slope * tv) * decay
-                    else:
-                        y1 = u1[c]
-                    acc[4 * v + c] += 0.5 * h * (u0[c] + u1[c]) - tv * (y1 - y0)
-                    state[4 * v + c] = y1
-            for c in range(4):
-                u0[c] = u1[c]
-            t = end
-            if i + 1 < last and times[i + 1] <= t:
-                i += 1
-        span = nodes[k] - begin
+def _segment(u0, u1, h, tau, state, acc):
+    """One linear stretch of the command from u0 to u1 (4,), h long: advance `state`, add its integral to `acc` (12,)."""
+    for v in range(3):
+        tv = tau * (1.0 + STEP * (v if v < 2 else -1))
+        decay = np.exp(-h / tv) if tv > 0 else 0.0
         for c in range(4):
-            if span > 0:
-                mean[k, c] = acc[c] / span
-                mean_tau[k, c] = (acc[4 + c] - acc[8 + c]) / (2 * STEP * tau * span) if tau > 0 else 0.0
-            else:
-                mean[k, c] = state[c]
-                mean_tau[k, c] = 0.0
-    state[12] = t
-    return i
+            y0 = state[4 * v + c]
+            slope = (u1[c] - u0[c]) / h
+            y1 = u1[c] - slope * tv + (y0 - u0[c] + slope * tv) * decay
+            acc[4 * v + c] += 0.5 * h * (u0[c] + u1[c]) - tv * (y1 - y0)
+            state[4 * v + c] = y1
 
 
 @njit(cache=True, nogil=True)
-def _interpolate(times, commands, i, last, t, out):
-    """Command at t, which lies between stamps i and i + 1 (held before the first and after the last)."""
-    if i + 1 < last and t > times[i]:
+def _at(times, commands, i, last, t, mode, out):
+    """Command at t, for which stamp i is the last at or before it (or the very first); `last` commands are known."""
+    if mode != HOLD and i + 1 < last and t > times[i]:
         f = (t - times[i]) / (times[i + 1] - times[i])
         for c in range(4):
             out[c] = commands[i, c] + f * (commands[i + 1, c] - commands[i, c])
     else:
         for c in range(4):
             out[c] = commands[i, c]
+
+
+@njit(cache=True, nogil=True)
+def _predict(times, commands, i, known, end, predictor, path_times, path):
+    """Commands i..known-1 (and a few before) and their prediction up to `end`, into path; returns how many."""
+    begin = max(0, max(min(i, known - ORDER), known - _AHEAD // 2))
+    size = known - begin
+    for k in range(size):
+        path_times[k] = times[begin + k]
+        path[k] = commands[begin + k]
+    period = path_times[size - 1] - path_times[size - 2] if size >= 2 else 0.0
+    if size < ORDER or not 0.0 < period < 0.05:
+        return size  # held
+    while path_times[size - 1] < end and size < _AHEAD:
+        for c in range(4):
+            value = predictor[c, ORDER]
+            for j in range(ORDER):
+                value += predictor[c, j] * path[size - 1 - j, c]
+            path[size, c] = value
+        path_times[size] = path_times[size - 1] + period
+        size += 1
+    return size
+
+
+def hold_predictor() -> np.ndarray:
+    """Prediction that the latest command stays. (4, ORDER + 1)."""
+    weights = np.zeros((4, ORDER + 1))
+    weights[:, 0] = 1.0
+    return weights
+
+
+def fit_predictor(commands: np.ndarray) -> np.ndarray:
+    """Least-squares weights with which the latest commands predict the next.
+
+    Args:
+        commands: (n, 4), evenly spaced.
+
+    Returns:
+        (4, ORDER + 1): weights of the latest, the one before ..., and a constant. With too few commands, or none that
+        vary, the prediction is to hold the latest.
+    """
+    weights = hold_predictor()
+    n = len(commands) - ORDER
+    if n < 10 * (ORDER + 1):
+        return weights
+    for c in range(4):
+        past = np.stack([commands[ORDER - 1 - j : ORDER - 1 - j + n, c] for j in range(ORDER)], 1)
+        centre, spread = past.mean(), past.std()
+        if not spread > 0.0:
+            continue
+        a = (past - centre) / spread
+        target = (commands[ORDER:, c] - commands[ORDER - 1 : -1, c]) / spread
+        step = np.linalg.solve(a.T @ a + 1e-6 * n * np.eye(ORDER), a.T @ target)
+        weights[c, :ORDER] += step
+        weights[c, ORDER] = -step.sum() * centre
+    return weights
+
+
+@njit(cache=True, nogil=True)
+def _run(times, commands, i, last, begin, end, mode, tau, state, acc):
+    """Carry the lag from begin to end along the first `last` commands; returns the stamp index at the end."""
+    u0 = np.empty(4)
+    u1 = np.empty(4)
+    t = begin
+    while t < end:
+        stop = end
+        if i + 1 < last and times[i + 1] < end:
+            stop = max(times[i + 1], t)
+        if stop > t:
+            _at(times, commands, i, last, t, mode, u0)
+            _at(times, commands, i, last, stop, mode, u1)
+            if mode == HOLD:
+                for c in range(4):
+                    u1[c] = u0[c]
+            _segment(u0, u1, stop - t, tau, state, acc)
+        t = stop
+        if i + 1 < last and times[i + 1] <= t:
+            i += 1
+    return i
+
+
+@njit(cache=True, nogil=True)
+def lagged_means(
+    times, commands, first, last, predictor, nodes, node_first, node_last, mode, tau, delay, state, mean, mean_tau,
+    mean_delay,
+):  # fmt: skip
+    """Means of the lagged command over the steps between nodes.
+
+    Args:
+        times: (n,) s, stamps of the commands, increasing.
+        commands: (n, 4) F [N] and M [N m] commanded at those stamps.
+        first, last: range of commands to use; times[first] must not be after the start time in `state`.
+        predictor: (4, ORDER + 1) weights of the latest commands in the prediction of the next; see `fit_predictor`.
+        nodes: (m,) s, increasing.
+        node_first, node_last: fill rows node_first..node_last-1, row k being the step that ends at nodes[k].
+        mode: LINEAR, HOLD or CAUSAL.
+        tau: s; 0 means no lag.
+        delay: s by which the command acts later than its stamp says.
+        state: (13,) lagged values for tau, tau (1 + STEP) and tau (1 - STEP), 4 each, then their time [s] on the clock
+            of the commands; updated in place, so that a later call goes on from the last node.
+        mean: (m, 4) receives the means.
+        mean_tau: (m, 4) receives d mean / d tau [1/s].
+        mean_delay: (m, 4) receives d mean / d delay [1/s].
+
+    Returns:
+        Index of the last command at or before the last node: the `first` of a later call.
+    """
+    i = first
+    acc = np.empty(12)
+    junk = np.empty(12)
+    guess = np.empty(13)
+    path_times = np.empty(_AHEAD)
+    path = np.empty((_AHEAD, 4))
+    start = np.empty(4)
+    begin = state[12]
+    while i + 1 < last and times[i + 1] <= begin:
+        i += 1
+    for k in range(node_first, node_last):
+        end = nodes[k] - delay
+        span = end - begin
+        if span <= 0.0:
+            for c in range(4):
+                mean[k, c] = state[c]
+                mean_tau[k, c] = 0.0
+                mean_delay[k, c] = 0.0
+            continue
+        for c in range(4):
+            start[c] = state[c]
+        acc[:] = 0.0
+        if mode == CAUSAL:
+            known = i + 1
+            while known < last and times[known] <= begin + delay + 1e-6:
+                known += 1
+            guess[:] = state
+            size = _predict(times, commands, i, known, end, predictor, path_times, path)
+            _run(path_times, path, 0, size, begin, end, LINEAR, tau, guess, acc)
+            for c in range(4):
+                mean_delay[k, c] = -(guess[c] - start[c]) / span
+            i = _run(times, commands, i, last, begin, end, LINEAR, tau, state, junk)
+        else:
+            i = _run(times, commands, i, last, begin, end, mode, tau, state, acc)
+            for c in range(4):
+                mean_delay[k, c] = -(state[c] - start[c]) / span
+        for c in range(4):
+            mean[k, c] = acc[c] / span
+            mean_tau[k, c] = (acc[4 + c] - acc[8 + c]) / (2 * STEP * tau * span) if tau > 0 else 0.0
+        begin = end
+        state[12] = end
+    return i

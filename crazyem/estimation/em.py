@@ -1,0 +1,236 @@
+"""Expectation maximisation over a window of the tape: full passes, incremental passes, scoring, and the uncertainty.
+
+A full pass filters and smooths the whole window with the present parameters. An incremental pass filters the new samples
+and smooths only the newest ones; each older sample keeps the expectations it was given with the parameters of its time
+(they are physical quantities: accelerations, rates), which is incremental EM in the sense of Neal and Hinton. Where EM
+crawls, a Fisher-scoring step on the likelihood of the innovations takes over.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.estimation import kernels
+from crazyem.estimation.inputs import InputHistory
+from crazyem.estimation.model import Noise, Parameters, Setup
+from crazyem.estimation.mstep import maximise
+from crazyem.estimation.tape import START_VARIANCE, Tape
+
+TOLERANCE = 0.05  # converged when the next scoring step is shorter than this many standard deviations
+MIN_LAGS = 16  # fewer rows than twice this say nothing about correlation in time
+
+
+@dataclass(frozen=True)
+class Information:
+    """Fisher information at a point, in logarithms of theta: what the data (and the weak prior) say.
+
+    Attributes:
+        matrix: (6, 6) information of the data, zero rows where a parameter is fixed.
+        covariance: (6, 6) of the logarithms, prior included, widened where innovations are correlated in time.
+        step: (6,) scoring step of the logarithms.
+        decrement: length of that step in standard deviations.
+        inflation: (6,) factor by which correlation widened each standard deviation.
+    """
+
+    matrix: NDArray
+    covariance: NDArray
+    step: NDArray
+    decrement: float
+    inflation: NDArray
+
+
+class WindowEM:
+    """Runs passes over a tape. Holds the present parameters; everything else it computes lives on the tape."""
+
+    def __init__(self, setup: Setup, tape: Tape, inputs: InputHistory) -> None:
+        self.setup = setup
+        self.tape = tape
+        self.inputs = inputs
+        self.parameters = setup.start
+        self._sums = np.zeros(kernels.SIZE)
+        self._squares = np.ones(4)
+
+    # E-step -------------------------------------------------------------------------------------------------
+
+    def forward(self, first: int, last: int, *, restart: bool) -> float:
+        """Filter rows first..last-1; with restart the prior at `first` is the one on the tape. Log-likelihood."""
+        t, p = self.tape, self.parameters
+        inertia = p.inertia
+        return kernels.forward(
+            first, last, restart, t.time, t.kind, t.y, t.thrust, t.torque, p.theta[0], inertia, np.linalg.inv(inertia),
+            p.noise.q, p.noise.r, START_VARIANCE, t.xp, t.pp, t.xf, t.pf, t.gain, t.s, t.e, t.blocks, t.middle,
+            t.loglik,
+        )  # fmt: skip
+
+    def backward(self, first: int, last: int) -> None:
+        """Smooth rows first..last-1 and fill their statistics."""
+        t, p = self.tape, self.parameters
+        inertia = p.inertia
+        kernels.backward(
+            first, last, t.time, t.kind, t.usable, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
+            t.thrust_delay, t.torque_delay, p.theta[4], p.theta[5], p.theta[0], inertia, np.linalg.inv(inertia), p.noise.q, p.noise.r, t.xf, t.pf, t.gain, t.s, t.e, t.blocks,
+            t.middle, t.stats, t.moments,
+        )  # fmt: skip
+
+    def refill_inputs(self, first: int, last: int) -> None:
+        """Mean inputs of the window with the present time constant."""
+        self.inputs.refill(self.tape, first, last, self.parameters.theta[4], self.parameters.theta[5])
+
+    # M-step -------------------------------------------------------------------------------------------------
+
+    def maximise(self, first: int, last: int, *, iterations: int = 30) -> Parameters:
+        """Parameters and noise that maximise the expected log-likelihood given the statistics of the window."""
+        kernels.total(first + 1, last, self.tape.stats, self._sums)
+        prior = self.setup.prior
+        theta = self.parameters.theta.copy()
+        if self._sums[kernels.COUNT] >= 3:
+            maximise(theta, self._sums, self.setup.free, prior.centre, prior.precision, iterations, self._squares)
+            # a lag linearised at one value is not to be believed far from it
+            before = self.parameters.theta[4]
+            theta[4] = min(1.25 * before, max(0.8 * before, theta[4]))
+        return Parameters(theta, self._noise(theta), self.parameters.inertia_products)
+
+    def _noise(self, theta: NDArray) -> Noise:
+        """Noise scales of the M-step: mean squares, the weak prior taking its share."""
+        sums, prior = self._sums, self.setup.prior
+        n = sums[kernels.COUNT]
+        if n < 3:
+            return self.parameters.noise
+        squares = np.empty(10)
+        squares[:2] = sums[kernels.IMPULSE : kernels.IMPULSE + 2] / n
+        squares[2:6] = self._squares / theta[:4] ** 2 / n
+        seen = np.maximum(sums[kernels.MEASURED : kernels.MEASURED + 4], 1e-9)
+        squares[6:] = sums[kernels.RESIDUAL : kernels.RESIDUAL + 4] / seen
+        # curvature of the log-likelihood in log s is 2 n; the prior adds its own
+        weight = 1.0 / (1.0 + 2 * np.concatenate([np.full(6, n), seen]) * prior.noise_sd**2)
+        with np.errstate(divide="ignore"):
+            logs = 0.5 * np.log(np.maximum(squares, 1e-300)) * (1 - weight) + prior.noise.logs * weight
+        logs = np.where(weight > 0.5, prior.noise.logs, logs)
+        return self._bounded(logs)
+
+    def _bounded(self, logs: NDArray) -> Noise:
+        prior = self.setup.prior
+        floor = np.log(np.concatenate([prior.impulse_floor, prior.measurement_floor]))
+        return Noise.from_logs(np.maximum(logs, floor))
+
+    def _noise_score(self, first: int, last: int) -> tuple[NDArray, float]:
+        """Scoring step (10,) of the logarithms of the noise scales, and its largest length in standard deviations.
+
+        The score comes from the smoother (Fisher's identity: it is the expected complete-data score); the information is
+        the larger of its diagonal part and the long-run variance of the score's terms, so that steps never overshoot far.
+        """
+        noise, prior = self.parameters.noise, self.setup.prior
+        rows = self.tape.stats[first + 1 : last]
+        counts = rows[:, kernels.COUNT : kernels.COUNT + 1]
+        terms = np.concatenate(
+            [
+                rows[:, kernels.IMPULSE : kernels.IMPULSE + 6] / noise.q - counts,
+                rows[:, kernels.RESIDUAL : kernels.RESIDUAL + 4] / np.square(noise.measurement)
+                - rows[:, kernels.MEASURED : kernels.MEASURED + 4],
+            ],
+            axis=1,
+        )
+        diagonal = 2 * rows[:, kernels.IMPULSE_SEEN :].sum(0)
+        information = np.maximum(diagonal, _long_run(terms)) + prior.noise_sd**-2
+        score = terms.sum(0) + (prior.noise.logs - noise.logs) / prior.noise_sd**2
+        step = np.clip(score / information, -1.5, 1.5)
+        bounded = self._bounded(noise.logs + step).logs - noise.logs
+        return bounded, float(np.max(np.abs(bounded) * np.sqrt(information)))
+
+    # passes -------------------------------------------------------------------------------------------------
+
+    def incremental(self, first: int, fresh: int, last: int, *, lookback: int) -> None:
+        """Filter rows fresh..last-1, smooth the newest `lookback` before them too, maximise."""
+        self.inputs.advance(self.tape, fresh, last, self.parameters.theta[4], self.parameters.theta[5])
+        self.forward(fresh, last, restart=False)
+        self.backward(max(first, fresh - lookback - 1), last)
+        self.parameters = self.maximise(first, last, iterations=3)
+
+    def information(self, first: int, last: int) -> Information:
+        """Score and information at the present parameters; the window must have been filtered with them."""
+        t, p, setup = self.tape, self.parameters, self.setup
+        inertia = p.inertia
+        matrix = kernels.sensitivities(
+            first, last, t.time, t.kind, t.usable, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
+            t.thrust_delay, t.torque_delay, p.theta, inertia, np.linalg.inv(inertia), t.xf, t.gain, t.s, t.e, t.blocks, t.middle, t.score,
+        )  # fmt: skip
+        free = np.flatnonzero(setup.free)
+        precision = setup.prior.precision
+        score = t.score[first:last, free].sum(0) - (precision * offset(p.theta, setup.prior.centre))[free]
+        posterior = matrix[np.ix_(free, free)] + np.diag(precision[free])
+        covariance = np.linalg.inv(posterior)
+        step = np.zeros(6)
+        step[free] = covariance @ score
+        decrement = float(np.sqrt(max(score @ step[free], 0.0)))
+        widened, inflation = _widen(covariance, t.score[first:last, free])
+        full, factors = np.zeros((6, 6)), np.ones(6)
+        full[np.ix_(free, free)] = widened
+        factors[free] = inflation
+        return Information(matrix, full, step, decrement, factors)
+
+    def converge(self, first: int, last: int, *, passes: int) -> Information:
+        """Full passes until the score test is passed, at most `passes`: EM while far, scoring when near.
+
+        The tape is left filtered and smoothed with the parameters that the returned information belongs to.
+        """
+        for count in range(passes):
+            self.refill_inputs(first, last)
+            self.forward(first, last, restart=True)
+            info = self.information(first, last)
+            self.backward(first, last)
+            noise_step, noise_length = self._noise_score(first, last)
+            if (info.decrement < TOLERANCE and noise_length < TOLERANCE) or count == passes - 1:
+                break
+            after = self.maximise(first, last)
+            em_step = np.max(np.abs(offset(after.theta, self.parameters.theta)[:4]))
+            if info.decrement < 10.0 and em_step < 0.1:
+                theta = displaced(self.parameters.theta, np.clip(info.step, -0.2, 0.2))
+                noise = Noise.from_logs(self.parameters.noise.logs + noise_step)
+                self.parameters = Parameters(theta, noise, after.inertia_products)
+            else:
+                self.parameters = after
+        return info
+
+
+def offset(theta: NDArray, origin: NDArray) -> NDArray:
+    """How far theta is from origin: logarithms of the ratios, the delay's difference in DELAY_UNIT. (6,) -> (6,)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = np.where((theta > 0) & (origin > 0), np.log(theta / origin), 0.0)
+    logs[5] = (theta[5] - origin[5]) / kernels.DELAY_UNIT
+    return logs
+
+
+def displaced(theta: NDArray, step: NDArray) -> NDArray:
+    """Inverse of `offset`: theta moved by a step in those coordinates."""
+    moved = theta * np.exp(step)
+    moved[5] = theta[5] + kernels.DELAY_UNIT * step[5]
+    return moved
+
+
+def _widen(covariance: NDArray, score: NDArray) -> tuple[NDArray, NDArray]:
+    """Covariance widened for scores that are correlated in time (Newey and West 1987), never narrowed.
+
+    Real disturbances are not white and onboard estimates have memory; the plain covariance then claims too much.
+    """
+    inflation = np.ones(len(covariance))
+    if len(score) < 2 * MIN_LAGS:
+        return covariance, inflation
+    scaled = score @ covariance
+    scaled = scaled - scaled.mean(0)
+    plain = np.sum(scaled**2, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(plain > 0, _long_run(scaled) / plain, 1.0)
+    inflation = np.sqrt(np.maximum(ratio, 1.0))
+    return covariance * np.outer(inflation, inflation), inflation
+
+
+def _long_run(terms: NDArray) -> NDArray:
+    """Variance of the sum over rows of terms (n, p) that may be correlated in time (Bartlett kernel). (p,)."""
+    n = len(terms)
+    long_run = np.sum(terms**2, 0)
+    if n >= 2 * MIN_LAGS:
+        lags = min(n // 8, 100)
+        for lag in range(1, lags + 1):
+            long_run += 2 * (1 - lag / (lags + 1)) * np.sum(terms[lag:] * terms[:-lag], 0)
+    return long_run

@@ -1,0 +1,98 @@
+"""The inputs of the rigid body: commanded thrust and torque as logged, turned into means over the steps of the tape."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.estimation.tape import Tape
+from crazyem.physics.lag import CAUSAL, fit_predictor, hold_predictor, lagged_means
+
+MAX_GAP = 0.1  # s without an input beyond which a step cannot be trusted
+SETTLE = 5.0  # time constants after which a lag has forgotten where it started
+
+
+class InputHistory:
+    """Stamps and wrenches in the order they came, and the state of the rotor lag at the newest node."""
+
+    def __init__(self, mode: int, capacity: int = 4096) -> None:
+        self.mode = mode  # LINEAR, HOLD or CAUSAL of crazyem.physics.lag
+        self.times = np.zeros(capacity)
+        self.wrenches = np.zeros((capacity, 4))
+        self.size = 0
+        self.lag = np.zeros(13)  # see lagged_means
+        self._at = 0  # command at or before the time of the lag's state
+        self.predictor = hold_predictor()
+        self.gap_end = -np.inf  # when the last long gap between inputs ended
+
+    @property
+    def newest(self) -> float:
+        """Stamp of the newest input [s], -inf if none."""
+        return self.times[self.size - 1] if self.size else -np.inf
+
+    def append(self, time: float, wrench: NDArray, *, needed_from: float) -> bool:
+        """Add an input; False if its stamp is not newer than the newest. Inputs before `needed_from` may be dropped."""
+        if time <= self.newest:
+            return False
+        if self.size == 0:
+            self.lag[:12] = np.tile(wrench, 3)
+            self.lag[12] = time
+        elif time - self.newest > MAX_GAP:
+            self.gap_end = time
+        if self.size == len(self.times):
+            self._make_room(needed_from)
+        self.times[self.size] = time
+        self.wrenches[self.size] = wrench
+        self.size += 1
+        return True
+
+    def _make_room(self, needed_from: float) -> None:
+        drop = max(0, int(np.searchsorted(self.times[: self.size], min(needed_from, self.lag[12]), "right")) - 1)
+        if drop > self.size // 4:
+            keep = self.size - drop
+            self.times[:keep] = self.times[drop : self.size].copy()
+            self.wrenches[:keep] = self.wrenches[drop : self.size].copy()
+            self.size = keep
+            self._at = max(0, self._at - drop)
+        else:
+            self.times = np.concatenate([self.times, np.zeros_like(self.times)])
+            self.wrenches = np.concatenate([self.wrenches, np.zeros_like(self.wrenches)])
+
+    def covers(self, begin: float, end: float) -> bool:
+        """Whether no stretch of [begin, end] is more than MAX_GAP away from inputs on both sides."""
+        times = self.times[: self.size]
+        first = int(np.searchsorted(times, begin, "right")) - 1
+        last = int(np.searchsorted(times, end, "left"))
+        if first < 0:
+            return False
+        inside = times[first : min(last + 1, self.size)]
+        return bool(np.all(np.diff(inside) <= MAX_GAP) and end - inside[-1] <= MAX_GAP)
+
+    def advance(self, tape: Tape, first: int, last: int, tau: float, delay: float) -> None:
+        """Fill the means of rows first..last-1, going on from the newest node."""
+        self._at = lagged_means(
+            self.times, self.wrenches, self._at, self.size, self.predictor, tape.time, first, last, self.mode, tau, delay, self.lag,
+            tape.mean, tape.mean_tau, tape.mean_delay,
+        )  # fmt: skip
+        tape.spread_inputs(first, last)
+
+    def skip_to(self, time: float, tau: float, delay: float) -> None:
+        """Move the lag's state to a time at which no node is wanted (on the ground)."""
+        node = np.array([time])
+        scratch = np.zeros((1, 4))
+        self._at = lagged_means(
+            self.times, self.wrenches, self._at, self.size, self.predictor, node, 0, 1, self.mode, tau, delay, self.lag, scratch,
+            scratch.copy(),
+            scratch.copy(),
+        )  # fmt: skip
+
+    def refill(self, tape: Tape, first: int, last: int, tau: float, delay: float) -> None:
+        """Recompute the means of rows first+1..last-1 with another time constant and delay."""
+        start = tape.time[first] - delay - 2 * SETTLE * max(tau, 0.02)
+        at = max(0, int(np.searchsorted(self.times[: self.size], start, "right")) - 1)
+        if self.mode == CAUSAL:
+            end = int(np.searchsorted(self.times[: self.size], tape.time[last - 1], "right"))
+            begin = int(np.searchsorted(self.times[: self.size], tape.time[first]))
+            self.predictor = fit_predictor(self.wrenches[begin:end])
+        self.lag[:12] = np.tile(self.wrenches[at], 3)
+        self.lag[12] = self.times[at]
+        self._at = at
+        self.advance(tape, first, last, tau, delay)

@@ -1,0 +1,144 @@
+"""What is estimated and what is assumed: parameter vector, noise scales, priors. Frozen; one `Parameters` per update."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.estimation.kernels import DELAY_UNIT
+from crazyem.vehicle import Vehicle
+
+NAMES = ("mass", "Ixx", "Iyy", "Izz", "motor_time_constant", "input_delay")
+GROUPS = ("position", "velocity", "attitude", "body_rate")
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise scales. Process noise is kept in units of acceleration, where it does not depend on mass and inertia.
+
+    Attributes:
+        impulse: (6,) intensities of specific force x y z [m/s^2 sqrt(s)] and angular acceleration [rad/s^2 sqrt(s)].
+        measurement: (4,) standard deviations of position [m], velocity [m/s], attitude [rad], body rate [rad/s].
+    """
+
+    impulse: NDArray
+    measurement: NDArray
+
+    @property
+    def logs(self) -> NDArray:
+        """Logarithms of all ten scales: impulses, then measurements."""
+        return np.log(np.concatenate([self.impulse, self.measurement]))
+
+    @classmethod
+    def from_logs(cls, logs: NDArray) -> "Noise":
+        """Inverse of `logs`."""
+        return cls(np.exp(logs[:6]), np.exp(logs[6:]))
+
+    @property
+    def q(self) -> NDArray:
+        """Impulse variances per second (6,), for the kernels."""
+        return np.square(self.impulse)
+
+    @property
+    def r(self) -> NDArray:
+        """Measurement variances (12,), for the kernels."""
+        return np.repeat(np.square(self.measurement), 3)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Weak log-normal priors on the parameters and on the noise scales; these keep a scale from collapsing to zero.
+
+    Attributes:
+        centre: (6,) of mass, Ixx, Iyy, Izz, time constant, delay.
+        sd: (6,) of the logarithms; of the delay in DELAY_UNIT.
+        noise: scales that the prior is centred on.
+        noise_sd: of the logarithms of the noise scales.
+        impulse_floor, measurement_floor: smallest scales admitted (6,), (4,): far below what a real sensor resolves.
+    """
+
+    centre: NDArray
+    sd: NDArray
+    noise: Noise
+    noise_sd: float = 1.5
+    impulse_floor: NDArray = field(default_factory=lambda: np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3]))
+    measurement_floor: NDArray = field(default_factory=lambda: np.array([5e-5, 1e-4, 1e-4, 1e-4]))
+
+    @property
+    def precision(self) -> NDArray:
+        """(6,) of the logarithms, and of the delay in DELAY_UNIT."""
+        return 1.0 / np.square(self.sd)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """A point in parameter space: theta (6,: m, Ixx, Iyy, Izz, tau, delay; SI), fixed products of inertia, noise."""
+
+    theta: NDArray
+    noise: Noise
+    inertia_products: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def inertia(self) -> NDArray:
+        """Inertia matrix (3, 3) [kg m^2]."""
+        xy, xz, yz = self.inertia_products
+        return np.array([[self.theta[1], xy, xz], [xy, self.theta[2], yz], [xz, yz, self.theta[3]]])
+
+    def with_theta(self, theta: NDArray) -> "Parameters":
+        """The same with another theta."""
+        return replace(self, theta=theta)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Start, prior and what is free: all that the estimator is told before the first sample."""
+
+    start: Parameters
+    prior: Prior
+    free: NDArray  # (6,) bool
+
+
+# Where the noise scales start: process noise large in units of acceleration, so that the first samples decide and not the start.
+START_IMPULSE = np.array([0.5, 0.5, 5.0, 20.0, 20.0, 20.0])
+START_MEASUREMENT = np.array([1e-3, 1e-2, 3e-3, 3e-3])
+
+# Delay between an input's stamp and its effect on the logged rates [s]: centre and standard deviation of the prior.
+# Commands of a Crazyflie: held for 2 ms at 500 Hz (1 ms in the mean), and rates low-passed at 80 Hz, second order (2.8 ms).
+DELAY_OF_COMMANDS = (3.5e-3, 2e-3)
+DELAY_OF_SPEEDS = (0.0, 10e-3)
+
+
+def setup_for(
+    vehicle: Vehicle, *, mass: float | None = None, inertia: tuple[float, float, float] | None = None, lag: bool = True
+) -> Setup:
+    """Start and prior for a vehicle.
+
+    Args:
+        vehicle: nominal constants; centre of the prior.
+        mass: [kg] start of a cold start, e.g. 0.001 (paper, eq. 116); the prior on mass is then flat in effect.
+        inertia: [kg m^2] start of a cold start.
+        lag: whether inputs are commands, with the rotor lag still to come (False: rotor speeds or true wrenches).
+    """
+    delay, delay_sd = DELAY_OF_COMMANDS if lag else DELAY_OF_SPEEDS
+    centre = np.array([vehicle.mass, *vehicle.inertia, vehicle.motor_time_constant, delay])
+    cold = mass is not None or inertia is not None
+    start = centre.copy()
+    if mass is not None:
+        start[0] = mass
+    if inertia is not None:
+        start[1:4] = inertia
+    has_lag = lag and vehicle.motor_time_constant > 0
+    timed = has_lag or not lag  # a wrench that is given as it acts has neither lag nor delay
+    if not has_lag:
+        start[4] = 0.0
+    if not timed:
+        start[5] = 0.0
+    noise = Noise(START_IMPULSE.copy(), START_MEASUREMENT.copy())
+    # A cold start claims to know nothing: centre on the start, as the paper does, but so wide that 4 s of data drown it.
+    prior = Prior(
+        centre=np.append(np.where(start > 0, start if cold else centre, 1.0)[:5], start[5]),
+        sd=np.array([*((10.0, 1.5, 1.5, 1.5) if cold else (1.0, 0.5, 0.5, 0.5)), 0.7, delay_sd / DELAY_UNIT]),
+        noise=Noise(np.array([0.02, 0.02, 0.05, 0.5, 0.5, 0.5]), START_MEASUREMENT.copy()),
+    )
+    free = np.array([True, True, True, True, has_lag, timed])
+    return Setup(Parameters(start, noise, vehicle.inertia_products), prior, free)

@@ -1,0 +1,368 @@
+"""The online estimator: samples in, estimates out; deterministic, so a replay gives the numbers of the flight.
+
+Samples of one instant are gathered into a node; a node waits until the inputs up to it are known, passes the contact gate
+and goes onto the tape. Every `every` nodes the newest `window` of them give an update: an incremental pass by default,
+full passes while the parameters still move, and every second a full pass that also renews the uncertainty.
+"""
+
+import math
+import time as clock
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.errors import DataError, UsageError
+from crazyem.estimation.contact import ContactGate
+from crazyem.estimation.em import Information, WindowEM, displaced, offset
+from crazyem.estimation.inputs import MAX_GAP, SETTLE, InputHistory
+from crazyem.estimation.kernels import DELAY_UNIT
+from crazyem.estimation.model import GROUPS, NAMES, Parameters, Setup, setup_for
+from crazyem.estimation.mstep import DELAY
+from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
+from crazyem.estimation.tape import Tape
+from crazyem.physics.lag import CAUSAL, HOLD, LINEAR
+from crazyem.physics.rotors import wrench_from_command, wrench_from_speed
+from crazyem.signals.sample import Sample
+from crazyem.vehicle import Vehicle
+
+SAME_NODE = 0.0015  # s; measurements closer than this belong to one node
+PATIENCE = 0.06  # s a node waits for inputs before the last one is held
+LOOKBACK = 40  # samples smoothed again in an incremental pass
+REFRESH = 25  # updates between two full passes with information
+YOUNG = 200  # samples below which every update is a full pass
+MOVED = 0.02  # change of a parameter's logarithm that calls for full passes
+IDENTIFIABLE = 0.15  # largest standard deviation of a logarithm that counts as identified
+
+_COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
+_INPUTS = ("motor_command", "rotor_speed", "wrench_command")
+
+
+@dataclass
+class Counters:
+    """What came in and what was not used."""
+
+    nodes: int = 0
+    grounded: int = 0
+    late: int = 0
+    missing: int = 0  # samples with NaN, used as missing
+    breaks: int = 0
+    unpowered: int = 0  # motor commands before any battery voltage was known
+
+
+@dataclass
+class _Node:
+    time: float
+    y: NDArray = field(default_factory=lambda: np.full(13, np.nan))
+
+
+class OnlineEstimator:
+    """Windowed online EM for mass, inertia, rotor time constant and noise scales.
+
+    Args:
+        vehicle: nominal constants: rotors, start, centre of the weak prior.
+        window: how many of the newest samples an update uses.
+        every: samples between updates.
+        input_signal: motor_command, rotor_speed or wrench_command; None takes the first of these the vehicle can use.
+        mass, inertia: start values of a cold start [kg], [kg m^2].
+
+    Attributes:
+        airborne: verdict of the contact gate on the newest node.
+        update_seconds: wall-clock cost of each update [s].
+        counters: what came in.
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        *,
+        window: int = 800,
+        every: int = 4,
+        input_signal: str | None = None,
+        mass: float | None = None,
+        inertia: tuple[float, float, float] | None = None,
+    ) -> None:
+        if window < 20:
+            raise UsageError(f"a window of {window} samples is too short to estimate from (at least 20)")
+        if every < 1:
+            raise UsageError(f"an update every {every} samples is not possible (at least 1)")
+        if input_signal is not None and input_signal not in _INPUTS:
+            raise UsageError(f"unknown input signal '{input_signal}' (known: {', '.join(_INPUTS)})")
+        self.vehicle = vehicle
+        self.window = window
+        self.every = every
+        self._input = input_signal
+        self._cold = (mass, inertia)
+        self._setup: Setup | None = None
+        self._em: WindowEM | None = None
+        self._tape = Tape(3 * window + 64)
+        self._inputs = InputHistory(CAUSAL)
+        self._gate = ContactGate(4 * vehicle.thrust_max)
+        self._group: dict[str, tuple[float, ...]] = {}
+        self._group_time = -math.inf
+        self._pending: list[_Node] = []
+        self._voltage = math.nan
+        self._flying: bool | None = None
+        self._starts = True
+        self._fresh = 0  # first row not yet filtered
+        self._since = 0
+        self._updates = 0
+        self._information: Information | None = None
+        self._settled: Parameters | None = None  # parameters of the last full pass
+        self._converged = False
+        self._last_time = math.nan
+        self.counters = Counters()
+        self.update_seconds: list[float] = []
+
+    # what comes in -------------------------------------------------------------------------------------------
+
+    @property
+    def airborne(self) -> bool:
+        """Whether the newest node was in free flight."""
+        return self._gate.airborne
+
+    def feed(self, sample: Sample) -> Estimate | None:
+        """Take one sample; returns an estimate when an update was due. Samples of unknown signals are ignored."""
+        result = None
+        if sample.time != self._group_time:
+            result = self._close_group()
+            self._group_time = sample.time
+        self._group[sample.signal] = sample.value
+        return result
+
+    def finish(self) -> Estimate:
+        """The estimate of the newest window, converged, with fresh uncertainty.
+
+        Raises:
+            DataError: there were no inputs that this vehicle can use.
+        """
+        self._close_group()
+        self._admit(flush=True)
+        if self._inputs.size == 0:
+            raise DataError(
+                f"nothing to estimate from: vehicle '{self.vehicle.name}' needs "
+                + ("motor commands with battery voltage" if self.vehicle.thrust_curve else "a thrust and torque signal")
+                + ", and the data have none"
+            )
+        if self._em is not None and self._tape.size > 5:
+            first = max(0, self._tape.size - self.window)
+            if self._fresh < self._tape.size:
+                self._em.incremental(first, self._fresh, self._tape.size, lookback=LOOKBACK)
+                self._fresh = self._tape.size
+            self._information = self._em.converge(first, self._tape.size, passes=60)
+            self._judge()
+            self._updates += 1
+        return self._estimate()
+
+    def _close_group(self) -> Estimate | None:
+        group, time = self._group, self._group_time
+        if not group:
+            return None
+        self._group = {}
+        if "voltage" in group and math.isfinite(group["voltage"][0]):
+            self._voltage = group["voltage"][0]
+        if "flying" in group and math.isfinite(group["flying"][0]):
+            self._flying = group["flying"][0] > 0.5
+        self._take_input(group, time)
+        if any(name in group for name in _COLUMNS):
+            self._take_measurement(group, time)
+        return self._admit(flush=False)
+
+    def _take_input(self, group: dict[str, tuple[float, ...]], time: float) -> None:
+        if self._input is None:
+            usable = {
+                "rotor_speed": self.vehicle.rotor_constant is not None,
+                "motor_command": bool(self.vehicle.thrust_curve),
+                "wrench_command": not self.vehicle.thrust_curve,
+            }
+            seen = [n for n in ("rotor_speed", "motor_command", "wrench_command") if usable[n] and n in group]
+            seen = [n for n in seen if n != "rotor_speed" or np.all(np.isfinite(group[n]))]
+            if not seen:
+                return
+            self._input = seen[0]
+        if self._input not in group:
+            return
+        value = np.asarray(group[self._input], float)
+        if not np.all(np.isfinite(value)):
+            self.counters.missing += 1
+            return
+        if self._input == "motor_command":
+            if math.isnan(self._voltage):
+                self.counters.unpowered += 1
+                return
+            wrench = wrench_from_command(value, np.float64(self._voltage), self.vehicle)
+        elif self._input == "rotor_speed":
+            wrench = wrench_from_speed(value, self.vehicle)
+        else:
+            wrench = value
+        if self._setup is None:
+            mass, inertia = self._cold
+            self._setup = setup_for(self.vehicle, mass=mass, inertia=inertia, lag=self._input != "rotor_speed")
+            if not self._setup.free[4]:
+                self._inputs.mode = LINEAR if self._input == "rotor_speed" else HOLD
+            self._em = WindowEM(self._setup, self._tape, self._inputs)
+        oldest = self._tape.time[max(0, self._tape.size - self.window)] if self._tape.size else time
+        if not self._inputs.append(time, wrench, needed_from=oldest - 2.0):
+            self.counters.late += 1
+
+    def _take_measurement(self, group: dict[str, tuple[float, ...]], time: float) -> None:
+        newest = self._pending[-1].time if self._pending else self._last_time
+        if time <= newest + 1e-9:
+            self.counters.late += 1
+            return
+        node = self._pending[-1] if self._pending and time - self._pending[-1].time < SAME_NODE else _Node(time)
+        new = node.y.copy()
+        for name, columns in _COLUMNS.items():
+            if name in group:
+                value = np.asarray(group[name], float)
+                if name == "attitude" and not np.all(np.isfinite(value)):
+                    value = np.full(4, np.nan)
+                if not np.all(np.isfinite(value)):
+                    self.counters.missing += 1
+                new[columns] = np.where(np.isfinite(value), value, np.nan)
+        if np.all(np.isnan(new)):
+            return
+        node.y = new
+        if not self._pending or node is not self._pending[-1]:
+            self._pending.append(node)
+
+    # nodes onto the tape ------------------------------------------------------------------------------------
+
+    def _admit(self, *, flush: bool) -> Estimate | None:
+        result = None
+        if self._em is None:
+            if len(self._pending) > 3:  # no inputs yet: nothing can come of these
+                del self._pending[:-3]
+            return None
+        while self._pending:
+            node = self._pending[0]
+            newest = max(self._pending[-1].time, self._inputs.newest)
+            if not flush and self._inputs.newest < node.time and newest - node.time < PATIENCE:
+                break
+            if not flush and len(self._pending) == 1 and newest - node.time < SAME_NODE:
+                break  # another block may still bring measurements of this instant
+            self._pending.pop(0)
+            result = self._place(node) or result
+        return result
+
+    def _place(self, node: _Node) -> Estimate | None:
+        assert self._em is not None
+        self._last_time = node.time
+        self.counters.nodes += 1
+        inputs, tape = self._inputs, self._tape
+        tau, delay = self._em.parameters.theta[4:6]
+        if node.time < inputs.times[0]:
+            return None
+        at = max(0, int(np.searchsorted(inputs.times[: inputs.size], node.time, "right")) - 1)
+        airborne = self._gate.update(height=float(node.y[2]), thrust=float(inputs.wrenches[at, 0]), flying=self._flying)
+        if not airborne:
+            self.counters.grounded += 1
+            if not self._starts:
+                self._starts = True
+            if self._fresh == tape.size:
+                inputs.skip_to(node.time, tau, delay)
+            return None
+        previous = tape.time[tape.size - 1] if tape.size else -math.inf
+        starts = self._starts or node.time - previous > MAX_GAP or not inputs.covers(previous, node.time)
+        if starts:
+            self.counters.breaks += 1
+        self._starts = False
+        dropped = tape.append(node.time, node.y, starts=starts, keep=self.window + LOOKBACK + 2 * self.every + 8)
+        self._fresh -= dropped
+        if node.time - inputs.gap_end < SETTLE * max(tau, 0.02) and self._setup is not None and self._setup.free[4]:
+            tape.usable[tape.size - 1] = False
+        self._since += 1
+        if self._since < self.every:
+            return None
+        self._since = 0
+        begin = clock.perf_counter()
+        self._update()
+        self.update_seconds.append(clock.perf_counter() - begin)
+        return self._estimate()
+
+    # updates ------------------------------------------------------------------------------------------------
+
+    def _update(self) -> None:
+        em, tape = self._em, self._tape
+        assert em is not None
+        self._updates += 1
+        last = tape.size
+        first = max(0, last - self.window)
+        em.incremental(first, self._fresh, last, lookback=LOOKBACK)
+        self._fresh = last
+        moved = math.inf
+        if self._settled is not None:
+            change = offset(em.parameters.theta, self._settled.theta)
+            moved = float(np.max(np.abs(change[:5])))
+        young = last - first < min(YOUNG, self.window)
+        if young or moved > MOVED or self._updates % REFRESH == 0:
+            self._information = em.converge(first, last, passes=4 if young or moved > MOVED else 3)
+            self._settled = em.parameters
+            self._judge()
+
+    def _judge(self) -> None:
+        assert self._information is not None
+        self._converged = self._information.decrement < 0.2
+
+    # what goes out ------------------------------------------------------------------------------------------
+
+    def _estimate(self) -> Estimate:
+        if self._em is None or self._setup is None or self._information is None:
+            return self._nothing()
+        theta = self._em.parameters.theta
+        sd = np.sqrt(np.maximum(np.diag(self._information.covariance), 0.0))
+        parameters = {}
+        for i, name in enumerate(NAMES):
+            identifiable, reason = self._verdict(i, float(sd[i]))
+            low, high = (displaced(theta, np.eye(6)[i] * z * sd[i])[i] for z in (-1.96, 1.96))
+            parameters[name] = ParameterEstimate(
+                value=float(theta[i]),
+                sd=float(sd[i] * (theta[i] if i != DELAY else DELAY_UNIT)),
+                ci95=(float(low), float(high)),
+                unit=PARAMETER_UNITS[name],
+                identifiable=identifiable,
+                reason=reason,
+            )
+        noise = self._em.parameters.noise
+        scale = np.concatenate([np.full(3, theta[0]), theta[1:4]])
+        intensities = noise.impulse * scale
+        names = ("force_x", "force_y", "thrust", "torque_x", "torque_y", "torque_z")
+        return Estimate(
+            time=float(self._tape.time[self._tape.size - 1]),
+            parameters=parameters,
+            noise={**dict(zip(names, intensities.tolist())), **dict(zip(GROUPS, noise.measurement.tolist()))},
+            samples=int(min(self._tape.size, self.window)),
+            updates=self._updates,
+            converged=self._converged,
+        )
+
+    def _verdict(self, i: int, sd: float) -> tuple[bool, str]:
+        assert self._em is not None and self._setup is not None
+        if not self._setup.free[i]:
+            return False, "the inputs already include the rotor lag" if i == 4 else "held fixed"
+        if i == DELAY:
+            prior = self._setup.prior.sd[DELAY]
+            return (True, "") if sd < 0.7 * prior else (False, "the data say no more than the prior does")
+        if self._tape.size < 20:
+            return False, f"only {self._tape.size} samples in flight"
+        if not sd < IDENTIFIABLE:
+            what = ("thrust", "torque about x", "torque about y", "torque about z", "commands")[i]
+            return False, f"too little excitation: {what} determines it only within {196 * sd:.0f} % (95 %)"
+        if not self._converged:
+            return False, "not converged yet"
+        return True, ""
+
+    def _nothing(self) -> Estimate:
+        """What is said before anything was flown: the nominal value and no confidence at all."""
+        vehicle = self.vehicle
+        values = (vehicle.mass, *vehicle.inertia, vehicle.motor_time_constant, 0.0)
+        reason = self._gate.reason or "no samples in flight"
+        return Estimate(
+            time=self._last_time,
+            parameters={
+                name: ParameterEstimate(value, math.inf, (0.0, math.inf), PARAMETER_UNITS[name], False, reason)
+                for name, value in zip(NAMES, values)
+            },
+            samples=0,
+            updates=self._updates,
+        )
