@@ -121,7 +121,7 @@ def text_summary(summary: Mapping[str, Any], estimate: Estimate) -> str:
 
 def live_line(phase: str, seconds: float, estimate: Estimate | None, *, lost: int, pushes: int) -> str:
     """One line per second: phase, mass and inertia with 95 % half widths, losses, pushes."""
-    head = f"{phase:<12.12} {seconds:6.1f} s"
+    head = f"{phase:<13.13} {seconds:6.1f} s"
     if estimate is None:
         return f"{head}  no estimate yet"
     parts = []
