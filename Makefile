@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: fly test slow lint bench clean setup
+.PHONY: fly test slow lint bench cfclient-test clean setup
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -14,7 +14,8 @@ $(READY): pyproject.toml
 setup: $(READY)
 
 fly: $(READY)  ## fly the simulated firmware with wrong constants and watch them being corrected
-	$(BIN)/crazyem fly --trajectory excite --duration 20 --record flight.mcap --json flight.json
+	$(BIN)/crazyem fly --scenario firmware_sim/scenarios/payload.toml --trajectory excite --duration 20 \
+		--record flight.mcap --json flight.json
 
 test: $(READY)  ## everything that is not marked slow
 	$(BIN)/python -m pytest -q -n 2
@@ -27,5 +28,13 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+bench: $(READY)  ## speed against named peers (those installed: pip install -e '.[bench]')
+	$(BIN)/python benchmarks/speed.py
+
+cfclient-test: $(READY)  ## the graphical client against the simulator, in an environment of its own
+	$(PYTHON) -m venv .venv-cfclient
+	.venv-cfclient/bin/python -m pip install --quiet --disable-pip-version-check 'cfclient==2026.8.1'
+	CFCLIENT_PYTHON=.venv-cfclient/bin/python $(BIN)/python -m pytest -q -m slow tests/firmware_sim/test_cfclient.py
+
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-cfclient .pytest_cache .mypy_cache .ruff_cache

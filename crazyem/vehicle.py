@@ -4,7 +4,7 @@ File format (all SI; `presets/*.toml` are examples):
 
     name = "cf2"
     mass = 0.029                      # kg
-    inertia = [1.66e-5, 1.67e-5, 2.93e-5]  # kg m^2: Ixx, Iyy, Izz, optionally followed by Ixy, Ixz, Iyz (matrix elements)
+    inertia = [1.66e-5, 1.67e-5, 2.93e-5]  # kg m^2: Ixx, Iyy, Izz[, Ixy, Ixz, Iyz]
     arm = 0.0325                      # m, rotor offset along body x and y (one number, or [x, y])
     thrust_curve = [c0, c1, c2, c3]   # N per rotor, polynomial in motor volts, constant first; or
     rotor_constant = 3.7e-8           # N/(rad/s)^2, thrust of one rotor over its speed squared
@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from crazyem.errors import FileFormatError, UsageError
 
@@ -168,7 +168,7 @@ def _check_inertia(moments: tuple[float, ...], products: tuple[float, ...], wher
         raise FileFormatError(f"{where}: key 'inertia' is not a positive definite matrix")
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
 
 

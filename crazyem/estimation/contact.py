@@ -36,7 +36,7 @@ class ContactGate:
             self.airborne, self.reason = True, ""
         elif not math.isnan(height):
             above = height - self._rest_height
-            if self.airborne and above < CONTACT or not self.airborne and above < CLEARANCE:
+            if (self.airborne and above < CONTACT) or (not self.airborne and above < CLEARANCE):
                 self.airborne, self.reason = False, "on the ground"
             else:
                 self.airborne, self.reason = True, ""

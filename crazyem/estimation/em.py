@@ -1,10 +1,10 @@
 """Expectation maximisation over a window of the tape: full passes, incremental passes, scoring, and the uncertainty.
 
-A full pass filters and smooths the whole window with the present parameters. An incremental pass filters the new samples
-and smooths only the newest ones; each older sample keeps the expectations it was given with the parameters of its time
-(they are physical quantities: accelerations, rates), which is incremental EM in the sense of Neal and Hinton. Where EM
-crawls, a Fisher-scoring step on the likelihood of the innovations takes over.
-"""
+A full pass filters and smooths the whole window with the present parameters. An incremental pass filters the
+new samples and smooths only the newest ones; each older sample keeps the expectations it was given with the
+parameters of its time (they are physical quantities: accelerations, rates), which is incremental EM in the
+sense of Neal and Hinton. Where EM crawls, a Fisher-scoring step on the likelihood of the innovations takes
+over."""
 
 from dataclasses import dataclass
 
@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.estimation import kernels
+from crazyem.estimation.aliasing import log_inertia_bias, noise_share, white_variance
 from crazyem.estimation.inputs import InputHistory
 from crazyem.estimation.model import Noise, Parameters, Setup
 from crazyem.estimation.mstep import maximise
+from crazyem.estimation.spectra import long_run
 from crazyem.estimation.tape import START_VARIANCE, Tape
 
 TOLERANCE = 0.05  # converged when the next scoring step is shorter than this many standard deviations
-MIN_LAGS = 16  # fewer rows than twice this say nothing about correlation in time
 
 
 @dataclass(frozen=True)
@@ -26,11 +27,13 @@ class Information:
     """Fisher information at a point, in logarithms of theta: what the data (and the weak prior) say.
 
     Attributes:
-        matrix: (6, 6) information of the data, zero rows where a parameter is fixed.
-        covariance: (6, 6) of the logarithms, prior included, widened where innovations are correlated in time.
-        step: (6,) scoring step of the logarithms.
+        matrix: (9, 9) information of the data, zero rows where a parameter is fixed.
+        covariance: (9, 9) of the logarithms, prior included, widened where innovations are correlated in time.
+        step: (9,) scoring step of the logarithms.
         decrement: length of that step in standard deviations.
-        inflation: (6,) factor by which correlation widened each standard deviation.
+        inflation: (9,) factor by which correlation widened each standard deviation.
+        bias: (3,) by which log Ixx, Iyy, Izz may be too large because commands are known only at their stamps; counted
+            as one more standard deviation in the covariance.
     """
 
     matrix: NDArray
@@ -38,6 +41,7 @@ class Information:
     step: NDArray
     decrement: float
     inflation: NDArray
+    bias: NDArray
 
 
 class WindowEM:
@@ -69,13 +73,14 @@ class WindowEM:
         inertia = p.inertia
         kernels.backward(
             first, last, t.time, t.kind, t.usable, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
-            t.thrust_delay, t.torque_delay, p.theta[4], p.theta[5], p.theta[0], inertia, np.linalg.inv(inertia), p.noise.q, p.noise.r, t.xf, t.pf, t.gain, t.s, t.e, t.blocks,
+            t.thrust_delay, t.torque_delay, p.theta[4], p.theta[5], p.theta[6:9], p.theta[0], inertia,
+            np.linalg.inv(inertia), p.noise.q, p.noise.r, t.xf, t.pf, t.gain, t.s, t.e, t.blocks,
             t.middle, t.stats, t.moments,
         )  # fmt: skip
 
     def refill_inputs(self, first: int, last: int) -> None:
         """Mean inputs of the window with the present time constant."""
-        self.inputs.refill(self.tape, first, last, self.parameters.theta[4], self.parameters.theta[5])
+        self.inputs.refill(self.tape, first, last, self.parameters.theta)
 
     # M-step -------------------------------------------------------------------------------------------------
 
@@ -85,7 +90,16 @@ class WindowEM:
         prior = self.setup.prior
         theta = self.parameters.theta.copy()
         if self._sums[kernels.COUNT] >= 3:
-            maximise(theta, self._sums, self.setup.free, prior.centre, prior.precision, iterations, self._squares)
+            maximise(
+                theta,
+                self.setup.unit,
+                self._sums,
+                self.setup.free,
+                prior.centre,
+                prior.precision,
+                iterations,
+                self._squares,
+            )
             # a lag linearised at one value is not to be believed far from it
             before = self.parameters.theta[4]
             theta[4] = min(1.25 * before, max(0.8 * before, theta[4]))
@@ -117,8 +131,8 @@ class WindowEM:
     def _noise_score(self, first: int, last: int) -> tuple[NDArray, float]:
         """Scoring step (10,) of the logarithms of the noise scales, and its largest length in standard deviations.
 
-        The score comes from the smoother (Fisher's identity: it is the expected complete-data score); the information is
-        the larger of its diagonal part and the long-run variance of the score's terms, so that steps never overshoot far.
+        The score comes from the smoother (Fisher's identity: the expected complete-data score); the information is the
+        larger of its diagonal part and the long-run variance of the score's terms, so that steps never overshoot far.
         """
         noise, prior = self.parameters.noise, self.setup.prior
         rows = self.tape.stats[first + 1 : last]
@@ -132,7 +146,7 @@ class WindowEM:
             axis=1,
         )
         diagonal = 2 * rows[:, kernels.IMPULSE_SEEN :].sum(0)
-        information = np.maximum(diagonal, _long_run(terms)) + prior.noise_sd**-2
+        information = np.maximum(diagonal, long_run(terms)) + prior.noise_sd**-2
         score = terms.sum(0) + (prior.noise.logs - noise.logs) / prior.noise_sd**2
         step = np.clip(score / information, -1.5, 1.5)
         bounded = self._bounded(noise.logs + step).logs - noise.logs
@@ -142,7 +156,7 @@ class WindowEM:
 
     def incremental(self, first: int, fresh: int, last: int, *, lookback: int) -> None:
         """Filter rows fresh..last-1, smooth the newest `lookback` before them too, maximise."""
-        self.inputs.advance(self.tape, fresh, last, self.parameters.theta[4], self.parameters.theta[5])
+        self.inputs.advance(self.tape, fresh, last, self.parameters.theta)
         self.forward(fresh, last, restart=False)
         self.backward(max(first, fresh - lookback - 1), last)
         self.parameters = self.maximise(first, last, iterations=3)
@@ -153,21 +167,49 @@ class WindowEM:
         inertia = p.inertia
         matrix = kernels.sensitivities(
             first, last, t.time, t.kind, t.usable, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
-            t.thrust_delay, t.torque_delay, p.theta, inertia, np.linalg.inv(inertia), t.xf, t.gain, t.s, t.e, t.blocks, t.middle, t.score,
+            t.thrust_delay, t.torque_delay, p.theta, self.setup.unit, inertia, np.linalg.inv(inertia), t.xf, t.gain,
+            t.s, t.e, t.blocks, t.middle, t.score,
         )  # fmt: skip
         free = np.flatnonzero(setup.free)
         precision = setup.prior.precision
-        score = t.score[first:last, free].sum(0) - (precision * offset(p.theta, setup.prior.centre))[free]
+        score = t.score[first:last, free].sum(0) - (precision * offset(p.theta, setup.prior.centre, setup.unit))[free]
         posterior = matrix[np.ix_(free, free)] + np.diag(precision[free])
         covariance = np.linalg.inv(posterior)
-        step = np.zeros(6)
+        step = np.zeros(9)
         step[free] = covariance @ score
         decrement = float(np.sqrt(max(score @ step[free], 0.0)))
         widened, inflation = _widen(covariance, t.score[first:last, free])
-        full, factors = np.zeros((6, 6)), np.ones(6)
+        full, factors = np.zeros((9, 9)), np.ones(9)
         full[np.ix_(free, free)] = widened
         factors[free] = inflation
-        return Information(matrix, full, step, decrement, factors)
+        bias = self.command_bias(first, last) if setup.free[4] else np.zeros(3)
+        for axis in range(3):
+            full[1 + axis, 1 + axis] += bias[axis] ** 2
+        if setup.free[4]:
+            full[4, 4] += np.mean(bias) ** 2
+        return Information(matrix, full, step, decrement, factors, bias)
+
+    def command_bias(self, first: int, last: int) -> NDArray:
+        """(3,) possible bias of the logarithms of inertia from noise in the samples of the commands (aliasing.py)."""
+        tape, theta = self.tape, self.parameters.theta
+        nodes = tape.time[first:last]
+        stamps, wrenches = self.inputs.between(nodes[0], nodes[-1])
+        if len(stamps) < 20:
+            return np.zeros(3)
+        nearest = np.clip(np.searchsorted(nodes, stamps), 1, len(nodes) - 1)
+        nearest -= stamps - nodes[nearest - 1] < nodes[nearest] - stamps
+        rates = tape.y[first:last][nearest, 10:13]
+        period = float(np.median(np.diff(stamps)))
+        variance = np.var(tape.torque[first + 1 : last], axis=0)
+        bias = np.zeros(3)
+        for axis in range(3):
+            white = white_variance(
+                wrenches[:, 1 + axis], rates[:, axis], rate_variance=float(self.parameters.noise.measurement[3] ** 2)
+            )
+            bias[axis] = log_inertia_bias(
+                noise_share(white, period=period, tau=float(theta[4]), torque_variance=float(variance[axis]))
+            )
+        return bias
 
     def converge(self, first: int, last: int, *, passes: int) -> Information:
         """Full passes until the score test is passed, at most `passes`: EM while far, scoring when near.
@@ -183,9 +225,9 @@ class WindowEM:
             if (info.decrement < TOLERANCE and noise_length < TOLERANCE) or count == passes - 1:
                 break
             after = self.maximise(first, last)
-            em_step = np.max(np.abs(offset(after.theta, self.parameters.theta)[:4]))
+            em_step = np.max(np.abs(offset(after.theta, self.parameters.theta, self.setup.unit)[:4]))
             if info.decrement < 10.0 and em_step < 0.1:
-                theta = displaced(self.parameters.theta, np.clip(info.step, -0.2, 0.2))
+                theta = displaced(self.parameters.theta, np.clip(info.step, -0.2, 0.2), self.setup.unit)
                 noise = Noise.from_logs(self.parameters.noise.logs + noise_step)
                 self.parameters = Parameters(theta, noise, after.inertia_products)
             else:
@@ -193,18 +235,18 @@ class WindowEM:
         return info
 
 
-def offset(theta: NDArray, origin: NDArray) -> NDArray:
-    """How far theta is from origin: logarithms of the ratios, the delay's difference in DELAY_UNIT. (6,) -> (6,)."""
+def offset(theta: NDArray, origin: NDArray, unit: NDArray) -> NDArray:
+    """How far theta is from origin: logarithms of the ratios, linear parameters in their units. (9,) -> (9,)."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        logs = np.where((theta > 0) & (origin > 0), np.log(theta / origin), 0.0)
-    logs[5] = (theta[5] - origin[5]) / kernels.DELAY_UNIT
-    return logs
+        far = np.where((theta > 0) & (origin > 0), np.log(theta / origin), 0.0)
+    far[kernels.DELAY :] = ((theta - origin) / unit)[kernels.DELAY :]
+    return far
 
 
-def displaced(theta: NDArray, step: NDArray) -> NDArray:
+def displaced(theta: NDArray, step: NDArray, unit: NDArray) -> NDArray:
     """Inverse of `offset`: theta moved by a step in those coordinates."""
     moved = theta * np.exp(step)
-    moved[5] = theta[5] + kernels.DELAY_UNIT * step[5]
+    moved[kernels.DELAY :] = (theta + unit * step)[kernels.DELAY :]
     return moved
 
 
@@ -214,23 +256,10 @@ def _widen(covariance: NDArray, score: NDArray) -> tuple[NDArray, NDArray]:
     Real disturbances are not white and onboard estimates have memory; the plain covariance then claims too much.
     """
     inflation = np.ones(len(covariance))
-    if len(score) < 2 * MIN_LAGS:
-        return covariance, inflation
     scaled = score @ covariance
     scaled = scaled - scaled.mean(0)
     plain = np.sum(scaled**2, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(plain > 0, _long_run(scaled) / plain, 1.0)
+        ratio = np.where(plain > 0, long_run(scaled) / plain, 1.0)
     inflation = np.sqrt(np.maximum(ratio, 1.0))
     return covariance * np.outer(inflation, inflation), inflation
-
-
-def _long_run(terms: NDArray) -> NDArray:
-    """Variance of the sum over rows of terms (n, p) that may be correlated in time (Bartlett kernel). (p,)."""
-    n = len(terms)
-    long_run = np.sum(terms**2, 0)
-    if n >= 2 * MIN_LAGS:
-        lags = min(n // 8, 100)
-        for lag in range(1, lags + 1):
-            long_run += 2 * (1 - lag / (lags + 1)) * np.sum(terms[lag:] * terms[:-lag], 0)
-    return long_run

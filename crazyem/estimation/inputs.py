@@ -66,33 +66,37 @@ class InputHistory:
         inside = times[first : min(last + 1, self.size)]
         return bool(np.all(np.diff(inside) <= MAX_GAP) and end - inside[-1] <= MAX_GAP)
 
-    def advance(self, tape: Tape, first: int, last: int, tau: float, delay: float) -> None:
-        """Fill the means of rows first..last-1, going on from the newest node."""
+    def between(self, begin: float, end: float) -> tuple[NDArray, NDArray]:
+        """Stamps (n,) and wrenches (n, 4) of the inputs in [begin, end]."""
+        times = self.times[: self.size]
+        first, last = int(np.searchsorted(times, begin)), int(np.searchsorted(times, end, "right"))
+        return times[first:last], self.wrenches[first:last]
+
+    def advance(self, tape: Tape, first: int, last: int, theta: NDArray) -> None:
+        """Fill the means of rows first..last-1 for parameters theta (9,), going on from the newest node."""
         self._at = lagged_means(
-            self.times, self.wrenches, self._at, self.size, self.predictor, tape.time, first, last, self.mode, tau, delay, self.lag,
-            tape.mean, tape.mean_tau, tape.mean_delay,
+            self.times, self.wrenches, self._at, self.size, self.predictor, tape.time, first, last, self.mode, theta[4],
+            theta[5], self.lag, tape.mean, tape.mean_tau, tape.mean_delay,
         )  # fmt: skip
-        tape.spread_inputs(first, last)
+        tape.spread_inputs(first, last, theta[6:9])
 
     def skip_to(self, time: float, tau: float, delay: float) -> None:
         """Move the lag's state to a time at which no node is wanted (on the ground)."""
         node = np.array([time])
         scratch = np.zeros((1, 4))
         self._at = lagged_means(
-            self.times, self.wrenches, self._at, self.size, self.predictor, node, 0, 1, self.mode, tau, delay, self.lag, scratch,
-            scratch.copy(),
+            self.times, self.wrenches, self._at, self.size, self.predictor, node, 0, 1, self.mode, tau, delay,
+            self.lag, scratch, scratch.copy(),
             scratch.copy(),
         )  # fmt: skip
 
-    def refill(self, tape: Tape, first: int, last: int, tau: float, delay: float) -> None:
-        """Recompute the means of rows first+1..last-1 with another time constant and delay."""
-        start = tape.time[first] - delay - 2 * SETTLE * max(tau, 0.02)
+    def refill(self, tape: Tape, first: int, last: int, theta: NDArray) -> None:
+        """Recompute the means of rows first+1..last-1 for other parameters theta (9,)."""
+        start = tape.time[first] - theta[5] - 2 * SETTLE * max(theta[4], 0.02)
         at = max(0, int(np.searchsorted(self.times[: self.size], start, "right")) - 1)
         if self.mode == CAUSAL:
-            end = int(np.searchsorted(self.times[: self.size], tape.time[last - 1], "right"))
-            begin = int(np.searchsorted(self.times[: self.size], tape.time[first]))
-            self.predictor = fit_predictor(self.wrenches[begin:end])
+            self.predictor = fit_predictor(self.between(tape.time[first], tape.time[last - 1])[1])
         self.lag[:12] = np.tile(self.wrenches[at], 3)
         self.lag[12] = self.times[at]
         self._at = at
-        self.advance(tape, first, last, tau, delay)
+        self.advance(tape, first, last, theta)

@@ -1,40 +1,42 @@
 """Compiled inner loops of the estimator: extended Kalman filter, smoother, statistics, innovation sensitivities.
 
-All matrices are 12 x 12 or smaller, so everything is explicit loops over contiguous rows. Every measured quantity is
-one component of the error state (position, velocity, attitude error, body rate), so measurements enter one scalar at
-a time and no matrix is ever inverted. The smoother is the modified Bryson-Frazier recursion: it gives the smoothed
-moments of Rauch-Tung-Striebel (reference.py is that, in textbook form; the tests compare them), and yields the
-smoothed process noise, all that the M-step needs, without inverting the prediction covariance.
+All matrices are 12 x 12 or smaller, so everything is explicit loops over contiguous rows. Every measured
+quantity is one component of the error state (position, velocity, attitude error, body rate), so measurements
+enter one scalar at a time and no matrix is ever inverted. The smoother is the modified Bryson-Frazier
+recursion: it gives the smoothed moments of Rauch-Tung-Striebel (reference.py is that, in textbook form; the
+tests compare them), and yields the smoothed process noise, all that the M-step needs, without inverting the
+prediction covariance.
 
-State arrays hold 13 numbers: position (3) m world, velocity (3) m/s world, quaternion x y z w (4) body to world, body
-rate (3) rad/s FLU. Noise intensities `q` (6,) are in units of acceleration: variance per second of specific-impulse
-x y z [(m/s)^2/s] and angular-velocity impulse x y z [(rad/s)^2/s], body frame. `r` (12,) are measurement variances.
-"""
+State arrays hold 13 numbers: position (3) m world, velocity (3) m/s world, quaternion x y z w (4) body to
+world, body rate (3) rad/s FLU. Noise intensities `q` (6,) are in units of acceleration: variance per second of
+specific-impulse x y z [(m/s)^2/s] and angular-velocity impulse x y z [(rad/s)^2/s], body frame. `r` (12,) are
+measurement variances."""
 
 import numpy as np
-from numba import njit
 
+from crazyem.compiled import compiled
 from crazyem.vehicle import GRAVITY
-
-FASTMATH = {"contract", "reassoc", "nsz"}  # lets dot products use vector registers; NaN keeps its meaning
 
 # Layout of a statistics row.
 MASS = 0  # 10: upper triangle of z z', z = (a, F0, dF/dtau, dF/ddelay)
-AXIS = 10  # 3 x 15: upper triangle of z z', z = (alpha_i, gyroscopic product, M0_i, dM_i/dtau, dM_i/ddelay)
-AXIS_SIZE = 15
-COUNT = 55  # 1: steps
-IMPULSE = 56  # 6: squared impulses over dt, by body axis: specific force, angular acceleration
-RESIDUAL = 62  # 4: squared measurement residuals of position, velocity, attitude, body rate
-MEASURED = 66  # 4: how many scalars went into each
-IMPULSE_SEEN = 70  # 6: squared share of each impulse's variance that the data resolve
-RESIDUAL_SEEN = 76  # 4: the same for the measurement noise
-SIZE = 80
+AXIS = 10  # 3 x 21: upper triangle of z z', z = (alpha_i, gyroscopic product, M0_i, dM_i/dtau, dM_i/ddelay, 1)
+AXIS_SIZE = 21
+COUNT = 73  # 1: steps
+IMPULSE = 74  # 6: squared impulses over dt, by body axis: specific force, angular acceleration
+RESIDUAL = 80  # 4: squared measurement residuals of position, velocity, attitude, body rate
+MEASURED = 84  # 4: how many scalars went into each
+IMPULSE_SEEN = 88  # 6: squared share of each impulse's variance that the data resolve
+RESIDUAL_SEEN = 94  # 4: the same for the measurement noise
+SIZE = 98
 
-PARAMETERS = 6  # mass, Ixx, Iyy, Izz, time constant (all by their logarithms), delay (in units of DELAY_UNIT)
-DELAY_UNIT = 1e-3  # s
+# Parameters: mass, Ixx, Iyy, Izz, time constant (by their logarithms); delay, torque offset x y z (linear, in units).
+PARAMETERS = 9
+LAG = 4
+DELAY = 5
+OFFSET = 6
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _half_turn(w, h, q):
     """Quaternion of the rotation vector w * h into q."""
     x, y, z = w[0] * h, w[1] * h, w[2] * h
@@ -49,7 +51,7 @@ def _half_turn(w, h, q):
     q[0], q[1], q[2], q[3] = s * x, s * y, s * z, c
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _product(p, q, out):
     """Hamilton product p * q, scalar last, normalised."""
     x = p[3] * q[0] + p[0] * q[3] + p[1] * q[2] - p[2] * q[1]
@@ -60,7 +62,7 @@ def _product(p, q, out):
     out[0], out[1], out[2], out[3] = x * n, y * n, z * n, w * n
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _matrix(q, m):
     """Rotation matrix of a quaternion into m (3, 3)."""
     x, y, z, w = q[0], q[1], q[2], q[3]
@@ -69,7 +71,7 @@ def _matrix(q, m):
     m[2, 0], m[2, 1], m[2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _log(q, out):
     """Rotation vector of a quaternion, the shorter way round."""
     sign = 1.0 if q[3] >= 0 else -1.0
@@ -78,7 +80,7 @@ def _log(q, out):
     out[0], out[1], out[2] = f * q[0], f * q[1], f * q[2]
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _angular_acceleration(w, torque, inertia, inverse, out):
     """Euler's equation: out = I^-1 (torque - w x I w)."""
     l0 = inertia[0, 0] * w[0] + inertia[0, 1] * w[1] + inertia[0, 2] * w[2]
@@ -91,7 +93,7 @@ def _angular_acceleration(w, torque, inertia, inverse, out):
         out[i] = inverse[i, 0] * t0 + inverse[i, 1] * t1 + inverse[i, 2] * t2
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _rate_jacobian(w, inertia, inverse, dt, out):
     """out = I + dt d(angular acceleration)/dw."""
     l0 = inertia[0, 0] * w[0] + inertia[0, 1] * w[1] + inertia[0, 2] * w[2]
@@ -114,7 +116,7 @@ def _rate_jacobian(w, inertia, inverse, dt, out):
         out[i, i] += 1.0
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _apply(blocks, dt, x, out):
     """out = Phi x for x (12, n); blocks are dv/dtheta, dv/dw, dtheta/dtheta, dtheta/dw, dw/dw of the transition."""
     n = x.shape[1]
@@ -135,7 +137,7 @@ def _apply(blocks, dt, x, out):
             out[9 + i, j] = e0 * w0 + e1 * w1 + e2 * w2
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _apply_transposed(blocks, dt, x, out):
     """out = Phi' x for x (12, n)."""
     n = x.shape[1]
@@ -158,7 +160,7 @@ def _apply_transposed(blocks, dt, x, out):
             )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def forward(first, last, restart, time, kind, y, thrust, torque, mass, inertia, inverse, q, r, p0,
             xp, pp, xf, pf, gain, s, e, blocks, middle, loglik):  # fmt: skip
     """Extended Kalman filter over samples first..last-1, written into the tape arrays; returns the log-likelihood.
@@ -330,7 +332,7 @@ def forward(first, last, restart, time, kind, y, thrust, torque, mass, inertia, 
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def _outer(out, base, z, n, weight):
     """Adds weight z z' (upper triangle, row by row) to out[base:]."""
     at = base
@@ -340,9 +342,10 @@ def _outer(out, base, z, n, weight):
             at += 1
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def backward(first, last, time, kind, usable, thrust, torque, thrust_tau, torque_tau, thrust_delay, torque_delay,
-             tau, delay, mass, inertia, inverse, q, r, xf, pf, gain, s, e, blocks, middle, stats, moments):  # fmt: skip
+             tau, delay, offset, mass, inertia, inverse, q, r, xf, pf, gain, s, e, blocks, middle, stats,
+             moments):  # fmt: skip
     """Smoother over samples last-1 down to first, information beyond `last` being none; fills statistics rows.
 
     Row k holds the step that ends at k (k > first, not a break, usable) and the measurements at k. `moments` (n, 12)
@@ -355,7 +358,7 @@ def backward(first, last, time, kind, usable, thrust, torque, thrust_tau, torque
     tmp = np.empty((12, 12))
     tra = np.empty((12, 12))
     lk = np.empty(12)
-    z = np.empty(5)
+    z = np.empty(6)
     alpha = np.empty(3)
     rate = np.empty(3)
     u = np.empty(6)
@@ -468,10 +471,11 @@ def backward(first, last, time, kind, usable, thrust, torque, thrust_tau, torque
             known = inertia[i, j] * mom[3 + j] + inertia[i, m] * mom[3 + m]
             known += rate[j] * (inertia[m, i] * rate[i] + inertia[m, j] * rate[j])
             known -= rate[m] * (inertia[j, i] * rate[i] + inertia[j, m] * rate[m])
-            z[2] = torque[k, i] - torque_tau[k, i] * tau - torque_delay[k, i] * delay - known
+            z[2] = torque[k, i] - torque_tau[k, i] * tau - torque_delay[k, i] * delay - offset[i] - known
             z[3] = torque_tau[k, i]
             z[4] = torque_delay[k, i]
-            _outer(row, AXIS + AXIS_SIZE * i, z, 5, dt)
+            z[5] = 1.0
+            _outer(row, AXIS + AXIS_SIZE * i, z, 6, dt)
             row[AXIS + AXIS_SIZE * i] += var[3 + i] / dt
         for i in range(6):
             row[IMPULSE + i] = (u[i] * u[i] + var[i]) / dt
@@ -479,7 +483,7 @@ def backward(first, last, time, kind, usable, thrust, torque, thrust_tau, torque
         row[COUNT] = 1.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def total(first, last, stats, out):
     """Sum of statistics rows first..last-1 into out (SIZE,)."""
     for i in range(SIZE):
@@ -489,16 +493,16 @@ def total(first, last, stats, out):
             out[i] += stats[k, i]
 
 
-@njit(cache=True, nogil=True, fastmath=FASTMATH)
+@compiled
 def sensitivities(first, last, time, kind, usable, thrust, torque, thrust_tau, torque_tau, thrust_delay,
-                  torque_delay, theta, inertia, inverse, xf, gain, s, e, blocks, middle, score):  # fmt: skip
-    """Derivatives of the innovations with respect to the six parameters (logarithms, DELAY_UNIT).
+                  torque_delay, theta, unit, inertia, inverse, xf, gain, s, e, blocks, middle, score):  # fmt: skip
+    """Derivatives of the innovations with respect to the nine parameters (logarithms, units).
 
     With the noise intensities in units of acceleration as free nuisance parameters the gains do not depend on these
     (up to the state-dependence of the Jacobian), so each sensitivity is a 12-vector carried along the filter.
 
     Returns:
-        Fisher information (6, 6); `score` (n, 6) receives each sample's contribution to the score.
+        Fisher information (9, 9); `score` (n, 9) receives each sample's contribution to the score.
     """
     d = np.zeros((12, PARAMETERS))
     d2 = np.zeros((12, PARAMETERS))
@@ -526,7 +530,7 @@ def sensitivities(first, last, time, kind, usable, thrust, torque, thrust_tau, t
                 d[3 + i, 0] += v
                 d[i, 0] += h * v
                 for a in range(4, 6):
-                    f = theta[4] if a == 4 else DELAY_UNIT
+                    f = theta[4] if a == 4 else unit[a]
                     t = f * dt * middle[k, i, 2] * (thrust_tau[k] if a == 4 else thrust_delay[k]) / theta[0]
                     d[3 + i, a] += t
                     d[i, a] += h * t
@@ -536,6 +540,10 @@ def sensitivities(first, last, time, kind, usable, thrust, torque, thrust_tau, t
                     t *= dt * f
                     d[9 + i, a] += t
                     d[6 + i, a] += h * t
+                for a in range(3):
+                    t = dt * inverse[i, a] * unit[OFFSET + a]
+                    d[9 + i, OFFSET + a] += t
+                    d[6 + i, OFFSET + a] += h * t
             for a in range(3):  # d(I^-1 (M - w x I w)) / d log I_aa = -I^-1 (e_a I_a alpha_a + w x e_a I_a w_a)
                 b = (a + 1) % 3
                 c = (a + 2) % 3

@@ -1,14 +1,23 @@
-"""What is estimated and what is assumed: parameter vector, noise scales, priors. Frozen; one `Parameters` per update."""
+"""What is estimated and what is assumed: parameter vector, noise scales, priors; all frozen."""
 
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.estimation.kernels import DELAY_UNIT
-from crazyem.vehicle import Vehicle
+from crazyem.vehicle import GRAVITY, Vehicle
 
-NAMES = ("mass", "Ixx", "Iyy", "Izz", "motor_time_constant", "input_delay")
+NAMES = (
+    "mass",
+    "Ixx",
+    "Iyy",
+    "Izz",
+    "motor_time_constant",
+    "input_delay",
+    "torque_offset_x",
+    "torque_offset_y",
+    "torque_offset_z",
+)
 GROUPS = ("position", "velocity", "attitude", "body_rate")
 
 
@@ -50,8 +59,8 @@ class Prior:
     """Weak log-normal priors on the parameters and on the noise scales; these keep a scale from collapsing to zero.
 
     Attributes:
-        centre: (6,) of mass, Ixx, Iyy, Izz, time constant, delay.
-        sd: (6,) of the logarithms; of the delay in DELAY_UNIT.
+        centre: (9,) of theta.
+        sd: (9,) of the logarithms; of the linear parameters in their units.
         noise: scales that the prior is centred on.
         noise_sd: of the logarithms of the noise scales.
         impulse_floor, measurement_floor: smallest scales admitted (6,), (4,): far below what a real sensor resolves.
@@ -66,13 +75,13 @@ class Prior:
 
     @property
     def precision(self) -> NDArray:
-        """(6,) of the logarithms, and of the delay in DELAY_UNIT."""
+        """(9,) of the logarithms, and of the linear parameters in their units."""
         return 1.0 / np.square(self.sd)
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """A point in parameter space: theta (6,: m, Ixx, Iyy, Izz, tau, delay; SI), fixed products of inertia, noise."""
+    """A point in parameter space: theta (9,; SI; kernels.py), fixed products of inertia, noise."""
 
     theta: NDArray
     noise: Noise
@@ -95,17 +104,24 @@ class Setup:
 
     start: Parameters
     prior: Prior
-    free: NDArray  # (6,) bool
+    free: NDArray  # (9,) bool
+    unit: NDArray  # (9,) of the linear parameters; 1 for those taken by their logarithms
 
 
-# Where the noise scales start: process noise large in units of acceleration, so that the first samples decide and not the start.
+# Where the noise scales start: process noise large, so that the first samples decide and not the start.
 START_IMPULSE = np.array([0.5, 0.5, 5.0, 20.0, 20.0, 20.0])
 START_MEASUREMENT = np.array([1e-3, 1e-2, 3e-3, 3e-3])
 
 # Delay between an input's stamp and its effect on the logged rates [s]: centre and standard deviation of the prior.
-# Commands of a Crazyflie: held for 2 ms at 500 Hz (1 ms in the mean), and rates low-passed at 80 Hz, second order (2.8 ms).
+# Commands of a Crazyflie: held for 2 ms at 500 Hz (1 ms in the mean), and rates low-passed at 80 Hz (2.8 ms).
 DELAY_OF_COMMANDS = (3.5e-3, 2e-3)
 DELAY_OF_SPEEDS = (0.0, 10e-3)
+DELAY_UNIT = 1e-3  # s
+
+# Rotors are never equal and the centre of mass is never in their middle, so a drone in trim commands a torque that
+# accelerates nothing. Taken for torque that acts it would read as a huge inertia. Standard deviation of the prior, as a
+# shift of the centre of mass over the arm.
+TRIM = 0.05
 
 
 def setup_for(
@@ -120,7 +136,7 @@ def setup_for(
         lag: whether inputs are commands, with the rotor lag still to come (False: rotor speeds or true wrenches).
     """
     delay, delay_sd = DELAY_OF_COMMANDS if lag else DELAY_OF_SPEEDS
-    centre = np.array([vehicle.mass, *vehicle.inertia, vehicle.motor_time_constant, delay])
+    centre = np.array([vehicle.mass, *vehicle.inertia, vehicle.motor_time_constant, delay, 0.0, 0.0, 0.0])
     cold = mass is not None or inertia is not None
     start = centre.copy()
     if mass is not None:
@@ -134,11 +150,15 @@ def setup_for(
     if not timed:
         start[5] = 0.0
     noise = Noise(START_IMPULSE.copy(), START_MEASUREMENT.copy())
-    # A cold start claims to know nothing: centre on the start, as the paper does, but so wide that 4 s of data drown it.
+    # A cold start claims to know nothing: centred on the start, but so wide that 4 s of data drown it.
     prior = Prior(
-        centre=np.append(np.where(start > 0, start if cold else centre, 1.0)[:5], start[5]),
-        sd=np.array([*((10.0, 1.5, 1.5, 1.5) if cold else (1.0, 0.5, 0.5, 0.5)), 0.7, delay_sd / DELAY_UNIT]),
+        centre=np.append(np.where(start > 0, start if cold else centre, 1.0)[:5], start[5:]),
+        sd=np.array(
+            [*((10.0, 1.5, 1.5, 1.5) if cold else (1.0, 0.5, 0.5, 0.5)), 0.7, delay_sd / DELAY_UNIT, 1.0, 1.0, 1.0]
+        ),
         noise=Noise(np.array([0.02, 0.02, 0.05, 0.5, 0.5, 0.5]), START_MEASUREMENT.copy()),
     )
-    free = np.array([True, True, True, True, has_lag, timed])
-    return Setup(Parameters(start, noise, vehicle.inertia_products), prior, free)
+    free = np.array([True, True, True, True, has_lag, timed, timed, timed, timed])
+    offset = max(TRIM * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
+    unit = np.array([1.0, 1.0, 1.0, 1.0, 1.0, DELAY_UNIT, offset, offset, offset])
+    return Setup(Parameters(start, noise, vehicle.inertia_products), prior, free, unit)

@@ -1,25 +1,24 @@
 """M-step: mass, inertia and rotor time constant that maximise the expected complete-data log-likelihood.
 
-With the noise intensities profiled out it is, for N steps (paper's eq. 107 and appendix in their correct, joint form),
+With the noise intensities profiled out it is, for N steps (paper's eq. 107 and appendix in their correct, joint
+form),
 
     Q = N log m - N/2 log S_F + N sum_i log I_i - N/2 sum_i log S_i + log prior,
     S_F = sum E[(m a - F)^2] dt,   S_i = sum E[(I_i alpha_i + (I_k - I_j) w_j w_k - M_i)^2] dt,
 
-F and M being linear in tau and in the delay around the values they were made with. Every S is a quadratic form c' A c in a vector c that
-is linear in the parameters, with A the sums of kernels.py, so Newton's method in the logarithms of the parameters costs
-microseconds; logarithms also rule out sign flips.
-"""
+M with its offset, F and M being linear in tau and in the delay around the values they were made with. Every S
+is a quadratic form c' A c in a vector c that is linear in the parameters, with A the sums of kernels.py, so
+Newton's method in the logarithms of the parameters costs microseconds; logarithms also rule out sign flips."""
 
 import numpy as np
-from numba import njit
 
-from crazyem.estimation.kernels import AXIS, AXIS_SIZE, COUNT, DELAY_UNIT, MASS, PARAMETERS
+from crazyem.compiled import compiled
+from crazyem.estimation.kernels import AXIS, AXIS_SIZE, COUNT, DELAY, LAG, MASS, OFFSET, PARAMETERS
 
-MAX_STEP = 1.0  # largest change of a logarithm (or of the delay, in ms) in one Newton step
-DELAY = 5  # index of the one parameter that is not taken by its logarithm
+MAX_STEP = 1.0  # largest change of a logarithm, or of a linear parameter in its unit, in one Newton step
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _unpack(sums, base, n, out):
     at = base
     for i in range(n):
@@ -29,14 +28,14 @@ def _unpack(sums, base, n, out):
             at += 1
 
 
-@njit(cache=True, nogil=True)
-def objective(theta, sums, free, centre, precision, gradient, hessian, squares):
-    """-Q at theta (6,), its gradient and Hessian (logarithms; delay in ms); squares (4,) receives S_F, S_x, S_y, S_z."""
+@compiled
+def objective(theta, unit, sums, free, centre, precision, gradient, hessian, squares):
+    """-Q at theta (9,), its gradient and Hessian (logarithms, units); squares (4,) receives S_F, S_x, S_y, S_z."""
     count = sums[COUNT]
-    a = np.zeros((5, 5))
-    c = np.zeros(5)
-    dc = np.zeros((5, PARAMETERS))
-    ac = np.zeros(5)
+    a = np.zeros((6, 6))
+    c = np.zeros(6)
+    dc = np.zeros((6, PARAMETERS))
+    ac = np.zeros(6)
     for i in range(PARAMETERS):
         gradient[i] = 0.0
         for j in range(PARAMETERS):
@@ -45,7 +44,7 @@ def objective(theta, sums, free, centre, precision, gradient, hessian, squares):
     grad = np.zeros(PARAMETERS)
     scale = np.empty(PARAMETERS)
     for u in range(PARAMETERS):
-        scale[u] = theta[u] if u != DELAY else DELAY_UNIT
+        scale[u] = theta[u] if u <= LAG else unit[u]
     for term in range(4):
         dc[:, :] = 0.0
         if term == 0:
@@ -57,17 +56,19 @@ def objective(theta, sums, free, centre, precision, gradient, hessian, squares):
             dc[3, 5] = -1.0
             value -= count * np.log(theta[0])
         else:
-            n = 5
+            n = 6
             i = term - 1
             j = (i + 1) % 3
             k = (i + 2) % 3
-            _unpack(sums, AXIS + AXIS_SIZE * i, 5, a)
-            c[0], c[1], c[2], c[3], c[4] = theta[1 + i], theta[1 + k] - theta[1 + j], -1.0, -theta[4], -theta[5]
+            _unpack(sums, AXIS + AXIS_SIZE * i, 6, a)
+            c[0], c[1], c[2] = theta[1 + i], theta[1 + k] - theta[1 + j], -1.0
+            c[3], c[4], c[5] = -theta[LAG], -theta[DELAY], -theta[OFFSET + i]
             dc[0, 1 + i] = 1.0
             dc[1, 1 + k] = 1.0
             dc[1, 1 + j] = -1.0
             dc[3, 4] = -1.0
-            dc[4, 5] = -1.0
+            dc[4, DELAY] = -1.0
+            dc[5, OFFSET + i] = -1.0
             value -= count * np.log(theta[1 + i])
         gradient[term] -= count
         s = 0.0
@@ -86,7 +87,7 @@ def objective(theta, sums, free, centre, precision, gradient, hessian, squares):
             grad[u] *= 2.0 * scale[u]
             gradient[u] += 0.5 * count * grad[u] / s
         for u in range(PARAMETERS):
-            if u != DELAY:
+            if u <= LAG:
                 hessian[u, u] += 0.5 * count * grad[u] / s
             for v in range(PARAMETERS):
                 h = 0.0
@@ -96,7 +97,7 @@ def objective(theta, sums, free, centre, precision, gradient, hessian, squares):
                 hessian[u, v] += 0.5 * count * (2.0 * h * scale[u] * scale[v] / s - grad[u] * grad[v] / (s * s))
     for u in range(PARAMETERS):
         if free[u]:
-            d = np.log(theta[u] / centre[u]) if u != DELAY else (theta[u] - centre[u]) / DELAY_UNIT
+            d = np.log(theta[u] / centre[u]) if u <= LAG else (theta[u] - centre[u]) / unit[u]
             value += 0.5 * precision[u] * d * d
             gradient[u] += precision[u] * d
             hessian[u, u] += precision[u]
@@ -109,15 +110,16 @@ def objective(theta, sums, free, centre, precision, gradient, hessian, squares):
     return value
 
 
-@njit(cache=True, nogil=True)
-def maximise(theta, sums, free, centre, precision, iterations, squares):
-    """Newton's method with Levenberg damping from theta (6,: m, Ixx, Iyy, Izz, tau, delay), in place.
+@compiled
+def maximise(theta, unit, sums, free, centre, precision, iterations, squares):
+    """Newton's method with Levenberg damping from theta (9,: kernels.py), in place.
 
     Args:
         theta: start, replaced by the maximiser.
+        unit: (9,) units of the linear parameters.
         sums: statistics summed over the window.
-        free: (6,) which parameters may move.
-        centre, precision: (6,) prior: centre, and 1/sd^2 of the logarithm (of the delay in DELAY_UNIT).
+        free: (9,) which parameters may move.
+        centre, precision: (9,) prior: centre, and 1/sd^2 of the logarithm, or of the linear parameter in its unit.
         iterations: at most so many Newton steps.
         squares: (4,) receives the residual sums S_F, S_x, S_y, S_z at the result.
     """
@@ -126,7 +128,7 @@ def maximise(theta, sums, free, centre, precision, iterations, squares):
     trial = np.empty(PARAMETERS)
     g2 = np.empty(PARAMETERS)
     h2 = np.empty((PARAMETERS, PARAMETERS))
-    value = objective(theta, sums, free, centre, precision, gradient, hessian, squares)
+    value = objective(theta, unit, sums, free, centre, precision, gradient, hessian, squares)
     damping = 0.0
     for _ in range(iterations):
         size = 0.0
@@ -142,8 +144,8 @@ def maximise(theta, sums, free, centre, precision, iterations, squares):
                 step[u] = min(MAX_STEP, max(-MAX_STEP, step[u]))
                 down += step[u] * gradient[u]
                 size = max(size, abs(step[u]))
-                trial[u] = theta[u] * np.exp(step[u]) if u != DELAY else theta[u] + DELAY_UNIT * step[u]
-            new = objective(trial, sums, free, centre, precision, g2, h2, squares)
+                trial[u] = theta[u] * np.exp(step[u]) if u <= LAG else theta[u] + unit[u] * step[u]
+            new = objective(trial, unit, sums, free, centre, precision, g2, h2, squares)
             if down < 0.0 and new <= value + 1e-9:
                 for u in range(PARAMETERS):
                     theta[u] = trial[u]
@@ -157,4 +159,4 @@ def maximise(theta, sums, free, centre, precision, iterations, squares):
             break
         if size < 1e-7:
             break
-    objective(theta, sums, free, centre, precision, gradient, hessian, squares)
+    objective(theta, unit, sums, free, centre, precision, gradient, hessian, squares)

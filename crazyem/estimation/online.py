@@ -1,9 +1,9 @@
 """The online estimator: samples in, estimates out; deterministic, so a replay gives the numbers of the flight.
 
-Samples of one instant are gathered into a node; a node waits until the inputs up to it are known, passes the contact gate
-and goes onto the tape. Every `every` nodes the newest `window` of them give an update: an incremental pass by default,
-full passes while the parameters still move, and every second a full pass that also renews the uncertainty.
-"""
+Samples of one instant are gathered into a node; a node waits until the inputs up to it are known, passes the
+contact gate and goes onto the tape. Every `every` nodes the newest `window` of them give an update: an
+incremental pass by default, full passes while the parameters still move, and every second a full pass that also
+renews the uncertainty."""
 
 import math
 import time as clock
@@ -16,9 +16,8 @@ from crazyem.errors import DataError, UsageError
 from crazyem.estimation.contact import ContactGate
 from crazyem.estimation.em import Information, WindowEM, displaced, offset
 from crazyem.estimation.inputs import MAX_GAP, SETTLE, InputHistory
-from crazyem.estimation.kernels import DELAY_UNIT
+from crazyem.estimation.kernels import DELAY
 from crazyem.estimation.model import GROUPS, NAMES, Parameters, Setup, setup_for
-from crazyem.estimation.mstep import DELAY
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
 from crazyem.estimation.tape import Tape
 from crazyem.physics.lag import CAUSAL, HOLD, LINEAR
@@ -33,6 +32,7 @@ REFRESH = 25  # updates between two full passes with information
 YOUNG = 200  # samples below which every update is a full pass
 MOVED = 0.02  # change of a parameter's logarithm that calls for full passes
 IDENTIFIABLE = 0.15  # largest standard deviation of a logarithm that counts as identified
+IMPLAUSIBLE = 3.0  # prior standard deviations beyond which an inertia is not believed
 
 _COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 _INPUTS = ("motor_command", "rotor_speed", "wrench_command")
@@ -292,11 +292,11 @@ class OnlineEstimator:
         self._fresh = last
         moved = math.inf
         if self._settled is not None:
-            change = offset(em.parameters.theta, self._settled.theta)
+            change = offset(em.parameters.theta, self._settled.theta, em.setup.unit)
             moved = float(np.max(np.abs(change[:5])))
         young = last - first < min(YOUNG, self.window)
         if young or moved > MOVED or self._updates % REFRESH == 0:
-            self._information = em.converge(first, last, passes=4 if young or moved > MOVED else 3)
+            self._information = em.converge(first, last, passes=4 if young else 2)
             self._settled = em.parameters
             self._judge()
 
@@ -309,15 +309,19 @@ class OnlineEstimator:
     def _estimate(self) -> Estimate:
         if self._em is None or self._setup is None or self._information is None:
             return self._nothing()
-        theta = self._em.parameters.theta
+        theta, prior = self._em.parameters.theta, self._setup.prior
         sd = np.sqrt(np.maximum(np.diag(self._information.covariance), 0.0))
+        # An inertia that the prior all but excludes says that the model does not hold here, not that the drone is odd.
+        deviation = np.abs(offset(theta, prior.centre, self._setup.unit))
+        implausible = deviation > IMPLAUSIBLE * prior.sd
+        sd[1:4] = np.where(implausible, np.maximum(sd, deviation), sd)[1:4]
         parameters = {}
         for i, name in enumerate(NAMES):
-            identifiable, reason = self._verdict(i, float(sd[i]))
-            low, high = (displaced(theta, np.eye(6)[i] * z * sd[i])[i] for z in (-1.96, 1.96))
+            identifiable, reason = self._verdict(i, float(sd[i]), implausible=bool(implausible[i]))
+            low, high = (displaced(theta, np.eye(9)[i] * z * sd[i], self._setup.unit)[i] for z in (-1.96, 1.96))
             parameters[name] = ParameterEstimate(
                 value=float(theta[i]),
-                sd=float(sd[i] * (theta[i] if i != DELAY else DELAY_UNIT)),
+                sd=float(sd[i] * (theta[i] if i < DELAY else self._setup.unit[i])),
                 ci95=(float(low), float(high)),
                 unit=PARAMETER_UNITS[name],
                 identifiable=identifiable,
@@ -336,16 +340,27 @@ class OnlineEstimator:
             converged=self._converged,
         )
 
-    def _verdict(self, i: int, sd: float) -> tuple[bool, str]:
-        assert self._em is not None and self._setup is not None
+    def _verdict(self, i: int, sd: float, *, implausible: bool) -> tuple[bool, str]:
+        assert self._em is not None
+        assert self._setup is not None
+        assert self._information is not None
         if not self._setup.free[i]:
             return False, "the inputs already include the rotor lag" if i == 4 else "held fixed"
-        if i == DELAY:
-            prior = self._setup.prior.sd[DELAY]
+        if i >= DELAY:
+            prior = self._setup.prior.sd[i]
             return (True, "") if sd < 0.7 * prior else (False, "the data say no more than the prior does")
         if self._tape.size < 20:
             return False, f"only {self._tape.size} samples in flight"
+        if implausible and 0 < i < 4:
+            return False, (
+                "the data ask for an inertia far from any such drone's: the logged commands do not explain its rotation"
+            )
         if not sd < IDENTIFIABLE:
+            if 0 < i < 4 and self._information.bias[i - 1] > IDENTIFIABLE:
+                return False, (
+                    "the logged commands are mostly noise between their stamps: torque about "
+                    f"{'xyz'[i - 1]} that acted cannot be told from them at this logging rate"
+                )
             what = ("thrust", "torque about x", "torque about y", "torque about z", "commands")[i]
             return False, f"too little excitation: {what} determines it only within {196 * sd:.0f} % (95 %)"
         if not self._converged:
@@ -355,7 +370,7 @@ class OnlineEstimator:
     def _nothing(self) -> Estimate:
         """What is said before anything was flown: the nominal value and no confidence at all."""
         vehicle = self.vehicle
-        values = (vehicle.mass, *vehicle.inertia, vehicle.motor_time_constant, 0.0)
+        values = (vehicle.mass, *vehicle.inertia, vehicle.motor_time_constant, 0.0, 0.0, 0.0, 0.0)
         reason = self._gate.reason or "no samples in flight"
         return Estimate(
             time=self._last_time,

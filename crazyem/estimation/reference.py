@@ -1,4 +1,4 @@
-"""The estimator's inner loops in plain numpy and textbook form: the slow twin that the compiled kernels are tested against.
+"""The estimator's inner loops in plain numpy and textbook form: the slow twin that tests hold the kernels against.
 
 Extended Kalman filter with dense matrices and joint measurement updates; Rauch-Tung-Striebel smoother with the
 covariance of the state at both ends of a step (lag-one); expectations taken from those. Nothing here is shared with
@@ -55,7 +55,8 @@ def extended_kalman_filter(
     q (6,) impulse variances per second in units of acceleration, r (12,) measurement variances.
     """
     n = len(time)
-    predicted, filtered = [], []
+    predicted: list[State] = []
+    filtered: list[State] = []
     pp, pf = np.empty((n, 12, 12)), np.empty((n, 12, 12))
     transitions, noises = np.zeros((n, 12, 12)), np.zeros((n, 12, 6))
     log_likelihood = 0.0

@@ -11,6 +11,9 @@ PARAMETER_UNITS = {
     "Izz": "kg m^2",
     "motor_time_constant": "s",
     "input_delay": "s",
+    "torque_offset_x": "N m",
+    "torque_offset_y": "N m",
+    "torque_offset_z": "N m",
 }
 
 

@@ -94,10 +94,10 @@ class Tape:
         self.size += 1
         return dropped
 
-    def spread_inputs(self, first: int, last: int) -> None:
-        """Copy mean inputs into the contiguous columns that the kernels read."""
+    def spread_inputs(self, first: int, last: int, offset: np.ndarray) -> None:
+        """Mean inputs, with the torque offset (3,) added, into the contiguous columns that the kernels read."""
         self.thrust[first:last] = self.mean[first:last, 0]
-        self.torque[first:last] = self.mean[first:last, 1:]
+        self.torque[first:last] = self.mean[first:last, 1:] + offset
         self.thrust_tau[first:last] = self.mean_tau[first:last, 0]
         self.torque_tau[first:last] = self.mean_tau[first:last, 1:]
         self.thrust_delay[first:last] = self.mean_delay[first:last, 0]

@@ -1,18 +1,19 @@
 """First-order rotor lag, exact for a command that is piecewise linear in time: tau dy/dt = u - y.
 
-The lag is linear and the same for all rotors, so it acts on thrust and torque directly. What a step of the rigid body
-needs is the mean of y over the step, and its derivatives with respect to tau and to a delay of the command (for
-estimating both). A millisecond of delay that nobody models reads as several per cent of inertia.
+The lag is linear and the same for all rotors, so it acts on thrust and torque directly. What a step of the
+rigid body needs is the mean of y over the step, and its derivatives with respect to tau and to a delay of the
+command (for estimating both). A millisecond of delay that nobody models reads as several per cent of inertia.
 
-A logged command is known only at its stamps, and in closed loop the next one already answers to the disturbance of the
-present step. To interpolate towards it is to let the step's own noise into its input: on hover data logged at 100 Hz that
-reads as 5 ms of delay and 16 % of inertia. So the mean of a step uses only commands stamped before the step began,
-continued by the prediction that the past allows (a linear one, fitted to the same commands: an innovation must be
-orthogonal to what predicts it); the lag itself is carried on along the commands as they then came (CAUSAL).
-"""
+A logged command is known only at its stamps, and in closed loop the next one already answers to the disturbance
+of the present step. To interpolate towards it is to let the step's own noise into its input: on hover data
+logged at 100 Hz that reads as 5 ms of delay and 16 % of inertia. So the mean of a step uses only commands
+stamped before the step began, continued by the prediction that the past allows (a linear one, fitted to the
+same commands: an innovation must be orthogonal to what predicts it); the lag itself is carried on along the
+commands as they then came (CAUSAL)."""
 
 import numpy as np
-from numba import njit
+
+from crazyem.compiled import compiled
 
 STEP = 1e-3  # relative change of tau for the central difference
 
@@ -25,9 +26,9 @@ ORDER = 3  # of the linear prediction
 _AHEAD = 64  # most commands known or predicted inside one step
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _segment(u0, u1, h, tau, state, acc):
-    """One linear stretch of the command from u0 to u1 (4,), h long: advance `state`, add its integral to `acc` (12,)."""
+    """One linear stretch of the command, u0 to u1 (4,), h long: advance `state`, add its integral to `acc` (12,)."""
     for v in range(3):
         tv = tau * (1.0 + STEP * (v if v < 2 else -1))
         decay = np.exp(-h / tv) if tv > 0 else 0.0
@@ -39,7 +40,7 @@ def _segment(u0, u1, h, tau, state, acc):
             state[4 * v + c] = y1
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _at(times, commands, i, last, t, mode, out):
     """Command at t, for which stamp i is the last at or before it (or the very first); `last` commands are known."""
     if mode != HOLD and i + 1 < last and t > times[i]:
@@ -51,10 +52,10 @@ def _at(times, commands, i, last, t, mode, out):
             out[c] = commands[i, c]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _predict(times, commands, i, known, end, predictor, path_times, path):
     """Commands i..known-1 (and a few before) and their prediction up to `end`, into path; returns how many."""
-    begin = max(0, max(min(i, known - ORDER), known - _AHEAD // 2))
+    begin = max(0, min(i, known - ORDER), known - _AHEAD // 2)
     size = known - begin
     for k in range(size):
         path_times[k] = times[begin + k]
@@ -107,7 +108,7 @@ def fit_predictor(commands: np.ndarray) -> np.ndarray:
     return weights
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _run(times, commands, i, last, begin, end, mode, tau, state, acc):
     """Carry the lag from begin to end along the first `last` commands; returns the stamp index at the end."""
     u0 = np.empty(4)
@@ -130,7 +131,7 @@ def _run(times, commands, i, last, begin, end, mode, tau, state, acc):
     return i
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def lagged_means(
     times, commands, first, last, predictor, nodes, node_first, node_last, mode, tau, delay, state, mean, mean_tau,
     mean_delay,

@@ -1,0 +1,29 @@
+"""`compiled`: numba's njit with a disk cache that notices an edit in any kernel, not only in the function's own file.
+
+Numba stamps a cached function with the modification time of its own file; a kernel that calls kernels or reads layout
+constants of another file would go on running old machine code after an edit there.
+"""
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from numba import njit
+
+FASTMATH = {"contract", "reassoc", "nsz"}  # lets dot products use vector registers; NaN keeps its meaning
+
+_ROOT = Path(__file__).parent
+_STAMP = tuple(
+    (path.name, path.stat().st_mtime_ns, path.stat().st_size)
+    for folder in ("physics", "estimation")
+    for path in sorted((_ROOT / folder).glob("*.py"))
+)
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """Compile `function` (explicit loops over arrays): cached on disk, without the interpreter lock."""
+    dispatcher: Any = njit(cache=True, nogil=True, fastmath=FASTMATH)(function)
+    with contextlib.suppress(AttributeError):  # private to numba; without it caching works, only less watchful
+        dispatcher._cache._cache_file._source_stamp = _STAMP
+    return dispatcher
