@@ -1,0 +1,179 @@
+"""The architecture as rules a machine can check: who may import whom, docstrings first, files readable in one sitting.
+
+Read with `ast`, so nothing under test is executed. docs/architecture.md explains the rules."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("crazyem", "firmware_sim")
+MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+READABLE = 450  # lines
+
+# Longer than READABLE, and why.
+LONG = {
+    # Filter, smoother and sensitivities call one another's inner loops; numba caches and stamps them as one file.
+    "crazyem/estimation/kernels.py",
+}
+
+# What the parts of crazyem may import of crazyem, besides themselves and `errors`. Nothing here is circular.
+ALLOWED: dict[str, set[str]] = {
+    "errors": set(),
+    "compiled": set(),
+    "vehicle": set(),
+    "physics": {"vehicle", "compiled"},
+    "signals": set(),
+    "control": {"vehicle", "physics"},
+    "links": {"signals"},
+    "estimation": {"vehicle", "compiled", "physics", "signals"},
+    "recordings": {"signals", "links", "estimation"},
+    "live": {"vehicle", "physics", "signals", "control", "links", "estimation", "recordings"},
+    "commands": {"vehicle", "physics", "signals", "control", "links", "estimation", "recordings", "live"},
+    "cli": {"commands"},
+    "__main__": {"cli"},
+    "__init__": {"live", "recordings", "vehicle"},  # the library's front door: lazily, on first use
+}
+
+# Finer than folders: the only modules that a part may import from another. Each says what the exception is for.
+ONLY: dict[tuple[str, str], set[str]] = {
+    ("recordings", "links"): {"crazyem.links.base", "crazyem.links.clock"},  # a type, and 24-bit stamps
+    ("recordings", "estimation"): {"crazyem.estimation.result"},  # the type it writes
+}
+
+# Arrows that point up today. Shorten this list, never lengthen it.
+DEBTS = {("crazyem/live/attach.py", "crazyem.commands.common")}  # warm_up is used from live too
+
+
+def imports(path: Path) -> Iterator[str]:
+    """Every module a file imports, wherever in it: absolute dotted names; for `from x import y` both x and x.y."""
+    package = path.relative_to(ROOT).with_suffix("").parts
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join(package[: -node.level]) if node.level else ""
+            module = ".".join(part for part in (base, node.module or "") if part)
+            yield module
+            yield from (f"{module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Call):  # importlib.import_module("x"), __import__("x")
+            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            if name in ("import_module", "__import__"):
+                yield from (a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str))
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def part_of(path: Path) -> str:
+    """Folder or module directly below the package: `crazyem/live/push.py` -> `live`."""
+    return path.relative_to(ROOT).with_suffix("").parts[1]
+
+
+def of_package(package: str) -> list[Path]:
+    return [path for path in MODULES if path.relative_to(ROOT).parts[0] == package]
+
+
+def modules_below(package: str) -> set[str]:
+    """Dotted names of all modules and packages of a package: tells a module from a name inside one."""
+    names = {".".join(path.relative_to(ROOT).with_suffix("").parts) for path in of_package(package)}
+    return {name.removesuffix(".__init__") for name in names} | {name.rpartition(".")[0] for name in names}
+
+
+def test_something_is_checked() -> None:
+    assert len(of_package("crazyem")) > 30
+    assert len(of_package("firmware_sim")) > 30
+
+
+@pytest.mark.parametrize(("package", "other"), [PACKAGES, PACKAGES[::-1]])
+def test_the_two_packages_never_import_each_other(package: str, other: str) -> None:
+    """The wire is all there is between them: an estimator that could see the truth would prove nothing."""
+    guilty = [(name_of(path), m) for path in of_package(package) for m in imports(path) if m.split(".")[0] == other]
+    assert guilty == []
+
+
+def test_arrows_point_down() -> None:
+    known = modules_below("crazyem")
+    guilty = []
+    for path in of_package("crazyem"):
+        part = part_of(path)
+        assert part in ALLOWED, f"{name_of(path)}: say in ALLOWED what this new part may import"
+        for module in imports(path):
+            pieces = module.split(".")
+            if pieces[0] != "crazyem" or len(pieces) < 2 or module not in known:
+                continue
+            target = pieces[1]
+            if target in (part, "errors") or (name_of(path), module) in DEBTS or module == "crazyem.commands":
+                continue
+            only = ONLY.get((part, target))
+            deeper = len(pieces) > 2
+            if target not in ALLOWED[part] or (only is not None and deeper and module not in only):
+                guilty.append((name_of(path), module))
+    assert guilty == []
+
+
+def test_the_allowed_arrows_have_no_circle() -> None:
+    """A part stands on parts that were placed before it, so some order of all parts exists."""
+    placed: set[str] = set()
+    while True:
+        ready = {part for part, below in ALLOWED.items() if part not in placed and below <= placed}
+        if not ready:
+            break
+        placed |= ready
+    assert placed == set(ALLOWED)
+
+
+def test_commands_are_only_used_from_above() -> None:
+    for path in of_package("crazyem"):
+        if part_of(path) in ("cli", "__main__", "commands"):
+            continue
+        above = {m for m in imports(path) if m.startswith(("crazyem.cli", "crazyem.commands"))}
+        allowed = {module for file, module in DEBTS if file == name_of(path)}
+        assert all(any(m in (a, "crazyem.commands") or m.startswith(a + ".") for a in allowed) for m in above), (
+            name_of(path),
+            above,
+        )
+
+
+@pytest.mark.parametrize("part", ["plant", "controllers", "commander", "flight", "scenario", "tables"])
+def test_the_simulated_drone_knows_no_packets(part: str) -> None:
+    """Physics and control do not know that a wire exists; only services, firmware and server do."""
+    wire = ("firmware_sim.wire", "firmware_sim.server", "firmware_sim.services", "firmware_sim.firmware", "socket")
+    guilty = [
+        (name_of(path), module)
+        for path in of_package("firmware_sim")
+        if part_of(path) == part
+        for module in imports(path)
+        if any(module == w or module.startswith(w + ".") for w in wire)
+    ]
+    assert guilty == []
+
+
+def test_only_links_know_cflib() -> None:
+    """One narrow interface: cflib stays behind crazyem.links, and firmware_sim speaks CRTP without it."""
+    guilty = [
+        name_of(path)
+        for path in MODULES
+        if part_of(path) != "links" and any(m.split(".")[0] == "cflib" for m in imports(path))
+    ]
+    assert guilty == []
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_module_says_first_what_it_is_for(path: Path) -> None:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    if path.name == "__init__.py" and not tree.body:
+        return  # an empty marker
+    documented = ast.get_docstring(tree)
+    assert documented, "the first statement is not a docstring"
+    assert documented.strip()[0].isalnum() or documented.strip()[0] == "`"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_file_is_readable_in_one_sitting(path: Path) -> None:
+    if name_of(path) in LONG:
+        return
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= READABLE
