@@ -110,7 +110,9 @@ class Setup:
 
 # Where the noise scales start: process noise large, so that the first samples decide and not the start.
 START_IMPULSE = np.array([0.5, 0.5, 5.0, 20.0, 20.0, 20.0])
-START_MEASUREMENT = np.array([1e-3, 1e-2, 3e-3, 3e-3])
+# Measurement noise starts large too: from below, the likelihood is flat in it and says nothing.
+START_MEASUREMENT = np.array([2e-2, 1e-1, 3e-2, 1e-1])
+TYPICAL_MEASUREMENT = np.array([1e-3, 1e-2, 3e-3, 3e-3])
 
 # Delay between an input's stamp and its effect on the logged rates [s]: centre and standard deviation of the prior.
 # Commands of a Crazyflie: held for 2 ms at 500 Hz (1 ms in the mean), and rates low-passed at 80 Hz (2.8 ms).
@@ -156,7 +158,7 @@ def setup_for(
         sd=np.array(
             [*((10.0, 1.5, 1.5, 1.5) if cold else (1.0, 0.5, 0.5, 0.5)), 0.7, delay_sd / DELAY_UNIT, 1.0, 1.0, 1.0]
         ),
-        noise=Noise(np.array([0.02, 0.02, 0.05, 0.5, 0.5, 0.5]), START_MEASUREMENT.copy()),
+        noise=Noise(np.array([0.02, 0.02, 0.05, 0.5, 0.5, 0.5]), TYPICAL_MEASUREMENT.copy()),
     )
     free = np.array([True, True, True, True, has_lag, timed, timed, timed, timed])
     offset = max(TRIM * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
