@@ -17,7 +17,7 @@ _ROOT = Path(__file__).parent
 _STAMP = tuple(
     (path.name, path.stat().st_mtime_ns, path.stat().st_size)
     for folder in ("physics", "estimation")
-    for path in sorted((_ROOT / folder).glob("*.py"))
+    for path in sorted((_ROOT / folder).rglob("*.py"))
 )
 
 

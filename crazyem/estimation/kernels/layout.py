@@ -1,0 +1,22 @@
+"""Where things are in the arrays of the kernels: rows of statistics, and the vector of parameters.
+
+Statistics of one step are sums of products weighted by dt, so that the M-step sees numbers that do not depend on the
+sampling rate.
+"""
+
+MASS = 0  # 10: upper triangle of z z', z = (a, F0, dF/dtau, dF/ddelay)
+AXIS = 10  # 3 x 21: upper triangle of z z', z = (alpha_i, gyroscopic product, M0_i, dM_i/dtau, dM_i/ddelay, 1)
+AXIS_SIZE = 21
+COUNT = 73  # 1: steps
+IMPULSE = 74  # 6: squared impulses over dt, by body axis: specific force, angular acceleration
+RESIDUAL = 80  # 4: squared measurement residuals of position, velocity, attitude, body rate
+MEASURED = 84  # 4: how many scalars went into each
+IMPULSE_SEEN = 88  # 6: squared share of each impulse's variance that the data resolve
+RESIDUAL_SEEN = 94  # 4: the same for the measurement noise
+SIZE = 98
+
+# Parameters: mass, Ixx, Iyy, Izz, time constant (by their logarithms); delay, torque offset x y z (linear, in units).
+PARAMETERS = 9
+LAG = 4
+DELAY = 5
+OFFSET = 6

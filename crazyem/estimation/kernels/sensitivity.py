@@ -1,0 +1,86 @@
+"""Derivatives of the innovations by the parameters: score and Fisher information."""
+
+import numpy as np
+
+from crazyem.compiled import compiled
+from crazyem.estimation.kernels.algebra import angular_acceleration, apply
+from crazyem.estimation.kernels.layout import OFFSET, PARAMETERS
+
+
+@compiled
+def sensitivities(first, last, time, kind, usable, thrust, torque, thrust_tau, torque_tau, thrust_delay,
+                  torque_delay, theta, unit, inertia, inverse, xf, gain, s, e, blocks, middle, score):  # fmt: skip
+    """Derivatives of the innovations with respect to the nine parameters (logarithms, units).
+
+    With the noise intensities in units of acceleration as free nuisance parameters the gains do not depend on these
+    (up to the state-dependence of the Jacobian), so each sensitivity is a 12-vector carried along the filter.
+
+    Returns:
+        Fisher information (9, 9); `score` (n, 9) receives each sample's contribution to the score.
+    """
+    d = np.zeros((12, PARAMETERS))
+    d2 = np.zeros((12, PARAMETERS))
+    info = np.zeros((PARAMETERS, PARAMETERS))
+    alpha = np.empty(3)
+    for k in range(first, last):
+        for a in range(PARAMETERS):
+            score[k, a] = 0.0
+        if kind[k] == 1 or k == first:
+            for i in range(12):
+                for a in range(PARAMETERS):
+                    d[i, a] = 0.0
+            continue
+        dt = time[k] - time[k - 1]
+        h = 0.5 * dt
+        w = xf[k - 1, 10:13]
+        apply(blocks[k], dt, d, d2)
+        for i in range(12):
+            for a in range(PARAMETERS):
+                d[i, a] = d2[i, a]
+        if usable[k]:
+            angular_acceleration(w, torque[k], inertia, inverse, alpha)
+            for i in range(3):
+                v = -dt * middle[k, i, 2] * thrust[k] / theta[0]
+                d[3 + i, 0] += v
+                d[i, 0] += h * v
+                for a in range(4, 6):
+                    f = theta[4] if a == 4 else unit[a]
+                    t = f * dt * middle[k, i, 2] * (thrust_tau[k] if a == 4 else thrust_delay[k]) / theta[0]
+                    d[3 + i, a] += t
+                    d[i, a] += h * t
+                    t = 0.0
+                    for j in range(3):
+                        t += inverse[i, j] * (torque_tau[k, j] if a == 4 else torque_delay[k, j])
+                    t *= dt * f
+                    d[9 + i, a] += t
+                    d[6 + i, a] += h * t
+                for a in range(3):
+                    t = dt * inverse[i, a] * unit[OFFSET + a]
+                    d[9 + i, OFFSET + a] += t
+                    d[6 + i, OFFSET + a] += h * t
+            for a in range(3):  # d(I^-1 (M - w x I w)) / d log I_aa = -I^-1 (e_a I_a alpha_a + w x e_a I_a w_a)
+                b = (a + 1) % 3
+                c = (a + 2) % 3
+                for i in range(3):
+                    t = inverse[i, a] * alpha[a] + w[a] * (inverse[i, b] * w[c] - inverse[i, c] * w[b])
+                    t *= -dt * theta[1 + a]
+                    d[9 + i, 1 + a] += t
+                    d[6 + i, 1 + a] += h * t
+        for i in range(12):
+            if s[k, i] == 0.0:
+                continue
+            inv = 1.0 / s[k, i]
+            g = gain[k, i]
+            for a in range(PARAMETERS):
+                da = d[i, a]
+                score[k, a] += da * e[k, i] * inv
+                for b in range(PARAMETERS):
+                    info[a, b] += da * d[i, b] * inv
+            for a in range(PARAMETERS):
+                da = d[i, a]
+                for j in range(12):
+                    d2[j, a] = g[j] * da
+            for j in range(12):
+                for a in range(PARAMETERS):
+                    d[j, a] -= d2[j, a]
+    return info
