@@ -45,19 +45,19 @@ def test_contenders_run_on_the_same_window_and_agree_on_its_likelihood(speed: Mo
 
 
 def test_online_costs_are_told_by_kind(speed: ModuleType) -> None:
-    result = speed.measure_online(seed=1, window=60, seconds=2.0)
+    result = speed.running.measure_online(seed=1, window=60, seconds=2.0)
     total = result["all updates"]["n"]
     assert (200 - 60) // 4 - 1 <= total <= (200 - 60) // 4  # the newest sample may still wait for its inputs
     assert result["update with full passes"]["n"] <= total
-    assert "samples" in speed.show({"online": result}) or "online" in speed.show({"online": result})
+    assert "load of one core" in speed.running.table({"online": result})
 
 
 def test_incremental_is_compared_with_full_passes(speed: ModuleType) -> None:
-    result = speed.measure_accuracy(seeds=[1], window=240, seconds=4.0, passes=30)
+    result = speed.running.measure_accuracy(seeds=[1], window=240, seconds=4.0, passes=30)
     assert result["n"] >= 1
     for name in ("one full pass", "converged"):
         assert all(len(values) == 4 and np.all(np.isfinite(values)) for values in result[name].values())
-    assert "converged" in speed.show({"accuracy": result})
+    assert "converged" in speed.running.table({"accuracy": result})
 
 
 @pytest.mark.parametrize(("peer", "module"), [("dynamax", "peer_dynamax"), ("casadi", "mhe_casadi")])
