@@ -73,7 +73,7 @@ def test_flight_of_a_real_drone(tmp_path: Path, name: str) -> None:
     assert 1.55 < estimates["mass"]["value"] / 0.027 < 1.75
     assert any("thrust scale" in notice for notice in summary["notices"])
 
-    # Below 2 Hz the rotors command ten to twenty times the torque that the rotation takes, mostly in proportion to the
+    # Below 2 Hz the rotors command 14 to 20 times the torque that the rotation takes, half of it in proportion to the
     # air speed: something else holds against it, and a model without it sees an enormous inertia. It must not say so.
     for axis in INERTIA:
         assert not estimates[axis]["identifiable"]
