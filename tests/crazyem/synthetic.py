@@ -29,6 +29,8 @@ class Truth:
         sensor: standard deviations of position [m], velocity [m/s], attitude [rad], body rate [rad/s].
         dither: amplitude of the torque dither, of the whole sum in rms terms [N m].
         heave: relative amplitude of the thrust dither.
+        fade: the torque dither fades in for so long [s]; with 0 the log begins amid a manoeuvre.
+        attitude_gain, rate_gain: of the controller [1/s^2], [1/s].
     """
 
     mass: float = 0.036
@@ -39,8 +41,9 @@ class Truth:
     sensor: tuple[float, float, float, float] = (1e-3, 1e-2, 3e-3, 2e-3)
     dither: float = 2e-4
     heave: float = 0.05
-    attitude_gain: float = 350.0  # rad/s^2 per rad
-    rate_gain: float = 57.0  # rad/s^2 per rad/s
+    fade: float = 0.5
+    attitude_gain: float = 350.0
+    rate_gain: float = 57.0
 
     @property
     def matrix(self) -> np.ndarray:
@@ -88,7 +91,7 @@ def _matrix(q):
 
 
 @njit(cache=True)
-def _fly(n, dt, control_every, mass, inertia, lag, scale, sensor, dither, heave, gains, phases, noise, errors):
+def _fly(n, dt, control_every, mass, inertia, lag, scale, sensor, dither, heave, fade, gains, phases, noise, errors):
     """n sub-steps; noise (n, 4) and errors (n, 12) are standard normal. States, measurements, commands, acting."""
     inverse = np.linalg.inv(inertia)
     p, v, w = np.zeros(3), np.zeros(3), np.zeros(3)
@@ -114,10 +117,11 @@ def _fly(n, dt, control_every, mass, inertia, lag, scale, sensor, dither, heave,
             wrong[2] = -2 * y[k, 8] * np.sign(y[k, 9])
             torque = inertia @ (gains[0] * wrong - gains[1] * rate)
             command[0] = mass * np.dot(wanted, seen[:, 2].copy()) * (1 + heave * np.sin(2 * np.pi * 0.7 * t))
+            shaken = dither * min(1.0, t / fade) if fade > 0 else dither
             for i in range(3):
                 command[1 + i] = torque[i]
                 for j in range(3):
-                    command[1 + i] += dither * np.sqrt(2 / 3) * np.sin(DITHER[i, j] * t + phases[i, j])
+                    command[1 + i] += shaken * np.sqrt(2 / 3) * np.sin(DITHER[i, j] * t + phases[i, j])
         commands[k] = command
         acting = command + (acting - command) * decay
         actings[k] = acting
@@ -140,7 +144,7 @@ def fly(truth: Truth = Truth(), *, seed: int = 0, duration: float = 8.0, rate: i
     dt = 1.0 / (rate * sub)
     x, y, commands, acting = _fly(
         n, dt, control_every, truth.mass, truth.matrix, truth.lag, np.array([truth.force_noise, truth.torque_noise]),
-        np.array(truth.sensor), truth.dither, truth.heave, np.array([truth.attitude_gain, truth.rate_gain]),
+        np.array(truth.sensor), truth.dither, truth.heave, truth.fade, np.array([truth.attitude_gain, truth.rate_gain]),
         rng.uniform(0, 2 * np.pi, (3, 3)), rng.normal(size=(n, 4)), rng.normal(size=(n, 12)),
     )  # fmt: skip
     fine = np.arange(n) * dt

@@ -1,0 +1,99 @@
+"""The contact gate: samples on the ground never enter the window, however the flight begins and ends."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crazyem.estimation.contact import CLEARANCE, CONTACT, OFF_FRACTION, ContactGate
+
+MAX = 0.48  # N, four rotors of 0.12 N
+HOVER = 0.28
+nan = math.nan
+
+
+def run(*samples, thrust_max=MAX):
+    """Verdicts for (height, thrust) or (height, thrust, flying) one after the other."""
+    gate = ContactGate(thrust_max)
+    return [gate.update(height=s[0], thrust=s[1], flying=s[2] if len(s) > 2 else None) for s in samples]
+
+
+def test_a_flight_from_the_ground_and_back():
+    heights = [0.0, 0.0, 0.01, 0.05, 0.09, 0.5, 1.0, 0.5, 0.09, 0.06, 0.04, 0.0, 0.0]
+    thrusts = [0.0, 0.2, 0.3, *[HOVER] * 8, 0.2, 0.0]
+    expected = [False, False, False, False, True, True, True, True, True, True, False, False, False]
+    assert run(*zip(heights, thrusts)) == expected
+
+
+def test_height_counts_from_where_it_rested():
+    assert run((0.75, 0.0), (0.78, HOVER), (0.84, HOVER), (0.79, HOVER)) == [False, False, True, False]
+    # a second rest on something higher
+    assert run((0.0, 0.0), (0.5, HOVER), (0.4, 0.0), (0.42, HOVER), (0.5, HOVER)) == [False, True, False, False, True]
+
+
+def test_a_recording_that_begins_in_flight():
+    assert run((1.0, HOVER), (1.01, HOVER), (0.02, HOVER)) == [True, True, True]
+    # once it has landed the ground is known
+    assert run((1.0, HOVER), (0.0, 0.0), (0.03, HOVER), (0.2, HOVER)) == [True, False, False, True]
+
+
+def test_no_height_at_all():
+    assert run((nan, 0.0), (nan, HOVER), (nan, 0.01)) == [False, True, False]
+
+
+def test_a_lost_height_keeps_the_verdict():
+    assert run((0.0, 0.0), (nan, HOVER), (0.5, HOVER), (nan, HOVER), (0.01, HOVER), (nan, HOVER)) == [
+        False, False, True, True, False, False]  # fmt: skip
+
+
+def test_the_firmware_has_the_last_word_when_it_says_not_flying():
+    assert run((0.0, 0.0), (0.5, HOVER, False), (0.5, HOVER, True), (0.02, HOVER, True)) == [False, False, False, False]
+    assert run((0.0, 0.0, False), (0.5, HOVER, True)) == [False, True]
+
+
+def test_the_gap_between_clearance_and_contact_keeps_noise_from_toggling():
+    between = (CLEARANCE + CONTACT) / 2
+    rising = run((0.0, 0.0), *[(between + 0.01 * (-1) ** k, HOVER) for k in range(10)])
+    assert not any(rising)
+    falling = run((0.0, 0.0), (0.5, HOVER), *[(between + 0.01 * (-1) ** k, HOVER) for k in range(10)])
+    assert all(falling[1:])
+
+
+def test_idling_rotors_are_off():
+    idle = 0.9 * OFF_FRACTION * MAX
+    assert run((0.0, idle), (1.0, idle)) == [False, False]
+
+
+def test_unknown_largest_thrust_takes_only_zero_for_off():
+    assert run((0.0, 0.0), (0.0, 1e-6), (0.5, 1e-6), thrust_max=math.inf) == [False, False, True]
+
+
+def test_the_reason_is_always_there_when_it_does_not_fly():
+    gate = ContactGate(MAX)
+    assert not gate.airborne
+    assert gate.reason
+    gate.update(height=0.0, thrust=0.0, flying=None)
+    assert "rotors off" in gate.reason
+    gate.update(height=0.01, thrust=HOVER, flying=None)
+    assert gate.reason == "on the ground"
+    gate.update(height=1.0, thrust=HOVER, flying=None)
+    assert gate.reason == ""
+
+
+@given(st.lists(st.tuples(st.floats(-0.02, 0.045) | st.just(nan), st.floats(0, MAX)), min_size=1, max_size=50))
+def test_no_ground_sample_is_ever_let_through(samples):
+    """Whatever the rotors do and whatever is measured: below the contact height after a rest nothing is flight."""
+    assert not any(run((0.0, 0.0), *((h + 0.0, f) for h, f in samples)))
+
+
+@given(st.lists(st.tuples(st.floats(-1, 3) | st.just(nan), st.floats(0, 1), st.none() | st.booleans()), max_size=50))
+def test_rotors_off_is_never_flight(samples):
+    for (_, thrust, flying), verdict in zip(samples, run(*samples)):
+        if thrust <= OFF_FRACTION * MAX or flying is False:
+            assert not verdict
+
+
+@pytest.mark.parametrize("height", [nan, 0.0, 1.0])
+def test_a_gate_decides_from_the_first_sample(height):
+    assert run((height, 0.0)) == [False]

@@ -1,0 +1,384 @@
+"""The online estimator on synthetic flights: values, determinism, bad samples, streams out of step, input signals."""
+
+import importlib.util
+import math
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crazyem.errors import DataError, UsageError
+from crazyem.estimation.online import OnlineEstimator
+from crazyem.signals.sample import Sample
+from crazyem.vehicle import load_vehicle
+
+_spec = importlib.util.spec_from_file_location("synthetic", Path(__file__).with_name("synthetic.py"))
+assert _spec is not None
+assert _spec.loader is not None
+synthetic = importlib.util.module_from_spec(_spec)
+sys.modules["synthetic"] = synthetic
+_spec.loader.exec_module(synthetic)
+
+# commands with rotor lag, but as a wrench: the nominal constants of a Crazyflie, wrong for the drone that flies
+LAGGED = replace(load_vehicle("cf2"), thrust_curve=(), rotor_constant=None, thrust_max=math.inf)
+TRUTH = synthetic.Truth()
+NAMES = ("mass", "Ixx", "Iyy", "Izz")
+TRUE = {"mass": TRUTH.mass, **dict(zip(NAMES[1:], TRUTH.inertia)), "motor_time_constant": TRUTH.lag}
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return synthetic.fly(TRUTH, seed=11, duration=5.0)
+
+
+def feed(estimator, samples):
+    """All estimates on the way."""
+    return [e for e in map(estimator.feed, samples) if e is not None]
+
+
+def same(a, b):
+    """Bit for bit, NaN included."""
+    return str(a.to_json()) == str(b.to_json()) and a.samples == b.samples and dict(a.noise) == dict(b.noise)
+
+
+def within(estimate, name, true, sds=4.0):
+    """The truth lies within so many standard deviations, which are themselves not ridiculous."""
+    p = estimate[name]
+    assert abs(p.value - true) < sds * p.sd, f"{name}: {p.value:.4g} +- {p.sd:.2g}, true {true:.4g}"
+    assert p.ci95[0] < p.value < p.ci95[1]
+
+
+def test_finds_the_drone_that_flies(flight):
+    estimator = OnlineEstimator(LAGGED)
+    estimates = feed(estimator, synthetic.samples(flight))
+    final = estimator.finish()
+    for name, true in TRUE.items():
+        within(final, name, true)
+    for name in NAMES:
+        assert final[name].identifiable, final[name].reason
+    assert final["mass"].relative_sd < 0.005
+    assert max(final[n].relative_sd for n in NAMES[1:]) < 0.15
+    assert final.converged
+    # what was said on the way was said in time order, with growing confidence
+    assert all(a.time < b.time for a, b in pairwise(estimates))
+    assert estimates[-1]["mass"].sd < estimates[10]["mass"].sd
+    assert estimator.airborne
+    assert final.samples == len(flight.time)
+    assert len(estimator.update_seconds) in (len(estimates), len(estimates) + 1)  # one more when the end is flushed
+
+
+def test_noise_scales_are_found_too(flight):
+    estimator = OnlineEstimator(LAGGED)
+    feed(estimator, synthetic.samples(flight))
+    noise = estimator.finish().noise
+    assert noise["position"] == pytest.approx(TRUTH.sensor[0], rel=0.15)
+    assert noise["velocity"] == pytest.approx(TRUTH.sensor[1], rel=0.15)
+    assert noise["attitude"] == pytest.approx(TRUTH.sensor[2], rel=0.15)
+    assert noise["thrust"] == pytest.approx(TRUTH.force_noise, rel=0.3)
+    assert noise["torque_x"] == pytest.approx(TRUTH.torque_noise, rel=0.5)
+    assert noise["torque_y"] == pytest.approx(TRUTH.torque_noise, rel=0.5)
+
+
+def test_the_same_samples_give_the_same_numbers(flight):
+    samples = synthetic.samples(flight)[:1500]
+    one, two = OnlineEstimator(LAGGED), OnlineEstimator(LAGGED)
+    for a, b in zip(feed(one, samples), feed(two, samples), strict=True):
+        assert same(a, b)
+    assert same(one.finish(), two.finish())
+
+
+def test_the_order_of_samples_of_one_instant_does_not_matter(flight):
+    samples = synthetic.samples(flight)[:1500]
+    rng = np.random.default_rng(0)
+    keys = rng.uniform(size=len(samples))
+    shuffled = [s for _, s in sorted(enumerate(samples), key=lambda e: (e[1].time, keys[e[0]]))]
+    assert shuffled != samples
+    one, two = OnlineEstimator(LAGGED), OnlineEstimator(LAGGED)
+    for a, b in zip(feed(one, samples), feed(two, shuffled), strict=True):
+        assert same(a, b)
+
+
+def test_signals_it_does_not_know_and_duplicates_change_nothing(flight):
+    samples = synthetic.samples(flight)[:1500]
+    noisy = []
+    for sample in samples:
+        noisy += [sample, sample, Sample("specific_force", sample.time, (0.0, 0.0, 9.81)),
+                  Sample("setpoint_position", sample.time, (math.nan,) * 3)]  # fmt: skip
+    one, two = OnlineEstimator(LAGGED), OnlineEstimator(LAGGED)
+    for a, b in zip(feed(one, samples), feed(two, noisy), strict=True):
+        assert same(a, b)
+
+
+def test_late_samples_are_counted_and_not_used(flight):
+    samples = synthetic.samples(flight)[:1500]
+    late = []
+    for k, sample in enumerate(samples):
+        late.append(sample)
+        if k > 200 and k % 100 == 0:
+            late.append(samples[k - 150])  # a packet of 300 ms ago, measurements or command
+    one, two = OnlineEstimator(LAGGED), OnlineEstimator(LAGGED)
+    a, b = feed(one, samples)[-1], feed(two, late)[-1]
+    assert two.counters.late > 0
+    assert one.counters.late == 0
+    # nothing but the moment of an update may move
+    for name in NAMES:
+        assert b[name].value == pytest.approx(a[name].value, rel=0.1 * a[name].relative_sd + 1e-9)
+
+
+def test_nan_is_missing_and_never_spreads(flight):
+    rng = np.random.default_rng(1)
+    samples = []
+    for sample in synthetic.samples(flight):
+        value = np.array(sample.value)
+        if rng.uniform() < 0.2:
+            value[rng.integers(len(value))] = rng.choice([np.nan, np.inf, -np.inf])
+        samples.append(replace(sample, value=tuple(value)))
+    estimator = OnlineEstimator(LAGGED)
+    for estimate in feed(estimator, samples):
+        assert all(np.isfinite(p.value) for p in estimate.parameters.values())
+    final = estimator.finish()
+    assert estimator.counters.missing > 100
+    for name, true in TRUE.items():
+        within(final, name, true)
+
+
+def test_one_packet_in_five_lost(flight):
+    """Measurements in two blocks, commands in a third, each with its own phase and its own losses."""
+    rng = np.random.default_rng(2)
+    blocks = (("position", "velocity", "attitude"), ("body_rate",))
+    events = []
+    for row in range(0, len(flight.fine_time) - 10, 10):
+        for phase, names in zip((0, 4), blocks):
+            if rng.uniform() > 0.2:
+                t, y = flight.fine_time[row + phase], flight.fine_y[row + phase]
+                events += [Sample(n, t, tuple(y[synthetic.COLUMNS[n]])) for n in names]
+        if rng.uniform() > 0.2:
+            t = flight.fine_time[row + 7]
+            events.append(Sample("wrench_command", t, tuple(flight.fine_wrench[row + 7])))
+    estimator = OnlineEstimator(LAGGED)
+    feed(estimator, events)
+    final = estimator.finish()
+    for name, true in TRUE.items():
+        within(final, name, true)
+    assert final["mass"].identifiable
+
+
+@pytest.mark.parametrize("phase", [5, 8])
+def test_commands_stamped_between_the_measurements(flight, phase):
+    events = []
+    for row in range(0, len(flight.fine_time) - 10, 10):
+        t, y = flight.fine_time[row], flight.fine_y[row]
+        events += [Sample(n, t, tuple(y[c])) for n, c in synthetic.COLUMNS.items()]
+        events.append(Sample("wrench_command", flight.fine_time[row + phase], tuple(flight.fine_wrench[row + phase])))
+    estimator = OnlineEstimator(LAGGED)
+    feed(estimator, events)
+    final = estimator.finish()
+    for name, true in TRUE.items():
+        within(final, name, true)
+
+
+def test_a_gap_is_a_break_and_not_a_step(flight):
+    samples = [s for s in synthetic.samples(flight) if not 2.0 < s.time < 2.5]
+    estimator = OnlineEstimator(LAGGED)
+    feed(estimator, samples)
+    assert estimator.counters.breaks == 2
+    final = estimator.finish()
+    for name, true in TRUE.items():
+        within(final, name, true)
+
+
+def test_commands_that_stop_for_a_while_are_not_held_over(flight):
+    samples = [s for s in synthetic.samples(flight) if s.signal != "wrench_command" or not 2.0 < s.time < 2.5]
+    estimator = OnlineEstimator(LAGGED)
+    feed(estimator, samples)
+    assert estimator.counters.breaks > 1
+    final = estimator.finish()
+    for name, true in TRUE.items():
+        within(final, name, true)
+
+
+def test_on_the_ground_nothing_is_identifiable_and_nothing_is_used():
+    estimator = OnlineEstimator(LAGGED)
+    rng = np.random.default_rng(0)
+    for k in range(300):
+        t = 0.01 * k
+        estimator.feed(Sample("wrench_command", t, (0.0 if k < 100 else 0.2, 0.0, 0.0, 0.0)))  # spins up, does not lift
+        estimator.feed(Sample("position", t, tuple(rng.normal(size=3) * 1e-3)))
+        estimator.feed(Sample("velocity", t, tuple(rng.normal(size=3) * 1e-2)))
+        estimator.feed(Sample("attitude", t, (0.0, 0.0, 0.0, 1.0)))
+        estimator.feed(Sample("body_rate", t, tuple(rng.normal(size=3) * 1e-3)))
+    final = estimator.finish()
+    assert not estimator.airborne
+    assert final.samples == 0
+    assert estimator.counters.grounded > 290
+    for name, p in final.parameters.items():
+        assert not p.identifiable, name
+        assert p.sd == math.inf or not p.identifiable
+    assert "ground" in final["mass"].reason
+    assert final["mass"].value == LAGGED.mass
+
+
+def test_ground_before_and_after_a_flight_leaves_the_estimate_alone(flight):
+    """The flight begins and ends on the ground, in contact; contact says a = 0 whatever the thrust."""
+
+    def on_ground(begin, end, thrust):
+        out = []
+        for t in np.arange(begin, end, 0.01):
+            out.append(Sample("wrench_command", float(t), (thrust, 0.0, 0.0, 0.0)))
+            still = {"position": (0, 0, -0.5), "velocity": (0, 0, 0), "attitude": (0, 0, 0, 1), "body_rate": (0, 0, 0)}
+            out += [Sample(name, float(t), tuple(map(float, value))) for name, value in still.items()]
+        return out
+
+    end = float(flight.time[-1])
+    samples = [*on_ground(-0.6, -0.3, 0.0), *on_ground(-0.3, -0.005, TRUTH.mass * 9.81), *synthetic.samples(flight),
+               *on_ground(end + 0.01, end + 0.4, 0.3), *on_ground(end + 0.4, end + 0.6, 0.0)]  # fmt: skip
+    estimator, plain = OnlineEstimator(LAGGED), OnlineEstimator(LAGGED)
+    feed(estimator, samples)
+    feed(plain, synthetic.samples(flight))
+    final, reference = estimator.finish(), plain.finish()
+    assert final.samples == reference.samples
+    for name in NAMES:
+        assert abs(final[name].value - reference[name].value) < 0.5 * reference[name].sd
+
+
+@pytest.mark.parametrize(("window", "every"), [(100, 1), (100, 7), (300, 10)])
+def test_window_and_every_are_settable(flight, window, every):
+    estimator = OnlineEstimator(LAGGED, window=window, every=every)
+    estimates = feed(estimator, synthetic.samples(flight))
+    assert len(estimates) == pytest.approx(len(flight.time) / every, abs=2)
+    assert max(e.samples for e in estimates) == window
+    within(estimator.finish(), "mass", TRUTH.mass)
+
+
+def test_a_long_flight_through_a_small_window(flight):
+    """The tape is shifted many times over; old samples fall off its front."""
+    estimator = OnlineEstimator(LAGGED, window=60, every=5)
+    longer = synthetic.fly(TRUTH, seed=3, duration=10.0)
+    estimates = feed(estimator, synthetic.samples(longer))
+    assert estimates[-1].samples == 60
+    assert all(np.isfinite(e["mass"].value) for e in estimates)
+    within(estimates[-1], "mass", TRUTH.mass)
+
+
+@pytest.mark.parametrize(("arguments", "word"), [
+    ({"window": 3}, "window"), ({"every": 0}, "every 0"), ({"input_signal": "throttle"}, "throttle"),
+])  # fmt: skip
+def test_bad_settings_give_one_sentence(arguments, word):
+    with pytest.raises(UsageError, match=word) as caught:
+        OnlineEstimator(LAGGED, **arguments)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["cf2", "zhao", "cf21bl"])
+def test_nothing_to_estimate_from_is_said(name):
+    with pytest.raises(DataError, match="nothing to estimate from") as caught:
+        OnlineEstimator(load_vehicle(name)).finish()
+    assert "\n" not in str(caught.value)
+
+
+def test_motor_commands_wait_for_a_battery_voltage():
+    estimator = OnlineEstimator(load_vehicle("cf2"))
+    for k in range(10):
+        estimator.feed(Sample("motor_command", 0.01 * k, (0.6,) * 4))
+        estimator.feed(Sample("position", 0.01 * k, (0.0, 0.0, 1.0)))
+    with pytest.raises(DataError, match="battery voltage"):
+        estimator.finish()
+    assert estimator.counters.unpowered == 10
+
+
+def mixed(wrench, arm, torque_per_thrust):
+    """Forces of the rotors for a wrench, as the firmware mixes them (n, 4) -> (n, 4)."""
+    f, x, y, z = (wrench / [4, 4 * arm[1], 4 * arm[0], 4 * torque_per_thrust]).T
+    return np.stack([f - x - y - z, f - x + y + z, f + x + y - z, f + x - y + z], 1)
+
+
+def test_motor_commands_with_battery_voltage(flight):
+    """Duty solved from the thrust curve; the drone is what commands it."""
+    vehicle = load_vehicle("cf2")
+    volts = np.linspace(0.5, 4.2, 3000)
+    curve = np.polynomial.polynomial.polyval(volts, vehicle.thrust_curve)
+    each = mixed(flight.wrench, vehicle.arm, vehicle.torque_per_thrust)
+    assert each.min() > 0.02
+    duty = np.interp(each, curve, volts) / 3.9
+    samples = []
+    for k, t in enumerate(flight.time):
+        samples += [Sample("voltage", t, (3.9,)), Sample("motor_command", t, tuple(duty[k]))]
+        samples += [Sample(n, t, tuple(flight.y[k, c])) for n, c in synthetic.COLUMNS.items()]
+    estimator, plain = OnlineEstimator(vehicle), OnlineEstimator(LAGGED)
+    feed(estimator, samples)
+    feed(plain, synthetic.samples(flight))
+    ours, reference = estimator.finish(), plain.finish()
+    for name in NAMES:
+        assert abs(ours[name].value - reference[name].value) < 0.3 * reference[name].sd
+
+
+def test_rotor_speeds_include_the_lag(flight):
+    vehicle = replace(load_vehicle("cf21bl"), mass=0.03)
+    each = mixed(flight.fine_acting[::10], vehicle.arm, vehicle.torque_per_thrust)
+    speed = np.sqrt(each / vehicle.rotor_constant)
+    samples = []
+    for k, t in enumerate(flight.time):
+        samples.append(Sample("rotor_speed", t, tuple(speed[k])))
+        samples += [Sample(n, t, tuple(flight.y[k, c])) for n, c in synthetic.COLUMNS.items()]
+    estimator = OnlineEstimator(vehicle)
+    feed(estimator, samples)
+    final = estimator.finish()
+    for name in NAMES:
+        within(final, name, TRUE[name])
+    assert not final["motor_time_constant"].identifiable
+    assert "lag" in final["motor_time_constant"].reason
+
+
+# The paper's drone: thrust and torque as inputs, no lag, logged at 200 Hz
+ZHAO = synthetic.Truth(mass=0.18, inertia=(2.5e-4, 3.1e-4, 2.0e-4), lag=0.0, force_noise=5e-3, torque_noise=5e-5,
+                       dither=3e-3)  # fmt: skip
+
+
+def test_cold_start_on_the_drone_of_the_paper():
+    flight = synthetic.fly(ZHAO, seed=4, duration=4.0, rate=100, sub=10, control_every=10)
+    estimator = OnlineEstimator(load_vehicle("zhao"), mass=0.001, inertia=(1e-4, 2e-4, 1e-4))
+    feed(estimator, synthetic.samples(flight))
+    final = estimator.finish()
+    for name, true in zip(NAMES, (ZHAO.mass, *ZHAO.inertia)):
+        within(final, name, true)
+        assert final[name].value == pytest.approx(true, rel=0.1)
+        assert final[name].identifiable
+    assert final["motor_time_constant"].value == 0.0
+    assert not final["motor_time_constant"].identifiable
+
+
+def test_cold_start_gives_what_a_warm_start_gives():
+    flight = synthetic.fly(ZHAO, seed=5, duration=4.0, rate=100, sub=10, control_every=10)
+    cold = OnlineEstimator(load_vehicle("zhao"), mass=0.001, inertia=(1e-4, 2e-4, 1e-4))
+    warm = OnlineEstimator(load_vehicle("zhao"))
+    for estimator in (cold, warm):
+        feed(estimator, synthetic.samples(flight))
+    a, b = cold.finish(), warm.finish()
+    for name in NAMES:
+        assert abs(a[name].value - b[name].value) < 0.3 * b[name].sd
+
+
+def test_products_of_inertia_of_the_vehicle_file_are_used():
+    """With the true products fixed the moments come out right; without them they are off by their coupling at most."""
+    truth = replace(TRUTH, inertia=(2.0e-5, 2.1e-5, 3.6e-5, 2e-6, -1e-6, 1e-6))
+    flight = synthetic.fly(truth, seed=6, duration=5.0)
+    estimator = OnlineEstimator(replace(LAGGED, inertia_products=truth.inertia[3:]))
+    feed(estimator, synthetic.samples(flight))
+    final = estimator.finish()
+    for name, true in zip(NAMES, (truth.mass, *truth.inertia[:3])):
+        within(final, name, true)
+
+
+def test_an_estimate_is_printed_and_serialised(flight):
+    estimator = OnlineEstimator(LAGGED)
+    feed(estimator, synthetic.samples(flight)[:600])
+    final = estimator.finish()
+    text = str(final)
+    for name in (*NAMES, "motor_time_constant"):
+        assert name in text
+        entry = final.to_json()[name]
+        assert set(entry) == {"value", "sd", "ci95", "unit", "identifiable", "reason"}
+        assert bool(entry["reason"]) != entry["identifiable"]
