@@ -216,19 +216,22 @@ class WindowEM:
 
         The tape is left filtered and smoothed with the parameters that the returned information belongs to.
         """
+        damping, before = np.ones(10), np.zeros(10)  # a noise scale whose steps swing back takes shorter ones
         for count in range(passes):
             self.refill_inputs(first, last)
             self.forward(first, last, restart=True)
             info = self.information(first, last)
             self.backward(first, last)
             noise_step, noise_length = self._noise_score(first, last)
+            damping = np.where(noise_step * before < 0, 0.5 * damping, np.minimum(1.3 * damping, 1.0))
+            before = noise_step
             if (info.decrement < TOLERANCE and noise_length < TOLERANCE) or count == passes - 1:
                 break
             after = self.maximise(first, last)
             em_step = np.max(np.abs(offset(after.theta, self.parameters.theta, self.setup.unit)[:4]))
             if info.decrement < 10.0 and em_step < 0.1:
                 theta = displaced(self.parameters.theta, np.clip(info.step, -0.2, 0.2), self.setup.unit)
-                noise = Noise.from_logs(self.parameters.noise.logs + noise_step)
+                noise = Noise.from_logs(self.parameters.noise.logs + damping * noise_step)
                 self.parameters = Parameters(theta, noise, after.inertia_products)
             else:
                 self.parameters = after
