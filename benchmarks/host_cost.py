@@ -74,7 +74,6 @@ def fly(*, duration: float, trajectory: str, seed: int) -> dict[str, Any]:
         "samples": told["samples"],
         "updates": told["updates"],
         "update_ms": told["update_ms"],
-        "blocks_per_s": told["samples"]["received"] / max(1e-9, marks[-1][0] - lines[1][0]),
         "pushes": len(told["pushes"]),
     }
 
