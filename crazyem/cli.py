@@ -1,29 +1,49 @@
 """The command line: parses, calls one function per command, turns errors into one sentence and an exit code."""
 
 import argparse
+import math
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NoReturn
 
-from crazyem.errors import CrazyemError
+from crazyem.errors import CrazyemError, UsageError
 
-
-def _positive_integer(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not positive")
-    return value
+LONGEST_WINDOW = 20_000  # samples; the buffers are made at once, and an update would take seconds long before
 
 
-def _speed(text: str) -> float:
-    value = float(text)
-    if not 0.05 <= value <= 100:
-        raise argparse.ArgumentTypeError("a speed is between 0.05 and 100")
-    return value
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one sentence, like every other error; the usage is behind --help."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{message} (see {self.prog} --help).")
+
+
+def _integer(low: int, high: int) -> Callable[[str], int]:
+    def integer(text: str) -> int:
+        if not re.fullmatch(r"[+-]?\d{1,18}", text) or not low <= int(text) <= high:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number between {low} and {high}")
+        return int(text)
+
+    return integer
+
+
+def _number(low: float, high: float, unit: str = "") -> Callable[[str], float]:
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:  # catches NaN
+            raise argparse.ArgumentTypeError(f"{text!r} is not a number between {low:g} and {high:g}{unit}")
+        return value
+
+    return number
 
 
 def parser() -> argparse.ArgumentParser:
     """The whole command line."""
-    top = argparse.ArgumentParser(
+    top = _Parser(
         prog="crazyem", description="Online estimates of a Crazyflie's mass and inertia, pushed to its controller."
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -33,8 +53,9 @@ def parser() -> argparse.ArgumentParser:
         vehicle, window, every = (None, None, None) if recorded else ("cf2", 800, 4)
         p = commands.add_parser(name, help=text, description=text)
         p.add_argument("--vehicle", default=vehicle, metavar="NAME|FILE", help="preset or vehicle file (default: cf2)")
-        p.add_argument("--window", type=_positive_integer, default=window, help="newest samples used (default: 800)")
-        p.add_argument("--every", type=_positive_integer, default=every, help="samples per update (default: 4)")
+        samples, step = _integer(20, LONGEST_WINDOW), _integer(1, LONGEST_WINDOW)
+        p.add_argument("--window", type=samples, metavar="N", default=window, help="newest samples (default: 800)")
+        p.add_argument("--every", type=step, metavar="N", default=every, help="samples per update (default: 4)")
         p.add_argument("--json", metavar="FILE", help="summary for programs; - for standard output")
         p.add_argument("--plot", metavar="FILE.png", help="summary plot (default: beside the recording or summary)")
         return p
@@ -45,32 +66,33 @@ def parser() -> argparse.ArgumentParser:
     fly.add_argument(
         "--trajectory", nargs="+", default=["hover"], metavar="NAME", help="hover, figure8, excite, or waypoints FILE"
     )
-    fly.add_argument("--duration", type=float, default=20.0, metavar="S", help="of the trajectory (default: 20)")
+    seconds = _number(1, 3600, " seconds")
+    fly.add_argument("--duration", type=seconds, default=20.0, metavar="S", help="of the trajectory (default: 20)")
     fly.add_argument("--no-push", action="store_true", help="estimate only, write no parameters")
     fly.add_argument("--record", metavar="FILE.mcap", help="record everything")
     fly.add_argument("--scenario", metavar="FILE", help="the simulator's truth (only the simulator reads it)")
-    fly.add_argument("--seed", type=int, help="of the simulator's noise (default: 0)")
-    fly.add_argument("--speed", type=_speed, metavar="X", help="of the simulator, times real time (default: 1)")
+    fly.add_argument("--seed", type=_integer(0, 2**31 - 1), help="of the simulator's noise (default: 0)")
+    fly.add_argument(
+        "--speed", type=_number(0.05, 100), metavar="X", help="of the simulator, times real time (default: 1)"
+    )
 
     replay = common("replay", "run the estimator over a recording", recorded=True)
     replay.add_argument("file", metavar="FILE", help="our MCAP, or a CSV (plain or gzip) of a known layout")
 
     watch = common("watch", "estimate without commanding")
     watch.add_argument("uri", metavar="URI")
-    watch.add_argument("--duration", type=float, metavar="S", help="s until it ends by itself")
+    watch.add_argument("--duration", type=_number(0.1, 1e6, " seconds"), metavar="S", help="s until it ends by itself")
     watch.add_argument("--record", metavar="FILE.mcap", help="record everything")
     return top
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    arguments, rest = parser().parse_known_args(argv)
-    if rest:
-        parser().error(f"unrecognized arguments: {' '.join(rest)}")
-    # In `fly --trajectory hover URI` the option has swallowed the URI.
-    if arguments.command == "fly" and arguments.uri is None and "://" in arguments.trajectory[-1]:
-        arguments.uri = arguments.trajectory.pop()
     try:
+        arguments = parser().parse_args(argv)
+        # In `fly --trajectory hover URI` the option has swallowed the URI.
+        if arguments.command == "fly" and arguments.uri is None and "://" in arguments.trajectory[-1]:
+            arguments.uri = arguments.trajectory.pop()
         if arguments.command == "fly":
             from crazyem.commands import fly as command
         elif arguments.command == "replay":

@@ -40,7 +40,7 @@ def plot_path(arguments: argparse.Namespace, *others: str | None) -> str:
     if arguments.plot:
         return str(arguments.plot)
     for other in others:
-        if other and other != "-":
+        if other and other != "-" and Path(other).name:
             name = Path(other).name
             for suffix in (".csv.gz", ".csv", ".mcap", ".json"):
                 name = name.removesuffix(suffix)
@@ -87,9 +87,9 @@ def report(
         say(text)
     else:
         print(text, flush=True)
-    write_plot(plot, history, vehicle, title=title)
     if arguments.json:
         write_json(summary, arguments.json)
+    write_plot(plot, history, vehicle, title=title)
     say(f"plot: {plot}" + (f"   summary: {arguments.json}" if arguments.json not in (None, "-") else ""))
     return estimate
 

@@ -244,7 +244,7 @@ class CrazyflieLink:
         self._last_packet = time.monotonic()
 
     def _on_connection_lost(self, _uri: str, _message: str) -> None:
-        self._report_lost(f"The drone at {self.uri} is gone (the link reports an error).")
+        self._report_lost(f"The drone at {self.uri} was lost (the link reports an error).")
 
     def _on_disconnected(self, _uri: str) -> None:
         if not self._owned:

@@ -155,8 +155,10 @@ class Session:
     def lost_sentence(self) -> str:
         """One sentence about a lost drone."""
         reason = self.lost.reason.rstrip(".") if self.lost else "no packets arrive"
+        if self.link.uri not in reason:
+            reason = f"the drone at {self.link.uri} was lost: {reason}"
         tail = f"; the recording {self.recorder.path} is intact up to there" if self.recorder is not None else ""
-        return f"the drone at {self.link.uri} was lost: {reason}{tail}."
+        return f"{reason[:1].lower()}{reason[1:]}{tail}."
 
     def close(self) -> None:
         """Stop receiving, let the estimator finish what has arrived, end the writes. Does not close the link."""

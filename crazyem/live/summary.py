@@ -1,7 +1,9 @@
 """The summary of a flight, a replay or a watch: JSON for programs (names are an interface), text for people."""
 
+import errno
 import json
 import math
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -87,13 +89,24 @@ def check_writable(path: str | None) -> None:
     """Find out before the flight, not after it, that a result cannot be written.
 
     Raises:
-        UsageError: no such folder, or it is a folder.
+        UsageError: the file cannot be opened for writing.
     """
     if path is None or path == "-":
         return
     target = Path(path)
-    if target.is_dir() or not target.resolve().parent.is_dir():
-        raise UsageError(f"cannot write {path}: no such folder, or it is a folder.")
+    try:
+        if target.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if target.exists() and not target.is_file():
+            return  # a device or a pipe: opening it may block
+        existed = target.exists()
+        with target.open("ab"):  # the only test that is right about permissions, full disks and strange file systems
+            pass
+        if not existed:
+            target.unlink()
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else str(error)
+        raise UsageError(f"cannot write {path}: {why}.") from None
 
 
 def text_summary(summary: Mapping[str, Any], estimate: Estimate) -> str:
