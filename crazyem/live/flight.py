@@ -223,18 +223,24 @@ class Flight:
             self._stream.stop()
         if not self._may_fly:
             return
+        notice = self.session.history.notice
         if self.session.lost is None:
-            self.session.history.notice("the flight ended early; the drone was landed.")
+            flew = self.telemetry.has(FLYING) or self.telemetry.height > self._ground + 0.1
             for _ in range(2):  # a Ctrl-C that arrives while landing is the second one: cut
                 try:
                     self._land()
+                    notice(
+                        "the flight ended early; the drone was landed." if flew else "the drone never left the ground."
+                    )
                     return
                 except MotorsCutError:
-                    break
+                    self._cut()
+                    raise
                 except FlightInterruptedError:
                     continue
                 except BaseException:
                     break
+            notice("the flight ended early and the drone could not be landed: its motors were cut.")
         self._cut()
 
     def _cut(self) -> None:
