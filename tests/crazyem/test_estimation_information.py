@@ -1,0 +1,96 @@
+"""What widens an interval: correlation in time (Newey and West) and noise in sampled commands, against closed forms."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crazyem.estimation.aliasing import log_inertia_bias, noise_share, white_variance
+from crazyem.estimation.spectra import MIN_ROWS, long_run
+
+
+def bartlett(terms, lags):
+    """Long-run variance of column sums, written out."""
+    total = (terms**2).sum(0)
+    for lag in range(1, lags + 1):
+        total = total + 2 * (1 - lag / (lags + 1)) * (terms[lag:] * terms[:-lag]).sum(0)
+    return total
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 900))
+@settings(max_examples=20, deadline=None)
+def test_long_run_is_the_bartlett_estimate(seed, n):
+    terms = np.random.default_rng(seed).normal(size=(n, 3)).cumsum(0)
+    lags = min(n // 8, 100) if n >= MIN_ROWS else 0
+    np.testing.assert_allclose(long_run(terms), bartlett(terms, lags), rtol=1e-9)
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.5, 0.9])
+def test_long_run_of_an_autoregressive_process(memory):
+    """The variance of a sum of n terms of an AR(1) process is n s^2 (1 + a) / (1 - a), for n large."""
+    rng = np.random.default_rng(1)
+    n = 4000
+    x = np.zeros((n, 8))
+    for k in range(1, n):
+        x[k] = memory * x[k - 1] + rng.normal(size=8)
+    expected = n / (1 - memory) ** 2
+    assert np.mean(long_run(x)) == pytest.approx(expected, rel=0.25)
+
+
+def test_white_part_of_a_command_is_found():
+    """Smooth command plus gain times measured rate: the noise of the rate comes through with the gain squared."""
+    rng = np.random.default_rng(0)
+    t = np.arange(3000) * 0.01
+    rate_noise = 2e-3 * rng.normal(size=len(t))
+    rate = 0.4 * np.sin(2 * np.pi * 0.5 * t) + rate_noise
+    command = 1e-4 * np.sin(2 * np.pi * 0.5 * t) - 1e-3 * rate
+    found = white_variance(command, rate, rate_variance=4e-6)
+    assert found == pytest.approx((1e-3 * 2e-3) ** 2, rel=0.1)
+    # what no rate explains counts in full
+    extra = 3e-6 * rng.normal(size=len(t))
+    assert white_variance(command + extra, rate, rate_variance=4e-6) == pytest.approx(4e-12 + 9e-12, rel=0.1)
+
+
+def test_a_smooth_command_has_no_white_part():
+    t = np.arange(1000) * 0.01
+    command = 1e-4 * np.sin(2 * np.pi * 1.0 * t)
+    assert white_variance(command, np.full(1000, np.nan), rate_variance=4e-6) < 1e-3 * np.var(command)
+    assert white_variance(np.zeros(1000), np.zeros(1000), rate_variance=4e-6) == 0.0
+
+
+def test_missing_rates_are_left_out():
+    rng = np.random.default_rng(0)
+    rate = 2e-3 * rng.normal(size=2000)
+    command = -1e-3 * rate
+    rate[rng.uniform(size=2000) < 0.3] = np.nan
+    assert white_variance(command, rate, rate_variance=4e-6) == pytest.approx(4e-12, rel=0.2)
+
+
+@given(st.floats(0, 1e-6), st.floats(1e-3, 0.05), st.floats(0, 0.2), st.floats(0, 1e-6))
+def test_share_is_a_share_and_bias_grows_with_it(white, period, tau, variance):
+    share = noise_share(white, period=period, tau=tau, torque_variance=variance)
+    assert 0.0 <= share <= 1.0
+    assert 0.0 <= log_inertia_bias(share) < 5.0
+    assert noise_share(white, period=period, tau=tau + 0.05, torque_variance=variance) <= share
+
+
+def test_lagged_white_samples_have_the_variance_that_the_share_says():
+    """White samples h apart, joined by steps, through a lag: variance h / (2 tau + h), by simulation."""
+    rng = np.random.default_rng(3)
+    period, tau, fine = 0.01, 0.06, 20
+    u = np.repeat(rng.normal(size=40000), fine)
+    decay = np.exp(-period / fine / tau)
+    y, out = 0.0, []
+    for value in u:
+        y = value + (y - value) * decay
+        out.append(y)
+    assert np.var(out) == pytest.approx(noise_share(1.0, period=period, tau=tau, torque_variance=1.0), rel=0.1)
+
+
+def test_attenuated_slope_of_a_noisy_regressor():
+    """Errors in variables: acceleration on a torque with a share of noise has a slope too small by that share."""
+    rng = np.random.default_rng(4)
+    torque, inertia, share = rng.normal(size=200000), 2.0, 0.2
+    seen = torque + np.sqrt(share / (1 - share)) * rng.normal(size=len(torque))
+    slope = np.dot(seen, torque / inertia) / np.dot(seen, seen)
+    assert np.log(1 / slope / inertia) == pytest.approx(log_inertia_bias(share), abs=0.02)
