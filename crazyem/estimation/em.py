@@ -19,7 +19,7 @@ from crazyem.estimation.mstep import maximise
 from crazyem.estimation.spectra import long_run
 from crazyem.estimation.tape import START_VARIANCE, Tape
 
-TOLERANCE = 0.05  # converged when the next scoring step is shorter than this many standard deviations
+TOLERANCE = 0.02  # converged when the next scoring step is shorter than this many standard deviations
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class WindowEM:
         t, p = self.tape, self.parameters
         inertia = p.inertia
         return kernels.forward(
-            first, last, restart, t.time, t.kind, t.y, t.thrust, t.torque, p.theta[0], inertia, np.linalg.inv(inertia),
+            first, last, restart, t.time, t.kind, t.y, t.thrust, t.torque, p.theta[0], inertia, p.inverse,
             p.noise.q, p.noise.r, START_VARIANCE, t.xp, t.pp, t.xf, t.pf, t.gain, t.s, t.e, t.blocks, t.middle,
             t.loglik,
         )  # fmt: skip
@@ -74,7 +74,7 @@ class WindowEM:
         kernels.backward(
             first, last, t.time, t.kind, t.usable, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
             t.thrust_delay, t.torque_delay, p.theta[4], p.theta[5], p.theta[6:9], p.theta[0], inertia,
-            np.linalg.inv(inertia), p.noise.q, p.noise.r, t.xf, t.pf, t.gain, t.s, t.e, t.blocks,
+            p.inverse, p.noise.q, p.noise.r, t.xf, t.pf, t.gain, t.s, t.e, t.blocks,
             t.middle, t.stats, t.moments,
         )  # fmt: skip
 
@@ -136,6 +136,8 @@ class WindowEM:
         """
         noise, prior = self.parameters.noise, self.setup.prior
         rows = self.tape.stats[first + 1 : last]
+        if len(rows) == 0:
+            return np.zeros(10), 0.0
         counts = rows[:, kernels.COUNT : kernels.COUNT + 1]
         terms = np.concatenate(
             [
@@ -146,7 +148,7 @@ class WindowEM:
             axis=1,
         )
         diagonal = 2 * rows[:, kernels.IMPULSE_SEEN :].sum(0)
-        information = np.maximum(diagonal, long_run(terms)) + prior.noise_sd**-2
+        information = np.maximum(diagonal, long_run(terms - terms.mean(0))) + prior.noise_sd**-2
         score = terms.sum(0) + (prior.noise.logs - noise.logs) / prior.noise_sd**2
         step = np.clip(score / information, -1.5, 1.5)
         bounded = self._bounded(noise.logs + step).logs - noise.logs
@@ -155,10 +157,19 @@ class WindowEM:
     # passes -------------------------------------------------------------------------------------------------
 
     def incremental(self, first: int, fresh: int, last: int, *, lookback: int) -> None:
-        """Filter rows fresh..last-1, smooth the newest `lookback` before them too, maximise."""
-        self.inputs.advance(self.tape, fresh, last, self.parameters.theta)
-        self.forward(fresh, last, restart=False)
-        self.backward(max(first, fresh - lookback - 1), last)
+        """Filter and smooth the new rows fresh..last-1 and `lookback` before them, maximise.
+
+        The older of these rows are filtered again: smoothing with other parameters than a row was filtered with puts
+        the change of the parameters into its accelerations.
+        """
+        theta, tape = self.parameters.theta, self.tape
+        self.inputs.advance(tape, fresh, last, theta)
+        begin = max(first, fresh - lookback - 1)
+        tape.spread_inputs(begin + 1, fresh, theta[6:9])
+        kept = tape.stats[begin].copy()  # the smoother starts anew at its first row and would empty it
+        self.forward(min(begin + 1, fresh), last, restart=False)
+        self.backward(begin, last)
+        tape.stats[begin] = kept
         self.parameters = self.maximise(first, last, iterations=3)
 
     def information(self, first: int, last: int) -> Information:
@@ -167,7 +178,7 @@ class WindowEM:
         inertia = p.inertia
         matrix = kernels.sensitivities(
             first, last, t.time, t.kind, t.usable, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
-            t.thrust_delay, t.torque_delay, p.theta, self.setup.unit, inertia, np.linalg.inv(inertia), t.xf, t.gain,
+            t.thrust_delay, t.torque_delay, p.theta, self.setup.unit, inertia, p.inverse, t.xf, t.gain,
             t.s, t.e, t.blocks, t.middle, t.score,
         )  # fmt: skip
         free = np.flatnonzero(setup.free)

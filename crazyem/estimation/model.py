@@ -1,6 +1,7 @@
 """What is estimated and what is assumed: parameter vector, noise scales, priors; all frozen."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ class Noise:
     impulse: NDArray
     measurement: NDArray
 
-    @property
+    @cached_property
     def logs(self) -> NDArray:
         """Logarithms of all ten scales: impulses, then measurements."""
         return np.log(np.concatenate([self.impulse, self.measurement]))
@@ -43,12 +44,12 @@ class Noise:
         """Inverse of `logs`."""
         return cls(np.exp(logs[:6]), np.exp(logs[6:]))
 
-    @property
+    @cached_property
     def q(self) -> NDArray:
         """Impulse variances per second (6,), for the kernels."""
         return np.square(self.impulse)
 
-    @property
+    @cached_property
     def r(self) -> NDArray:
         """Measurement variances (12,), for the kernels."""
         return np.repeat(np.square(self.measurement), 3)
@@ -87,11 +88,16 @@ class Parameters:
     noise: Noise
     inertia_products: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    @property
+    @cached_property
     def inertia(self) -> NDArray:
         """Inertia matrix (3, 3) [kg m^2]."""
         xy, xz, yz = self.inertia_products
         return np.array([[self.theta[1], xy, xz], [xy, self.theta[2], yz], [xz, yz, self.theta[3]]])
+
+    @cached_property
+    def inverse(self) -> NDArray:
+        """Inverse of the inertia matrix."""
+        return np.linalg.inv(self.inertia)
 
     def with_theta(self, theta: NDArray) -> "Parameters":
         """The same with another theta."""

@@ -36,6 +36,7 @@ def objective(theta, unit, sums, free, centre, precision, gradient, hessian, squ
     c = np.zeros(6)
     dc = np.zeros((6, PARAMETERS))
     ac = np.zeros(6)
+    adc = np.zeros((6, PARAMETERS))
     for i in range(PARAMETERS):
         gradient[i] = 0.0
         for j in range(PARAMETERS):
@@ -86,14 +87,18 @@ def objective(theta, unit, sums, free, centre, precision, gradient, hessian, squ
                 grad[u] += dc[p, u] * ac[p]
             grad[u] *= 2.0 * scale[u]
             gradient[u] += 0.5 * count * grad[u] / s
+        for p in range(n):
+            for v in range(PARAMETERS):
+                adc[p, v] = 0.0
+                for q in range(n):
+                    adc[p, v] += a[p, q] * dc[q, v]
         for u in range(PARAMETERS):
             if u <= LAG:
                 hessian[u, u] += 0.5 * count * grad[u] / s
             for v in range(PARAMETERS):
                 h = 0.0
                 for p in range(n):
-                    for q in range(n):
-                        h += dc[p, u] * a[p, q] * dc[q, v]
+                    h += dc[p, u] * adc[p, v]
                 hessian[u, v] += 0.5 * count * (2.0 * h * scale[u] * scale[v] / s - grad[u] * grad[v] / (s * s))
     for u in range(PARAMETERS):
         if free[u]:

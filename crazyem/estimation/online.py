@@ -27,8 +27,8 @@ from crazyem.vehicle import Vehicle
 
 SAME_NODE = 0.0015  # s; measurements closer than this belong to one node
 PATIENCE = 0.06  # s a node waits for inputs before the last one is held
-LOOKBACK = 40  # samples smoothed again in an incremental pass
-REFRESH = 25  # updates between two full passes with information
+LOOKBACK = 20  # samples smoothed again in an incremental pass
+REFRESH = 12  # updates between two full passes with information
 YOUNG = 200  # samples below which every update is a full pass
 MOVED = 0.02  # change of a parameter's logarithm that calls for full passes
 IDENTIFIABLE = 0.15  # largest standard deviation of a logarithm that counts as identified
@@ -182,10 +182,10 @@ class OnlineEstimator:
             self._input = seen[0]
         if self._input not in group:
             return
-        value = np.asarray(group[self._input], float)
-        if not np.all(np.isfinite(value)):
+        if not all(map(math.isfinite, group[self._input])):
             self.counters.missing += 1
             return
+        value = np.asarray(group[self._input], float)
         if self._input == "motor_command":
             if math.isnan(self._voltage):
                 self.counters.unpowered += 1
@@ -214,12 +214,13 @@ class OnlineEstimator:
         new = node.y.copy()
         for name, columns in _COLUMNS.items():
             if name in group:
-                value = np.asarray(group[name], float)
-                if name == "attitude" and not np.all(np.isfinite(value)):
-                    value = np.full(4, np.nan)
-                if not np.all(np.isfinite(value)):
-                    self.counters.missing += 1
-                new[columns] = np.where(np.isfinite(value), value, np.nan)
+                value = group[name]
+                if all(map(math.isfinite, value)):
+                    new[columns] = value
+                    continue
+                self.counters.missing += 1
+                if name != "attitude":  # half an attitude is none
+                    new[columns] = [v if math.isfinite(v) else math.nan for v in value]
         if np.all(np.isnan(new)):
             return
         node.y = new
@@ -315,14 +316,14 @@ class OnlineEstimator:
         deviation = np.abs(offset(theta, prior.centre, self._setup.unit))
         implausible = deviation > IMPLAUSIBLE * prior.sd
         sd[1:4] = np.where(implausible, np.maximum(sd, deviation), sd)[1:4]
+        low, high = (displaced(theta, z * sd, self._setup.unit) for z in (-1.96, 1.96))
         parameters = {}
         for i, name in enumerate(NAMES):
             identifiable, reason = self._verdict(i, float(sd[i]), implausible=bool(implausible[i]))
-            low, high = (displaced(theta, np.eye(9)[i] * z * sd[i], self._setup.unit)[i] for z in (-1.96, 1.96))
             parameters[name] = ParameterEstimate(
                 value=float(theta[i]),
                 sd=float(sd[i] * (theta[i] if i < DELAY else self._setup.unit[i])),
-                ci95=(float(low), float(high)),
+                ci95=(float(low[i]), float(high[i])),
                 unit=PARAMETER_UNITS[name],
                 identifiable=identifiable,
                 reason=reason,
