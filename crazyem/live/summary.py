@@ -140,7 +140,8 @@ def live_line(phase: str, seconds: float, estimate: Estimate | None, *, lost: in
     parts = []
     for name, unit, scale in (("mass", "g", 1e3), ("Ixx", "", 1e6), ("Iyy", "", 1e6), ("Izz", "e-6 kg m2", 1e6)):
         p = estimate[name]
-        half = (p.ci95[1] - p.ci95[0]) / 2
+        half = (p.ci95[1] - p.ci95[0]) / 2 * scale
+        width = f"{half:.2f}" if half < 99 else ">99"  # keeps the line within a terminal
         mark = "" if p.identifiable else "?"
-        parts.append(f"{name} {p.value * scale:.2f}+-{min(half * scale, 999):.2f}{mark}{' ' + unit if unit else ''}")
+        parts.append(f"{name} {p.value * scale:.2f}+-{width}{mark}{' ' + unit if unit else ''}")
     return f"{head}  {'  '.join(parts)}  lost {lost}  pushes {pushes}"
