@@ -117,7 +117,9 @@ def test_the_stock_mcap_reader_decodes_every_channel(tmp_path):
     write_everything(path)
     topics = {}
     with path.open("rb") as stream:
-        for schema, channel, _, message in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+        for schema, channel, _, message in make_reader(
+            stream, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
             topics[channel.topic] = (schema.name, message)
     assert {topic: name for topic, (name, _) in topics.items()} == {
         "/log/0": "crazyem.log.Block0",
