@@ -149,7 +149,7 @@ def parse_vehicle(source: str, *, where: str = "vehicle") -> Vehicle:
         rotor_constant=_positive(data, "rotor_constant", where) if "rotor_constant" in data else None,
         torque_per_thrust=_positive(data, "torque_per_thrust", where) if has_rotors else 0.0,
         motor_time_constant=_number(data, "motor_time_constant", where, 0.0, low=0.0, high=1.0),
-        thrust_max=_positive(data, "thrust_max", where) if "thrust_max" in data else math.inf,
+        thrust_max=_number(data, "thrust_max", where, math.inf, low=1e-9),
         battery_compensated=data.get("battery_compensated", True),
         effects=effects,
     )
@@ -183,7 +183,7 @@ def _number(
 
 def _positive(data: Mapping[str, Any], key: str, where: str) -> float:
     value = data.get(key)
-    if not _is_number(value) or value <= 0:
+    if not _is_number(value) or not 0 < value < math.inf:
         raise FileFormatError(f"{where}: key '{key}' must be a positive number, got {value!r}")
     return float(value)
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.estimation import kernels
-from crazyem.estimation.aliasing import log_inertia_bias, noise_share, white_variance
+from crazyem.estimation.aliasing import lagged_noise, white_variance
 from crazyem.estimation.inputs import InputHistory
 from crazyem.estimation.model import Noise, Parameters, Setup
 from crazyem.estimation.mstep import maximise
@@ -32,8 +32,8 @@ class Information:
         step: (9,) scoring step of the logarithms.
         decrement: length of that step in standard deviations.
         inflation: (9,) factor by which correlation widened each standard deviation.
-        bias: (3,) by which log Ixx, Iyy, Izz may be too large because commands are known only at their stamps; counted
-            as one more standard deviation in the covariance.
+        bias: (9,) by which the parameters may be off because commands are known only at their stamps, in the same
+            coordinates; counted as one more standard deviation in the covariance.
     """
 
     matrix: NDArray
@@ -193,34 +193,40 @@ class WindowEM:
         full, factors = np.zeros((9, 9)), np.ones(9)
         full[np.ix_(free, free)] = widened
         factors[free] = inflation
-        bias = self.command_bias(first, last) if setup.free[4] else np.zeros(3)
-        for axis in range(3):
-            full[1 + axis, 1 + axis] += bias[axis] ** 2
+        bias = np.zeros(9)
         if setup.free[4]:
-            full[4, 4] += np.mean(bias) ** 2
+            bias[free] = covariance @ self.command_noise_score(first, last)[free]
+        full += np.diag(bias**2)
         return Information(matrix, full, step, decrement, factors, bias)
 
-    def command_bias(self, first: int, last: int) -> NDArray:
-        """(3,) possible bias of the logarithms of inertia from noise in the samples of the commands (aliasing.py)."""
-        tape, theta = self.tape, self.parameters.theta
+    def command_noise_score(self, first: int, last: int) -> NDArray:
+        """(9,) what noise in the samples of the commands adds to the score (aliasing.py).
+
+        A step's innovation holds minus the noise's torque; its derivatives by log I, log tau and delay hold the same
+        noise, so their product has a mean.
+        """
+        tape, p, unit = self.tape, self.parameters, self.setup.unit
+        score = np.zeros(9)
         nodes = tape.time[first:last]
         stamps, wrenches = self.inputs.between(nodes[0], nodes[-1])
-        if len(stamps) < 20:
-            return np.zeros(3)
+        if len(stamps) < 20 or len(nodes) < 20:
+            return score
         nearest = np.clip(np.searchsorted(nodes, stamps), 1, len(nodes) - 1)
         nearest -= stamps - nodes[nearest - 1] < nodes[nearest] - stamps
         rates = tape.y[first:last][nearest, 10:13]
-        period = float(np.median(np.diff(stamps)))
-        variance = np.var(tape.torque[first + 1 : last], axis=0)
-        bias = np.zeros(3)
+        m2, m_tau, m_delay = lagged_noise(period=float(np.median(np.diff(stamps))), tau=float(p.theta[4]))
+        rate_variance = float(p.noise.measurement[3] ** 2)
+        steps = int(np.count_nonzero(tape.usable[first + 1 : last]))
+        dt = float(np.median(np.diff(nodes)))
         for axis in range(3):
-            white = white_variance(
-                wrenches[:, 1 + axis], rates[:, axis], rate_variance=float(self.parameters.noise.measurement[3] ** 2)
-            )
-            bias[axis] = log_inertia_bias(
-                noise_share(white, period=period, tau=float(theta[4]), torque_variance=float(variance[axis]))
-            )
-        return bias
+            white = white_variance(wrenches[:, 1 + axis], rates[:, axis], rate_variance=rate_variance)
+            # variance of a step's mean torque as the filter sees it: process noise, and rates measured at both ends
+            spread = (p.noise.impulse[3 + axis] ** 2 / dt + 2 * rate_variance / dt**2) * p.theta[1 + axis] ** 2
+            weight = steps * white / spread
+            score[1 + axis] += weight * m2
+            score[4] -= weight * m_tau * p.theta[4]
+            score[5] -= weight * m_delay * unit[5]
+        return score
 
     def converge(self, first: int, last: int, *, passes: int) -> Information:
         """Full passes until the score test is passed, at most `passes`: EM while far, scoring when near.

@@ -35,6 +35,7 @@ class InputHistory:
         if self.size == 0:
             self.lag[:12] = np.tile(wrench, 3)
             self.lag[12] = time
+            self.gap_end = time  # what was commanded before is unknown, and the lag remembers it
         elif time - self.newest > MAX_GAP:
             self.gap_end = time
         if self.size == len(self.times):

@@ -78,7 +78,7 @@ def objective(theta, unit, sums, free, centre, precision, gradient, hessian, squ
             for q in range(n):
                 ac[p] += a[p, q] * c[q]
             s += c[p] * ac[p]
-        s = max(s, 1e-300)
+        s = max(s, 1e-150)  # squared below
         squares[term] = s
         value += 0.5 * count * np.log(s)
         for u in range(PARAMETERS):

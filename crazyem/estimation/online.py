@@ -34,6 +34,12 @@ MOVED = 0.02  # change of a parameter's logarithm that calls for full passes
 IDENTIFIABLE = 0.15  # largest standard deviation of a logarithm that counts as identified
 IMPLAUSIBLE = 3.0  # prior standard deviations beyond which an inertia is not believed
 
+# No drone is faster, further or stronger (SI): a sample beyond is an error of transmission, used as missing.
+SANE = {
+    "position": 1e4, "velocity": 1e2, "attitude": 2.0, "body_rate": 2e2,
+    "motor_command": 1.5, "rotor_speed": 1e5, "wrench_command": 1e3,
+}  # fmt: skip
+
 _COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 _INPUTS = ("motor_command", "rotor_speed", "wrench_command")
 
@@ -54,6 +60,14 @@ class Counters:
 class _Node:
     time: float
     y: NDArray = field(default_factory=lambda: np.full(13, np.nan))
+
+
+def _sane(signal: str, value: tuple[float, ...]) -> bool:
+    """Whether every component is a number that can be true (a NaN is not, nor a quaternion far from unit length)."""
+    limit = SANE[signal]
+    if not all(abs(v) < limit for v in value):
+        return False
+    return signal != "attitude" or 0.5 < math.hypot(*value) < 2.0
 
 
 class OnlineEstimator:
@@ -182,7 +196,7 @@ class OnlineEstimator:
             self._input = seen[0]
         if self._input not in group:
             return
-        if not all(map(math.isfinite, group[self._input])):
+        if not _sane(self._input, group[self._input]):
             self.counters.missing += 1
             return
         value = np.asarray(group[self._input], float)
@@ -215,12 +229,12 @@ class OnlineEstimator:
         for name, columns in _COLUMNS.items():
             if name in group:
                 value = group[name]
-                if all(map(math.isfinite, value)):
+                if _sane(name, value):
                     new[columns] = value
                     continue
                 self.counters.missing += 1
                 if name != "attitude":  # half an attitude is none
-                    new[columns] = [v if math.isfinite(v) else math.nan for v in value]
+                    new[columns] = [v if abs(v) < SANE[name] else math.nan for v in value]
         if np.all(np.isnan(new)):
             return
         node.y = new
@@ -357,7 +371,7 @@ class OnlineEstimator:
                 "the data ask for an inertia far from any such drone's: the logged commands do not explain its rotation"
             )
         if not sd < IDENTIFIABLE:
-            if 0 < i < 4 and self._information.bias[i - 1] > IDENTIFIABLE:
+            if 0 < i < 4 and abs(self._information.bias[i]) > IDENTIFIABLE:
                 return False, (
                     "the logged commands are mostly noise between their stamps: torque about "
                     f"{'xyz'[i - 1]} that acted cannot be told from them at this logging rate"

@@ -132,6 +132,21 @@ def _run(times, commands, i, last, begin, end, mode, tau, state, acc):
 
 
 @compiled
+def _back(t0, t1, u0, u1, t, tau, state):
+    """Undo the lag from t back to t0 on the line from (t0, u0) to (t1, u1)."""
+    h = t - t0
+    for v in range(3):
+        tv = tau * (1.0 + STEP * (v if v < 2 else -1))
+        if tv <= 0.0:
+            continue
+        grow = np.exp(h / tv)
+        for c in range(4):
+            slope = (u1[c] - u0[c]) / (t1 - t0)
+            end = u0[c] + slope * h
+            state[4 * v + c] = u0[c] - slope * tv + (state[4 * v + c] - end + slope * tv) * grow
+
+
+@compiled
 def lagged_means(
     times, commands, first, last, predictor, nodes, node_first, node_last, mode, tau, delay, state, mean, mean_tau,
     mean_delay,
@@ -185,6 +200,13 @@ def lagged_means(
                 known += 1
             guess[:] = state
             size = _predict(times, commands, i, known, end, predictor, path_times, path)
+            if known == i + 1 and i + 1 < last and begin > times[i]:
+                # the state at `begin` has been carried towards a command that is not known yet: go back to the last
+                # stamp, and come here again along what is known and predicted
+                _back(times[i], times[i + 1], commands[i], commands[i + 1], begin, tau, guess)
+                _run(path_times, path, 0, size, times[i], begin, LINEAR, tau, guess, junk)
+                for c in range(4):
+                    start[c] = guess[c]
             _run(path_times, path, 0, size, begin, end, LINEAR, tau, guess, acc)
             for c in range(4):
                 mean_delay[k, c] = -(guess[c] - start[c]) / span

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crazyem.estimation.aliasing import log_inertia_bias, noise_share, white_variance
+from crazyem.estimation.aliasing import lagged_noise, white_variance
 from crazyem.estimation.spectra import MIN_ROWS, long_run
 
 
@@ -66,16 +66,8 @@ def test_missing_rates_are_left_out():
     assert white_variance(command, rate, rate_variance=4e-6) == pytest.approx(4e-12, rel=0.2)
 
 
-@given(st.floats(0, 1e-6), st.floats(1e-3, 0.05), st.floats(0, 0.2), st.floats(0, 1e-6))
-def test_share_is_a_share_and_bias_grows_with_it(white, period, tau, variance):
-    share = noise_share(white, period=period, tau=tau, torque_variance=variance)
-    assert 0.0 <= share <= 1.0
-    assert 0.0 <= log_inertia_bias(share) < 5.0
-    assert noise_share(white, period=period, tau=tau + 0.05, torque_variance=variance) <= share
-
-
-def test_lagged_white_samples_have_the_variance_that_the_share_says():
-    """White samples h apart, joined by steps, through a lag: variance h / (2 tau + h), by simulation."""
+def test_lagged_white_samples_keep_the_variance_of_theory():
+    """White samples h apart, each held for h, through a lag: variance h / (2 tau + h), by simulation."""
     rng = np.random.default_rng(3)
     period, tau, fine = 0.01, 0.06, 20
     u = np.repeat(rng.normal(size=40000), fine)
@@ -84,13 +76,31 @@ def test_lagged_white_samples_have_the_variance_that_the_share_says():
     for value in u:
         y = value + (y - value) * decay
         out.append(y)
-    assert np.var(out) == pytest.approx(noise_share(1.0, period=period, tau=tau, torque_variance=1.0), rel=0.1)
+    mean_square, _, _ = lagged_noise(period=period, tau=tau)
+    assert np.var(out) == pytest.approx(period / (2 * tau + period), rel=0.1)
+    assert mean_square == pytest.approx(np.var(out), rel=0.3)  # held for the step, joined by lines before it
+
+
+def test_noise_leans_on_its_own_derivative_by_the_time_constant():
+    """E[m dm/dtau] is half the derivative of E[m^2]."""
+    period = 0.01
+    low, high = lagged_noise(period=period, tau=0.055)[0], lagged_noise(period=period, tau=0.065)[0]
+    _, by_tau, by_delay = lagged_noise(period=period, tau=0.06)
+    assert by_tau == pytest.approx(0.5 * (high - low) / 0.010, rel=0.1)
+    assert by_tau < 0  # more lag lets less through
+    assert abs(by_delay) > 0
 
 
 def test_attenuated_slope_of_a_noisy_regressor():
-    """Errors in variables: acceleration on a torque with a share of noise has a slope too small by that share."""
+    """Errors in variables: acceleration on a torque with a share of noise has a slope too small by that share.
+
+    The estimator counts covariance times the score that the noise adds; for one axis alone that is the share itself.
+    """
     rng = np.random.default_rng(4)
-    torque, inertia, share = rng.normal(size=200000), 2.0, 0.2
+    torque, inertia, share = rng.normal(size=200000), 2.0, 0.1
     seen = torque + np.sqrt(share / (1 - share)) * rng.normal(size=len(torque))
     slope = np.dot(seen, torque / inertia) / np.dot(seen, seen)
-    assert np.log(1 / slope / inertia) == pytest.approx(log_inertia_bias(share), abs=0.02)
+    weight = 1.0 / inertia**2
+    information = np.dot(seen, seen) * weight
+    added = len(seen) * (share / (1 - share)) * weight
+    assert np.log(1 / slope / inertia) == pytest.approx(added / information, abs=0.02)
