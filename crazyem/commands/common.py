@@ -2,12 +2,10 @@
 
 import argparse
 import sys
-import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from crazyem.errors import CrazyemError
 from crazyem.estimation.result import Estimate
 from crazyem.links.base import LinkStatistics
 from crazyem.live.history import History
@@ -115,33 +113,10 @@ def new_estimator(vehicle: Vehicle, arguments: argparse.Namespace) -> Any:
     return OnlineEstimator(vehicle, window=arguments.window, every=arguments.every)
 
 
-def warm_up(vehicle: Vehicle) -> None:
-    """Compile the kernels before anything flies: a first compilation holds Python for seconds, setpoints included."""
-    import math
+def compile_kernels(vehicle: Vehicle) -> None:
+    """Compile before anything flies, and say so where it took its time."""
+    from crazyem.live.warm_up import warm_up
 
-    from crazyem.estimation.online import OnlineEstimator
-    from crazyem.signals.sample import Sample
-
-    begun = time.monotonic()
-    estimator = OnlineEstimator(vehicle, window=100, every=4)
-    hover = 0.5
-    try:
-        for i in range(160):
-            t = 0.01 * i
-            s = 0.01 * math.sin(7 * t)
-            for name, value in (
-                ("flying", (1.0,)),
-                ("voltage", (3.9,)),
-                ("motor_command", (hover + s, hover - s, hover + 2 * s, hover - 2 * s)),
-                ("position", (s, -s, 1.0 + s)),
-                ("velocity", (7 * s, 7 * s, s)),
-                ("attitude", (s, s, s, math.sqrt(1 - 3 * s * s))),
-                ("body_rate", (s, s, s)),
-                ("specific_force", (s, s, 9.81)),
-            ):
-                estimator.feed(Sample(name, t, value))
-        estimator.finish()
-    except CrazyemError:
-        pass  # nonsense data may be refused; compiling was the point
-    if time.monotonic() - begun > 3.0:
-        say(f"compiled the estimator in {time.monotonic() - begun:.0f} s (once per installation)")
+    seconds = warm_up(vehicle)
+    if seconds > 3.0:
+        say(f"compiled the estimator in {seconds:.0f} s (once per installation)")

@@ -10,12 +10,12 @@ from typing import Any
 from crazyem.commands.common import (
     LiveLine,
     close_recorder,
+    compile_kernels,
     new_estimator,
     plot_path,
     raise_after,
     report,
     say,
-    warm_up,
 )
 from crazyem.control.trajectories import Trajectory, Vector, excite, figure8, hover
 from crazyem.control.waypoints import read_waypoints, waypoints
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     new_estimator(vehicle, arguments)  # a wrong window is refused here
     if arguments.uri and (arguments.scenario or arguments.speed is not None or arguments.seed is not None):
         raise UsageError("--scenario, --seed and --speed belong to the built-in simulator: leave out the URI.")
-    warm_up(vehicle)
+    compile_kernels(vehicle)
     with contextlib.ExitStack() as stack:
         uri = arguments.uri
         if not uri:

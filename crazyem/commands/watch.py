@@ -8,12 +8,12 @@ import time
 from crazyem.commands.common import (
     LiveLine,
     close_recorder,
+    compile_kernels,
     new_estimator,
     plot_path,
     raise_after,
     report,
     say,
-    warm_up,
 )
 from crazyem.commands.fly import interrupts
 from crazyem.errors import CrazyemError
@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     for path in (arguments.json, arguments.record, plot):
         check_writable(path)
     new_estimator(vehicle, arguments)
-    warm_up(vehicle)
+    compile_kernels(vehicle)
     error: BaseException | None = None
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(interrupts())

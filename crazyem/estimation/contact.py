@@ -30,7 +30,8 @@ class ContactGate:
             self._seen_off = True
             if not math.isnan(height):
                 self._rest_height = height
-            self.airborne, self.reason = False, "on the ground, rotors off"
+            off = ", rotors off" if thrust <= self._off_below else ""
+            self.airborne, self.reason = False, "on the ground" + off
         elif math.isnan(self._rest_height):
             # Recording begins in the air, or height is not measured: rotors that turn are all there is to go by.
             self.airborne, self.reason = True, ""

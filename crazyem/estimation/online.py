@@ -16,7 +16,7 @@ from crazyem.errors import DataError, UsageError
 from crazyem.estimation.contact import ContactGate
 from crazyem.estimation.em import Information, WindowEM, displaced, offset
 from crazyem.estimation.inputs import MAX_GAP, SETTLE, InputHistory
-from crazyem.estimation.kernels import DELAY
+from crazyem.estimation.kernels import DELAY, LAG
 from crazyem.estimation.model import GROUPS, NAMES, Parameters, Setup, setup_for
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
 from crazyem.estimation.tape import Tape
@@ -331,12 +331,16 @@ class OnlineEstimator:
         implausible = deviation > IMPLAUSIBLE * prior.sd
         sd[1:4] = np.where(implausible, np.maximum(sd, deviation), sd)[1:4]
         low, high = (displaced(theta, z * sd, self._setup.unit) for z in (-1.96, 1.96))
+        if not self._setup.free[LAG]:  # the inputs contain the lag, so the data say nothing of it
+            sd[LAG], low[LAG], high[LAG] = math.inf, 0.0, math.inf
         parameters = {}
         for i, name in enumerate(NAMES):
             identifiable, reason = self._verdict(i, float(sd[i]), implausible=bool(implausible[i]))
             parameters[name] = ParameterEstimate(
                 value=float(theta[i]),
-                sd=float(sd[i] * (theta[i] if i < DELAY else self._setup.unit[i])),
+                sd=float(sd[i] * (theta[i] if i < DELAY else self._setup.unit[i]))
+                if math.isfinite(sd[i])
+                else math.inf,
                 ci95=(float(low[i]), float(high[i])),
                 unit=PARAMETER_UNITS[name],
                 identifiable=identifiable,

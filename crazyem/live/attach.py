@@ -78,9 +78,9 @@ def attach(
     Raises:
         UsageError: unknown vehicle, not connected, or a log variable is missing. LinkError: no answer.
     """
-    from crazyem.commands.common import warm_up
     from crazyem.estimation.online import OnlineEstimator
     from crazyem.links.crazyflie import CrazyflieLink
+    from crazyem.live.warm_up import warm_up
 
     model = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
     warm_up(model)

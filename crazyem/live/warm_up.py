@@ -1,0 +1,35 @@
+"""Compiling before anything flies: a first compilation holds Python for seconds, the setpoint stream included."""
+
+import math
+import time
+
+from crazyem.errors import CrazyemError
+from crazyem.estimation.online import OnlineEstimator
+from crazyem.signals.sample import Sample
+from crazyem.vehicle import Vehicle
+
+
+def warm_up(vehicle: Vehicle) -> float:
+    """Compile the kernels; returns the seconds it took (once per installation, then they come from the disk)."""
+    begun = time.monotonic()
+    estimator = OnlineEstimator(vehicle, window=100, every=4)
+    hover = 0.5
+    try:
+        for i in range(160):
+            t = 0.01 * i
+            s = 0.01 * math.sin(7 * t)
+            for name, value in (
+                ("flying", (1.0,)),
+                ("voltage", (3.9,)),
+                ("motor_command", (hover + s, hover - s, hover + 2 * s, hover - 2 * s)),
+                ("position", (s, -s, 1.0 + s)),
+                ("velocity", (7 * s, 7 * s, s)),
+                ("attitude", (s, s, s, math.sqrt(1 - 3 * s * s))),
+                ("body_rate", (s, s, s)),
+                ("specific_force", (s, s, 9.81)),
+            ):
+                estimator.feed(Sample(name, t, value))
+        estimator.finish()
+    except CrazyemError:
+        pass  # nonsense data may be refused; compiling was the point
+    return time.monotonic() - begun
