@@ -197,7 +197,7 @@ def measure_speed(*, seed: int, window: int, rounds: int, seconds: float, with_p
                 contender.run()
         live()
     unit = float(np.median(ours[0].seconds))
-    incremental = Contender("crazyem: incremental update (4 new, 40 smoothed)", live, seconds=live.seconds)
+    incremental = Contender("crazyem: incremental update (4 new, 20 again)", live, seconds=live.seconds)
     return {
         "window": window,
         "rows": [_row(c, unit) for c in [*ours, incremental, *others]],
