@@ -3,14 +3,12 @@
 The slow tests are the statistics: bias and coverage over many flights.
 """
 
-import importlib.util
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+import synthetic
 from scipy.stats import binom
 
 from crazyem.estimation import kernels
@@ -21,13 +19,6 @@ from crazyem.estimation.online import OnlineEstimator
 from crazyem.estimation.tape import Tape
 from crazyem.physics.lag import CAUSAL
 from crazyem.vehicle import load_vehicle
-
-_spec = importlib.util.spec_from_file_location("synthetic", Path(__file__).with_name("synthetic.py"))
-assert _spec is not None
-assert _spec.loader is not None
-synthetic = importlib.util.module_from_spec(_spec)
-sys.modules["synthetic"] = synthetic
-_spec.loader.exec_module(synthetic)
 
 LAGGED = replace(load_vehicle("cf2"), thrust_curve=(), rotor_constant=None, thrust_max=math.inf)
 TRUTH = synthetic.Truth()

@@ -1,24 +1,14 @@
 """The compiled filter, smoother and sensitivities against the textbook twin and finite differences."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+import synthetic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from crazyem.estimation import kernels, reference
 from crazyem.estimation.tape import BREAK, START_VARIANCE, Tape
-
-_spec = importlib.util.spec_from_file_location("synthetic", Path(__file__).with_name("synthetic.py"))
-assert _spec is not None
-assert _spec.loader is not None
-synthetic = importlib.util.module_from_spec(_spec)
-sys.modules["synthetic"] = synthetic
-_spec.loader.exec_module(synthetic)
 
 MASS = 0.036
 INERTIA = np.array([[2.0e-5, 1e-6, -5e-7], [1e-6, 2.1e-5, 8e-7], [-5e-7, 8e-7, 3.6e-5]])

@@ -1,26 +1,17 @@
 """The online estimator on synthetic flights: values, determinism, bad samples, streams out of step, input signals."""
 
-import importlib.util
 import math
-import sys
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
+import synthetic
 
 from crazyem.errors import DataError, UsageError
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle
-
-_spec = importlib.util.spec_from_file_location("synthetic", Path(__file__).with_name("synthetic.py"))
-assert _spec is not None
-assert _spec.loader is not None
-synthetic = importlib.util.module_from_spec(_spec)
-sys.modules["synthetic"] = synthetic
-_spec.loader.exec_module(synthetic)
 
 # commands with rotor lag, but as a wrench: the nominal constants of a Crazyflie, wrong for the drone that flies
 LAGGED = replace(load_vehicle("cf2"), thrust_curve=(), rotor_constant=None, thrust_max=math.inf)

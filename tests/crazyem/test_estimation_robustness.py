@@ -1,26 +1,17 @@
 """What once went wrong and must not again: absurd samples, logs that begin anywhere, commands that nobody can know."""
 
-import importlib.util
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+import synthetic
 
 from crazyem.errors import FileFormatError
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.physics.lag import CAUSAL, hold_predictor, lagged_means
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle, parse_vehicle
-
-_spec = importlib.util.spec_from_file_location("synthetic", Path(__file__).with_name("synthetic.py"))
-assert _spec is not None
-assert _spec.loader is not None
-synthetic = importlib.util.module_from_spec(_spec)
-sys.modules["synthetic"] = synthetic
-_spec.loader.exec_module(synthetic)
 
 LAGGED = replace(load_vehicle("cf2"), thrust_curve=(), rotor_constant=None, thrust_max=math.inf)
 TRUTH = synthetic.Truth()

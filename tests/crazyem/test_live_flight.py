@@ -1,10 +1,9 @@
 """The flight loop against a fake drone: the order of things, and every way out of a flight."""
 
-import importlib.util
 import threading
 import time
-from pathlib import Path
 
+import fake_drone as fake
 import pytest
 
 from crazyem.control.trajectories import excite, hover
@@ -14,10 +13,6 @@ from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Inte
 from crazyem.live.session import Session, block_plan
 from crazyem.live.summary import build_summary
 from crazyem.vehicle import load_vehicle
-
-_spec = importlib.util.spec_from_file_location("fake_drone", Path(__file__).with_name("fake_drone.py"))
-fake = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(fake)
 
 
 class ListRecorder:
