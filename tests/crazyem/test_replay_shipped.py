@@ -1,4 +1,4 @@
-"""The recording that comes with the project: its replay finds what the scenario hid, and what the flight itself found."""
+"""The recording that comes with the project: its replay finds what the scenario hid, and its pushes are in it."""
 
 import json
 from pathlib import Path
