@@ -1,6 +1,7 @@
 """The command line: parses, calls one function per command, turns errors into one sentence and an exit code."""
 
 import argparse
+import importlib
 import math
 import re
 import sys
@@ -93,13 +94,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         # In `fly --trajectory hover URI` the option has swallowed the URI.
         if arguments.command == "fly" and arguments.uri is None and "://" in arguments.trajectory[-1]:
             arguments.uri = arguments.trajectory.pop()
-        if arguments.command == "fly":
-            from crazyem.commands import fly as command
-        elif arguments.command == "replay":
-            from crazyem.commands import replay as command  # type: ignore[no-redef]
-        else:
-            from crazyem.commands import watch as command  # type: ignore[no-redef]
-        return command.run(arguments)
+        # Imported only now: `crazyem --help` should not wait for numba. The name is one of the parser's own.
+        command = importlib.import_module(f"crazyem.commands.{arguments.command}")
+        return int(command.run(arguments))
     except CrazyemError as error:
         sentence = str(error)
         print(f"crazyem: {sentence}{'' if sentence.endswith('.') else '.'}", file=sys.stderr)

@@ -5,7 +5,7 @@ Knows no sockets and no real time: `receive` takes a packet, `advance` lets time
 
 from collections import deque
 from collections.abc import Mapping
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -72,6 +72,10 @@ class FlightLike(Protocol):
     setpoint: np.ndarray
     motors_allowed: bool
     armed: bool
+    truth_header: ClassVar[list[str]]
+
+    def truth_row(self) -> list[float]:
+        """What is true now, as truth_header names it."""
 
     def parameter_written(self, name: str) -> None:
         """A parameter of the flight has been written."""

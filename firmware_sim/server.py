@@ -45,13 +45,13 @@ class TruthWriter:
     def __init__(self, file: TextIO, firmware: Firmware):
         self._file, self._flight = file, firmware.flight
         self.next_row = self._flight.tick + 1  # tick of the next row
-        self._file.write(",".join(self._flight.truth_header) + "\n")  # type: ignore[attr-defined]
+        self._file.write(",".join(self._flight.truth_header) + "\n")
 
     def update(self) -> None:
         """Write a row if one is due."""
         if self._flight.tick >= self.next_row:
             self.next_row = self._flight.tick - self._flight.tick % _TRUTH_PERIOD + _TRUTH_PERIOD
-            row = self._flight.truth_row()  # type: ignore[attr-defined]
+            row = self._flight.truth_row()
             try:
                 self._file.write(",".join(f"{value:.9g}" for value in row) + "\n")
             except OSError as error:

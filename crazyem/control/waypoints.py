@@ -57,8 +57,8 @@ def read_waypoints(path: str | Path) -> list[dict[str, float]]:
         values: dict[str, float] = {}
         for key, raw in row.items():
             try:
-                value = float(raw)  # type: ignore[arg-type]
-            except (TypeError, ValueError):
+                value = float(str(raw))
+            except ValueError:
                 value = math.nan
             if not math.isfinite(value):
                 raise FileFormatError(f"waypoint file {path}, point {i}: '{key}' is not a number.")

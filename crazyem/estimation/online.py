@@ -2,8 +2,8 @@
 
 Samples of one instant are gathered into a node; a node waits until the inputs up to it are known, passes the
 contact gate and goes onto the tape. Every `every` nodes the newest `window` of them give an update: an
-incremental pass by default, full passes while the parameters still move, and every second a full pass that also
-renews the uncertainty."""
+incremental pass by default, full passes while the parameters still move, and every 12th update (half a second at
+100 Hz) full passes that also renew the uncertainty."""
 
 import math
 import time as clock
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from crazyem.errors import DataError, UsageError
 from crazyem.estimation.contact import ContactGate
-from crazyem.estimation.em import Information, WindowEM, displaced, offset
+from crazyem.estimation.em import Information, WindowEM, offset
 from crazyem.estimation.inputs import MAX_GAP, SETTLE, InputHistory
-from crazyem.estimation.kernels import DELAY, LAG
-from crazyem.estimation.model import GROUPS, NAMES, Parameters, Setup, setup_for
-from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
+from crazyem.estimation.model import Parameters, Setup, setup_for
+from crazyem.estimation.result import Estimate
 from crazyem.estimation.tape import Tape
+from crazyem.estimation.verdict import estimate_of, nothing_known
 from crazyem.physics.lag import CAUSAL, HOLD, LINEAR
 from crazyem.physics.rotors import wrench_from_command, wrench_from_speed
 from crazyem.signals.sample import Sample
@@ -31,8 +31,6 @@ LOOKBACK = 20  # samples smoothed again in an incremental pass
 REFRESH = 12  # updates between two full passes with information
 YOUNG = 200  # samples below which every update is a full pass
 MOVED = 0.02  # change of a parameter's logarithm that calls for full passes
-IDENTIFIABLE = 0.15  # largest standard deviation of a logarithm that counts as identified
-IMPLAUSIBLE = 3.0  # prior standard deviations beyond which an inertia is not believed
 
 # No drone is faster, further or stronger (SI): a sample beyond is an error of transmission, used as missing.
 SANE = {
@@ -323,80 +321,13 @@ class OnlineEstimator:
 
     def _estimate(self) -> Estimate:
         if self._em is None or self._setup is None or self._information is None:
-            return self._nothing()
-        theta, prior = self._em.parameters.theta, self._setup.prior
-        sd = np.sqrt(np.maximum(np.diag(self._information.covariance), 0.0))
-        # An inertia that the prior all but excludes says that the model does not hold here, not that the drone is odd.
-        deviation = np.abs(offset(theta, prior.centre, self._setup.unit))
-        implausible = deviation > IMPLAUSIBLE * prior.sd
-        sd[1:4] = np.where(implausible, np.maximum(sd, deviation), sd)[1:4]
-        low, high = (displaced(theta, z * sd, self._setup.unit) for z in (-1.96, 1.96))
-        if not self._setup.free[LAG]:  # the inputs contain the lag, so the data say nothing of it
-            sd[LAG], low[LAG], high[LAG] = math.inf, 0.0, math.inf
-        parameters = {}
-        for i, name in enumerate(NAMES):
-            identifiable, reason = self._verdict(i, float(sd[i]), implausible=bool(implausible[i]))
-            parameters[name] = ParameterEstimate(
-                value=float(theta[i]),
-                sd=float(sd[i] * (theta[i] if i < DELAY else self._setup.unit[i]))
-                if math.isfinite(sd[i])
-                else math.inf,
-                ci95=(float(low[i]), float(high[i])),
-                unit=PARAMETER_UNITS[name],
-                identifiable=identifiable,
-                reason=reason,
-            )
-        noise = self._em.parameters.noise
-        scale = np.concatenate([np.full(3, theta[0]), theta[1:4]])
-        intensities = noise.impulse * scale
-        names = ("force_x", "force_y", "thrust", "torque_x", "torque_y", "torque_z")
-        return Estimate(
+            return nothing_known(self.vehicle, reason=self._gate.reason, time=self._last_time, updates=self._updates)
+        return estimate_of(
+            self._em.parameters,
+            self._setup,
+            self._information,
             time=float(self._tape.time[self._tape.size - 1]),
-            parameters=parameters,
-            noise={**dict(zip(names, intensities.tolist())), **dict(zip(GROUPS, noise.measurement.tolist()))},
             samples=int(min(self._tape.size, self.window)),
             updates=self._updates,
             converged=self._converged,
-        )
-
-    def _verdict(self, i: int, sd: float, *, implausible: bool) -> tuple[bool, str]:
-        assert self._em is not None
-        assert self._setup is not None
-        assert self._information is not None
-        if not self._setup.free[i]:
-            return False, "the inputs already include the rotor lag" if i == 4 else "held fixed"
-        if i >= DELAY:
-            prior = self._setup.prior.sd[i]
-            return (True, "") if sd < 0.7 * prior else (False, "the data say no more than the prior does")
-        if self._tape.size < 20:
-            return False, f"only {self._tape.size} samples in flight"
-        if implausible and 0 < i < 4:
-            return False, (
-                "the data ask for an inertia far from any such drone's: the logged commands do not explain its rotation"
-            )
-        if not sd < IDENTIFIABLE:
-            if 0 < i < 4 and abs(self._information.bias[i]) > IDENTIFIABLE:
-                return False, (
-                    "the logged commands are mostly noise between their stamps: torque about "
-                    f"{'xyz'[i - 1]} that acted cannot be told from them at this logging rate"
-                )
-            what = ("thrust", "torque about x", "torque about y", "torque about z", "commands")[i]
-            return False, f"too little excitation: {what} determines it only within {196 * sd:.0f} % (95 %)"
-        if not self._converged:
-            return False, "not converged yet"
-        return True, ""
-
-    def _nothing(self) -> Estimate:
-        """What is said before anything was flown: the nominal value and no confidence at all."""
-        vehicle = self.vehicle
-        values = (vehicle.mass, *vehicle.inertia, vehicle.motor_time_constant, 0.0, 0.0, 0.0, 0.0)
-        reason = self._gate.reason or "no samples in flight"
-        return Estimate(
-            time=self._last_time,
-            parameters={
-                name: ParameterEstimate(value, math.inf, (0.0, math.inf), PARAMETER_UNITS[name], False, reason)
-                for name, value in zip(NAMES, values)
-            },
-            samples=0,
-            updates=self._updates,
         )

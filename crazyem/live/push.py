@@ -1,6 +1,5 @@
 """Writes the guard's decisions to the drone in a thread of its own, and keeps account of every echo."""
 
-import contextlib
 import queue
 import threading
 from collections.abc import Callable
@@ -82,16 +81,17 @@ class Pusher:
 
     def _write(self, time: float, name: str, value: float) -> None:
         verified, why = False, "no echo came"
-        with contextlib.suppress(Exception):  # whatever the link throws, the flight goes on without pushes
-            try:
-                write = self.link.write_parameter(name, value, timeout=self.timeout)
-                verified = write.verified
-                if write.echoed is not None:
-                    why = f"the drone echoed {write.echoed:.6g}"
-                if self.on_write is not None:
-                    self.on_write(write)
-            except CrazyemError as error:
-                why = str(error)
+        try:
+            write = self.link.write_parameter(name, value, timeout=self.timeout)
+            if write.echoed is not None:
+                why = f"the drone echoed {write.echoed:.6g}"
+            if self.on_write is not None:
+                self.on_write(write)
+            verified = write.verified
+        except CrazyemError as error:
+            why = str(error)
+        except Exception as error:  # a fault of ours ends the pushing, not the flight; the sentence below names it
+            why = repr(error)
         self.history.pushes.append(Push(time, name, value, verified))
         if not verified:
             sentence = f"the write of {name} = {value:.6g} was not confirmed ({why}): nothing more is pushed."

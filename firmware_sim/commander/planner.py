@@ -205,9 +205,9 @@ class Planner:
                 else ((-sense * s, sense * c), (-sense * c, -sense * s))
             )
             offset = (r * e[0], r * e[1], 0.0)
-            velocity = tuple(growth * e[k] + r * rate * n[k] for k in (0, 1))
-            acceleration = tuple(2.0 * growth * rate * n[k] - r * rate**2 * e[k] for k in (0, 1))
-            return offset, (*velocity, ascent / duration), (*acceleration, 0.0)  # type: ignore[return-value]
+            vx, vy = (growth * e[k] + r * rate * n[k] for k in (0, 1))
+            ax, ay = (2.0 * growth * rate * n[k] - r * rate**2 * e[k] for k in (0, 1))
+            return offset, (vx, vy, ascent / duration), (ax, ay, 0.0)
 
         offset0, v0, a0 = end(r0, phi0)
         offset1, v1, a1 = end(r1, phi0 - sense * angle)

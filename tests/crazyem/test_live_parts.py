@@ -4,6 +4,7 @@ import json
 import math
 import random
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ import pytest
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
 from crazyem.live.clock import FirmwareClock
+from crazyem.live.guard import Decision
 from crazyem.live.history import SETTLE, History, Push
 from crazyem.live.pipeline import Pipeline
 from crazyem.live.plot import write_plot
+from crazyem.live.push import Pusher
 from crazyem.live.simulator import Simulator
 from crazyem.live.summary import build_summary, check_writable, live_line, text_summary, write_json
 from crazyem.signals.sample import Sample
@@ -176,3 +179,19 @@ def test_clock_absorbs_a_stall_without_freezing_or_jumping():
     assert rates.min() > 0.7
     assert rates.max() < 1.3
     assert answers[-1][1] == pytest.approx(firmware, abs=0.02)
+
+
+class _BrokenLink:
+    def write_parameter(self, name, value, timeout=1.0):
+        raise RuntimeError("a fault nobody foresaw")
+
+
+def test_a_fault_while_pushing_is_named_and_ends_the_pushing():
+    guard = SimpleNamespace(stopped="")
+    guard.stop = lambda reason: setattr(guard, "stopped", reason)
+    history = History()
+    pusher = Pusher(_BrokenLink(), guard, history=history)
+    pusher.submit(Decision(1.0, writes=(("ctrlLee.mass", 0.03), ("ctrlLee.J_x", 1e-5))))
+    pusher.close()
+    assert [p.verified for p in history.pushes] == [False]  # the second write was never tried
+    assert "a fault nobody foresaw" in guard.stopped

@@ -1,0 +1,111 @@
+"""From parameters and information to what is said: values, intervals, and whether the data support them at all."""
+
+import math
+
+import numpy as np
+
+from crazyem.estimation.em import Information, displaced, offset
+from crazyem.estimation.kernels import DELAY, LAG
+from crazyem.estimation.model import GROUPS, NAMES, Parameters, Setup
+from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
+from crazyem.vehicle import Vehicle
+
+IDENTIFIABLE = 0.15  # largest standard deviation of a logarithm that counts as identified
+IMPLAUSIBLE = 3.0  # prior standard deviations beyond which an inertia is not believed
+FEWEST = 20  # samples in flight before anything counts as identified
+
+
+def estimate_of(
+    parameters: Parameters,
+    setup: Setup,
+    information: Information,
+    *,
+    time: float,
+    samples: int,
+    updates: int,
+    converged: bool,
+) -> Estimate:
+    """The estimate, every parameter with its standard deviation, 95 % interval and verdict.
+
+    Args:
+        parameters: where the estimator is now.
+        setup: prior, units, and what is free.
+        information: of the last full pass.
+        time: of the newest sample [s].
+        samples: in the window.
+        updates: so far.
+        converged: whether the score test was passed.
+    """
+    theta, prior, unit = parameters.theta, setup.prior, setup.unit
+    sd = np.sqrt(np.maximum(np.diag(information.covariance), 0.0))
+    # An inertia that the prior all but excludes says that the model does not hold here, not that the drone is odd.
+    deviation = np.abs(offset(theta, prior.centre, unit))
+    implausible = deviation > IMPLAUSIBLE * prior.sd
+    sd[1:4] = np.where(implausible, np.maximum(sd, deviation), sd)[1:4]
+    low, high = (displaced(theta, z * sd, unit) for z in (-1.96, 1.96))
+    absolute = sd * np.where(np.arange(len(sd)) < DELAY, theta, unit)
+    if not setup.free[LAG]:  # the inputs contain the lag, so the data say nothing of it
+        absolute[LAG], low[LAG], high[LAG] = math.inf, 0.0, math.inf
+    said = {}
+    for i, name in enumerate(NAMES):
+        reason = _objection(
+            i, float(sd[i]), setup, information, samples=samples, converged=converged, implausible=bool(implausible[i])
+        )
+        said[name] = ParameterEstimate(
+            value=float(theta[i]),
+            sd=float(absolute[i]),
+            ci95=(float(low[i]), float(high[i])),
+            unit=PARAMETER_UNITS[name],
+            identifiable=not reason,
+            reason=reason,
+        )
+    noise = parameters.noise
+    intensities = noise.impulse * np.concatenate([np.full(3, theta[0]), theta[1:4]])
+    names = ("force_x", "force_y", "thrust", "torque_x", "torque_y", "torque_z")
+    return Estimate(
+        time=time,
+        parameters=said,
+        noise={**dict(zip(names, intensities.tolist())), **dict(zip(GROUPS, noise.measurement.tolist()))},
+        samples=samples,
+        updates=updates,
+        converged=converged,
+    )
+
+
+def _objection(
+    i: int, sd: float, setup: Setup, information: Information, *, samples: int, converged: bool, implausible: bool
+) -> str:
+    """Why parameter i is not identifiable; empty if it is. sd is that of its logarithm, or in its unit."""
+    inertia = 0 < i < LAG
+    if not setup.free[i]:
+        return "the inputs already include the rotor lag" if i == LAG else "held fixed"
+    if i >= DELAY:
+        return "" if sd < 0.7 * setup.prior.sd[i] else "the data say no more than the prior does"
+    if samples < FEWEST:
+        return f"only {samples} samples in flight"
+    if implausible and inertia:
+        return "the data ask for an inertia far from any such drone's: the logged commands do not explain its rotation"
+    if not sd < IDENTIFIABLE:
+        if inertia and abs(information.bias[i]) > IDENTIFIABLE:
+            return (
+                f"the logged commands are mostly noise between their stamps: torque about {'xyz'[i - 1]} that acted "
+                "cannot be told from them at this logging rate"
+            )
+        what = ("thrust", "torque about x", "torque about y", "torque about z", "commands")[i]
+        return f"too little excitation: {what} determines it only within {196 * sd:.0f} % (95 %)"
+    return "" if converged else "not converged yet"
+
+
+def nothing_known(vehicle: Vehicle, *, reason: str, time: float, updates: int) -> Estimate:
+    """What is said before anything was flown: the nominal value and no confidence at all."""
+    values = (vehicle.mass, *vehicle.inertia, vehicle.motor_time_constant, 0.0, 0.0, 0.0, 0.0)
+    return Estimate(
+        time=time,
+        parameters={
+            name: ParameterEstimate(
+                value, math.inf, (0.0 if i <= LAG else -math.inf, math.inf), PARAMETER_UNITS[name], False, reason
+            )
+            for i, (name, value) in enumerate(zip(NAMES, values))
+        },
+        updates=updates,
+    )
