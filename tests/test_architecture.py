@@ -26,8 +26,9 @@ ALLOWED: dict[str, set[str]] = {
     "links": {"signals"},
     "estimation": {"vehicle", "compiled", "physics", "signals"},
     "recordings": {"signals", "links", "estimation"},
+    "doctor": {"vehicle", "physics", "signals", "recordings"},
     "live": {"vehicle", "physics", "signals", "control", "links", "estimation", "recordings"},
-    "commands": {"vehicle", "physics", "signals", "control", "links", "estimation", "recordings", "live"},
+    "commands": {"vehicle", "physics", "signals", "control", "links", "estimation", "recordings", "doctor", "live"},
     "cli": {"commands"},
     "__main__": {"cli"},
     "__init__": {"live", "recordings", "vehicle"},  # the library's front door: lazily, on first use

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
 from crazyem.links.clock import StampUnwrapper
+from crazyem.recordings.finding import note
 from crazyem.recordings.interpolation import interpolated_rows
 from crazyem.recordings.mapping import CsvMapping, SignalColumns, known_mappings
+from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.packets import signals_from_packets
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.signals.packet import Block, Packet, Variable
@@ -30,7 +32,7 @@ def recognises(head: bytes) -> bool:
     return len(names) > 1 and all(name.isprintable() for name in names)
 
 
-def read(path: Path) -> Recording:
+def read(path: Path, options: ReadOptions) -> Recording:
     """Read a CSV flight. Raises FileFormatError naming the file and what is wrong with it."""
     try:
         raw = path.read_bytes()
@@ -54,7 +56,7 @@ def read(path: Path) -> Recording:
     signals, metadata = reader(path, mapping, header, body, notices)
     if not any(array.time.size for array in signals.values()):
         raise FileFormatError(f"{path}: there is a header but not a single sample.")
-    return Recording(str(path), f"csv:{mapping.name}", signals, metadata, tuple(notices))
+    return Recording(str(path), f"csv:{mapping.name}", signals, metadata, tuple(note("mapping", n) for n in notices))
 
 
 def _header(line: str) -> list[str]:

@@ -8,6 +8,8 @@ from typing import Any
 
 from crazyem.errors import FileFormatError
 from crazyem.recordings import schemas
+from crazyem.recordings.finding import note
+from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.packets import signals_from_packets
 from crazyem.recordings.recording import Event, Recording
 from crazyem.signals.packet import Block, Packet
@@ -28,7 +30,7 @@ def recognises(head: bytes) -> bool:
     return head.startswith(MAGIC)
 
 
-def read(path: Path) -> Recording:
+def read(path: Path, options: ReadOptions) -> Recording:
     """Read one of our recordings; a cut-off or damaged one as far as it goes, which `notices` then says.
 
     Raises: FileFormatError if it holds no log data of ours.
@@ -45,7 +47,14 @@ def read(path: Path) -> Recording:
         raise FileFormatError(f"{path} is a recording without a single sample of a known signal.")
     if content.unreadable:
         notices.append(f"{content.unreadable} messages could not be decoded and were dropped.")
-    return Recording(str(path), "mcap", signals, content.metadata, tuple(notices), tuple(content.events))
+    return Recording(
+        str(path),
+        "mcap",
+        signals,
+        content.metadata,
+        tuple(note("integrity", n) for n in notices),
+        tuple(content.events),
+    )
 
 
 class _Content:

@@ -1,5 +1,6 @@
 """A flight read from a file: arrays of signals in the order in which the estimator must see them, and what was odd."""
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
@@ -7,19 +8,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import DataError
-from crazyem.signals.sample import SIGNALS, Sample
+from crazyem.recordings.finding import Finding
+from crazyem.signals.sample import ESTIMATOR_SIGNALS, SIGNALS, Sample, components
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SignalArray:
-    """All samples of one signal.
+    """All samples of one signal, as measured: at its own rate, nothing resampled, nothing filled in.
 
     Attributes:
-        time: (n,) s on the clock of the source.
-        value: (n, c) SI, NaN where missing.
+        time: (n,) s on the clock of the source, minus the recording's `origin`.
+        value: (n, c) NaN where missing; SI for signals of the vocabulary, else in `unit`.
         order: (n,) position of each sample in the processing order of the whole recording.
         host_time: (n,) s since the epoch, NaN where unknown.
         marked: (n,) True where a NaN is ours (interpolated stretch, sensor says "missing"), not the file's.
+        quantity: key of `crazyem.signals.sample.SIGNALS`, "" for a column nobody mapped.
+        unit: of `value`; "" where the source does not say.
+        frame: as in `SIGNALS`, or what is known of it.
+        clock: "firmware", "host", or the name the source has for it; signals of one clock can be compared in time.
+        stream: signals with one stream were sampled together (a log block, a table, a topic) and share `time`.
+        source: the names in the file, one a component where there are several.
     """
 
     time: NDArray[np.float64]
@@ -27,6 +35,25 @@ class SignalArray:
     order: NDArray[np.int64]
     host_time: NDArray[np.float64]
     marked: NDArray[np.bool_]
+    quantity: str = ""
+    unit: str = ""
+    frame: str = ""
+    clock: str = ""
+    stream: str = ""
+    source: tuple[str, ...] = ()
+
+    @property
+    def period(self) -> float:
+        """Median time between samples [s]; NaN with fewer than two."""
+        return float(np.median(np.diff(self.time))) if self.time.size > 1 else math.nan
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Names of the components, () for a scalar."""
+        if self.quantity in SIGNALS:
+            return components(self.quantity)
+        count = self.value.shape[1]
+        return tuple(str(i) for i in range(count)) if count > 1 else ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,18 +78,26 @@ class Recording:
     Attributes:
         path: the file, as given.
         source: which reader and mapping produced it, e.g. "mcap" or "csv:nanobench".
-        signals: arrays by signal name (keys of `crazyem.signals.sample.SIGNALS`).
+        signals: arrays by name: a key of `SIGNALS` for what the estimator should use, "<quantity>@<origin>" for
+            further measurements of the same quantity ("position@mocap"), and the source's own name for anything else.
         metadata: run configuration and the like: section -> key -> text.
-        notices: one sentence for each thing a user should know about the file.
+        findings: what the reader noticed; the doctor looks for more.
         events: what else happened, by time.
+        origin: s on the clock of the source at which `time` is 0; `origin + time` are the stamps of the file, exactly.
     """
 
     path: str
     source: str
     signals: Mapping[str, SignalArray]
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    notices: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     events: tuple[Event, ...] = ()
+    origin: float = 0.0
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """One sentence for each thing the reader noticed."""
+        return tuple(finding.text for finding in self.findings)
 
     @property
     def duration(self) -> float:
@@ -74,8 +109,8 @@ class Recording:
         return sum(array.time.size for array in self.signals.values())
 
     def samples(self) -> Iterator[Sample]:
-        """Every sample, in the order in which it was (or would have been) processed live."""
-        names = [name for name in self.signals if self.signals[name].time.size]
+        """Every sample the estimator is fed, in the order in which it was (or would have been) processed live."""
+        names = [name for name in self.signals if name in ESTIMATOR_SIGNALS and self.signals[name].time.size]
         if not names:
             return
         arrays = [self.signals[name] for name in names]
@@ -129,6 +164,9 @@ def collect(samples: Iterable[tuple[Sample, bool]]) -> dict[str, SignalArray]:
             np.array(orders[name], np.int64),
             np.array(hosts[name], float),
             np.array(marks[name], bool),
+            quantity=name,
+            unit=SIGNALS[name][1],
+            frame=SIGNALS[name][2],
         )
         for name in SIGNALS
         if name in times

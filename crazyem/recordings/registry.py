@@ -1,13 +1,16 @@
-"""Which reader opens which file: told by the file's first bytes, never by its name alone."""
+"""Which reader opens which file: told by the file's first bytes, never by its name alone.
+
+A reader for a new format is one file with `recognises` and `read`, and one line in `READERS`.
+"""
 
 import gzip
+import importlib
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.recordings import csv_file, mcap_file
+from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 
 _HEAD_BYTES = 64 * 1024
@@ -15,39 +18,73 @@ _HEAD_BYTES = 64 * 1024
 
 @dataclass(frozen=True, slots=True)
 class Reader:
-    """A file format: `recognises` looks at the (decompressed) first bytes, `read` returns the recording."""
+    """A file format.
+
+    Its module has `recognises(head: bytes) -> bool`, given the (decompressed) first bytes of a file, and
+    `read(path: Path, options: ReadOptions) -> Recording`, which raises FileFormatError. A reader of folders has
+    `recognises_folder(path: Path) -> bool` instead of, or besides, `recognises`. Imported on first use only.
+    """
 
     name: str
-    recognises: Callable[[bytes], bool]
-    read: Callable[[Path], Recording]
+    module: str
+
+    def has(self, function: str) -> bool:
+        return hasattr(self._module(), function)
+
+    def recognises(self, head: bytes) -> bool:
+        return self.has("recognises") and bool(self._module().recognises(head))
+
+    def recognises_folder(self, path: Path) -> bool:
+        return self.has("recognises_folder") and bool(self._module().recognises_folder(path))
+
+    def read(self, path: Path, options: ReadOptions) -> Recording:
+        recording = self._module().read(path, options)
+        assert isinstance(recording, Recording)
+        return recording
+
+    def _module(self):
+        return importlib.import_module(f"crazyem.recordings.{self.module}")
 
 
+# Most specific first.
 READERS: tuple[Reader, ...] = (
-    Reader("MCAP", mcap_file.recognises, mcap_file.read),
-    Reader("CSV", csv_file.recognises, csv_file.read),
+    Reader("MCAP", "mcap_file"),
+    Reader("CSV", "csv_file"),
 )
 
 
-def open_recording(path: str | Path) -> Recording:
-    """Read a flight from any file format we know.
+def open_recording(path: str | Path, options: ReadOptions | None = None) -> Recording:
+    """Read a flight from any format we know.
 
     Raises: UsageError if there is no such file, FileFormatError if it is not a recording.
     """
     path = Path(path)
-    if not path.exists():
-        raise UsageError(f"{path}: no such file.")
-    if path.is_dir():
-        raise UsageError(f"{path} is a directory, not a recording.")
-    head = _head(path)
+    return reader_of(path).read(path, options or ReadOptions())
+
+
+def reader_of(path: Path) -> Reader:
+    """The reader for a file or folder. Raises as `open_recording`."""
+    known = ", ".join(reader.name for reader in READERS)
+    try:
+        if path.is_dir():
+            for reader in READERS:
+                if reader.recognises_folder(path):
+                    return reader
+            raise UsageError(f"{path} is a directory, not a recording.")
+        if not path.exists():
+            raise UsageError(f"{path}: no such file.")
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
+    head = head_of(path)
     for reader in READERS:
         if reader.recognises(head):
-            return reader.read(path)
-    known = ", ".join(reader.name for reader in READERS)
+            return reader
     what = "is empty" if not head else f"is not a recording in a format known here ({known})"
     raise FileFormatError(f"{path} {what}.")
 
 
-def _head(path: Path) -> bytes:
+def head_of(path: Path) -> bytes:
+    """The first bytes of a file, unpacked if it is a gzip file."""
     try:
         with path.open("rb") as raw:
             start = raw.read(_HEAD_BYTES)

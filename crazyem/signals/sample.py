@@ -16,7 +16,49 @@ SIGNALS: dict[str, tuple[int, str, str]] = {
     "setpoint_position": (3, "m", "world"),
     "setpoint_velocity": (3, "m/s", "world"),
     "flying": (1, "1", "1 while the firmware says that rotors turn, else 0"),
+    # From here on what recordings carry besides: for diagnosis and viewers, not for the estimator.
+    "acceleration": (3, "m/s^2", "world, gravity removed"),
+    "euler": (3, "rad", "roll, pitch, yaw (ZYX, right-handed), body FLU to world"),
+    "motor_request": (4, "1", "thrust asked of rotors 1..4 before battery compensation, 0..1"),
+    "mixer_command": (4, "1", "thrust, roll, pitch, yaw handed to the mixer, PWM counts"),
+    "setpoint_acceleration": (3, "m/s^2", "world"),
+    "setpoint_euler": (3, "rad", "roll, pitch, yaw (ZYX, right-handed), body FLU to world"),
+    "setpoint_rate": (3, "rad/s", "body FLU"),
 }
+
+# names of the components in files and viewers; a single component has none
+COMPONENTS: dict[str, tuple[str, ...]] = {
+    "attitude": ("x", "y", "z", "w"),
+    "euler": ("roll", "pitch", "yaw"),
+    "setpoint_euler": ("roll", "pitch", "yaw"),
+    "motor_command": ("m1", "m2", "m3", "m4"),
+    "motor_request": ("m1", "m2", "m3", "m4"),
+    "rotor_speed": ("m1", "m2", "m3", "m4"),
+    "wrench_command": ("thrust", "torque_x", "torque_y", "torque_z"),
+    "mixer_command": ("thrust", "roll", "pitch", "yaw"),
+}
+
+# What the estimator is fed; the rest of a recording never reaches it.
+ESTIMATOR_SIGNALS: tuple[str, ...] = (
+    "position",
+    "velocity",
+    "attitude",
+    "body_rate",
+    "specific_force",
+    "motor_command",
+    "rotor_speed",
+    "voltage",
+    "wrench_command",
+    "setpoint_position",
+    "setpoint_velocity",
+    "flying",
+)
+
+
+def components(quantity: str) -> tuple[str, ...]:
+    """Names of the components of a vocabulary signal: () for a scalar."""
+    count = SIGNALS[quantity][0]
+    return COMPONENTS.get(quantity, ("x", "y", "z")[:count] if count > 1 else ())
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,8 +9,11 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from crazyem.signals.packet import Block, Packet
-from crazyem.signals.sample import SIGNALS, Sample
+from crazyem.signals.sample import ESTIMATOR_SIGNALS, SIGNALS, Sample
 
 STANDARD_GRAVITY = 9.81  # m/s^2, the constant the firmware multiplies and divides by
 _RPM = 2.0 * math.pi / 60.0
@@ -67,43 +70,121 @@ def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Values:
     )
 
 
-def _scaled(factor: float) -> Callable[[Values], Values]:
-    return lambda values: tuple(float(v) * factor for v in values)
+# Each conversion exists for one packet (tuples, on the live path) and for whole columns (arrays, for recordings); both
+# do the same arithmetic in the same order, so that a replay sees bit for bit what the live loop saw.
+Columns = Sequence[NDArray[np.float64]]
 
 
-def _divided(divisor: float) -> Callable[[Values], Values]:
-    return lambda values: tuple(float(v) / divisor for v in values)
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """From firmware values to the components of a signal: `one` packet's, and `many` ((n,) columns to (n, c))."""
+
+    one: Callable[[Values], Values]
+    many: Callable[[Columns], NDArray[np.float64]]
 
 
-def _as_is(values: Values) -> Values:
-    return tuple(float(v) for v in values)
+def _scaled(factor: float) -> Conversion:
+    return Conversion(
+        lambda values: tuple(float(v) * factor for v in values),
+        lambda columns: np.column_stack([np.asarray(c, float) * factor for c in columns]),
+    )
 
 
-def _scalar_first(values: Values) -> Values:
-    return (float(values[1]), float(values[2]), float(values[3]), float(values[0]))
+def _divided(divisor: float) -> Conversion:
+    return Conversion(
+        lambda values: tuple(float(v) / divisor for v in values),
+        lambda columns: np.column_stack([np.asarray(c, float) / divisor for c in columns]),
+    )
 
 
-def _compressed(values: Values) -> Values:
+def _row_by_row(one: Callable[[Values], Values], width: int) -> Conversion:
+    """For the rare ones: the scalar arithmetic itself, since sin and cos of numpy may differ in the last bit."""
+
+    def many(columns: Columns) -> NDArray[np.float64]:
+        rows = zip(*(np.asarray(c, float).tolist() for c in columns), strict=True)
+        flat = [x for row in rows for x in one(row)]
+        return np.array(flat, float).reshape(-1, width)
+
+    return Conversion(one, many)
+
+
+def _stacked(columns: Columns) -> NDArray[np.float64]:
+    return np.column_stack([np.asarray(c, float) for c in columns])
+
+
+_as_is = Conversion(lambda values: tuple(float(v) for v in values), _stacked)
+
+_scalar_first = Conversion(
+    lambda values: (float(values[1]), float(values[2]), float(values[3]), float(values[0])),
+    lambda columns: _stacked(columns)[:, [1, 2, 3, 0]],
+)
+
+
+def _compressed_one(values: Values) -> Values:
     code = values[0]
     return (_NAN,) * 4 if math.isnan(code) else decompress_quaternion(int(code))
 
 
-def _legacy_euler(values: Values) -> Values:
+def decompress_quaternions(codes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 4) quaternions (x, y, z, w) from (n,) codes; NaN where the code is NaN. See `decompress_quaternion`."""
+    codes = np.asarray(codes, float)
+    sound = np.isfinite(codes)
+    code = np.where(sound, codes, 0.0).astype(np.int64)
+    largest = (code >> 30) & 3
+    quaternion = np.zeros((code.size, 4))
+    squares = np.zeros(code.size)
+    for i in (3, 2, 1, 0):
+        small = largest != i
+        magnitude = math.sqrt(0.5) * ((code & _QUAT_MASK) / _QUAT_MASK)
+        value = np.where((code >> 9) & 1, -magnitude, magnitude)
+        quaternion[:, i] = np.where(small, value, 0.0)
+        squares += np.where(small, magnitude * magnitude, 0.0)
+        code = np.where(small, code >> 10, code)
+    quaternion[np.arange(code.size), largest] = np.sqrt(np.maximum(0.0, 1.0 - squares))
+    quaternion[~sound] = np.nan
+    return quaternion
+
+
+_compressed = Conversion(_compressed_one, lambda columns: decompress_quaternions(columns[0]))
+
+
+def _legacy_euler_one(values: Values) -> Values:
     roll, pitch, yaw = (math.radians(v) for v in values)
     return quaternion_from_euler(roll, -pitch, yaw)  # stateEstimate.pitch keeps the legacy, inverted sign
 
 
-def _legacy_rates(values: Values) -> Values:
-    return (values[0] / 1000.0, -values[1] / 1000.0, values[2] / 1000.0)  # ratePitch = -gyro.y
+_legacy_euler = _row_by_row(_legacy_euler_one, 4)
+
+_legacy_rates = Conversion(
+    lambda values: (values[0] / 1000.0, -values[1] / 1000.0, values[2] / 1000.0),  # ratePitch = -gyro.y
+    lambda columns: _stacked(columns) / 1000.0 * np.array([1.0, -1.0, 1.0]),
+)
 
 
-def _rpm(values: Values) -> Values:
-    return tuple(_NAN if v == _RPM_MISSING else float(v) * _RPM for v in values)
+def _rpm_many(columns: Columns) -> NDArray[np.float64]:
+    rpm = _stacked(columns)
+    return np.where(rpm == _RPM_MISSING, np.nan, rpm * _RPM)
 
 
-def _flying_bit(values: Values) -> Values:
-    info = values[0]
-    return (_NAN,) if math.isnan(info) else (float((int(info) >> 4) & 1),)
+_rpm = Conversion(lambda values: tuple(_NAN if v == _RPM_MISSING else float(v) * _RPM for v in values), _rpm_many)
+
+
+def _flying_many(columns: Columns) -> NDArray[np.float64]:
+    info = np.asarray(columns[0], float)
+    sound = np.isfinite(info)
+    bit = (np.where(sound, info, 0.0).astype(np.int64) >> 4) & 1
+    return np.where(sound, bit, np.nan)[:, None]
+
+
+_flying_bit = Conversion(
+    lambda values: (_NAN,) if math.isnan(values[0]) else (float((int(values[0]) >> 4) & 1),), _flying_many
+)
+
+# stateEstimateZ.az includes gravity, in mm/s^2 of the firmware's own 9.81
+_compressed_acceleration = Conversion(
+    lambda values: (values[0] / 1000.0, values[1] / 1000.0, values[2] / 1000.0 - STANDARD_GRAVITY),
+    lambda columns: _stacked(columns) / 1000.0 - np.array([0.0, 0.0, STANDARD_GRAVITY]),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +193,7 @@ class Source:
 
     signal: str
     variables: tuple[str, ...]
-    convert: Callable[[Values], Values]
+    convert: Conversion
 
 
 def _names(pattern: str, parts: str) -> tuple[str, ...]:
@@ -132,7 +213,9 @@ SOURCES: tuple[Source, ...] = (
     Source("body_rate", _names("gyro.*", "x y z"), _scaled(math.pi / 180.0)),
     Source("body_rate", _names("stateEstimateZ.*", "rateRoll ratePitch rateYaw"), _legacy_rates),
     Source("specific_force", _names("acc.*", "x y z"), _scaled(STANDARD_GRAVITY)),
-    Source("motor_command", _names("motor.*", "m1 m2 m3 m4"), _divided(65535.0)),
+    Source(
+        "motor_command", _names("motor.*", "m1 m2 m3 m4"), _divided(65535.0)
+    ),  # today's firmware: what a link speaks
     Source("rotor_speed", _names("motor.*_rpm", "m1 m2 m3 m4"), _rpm),
     Source("rotor_speed", _names("rpm.*", "m1 m2 m3 m4"), _rpm),
     Source("voltage", ("pm.vbat",), _as_is),
@@ -145,6 +228,19 @@ SOURCES: tuple[Source, ...] = (
     Source("setpoint_velocity", _names("ctrltargetZ.*", "vx vy vz"), _divided(1000.0)),
     Source("flying", ("supervisor.info",), _flying_bit),
     Source("flying", ("sys.isFlying",), _as_is),
+    Source("acceleration", _names("stateEstimate.*", "ax ay az"), _scaled(STANDARD_GRAVITY)),
+    Source("acceleration", _names("stateEstimateZ.*", "ax ay az"), _compressed_acceleration),
+    Source("mixer_command", _names("controller.cmd_*", "thrust roll pitch yaw"), _as_is),
+    Source("setpoint_acceleration", _names("ctrltarget.*", "ax ay az"), _as_is),
+)
+# Which of these motor.m1..4 is depends on the firmware (crazyem/recordings/motor_meaning.py); pwm.* is always real.
+DUTY_SOURCES: tuple[Source, ...] = (
+    Source("motor_command", _names("pwm.*_pwm", "m1 m2 m3 m4"), _divided(65535.0)),
+    Source("motor_command", _names("motor.*", "m1 m2 m3 m4"), _divided(65535.0)),
+)
+REQUEST_SOURCES: tuple[Source, ...] = (
+    Source("motor_command", _names("pwm.*_pwm", "m1 m2 m3 m4"), _divided(65535.0)),
+    Source("motor_request", _names("motor.*", "m1 m2 m3 m4"), _divided(65535.0)),
 )
 
 # Blocks that each fit one packet of 26 bytes; what the estimator asks for when the user names nothing.
@@ -195,7 +291,7 @@ class BlockDecoder:
 
     def __init__(self, block: Block, signals: Iterable[str] | None = None) -> None:
         index = {variable.name: i for i, variable in enumerate(block.variables)}
-        allowed = set(SIGNALS) if signals is None else set(signals)
+        allowed = set(ESTIMATOR_SIGNALS) if signals is None else set(signals)
         chosen: dict[str, Source] = {}
         for source in SOURCES:
             if source.signal in allowed and source.signal not in chosen and all(v in index for v in source.variables):
@@ -203,7 +299,7 @@ class BlockDecoder:
         self.block = block
         self.signals: tuple[str, ...] = tuple(name for name in SIGNALS if name in chosen)
         self._plan = tuple(
-            (name, tuple(index[v] for v in chosen[name].variables), chosen[name].convert) for name in self.signals
+            (name, tuple(index[v] for v in chosen[name].variables), chosen[name].convert.one) for name in self.signals
         )
 
     def decode(self, packet: Packet) -> list[Sample]:
@@ -222,7 +318,7 @@ def decoders(blocks: Iterable[Block]) -> dict[int, BlockDecoder]:
     names = {block.identifier: {v.name for v in block.variables} for block in blocks}
     assigned: dict[str, int] = {}
     for source in SOURCES:
-        if source.signal in assigned:
+        if source.signal in assigned or source.signal not in ESTIMATOR_SIGNALS:
             continue
         for block in blocks:
             if names[block.identifier].issuperset(source.variables):

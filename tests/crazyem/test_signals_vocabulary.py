@@ -14,8 +14,10 @@ from crazyem.recordings import open_recording
 from crazyem.signals.packet import Block, Packet, Variable
 from crazyem.signals.sample import SIGNALS, Sample
 from crazyem.signals.vocabulary import (
+    DUTY_SOURCES,
     IMU_BLOCK,
     MOTOR_BLOCK,
+    REQUEST_SOURCES,
     SOURCES,
     STATE_BLOCK,
     BlockDecoder,
@@ -114,14 +116,27 @@ def test_a_signal_needs_all_its_variables_and_is_decoded_once():
 
 def test_every_source_gives_what_the_vocabulary_promises():
     for source in SOURCES:
-        values = source.convert(tuple(1.0 for _ in source.variables))
+        values = source.convert.one(tuple(1.0 for _ in source.variables))
         assert len(values) == SIGNALS[source.signal][0], source
         assert all(type(v) is float for v in values), source
 
 
+def test_whole_columns_convert_bit_for_bit_like_single_packets():
+    """Replay reads columns where the live loop saw packets; the result has to be the same number."""
+    rng = np.random.default_rng(7)
+    for source in (*SOURCES, *DUTY_SOURCES, *REQUEST_SOURCES):
+        columns = [np.append(rng.integers(0, 2**32, 300).astype(float), [math.nan, 65535.0]) for _ in source.variables]
+        if "info" not in source.variables[0] and "quat" not in source.variables[0]:
+            columns = [c * rng.uniform(1e-7, 1e-3) if c[-1] != 65535.0 else c for c in columns]
+        many = source.convert.many(columns)
+        one = [source.convert.one(row) for row in zip(*(c.tolist() for c in columns), strict=True)]
+        assert many.shape == (302, SIGNALS[source.signal][0])
+        assert many.tobytes() == np.array(one, float).tobytes() or np.array_equal(many, one, equal_nan=True), source
+
+
 def test_nan_stays_nan():
     for source in SOURCES:
-        assert any(math.isnan(v) for v in source.convert(tuple(math.nan for _ in source.variables))), source
+        assert any(math.isnan(v) for v in source.convert.one(tuple(math.nan for _ in source.variables))), source
 
 
 def test_what_is_asked_for_when_nobody_says():

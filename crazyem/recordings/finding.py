@@ -1,0 +1,99 @@
+"""What is odd about a recording: named, located in time, graded, with its evidence and what to do about it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Grade(StrEnum):
+    """How much a finding matters to an estimate or a diagnosis made from the recording."""
+
+    HARMLESS = "harmless"  # good to know; results stand
+    DEGRADES = "degrades"  # results are worse or partly wrong unless it is dealt with
+    UNUSABLE = "unusable"  # the signal, or the recording, must not be used as it is
+
+
+# Fixes that lose nothing: each can be undone, or removes only what was never measured.
+FIXES = {
+    "scale": "multiply the components of the signals by `factor` (unit, sign or scale)",
+    "world_to_body": "rotate a world vector into the body frame by the attitude of the recording",
+    "shift": "add `factor[0]` seconds to the time stamps of the signals",
+    "unwrap": "add `factor[i]` seconds to the stamps from sample `rows[i]` on",
+    "mark": "the samples in `rows` become missing (they were never measured)",
+    "sort": "samples into the order of their stamps",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fix:
+    """A lossless repair.
+
+    Attributes:
+        kind: a key of `FIXES`.
+        signals: names of the signals it changes.
+        factor: numbers, meaning by kind; one a component for "scale".
+        rows: sample numbers it applies to, None for all.
+    """
+
+    kind: str
+    signals: tuple[str, ...]
+    factor: tuple[float, ...] = ()
+    rows: NDArray[np.int64] | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: the rows as a count."""
+        count = None if self.rows is None else int(self.rows.size)
+        return {"kind": self.kind, "signals": list(self.signals), "factor": list(self.factor), "rows": count}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finding:
+    """One thing that is odd about a recording.
+
+    Attributes:
+        check: which check found it, e.g. "gaps"; readers use "integrity", "interpolated", "mapping", "motor_meaning".
+        grade: how much it matters.
+        text: one sentence for people.
+        signal: name of the signal concerned; "" for the whole recording.
+        intervals: (start, end) in s on the recording's time axis, in order; () if it concerns all of it.
+        evidence: the numbers behind it, by a name that carries the unit ("longest_s", "slope", "share").
+        advice: what to do, one sentence.
+        fix: a lossless repair, None if there is none.
+    """
+
+    check: str
+    grade: Grade
+    text: str
+    signal: str = ""
+    intervals: tuple[tuple[float, float], ...] = ()
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    advice: str = ""
+    fix: Fix | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "check": self.check,
+            "grade": str(self.grade),
+            "signal": self.signal,
+            "text": self.text,
+            "intervals": [[float(a), float(b)] for a, b in self.intervals],
+            "evidence": {k: float(v) for k, v in self.evidence.items()},
+            "advice": self.advice,
+            "fix": None if self.fix is None else self.fix.to_dict(),
+        }
+
+
+def note(check: str, text: str, grade: Grade = Grade.HARMLESS, **evidence: float) -> Finding:
+    """A finding of a reader: a sentence and its numbers."""
+    return Finding(check, grade, text, evidence=evidence)
+
+
+def intervals_of(time: NDArray[np.float64], rows: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
+    """(start, end) of each run of True, from (n,) times and flags."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], rows, [False]]).astype(np.int8)))
+    return tuple((float(time[a]), float(time[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True))

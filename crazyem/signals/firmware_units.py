@@ -1,0 +1,41 @@
+"""Units of firmware log variables that are in no vocabulary, by name: what viewers and exports write beside them.
+
+Sources: the log groups of crazyflie-firmware (HEAD of August 2026). A name that is not here has no unit: "".
+"""
+
+import re
+
+# first match wins; patterns are of whole names
+_UNITS: tuple[tuple[str, str], ...] = (
+    (r"stateEstimate\.(roll|pitch|yaw)", "deg"),
+    (r"stateEstimate\.a[xyz]", "g"),
+    (r"stateEstimate\.v[xyz]", "m/s"),
+    (r"stateEstimate\.[xyz]", "m"),
+    (r"stateEstimateZ\.a[xyz]", "mm/s^2"),
+    (r"stateEstimateZ\.v[xyz]", "mm/s"),
+    (r"stateEstimateZ\.[xyz]", "mm"),
+    (r"stateEstimateZ\.rate\w+", "mrad/s"),
+    (r"(stateEstimate|kalman)\.q\w", "1"),
+    (r"gyro\.[xyz]|gyro_unfiltered\.[xyz]", "deg/s"),
+    (r"acc\.[xyz]|supervisor\.accNorm|controller\.accelz", "g"),
+    (r"controller\.r_(roll|pitch|yaw)", "rad/s"),
+    (r"controller\.(roll|pitch|yaw)Rate", "deg/s"),
+    (r"controller\.(roll|pitch|yaw)", "deg"),
+    (r"motor\.m\d_rpm|rpm\.m\d", "rpm"),
+    (r"pm\.vbat", "V"),
+    (r"pm\.vbatMV", "mV"),
+    (r"pm\.batteryLevel", "%"),
+    (r"baro\.asl", "m"),
+    (r"baro\.temp", "degC"),
+    (r"baro\.pressure", "mbar"),
+    (r"range\.\w+", "mm"),
+    (r"ext_pos\.[XYZ]|locSrv\.[xyz]", "m"),
+    (r"ctrltarget\.(roll|pitch)", "deg"),
+    (r"ctrltarget\.yaw", "deg/s"),
+)
+_COMPILED = tuple((re.compile(pattern), unit) for pattern, unit in _UNITS)
+
+
+def unit_of(name: str) -> str:
+    """Unit of a firmware log variable as logged, "" where not known."""
+    return next((unit for pattern, unit in _COMPILED if pattern.fullmatch(name)), "")
