@@ -25,7 +25,24 @@ class Check:
         return list(module.check(recording))
 
 
-CHECKS: tuple[Check, ...] = ()
+CHECKS: tuple[Check, ...] = (
+    Check("numbers", "values that are no numbers or cannot be"),
+    Check("gaps", "gaps and dropped records"),
+    Check("interpolated", "samples on straight lines, never measured"),
+    Check("repeated", "repeated samples"),
+    Check("clocks", "clock wraps, jumps, drift; nominal against real rate"),
+    Check("frozen", "frozen and stuck channels"),
+    Check("saturation", "rotors at their limit"),
+    Check("rotor_sensor", "a rotor speed sensor that counts half or drops to zero"),
+    Check("angles", "angles against the quaternion: degrees for radians, inverted pitch"),
+    Check("rates", "body rate against the attitude's derivative: unit, frame, sign, scale"),
+    Check("velocities", "velocity against the position's derivative: unit, frame, scale"),
+    Check("forces", "specific force and acceleration against the velocity's derivative: unit, frame, scale"),
+    Check("tilt", "a tilted pose frame"),
+    Check("lag", "lag between streams, and its drift"),
+    Check("weight", "thrust against weight, and a mass the publisher claims"),
+    Check("flight", "crash, upset, never left the ground"),
+)
 
 
 def examine(recording: Recording) -> tuple[Finding, ...]:

@@ -49,7 +49,13 @@ class Reader:
 # Most specific first.
 READERS: tuple[Reader, ...] = (
     Reader("MCAP", "mcap_file"),
+    Reader("rosbag2", "rosbag2_file"),
+    Reader("uSD card log", "usd_file"),
+    Reader("ULog", "ulog_file"),
+    Reader("exported CSV", "exported_csv"),
+    Reader("cfclient CSV", "cfclient_csv"),
     Reader("CSV", "csv_file"),
+    Reader("MAVLink tlog", "tlog_file"),
 )
 
 

@@ -1,0 +1,9 @@
+"""Check: angles against the quaternion: degrees for radians, inverted pitch."""
+
+from crazyem.recordings.finding import Finding
+from crazyem.recordings.recording import Recording
+
+
+def check(recording: Recording) -> list[Finding]:
+    """Findings of this check."""
+    return []

@@ -1,0 +1,9 @@
+"""Check: clock wraps, jumps, drift; nominal against real rate."""
+
+from crazyem.recordings.finding import Finding
+from crazyem.recordings.recording import Recording
+
+
+def check(recording: Recording) -> list[Finding]:
+    """Findings of this check."""
+    return []

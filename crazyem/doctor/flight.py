@@ -1,0 +1,9 @@
+"""Check: crash, upset, never left the ground."""
+
+from crazyem.recordings.finding import Finding
+from crazyem.recordings.recording import Recording
+
+
+def check(recording: Recording) -> list[Finding]:
+    """Findings of this check."""
+    return []

@@ -1,0 +1,9 @@
+"""Check: a tilted pose frame."""
+
+from crazyem.recordings.finding import Finding
+from crazyem.recordings.recording import Recording
+
+
+def check(recording: Recording) -> list[Finding]:
+    """Findings of this check."""
+    return []

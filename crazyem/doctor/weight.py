@@ -1,0 +1,9 @@
+"""Check: thrust against weight, and a mass the publisher claims."""
+
+from crazyem.recordings.finding import Finding
+from crazyem.recordings.recording import Recording
+
+
+def check(recording: Recording) -> list[Finding]:
+    """Findings of this check."""
+    return []

@@ -1,0 +1,17 @@
+"""PX4 ULog files."""
+
+from pathlib import Path
+
+from crazyem.errors import FileFormatError
+from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.recording import Recording
+
+
+def recognises(head: bytes) -> bool:
+    """True if a file starting with these bytes is one."""
+    return False
+
+
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read one."""
+    raise FileFormatError(f"{path}: this format cannot be read yet.")
