@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from firmware_sim.air import Air
 from firmware_sim.errors import FirmwareSimError, ServerError
 from firmware_sim.firmware import Firmware
 from firmware_sim.server import Server, bind
@@ -70,7 +71,8 @@ def _run(arguments: argparse.Namespace) -> None:
         flight = Flight(scenario, arguments.seed)
         firmware = Firmware(flight, platform=scenario.platform, seed=arguments.seed, parameters=scenario.parameters)
         firmware.advance(1)  # compiles what is not compiled yet, before the clock starts
-        server = Server(firmware, sock, speed=arguments.speed, truth=truth)
+        air = Air(scenario.link.loss, scenario.link.burst, arguments.seed)
+        server = Server(firmware, sock, speed=arguments.speed, truth=truth, air=air)
 
         def stop(_signal: int, _frame: object) -> None:
             server.stopping = True

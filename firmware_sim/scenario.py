@@ -94,6 +94,14 @@ class Ground:
     friction: float = key(0.6, 0.0, 10.0)
 
 
+@dataclass(frozen=True)
+class Link:
+    """The radio: what becomes of log packets on their way down. Requests and their replies are never lost here."""
+
+    loss: float = key(0.0, 0.0, 0.99)  # share of log packets that never arrive
+    burst: float = key(1.0, 1.0, 1000.0)  # packets lost in a row, mean
+
+
 _SECTIONS: dict[str, type] = {
     "vehicle": Vehicle,
     "noise": Noise,
@@ -102,6 +110,7 @@ _SECTIONS: dict[str, type] = {
     "estimator": Estimator,
     "start": Start,
     "ground": Ground,
+    "link": Link,
 }
 
 
@@ -117,6 +126,7 @@ class Scenario:
     estimator: Estimator = field(default_factory=Estimator)
     start: Start = field(default_factory=Start)
     ground: Ground = field(default_factory=Ground)
+    link: Link = field(default_factory=Link)
     parameters: dict[str, float] = field(default_factory=dict)
 
     def inertia(self) -> np.ndarray:

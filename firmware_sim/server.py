@@ -11,6 +11,7 @@ from collections import deque
 from typing import TextIO
 
 from firmware_sim import wire
+from firmware_sim.air import Air
 from firmware_sim.errors import ServerError
 from firmware_sim.firmware import Firmware
 
@@ -61,8 +62,17 @@ class TruthWriter:
 class Server:
     """Runs a firmware behind a bound socket. speed: firmware seconds per second of host time."""
 
-    def __init__(self, firmware: Firmware, sock: socket.socket, *, speed: float = 1.0, truth: TextIO | None = None):
+    def __init__(
+        self,
+        firmware: Firmware,
+        sock: socket.socket,
+        *,
+        speed: float = 1.0,
+        truth: TextIO | None = None,
+        air: Air | None = None,
+    ):
         self.firmware, self._sock, self._speed = firmware, sock, speed
+        self._air = air or Air(0.0, 1.0, 0)
         self.client: Address | None = None
         self.dropped = 0  # log packets
         self._pending: deque[bytes] = deque()  # replies the socket had no room for
@@ -136,6 +146,8 @@ class Server:
             self._pending.popleft()
         while outbox:
             datagram, droppable = outbox.popleft()
+            if droppable and self._air.loses():
+                continue
             if self._pending or not self._put(datagram):
                 if droppable:
                     self.dropped += 1
