@@ -1,0 +1,66 @@
+"""From the frames of PX4 and MAVLink (body front-right-down, world north-east-down) to ours (body FLU, world z up).
+
+The world becomes north-west-up: x stays north and the yaw of a drone that faces north stays 0; only its sign turns, so
+that it counts counter-clockwise seen from above. Both frames turn by half a turn about x, D = diag(1, -1, -1): a
+vector v becomes D v and an attitude R becomes D R D, whose quaternion has the same scalar and x.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Columns = Sequence[NDArray[np.generic]]
+
+WORLD = "world, north-west-up"
+BODY = "body FLU"
+MOTORS = "rotors 1..4 as the autopilot numbers them"
+
+
+def stacked(columns: Columns) -> NDArray[np.float64]:
+    """(n, c) float64 from c columns of (n,) numbers."""
+    return np.column_stack([np.asarray(c, float) for c in columns])
+
+
+def vectors(columns: Columns) -> NDArray[np.float64]:
+    """(n, 3) in FLU or NWU from three columns in FRD or NED."""
+    value = stacked(columns)
+    value[:, 1:] *= -1.0
+    return value
+
+
+def quaternions(columns: Columns) -> NDArray[np.float64]:
+    """(n, 4) x y z w, body FLU to NWU, from columns w x y z of FRD to NED."""
+    w, x, y, z = (np.asarray(c, float) for c in columns)
+    return np.column_stack([x, -y, -z, w])
+
+
+def euler(columns: Columns) -> NDArray[np.float64]:
+    """(n, 3) roll, pitch, yaw [rad] of FLU to NWU from those of FRD to NED, both in order ZYX."""
+    return vectors(columns)
+
+
+def quaternions_from_euler(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 4) x y z w from (n, 3) roll, pitch, yaw [rad], ZYX, in whatever frame the angles are in."""
+    cr, cp, cy = np.moveaxis(np.cos(angles / 2.0), -1, 0)
+    sr, sp, sy = np.moveaxis(np.sin(angles / 2.0), -1, 0)
+    return np.column_stack(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ]
+    )
+
+
+def euler_from_quaternions(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 3) roll, pitch, yaw [rad], ZYX, from (n, 4) x y z w."""
+    x, y, z, w = np.moveaxis(quaternion, -1, 0)
+    return np.column_stack(
+        [
+            np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+            np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0)),
+            np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+        ]
+    )

@@ -1,0 +1,202 @@
+"""From topics (named rows of numbers with a time each) to signals: what the readers of ULog, tlog and rosbag2 share."""
+
+import gzip
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.errors import FileFormatError, UsageError
+from crazyem.recordings.finding import Finding, Grade, note
+from crazyem.recordings.recording import SignalArray
+from crazyem.signals.sample import SIGNALS
+
+# Bounds on columns that nobody mapped: 16 bytes a sample, so some hundred megabytes at most.
+RAW_SIGNALS = 4000
+RAW_SAMPLES = 24_000_000
+LARGEST_FILE = 4 << 30  # bytes, unpacked
+TEXT = 300  # characters of a metadata value that are kept
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Topic:
+    """Messages of one kind.
+
+    Attributes:
+        name: becomes the `stream` of its signals; raw columns are called "<name>.<column>".
+        columns: column -> (n,) numbers, in the type in which they were stored.
+        time: (n,) s, on the time axis of the recording.
+        order: (n,) position of each row among the rows of all topics; a number occurs once.
+        host_time: (n,) s since the epoch, None where unknown.
+        clock: as in `SignalArray`.
+        units: column -> unit, where known.
+    """
+
+    name: str
+    columns: Mapping[str, NDArray[np.generic]]
+    time: NDArray[np.float64]
+    order: NDArray[np.int64]
+    host_time: NDArray[np.float64] | None = None
+    clock: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mapped:
+    """Columns of a topic that are a signal of the vocabulary.
+
+    Attributes:
+        quantity: key of `SIGNALS`.
+        value: (n, c) SI.
+        columns: those it was made of.
+        marked: (n,) True where a NaN is ours because the file calls the value invalid; None: nowhere.
+        frame: what is known of it beyond `SIGNALS`.
+        origin: "" for a candidate to be the signal itself, "mocap" and the like for a further measurement.
+    """
+
+    quantity: str
+    topic: Topic
+    value: NDArray[np.float64]
+    columns: tuple[str, ...]
+    marked: NDArray[np.bool_] | None = None
+    frame: str = ""
+    origin: str = ""
+
+
+def masked(value: NDArray[np.float64], invalid: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """The values with NaN in rows that the file calls invalid, and those rows; (n, c) and (n,)."""
+    return np.where(invalid[:, None], np.nan, value), invalid
+
+
+def ranks(times: Sequence[NDArray[np.generic]]) -> list[NDArray[np.int64]]:
+    """Position of each row of each topic when all rows are sorted by time; equal times in the order of the topics."""
+    sizes = [t.size for t in times]
+    flat = np.concatenate(times) if times else np.empty(0)
+    place = np.empty(flat.size, np.int64)
+    place[np.argsort(flat, kind="stable")] = np.arange(flat.size)
+    return np.split(place, np.cumsum(sizes)[:-1]) if times else []
+
+
+def signals_of(topics: Sequence[Topic], mapped: Sequence[Mapped]) -> tuple[dict[str, SignalArray], list[Finding]]:
+    """Signals by name, and what was left out.
+
+    Args:
+        topics: all of the recording.
+        mapped: best first; the first of a quantity gets its name, the others are called "<quantity>@<topic>".
+
+    Returns: vocabulary first, then every column that is in none of them as "<topic>.<column>".
+    """
+    mapped = [m for m in mapped if m.topic.time.size]
+    used = {(m.topic.name, column) for m in mapped for column in m.columns}
+    raw, left_out = _within_bounds([(t, c) for t in topics for c in t.columns if (t.name, c) not in used])
+    step = len(mapped) + len(raw)  # room for every signal of a row: orders stay unique and follow the rows
+    unmarked = {t.name: np.zeros(t.time.size, bool) for t in topics}
+    hosts = {t.name: np.full(t.time.size, np.nan) if t.host_time is None else t.host_time for t in topics}
+    found: dict[str, SignalArray] = {}
+    for place, m in enumerate(mapped):
+        name = f"{m.quantity}@{m.origin}" if m.origin else m.quantity
+        if name in found:
+            name = f"{m.quantity}@{m.topic.name}"
+        if name in found:
+            name = f"{m.quantity}@{m.topic.name}.{m.columns[0]}"
+        found[name] = SignalArray(
+            m.topic.time,
+            m.value,
+            m.topic.order * step + place,
+            hosts[m.topic.name],
+            unmarked[m.topic.name] if m.marked is None else m.marked & ~np.isfinite(m.value).all(axis=1),
+            quantity=m.quantity,
+            unit=SIGNALS[m.quantity][1],
+            frame=m.frame or SIGNALS[m.quantity][2],
+            clock=m.topic.clock,
+            stream=m.topic.name,
+            source=tuple(f"{m.topic.name}.{c}" for c in m.columns),
+        )
+    signals = {name: found[name] for name in sorted(found, key=lambda name: list(SIGNALS).index(name.split("@")[0]))}
+    for place, (topic, column) in enumerate(raw, start=len(mapped)):
+        signals[f"{topic.name}.{column}"] = SignalArray(
+            topic.time,
+            np.asarray(topic.columns[column], float)[:, None],
+            topic.order * step + place,
+            hosts[topic.name],
+            unmarked[topic.name],
+            unit=topic.units.get(column, ""),
+            clock=topic.clock,
+            stream=topic.name,
+            source=(f"{topic.name}.{column}",),
+        )
+    return signals, left_out
+
+
+def _within_bounds(raw: list[tuple[Topic, str]]) -> tuple[list[tuple[Topic, str]], list[Finding]]:
+    """As many columns as fit the bounds, the shortest first; in their own order."""
+    place = sorted(range(len(raw)), key=lambda i: raw[i][0].time.size)
+    total = 0
+    kept = set()
+    for i in place[:RAW_SIGNALS]:
+        total += raw[i][0].time.size
+        if total > RAW_SAMPLES:
+            break
+        kept.add(i)
+    if len(kept) == len(raw):
+        return raw, []
+    first = next(f"{t.name}.{c}" for i, (t, c) in enumerate(raw) if i not in kept)
+    finding = note(
+        "mapping",
+        f"{len(raw) - len(kept)} of {len(raw)} columns without a meaning here were left out to bound memory, "
+        f"the first is {first}.",
+        left_out=float(len(raw) - len(kept)),
+    )
+    return [pair for i, pair in enumerate(raw) if i in kept], [finding]
+
+
+def file_bytes(path: Path, limit: int | None = None) -> bytes:
+    """All bytes of a file, unpacked if it is a gzip file. Raises FileFormatError beyond `limit` bytes, UsageError."""
+    limit = LARGEST_FILE if limit is None else limit
+    try:
+        with path.open("rb") as plain:
+            packed = plain.read(2) == b"\x1f\x8b"
+        with gzip.open(path, "rb") if packed else path.open("rb") as stream:
+            data = stream.read(limit + 1)
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise FileFormatError(f"{path} is not a readable gzip file ({error}).") from error
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
+    if len(data) > limit:
+        raise FileFormatError(f"{path} is larger than {limit >> 20} MiB (unpacked), more than can be read at once.")
+    return bytes(data)
+
+
+def damage(skipped: Sequence[tuple[int, int]], size: int, what: str) -> list[Finding]:
+    """A finding about bytes that are no part of any sound message.
+
+    Args:
+        skipped: (offset, count) of each run, in order.
+        size: of the file, bytes.
+        what: a message is called so.
+    """
+    found = []
+    cut = [run for run in skipped if sum(run) == size]
+    for offset, count in cut:
+        text = f"The last {count} bytes, from byte {offset} on, are no whole {what}: the file is cut short or damaged."
+        found.append(note("integrity", text, Grade.DEGRADES, offset=float(offset), bytes=float(count)))
+    inside = [run for run in skipped if sum(run) != size]
+    if inside:
+        total = sum(count for _, count in inside)
+        places = ", ".join(str(offset) for offset, _ in inside[:5]) + (", ..." if len(inside) > 5 else "")
+        text = f"{total} bytes in {len(inside)} places (at byte {places}) are no sound {what} and were skipped."
+        found.append(
+            note("integrity", text, Grade.DEGRADES, offset=float(inside[0][0]), bytes=float(total), places=len(inside))
+        )
+    return found
+
+
+def text_of(value: object) -> str:
+    """A metadata value: printable and not endless."""
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", "replace")
+    text = "".join(c if c.isprintable() else " " for c in str(value)[: 4 * TEXT]).strip()
+    return text if len(text) <= TEXT else text[: TEXT - 3] + "..."
