@@ -1,6 +1,7 @@
 """From tables of firmware variables to signals, a column at a time: what every reader of firmware logs ends with."""
 
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -46,32 +47,31 @@ def signals_from_tables(tables: Iterable[Table], *, motor: str | None) -> dict[s
             it), or None where nobody knows; then it stays a column without a meaning.
     """
     tables = tuple(tables)
-    chosen: dict[str, tuple[Table, Source]] = {}
+    chosen: dict[str, tuple[_Shared, Source]] = {}
+    shared = [_Shared(table) for table in tables]
     for source in _sources(motor):
         if source.signal not in chosen:
-            table = next((t for t in tables if set(source.variables) <= t.columns.keys()), None)
-            if table is not None:
-                chosen[source.signal] = (table, source)
-    used = {(table.name, v) for table, source in chosen.values() for v in source.variables}
-    rest = [(table, name) for table in tables for name in table.columns if (table.name, name) not in used]
-    several = {name for _, name in rest if sum(n == name for _, n in rest) > 1 or name in SIGNALS}
-    # room for every signal of a row, so that orders are unique and follow the rows
-    step = len(chosen) + len(rest)
+            where = next((s for s in shared if set(source.variables) <= s.table.columns.keys()), None)
+            if where is not None:
+                chosen[source.signal] = (where, source)
+    used = {(id(where), v) for where, source in chosen.values() for v in source.variables}
+    rest = [(where, name) for where in shared for name in where.table.columns if (id(where), name) not in used]
+    times = Counter(name for _, name in rest)
+    # room for every vocabulary signal of a row, so that orders are unique and follow the rows; the other variables of a
+    # row were sampled at one instant and no estimator sees them: one place is enough
+    step = len(chosen) + 1
     signals: dict[str, SignalArray] = {}
-    place = 0
-    for name in SIGNALS:
-        if name in chosen:
-            table, source = chosen[name]
-            raw = [table.columns[v] for v in source.variables]
-            value = source.convert.many(raw)  # type: ignore[arg-type]
-            sound = np.logical_and.reduce([np.isfinite(np.asarray(c, float)) for c in raw])
-            signals[name] = _array(table, value, place, step, name, source.variables, sound)
-            place += 1
-    for table, name in rest:
-        value = np.asarray(table.columns[name], float)[:, None]
-        label = f"{name}@{table.name}" if name in several else name
-        signals[label] = _array(table, value, place, step, "", (name,), None)
-        place += 1
+    for place, name in enumerate(n for n in SIGNALS if n in chosen):
+        where, source = chosen[name]
+        columns = [where.table.columns[v] for v in source.variables]
+        value = source.convert.many(columns)  # type: ignore[arg-type]
+        signals[name] = where.array(value, place, step, quantity=name, source=source.variables, columns=columns)
+    for where, name in rest:
+        value = np.asarray(where.table.columns[name], float)[:, None]
+        label = f"{name}@{where.table.name}" if times[name] > 1 or name in SIGNALS else name
+        while label in signals:  # tables of one name
+            label += "'"
+        signals[label] = where.array(value, len(chosen), step, source=(name,))
     return signals
 
 
@@ -80,29 +80,45 @@ def _sources(motor: str | None) -> tuple[Source, ...]:
     return (*first, *(s for s in SOURCES if s.signal != "motor_command"))
 
 
-def _array(
-    table: Table,
-    value: NDArray[np.float64],
-    place: int,
-    step: int,
-    quantity: str,
-    source: tuple[str, ...],
-    sound: NDArray[np.bool_] | None,
-) -> SignalArray:
-    n = table.time.size
-    # a NaN that decoding made of valid values (a rotor speed of 65535 is "missing") is ours, not the file's
-    ours = np.zeros(n, bool) if sound is None else sound & ~np.isfinite(value).all(axis=1)
-    unit, frame = SIGNALS[quantity][1:] if quantity else (unit_of(source[0]), "")
-    return SignalArray(
-        table.time,
-        value,
-        table.order * step + place,
-        np.full(n, np.nan) if table.host_time is None else table.host_time,
-        ours,
-        quantity=quantity,
-        unit=unit,
-        frame=frame,
-        clock=table.clock,
-        stream=table.name,
-        source=source,
-    )
+class _Shared:
+    """What all signals of a table have in common, made once: ten minutes at 1 kHz are megabytes of it."""
+
+    def __init__(self, table: Table) -> None:
+        self.table = table
+        n = table.time.size
+        self._host = np.full(n, np.nan) if table.host_time is None else table.host_time
+        self._unmarked = np.zeros(n, bool)
+        self._orders: dict[int, NDArray[np.int64]] = {}
+
+    def array(
+        self,
+        value: NDArray[np.float64],
+        place: int,
+        step: int,
+        *,
+        quantity: str = "",
+        source: tuple[str, ...],
+        columns: Sequence[NDArray[np.generic]] = (),
+    ) -> SignalArray:
+        """A signal of this table; `columns`: what a vocabulary signal was converted from."""
+        marked = self._unmarked
+        missing = ~np.isfinite(value).all(axis=1) if columns else marked
+        if missing.any():
+            # a NaN that decoding made of valid values (a rotor speed of 65535 is "missing") is ours, not the file's
+            marked = missing & np.logical_and.reduce([np.isfinite(np.asarray(c, float)) for c in columns])
+        if place not in self._orders:
+            self._orders[place] = self.table.order * step + place
+        unit, frame = SIGNALS[quantity][1:] if quantity else (unit_of(source[0]), "")
+        return SignalArray(
+            self.table.time,
+            value,
+            self._orders[place],
+            self._host,
+            marked,
+            quantity=quantity,
+            unit=unit,
+            frame=frame,
+            clock=self.table.clock,
+            stream=self.table.name,
+            source=source,
+        )

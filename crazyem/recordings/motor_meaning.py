@@ -1,0 +1,255 @@
+"""What motor.m1..4 of a firmware log is, decided from evidence in the log: thrust asked for, or the PWM that was sent.
+
+Until 2022-11-09 (crazyflie-firmware #1147, commit 96a23724) the firmware logged in motor.m1..4 what its mixer asked
+for, before the battery compensation; since then it logs the PWM ratio it sends, after it. Nothing in a file says which.
+What does tell, strongest first:
+
+* pwm.m1..4_pwm, always the PWM sent (#83, 2015): equal to motor.m1..4 or not.
+* The age of the firmware, from a version in the metadata, from variables that old firmware did not have, and from the
+  type of motor.m1: int32 until 2020-02-28 (#554), uint32 then, uint16 since 2024-05-29 (#1380, e5eafd5c).
+* The mixer's arithmetic. Without compensation m1..4 = T -+ r +- p +- y, where r, p and y are whole numbers and T loses
+  its fraction: m1+m3-m2-m4, m1+m2-m3-m4 and m1+m4-m2-m3 are then multiples of 4, in every row. The compensation is not
+  linear and leaves that to chance, one row in 16. On real logs: 99.9 to 100 % of rows of known requests, 5 to 7 % of
+  known PWM (docs/formats/usd.md).
+* controller.cmd_*, from which the mixer's output can be computed and compared.
+
+How the commands follow the battery is not used: on real flights whose answer is known, the slope of log(request) over
+log(voltage) came out at -1.07 +- 0.42, and at 0 it would have meant a request. Air and propellers change as much.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.errors import UsageError
+from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.tables import MEANINGS, Table
+
+MOTORS = ("motor.m1", "motor.m2", "motor.m3", "motor.m4")
+_SENT = tuple(f"pwm.m{i}_pwm" for i in (1, 2, 3, 4))
+_MIXED = tuple(f"controller.cmd_{name}" for name in ("thrust", "roll", "pitch", "yaw"))
+_FULL = 65535.0
+
+# Variables that crazyflie-firmware got after the change, with the pull request and its date.
+_NEWER: tuple[tuple[str, str], ...] = (
+    (r"motor\.m[1-4]req", "#1147, 2022-11"),  # came with the change itself: "requested, including compensation"
+    (r"supervisor\.(info|accNorm)", "#1272 and #1281, 2023-05"),
+    (r"ctrlLee\.(thrustSi|torque[xyz]|error_\w+)", "#1343, 2024-01"),
+    (r"motor\.m[1-4]_e?rpm", "#1556, 2025-11"),
+)
+_FIRST_NEW, _LAST_OLD = (2023, 2), (2022, 9)  # releases known to be on either side
+_VERSION = re.compile(r"\b(20\d\d)\.(\d{1,2})\b")
+_ROWS = 30  # fewer prove nothing: 0.1**30 and 0.5**30 are what chance would do
+_NAMES = {"duty": "the PWM sent, after battery compensation", "request": "the thrust asked for, before it"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Meaning:
+    """What motor.m1..4 is.
+
+    Attributes:
+        meaning: "duty" (PWM sent, after battery compensation), "request" (thrust asked for, before it), or None where
+            nothing tells, or where the recording has no motor.m1..4.
+        reason: why, one sentence; "" without motor.m1..4.
+        evidence: the numbers behind it.
+        findings: for the recording's `findings`: what was decided, or what the user has to say, or contradicts.
+    """
+
+    meaning: str | None
+    reason: str = ""
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Section "motor" for the recording's `metadata`; none without motor.m1..4."""
+        return {"motor": {"meaning": self.meaning or "unknown", "reason": self.reason}} if self.reason else {}
+
+
+@dataclass(slots=True)
+class _Votes:
+    """What each kind of evidence says, with its words."""
+
+    numbers: list[tuple[str, str]] = field(default_factory=list)  # pwm.*: the PWM itself
+    age: list[tuple[str, str]] = field(default_factory=list)
+    mixer: list[tuple[str, str]] = field(default_factory=list)
+    evidence: dict[str, float] = field(default_factory=dict)
+
+
+def decide(
+    tables: Sequence[Table], *, given: str | None = None, metadata: Mapping[str, Mapping[str, str]] | None = None
+) -> Meaning:
+    """What motor.m1..4 of a recording is.
+
+    Args:
+        tables: firmware variables as logged, not interpolated; `ctypes` only where they are the firmware's own (a host
+            may fetch a variable as another type).
+        given: what the user says it is ("duty" or "request"); holds where nothing tells, and wins over what does, with
+            a finding.
+        metadata: of the recording: a firmware version, or names of the drone's log variables in ["drone"].
+
+    Raises: UsageError if `given` is something else.
+    """
+    if given is not None and given not in MEANINGS:
+        raise UsageError(f'motor.m1..4 is "duty" or "request", not "{given}".')
+    table = next((t for t in tables if set(MOTORS) <= t.columns.keys()), None)
+    if table is None:
+        return Meaning(None)
+    votes = _Votes()
+    _compare_with_sent(table, votes)
+    _judge_age(tables, metadata or {}, votes)
+    _judge_mixer(table, votes)
+    decided, reason = _weigh(votes)
+    return _answer(decided, reason, given, votes.evidence)
+
+
+def _weigh(votes: _Votes) -> tuple[str | None, str]:
+    """The verdict of all votes, with its reason."""
+    if votes.numbers:
+        return votes.numbers[0]
+    ages = {vote for vote, _ in votes.age}
+    mixer = votes.mixer[0] if votes.mixer else None
+    words = "; ".join(text for _, text in votes.age)
+    if len(ages) > 1:
+        return None, f"the log contradicts itself: {words}"
+    if not ages:
+        return mixer if mixer else (None, "nothing in the log tells")
+    (age,) = ages
+    if mixer is None or mixer[0] == age:
+        return age, "; ".join([words] + ([mixer[1]] if mixer else []))
+    if age == "duty":  # new firmware sends the mixer's output as it is where compensation is switched off
+        return age, f"{words}; {mixer[1]}, so the battery compensation was off"
+    return None, f"the log contradicts itself: {words}; {mixer[1]}"
+
+
+def _answer(decided: str | None, reason: str, given: str | None, evidence: dict[str, float]) -> Meaning:
+    if decided is None and given is None:
+        text = f"What motor.m1..4 is cannot be told ({reason}): it may be {_NAMES['duty']}, or {_NAMES['request']}."
+        finding = Finding(
+            "motor_meaning", Grade.DEGRADES, text, evidence=evidence, advice="Say --motor duty or --motor request."
+        )
+        return Meaning(None, reason, evidence, (finding,))
+    if decided is None:
+        reason = f"said by the user; {reason}"
+    if given is not None and decided not in (None, given):
+        text = f"motor.m1..4 is taken as {_NAMES[given]}, as told, but the log says: {_NAMES[decided]} ({reason})."
+        advice = f"Leave --motor out, or say --motor {decided}."
+        finding = Finding("motor_meaning", Grade.DEGRADES, text, evidence=evidence, advice=advice)
+        return Meaning(given, f"said by the user, against the log ({reason})", evidence, (finding,))
+    meaning = given or decided
+    assert meaning is not None
+    text = f"motor.m1..4 is {_NAMES[meaning]}: {reason}."
+    return Meaning(meaning, reason, evidence, (Finding("motor_meaning", Grade.HARMLESS, text, evidence=evidence),))
+
+
+def _matrix(table: Table, names: Sequence[str]) -> NDArray[np.float64]:
+    """(len(names), n) of columns."""
+    return np.stack([np.asarray(table.columns[name], float) for name in names])
+
+
+def _compare_with_sent(table: Table, votes: _Votes) -> None:
+    if not set(_SENT) <= table.columns.keys():
+        return
+    motor, sent = _matrix(table, MOTORS), _matrix(table, _SENT)
+    turning = (sent > 0) & (sent < _FULL)
+    if turning.sum() < _ROWS:
+        return
+    equal = float((motor == sent)[turning].mean())
+    votes.evidence["pwm_equal_share"] = equal
+    voltage = _voltage(table)
+    if equal > 0.5:
+        votes.numbers.append(("duty", f"it equals pwm.m1..4_pwm in {100 * equal:.0f} % of samples"))
+        return
+    text = f"it equals pwm.m1..4_pwm in only {100 * equal:.1f} % of samples"
+    if voltage is not None:
+        error = float(np.median(np.abs(_compensated(motor, voltage) - sent)[turning]))
+        votes.evidence["compensation_error_counts"] = error
+        text += f", the old battery compensation turns one into the other within {error:.0f} counts (median)"
+    votes.numbers.append(("request", text))
+
+
+def _voltage(table: Table) -> NDArray[np.float64] | None:
+    for name, scale in (("pm.vbat", 1.0), ("pm.vbatMV", 1000.0)):
+        if name in table.columns:
+            return np.asarray(table.columns[name], float) / scale
+    return None
+
+
+def _compensated(request: NDArray[np.float64], voltage: NDArray[np.float64]) -> NDArray[np.float64]:
+    """PWM for a request [counts] in firmware before 2025: a parabola through a measured table (motors.c)."""
+    grams = request / 65536.0 * 60.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return _FULL * (-0.0006239 * grams * grams + 0.088 * grams) / voltage
+
+
+def _judge_age(tables: Sequence[Table], metadata: Mapping[str, Mapping[str, str]], votes: _Votes) -> None:
+    names = {name for table in tables for name in table.columns}
+    names.update(metadata.get("drone", {}).get("log_variables", "").split())
+    for pattern, origin in _NEWER:
+        found = sorted(name for name in names if re.fullmatch(pattern, name))
+        if found:
+            votes.age.append(("duty", f"the firmware has {found[0]}, which came later ({origin})"))
+            break
+    types = {table.ctypes[name] for table in tables for name in MOTORS if name in table.ctypes}
+    if types == {"uint16_t"}:
+        votes.age.append(("duty", "it is a uint16, as since 2024-05-29"))
+    elif types == {"int32_t"}:
+        votes.age.append(("request", "it is an int32, as until 2020-02-28"))
+    version = _version(metadata)
+    if version is not None and version >= _FIRST_NEW:
+        votes.age.append(("duty", f"the firmware is of {version[0]}-{version[1]:02d}"))
+    elif version is not None and version <= _LAST_OLD:
+        votes.age.append(("request", f"the firmware is of {version[0]}-{version[1]:02d}"))
+
+
+def _version(metadata: Mapping[str, Mapping[str, str]]) -> tuple[int, int] | None:
+    """Year and month of the firmware's release, where a key or section of the metadata speaks of firmware."""
+    for section, entries in metadata.items():
+        for key, text in entries.items():
+            found = _VERSION.search(text[:200])
+            if found and "firmware" in f"{section} {key}".lower():
+                return int(found[1]), int(found[2])
+    return None
+
+
+def _judge_mixer(table: Table, votes: _Votes) -> None:
+    motor = _matrix(table, MOTORS)
+    # a clipped rotor, or four equal ones (idle on the ground), obey or break the rule for other reasons
+    usable = ((motor > 0) & (motor < _FULL) & (motor == np.floor(motor))).all(axis=0) & (np.ptp(motor, axis=0) > 0)
+    rows = int(usable.sum())
+    if rows < _ROWS:
+        return
+    m1, m2, m3, m4 = motor[:, usable].astype(np.int64)
+    whole = [(m1 + m3 - m2 - m4) % 4 == 0, (m1 + m2 - m3 - m4) % 4 == 0, (m1 + m4 - m2 - m3) % 4 == 0]
+    share = float(np.logical_and.reduce(whole).mean())
+    votes.evidence |= {"mixer_share": share, "mixer_rows": rows}
+    _compare_with_mixer(table, motor, usable, votes)
+    if share > 0.9:
+        votes.mixer.append(
+            ("request", f"it is on the mixer's whole-number grid in {100 * share:.1f} % of rows, not compensated")
+        )
+    elif share < 0.5:
+        votes.mixer.append(
+            ("duty", f"it is on the mixer's whole-number grid in {100 * share:.1f} % of rows (by chance: 6 %)")
+        )
+
+
+def _compare_with_mixer(table: Table, motor: NDArray[np.float64], usable: NDArray[np.bool_], votes: _Votes) -> None:
+    """Against m = T -+ r +- p +- y of controller.cmd_*, which are 0 under controllers other than the PID."""
+    if not set(_MIXED) <= table.columns.keys():
+        return
+    thrust, roll, pitch, yaw = _matrix(table, _MIXED)
+    rows = usable & (thrust > 0)
+    if rows.sum() < _ROWS:
+        return
+    r, p = np.trunc(roll / 2.0), np.trunc(pitch / 2.0)
+    mixed = np.trunc(np.stack([thrust - r + p + yaw, thrust - r - p - yaw, thrust + r - p + yaw, thrust + r + p - yaw]))
+    equal = float((np.abs(mixed - motor) <= 1.0).all(axis=0)[rows].mean())
+    votes.evidence["mixer_equal_share"] = equal
+    if equal > 0.5:
+        votes.mixer.append(
+            ("request", f"it is what the mixer makes of controller.cmd_* in {100 * equal:.0f} % of rows")
+        )

@@ -1,0 +1,87 @@
+"""Where the records of a uSD card log start, and all records of one kind as one structured array.
+
+A record's length is known from its id only, so records must be walked from the first to the last. Logs are long runs of
+one kind with few others between them, so a run is taken in one comparison; where kinds alternate, the walk is a plain
+loop (0.2 us a record).
+"""
+
+from array import array
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.recordings.usd_format import EventType
+
+_STREAK = 16  # records of one kind in a row before a run is guessed
+_WINDOW = 1 << 16  # records compared at once, at most: bounds the memory of a comparison
+_GATHERED = 1 << 22  # bytes copied at once where records of one kind do not lie side by side
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Records:
+    """Whole records in file order.
+
+    Attributes:
+        start: (n,) byte at which each starts.
+        kind: (n,) index of its event type.
+        stop: byte after the last whole record.
+        unknown: the event id found at `stop`, None if the bytes simply run out there.
+    """
+
+    start: NDArray[np.int64]
+    kind: NDArray[np.uint16]
+    stop: int
+    unknown: int | None
+
+
+def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int) -> Records:
+    """Every whole record of `data[begin:end]`, up to the first that is cut off or of an unknown kind."""
+    kinds = {event.identifier: i for i, event in enumerate(events)}
+    sizes = [event.layout.itemsize for event in events]
+    start, kind = array("q"), array("H")
+    at, previous, streak = begin, -1, 0
+    unknown: int | None = None
+    while at + 2 <= end:
+        identifier = data[at] | data[at + 1] << 8
+        found = kinds.get(identifier)
+        if found is None:
+            unknown = identifier
+            break
+        size = sizes[found]
+        if at + size > end:
+            break
+        streak = streak + 1 if found == previous else 1
+        previous = found
+        if streak < _STREAK:
+            start.append(at)
+            kind.append(found)
+            at += size
+            continue
+        run = _run(data, at, end, size, identifier)
+        start.frombytes(np.arange(at, at + run * size, size, dtype=np.int64).tobytes())
+        kind.frombytes(np.full(run, found, np.uint16).tobytes())
+        at += run * size
+        streak = _STREAK - 1 if run == _WINDOW else 0  # a full window: the run may go on
+    return Records(np.frombuffer(start, np.int64), np.frombuffer(kind, np.uint16), at, unknown)
+
+
+def _run(data: bytes, at: int, end: int, size: int, identifier: int) -> int:
+    """Length of the run of whole records of one kind that starts at `at`, at most a window."""
+    count = min((end - at) // size, _WINDOW)
+    same = np.ndarray((count,), "<u2", data, at, (size,)) == identifier
+    return count if same.all() else int(np.argmin(same))
+
+
+def gather(data: bytes, event: EventType, start: NDArray[np.int64]) -> NDArray[np.void]:
+    """(n,) records of one kind; a view of `data` where they lie side by side, else a copy."""
+    size = event.layout.itemsize
+    if start.size and int(start[-1]) - int(start[0]) == (start.size - 1) * size:
+        return np.frombuffer(data, event.layout, start.size, int(start[0]))
+    source = np.frombuffer(data, np.uint8)
+    result = np.empty((start.size, size), np.uint8)
+    step = max(1, _GATHERED // (8 * size))
+    for first in range(0, start.size, step):
+        rows = start[first : first + step]
+        result[first : first + step] = source[rows[:, None] + np.arange(size)]
+    return result.reshape(-1).view(event.layout)
