@@ -1,0 +1,215 @@
+"""A recording as one table: which column holds which component of which signal, and which row which samples."""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.recordings.finding import Finding
+from crazyem.recordings.recording import Event, Recording, SignalArray
+
+# Units of the components where they differ within a signal.
+_MIXED_UNITS: dict[str, tuple[str, ...]] = {"wrench_command": ("N", "N m", "N m", "N m")}
+_RESERVED = ("time", "host_time")
+MARKED = "marked"
+
+
+@dataclass(frozen=True, slots=True)
+class SignalEntry:
+    """All that is known of a signal besides its samples (see `SignalArray`).
+
+    Attributes:
+        name: in the recording.
+        parts: names of the components, ("",) for a scalar.
+        marked: True if some of its samples are marked.
+    """
+
+    name: str
+    parts: tuple[str, ...]
+    quantity: str
+    unit: str
+    frame: str
+    clock: str
+    stream: str
+    source: tuple[str, ...]
+    marked: bool = False
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each component."""
+        mixed = _MIXED_UNITS.get(self.quantity, ())
+        return mixed if len(mixed) == len(self.parts) else (self.unit,) * len(self.parts)
+
+
+def entry_of(name: str, array: SignalArray) -> SignalEntry:
+    """The entry of a signal."""
+    count = array.value.shape[1]
+    parts = array.components if len(array.components) == count else tuple(str(i) for i in range(count))
+    return SignalEntry(
+        name,
+        ("",) if count == 1 else parts,
+        array.quantity,
+        array.unit,
+        array.frame,
+        array.clock,
+        array.stream,
+        array.source,
+        bool(array.marked.any()),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """What a recording holds besides samples; of a recording in parts, what they add up to.
+
+    Attributes:
+        source: as in `Recording`.
+        entries: one a signal, in the order of the recording.
+        origin, metadata, findings, events: as in `Recording`.
+    """
+
+    source: str
+    entries: tuple[SignalEntry, ...]
+    origin: float = 0.0
+    metadata: dict[str, dict[str, str]] | None = None
+    findings: tuple[Finding, ...] = ()
+    events: tuple[Event, ...] = ()
+
+    @property
+    def columns(self) -> tuple["Column", ...]:
+        """The columns after `time` and `host_time`: components, and a flag for signals with marked samples."""
+        used = set(_RESERVED)
+        columns = []
+        for entry in self.entries:
+            wanted = [f"{entry.name}_{part}" if part else entry.name for part in entry.parts]
+            units = list(entry.units)
+            if entry.marked:
+                wanted.append(f"{entry.name}_{MARKED}")
+                units.append("")
+            for component, (name, unit) in enumerate(zip(wanted, units, strict=True)):
+                unique = _unique(_printable(name), used)
+                columns.append(Column(unique, unit, entry, component if component < len(entry.parts) else None))
+        return tuple(columns)
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of the table.
+
+    Attributes:
+        name: unique, printable, without unit: "position_x", "voltage", "position_marked".
+        unit: of its numbers.
+        entry: the signal.
+        component: which of its components; None for the flag that tells marked samples.
+    """
+
+    name: str
+    unit: str
+    entry: SignalEntry
+    component: int | None
+
+    @property
+    def title(self) -> str:
+        """Header of a CSV column: "position_x [m]"; no brackets without a unit."""
+        return f"{self.name} [{_printable(self.unit)}]" if self.unit else self.name
+
+
+def _unique(wanted: str, used: set[str]) -> str:
+    name, number = wanted, 1
+    while name in used:
+        number += 1
+        name = f"{wanted}#{number}"
+    used.add(name)
+    return name
+
+
+def describe(parts: Iterable[Recording]) -> Description:
+    """What the parts of a recording (or the one recording) add up to; holds one part at a time."""
+    source, origin = "", 0.0
+    entries: dict[str, SignalEntry] = {}
+    metadata: dict[str, dict[str, str]] = {}
+    findings: dict[tuple[str, str, str], Finding] = {}
+    events: list[Event] = []
+    for part in parts:
+        source, origin = part.source, part.origin
+        for name, array in part.signals.items():
+            entry = entry_of(name, array)
+            known = entries.get(name)
+            entries[name] = entry if known is None else replace(known, marked=known.marked or entry.marked)
+        for section, values in part.metadata.items():
+            metadata.setdefault(section, {}).update(values)
+        for finding in part.findings:
+            key = (finding.check, finding.signal, finding.text)
+            known_finding = findings.get(key)
+            if known_finding is None:
+                findings[key] = finding
+            else:
+                findings[key] = replace(known_finding, intervals=(*known_finding.intervals, *finding.intervals))
+        events.extend(part.events)
+    return Description(source, tuple(entries.values()), origin, metadata, tuple(findings.values()), tuple(events))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """The rows of a table: runs of samples, in processing order, with one stamp and one host time.
+
+    Attributes:
+        time: (r,) s.
+        host_time: (r,) s since the epoch, NaN where unknown.
+        row: signal -> (n,) row of each of its samples, ascending.
+        sample: signal -> (n,) number of that sample in its array.
+    """
+
+    time: NDArray[np.float64]
+    host_time: NDArray[np.float64]
+    row: dict[str, NDArray[np.int64]]
+    sample: dict[str, NDArray[np.int64]]
+
+
+def rows_of(recording: Recording, names: Iterable[str]) -> Rows:
+    """Samples of the named signals as rows.
+
+    Samples that follow one another in processing order share a row if their stamps and host times are the same, bit
+    for bit, and the columns of the later one are further right. So the order of the samples is the order of reading
+    the table row by row, from left to right.
+    """
+    arrays = {name: recording.signals[name] for name in names if name in recording.signals}
+    if not arrays:
+        empty = np.empty(0)
+        return Rows(empty, empty, {}, {})
+    order = np.concatenate([a.order for a in arrays.values()])
+    place = np.concatenate([np.full(a.order.size, i, np.int32) for i, a in enumerate(arrays.values())])
+    sample = np.concatenate([np.arange(a.order.size) for a in arrays.values()])
+    time = np.concatenate([np.asarray(a.time, float) for a in arrays.values()])
+    host = np.concatenate([np.asarray(a.host_time, float) for a in arrays.values()])
+    by_order = np.argsort(order, kind="stable")
+    del order
+    place, sample, time, host = place[by_order], sample[by_order], time[by_order], host[by_order]
+    host[np.isnan(host)] = np.nan  # one bit pattern, so that unknown equals unknown
+    starts = np.ones(time.size, bool)
+    starts[1:] = (
+        (time[1:].view(np.int64) != time[:-1].view(np.int64))
+        | (host[1:].view(np.int64) != host[:-1].view(np.int64))
+        | (place[1:] <= place[:-1])
+    )
+    row = np.cumsum(starts) - 1
+    where = [np.flatnonzero(place == i) for i in range(len(arrays))]
+    return Rows(
+        time[starts],
+        host[starts],
+        {name: row[w] for name, w in zip(arrays, where, strict=True)},
+        {name: sample[w] for name, w in zip(arrays, where, strict=True)},
+    )
+
+
+def _printable(name: str) -> str:
+    """A name that fits one line of text: what cannot be printed becomes a question mark."""
+    return "".join(c if c.isprintable() else "?" for c in name)
+
+
+def name_and_unit(title: str) -> tuple[str, str]:
+    """Name and unit in the header of a column; unit "" where there are no brackets."""
+    found = re.fullmatch(r"(.*) \[([^\[\]]*)\]", title)
+    return (found.group(1), found.group(2)) if found else (title, "")

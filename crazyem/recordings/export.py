@@ -1,0 +1,226 @@
+"""Recordings as tables for other programs: CSV with a CSVW description beside it, and Parquet; nothing is resampled.
+
+A row is an instant: samples with the same stamp that follow one another. A field is empty (null) where a signal has no
+sample in that row, and NaN where it has one that is not a number.
+"""
+
+import contextlib
+import csv
+import io
+import json
+import math
+import os
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from crazyem.errors import UsageError
+from crazyem.recordings.columns import Column, Description, Rows, describe, rows_of
+from crazyem.recordings.description import to_json
+from crazyem.recordings.recording import Recording
+
+TIME, HOST_TIME = "time [s]", "host_time [s]"
+METADATA_SUFFIX = "-metadata.json"  # CSVW: where programs look for the description of a CSV
+SUFFIXES = (".csv", ".parquet")
+_ROWS = 65536  # rows of a block: bounds what is held besides the recording
+_WHAT = {"time": "on the clock of the recording", "host_time": "since the epoch, clock of the host"}
+
+
+def export(recording: Recording, path: str | Path, *, force: bool = False) -> Description:
+    """Write a recording to `path`: .csv (and its -metadata.json) or .parquet.
+
+    Written beside the target first and moved there when complete.
+
+    Raises: UsageError if the suffix is neither, the file exists (unless `force`), or it cannot be written.
+    """
+    return export_parts(lambda: iter((recording,)), path, force=force)
+
+
+def export_parts(parts: Any, path: str | Path, *, force: bool = False) -> Description:
+    """As `export`, for a recording in parts: one part is in memory at a time.
+
+    Args:
+        parts: function without arguments that starts reading; called twice, for the columns and for the samples.
+        path: as in `export`.
+        force: replace an existing file.
+    """
+    path = Path(path)
+    write = {".csv": _write_csv, ".parquet": _write_parquet}.get(path.suffix.lower())
+    if write is None:
+        raise UsageError(f"{path}: an export ends in {' or '.join(SUFFIXES)}.")
+    description = describe(parts())
+    with new_file(path, force=force) as temporary:
+        write(description, parts(), temporary)
+        if write is _write_csv:
+            beside = path.with_name(path.name + METADATA_SUFFIX)
+            with new_file(beside, force=force) as other:
+                text = json.dumps(csvw(description, path.name), indent=1, allow_nan=False, ensure_ascii=True)
+                other.write_text(text + "\n", encoding="utf-8")
+    return description
+
+
+@contextlib.contextmanager
+def new_file(path: Path, *, force: bool = False) -> Iterator[Path]:
+    """A temporary file that becomes `path` when the block ends well, and vanishes when it does not.
+
+    Raises: UsageError if `path` exists and not `force`, or it cannot be written.
+    """
+    try:
+        if path.is_dir():
+            raise UsageError(f"{path} is a directory.")
+        if not force and path.exists():
+            raise UsageError(f"{path} exists already (--force replaces it).")
+        handle, name = tempfile.mkstemp(prefix=".crazyem-", suffix=path.suffix, dir=path.parent)
+        os.close(handle)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}.") from None
+    temporary = Path(name)
+    try:
+        yield temporary
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
+        temporary.replace(path)
+    except OSError as error:
+        raise UsageError(f"cannot write {path}: {error.strerror or error}.") from None
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _blocks(description: Description, parts: Iterable[Recording], schema: Any) -> Iterator[Any]:
+    """The table, a RecordBatch at a time."""
+    import pyarrow as pa
+
+    names = [entry.name for entry in description.entries]
+    columns = description.columns
+    for recording in parts:
+        rows = rows_of(recording, names)
+        for first in range(0, rows.time.size, _ROWS):
+            last = min(first + _ROWS, rows.time.size)
+            host = rows.host_time[first:last]
+            arrays = [pa.array(rows.time[first:last]), pa.array(host, mask=np.isnan(host))]
+            arrays += [_filled(recording, rows, column, first, last) for column in columns]
+            yield pa.record_batch(arrays, schema=schema)
+
+
+def _filled(recording: Recording, rows: Rows, column: Column, first: int, last: int) -> Any:
+    """Rows `first` to `last` of a column; null where the signal has no sample."""
+    import pyarrow as pa
+
+    array = recording.signals.get(column.entry.name)
+    flag = column.component is None
+    values = np.zeros(last - first, bool if flag else float)
+    absent = np.ones(last - first, bool)
+    if array is not None:
+        row = rows.row[column.entry.name]
+        a, b = np.searchsorted(row, (first, last))
+        here, sample = row[a:b] - first, rows.sample[column.entry.name][a:b]
+        values[here] = array.marked[sample] if flag else array.value[sample, column.component]
+        absent[here] = False
+    return pa.array(values, mask=absent)
+
+
+def _write_csv(description: Description, parts: Iterable[Recording], path: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import csv as pa_csv
+
+    header = io.StringIO()
+    columns = description.columns
+    csv.writer(header, lineterminator="\n").writerow([TIME, HOST_TIME, *(c.title for c in columns)])
+    plain = pa.schema(
+        [pa.field("time", pa.float64()), pa.field("host_time", pa.float64())]
+        + [pa.field(c.name, pa.bool_() if c.component is None else pa.float64()) for c in columns]
+    )
+    schema = pa.schema([pa.field(f.name, pa.int8()) if f.type == pa.bool_() else f for f in plain])  # 1, not "true"
+    with path.open("wb") as file:
+        file.write(header.getvalue().encode("utf-8", "replace"))
+        options = pa_csv.WriteOptions(include_header=False)
+        with pa_csv.CSVWriter(file, schema, write_options=options) as writer:
+            for block in _blocks(description, parts, plain):
+                writer.write(block.cast(schema))
+
+
+def _write_parquet(description: Description, parts: Iterable[Recording], path: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    fields = [_field(name, pa.float64(), {"unit": "s", "description": text}) for name, text in _WHAT.items()]
+    for column in description.columns:
+        kind = pa.bool_() if column.component is None else pa.float64()
+        fields.append(_field(column.name, kind, _about(column)))
+    schema = pa.schema(
+        fields,
+        metadata={
+            "crazyem": json.dumps(to_json(description), allow_nan=False),
+            "PANDAS_ATTRS": json.dumps(attributes(description), allow_nan=False),
+        },
+    )
+    with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
+        for block in _blocks(description, parts, schema):
+            writer.write_batch(block)
+
+
+def _field(name: str, kind: Any, about: dict[str, str]) -> Any:
+    import pyarrow as pa
+
+    return pa.field(name, kind, metadata={k: v.encode("utf-8", "replace") for k, v in about.items()})
+
+
+def _about(column: Column) -> dict[str, str]:
+    """What is known of a column, in words."""
+    entry = column.entry
+    about = {"signal": entry.name, "quantity": entry.quantity, "unit": column.unit, "frame": entry.frame}
+    about |= {"clock": entry.clock, "stream": entry.stream, "source": _source(column)}
+    if column.component is None:
+        about["description"] = "true where the sample was not measured, or the sensor said that it has none"
+    return {k: v for k, v in about.items() if v}
+
+
+def _source(column: Column) -> str:
+    source = column.entry.source
+    if len(source) == len(column.entry.parts) and column.component is not None:
+        return source[column.component]
+    return ", ".join(source)
+
+
+def attributes(description: Description) -> dict[str, Any]:
+    """For `DataFrame.attrs`: units, frames, clocks, streams and sources by column; origin; source of the recording."""
+    result: dict[str, Any] = {"units": {"time": "s", "host_time": "s"}}
+    for key, plural in (
+        ("unit", "units"), ("frame", "frames"), ("clock", "clocks"), ("stream", "streams"), ("source", "sources"),
+    ):  # fmt: skip
+        found = {c.name: about[key] for c in description.columns if key in (about := _about(c))}
+        result[plural] = result.get(plural, {}) | found
+    origin = float(description.origin)
+    return result | {"origin_s": origin if math.isfinite(origin) else None, "recording": description.source}
+
+
+def csvw(description: Description, name: str) -> dict[str, Any]:
+    """The CSVW description (https://www.w3.org/TR/tabular-metadata/) of an exported CSV called `name`."""
+    columns: list[dict[str, Any]] = [
+        {"titles": title, "name": key, "datatype": "double", "schema:unitText": "s", "dc:description": _WHAT[key]}
+        for title, key in ((TIME, "time"), (HOST_TIME, "host_time"))
+    ]
+    for column in description.columns:
+        about = _about(column)
+        kind = "boolean" if column.component is None else "double"
+        entry: dict[str, Any] = {"titles": column.title, "name": quote(column.name, safe=""), "datatype": kind}
+        if kind == "boolean":
+            entry["datatype"] = {"base": "boolean", "format": "1|0"}
+        for key, term in (
+            ("unit", "schema:unitText"), ("frame", "dc:description"), ("source", "dc:source"),
+        ):  # fmt: skip
+            if key in about:
+                entry[term] = about[key]
+        columns.append(entry)
+    return {
+        "@context": "http://www.w3.org/ns/csvw",
+        "url": quote(name.encode("utf-8", "surrogateescape")),
+        "dialect": {"header": True, "delimiter": ",", "encoding": "utf-8"},
+        "tableSchema": {"columns": columns},
+        "notes": [{"crazyem": to_json(description)}],
+    }

@@ -1,0 +1,63 @@
+"""Recordings too large for memory, read a stretch at a time where their reader can."""
+
+import importlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from crazyem.errors import UsageError
+from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.recording import Recording
+from crazyem.recordings.registry import reader_of
+
+SECONDS = 60.0  # of flight a part
+_SHARE = 0.25  # of the free memory that a file may take up before it is read in parts
+_PACKED = 8.0  # how much larger a gzip file is once unpacked, about
+
+
+def can_be_parted(path: Path) -> bool:
+    """True if the reader of this file can read it in parts. Raises as `open_recording`."""
+    return reader_of(path).has("read_parts")
+
+
+def is_large(path: Path, *, jobs: int = 1) -> bool:
+    """True if reading the file whole, `jobs` such files at a time, may need more than a quarter of the free memory."""
+    if not path.is_file():
+        return False
+    size = path.stat().st_size * (_PACKED if path.suffix == ".gz" else 1.0)
+    return size * jobs > _SHARE * free_memory()
+
+
+def free_memory() -> float:
+    """Bytes of memory that programs can have now."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as lines:
+            for line in lines:
+                if line.startswith("MemAvailable:"):
+                    return float(line.split()[1]) * 1024.0
+    except (OSError, ValueError):
+        pass
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")) / 2.0
+    except (OSError, ValueError, AttributeError):
+        return 4e9
+
+
+def open_parts(
+    path: str | Path, options: ReadOptions | None = None, *, seconds: float = SECONDS
+) -> Iterator[Recording]:
+    """Consecutive stretches of a recording; memory is bounded by the length of one.
+
+    Args:
+        path: a file whose reader can read in parts.
+        options: as in `open_recording`.
+        seconds: length of a part.
+
+    Raises: as `open_recording`; UsageError if the format cannot be read in parts.
+    """
+    path = Path(path)
+    reader = reader_of(path)
+    if not reader.has("read_parts"):
+        raise UsageError(f"{path}: a {reader.name} cannot be read in parts, only whole.")
+    module = importlib.import_module(f"crazyem.recordings.{reader.module}")
+    yield from module.read_parts(path, options or ReadOptions(), seconds=seconds)
