@@ -55,8 +55,9 @@ def quaternions_from_euler(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def euler_from_quaternions(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 3) roll, pitch, yaw [rad], ZYX, from (n, 4) x y z w."""
-    x, y, z, w = np.moveaxis(quaternion, -1, 0)
+    """(n, 3) roll, pitch, yaw [rad], ZYX, from (n, 4) x y z w of any length but 0; NaN for that."""
+    with np.errstate(invalid="ignore"):
+        x, y, z, w = np.moveaxis(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True), -1, 0)
     return np.column_stack(
         [
             np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),

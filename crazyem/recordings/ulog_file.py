@@ -1,17 +1,282 @@
-"""PX4 ULog files."""
+"""PX4 ULog files: each topic at its own rate, on the autopilot's clock, turned from FRD and NED to FLU and NWU.
 
+Decoding is pyulog's; `ulog_scan` decides before what of a file is sound. What becomes which signal is the table
+`_SIGNALS`; docs/formats/ulog.md explains it. Sources: docs.px4.io (ULog file format, uORB message reference).
+"""
+
+import contextlib
+import io
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+from pyulog import ULog
+
 from crazyem.errors import FileFormatError
+from crazyem.recordings.finding import Finding, Grade, note
+from crazyem.recordings.frd_ned import (
+    BODY,
+    MOTORS,
+    WORLD,
+    euler,
+    euler_from_quaternions,
+    quaternions,
+    stacked,
+    vectors,
+)
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
+from crazyem.recordings.topics import Mapped, Topic, damage, file_bytes, masked, ranks, signals_of, text_of
+from crazyem.recordings.ulog_scan import HEADER, MAGIC, Scan, scan, unknown_flags
+
+CLOCK = "autopilot"  # microseconds since boot
+_ATTITUDE = "quaternion x y z w, body (FLU) to world (north-west-up)"
+_RPM = 2.0 * math.pi / 60.0
+_PARAMETERS = 4000  # that are kept as metadata
+_MESSAGES = 500  # texts of the autopilot that are kept
+_SECOND = 1_000_000  # us
+# a sample may lie this long before its publication; beyond, the stamp is not believed
+_LONGEST_DELAY = 1 * _SECOND
+
+Data = Mapping[str, NDArray[np.generic]]
 
 
 def recognises(head: bytes) -> bool:
     """True if a file starting with these bytes is one."""
-    return False
+    return head.startswith(MAGIC)
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
-    """Read one."""
-    raise FileFormatError(f"{path}: this format cannot be read yet.")
+    """Read a ULog file. Raises FileFormatError naming the file and what is wrong with it."""
+    data = file_bytes(path)
+    if not recognises(data) or len(data) < HEADER:
+        raise FileFormatError(f"{path}: the header of a ULog file has {HEADER} bytes, this one is cut or is none.")
+    if unknown_flags(data):
+        raise FileFormatError(f"{path}: the log is marked as of a kind that readers of today must not read.")
+    sound = scan(data)
+    del data
+    log = _decode(path, sound)
+    topics = _topics(log)
+    if not any(topic.time.size for topic in topics):
+        raise FileFormatError(f"{path}: the log holds not a single message of a topic ({sound.messages} others).")
+    mapped = [m for source in _SIGNALS for m in source.of(topics)]
+    signals, left_out = signals_of(topics, mapped)
+    findings = [*_integrity(sound, topics, log), *left_out, *_notes(signals)]
+    return Recording(str(path), "ulog", signals, _metadata(log), tuple(findings))
+
+
+def _decode(path: Path, sound: Scan) -> ULog:
+    """pyulog's view of the sound messages; whatever it trips over names the file."""
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints what it notices
+            return ULog(io.BytesIO(sound.data))
+    except Exception as error:  # of any kind, from deep inside pyulog
+        raise FileFormatError(f"{path}: the log cannot be decoded ({type(error).__name__}: {error}).") from error
+
+
+def _topics(log: ULog) -> list[Topic]:
+    """One topic a message and instance, its rows in the order of the file, times in s since boot."""
+    sets = [d for d in log.data_list if d.data["timestamp"].size]
+    stamps = [_stamps(d.data) for d in sets]
+    topics = []
+    for d, (stamp, used), order in zip(sets, stamps, ranks([s for s, _ in stamps]), strict=True):
+        name = d.name if d.multi_id == 0 else f"{d.name}_{d.multi_id}"
+        chars = {f.field_name for f in d.field_data if f.type_str == "char"}
+        columns = {k: v for k, v in d.data.items() if k != used and k not in chars and "_padding" not in k}
+        units = {k: "us" for k in columns if k.rpartition(".")[2] in ("timestamp", "timestamp_sample")}
+        time = np.asarray(stamp.astype(np.float64) * 1e-6)
+        topics.append(Topic(name, columns, time, order, clock=CLOCK, units=units))
+    return topics
+
+
+def _stamps(data: Data) -> tuple[NDArray[np.uint64], str]:
+    """(n,) us at which the values were measured, and the column that says so.
+
+    That is `timestamp_sample` where a message has it and it lies shortly before the publication (`timestamp`).
+    """
+    published = np.asarray(data["timestamp"]).astype(np.uint64)
+    column = data.get("timestamp_sample")
+    if column is None or column.dtype.kind != "u":
+        return published, "timestamp"
+    sampled = np.asarray(column).astype(np.uint64)
+    early = (sampled > 0) & (sampled <= published) & (published - sampled <= _LONGEST_DELAY)
+    return (sampled, "timestamp_sample") if early.all() else (published, "timestamp")
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """Columns of a topic that are a signal: a best source comes first in `_SIGNALS`."""
+
+    quantity: str
+    topic: str
+    columns: tuple[str, ...]
+    convert: Callable[[Topic, list[NDArray[np.generic]]], NDArray[np.float64]]
+    valid: tuple[str, ...] = ()  # flags that must all be set, else the value is missing
+    absent_is_nan: bool = False  # a NaN is the format's way to say that there is no value
+    frame: str = ""
+    origin: str = ""
+    only_if: tuple[str, int] | None = None  # a column that must have this value throughout
+
+    def of(self, topics: list[Topic]) -> Iterator[Mapped]:
+        for topic in topics:
+            if topic.name != self.topic or not set(self.columns) <= topic.columns.keys():
+                continue
+            if self.only_if is not None:
+                flag = topic.columns.get(self.only_if[0])
+                if flag is None or not (flag == self.only_if[1]).all():
+                    continue
+            value = self.convert(topic, [topic.columns[c] for c in self.columns])
+            invalid = np.zeros(topic.time.size, bool)
+            for name in self.valid:
+                if name in topic.columns:
+                    invalid |= topic.columns[name] == 0
+            value, marked = masked(value, invalid)
+            if self.absent_is_nan:
+                marked = marked | ~np.isfinite(value).all(axis=1)
+            yield Mapped(self.quantity, topic, value, self.columns, marked, self.frame, self.origin)
+
+
+def _plain(topic: Topic, columns: list[NDArray[np.generic]]) -> NDArray[np.float64]:
+    return stacked(columns)
+
+
+def _frd(topic: Topic, columns: list[NDArray[np.generic]]) -> NDArray[np.float64]:
+    return vectors(columns)
+
+
+def _turned(topic: Topic, columns: list[NDArray[np.generic]]) -> NDArray[np.float64]:
+    return quaternions(columns)
+
+
+def _angles(topic: Topic, columns: list[NDArray[np.generic]]) -> NDArray[np.float64]:
+    return euler(columns)
+
+
+def _angles_of_quaternion(topic: Topic, columns: list[NDArray[np.generic]]) -> NDArray[np.float64]:
+    return euler_from_quaternions(quaternions(columns))
+
+
+def _rad_per_s(topic: Topic, columns: list[NDArray[np.generic]]) -> NDArray[np.float64]:
+    return stacked(columns) * _RPM
+
+
+def _not(topic: Topic, columns: list[NDArray[np.generic]]) -> NDArray[np.float64]:
+    return (stacked(columns) == 0).astype(float)
+
+
+def _of(pattern: str, parts: str) -> tuple[str, ...]:
+    return tuple(pattern.replace("*", part) for part in parts.split())
+
+
+_XYZ = _of("*", "x y z")
+_THREE = "0 1 2"
+_FOUR = "0 1 2 3"
+
+_LOCAL = "vehicle_local_position"
+_TARGET = "vehicle_local_position_setpoint"
+_SIGNALS: tuple[_Source, ...] = (
+    _Source("position", _LOCAL, _XYZ, _frd, ("xy_valid", "z_valid"), frame=WORLD),
+    _Source("velocity", _LOCAL, _of("*", "vx vy vz"), _frd, ("v_xy_valid", "v_z_valid"), frame=WORLD),
+    _Source("attitude", "vehicle_attitude", _of("q[*]", _FOUR), _turned, frame=_ATTITUDE),
+    _Source("body_rate", "vehicle_angular_velocity", _of("xyz[*]", _THREE), _frd, frame=BODY),
+    _Source("body_rate", "sensor_combined", _of("gyro_rad[*]", _THREE), _frd, frame=BODY),
+    _Source("body_rate", "vehicle_attitude", _of("*speed", "roll pitch yaw"), _frd, frame=BODY),
+    _Source("specific_force", "sensor_combined", _of("accelerometer_m_s2[*]", _THREE), _frd, frame=BODY),
+    _Source("specific_force", "vehicle_acceleration", _of("xyz[*]", _THREE), _frd, frame=BODY),
+    _Source("rotor_speed", "esc_status", _of("esc[*].esc_rpm", _FOUR), _rad_per_s, frame=MOTORS),
+    _Source("voltage", "battery_status", ("voltage_v",), _plain),
+    _Source("setpoint_position", _TARGET, _XYZ, _frd, absent_is_nan=True, frame=WORLD),
+    _Source("setpoint_velocity", _TARGET, _of("*", "vx vy vz"), _frd, absent_is_nan=True, frame=WORLD),
+    _Source("flying", "vehicle_land_detected", ("landed",), _not, frame="1 while the autopilot does not say landed"),
+    _Source("acceleration", _LOCAL, _of("*", "ax ay az"), _frd, ("v_xy_valid", "v_z_valid"), frame=WORLD),
+    _Source("motor_request", "actuator_motors", _of("control[*]", _FOUR), _plain, absent_is_nan=True, frame=MOTORS),
+    _Source("setpoint_acceleration", _TARGET, _of("acceleration[*]", _THREE), _frd, absent_is_nan=True, frame=WORLD),
+    _Source("setpoint_acceleration", _TARGET, _of("*", "acc_x acc_y acc_z"), _frd, absent_is_nan=True, frame=WORLD),
+    _Source("setpoint_euler", "vehicle_attitude_setpoint", _of("q_d[*]", _FOUR), _angles_of_quaternion),
+    _Source("setpoint_euler", "vehicle_attitude_setpoint", _of("*_body", "roll pitch yaw"), _angles),
+    _Source(
+        "setpoint_rate",
+        "vehicle_rates_setpoint",
+        _of("*", "roll pitch yaw"),
+        _frd,
+        absent_is_nan=True,
+        frame=BODY,
+    ),
+    *(
+        source
+        for topic in ("vehicle_mocap_odometry", "vehicle_visual_odometry")
+        for source in (
+            _Source(
+                "position",
+                topic,
+                _of("position[*]", _THREE),
+                _frd,
+                absent_is_nan=True,
+                frame=WORLD,
+                origin="mocap" if "mocap" in topic else "vision",
+                only_if=("pose_frame", 1),  # NED
+            ),
+            _Source(
+                "attitude",
+                topic,
+                _of("q[*]", _FOUR),
+                _turned,
+                absent_is_nan=True,
+                frame=_ATTITUDE,
+                origin="mocap" if "mocap" in topic else "vision",
+                only_if=("pose_frame", 1),
+            ),
+        )
+    ),
+)
+
+
+def _integrity(sound: Scan, topics: list[Topic], log: ULog) -> list[Finding]:
+    found = damage(sound.skipped, sound.size, "ULog message")
+    for name, reason in sorted(sound.refused.items())[:20]:
+        found.append(note("integrity", f"The topic {text_of(name)} is not read: {reason}.", Grade.DEGRADES))
+    if log.dropouts:
+        intervals = tuple((d.timestamp * 1e-6, d.timestamp * 1e-6 + d.duration * 1e-3) for d in log.dropouts)
+        total, longest = sum(d.duration for d in log.dropouts) * 1e-3, max(d.duration for d in log.dropouts) * 1e-3
+        found.append(
+            Finding(
+                "gaps",
+                Grade.DEGRADES,
+                f"The logger dropped messages {len(intervals)} times, {total:.3f} s in all, {longest:.3f} s at most.",
+                intervals=intervals[:1000],
+                evidence={"dropouts": float(len(intervals)), "total_s": total, "longest_s": longest},
+                advice="Log fewer topics or use a faster card; do not fit across the gaps.",
+            )
+        )
+    return found
+
+
+def _notes(signals: Mapping[str, object]) -> list[Finding]:
+    if "motor_request" not in signals:
+        return []
+    text = (
+        "actuator_motors is the thrust that the allocation asks of each motor, 0 to 1; it became motor_request. "
+        "What the speed controllers were sent depends on the thrust curve and the outputs' calibration."
+    )
+    return [note("motor_meaning", text)]
+
+
+def _metadata(log: ULog) -> dict[str, dict[str, str]]:
+    """What the log says of the autopilot, its parameters and its own words."""
+    info = {text_of(k): text_of(v) for k, v in list(log.msg_info_dict.items())[:200]}
+    version = log.get_version_info_str() if isinstance(log.msg_info_dict.get("ver_sw_release"), int) else None
+    info |= {"version": version} if version else {}
+    parameters = {text_of(k): repr(v) for k, v in list(log.initial_parameters.items())[:_PARAMETERS]}
+    changed = {
+        f"{i} {t * 1e-6:.6f} s {text_of(k)}": repr(v)
+        for i, (t, k, v) in enumerate(log.changed_parameters[:_PARAMETERS])
+    }
+    texts = {
+        f"{i} {m.timestamp * 1e-6:.6f} s {m.log_level_str()}": text_of(m.message)
+        for i, m in enumerate(log.logged_messages[:_MESSAGES])
+    }
+    sections = {"ulog": info, "parameters": parameters, "changed_parameters": changed, "messages": texts}
+    return {name: section for name, section in sections.items() if section}

@@ -1,0 +1,290 @@
+"""Walks the messages of a ULog file: what is sound is handed to pyulog, what is not is named by its place.
+
+pyulog trusts the sizes that a file claims (an array of 10^9 elements becomes 10^9 fields) and steps over damage a byte
+at a time. So every message is checked here first: that its type exists, that it has the size that its type demands,
+that a data message belongs to a topic and has the size of its format. After damage the walk goes on at the next place
+where four sound messages follow each other. ULog has no checksums: a flipped bit inside a value cannot be noticed.
+
+Source: docs.px4.io/main/en/dev_log/ulog_file_format.
+"""
+
+import re
+import struct
+from dataclasses import dataclass, field
+
+MAGIC = b"ULog\x01\x12\x35"
+HEADER = 16
+SYNC = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
+SIZES = {
+    "int8_t": 1,
+    "uint8_t": 1,
+    "int16_t": 2,
+    "uint16_t": 2,
+    "int32_t": 4,
+    "uint32_t": 4,
+    "int64_t": 8,
+    "uint64_t": 8,
+    "float": 4,
+    "double": 8,
+    "bool": 1,
+    "char": 1,
+}
+_LARGEST = 65535  # bytes of a message: its size has 16 bits
+_FIELDS = 200_000  # of all topics together
+_DEEPEST = 8  # types within types
+_CHAIN = 4  # messages in a row that make a place sound
+_KINDS = b"DAFIMPQLCOSRB"
+_CANDIDATE = re.compile(b"[" + _KINDS + b"]")
+_FORMAT = re.compile(rb"[A-Za-z0-9_\-/]+:(?:\w+(?:\[\d{1,10}\])? \w+;)*(?:\w+(?:\[\d{1,10}\])? \w+)?\Z")
+_FIELD = re.compile(r"(\w+?)(?:\[(\d+)\])? (\w+)")
+_KEY = re.compile(rb"(\w+)(?:\[(\d{1,10})\])? [^\x00-\x1f]+\Z")
+
+
+@dataclass(slots=True)
+class Scan:
+    """What a file holds.
+
+    Attributes:
+        data: header and all sound messages, or the file itself if it is sound throughout.
+        skipped: (offset, count) of each run of bytes that is no sound message.
+        refused: why a topic that the file announces is not read, by name.
+        messages: how many are sound.
+        size: of the file, bytes.
+    """
+
+    data: bytes = b""
+    skipped: list[tuple[int, int]] = field(default_factory=list)
+    refused: dict[str, str] = field(default_factory=dict)
+    messages: int = 0
+    size: int = 0
+
+
+class _Types:
+    """Formats and topics met so far; knows how large a message must be."""
+
+    def __init__(self) -> None:
+        self.formats: dict[str, list[tuple[str, int, str]]] = {}
+        self.topics: dict[int, tuple[int, int]] = {}  # message id -> least and greatest size
+        self.names: dict[int, str] = {}
+        self.refused_ids: set[int] = set()
+        self.fields = 0
+
+    def define(self, text: str) -> None:
+        name, _, fields = text.partition(":")
+        self.formats[name] = [(kind, int(count or 0), label) for kind, count, label in _FIELD.findall(fields)]
+
+    def announce(self, identifier: int, name: str) -> str:
+        """Adds a topic; "" or why it cannot be read."""
+        reason = self._refusal(identifier, name)
+        self.names[identifier] = name
+        if reason:
+            self.refused_ids.add(identifier)
+            self.topics.pop(identifier, None)
+        return reason
+
+    def _refusal(self, identifier: int, name: str) -> str:
+        if identifier in self.names:
+            return f"its number belongs to {self.names[identifier]}"
+        if name not in self.formats:
+            return "its format is not defined"
+        size, count = self._extent(name, 0)
+        if not size or size > _LARGEST:
+            return "its format is larger than a message, or contains itself or an unknown type"
+        if not any(f == ("uint64_t", 0, "timestamp") for f in self.formats[name]):
+            return "its format has no timestamp"
+        if self.fields + count > _FIELDS:
+            return f"the topics have more than {_FIELDS} fields together"
+        self.fields += count
+        self.topics[identifier] = (size - self._padding(name), size)
+        return ""
+
+    def _extent(self, name: str, depth: int) -> tuple[int, int]:
+        """Bytes and fields of a type; (0, 0) if it has none or too many, contains itself or an unknown type."""
+        if depth > _DEEPEST:
+            return 0, 0
+        size = count = 0
+        for kind, length, _ in self.formats.get(name, ()):
+            one, fields = (SIZES[kind], 1) if kind in SIZES else self._extent(kind, depth + 1)
+            if not one:
+                return 0, 0
+            size += one * max(length, 1)
+            count += fields * max(length, 1)
+            if size > _LARGEST:
+                return 0, 0
+        return size, count
+
+    def _padding(self, name: str) -> int:
+        """Bytes at the end that the logger leaves out."""
+        total = 0
+        for kind, length, label in reversed(self.formats[name]):
+            if not label.startswith("_padding") or kind not in SIZES:
+                break
+            total += SIZES[kind] * max(length, 1)
+        return total
+
+
+def scan(data: bytes) -> Scan:
+    """Every sound message of a file that starts with `MAGIC` and has its 16 bytes of header."""
+    found = Scan(size=len(data))
+    types = _Types()
+    whole, offsets = _appended(data)
+    view = memoryview(data)
+    kept: list[memoryview | bytes] = []  # runs of sound messages before `start`
+    position, start, size = HEADER, HEADER, len(data)
+    limit = HEADER  # no message reaches beyond this: the end of the file, or of the part before appended data
+    unpack = struct.Struct("<HB").unpack_from
+    two = struct.Struct("<H").unpack_from
+    topics = types.topics
+    while position < size:
+        sound = False
+        if position >= limit:
+            limit = min((o for o in offsets if position < o < size), default=size)
+        if position + 3 <= limit:
+            length, kind = unpack(data, position)
+            after = position + 3 + length
+            if after <= limit:
+                if kind == 0x44 and length > 2:  # 'D', nearly all of a file
+                    limits = topics.get(two(data, position + 3)[0])
+                    sound = limits is not None and length - 2 == limits[0]
+                    if not sound and limits is not None and limits[0] < length - 2 <= limits[1]:
+                        found.messages += 1
+                        kept += [view[start:position], _without_padding(data, position, limits[0])]
+                        start = position = after
+                        continue
+                if not sound:
+                    sound, keep = _check(data, position, length, kind, types, found)
+                    if sound and not keep:  # pyulog is not to see it
+                        found.messages += 1
+                        kept.append(view[start:position])
+                        start = position = after
+                        continue
+        if sound:
+            found.messages += 1
+            position = after
+            continue
+        kept.append(view[start:position])
+        again = _resume(data, position, limit, types)
+        found.skipped.append((position, again - position))
+        start = position = again
+    kept.append(view[start:size])
+    found.data = data if whole and len(kept) == 1 else b"".join([_plain_header(data), *kept])
+    return found
+
+
+def _without_padding(data: bytes, at: int, size: int) -> bytes:
+    """A data message as the logger of PX4 writes it: without the padding at its end, which pyulog does not expect."""
+    return struct.pack("<HB", size + 2, 0x44) + data[at + 3 : at + 5 + size]
+
+
+def _check(data: bytes, at: int, length: int, kind: int, types: _Types, found: Scan) -> tuple[bool, bool]:
+    """Whether a message that is not plainly data is sound, and whether pyulog is to see it; takes note of formats."""
+    body = data[at + 3 : at + 3 + length]
+    if kind == 0x44:
+        return length > 2 and int.from_bytes(body[:2], "little") in types.refused_ids, False
+    if not _plausible(body, kind, at):
+        return False, False
+    if kind == 0x46:  # 'F'
+        if types.names:
+            return True, False  # too late: definitions come first
+        types.define(body.decode("ascii"))
+    elif kind == 0x41:  # 'A'
+        name, identifier = body[3:].decode("ascii"), int.from_bytes(body[1:3], "little")
+        if types.names.get(identifier) == name:
+            return True, False  # announced once more, in appended data
+        reason = types.announce(identifier, name)
+        if reason:
+            found.refused[name] = reason
+            return True, False
+    elif kind in b"BR":
+        return True, kind == 0x42 and not any(body[8:])
+    return True, True
+
+
+def _plausible(body: bytes, kind: int, at: int) -> bool:
+    """Whether a message has the size and the shape of its type; `at` is its offset."""
+    match chr(kind):
+        case "F":
+            return len(body) <= 8192 and _FORMAT.match(body) is not None
+        case "A":
+            return 3 < len(body) <= 300 and body[3:].isascii() and body[3:].decode("ascii").isprintable()
+        case "I" | "P":
+            return _key_value(body)
+        case "M" | "Q":
+            return _key_value(body[1:])
+        case "L":
+            return len(body) >= 9 and 0x30 <= body[0] <= 0x37
+        case "C":
+            return len(body) >= 11 and 0x30 <= body[0] <= 0x37
+        case "O" | "R":
+            return len(body) == 2
+        case "S":
+            return body == SYNC
+        case "B":
+            return len(body) >= 40 and at == HEADER
+    return False
+
+
+def _key_value(body: bytes) -> bool:
+    """Length of key, key ("char[5] name"), value of the size that the key's type says."""
+    if len(body) < 2 or len(body) < 1 + body[0]:
+        return False
+    key = _KEY.match(body[1 : 1 + body[0]])
+    if key is None or key[1].decode("ascii", "replace") not in SIZES:
+        return False
+    return len(body) - 1 - body[0] == SIZES[key[1].decode()] * int(key[2] or 1)
+
+
+def _resume(data: bytes, damaged: int, limit: int, types: _Types) -> int:
+    """The next place after `damaged` where sound messages follow each other up to `limit`; else that."""
+    for match in _CANDIDATE.finditer(data, damaged + 3, limit):
+        start = match.start() - 2
+        position = start
+        for _ in range(_CHAIN):
+            if position == limit:
+                break
+            if position + 3 > limit:
+                position = -1
+                break
+            length, kind = struct.unpack_from("<HB", data, position)
+            if position + 3 + length > limit or not _sound(data, position, length, kind, types):
+                position = -1
+                break
+            position += 3 + length
+        if position > 0:
+            return start
+    return limit
+
+
+def _sound(data: bytes, at: int, length: int, kind: int, types: _Types) -> bool:
+    """As `_check`, without taking note of anything."""
+    if kind == 0x44:
+        if length <= 2:
+            return False
+        identifier = int.from_bytes(data[at + 3 : at + 5], "little")
+        limits = types.topics.get(identifier)
+        return identifier in types.refused_ids or (limits is not None and limits[0] <= length - 2 <= limits[1])
+    if kind not in _KINDS or length > 8192:
+        return False
+    return _plausible(data[at + 3 : at + 3 + length], kind, at)
+
+
+def _appended(data: bytes) -> tuple[bool, tuple[int, ...]]:
+    """Whether the file needs no other header, and the offsets at which data was appended to it."""
+    if data[HEADER + 2 : HEADER + 3] != b"B" or len(data) < HEADER + 43:
+        return True, ()
+    flags = data[HEADER + 11 : HEADER + 19]
+    offsets = struct.unpack_from("<3Q", data, HEADER + 19)
+    return not any(flags) and not any(offsets), tuple(o for o in offsets if o > HEADER)
+
+
+def unknown_flags(data: bytes) -> bool:
+    """True if the file says that readers of today must not read it."""
+    if data[HEADER + 2 : HEADER + 3] != b"B" or len(data) < HEADER + 43:
+        return False
+    flags = data[HEADER + 11 : HEADER + 19]
+    return bool(flags[0] & ~1) or any(flags[1:])
+
+
+def _plain_header(data: bytes) -> bytes:
+    """The file's header without the mark of appended data."""
+    return data[:7] + b"\x01" + data[8:HEADER]
