@@ -25,7 +25,7 @@ ALLOWED: dict[str, set[str]] = {
     "control": {"vehicle", "physics"},
     "links": {"signals"},
     "estimation": {"vehicle", "compiled", "physics", "signals"},
-    "recordings": {"signals", "links", "estimation"},
+    "recordings": {"compiled", "signals", "links", "estimation"},
     "doctor": {"vehicle", "physics", "signals", "recordings"},
     "live": {"vehicle", "physics", "signals", "control", "links", "estimation", "recordings"},
     "commands": {"vehicle", "physics", "signals", "control", "links", "estimation", "recordings", "doctor", "live"},

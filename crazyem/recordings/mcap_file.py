@@ -1,164 +1,170 @@
 """Reading our own recordings (MCAP), whole or cut off: every complete chunk counts, in the order it was written."""
 
-import io
-import struct
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 from crazyem.errors import FileFormatError
-from crazyem.recordings import schemas
-from crazyem.recordings.finding import note
+from crazyem.recordings.finding import Finding, Grade, note
+from crazyem.recordings.mcap_content import Content, join
+from crazyem.recordings.mcap_findings import OWN_METADATA, finding_of, findings_from_json
+from crazyem.recordings.mcap_messages import PROFILE
+from crazyem.recordings.mcap_scan import MAGIC, Loss, Problem
+from crazyem.recordings.mcap_survey import Part, from_summary, parts, profile_of
 from crazyem.recordings.options import ReadOptions
-from crazyem.recordings.packets import signals_from_packets
-from crazyem.recordings.recording import Event, Recording
-from crazyem.signals.packet import Block, Packet
+from crazyem.recordings.recording import Recording, SignalArray
+from crazyem.recordings.tables import Table, signals_from_tables
 
-MAGIC = b"\x89MCAP0\r\n"
-_LARGEST_CHUNK = 256 * 1024 * 1024  # bytes unpacked; ours are a quarter MiB, a damaged length claims anything
-
-_KINDS = {
-    "crazyem.Setpoint": "setpoint",
-    "crazyem.ParameterWrite": "parameter_write",
-    "crazyem.Estimate": "estimate",
-    "foxglove.Log": "log",
-}
+_MOST_BYTES = 256 * 1024 * 1024  # unpacked, in one part of `read_parts`, however slowly its clock runs
 
 
 def recognises(head: bytes) -> bool:
-    """True if the file starts with MCAP's magic bytes."""
-    return head.startswith(MAGIC)
+    """True for MCAP of ours: profile "crazyem", or a damaged header that still says so."""
+    profile = profile_of(head)
+    return profile == PROFILE or (profile is None and head.startswith(MAGIC) and b"crazyem" in head[:128])
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
-    """Read one of our recordings; a cut-off or damaged one as far as it goes, which `notices` then says.
+    """Read one of our recordings; a cut-off or damaged one as far as it goes, which its findings then say.
 
     Raises: FileFormatError if it holds no log data of ours.
     """
-    notices: list[str] = []
-    content = _Content()
-    for record in _records(path.read_bytes(), notices):
-        content.take(record)
-    if not content.blocks:
-        what = f"it was cut off before its first log data ({notices[0]})" if notices else "it holds no log blocks"
-        raise FileFormatError(f"{path} is an MCAP file, but not a usable recording: {what.rstrip('.')}.")
-    signals = signals_from_packets(content.blocks.values(), content.packets)
-    if not signals:
-        raise FileFormatError(f"{path} is a recording without a single sample of a known signal.")
-    if content.unreadable:
-        notices.append(f"{content.unreadable} messages could not be decoded and were dropped.")
-    return Recording(
-        str(path),
-        "mcap",
-        signals,
-        content.metadata,
-        tuple(note("integrity", n) for n in notices),
-        tuple(content.events),
-    )
+    reading = _Reading(path, options)
+    for part in reading.parts():
+        reading.take(part)
+    reading.check()
+    return reading.recording()
 
 
-class _Content:
-    """What the records of a file add up to."""
+def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Iterator[Recording]:
+    """Read a recording of any size in parts, in bounded memory.
 
-    def __init__(self) -> None:
-        self.schemas: dict[int, str] = {}
-        self.codecs: dict[int, schemas.BlockCodec] = {}
-        self.kinds: dict[int, tuple[str, Any]] = {}
-        self.blocks: dict[int, Block] = {}
-        self.packets: list[Packet] = []
-        self.events: list[Event] = []
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.unreadable = 0
+    Joined, the parts are what `read` gives: each has the samples and events of at least `seconds` (by log time, chunks
+    are not split), the metadata and findings known by its end; the stamps count from the same origin in all. Only
+    signals that were processed in another order than that of their rows keep the order of processing.
 
-    def take(self, record: Any) -> None:
-        kind = type(record).__name__
-        if kind == "Message":
-            self._message(record)
-        elif kind == "Schema":
-            self.schemas[record.id] = record.name
-        elif kind == "Channel":
-            self._channel(record)
-        elif kind == "Metadata":
-            self.metadata.setdefault(record.name, {}).update(record.metadata)
-
-    def _channel(self, record: Any) -> None:
-        name = self.schemas.get(record.schema_id, "")
-        if name.startswith("crazyem.log."):
-            if record.id not in self.codecs:
-                try:
-                    block = schemas.block_from_metadata(record.metadata)
-                except (ValueError, KeyError, TypeError):
-                    self.unreadable += 1
-                    return
-                self.codecs[record.id] = schemas.BlockCodec(block)
-                self.blocks[block.identifier] = block
-        elif name in _KINDS:
-            self.kinds[record.id] = (_KINDS[name], schemas.message_class(name))
-
-    def _message(self, record: Any) -> None:
-        codec = self.codecs.get(record.channel_id)
-        try:
-            if codec is not None:
-                self.packets.append(codec.decode(record.data))
-            elif record.channel_id in self.kinds:
-                kind, message = self.kinds[record.channel_id]
-                self.events.append(Event(record.log_time / 1e9, kind, _fields(message.FromString(record.data))))
-        except Exception:  # protobuf's DecodeError has no public base across its back ends
-            self.unreadable += 1
-
-
-def _fields(message: Any) -> dict[str, object]:
-    """All fields of a message by name; nested messages as dictionaries, NaN for an echo that never came kept."""
-    result: dict[str, object] = {}
-    for field in message.DESCRIPTOR.fields:
-        value = getattr(message, field.name)
-        if field.message_type is None:
-            result[field.name] = value
-        elif isinstance(value, (list, tuple)) or hasattr(value, "add"):
-            result[field.name] = [_fields(item) for item in value]
-        else:
-            result[field.name] = _fields(value)
-    return result
-
-
-def _records(data: bytes, notices: list[str]) -> Iterator[Any]:
-    """Schemas, channels, messages and metadata in file order, up to where the file ends or breaks."""
-    from mcap.records import Chunk, DataEnd
-    from mcap.stream_reader import StreamReader, breakup_chunk
-
-    reader = StreamReader(io.BytesIO(data), emit_chunks=True, record_size_limit=max(1, len(data)))
-    records = reader.records
-    damaged = 0
-    while True:
-        try:
-            record = next(records)
-        except StopIteration:
-            break
-        except Exception as error:  # struct, unicode, mcap's own: a broken file may raise anything
-            notices.append(_ending(error))
-            break
-        if not isinstance(record, Chunk):
-            if isinstance(record, DataEnd):
-                break  # what follows is a summary of what we have seen
-            yield record
+    Raises: as `read`, with the first part.
+    """
+    reading = _Reading(path, options)
+    if not reading.announced:  # cut off: without a summary, what is in the file is known only after a look at all of it
+        for part in parts(path, []):
+            reading.announced.extend(part.announced)
+    reading.content.announce(reading.announced)
+    begun: int | None = None
+    size, first = 0, True
+    for part in reading.parts():
+        reading.take(part)
+        if part.scan is None or not len(part.scan.messages):
             continue
-        try:
-            if record.uncompressed_size > _LARGEST_CHUNK:
-                raise ValueError("chunk too large")
-            inner = breakup_chunk(record, validate_crc=True)
-        except Exception:
-            damaged += 1
-            continue
-        yield from inner
-    if damaged:
-        notices.append(f"{damaged} damaged stretches of the file were left out.")
+        times = part.scan.messages[:, 3]
+        begun = int(times[0]) if begun is None else begun
+        size += part.scan.data.size
+        if int(times[-1]) - begun >= seconds * 1e9 or size >= _MOST_BYTES:
+            yield reading.recording()
+            begun, size, first = None, 0, False
+    if first:
+        reading.check()
+    if first or begun is not None or reading.content.events:
+        yield reading.recording()
 
 
-def _ending(error: Exception) -> str:
-    cut = isinstance(error, (EOFError, struct.error)) or type(error).__name__ in (
-        "EndOfFile",
-        "RecordLengthLimitExceeded",
-    )
-    if cut:
-        return "The file ends in the middle of a record; everything before it was read."
-    return "The file is damaged towards its end; everything before that was read."
+class _Reading:
+    """One pass over a file."""
+
+    def __init__(self, path: Path, options: ReadOptions) -> None:
+        self.path, self.options = path, options
+        self.content = Content()
+        self.problems: list[Problem] = []
+        self.announced = from_summary(path)
+        self._lost: dict[int, int] = {}  # number of the problem -> messages
+        self._sequence = 0
+        self._samples = False
+        self._motor: str | None = None
+        self._told: list[Finding] = []
+
+    def parts(self) -> Iterator[Part]:
+        # a damaged chunk may have held announcements that the summary repeats
+        self.content.announce(self.announced)
+        return parts(self.path, self.problems)
+
+    def take(self, part: Part) -> None:
+        self.content.take(part)
+        if part.scan is None or not len(part.scan.messages):
+            return
+        numbers = part.scan.messages[:, 5]
+        missing = int(numbers[0]) - self._sequence - 1
+        damaged = [i for i, p in enumerate(self.problems) if p.loss is Loss.DAMAGED and i not in self._lost]
+        if damaged:
+            self._lost.update(dict.fromkeys(damaged, 0))
+            self._lost[damaged[-1]] = max(missing, 0)
+        self._sequence = int(numbers[-1])
+
+    def check(self) -> None:
+        """Raise FileFormatError if there is nothing in the file that could make a recording."""
+        if not self.content.empty or OWN_METADATA in self.content.metadata:
+            return
+        what = "it holds no log blocks"
+        if self.problems:
+            problem = self.problems[0]
+            cut = problem.loss is not Loss.DAMAGED
+            what = "it was cut off before its first log data" if cut else f"it is damaged at byte {problem.offset}"
+        raise FileFormatError(f"{self.path} is an MCAP file, but not a usable recording: {what}.")
+
+    def recording(self) -> Recording:
+        """What has been taken since the last one."""
+        own = self.content.metadata.get(OWN_METADATA)
+        sessions = self.content.tables()
+        signals = self._signals(sessions)
+        signals.update(self.content.streams())
+        self._samples = self._samples or any(array.time.size for array in signals.values())
+        if not self._samples and own is None:
+            raise FileFormatError(f"{self.path} is a recording without a single sample.")
+        events, self.content.events = tuple(self.content.events), []
+        metadata = {name: entries for name, entries in self.content.metadata.items() if name != OWN_METADATA}
+        origin, source, imported = _imported(own)
+        return Recording(
+            str(self.path),
+            source,
+            signals,
+            metadata,
+            (*imported, *self._findings()),
+            events,
+            origin,
+        )
+
+    def _signals(self, sessions: Mapping[int, list[Table]]) -> dict[str, SignalArray]:
+        if not sessions:
+            return {}
+        motor = self._meaning([table for tables in sessions.values() for table in tables])
+        found = []
+        for tables in sessions.values():
+            signals = signals_from_tables(tables, motor=motor)
+            found.append({name: array for name, array in signals.items() if array.time.size})
+        return join(found)
+
+    def _meaning(self, tables: Iterable[Table]) -> str | None:
+        """What motor.m1..4 is, decided once for a file."""
+        if self._motor is None:
+            self._motor = self.options.motor or "duty"
+        return self._motor
+
+    def _findings(self) -> tuple[Finding, ...]:
+        found = [finding_of(p, lost_messages=self._lost.get(i)) for i, p in enumerate(self.problems)]
+        if self.content.unreadable:
+            n = self.content.unreadable
+            text = f"{n} messages could not be decoded and were dropped."
+            found.append(note("integrity", text, Grade.DEGRADES, messages=float(n)))
+        return (*self._told, *found)
+
+
+def _imported(own: Mapping[str, str] | None) -> tuple[float, str, tuple[Finding, ...]]:
+    """Origin, source and findings of an imported recording; those of a flight of ours without."""
+    if own is None:
+        return 0.0, "mcap", ()
+    try:
+        origin = float(own.get("origin", "0"))
+        findings = findings_from_json(own.get("findings", "[]"))
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        text = "What the first reader of this recording noticed cannot be read any more."
+        return 0.0, own.get("source", "mcap"), (note("integrity", text, Grade.DEGRADES),)
+    return origin if math.isfinite(origin) else 0.0, own.get("source", "mcap"), findings

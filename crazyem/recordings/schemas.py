@@ -2,22 +2,27 @@
 
 Log packets have one message type a block, with one field a variable, and are packed and unpacked by `struct`: all their
 fields are 8 bytes wide, so a message has a fixed length and costs about a microsecond. Every other message goes
-through google.protobuf. Field numbers are part of the file format (docs/recording_format.md).
+through google.protobuf. Field numbers are part of the file format (docs/formats/mcap.md).
 """
 
 import functools
 import json
 import struct
-from typing import Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from crazyem.signals.packet import Block, Packet, Variable
 
+if TYPE_CHECKING:
+    from crazyem.recordings.stream_codec import FixedMessages
+
 _F = descriptor_pb2.FieldDescriptorProto
 _TYPES = {
     "double": _F.TYPE_DOUBLE,
     "sfixed64": _F.TYPE_SFIXED64,
+    "fixed64": _F.TYPE_FIXED64,
     "int64": _F.TYPE_INT64,
     "int32": _F.TYPE_INT32,
     "uint32": _F.TYPE_UINT32,
@@ -59,6 +64,25 @@ _MESSAGES: dict[str, tuple[tuple[str, str], ...]] = {
         ("updates", "int64"),
         ("converged", "bool"),
     ),
+    # the drone's packets so far, and over the last second
+    "crazyem.Link": (
+        ("host_time", "double"),
+        ("received", "int64"),
+        ("lost", "int64"),
+        ("late", "int64"),
+        ("rate", "double"),
+        ("loss", "double"),
+        ("latency", "double"),
+    ),
+    # what the newest sample had that the model did not predict, and the standard deviation it was expected to have
+    "crazyem.Residual": (
+        ("time", "double"),
+        ("host_time", "double"),
+        *((f"{w}_{axis}", "double") for w in ("position", "velocity", "attitude", "body_rate") for axis in "xyz"),
+        *((f"{w}_{axis}_sd", "double") for w in ("position", "velocity", "attitude", "body_rate") for axis in "xyz"),
+    ),
+    # anything that happened and has no message of its own
+    "crazyem.Event": (("time", "double"), ("kind", "string"), ("json", "string")),
     "foxglove.Vector3": (("x", "double"), ("y", "double"), ("z", "double")),
     "foxglove.Quaternion": (("x", "double"), ("y", "double"), ("z", "double"), ("w", "double")),
     "foxglove.Pose": (("position", "foxglove.Vector3"), ("orientation", "foxglove.Quaternion")),
@@ -161,7 +185,7 @@ class BlockCodec:
     def __init__(self, block: Block) -> None:
         self.block = block
         self.schema_name = f"crazyem.log.Block{block.identifier}"
-        tags = [_tag(1, 1), _tag(2, 1), *(_tag(n, 1) for n in range(3, 3 + len(block.variables)))]
+        tags = [tag(1, 1), tag(2, 1), *(tag(n, 1) for n in range(3, 3 + len(block.variables)))]
         kinds = ["q", *("d" for _ in tags[1:])]
         self._struct = struct.Struct("<" + "".join(f"{len(t)}s{k}" for t, k in zip(tags, kinds, strict=True)))
         self._tags = tuple(tags)
@@ -183,9 +207,13 @@ class BlockCodec:
     def schema_data(self) -> bytes:
         fields = [("firmware_time_ms", "sfixed64"), ("host_time", "double")]
         fields += [(v.name.replace(".", "_"), "double") for v in self.block.variables]
-        name = self.schema_name.rsplit(".", 1)[1]
-        file = _file(f"crazyem/log/{name}.proto", "crazyem.log", [_message(name, tuple(fields))])
-        return descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+        return dynamic_schema("crazyem.log", self.schema_name.rsplit(".", 1)[1], fields)
+
+    def table(self) -> "FixedMessages":
+        """The same messages as arrays: fields firmware_time_ms, host_time, then the variables."""
+        from crazyem.recordings.stream_codec import FixedMessages
+
+        return FixedMessages(["<i8", "<f8", *("<f8" for _ in self.block.variables)])
 
     def metadata(self) -> dict[str, str]:
         """What the channel says of the block: enough to decode it without any other record."""
@@ -200,6 +228,16 @@ def block_from_metadata(metadata: dict[str, str]) -> Block:
     return Block(int(metadata["identifier"]), variables, int(metadata["period_ms"]))
 
 
-def _tag(number: int, wire_type: int) -> bytes:
-    key = number << 3 | wire_type
-    return bytes([key]) if key < 0x80 else bytes([key & 0x7F | 0x80, key >> 7])
+def dynamic_schema(package: str, name: str, fields: Iterable[tuple[str, str]]) -> bytes:
+    """The serialised FileDescriptorSet of a message made up at run time, from (field, type) in order."""
+    file = _file(f"{package.replace('.', '/')}/{name}.proto", package, [_message(name, tuple(fields))])
+    return bytes(descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString())
+
+
+def tag(number: int, wire_type: int) -> bytes:
+    """The bytes before a field."""
+    key, data = number << 3 | wire_type, bytearray()
+    while key >= 0x80:
+        data.append(key & 0x7F | 0x80)
+        key >>= 7
+    return bytes(data) + bytes([key])

@@ -9,15 +9,14 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from importlib import metadata as package_metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from mcap.writer import CompressionType, Writer
-
 from crazyem.errors import UsageError
-from crazyem.links.base import ParameterWrite
+from crazyem.links.base import LinkStatistics, ParameterWrite
 from crazyem.recordings import schemas
+from crazyem.recordings.mcap_messages import EVENTS, POSE_EVERY, PROFILE, pose_messages, timestamp, versions
+from crazyem.recordings.mcap_output import Output
 from crazyem.signals.packet import Block, Packet
 from crazyem.signals.sample import Sample
 from crazyem.signals.vocabulary import BlockDecoder, decoders
@@ -25,12 +24,7 @@ from crazyem.signals.vocabulary import BlockDecoder, decoders
 if TYPE_CHECKING:  # the recorder takes results and does not compute them
     from crazyem.estimation.result import Estimate
 
-FORMAT_VERSION = "1"
-PROFILE = "crazyem"
-CHUNK_BYTES = 256 * 1024
 FLUSH_EVERY = 0.5  # s
-POSE_EVERY = 0.04  # s of firmware time between poses, which are for viewers only
-WORLD, BODY = "world", "crazyflie"
 
 
 class Setpoint(Protocol):
@@ -52,24 +46,30 @@ class RecordingWriter:
     """A recording in progress. All methods but `close` return at once and may be called from any thread.
 
     Args:
-        path: the file; its folder must exist, an existing file is replaced.
+        path: the file; its folder must exist.
         metadata: section -> key -> text, written first: run configuration, vehicle TOML, parameter table.
+        append: continue a recording that exists (finished or cut off) as its next session instead of replacing it:
+            channels are announced anew, sequence numbers and log times go on, sections of metadata are named
+            "session 2: configuration". Nothing in the file changes before the new session's first bytes are written,
+            and what these replace is only the summary at its end, which is written again.
 
     Attributes:
         path: the file, as text.
         failure: why writing stopped (disk full, ...), "" while all is well. Flying goes on regardless.
+        session: number of this session in the file, from 1.
 
-    Raises: UsageError if the file cannot be created.
+    Raises: UsageError if the file cannot be created; with `append`, FileFormatError if it is no recording that can be
+        continued.
     """
 
-    def __init__(self, path: str | Path, metadata: Mapping[str, Mapping[str, str]] | None = None) -> None:
+    def __init__(
+        self, path: str | Path, metadata: Mapping[str, Mapping[str, str]] | None = None, *, append: bool = False
+    ) -> None:
         self.path = str(path)
         self.failure = ""
-        try:
-            self._file = open(path, "wb")  # noqa: SIM115 - closed by `close`
-        except OSError as error:
-            raise UsageError(f"{path} cannot be written: {error.strerror or error}.") from error
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self.session = 1
+        self._sequence = 0
+        self._log_time = 0
         self._queue: queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]] | None] = queue.SimpleQueue()
         self._codecs: dict[int, tuple[int, schemas.BlockCodec]] = {}
         self._blocks: dict[int, Block] = {}
@@ -77,24 +77,40 @@ class RecordingWriter:
         self._channels: dict[str, int] = {}
         self._attitude: tuple[float, ...] | None = None
         self._pose_time = -math.inf
-        self._sequence = 0
-        self._log_time = 0
+        self._link_before: tuple[float, int, int] | None = None
         self._closed = False
         self._lock = threading.Lock()
         try:
+            if append and Path(path).exists() and Path(path).stat().st_size:
+                self._reopen(Path(path))
+            else:
+                self._file: Any = open(path, "wb")  # noqa: SIM115 - closed by `close`
+                self._output = Output(self._file)
             self._begin(metadata or {})
         except OSError as error:
             raise UsageError(f"{path} cannot be written: {error.strerror or error}.") from error
         self._thread = threading.Thread(target=self._run, name="crazyem-recorder", daemon=True)
         self._thread.start()
 
+    def _reopen(self, path: Path) -> None:
+        from crazyem.recordings.append import reopen
+
+        before = reopen(path)
+        self._file = before.stream
+        self._output = Output(self._file, book=before.book)
+        self.session = before.sessions + 1
+        self._sequence, self._log_time = before.sequence, before.log_time
+
     def _begin(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
-        self._writer.start(profile=PROFILE, library=f"crazyem {_version('crazyem')}")
-        versions = {name: _version(name) for name in ("crazyem", "cflib", "mcap", "numpy")}
-        self._writer.add_metadata("crazyem", {"format": FORMAT_VERSION, **versions})
+        if self.session == 1:
+            self._output.start(PROFILE, f"crazyem {versions()['crazyem']}")
+        self._output.metadata(*self._section("crazyem", versions()))
         for section, entries in metadata.items():
             self._write_metadata(section, {k: str(v) for k, v in entries.items()})
-        self._writer.flush()
+        self._output.flush(sync=True)
+
+    def _section(self, name: str, entries: Mapping[str, str]) -> tuple[str, Mapping[str, str]]:
+        return (name if self.session == 1 else f"session {self.session}: {name}"), entries
 
     def __enter__(self) -> "RecordingWriter":
         return self
@@ -128,6 +144,20 @@ class RecordingWriter:
         """An update of the estimator."""
         self._put(self._write_estimate, _now(), estimate)
 
+    def link(self, statistics: LinkStatistics, *, latency: float = math.nan) -> None:
+        """Packets so far, by fate; call it once a second. `latency` in s, where known."""
+        self._put(self._write_link, _now(), statistics, latency)
+
+    def residual(self, time: float, values: Sequence[float], sd: Sequence[float]) -> None:
+        """What the newest sample had that the model did not predict.
+
+        Args:
+            time: s on the firmware clock.
+            values: (12,) position [m], velocity [m/s], attitude [rad], body rate [rad/s]; NaN where not measured.
+            sd: (12,) standard deviations expected of them.
+        """
+        self._put(self._write_residual, time, _now(), tuple(map(float, values)), tuple(map(float, sd)))
+
     def event(self, text: str, level: str = "INFO") -> None:
         """A remark: a phase of the flight, a warning. `level` is one of foxglove.Log's."""
         self._put(self._write_event, _now(), text, level)
@@ -156,15 +186,15 @@ class RecordingWriter:
                 try:
                     item = self._queue.get(timeout=max(0.0, due - time.monotonic()))
                 except queue.Empty:
-                    item = (self._writer.flush, ())
+                    item = (self._flush, ())
                 if item is None:
                     break
                 item[0](*item[1])
                 if time.monotonic() >= due:
-                    self._writer.flush()
+                    self._flush()
                     due = time.monotonic() + FLUSH_EVERY
             ended = True
-            self._writer.finish()
+            self._output.finish()
         except (OSError, ValueError, TypeError) as error:
             self.failure = f"{self.path}: recording stopped: {error}."
             while not ended:  # keep the queue empty until the end, so that memory does not grow
@@ -175,31 +205,32 @@ class RecordingWriter:
             except OSError as error:
                 self.failure = self.failure or f"{self.path}: recording stopped: {error}."
 
+    def _flush(self) -> None:
+        self._output.flush(sync=True)  # a power loss takes what the system still holds
+
     def _message(self, channel: int, host_time: float, data: bytes) -> None:
         if math.isfinite(host_time):
-            self._log_time = max(self._log_time, int(host_time * 1e9))
+            self._log_time = min(max(self._log_time, int(host_time * 1e9)), 2**63 - 1)
         self._sequence += 1
-        self._writer.add_message(
-            channel, self._log_time, data, publish_time=self._log_time, sequence=self._sequence & 0xFFFFFFFF
-        )
+        self._output.message(channel, self._log_time, data, publish_time=self._log_time, sequence=self._sequence)
 
     def _channel(self, topic: str, schema_name: str) -> int:
         if topic not in self._channels:
-            schema = self._writer.register_schema(schema_name, "protobuf", schemas.schema_data(schema_name))
-            self._channels[topic] = self._writer.register_channel(topic, "protobuf", schema)
+            schema = self._output.schema(schema_name, "protobuf", schemas.schema_data(schema_name))
+            self._channels[topic] = self._output.channel(topic, "protobuf", schema)
         return self._channels[topic]
 
     def _write_metadata(self, section: str, entries: dict[str, str]) -> None:
-        self._writer.add_metadata(section, entries)
+        self._output.metadata(*self._section(section, entries))
 
     def _write_blocks(self, blocks: tuple[Block, ...]) -> None:
         for block in blocks:
             if block.identifier in self._blocks:
                 continue
             codec = schemas.BlockCodec(block)
-            schema = self._writer.register_schema(codec.schema_name, "protobuf", codec.schema_data())
-            topic = f"/log/{block.identifier}"
-            channel = self._writer.register_channel(topic, "protobuf", schema, codec.metadata())
+            schema = self._output.schema(codec.schema_name, "protobuf", codec.schema_data())
+            told = {**codec.metadata(), "session": str(self.session)}
+            channel = self._output.channel(f"/log/{block.identifier}", "protobuf", schema, told)
             self._codecs[block.identifier] = (channel, codec)
             self._blocks[block.identifier] = block
         shown = decoders(self._blocks.values())
@@ -233,22 +264,15 @@ class RecordingWriter:
         host_time = position.host_time
         translation = dict(zip("xyz", position.value, strict=True))
         rotation = dict(zip("xyzw", self._attitude, strict=True))
-        stamp = _timestamp(host_time)
-        pose = schemas.message_class("foxglove.PoseInFrame")(
-            timestamp=stamp, frame_id=WORLD, pose={"position": translation, "orientation": rotation}
-        )
-        self._message(self._channel("/pose", "foxglove.PoseInFrame"), host_time, pose.SerializeToString())
-        frame = schemas.message_class("foxglove.FrameTransform")(
-            timestamp=stamp, parent_frame_id=WORLD, child_frame_id=BODY, translation=translation, rotation=rotation
-        )
-        self._message(self._channel("/tf", "foxglove.FrameTransform"), host_time, frame.SerializeToString())
+        for topic, schema, fields in pose_messages(_nanoseconds(host_time), translation, rotation):
+            self._write(topic, schema, host_time, fields)
 
     def _write_setpoint(self, time: float, host_time: float, reference: Setpoint) -> None:
         fields = {"time": time, "host_time": host_time, "yaw": reference.yaw, "yaw_rate": reference.yaw_rate}
         for what in ("position", "velocity", "acceleration"):
             for axis, value in zip("xyz", getattr(reference, what), strict=True):
                 fields[f"{what}_{axis}"] = float(value)
-        self._write("/setpoint", "crazyem.Setpoint", host_time, fields)
+        self._write(*EVENTS["setpoint"], host_time, fields)
 
     def _write_parameter(self, write: ParameterWrite) -> None:
         fields = {
@@ -258,7 +282,7 @@ class RecordingWriter:
             "echoed": math.nan if write.echoed is None else float(write.echoed),
             "verified": write.verified,
         }
-        self._write("/parameter_write", "crazyem.ParameterWrite", write.host_time, fields)
+        self._write(*EVENTS["parameter_write"], write.host_time, fields)
 
     def _write_estimate(self, host_time: float, estimate: "Estimate") -> None:
         parameters = [
@@ -282,11 +306,35 @@ class RecordingWriter:
             "updates": int(estimate.updates),
             "converged": bool(estimate.converged),
         }
-        self._write("/estimate", "crazyem.Estimate", host_time, fields)
+        self._write(*EVENTS["estimate"], host_time, fields)
+
+    def _write_link(self, host_time: float, statistics: LinkStatistics, latency: float) -> None:
+        fields: dict[str, Any] = {
+            "host_time": host_time,
+            "received": statistics.received,
+            "lost": statistics.lost,
+            "late": statistics.late,
+            "latency": latency,
+        }
+        before, fields["rate"], fields["loss"] = self._link_before, math.nan, math.nan
+        if before is not None and host_time > before[0]:
+            received, lost = statistics.received - before[1], statistics.lost - before[2]
+            fields["rate"] = received / (host_time - before[0])
+            fields["loss"] = lost / (received + lost) if received + lost > 0 else math.nan
+        self._link_before = (host_time, statistics.received, statistics.lost)
+        self._write(*EVENTS["link"], host_time, fields)
+
+    def _write_residual(self, time: float, host_time: float, values: tuple[float, ...], sd: tuple[float, ...]) -> None:
+        fields = {"time": float(time), "host_time": host_time}
+        names = [f"{w}_{a}" for w in ("position", "velocity", "attitude", "body_rate") for a in "xyz"]
+        fields.update(zip(names, values, strict=True))
+        fields.update(zip((f"{n}_sd" for n in names), sd, strict=True))
+        self._write(*EVENTS["residual"], host_time, fields)
 
     def _write_event(self, host_time: float, text: str, level: str) -> None:
-        fields = {"timestamp": _timestamp(host_time), "level": level, "message": text, "name": "crazyem"}
-        self._write("/events", "foxglove.Log", host_time, fields)
+        stamp = timestamp(_nanoseconds(host_time))
+        fields = {"timestamp": stamp, "level": level, "message": text, "name": "crazyem"}
+        self._write(*EVENTS["log"], host_time, fields)
 
     def _write(self, topic: str, schema: str, host_time: float, fields: dict[str, Any]) -> None:
         self._message(
@@ -298,13 +346,5 @@ def _now() -> float:
     return time.time()
 
 
-def _timestamp(host_time: float) -> dict[str, int]:
-    nanoseconds = int(host_time * 1e9) if math.isfinite(host_time) else 0
-    return {"seconds": nanoseconds // 10**9, "nanos": nanoseconds % 10**9}
-
-
-def _version(package: str) -> str:
-    try:
-        return package_metadata.version(package)
-    except package_metadata.PackageNotFoundError:
-        return "unknown"
+def _nanoseconds(host_time: float) -> int:
+    return int(min(max(host_time, 0.0), 9.0e9) * 1e9) if math.isfinite(host_time) else 0

@@ -178,7 +178,7 @@ def small(tmp_path_factory):
         for k, packet in enumerate(packets):
             writer.packet(packet)
             if k % 30 == 29:
-                writer._put(writer._writer.flush)  # several chunks
+                writer._put(writer._output.flush)  # several chunks
     return path, path.read_bytes(), live(packets)
 
 
@@ -247,7 +247,7 @@ def test_mcap_of_somebody_else(tmp_path):
         channel = writer.register_channel("/x", "json", schema)
         writer.add_message(channel, 1, b"{}", 1)
         writer.finish()
-    with pytest.raises(FileFormatError, match="holds no log blocks"):
+    with pytest.raises(FileFormatError, match="not a recording in a format known"):
         open_recording(path)
 
 
@@ -268,7 +268,7 @@ def test_a_full_disk_stops_the_recording_not_the_flight(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     writer = RecordingWriter(tmp_path / "flight.mcap")
-    monkeypatch.setattr(writer._writer, "finish", full)
+    monkeypatch.setattr(writer._output, "finish", full)
     writer.blocks(BLOCKS)
     for packet in flight(20):
         writer.packet(packet)

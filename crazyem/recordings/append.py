@@ -1,0 +1,148 @@
+"""Continuing a recording that exists: its summary is made again from its records, and nothing of it is lost.
+
+The summary at the end of a finished file says nothing that its chunks do not. So the next session begins where the
+data end, on top of the summary: a crash at any moment leaves a file that is cut off behind complete chunks, which every
+reader of ours takes. The file is changed for the first time by the first write of the new session.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mcap.records import MetadataIndex, Schema
+
+from crazyem.errors import FileFormatError
+from crazyem.recordings.mcap_messages import PROFILE
+from crazyem.recordings.mcap_output import Book, index_record, note_chunk
+from crazyem.recordings.mcap_scan import DATA_END, HEAD, MAGIC, MESSAGE_INDEX, METADATA, Loss, Problem
+from crazyem.recordings.mcap_survey import Part, index_of, parse, parts, profile_of
+
+
+@dataclass
+class Continued:
+    """A recording to go on with.
+
+    Attributes:
+        stream: positioned behind the last complete record.
+        book: what is in the file so far.
+        sequence: of the last message.
+        log_time: the latest [ns].
+        sessions: that are in the file.
+    """
+
+    stream: Any
+    book: Book
+    sequence: int
+    log_time: int
+    sessions: int
+
+
+def reopen(path: Path) -> Continued:
+    """A finished or cut-off recording of ours, to be continued.
+
+    Raises: FileFormatError if it is not ours, is an imported recording, or is damaged before its end; OSError.
+    """
+    with path.open("rb") as head:
+        if profile_of(head.read(4096)) != PROFILE:
+            raise FileFormatError(f"{path} is not a recording of crazyem and cannot be continued.")
+    problems: list[Problem] = []
+    found = _Found(Book(), len(MAGIC))
+    for part in parts(path, problems):
+        if part.record.opcode == DATA_END:
+            break
+        found.take(part)
+    damaged = next((p for p in problems if p.loss is Loss.DAMAGED), None)
+    if damaged is not None:
+        raise FileFormatError(f"{path} is damaged at byte {damaged.offset}; recover it before it is continued.")
+    if any(topic.startswith("/signals/") for _, topic, _, _ in found.book.channels.values()):
+        raise FileFormatError(f"{path} is an imported recording, to which no flight can be added.")
+    missing = found.close_chunk()
+    stream = _Tail(path, found.end, missing)
+    return Continued(stream, found.book, found.sequence, min(found.book.end or 0, 2**63 - 1), found.sessions)
+
+
+class _Found:
+    """The book of a file, made again from its records."""
+
+    def __init__(self, book: Book, end: int) -> None:
+        self.book, self.end = book, end
+        self.sequence, self.sessions = 0, 1
+        self._chunk: Part | None = None
+        self._indexes: dict[int, bytes] = {}
+
+    def take(self, part: Part) -> None:
+        record = part.record
+        if record.opcode == MESSAGE_INDEX:
+            channel = int.from_bytes(record.data[:2], "little")
+            self._indexes[channel] = HEAD.pack(record.opcode, len(record.data)) + record.data
+        else:
+            self.close_chunk()
+        self.end = record.end
+        for entry in part.announced:
+            self._announce(entry)
+        if part.chunk is not None:
+            self._chunk = part
+        if part.scan is not None and part.scan.messages.size:
+            self.sequence = int(part.scan.messages[-1, 5])
+        if record.opcode == METADATA:
+            metadata = parse(METADATA, record.data)
+            if metadata is not None:
+                entry = MetadataIndex(length=record.end - record.offset, name=metadata.name, offset=record.offset)
+                self.book.metadata.append(entry)
+
+    def _announce(self, entry: Any) -> None:
+        if isinstance(entry, Schema):
+            self.book.schemas[entry.id] = (entry.name, entry.encoding, entry.data)
+        else:
+            told = (entry.schema_id, entry.topic, entry.message_encoding, entry.metadata)
+            self.book.channels[entry.id] = told
+            number = entry.metadata.get("session", "1")
+            self.sessions = max(self.sessions, int(number) if number.isdecimal() and len(number) < 6 else 1)
+
+    def close_chunk(self) -> bytes:
+        """Enter the last chunk; returns the index records that should follow it if the file was cut among them."""
+        part, indexes = self._chunk, self._indexes
+        self._chunk, self._indexes = None, {}
+        if part is None or part.chunk is None or part.scan is None:
+            return b""
+        record, chunk = part.record, part.chunk
+        index = index_of(part.scan.messages)
+        missing = b""
+        if indexes.keys() != index.keys():
+            indexes = {channel: index_record(channel, pairs) for channel, pairs in index.items()}
+            missing = b"".join(indexes.values())
+            self.end = record.end
+        note_chunk(
+            self.book, record.offset, record.end - record.offset, chunk.compression, len(chunk.packed), chunk.size,
+            index, indexes,
+        )  # fmt: skip
+        return missing
+
+
+class _Tail:
+    """A file whose bytes from `offset` on give way to `first` and to what is written, once something is."""
+
+    def __init__(self, path: Path, offset: int, first: bytes) -> None:
+        self._file = path.open("r+b")
+        self._offset, self._first = offset, first
+        self._begun = False
+
+    def write(self, data: bytes) -> int:
+        if not self._begun:
+            self._file.truncate(self._offset)
+            self._file.seek(self._offset)
+            self._file.write(self._first)
+            self._begun = True
+        return self._file.write(data)
+
+    def tell(self) -> int:
+        return self._file.tell() if self._begun else self._offset + len(self._first)
+
+    def flush(self) -> None:
+        self._file.flush()
+
+    def fileno(self) -> int:
+        return self._file.fileno()
+
+    def close(self) -> None:
+        self._file.close()

@@ -1,0 +1,82 @@
+"""Findings of a reader as JSON text in a recording of ours, exact: a recording that is read again says them again."""
+
+import json
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.mcap_scan import Loss, Problem
+
+OWN_METADATA = "crazyem.signals"  # metadata record of an imported recording that is ours, not the source's
+_MOST_ROWS = 100_000_000  # of a fix; guards against runs that claim anything
+
+
+def findings_to_json(findings: Iterable[Finding]) -> str:
+    """One text; sample numbers of fixes as runs."""
+    entries = []
+    for finding in findings:
+        entry = finding.to_dict()
+        if finding.fix is not None and finding.fix.rows is not None:
+            entry["fix"]["rows"] = _runs(np.asarray(finding.fix.rows, np.int64))
+        entries.append(entry)
+    return json.dumps(entries)
+
+
+def findings_from_json(text: str) -> tuple[Finding, ...]:
+    """Inverse of `findings_to_json`. Raises ValueError, KeyError, TypeError or AttributeError on anything else."""
+    return tuple(
+        Finding(
+            check=str(entry["check"]),
+            grade=Grade(entry["grade"]),
+            text=str(entry["text"]),
+            signal=str(entry["signal"]),
+            intervals=tuple((float(a), float(b)) for a, b in entry["intervals"]),
+            evidence={str(k): float(v) for k, v in entry["evidence"].items()},
+            advice=str(entry["advice"]),
+            fix=_fix(entry["fix"]),
+        )
+        for entry in json.loads(text)
+    )
+
+
+def _fix(entry: Any) -> Fix | None:
+    if entry is None:
+        return None
+    rows = None
+    if entry["rows"] is not None:
+        runs = [(int(a), int(b)) for a, b in entry["rows"]]
+        if any(a < 0 or b < a for a, b in runs) or sum(b - a for a, b in runs) > _MOST_ROWS:
+            raise ValueError("not rows")
+        rows = np.concatenate([np.empty(0, np.int64), *(np.arange(a, b) for a, b in runs)]).astype(np.int64)
+    return Fix(str(entry["kind"]), tuple(map(str, entry["signals"])), tuple(map(float, entry["factor"])), rows)
+
+
+def _runs(rows: NDArray[np.int64]) -> list[list[int]]:
+    """[first, beyond the last] of each run of consecutive numbers, in the order given."""
+    if not rows.size:
+        return []
+    breaks = np.flatnonzero(np.diff(rows) != 1) + 1
+    starts, ends = rows[np.r_[0, breaks]], rows[np.r_[breaks - 1, rows.size - 1]] + 1
+    return [[int(a), int(b)] for a, b in zip(starts, ends, strict=True)]
+
+
+def finding_of(problem: Problem, *, lost_messages: int | None = None) -> Finding:
+    """What a reader says of bytes that it could not use."""
+    where = f"byte {problem.offset}"
+    evidence = {"offset_byte": float(problem.offset), "lost_byte": float(problem.end - problem.offset)}
+    lost = ""
+    if lost_messages is not None:
+        evidence["lost_messages"] = float(lost_messages)
+        lost = f", {lost_messages} messages are lost"
+    if problem.loss is Loss.OPEN:
+        text = "The recording was not closed; every complete chunk was read, at most the last second is missing."
+        return Finding("integrity", Grade.HARMLESS, text, evidence=evidence)
+    if problem.loss is Loss.CUT:
+        text = f"The file ends in the middle of a record ({where}); everything before it was read."
+        return Finding("integrity", Grade.HARMLESS, text, evidence=evidence)
+    text = f"The file is damaged at {where}: {problem.why}; {problem.end - problem.offset} bytes were left out{lost}."
+    advice = "Look for another copy of the file; what is between the last sample before and the first after is gone."
+    return Finding("integrity", Grade.DEGRADES, text, evidence=evidence, advice=advice)

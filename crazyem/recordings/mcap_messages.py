@@ -1,0 +1,66 @@
+"""What both writers of our MCAP files share: topics by kind of event, poses for viewers, versions."""
+
+from importlib import metadata as package_metadata
+from typing import Any
+
+PROFILE = "crazyem"
+FORMAT_VERSION = "1"
+WORLD, BODY = "world", "crazyflie"
+POSE_EVERY = 0.04  # s between poses, which are for viewers only
+
+# kind of event -> topic, schema
+EVENTS: dict[str, tuple[str, str]] = {
+    "setpoint": ("/setpoint", "crazyem.Setpoint"),
+    "parameter_write": ("/parameter_write", "crazyem.ParameterWrite"),
+    "estimate": ("/estimate", "crazyem.Estimate"),
+    "log": ("/events", "foxglove.Log"),
+    "link": ("/link", "crazyem.Link"),
+    "residual": ("/residual", "crazyem.Residual"),
+}
+OTHER_EVENTS = ("/other_events", "crazyem.Event")
+FINDINGS = "/findings"
+
+
+def pose_messages(
+    nanoseconds: int, translation: dict[str, float], rotation: dict[str, float]
+) -> list[tuple[str, str, dict[str, Any]]]:
+    """Topic, schema and fields of a pose (m, quaternion body to world), as viewers want it; time since 1970."""
+    stamp = timestamp(nanoseconds)
+    pose = {"position": translation, "orientation": rotation}
+    frame = {"parent_frame_id": WORLD, "child_frame_id": BODY, "translation": translation, "rotation": rotation}
+    return [
+        ("/pose", "foxglove.PoseInFrame", {"timestamp": stamp, "frame_id": WORLD, "pose": pose}),
+        ("/tf", "foxglove.FrameTransform", {"timestamp": stamp, **frame}),
+    ]
+
+
+def timestamp(nanoseconds: int) -> dict[str, int]:
+    """Fields of google.protobuf.Timestamp."""
+    return {"seconds": nanoseconds // 10**9, "nanos": nanoseconds % 10**9}
+
+
+def fields_of(message: Any) -> dict[str, object]:
+    """All fields of a message by name; nested messages as dictionaries, NaN for an echo that never came kept."""
+    result: dict[str, object] = {}
+    for field in message.DESCRIPTOR.fields:
+        value = getattr(message, field.name)
+        if field.message_type is None:
+            result[field.name] = value
+        elif isinstance(value, (list, tuple)) or hasattr(value, "add"):
+            result[field.name] = [fields_of(item) for item in value]
+        else:
+            result[field.name] = fields_of(value)
+    return result
+
+
+def versions() -> dict[str, str]:
+    """Of the format and of everything that had a part in writing a file."""
+    names = ("crazyem", "cflib", "mcap", "numpy")
+    return {"format": FORMAT_VERSION, **{name: _version(name) for name in names}}
+
+
+def _version(package: str) -> str:
+    try:
+        return package_metadata.version(package)
+    except package_metadata.PackageNotFoundError:
+        return "unknown"

@@ -1,0 +1,346 @@
+"""Writing MCAP records: chunks of bounded size, their indexes, and the summary at the end; also into an existing file.
+
+Like mcap.writer, and with its record types, but chunks never grow beyond their limit, whole arrays of messages are
+written at once, schemas and channels are repeated every few chunks (so that a damaged chunk takes nothing with it), and
+a file can be continued.
+"""
+
+import errno
+import os
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.recordings.mcap_scan import HEAD, MAGIC, MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX
+
+CHUNK_BYTES = 256 * 1024
+ANNOUNCE_EVERY = 20  # chunks
+
+
+@dataclass
+class Book:
+    """What the summary of a file says: kept while writing, or made again from a file.
+
+    Attributes:
+        schemas: identifier -> (name, encoding, data).
+        channels: identifier -> (schema identifier, topic, message encoding, metadata).
+        chunks, attachments, metadata: index records of the mcap library.
+        counts: messages of each channel.
+        start, end: log times of the first and last message [ns], None without messages.
+    """
+
+    schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
+    channels: dict[int, tuple[int, str, str, dict[str, str]]] = field(default_factory=dict)
+    chunks: list[Any] = field(default_factory=list)
+    attachments: list[Any] = field(default_factory=list)
+    metadata: list[Any] = field(default_factory=list)
+    counts: dict[int, int] = field(default_factory=dict)
+    start: int | None = None
+    end: int | None = None
+
+    def count(self, channel: int, messages: int, start: int, end: int) -> None:
+        """Add `messages` of a channel with log times from `start` to `end` [ns]."""
+        self.counts[channel] = self.counts.get(channel, 0) + messages
+        self.start = start if self.start is None else min(self.start, start)
+        self.end = end if self.end is None else max(self.end, end)
+
+
+class Output:
+    """An MCAP file being written.
+
+    Args:
+        stream: opened for writing, positioned where the next record goes; stays open.
+        book: of a file that is continued, else None.
+        chunk_bytes: a chunk is closed before it grows beyond this (a single larger message makes a larger chunk).
+
+    Raises: OSError from the stream, as it comes.
+    """
+
+    def __init__(self, stream: BinaryIO, *, book: Book | None = None, chunk_bytes: int = CHUNK_BYTES) -> None:
+        self.book = book or Book()
+        self._stream = stream
+        self._limit = chunk_bytes
+        self._buffer = bytearray()
+        self._index: dict[int, list[tuple[int, int]]] = {}
+        self._since = 0  # chunks since everything was announced
+
+    def start(self, profile: str, library: str) -> None:
+        """Magic bytes and header of a new file."""
+        from mcap.records import Header
+
+        self._stream.write(MAGIC + _bytes(Header(profile, library)))
+
+    # --- announcements ------------------------------------------------------------------------------------------
+
+    def schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Announce a schema; returns its identifier, the same for the same schema."""
+        entry = (name, encoding, data)
+        for known, other in self.book.schemas.items():
+            if other == entry:
+                return known
+        identifier = max(self.book.schemas, default=0) + 1
+        self.book.schemas[identifier] = entry
+        self._buffer += _bytes(_schema(identifier, entry))
+        return identifier
+
+    def channel(self, topic: str, encoding: str, schema: int, metadata: Mapping[str, str] | None = None) -> int:
+        """Announce a channel; returns its new identifier. Raises ValueError when all 65535 are taken."""
+        identifier = max(self.book.channels, default=0) + 1
+        if identifier > 0xFFFF:
+            raise ValueError("too many channels for one file")
+        self.book.channels[identifier] = (schema, topic, encoding, dict(metadata or {}))
+        self._buffer += _bytes(_channel(identifier, self.book.channels[identifier]))
+        return identifier
+
+    def _announcements(self) -> bytes:
+        schemas = b"".join(_bytes(_schema(i, entry)) for i, entry in self.book.schemas.items())
+        return schemas + b"".join(_bytes(_channel(i, entry)) for i, entry in self.book.channels.items())
+
+    def announce_again(self) -> None:
+        """Put everything announced so far in front of the next chunk's messages."""
+        self._buffer[:] = self._announcements()
+
+    def flush_announcements(self) -> None:
+        """What waits to be announced goes out in records of its own, before a chunk that is copied."""
+        if not self._index and self._buffer:
+            self._stream.write(bytes(self._buffer))
+            self._buffer.clear()
+
+    # --- messages -----------------------------------------------------------------------------------------------
+
+    def message(self, channel: int, log_time: int, data: bytes, *, sequence: int, publish_time: int) -> None:
+        """One message; times in ns since the epoch. Closes the chunk before it, if it would grow too large."""
+        head = MESSAGE_HEAD.pack(MESSAGE, 22 + len(data), channel, sequence & 0xFFFFFFFF, log_time, publish_time)
+        record = head + data
+        if self._index and len(self._buffer) + len(record) > self._limit:
+            self.flush()
+        self._index.setdefault(channel, []).append((log_time, self._place()))
+        self._buffer += record
+
+    def messages(self, packed: bytes, index: Mapping[int, NDArray[np.uint64]]) -> None:
+        """A chunk of messages made elsewhere.
+
+        Args:
+            packed: message records, one after the other.
+            index: channel -> (n, 2) log time [ns] and offset in `packed` of each of its messages.
+        """
+        self.flush()
+        place = self._place()
+        self._buffer += packed
+        shift = np.array([0, place], np.uint64)
+        self._close_chunk({channel: pairs + shift for channel, pairs in index.items()})
+
+    def _place(self) -> int:
+        """Offset of the next message in the chunk; repeats the announcements first where that is due."""
+        if not self._index and self._since >= ANNOUNCE_EVERY:
+            announcements = self._announcements()
+            if len(announcements) <= self._limit // 4:
+                self._buffer[:] = announcements
+            self._since = 0
+        return len(self._buffer)
+
+    @property
+    def room(self) -> int:
+        """Bytes of messages that fit into the next chunk of `messages`."""
+        waiting = len(self._buffer) if not self._index else 0
+        return max(1, self._limit - max(waiting, len(self._announcements()) if self._since >= ANNOUNCE_EVERY else 0))
+
+    def flush(self, *, sync: bool = False) -> None:
+        """Close the chunk in progress, if it has messages, and hand everything to the operating system.
+
+        Args:
+            sync: wait until it is on the disk.
+        """
+        if self._index:
+            self._close_chunk({c: np.array(pairs, np.uint64) for c, pairs in self._index.items()})
+        self._stream.flush()
+        if sync:
+            try:
+                os.fsync(self._stream.fileno())
+            except OSError as error:
+                if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # not a disk: a pipe, a null device
+                    raise
+
+    def _close_chunk(self, index: Mapping[int, NDArray[np.uint64]]) -> None:
+        import zstandard
+
+        raw = bytes(self._buffer)
+        self._buffer.clear()
+        self._index = {}
+        self._since += 1
+        self.chunk("zstd", zstandard.compress(raw), size=len(raw), crc=zlib.crc32(raw), index=index)
+
+    def chunk(
+        self, compression: str, packed: bytes, *, size: int, crc: int, index: Mapping[int, NDArray[np.uint64]]
+    ) -> None:
+        """A chunk as it stands, with the index of its messages (as in `messages`, offsets in the unpacked chunk).
+
+        Everything it needs must have been announced, or stand in it.
+        """
+        from mcap.records import Chunk
+
+        start, end = _span(index)
+        record = _bytes(
+            Chunk(
+                compression=compression,
+                data=packed,
+                message_start_time=start,
+                message_end_time=end,
+                uncompressed_crc=crc,
+                uncompressed_size=size,
+            )
+        )
+        offset = self._stream.tell()
+        indexes = {channel: index_record(channel, pairs) for channel, pairs in index.items()}
+        self._stream.write(b"".join((record, *indexes.values())))
+        note_chunk(self.book, offset, len(record), compression, len(packed), size, index, indexes)
+
+    # --- beside the chunks --------------------------------------------------------------------------------------
+
+    def metadata(self, name: str, entries: Mapping[str, str]) -> None:
+        """A metadata record: it goes into the file at once, before the chunk in progress."""
+        from mcap.records import Metadata, MetadataIndex
+
+        record = _bytes(Metadata(name=_text(name), metadata={_text(k): _text(v) for k, v in entries.items()}))
+        self.book.metadata.append(MetadataIndex(offset=self._stream.tell(), length=len(record), name=_text(name)))
+        self._stream.write(record)
+
+    def attachment(self, record: Any) -> None:
+        """An attachment: a record of the mcap library."""
+        from mcap.records import AttachmentIndex
+
+        data = _bytes(record)
+        entry = AttachmentIndex(
+            offset=self._stream.tell(),
+            length=len(data),
+            log_time=record.log_time,
+            create_time=record.create_time,
+            data_size=len(record.data),
+            name=record.name,
+            media_type=record.media_type,
+        )
+        self.book.attachments.append(entry)
+        self._stream.write(data)
+
+    def finish(self) -> None:
+        """Everything that waits, then the summary; the file is complete."""
+        from mcap.records import DataEnd
+
+        self.flush()
+        self._stream.write(_bytes(DataEnd(0)))
+        self._stream.write(_summary(self.book, self._stream.tell()) + MAGIC)
+        self._stream.flush()
+
+
+def note_chunk(
+    book: Book,
+    offset: int,
+    length: int,
+    compression: str,
+    packed_size: int,
+    size: int,
+    index: Mapping[int, NDArray[np.uint64]],
+    indexes: Mapping[int, bytes],
+) -> None:
+    """Enter a chunk at `offset` into the book, whose index records (`indexes`) follow it in this order."""
+    from mcap.records import ChunkIndex
+
+    start, end = _span(index)
+    places, at = {}, offset + length
+    for channel, record in indexes.items():
+        places[channel] = at
+        at += len(record)
+    book.chunks.append(
+        ChunkIndex(
+            chunk_length=length,
+            chunk_start_offset=offset,
+            compression=compression,
+            compressed_size=packed_size,
+            message_end_time=end,
+            message_index_length=at - offset - length,
+            message_index_offsets=places,
+            message_start_time=start,
+            uncompressed_size=size,
+        )
+    )
+    for channel, pairs in index.items():
+        book.count(channel, len(pairs), int(pairs[:, 0].min()), int(pairs[:, 0].max()))
+
+
+def index_record(channel: int, pairs: NDArray[np.uint64]) -> bytes:
+    """A message index record: (n, 2) log times [ns] and offsets in the unpacked chunk."""
+    entries = pairs.astype("<u8").tobytes()
+    content = channel.to_bytes(2, "little") + len(entries).to_bytes(4, "little") + entries
+    return HEAD.pack(MESSAGE_INDEX, len(content)) + content
+
+
+def _summary(book: Book, offset: int) -> bytes:
+    from mcap.opcode import Opcode
+    from mcap.records import Footer, Statistics, SummaryOffset
+
+    statistics = Statistics(
+        attachment_count=len(book.attachments),
+        channel_count=len(book.channels),
+        channel_message_counts=dict(book.counts),
+        chunk_count=len(book.chunks),
+        message_count=sum(book.counts.values()),
+        message_end_time=book.end or 0,
+        message_start_time=book.start or 0,
+        metadata_count=len(book.metadata),
+        schema_count=len(book.schemas),
+    )
+    groups = (
+        (Opcode.SCHEMA, [_schema(i, entry) for i, entry in book.schemas.items()]),
+        (Opcode.CHANNEL, [_channel(i, entry) for i, entry in book.channels.items()]),
+        (Opcode.STATISTICS, [statistics]),
+        (Opcode.CHUNK_INDEX, book.chunks),
+        (Opcode.ATTACHMENT_INDEX, book.attachments),
+        (Opcode.METADATA_INDEX, book.metadata),
+    )
+    data, offsets = b"", b""
+    for opcode, entries in groups:
+        group = b"".join(map(_bytes, entries))
+        if group:
+            offsets += _bytes(SummaryOffset(opcode, group_length=len(group), group_start=offset + len(data)))
+        data += group
+    where = offset + len(data)
+    data += offsets
+    footer = _bytes(Footer(summary_crc=0, summary_offset_start=where, summary_start=offset))
+    crc = zlib.crc32(footer[:-4], zlib.crc32(data))
+    return data + footer[:-4] + crc.to_bytes(4, "little")
+
+
+def _span(index: Mapping[int, NDArray[np.uint64]]) -> tuple[int, int]:
+    times = [pairs[:, 0] for pairs in index.values() if len(pairs)]
+    return (int(min(t.min() for t in times)), int(max(t.max() for t in times))) if times else (0, 0)
+
+
+def _schema(identifier: int, entry: tuple[str, str, bytes]) -> Any:
+    from mcap.records import Schema
+
+    name, encoding, data = entry
+    return Schema(id=identifier, data=data, encoding=encoding, name=name)
+
+
+def _channel(identifier: int, entry: tuple[int, str, str, dict[str, str]]) -> Any:
+    from mcap.records import Channel
+
+    schema, topic, encoding, metadata = entry
+    return Channel(id=identifier, topic=topic, message_encoding=encoding, metadata=metadata, schema_id=schema)
+
+
+def _bytes(record: Any) -> bytes:
+    from mcap.data_stream import RecordBuilder
+
+    builder = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())
+
+
+def _text(value: object) -> str:
+    """Text that UTF-8 can hold: file names may contain bytes that are none."""
+    return str(value).encode("utf-8", "replace").decode("utf-8")

@@ -1,0 +1,251 @@
+"""Walking through an MCAP file record by record, whole or damaged: what stands where, and which bytes are lost.
+
+Nothing is believed that the file claims: lengths are checked against the file and against each other, chunks are
+unpacked into a bounded buffer and checked against their CRC. After a stretch that makes no sense the walk goes on at
+the next chunk. Format: https://mcap.dev/spec (version 0).
+"""
+
+import re
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAGIC = b"\x89MCAP0\r\n"
+LARGEST_CHUNK = 64 * 1024 * 1024  # bytes unpacked; ours have a quarter MiB, a damaged length claims anything
+LARGEST_RECORD = 64 * 1024 * 1024  # bytes of any record but chunks and attachments
+OTHERS = 100_000  # schemas and channels in one chunk; no sound file has more
+
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 1, 2, 3, 4, 5, 6, 7
+CHUNK_INDEX, ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX = 8, 9, 10, 11, 12, 13
+SUMMARY_OFFSET, DATA_END = 14, 15
+
+HEAD = struct.Struct("<BQ")
+MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
+_CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, unpacked size, CRC, length of the compression's name
+_WINDOW = 1024 * 1024
+# where a chunk may begin: opcode, length, times, size, CRC, compression, length of what follows
+_CHUNK_START = re.compile(rb"(?s)\x06(?=.{36}(?:\x04\0\0\0zstd|\x03\0\0\0lz4|\0\0\0\0).{8})")
+
+
+class Loss(StrEnum):
+    """Why bytes of a file could not be used."""
+
+    CUT = "cut"  # the file ends in the middle of a record
+    DAMAGED = "damaged"  # bytes are not what was written
+    OPEN = "open"  # nothing is missing but the end: the writer was stopped
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Bytes `offset` to `end` of the file could not be used, and why."""
+
+    loss: Loss
+    offset: int
+    end: int
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """A record at the top level of a file: where it starts, where the next one does, what is in it.
+
+    The content of attachments is left out: `data` is empty.
+    """
+
+    offset: int
+    end: int
+    opcode: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class PackedChunk:
+    """The fields of a chunk record; times in ns."""
+
+    start: int
+    end: int
+    size: int
+    crc: int
+    compression: str
+    packed: memoryview
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """The records of an unpacked chunk.
+
+    Attributes:
+        data: (b,) bytes of the chunk.
+        messages: (n, 6) in order: offset of the payload in `data`, its length, channel, log time, publish time [ns,
+            both unsigned, stored in signed numbers], sequence.
+        others: (m, 3) opcode, offset of the content, length.
+    """
+
+    data: NDArray[np.uint8]
+    messages: NDArray[np.int64]
+    others: NDArray[np.int64]
+
+
+def records(stream: BinaryIO, problems: list[Problem]) -> Iterator[Record]:
+    """The records between the magic bytes, those of the summary included; what cannot be read goes to `problems`.
+
+    Chunks are checked for consistent lengths only; `unpack` checks the rest.
+    """
+    size = stream.seek(0, 2)
+    offset = len(MAGIC)
+    closed = False
+    while offset < size:
+        stream.seek(offset)
+        head = stream.read(HEAD.size)
+        if closed and head[: len(MAGIC)] == MAGIC and size - offset == len(MAGIC):
+            return
+        opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (head[0], size)
+        end = offset + HEAD.size + length
+        data = None
+        if end <= size and _plausible(opcode, length):
+            data = b"" if opcode == ATTACHMENT else stream.read(length)
+            if not _consistent(opcode, data):
+                data = None
+        if data is None:
+            found = _next_chunk(stream, offset + 1, size)
+            if found is None:
+                beyond = end > size and (0 < opcode <= DATA_END or len(head) < HEAD.size)
+                if beyond:
+                    problems.append(Problem(Loss.CUT, offset, size, "the file ends in the middle of a record"))
+                else:
+                    problems.append(Problem(Loss.DAMAGED, offset, size, "the bytes are no record"))
+                return
+            problems.append(Problem(Loss.DAMAGED, offset, found, "the bytes are no record"))
+            offset = found
+            continue
+        closed = opcode == FOOTER
+        yield Record(offset, end, opcode, data)
+        offset = end
+    problems.append(Problem(Loss.OPEN, size, size, "the recording was not closed"))
+
+
+def _plausible(opcode: int, length: int) -> bool:
+    if opcode == CHUNK:
+        return length >= _CHUNK_HEAD.size + 8
+    if opcode == MESSAGE:
+        return 22 <= length <= LARGEST_RECORD
+    if opcode == DATA_END:
+        return length == 4
+    if opcode == FOOTER:
+        return length == 20
+    if opcode == ATTACHMENT:
+        return length >= 36
+    return (0 < opcode <= DATA_END or opcode >= 0x80) and length <= LARGEST_RECORD
+
+
+def _consistent(opcode: int, data: bytes) -> bool:
+    """Whether the lengths inside a record add up to the record's."""
+    try:
+        if opcode == CHUNK:
+            parse_chunk(data)
+        elif opcode == MESSAGE_INDEX:
+            return len(data) >= 6 and int.from_bytes(data[2:6], "little") == len(data) - 6
+        elif opcode == METADATA:
+            name = int.from_bytes(data[:4], "little")
+            return int.from_bytes(data[4 + name : 8 + name], "little") == len(data) - 8 - name
+    except ValueError:
+        return False
+    return True
+
+
+def _next_chunk(stream: BinaryIO, offset: int, size: int) -> int | None:
+    """Offset of the next chunk record that lies wholly in the file and whose lengths agree; None if there is none."""
+    overlap = 64
+    while offset < size:
+        stream.seek(offset)
+        window = stream.read(_WINDOW + overlap)
+        for match in _CHUNK_START.finditer(window):
+            at = match.start()
+            length = int.from_bytes(window[at + 1 : at + 9], "little")
+            name = int.from_bytes(window[at + 37 : at + 41], "little")
+            inner = int.from_bytes(window[at + 41 + name : at + 49 + name], "little")
+            if length == _CHUNK_HEAD.size + name + 8 + inner and offset + at + HEAD.size + length <= size:
+                return offset + at
+        offset += _WINDOW
+    return None
+
+
+def parse_chunk(data: bytes) -> PackedChunk:
+    """The fields of a chunk record. Raises ValueError if its lengths do not agree."""
+    if len(data) < _CHUNK_HEAD.size + 8:
+        raise ValueError("a chunk is too short")
+    start, end, size, crc, name = _CHUNK_HEAD.unpack_from(data)
+    at = _CHUNK_HEAD.size + name + 8
+    if name > 16 or len(data) < at or int.from_bytes(data[at - 8 : at], "little") != len(data) - at:
+        raise ValueError("the lengths in a chunk do not agree")
+    try:
+        compression = data[_CHUNK_HEAD.size : _CHUNK_HEAD.size + name].decode("ascii")
+    except UnicodeDecodeError as error:
+        raise ValueError("a chunk does not name its compression") from error
+    return PackedChunk(start, end, size, crc, compression, memoryview(data)[at:])
+
+
+def unpack(chunk: PackedChunk, *, limit: int = LARGEST_CHUNK) -> bytes:
+    """The records of a chunk, unpacked and checked; never more than `limit` bytes of memory.
+
+    Raises: ValueError, with the reason.
+    """
+    if chunk.size > limit:
+        raise ValueError(f"a chunk claims {chunk.size} bytes, more than {limit}")
+    if chunk.compression == "zstd":
+        data = _unpack_zstd(chunk)
+    elif chunk.compression == "lz4":
+        data = _unpack_lz4(chunk)
+    elif chunk.compression == "":
+        data = bytes(chunk.packed)
+    else:
+        raise ValueError(f"unknown compression {chunk.compression!r}")
+    if len(data) != chunk.size:
+        raise ValueError("a chunk does not unpack to its size")
+    if chunk.crc and zlib.crc32(data) != chunk.crc:
+        raise ValueError("the CRC of a chunk does not match")
+    return data
+
+
+def _unpack_zstd(chunk: PackedChunk) -> bytes:
+    import zstandard
+
+    # one byte more than claimed shows a chunk that is larger than it says, without unpacking the rest
+    try:
+        with zstandard.ZstdDecompressor(max_window_size=2 * LARGEST_CHUNK).stream_reader(
+            chunk.packed, read_across_frames=True
+        ) as reader:
+            parts = [reader.read(chunk.size)] if chunk.size else []
+            parts.append(reader.read(1))
+        return b"".join(parts) if parts[-1] else parts[0] if len(parts) > 1 else b""
+    except (zstandard.ZstdError, MemoryError) as error:
+        raise ValueError("a chunk does not unpack") from error
+
+
+def _unpack_lz4(chunk: PackedChunk) -> bytes:
+    import lz4.frame  # type: ignore[import-untyped]
+
+    try:
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(bytes(chunk.packed), max_length=chunk.size + 1))
+    except (RuntimeError, EOFError, MemoryError) as error:
+        raise ValueError("a chunk does not unpack") from error
+
+
+def scan(data: bytes) -> Scan:
+    """The records in the bytes of a chunk. Raises ValueError where they make no sense."""
+    from crazyem.recordings.mcap_kernel import count, fill  # numba takes a second to import
+
+    array = np.frombuffer(data, np.uint8)
+    counts = np.zeros(2, np.int64)
+    if count(array, counts) < 0 or counts[1] > OTHERS:
+        raise ValueError("the records in a chunk make no sense")
+    messages = np.empty((counts[0], 6), np.int64)
+    others = np.empty((counts[1], 3), np.int64)
+    fill(array, messages, others)
+    return Scan(array, messages, others)

@@ -1,0 +1,424 @@
+"""Writing any recording as MCAP of ours: one channel a stream, its signals exact, in the order of processing.
+
+What `mcap_file.read` makes of it is the same recording: times, values, host times and marks bit for bit, units, frames,
+clocks and sources, events, findings and metadata. docs/formats/mcap.md has the channels.
+"""
+
+import json
+import math
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.errors import UsageError
+from crazyem.recordings import schemas
+from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.mcap_findings import OWN_METADATA, findings_to_json
+from crazyem.recordings.mcap_messages import (
+    EVENTS,
+    FINDINGS,
+    OTHER_EVENTS,
+    POSE_EVERY,
+    PROFILE,
+    fields_of,
+    pose_messages,
+    versions,
+)
+from crazyem.recordings.mcap_output import Output
+from crazyem.recordings.mcap_scan import MESSAGE, MESSAGE_HEAD
+from crazyem.recordings.recording import Event, Recording, SignalArray
+from crazyem.recordings.stream_codec import MOST_FIELDS, MOST_SIGNALS, Column, StreamLayout, unique_name
+
+_EPOCH = (9.0e8, 4.2e9)  # s: stamps between 1998 and 2103 are taken for times since 1970
+_LEVELS = {Grade.HARMLESS: 2, Grade.DEGRADES: 3, Grade.UNUSABLE: 4}  # of foxglove.Log
+
+
+def write_recording(
+    recording: Recording,
+    path: str | Path,
+    *,
+    metadata: Mapping[str, Mapping[str, str]] | None = None,
+    replace: bool = False,
+) -> None:
+    """Write a recording as MCAP, whole or not at all.
+
+    Args:
+        recording: from any reader.
+        path: the file.
+        metadata: sections to add to those of the recording.
+        replace: an existing file may be replaced.
+
+    Raises: UsageError if the file exists or cannot be written.
+    """
+    path = Path(path)
+    if path.exists() and not replace:
+        raise UsageError(f"{path} exists already; it was left as it is.")
+    temporary = ""
+    try:
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+        with os.fdopen(handle, "wb") as stream:
+            _write(recording, Output(stream), {**recording.metadata, **(metadata or {})})
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.chmod(temporary, 0o666 & ~_umask())
+        if replace:
+            os.replace(temporary, path)
+        else:
+            os.link(temporary, path)  # fails if somebody was faster
+            os.unlink(temporary)
+    except FileExistsError as error:
+        raise UsageError(f"{path} exists already; it was left as it is.") from error
+    except OSError as error:
+        raise UsageError(f"{path} cannot be written: {error.strerror or error}.") from error
+    finally:
+        if temporary and os.path.exists(temporary):
+            os.unlink(temporary)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _write(recording: Recording, output: Output, metadata: Mapping[str, Mapping[str, str]]) -> None:
+    output.start(PROFILE, f"crazyem {versions()['crazyem']}")
+    own = {
+        **versions(),
+        "origin": repr(float(recording.origin)),
+        "source": recording.source,
+        "path": recording.path,
+        "findings": findings_to_json(recording.findings),
+    }
+    output.metadata(OWN_METADATA, own)
+    for section, entries in metadata.items():
+        output.metadata(section, entries)
+    ranks = _ranks(recording.signals)
+    streams = [_Stream(output, group) for group in _groups(recording.signals, ranks)]
+    clock = _Clock(recording, streams)
+    extras = [*_poses(output, recording, ranks, clock), *_events(output, recording, clock), *_notes(output, recording)]
+    _Merge(output, streams, extras, clock).write()
+    output.finish()
+
+
+# --- which signals share messages -------------------------------------------------------------------------------------
+
+
+def _ranks(signals: Mapping[str, SignalArray]) -> dict[str, NDArray[np.int64]]:
+    """Place of each sample among all samples of the recording, in processing order."""
+    if not signals:
+        return {}
+    order = np.concatenate([array.order for array in signals.values()])
+    ranks = np.empty(order.size, np.int64)
+    ranks[np.argsort(order, kind="stable")] = np.arange(order.size)
+    ends = np.cumsum([array.order.size for array in signals.values()])
+    return dict(zip(signals, np.split(ranks, ends[:-1]), strict=True))
+
+
+class _Group:
+    """Signals of one stream whose samples were taken and processed together, row by row."""
+
+    def __init__(self, stream: str) -> None:
+        self.stream = stream
+        self.names: list[str] = []
+        self.indices: list[int] = []
+        self.arrays: list[SignalArray] = []
+        self.base: NDArray[np.int64] = np.empty(0, np.int64)
+
+    @property
+    def width(self) -> int:
+        return sum(array.value.shape[1] for array in self.arrays)
+
+    def takes(self, array: SignalArray, rank: NDArray[np.int64]) -> bool:
+        """Whether `array` belongs into the same messages, after those that are here."""
+        if len(self.arrays) >= MOST_SIGNALS or self.width + array.value.shape[1] > MOST_FIELDS:
+            return False
+        mine = self.arrays[0]
+        return (
+            array.time.size == mine.time.size
+            and np.array_equal(rank, self.base + len(self.arrays))
+            and _same_bits(array.time, mine.time)
+            and _same_bits(array.host_time, mine.host_time)
+        )
+
+
+def _same_bits(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+    if a is b:
+        return True
+    return np.array_equal(np.ascontiguousarray(a).view(np.int64), np.ascontiguousarray(b).view(np.int64))
+
+
+def _groups(signals: Mapping[str, SignalArray], ranks: Mapping[str, NDArray[np.int64]]) -> list[_Group]:
+    """Groups in order of their first sample, which is the order of the channels."""
+    index = {name: i for i, name in enumerate(signals)}
+    groups: list[_Group] = []
+    for name in sorted(signals, key=lambda n: (int(ranks[n][0]) if ranks[n].size else -1, index[n])):
+        array = signals[name]
+        # the newest group of a stream only: its neighbours in the processing order come one after the other
+        newest = next((g for g in reversed(groups) if g.stream == array.stream), None)
+        if newest is None or not newest.takes(array, ranks[name]):
+            newest = _Group(array.stream)
+            newest.base = ranks[name]
+            groups.append(newest)
+        newest.names.append(name)
+        newest.indices.append(index[name])
+        newest.arrays.append(array)
+    return groups
+
+
+class _Stream:
+    """A group as a channel: encodes any of its rows."""
+
+    def __init__(self, output: Output, group: _Group) -> None:
+        taken = {topic.removeprefix("/signals/") for _, topic, _, _ in output.book.channels.values()}
+        # rows in processing order; where that is not the order of the arrays, messages say which row they are
+        self.rows = np.argsort(group.base, kind="stable")
+        shuffled = not np.array_equal(self.rows, np.arange(self.rows.size))
+        self.arrays = group.arrays
+        self.keys = group.base[self.rows].astype(float)
+        self.layout = StreamLayout(
+            identifier=unique_name(group.stream or "table", taken),
+            stream=group.stream,
+            signals=tuple(
+                Column(n, i, a.value.shape[1], a.quantity, a.unit, a.frame, a.clock, a.source)
+                for n, i, a in zip(group.names, group.indices, group.arrays, strict=True)
+            ),
+            rows=shuffled,
+            components=tuple(_components(a) for a in group.arrays),
+        )
+        schema = output.schema(self.layout.schema_name, "protobuf", self.layout.schema_data())
+        topic = f"/signals/{self.layout.identifier}"
+        self.channel = output.channel(topic, "protobuf", schema, self.layout.metadata())
+        self.size = MESSAGE_HEAD.size + self.layout.messages.size
+
+    def encode(self, first: int, last: int) -> NDArray[np.uint8]:
+        """(n, size) message contents of samples `first` to `last`, counted in processing order."""
+        rows = self.rows[first:last]
+        marked = np.zeros(rows.size, np.uint64)
+        for bit, array in enumerate(self.arrays):
+            marked |= array.marked[rows].astype(np.uint64) << np.uint64(bit)
+        columns: list[NDArray[Any]] = [self.arrays[0].time[rows], self.arrays[0].host_time[rows], marked]
+        if self.layout.rows:
+            columns.append(rows)
+        for array in self.arrays:
+            columns.extend(array.value[rows].T)
+        return self.layout.messages.encode(columns)
+
+
+def _components(array: SignalArray) -> tuple[str, ...]:
+    width = array.value.shape[1]
+    names = array.components
+    return names if len(names) == width else () if width == 1 else tuple(str(i) for i in range(width))
+
+
+# --- times and order in the file --------------------------------------------------------------------------------------
+
+
+class _Clock:
+    """Log times [ns]: the host's where known, else the source's if it counts from 1970, else from the first sample."""
+
+    def __init__(self, recording: Recording, streams: Sequence[_Stream]) -> None:
+        times = [s.arrays[0].time for s in streams if s.arrays[0].time.size]
+        least = min((float(np.nanmin(t)) for t in times if np.isfinite(t).any()), default=0.0)
+        self.host_known = any(np.isfinite(s.arrays[0].host_time).any() for s in streams)
+        epoch = _EPOCH[0] <= least + recording.origin <= _EPOCH[1]
+        self.shift = recording.origin if epoch else -min(least, 0.0)
+
+    def of(self, time: NDArray[np.float64], host_time: NDArray[np.float64]) -> NDArray[np.float64]:
+        """ns, NaN where not known."""
+        return (host_time if self.host_known else time + self.shift) * 1e9
+
+
+class _Extra:
+    """A message of its own: `key` is where it belongs among the samples, NaN: by its `log_time` [ns, 0: unknown]."""
+
+    def __init__(self, channel: int, data: bytes, *, key: float = math.nan, log_time: int, publish: int = -1) -> None:
+        self.channel, self.data, self.key = channel, data, key
+        self.log_time, self.publish = log_time, publish
+
+
+class _Merge:
+    """All messages in one order, written in chunks."""
+
+    def __init__(self, output: Output, streams: Sequence[_Stream], extras: Sequence[_Extra], clock: _Clock) -> None:
+        self.output, self.streams = output, streams
+        self.extras = [e for e in extras if not math.isnan(e.key)]
+        keys = [s.keys for s in streams]
+        times = [clock.of(s.arrays[0].time[s.rows], s.arrays[0].host_time[s.rows]) for s in streams]
+        key, time = np.concatenate([*keys, np.empty(0)]), np.concatenate([*times, np.empty(0)])
+        running = _running(time[np.argsort(key)])
+        free = [e for e in extras if math.isnan(e.key)]
+        if free:
+            ordered = np.sort(key)
+            wanted = np.maximum.accumulate(np.array([e.log_time for e in free], np.uint64))
+            for extra, place in zip(free, np.searchsorted(running, wanted).tolist(), strict=True):
+                extra.key = float(ordered[place]) - 0.5 if place < key.size else math.inf
+        self.extras = sorted((*self.extras, *free), key=lambda e: e.key)
+        places = [np.full(k.size, i, np.int32) for i, k in enumerate(keys)]
+        count = len(self.extras)
+        which = np.concatenate([*places, np.full(count, len(streams), np.int32)])
+        sizes = np.concatenate([np.full(k.size, s.size) for k, s in zip(keys, streams, strict=True)] + [np.empty(0)])
+        sizes = np.concatenate([sizes, [MESSAGE_HEAD.size + len(e.data) for e in self.extras]]).astype(np.int64)
+        key = np.concatenate([key, np.array([e.key for e in self.extras], float)])
+        time = np.concatenate([time, np.array([e.log_time or math.nan for e in self.extras], float)])
+        order = np.argsort(key, kind="stable")
+        self.which, self.sizes = which[order], sizes[order]
+        self.log_times = _running(time[order])
+
+    def write(self) -> None:
+        """Chunk by chunk; sequence numbers count through the file."""
+        ends = np.cumsum(self.sizes)
+        done = np.zeros(len(self.streams) + 1, np.int64)
+        first, start = 0, 0
+        while first < ends.size:
+            last = int(np.searchsorted(ends, start + self.output.room, side="right"))
+            last = max(last, first + 1)
+            self._chunk(first, last, done)
+            first, start = last, int(ends[last - 1])
+
+    def _chunk(self, first: int, last: int, done: NDArray[np.int64]) -> None:
+        which, sizes, times = self.which[first:last], self.sizes[first:last], self.log_times[first:last]
+        offsets = np.cumsum(sizes) - sizes
+        data = np.empty(int(sizes.sum()), np.uint8)
+        index: dict[int, NDArray[np.uint64]] = {}
+        for i, stream in enumerate(self.streams):
+            mine = np.flatnonzero(which == i)
+            if not mine.size:
+                continue
+            heads = _heads(stream.channel, stream.size, times[mine], first + mine + 1)
+            contents = stream.encode(int(done[i]), int(done[i]) + mine.size)
+            done[i] += mine.size
+            data[offsets[mine, None] + np.arange(stream.size)] = np.hstack([heads, contents])
+            index[stream.channel] = np.column_stack([times[mine], offsets[mine].astype(np.uint64)])
+        others: dict[int, list[tuple[int, int]]] = {}
+        for at in np.flatnonzero(which == len(self.streams)).tolist():
+            extra = self.extras[int(done[-1])]
+            done[-1] += 1
+            time, offset = int(times[at]), int(offsets[at])
+            publish = time if extra.publish < 0 else extra.publish
+            head = MESSAGE_HEAD.pack(
+                MESSAGE, 22 + len(extra.data), extra.channel, (first + at + 1) & 0xFFFFFFFF, time, publish
+            )
+            data[offset : offset + int(sizes[at])] = np.frombuffer(head + extra.data, np.uint8)
+            others.setdefault(extra.channel, []).append((time, offset))
+        index.update({channel: np.array(pairs, np.uint64) for channel, pairs in others.items()})
+        self.output.messages(data.tobytes(), index)
+
+
+_HEAD_TYPE = np.dtype([("o", "u1"), ("n", "<u8"), ("c", "<u2"), ("s", "<u4"), ("t", "<u8"), ("p", "<u8")])
+
+
+def _heads(channel: int, size: int, times: NDArray[np.uint64], sequence: NDArray[np.int64]) -> NDArray[np.uint8]:
+    heads = np.zeros(times.size, _HEAD_TYPE)
+    heads["o"], heads["n"], heads["c"] = MESSAGE, size - 9, channel
+    heads["s"] = sequence & 0xFFFFFFFF
+    heads["t"] = heads["p"] = times
+    return heads.view(np.uint8).reshape(times.size, _HEAD_TYPE.itemsize)
+
+
+def _running(time: NDArray[np.float64]) -> NDArray[np.uint64]:
+    """Log times that never decrease, from times in ns with gaps (NaN)."""
+    known = np.where(np.isfinite(time), np.clip(time, 0.0, 9.0e18), 0.0)
+    if not known.size:
+        return np.empty(0, np.uint64)
+    finite = known[np.isfinite(time)]
+    known[0] = known[0] if math.isfinite(time[0]) or not finite.size else finite[0]
+    return np.maximum.accumulate(known).astype(np.uint64)
+
+
+# --- what else is in the file -----------------------------------------------------------------------------------------
+
+
+def _channel(output: Output, topic: str, schema_name: str) -> int:
+    for identifier, (_, known, _, _) in output.book.channels.items():
+        if known == topic:
+            return identifier
+    schema = output.schema(schema_name, "protobuf", schemas.schema_data(schema_name))
+    return output.channel(topic, "protobuf", schema)
+
+
+def _poses(output: Output, recording: Recording, ranks: Mapping[str, NDArray[np.int64]], clock: _Clock) -> list[_Extra]:
+    """foxglove.PoseInFrame and FrameTransform at 25 Hz, for the 3D panels of viewers; never read back."""
+    position, attitude = recording.signals.get("position"), recording.signals.get("attitude")
+    if position is None or attitude is None or not position.time.size or not attitude.time.size:
+        return []
+    if position.value.shape[1] != 3 or attitude.value.shape[1] != 4:
+        return []
+    whole = np.isfinite(attitude.value.sum(axis=1))
+    turns = np.argsort(ranks["attitude"])
+    turns = turns[whole[turns]]
+    log_times = clock.of(position.time, position.host_time)
+    extras, newest = [], -math.inf
+    for row in np.argsort(ranks["position"]).tolist():
+        time = float(position.time[row])
+        if not abs(time - newest) >= POSE_EVERY:
+            continue
+        # the attitude known by then; the sample after the position if it was taken at the same time
+        at = int(np.searchsorted(ranks["attitude"][turns], ranks["position"][row] + 1, side="right")) - 1
+        if at < 0 or not np.isfinite(position.value[row]).all():
+            continue
+        newest = time
+        stamp = log_times[row] if math.isfinite(log_times[row]) else 0.0
+        rotation = dict(zip("xyzw", attitude.value[turns[at]].tolist(), strict=True))
+        translation = dict(zip("xyz", position.value[row].tolist(), strict=True))
+        nanoseconds = int(min(max(stamp, 0.0), 9.0e18))
+        key = float(ranks["position"][row]) + 0.25
+        for topic, schema, fields in pose_messages(nanoseconds, translation, rotation):
+            data = schemas.message_class(schema)(**fields).SerializeToString()
+            extras.append(_Extra(_channel(output, topic, schema), data, key=key, log_time=nanoseconds))
+    return extras
+
+
+def _events(output: Output, recording: Recording, clock: _Clock) -> list[_Extra]:
+    """Events as messages of their kind where that holds all of them, else as JSON."""
+    extras = []
+    for event in recording.events:
+        found = _native(event)
+        if found is None:
+            topic, schema = OTHER_EVENTS
+            fields = {"time": event.time, "kind": event.kind, "json": json.dumps(dict(event.data), default=str)}
+            found = topic, schema, schemas.message_class(schema)(**fields).SerializeToString()
+        topic, schema, data = found
+        stamp = _nanoseconds(event.time)
+        shown = stamp if clock.host_known or clock.shift > _EPOCH[0] else 0
+        extras.append(_Extra(_channel(output, topic, schema), data, log_time=shown, publish=max(stamp, 0)))
+    return extras
+
+
+def _native(event: Event) -> tuple[str, str, bytes] | None:
+    """The event as a message of its own kind, None if that would lose anything of it."""
+    if event.kind not in EVENTS or _nanoseconds(event.time) / 10**9 != event.time:
+        return None
+    topic, schema = EVENTS[event.kind]
+    message = schemas.message_class(schema)
+    try:
+        data = message(**event.data).SerializeToString()
+        same = repr(fields_of(message.FromString(data))) == repr(dict(event.data))
+    except (TypeError, ValueError, AttributeError):
+        return None
+    return (topic, schema, data) if same else None
+
+
+def _nanoseconds(seconds: float) -> int:
+    """Exact, within what a log time can hold; 0 for no number."""
+    return min(max(round(Fraction(seconds) * 10**9), 0), 2**63 - 1) if math.isfinite(seconds) else 0
+
+
+def _notes(output: Output, recording: Recording) -> list[_Extra]:
+    """Findings as log lines, for viewers; they are read back from the metadata."""
+    extras = []
+    for finding in recording.findings:
+        fields = {"timestamp": {}, "level": _LEVELS[finding.grade], "message": _line(finding), "name": finding.check}
+        data = schemas.message_class("foxglove.Log")(**fields).SerializeToString()
+        extras.append(_Extra(_channel(output, FINDINGS, "foxglove.Log"), data, log_time=0))
+    return extras
+
+
+def _line(finding: Finding) -> str:
+    return f"{finding.signal}: {finding.text}" if finding.signal else finding.text

@@ -1,0 +1,171 @@
+"""What an MCAP file holds, part by part: chunks unpacked and checked, announcements parsed, losses located."""
+
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.errors import FileFormatError, UsageError
+from crazyem.recordings import mcap_scan
+from crazyem.recordings.mcap_scan import HEAD, MAGIC, Loss, PackedChunk, Problem, Record, Scan
+
+RATIO = 400  # a file that unpacks to more than this many times its size (and 64 MiB) is a bomb; flights have 2 to 30
+_BATCH = 256 * 1024  # bytes of records outside chunks that are looked at together
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A chunk, or records that stand outside of chunks.
+
+    Attributes:
+        record: the first record.
+        scan: messages of a chunk or of a run of records outside chunks; None for anything else.
+        chunk: the chunk as it stands in the file, None outside chunks.
+        announced: schemas and channels in it (records of the mcap library).
+    """
+
+    record: Record
+    scan: Scan | None = None
+    chunk: PackedChunk | None = None
+    announced: list[Any] = field(default_factory=list)
+
+
+def parts(path: Path, problems: list[Problem], *, limit: int = mcap_scan.LARGEST_CHUNK) -> Iterator[Part]:
+    """All that can be read of a file, in its order; what cannot goes to `problems`.
+
+    Args:
+        limit: bytes of the largest chunk that is unpacked.
+
+    Raises: UsageError if it cannot be opened, FileFormatError for a decompression bomb.
+    """
+    try:
+        with path.open("rb") as stream:
+            most = mcap_scan.LARGEST_CHUNK + RATIO * path.stat().st_size
+            yield from _parts(path, stream, problems, limit, most)
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
+
+
+def _parts(path: Path, stream: BinaryIO, problems: list[Problem], limit: int, most: int) -> Iterator[Part]:
+    loose: list[Record] = []
+    unpacked = waiting = 0
+    for record in mcap_scan.records(stream, problems):
+        if record.opcode in (mcap_scan.SCHEMA, mcap_scan.CHANNEL, mcap_scan.MESSAGE):
+            loose.append(record)
+            waiting += record.end - record.offset
+            if waiting < _BATCH:
+                continue
+        if loose:
+            yield from _loose(loose, problems)
+            waiting = 0
+            loose = []
+        if record.opcode in (mcap_scan.SCHEMA, mcap_scan.CHANNEL, mcap_scan.MESSAGE):
+            continue
+        if record.opcode != mcap_scan.CHUNK:
+            yield Part(record)
+            continue
+        try:
+            chunk = mcap_scan.parse_chunk(record.data)
+            unpacked += min(chunk.size, limit)
+            if unpacked > most:
+                raise FileFormatError(f"{path} unpacks to more than {most} bytes; it is no recording of a flight.")
+            scan = mcap_scan.scan(mcap_scan.unpack(chunk, limit=limit))
+        except ValueError as error:
+            problems.append(Problem(Loss.DAMAGED, record.offset, record.end, str(error)))
+            continue
+        yield Part(record, scan, chunk, _announced(scan))
+    if loose:
+        yield from _loose(loose, problems)
+
+
+def _loose(loose: list[Record], problems: list[Problem]) -> Iterator[Part]:
+    data = b"".join(HEAD.pack(r.opcode, len(r.data)) + r.data for r in loose)
+    whole = Record(loose[0].offset, loose[-1].end, loose[0].opcode, b"")
+    try:
+        scan = mcap_scan.scan(data)
+    except ValueError as error:
+        problems.append(Problem(Loss.DAMAGED, whole.offset, whole.end, str(error)))
+        return
+    yield Part(whole, scan, None, _announced(scan))
+
+
+def _announced(scan: Scan) -> list[Any]:
+    found = []
+    for opcode, offset, length in scan.others.tolist():
+        record = parse(opcode, scan.data[offset : offset + length].tobytes())
+        if record is not None:
+            found.append(record)
+    return found
+
+
+def parse(opcode: int, data: bytes) -> Any:
+    """A record of the mcap library (schema, channel, metadata, header, footer), None if it cannot be one."""
+    from mcap import records
+    from mcap.data_stream import ReadDataStream
+    from mcap.exceptions import McapError
+
+    kinds: dict[int, Any] = {
+        mcap_scan.HEADER: records.Header,
+        mcap_scan.FOOTER: records.Footer,
+        mcap_scan.SCHEMA: records.Schema,
+        mcap_scan.CHANNEL: records.Channel,
+        mcap_scan.METADATA: records.Metadata,
+        mcap_scan.ATTACHMENT: records.Attachment,
+    }
+    try:
+        return kinds[opcode].read(ReadDataStream(io.BytesIO(data)))
+    except (McapError, ValueError, EOFError, OverflowError):
+        return None
+    except Exception as error:  # struct.error is no ValueError
+        if type(error).__name__ == "error":
+            return None
+        raise
+
+
+def profile_of(head: bytes) -> str | None:
+    """The profile in the header record of an MCAP file's first bytes; None if there is none."""
+    start = len(MAGIC) + HEAD.size
+    if not head.startswith(MAGIC) or len(head) < start + 4 or head[len(MAGIC)] != mcap_scan.HEADER:
+        return None
+    length = int.from_bytes(head[start : start + 4], "little")
+    return head[start + 4 : start + 4 + length].decode("utf-8", "replace") if length < 1024 else None
+
+
+def from_summary(path: Path) -> list[Any]:
+    """Schemas and channels that the summary at the end of a file repeats; [] if there is none."""
+    tail = HEAD.size + 20 + len(MAGIC)
+    found = []
+    try:
+        with path.open("rb") as stream:
+            size = stream.seek(0, 2)
+            stream.seek(max(0, size - tail))
+            end = stream.read()
+            footer = parse(mcap_scan.FOOTER, end[HEAD.size :]) if end.endswith(MAGIC) else None
+            start = footer.summary_start if footer else 0
+            if not 0 < start < size or size - start > mcap_scan.LARGEST_RECORD:
+                return []
+            stream.seek(start)
+            data = stream.read(size - start - tail)
+    except OSError:
+        return []
+    at = 0
+    while at + HEAD.size <= len(data):
+        opcode, length = HEAD.unpack_from(data, at)
+        content = data[at + HEAD.size : at + HEAD.size + length]
+        if opcode in (mcap_scan.SCHEMA, mcap_scan.CHANNEL) and len(content) == length:
+            found.append(parse(opcode, content))
+        at += HEAD.size + length
+    return [record for record in found if record is not None]
+
+
+def index_of(messages: NDArray[np.int64]) -> dict[int, NDArray[np.uint64]]:
+    """Channel -> (n, 2) log time [ns] and offset of each message record, from `Scan.messages`."""
+    index = {}
+    for channel in np.unique(messages[:, 2]).tolist():
+        mine = messages[messages[:, 2] == channel]
+        index[channel] = np.column_stack([mine[:, 3], mine[:, 0] - 31]).astype(np.uint64)
+    return index

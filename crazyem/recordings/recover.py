@@ -1,0 +1,205 @@
+"""A broken MCAP file into a new, valid one: every complete chunk, whatever program wrote it."""
+
+import os
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from crazyem.errors import FileFormatError, UsageError
+from crazyem.recordings import mcap_scan
+from crazyem.recordings.mcap_messages import PROFILE
+from crazyem.recordings.mcap_output import Output
+from crazyem.recordings.mcap_scan import HEAD, MAGIC, Loss, Problem
+from crazyem.recordings.mcap_survey import Part, from_summary, index_of, parse, parts, profile_of
+
+
+@dataclass
+class Report:
+    """What became of a file.
+
+    Attributes:
+        profile: of the file, "" if its header is damaged.
+        messages, chunks, metadata, attachments: what was recovered.
+        lost_messages: as the sequence numbers tell; None for a file of another program.
+        problems: the bytes that could not be used, by offset.
+        closed: whether the file was complete.
+    """
+
+    profile: str = ""
+    messages: int = 0
+    chunks: int = 0
+    metadata: int = 0
+    attachments: int = 0
+    lost_messages: int | None = None
+    problems: list[Problem] = field(default_factory=list)
+
+    @property
+    def closed(self) -> bool:
+        return not any(p.loss in (Loss.CUT, Loss.OPEN) for p in self.problems)
+
+    @property
+    def lost_bytes(self) -> int:
+        return sum(p.end - p.offset for p in self.problems)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "profile": self.profile,
+            "messages": self.messages,
+            "chunks": self.chunks,
+            "metadata": self.metadata,
+            "attachments": self.attachments,
+            "lost_messages": self.lost_messages,
+            "lost_bytes": self.lost_bytes,
+            "closed": self.closed,
+            "problems": [{"kind": str(p.loss), "offset": p.offset, "end": p.end, "text": p.why} for p in self.problems],
+        }
+
+    def __str__(self) -> str:
+        lines = [f"{self.messages} messages in {self.chunks} chunks recovered"]
+        if self.lost_messages:
+            lines.append(f"{self.lost_messages} messages lost")
+        lines += [f"byte {p.offset} to {p.end}: {p.why}" for p in self.problems if p.loss is not Loss.OPEN]
+        return "\n".join(lines)
+
+
+def recover(source: str | Path, target: str | Path, *, replace: bool = False) -> Report:
+    """Write all that can be read of an MCAP file into a new one, with its index and statistics made anew.
+
+    Args:
+        source: of any profile; only read.
+        target: another file.
+        replace: an existing target may be replaced.
+
+    Raises: UsageError (no such file, target exists or cannot be written), FileFormatError (no MCAP file, or nothing in
+        it that can be read).
+    """
+    source, target = Path(source), Path(target)
+    if not source.is_file():
+        raise UsageError(f"{source}: no such file.")
+    if target.exists() and (not replace or target.samefile(source)):
+        what = "is the damaged file itself" if target.samefile(source) else "exists already"
+        raise UsageError(f"{target} {what}; it was left as it is.")
+    temporary = ""
+    try:
+        with source.open("rb") as stream:
+            head = stream.read(4096)
+        if not head.startswith(MAGIC):
+            raise FileFormatError(f"{source} is not an MCAP file.")
+        handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+        with os.fdopen(handle, "wb") as stream:
+            report = _copy(source, head, Output(stream))
+            stream.flush()
+            os.fsync(stream.fileno())
+        if not report.messages:
+            where = f" (byte {report.problems[0].offset}: {report.problems[0].why})" if report.problems else ""
+            raise FileFormatError(f"{source}: not one message can be recovered{where}.")
+        os.chmod(temporary, source.stat().st_mode & 0o777 | 0o200)
+        os.replace(temporary, target)
+    except OSError as error:
+        raise UsageError(f"{target} cannot be written: {error.strerror or error}.") from error
+    finally:
+        if temporary and os.path.exists(temporary):
+            os.unlink(temporary)
+    return report
+
+
+def _copy(source: Path, head: bytes, output: Output) -> Report:
+    profile = profile_of(head)
+    report = Report(profile=profile or "")
+    output.start(report.profile, "crazyem recover")
+    # a damaged chunk may have held announcements that only the summary repeats
+    known = {(type(r).__name__, r.id): r for r in from_summary(source)}
+    counter = _Sequence()
+    seen: set[tuple[str, int]] = set()
+    summary = False
+    for part in parts(source, report.problems):
+        summary = summary or part.record.opcode == mcap_scan.DATA_END
+        for entry in part.announced:
+            if not summary:
+                _announce(output, entry)
+                seen.add((type(entry).__name__, entry.id))
+        if part.scan is not None:
+            _restore(output, part, known, seen)
+            _messages(output, part, report)
+            counter.take(part)
+        elif part.record.opcode == mcap_scan.METADATA:
+            record = parse(mcap_scan.METADATA, part.record.data)
+            if record is not None:
+                output.metadata(record.name, record.metadata)
+                report.metadata += 1
+        elif part.record.opcode == mcap_scan.ATTACHMENT:
+            report.attachments += _attachment(source, part, output)
+    report.lost_messages = counter.lost if report.profile == PROFILE else None
+    output.finish()
+    return report
+
+
+def _announce(output: Output, entry: Any) -> None:
+    if hasattr(entry, "topic"):
+        told = (entry.schema_id, entry.topic, entry.message_encoding, entry.metadata)
+        output.book.channels.setdefault(entry.id, told)
+    else:
+        output.book.schemas.setdefault(entry.id, (entry.name, entry.encoding, entry.data))
+
+
+def _restore(output: Output, part: Part, known: dict[tuple[str, int], Any], seen: set[tuple[str, int]]) -> None:
+    """Announce what the messages of this part need and nothing before has announced, from the summary."""
+    assert part.scan is not None
+    needed = []
+    for channel in set(part.scan.messages[:, 2].tolist()):
+        entry = known.get(("Channel", channel))
+        if entry is None or ("Channel", channel) in seen:
+            continue
+        schema = known.get(("Schema", entry.schema_id))
+        if schema is not None and ("Schema", schema.id) not in seen:
+            needed.append(schema)
+        needed.append(entry)
+    for entry in needed:
+        seen.add((type(entry).__name__, entry.id))
+        _announce(output, entry)
+    if needed:
+        output.announce_again()
+
+
+def _messages(output: Output, part: Part, report: Report) -> None:
+    """A chunk goes over as it stands, byte for byte; records outside chunks into chunks."""
+    assert part.scan is not None
+    index = index_of(part.scan.messages)
+    if not index:
+        return
+    report.messages += len(part.scan.messages)
+    report.chunks += 1
+    if part.chunk is not None:
+        chunk = part.chunk
+        output.flush_announcements()
+        output.chunk(chunk.compression, bytes(chunk.packed), size=chunk.size, crc=chunk.crc, index=index)
+    else:
+        output.messages(part.scan.data.tobytes(), index)
+
+
+def _attachment(source: Path, part: Part, output: Output) -> int:
+    with source.open("rb") as stream:
+        stream.seek(part.record.offset + HEAD.size)
+        data = stream.read(part.record.end - part.record.offset - HEAD.size)
+    record = parse(mcap_scan.ATTACHMENT, data)
+    if record is None:
+        return 0
+    output.attachment(record)
+    return 1
+
+
+class _Sequence:
+    """Counts what is missing in the sequence numbers of our recordings, which run through the whole file."""
+
+    def __init__(self) -> None:
+        self.newest = 0
+        self.lost = 0
+
+    def take(self, part: Part) -> None:
+        assert part.scan is not None
+        numbers = part.scan.messages[:, 5]
+        if numbers.size:
+            self.lost += max(int(numbers[0]) - self.newest - 1, 0)
+            self.newest = int(numbers[-1])

@@ -1,0 +1,186 @@
+"""Messages of fixed length, all fields eight bytes wide: arrays to protobuf bytes and back, a column at a time.
+
+Two kinds of channels use them: log blocks as flown (schemas.BlockCodec) and signals of an imported recording
+(`StreamLayout`). A protobuf decoder reads either; here they are a numpy record array with tags between the fields.
+"""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.recordings import schemas
+
+MOST_SIGNALS = 60  # in one message, a bit each in `marked`
+MOST_FIELDS = 4096  # in one message; guards against metadata that claim anything
+
+
+class FixedMessages:
+    """Messages whose fields are all doubles or 64-bit integers and all present.
+
+    Args:
+        kinds: numpy type of each field, "<f8", "<i8" or "<u8"; numbered from 1.
+    """
+
+    def __init__(self, kinds: Sequence[str]) -> None:
+        tags = [schemas.tag(number, 1) for number in range(1, len(kinds) + 1)]
+        offsets, at = [], 0
+        for tag in tags:
+            offsets.append(at + len(tag))
+            at += len(tag) + 8
+        self.size = at
+        self._dtype = np.dtype(
+            {"names": [str(i) for i in range(len(kinds))], "formats": list(kinds), "offsets": offsets, "itemsize": at}
+        )
+        self._blank = np.zeros(at, np.uint8)
+        fixed = np.ones(at, bool)
+        for tag, offset in zip(tags, offsets, strict=True):
+            self._blank[offset - len(tag) : offset] = np.frombuffer(tag, np.uint8)
+            fixed[offset : offset + 8] = False
+        self._tags = np.flatnonzero(fixed)
+
+    def encode(self, columns: Sequence[NDArray[Any]]) -> NDArray[np.uint8]:
+        """(n, size) bytes of n messages, from one (n,) array a field."""
+        count = len(columns[0])
+        rows = np.empty((count, self.size), np.uint8)
+        rows[:] = self._blank
+        fields = rows.view(self._dtype)[:, 0]
+        for name, column in zip(self._dtype.names or (), columns, strict=True):
+            fields[name] = column
+        return rows
+
+    def decode(self, data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """(n,) record array with fields "0", "1", ... of the messages at `offsets`, and which of them are sound."""
+        rows = data[offsets[:, None] + np.arange(self.size)]
+        sound = (rows[:, self._tags] == self._blank[self._tags]).all(axis=1)
+        return rows.view(self._dtype)[:, 0], sound
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A signal in a stream: what `SignalArray` says of it.
+
+    Attributes:
+        index: its place among the signals of the recording.
+        width: number of components.
+    """
+
+    name: str
+    index: int
+    width: int
+    quantity: str = ""
+    unit: str = ""
+    frame: str = ""
+    clock: str = ""
+    source: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class StreamLayout:
+    """The messages of one stream: time, host_time, marked, perhaps row, then the components of its signals.
+
+    Attributes:
+        identifier: a protobuf name, unique in the file.
+        stream: as in `SignalArray`.
+        signals: in processing order.
+        rows: messages carry their row in the arrays, where that is not the order in which they were processed.
+        components: names of the components, one tuple a signal.
+    """
+
+    identifier: str
+    stream: str
+    signals: tuple[Column, ...]
+    rows: bool = False
+    components: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def schema_name(self) -> str:
+        return f"crazyem.signals.{self.identifier}"
+
+    @cached_property
+    def messages(self) -> FixedMessages:
+        fixed = ["<f8", "<f8", "<u8", *(["<i8"] if self.rows else [])]
+        return FixedMessages(fixed + ["<f8"] * sum(s.width for s in self.signals))
+
+    @property
+    def first(self) -> int:
+        """Number of the field of the first component, from 0."""
+        return 4 if self.rows else 3
+
+    def fields(self) -> list[tuple[str, str]]:
+        """Name and protobuf type of each field."""
+        fields = [("time", "double"), ("host_time", "double"), ("marked", "fixed64")]
+        fields += [("row", "sfixed64")] if self.rows else []
+        taken = {name for name, _ in fields}
+        for signal, names in zip(self.signals, self.components, strict=True):
+            for component in names or ("",) * signal.width:
+                name = unique_name(f"{signal.name}_{component}" if component else signal.name, taken)
+                fields.append((name, "double"))
+        return fields
+
+    def schema_data(self) -> bytes:
+        """Serialised FileDescriptorSet."""
+        return schemas.dynamic_schema("crazyem.signals", self.identifier, self.fields())
+
+    def metadata(self) -> dict[str, str]:
+        """What the channel says of its signals, enough to make them again."""
+        names = [name for name, _ in self.fields()[self.first :]]
+        signals = []
+        for s in self.signals:
+            own, names = names[: s.width], names[s.width :]
+            signals.append(
+                {
+                    "name": s.name,
+                    "quantity": s.quantity,
+                    "unit": s.unit,
+                    "frame": s.frame,
+                    "clock": s.clock,
+                    "source": list(s.source),
+                    "components": own,
+                    "index": s.index,
+                }
+            )
+        return {"stream": self.stream, "rows": str(int(self.rows)), "signals": json.dumps(signals)}
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, str]) -> "StreamLayout":
+        """Inverse of `metadata`, of what reading needs. Raises ValueError, KeyError or TypeError on anything else."""
+        columns = tuple(
+            Column(
+                name=str(entry["name"]),
+                index=int(entry["index"]),
+                width=len(list(entry["components"])),
+                quantity=str(entry["quantity"]),
+                unit=str(entry["unit"]),
+                frame=str(entry["frame"]),
+                clock=str(entry["clock"]),
+                source=tuple(str(v) for v in entry["source"]),
+            )
+            for entry in json.loads(metadata["signals"])
+        )
+        if not columns or len(columns) > MOST_SIGNALS or sum(c.width for c in columns) > MOST_FIELDS:
+            raise ValueError("not a stream of signals")
+        return cls("", str(metadata["stream"]), columns, metadata["rows"] == "1")
+
+
+def unique_name(text: str, taken: set[str]) -> str:
+    """A protobuf identifier that looks like `text`, and is none of `taken` (to which it is added) however spelt."""
+    name = re.sub(r"[^A-Za-z0-9_]+", "_", text).strip("_") or "x"
+    name = f"x{name}" if name[0].isdigit() else name
+    candidate, number = name, 1
+    # JSON names of protobuf fields drop underscores and capitals: two fields must differ in those as well
+    keys = {_key(t) for t in taken}
+    while _key(candidate) in keys:
+        number += 1
+        candidate = f"{name}_n{number}"
+    taken.add(candidate)
+    return candidate
+
+
+def _key(name: str) -> str:
+    return name.replace("_", "").lower()
