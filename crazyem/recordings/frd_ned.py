@@ -10,6 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.recordings.topics import floats
+
 Columns = Sequence[NDArray[np.generic]]
 
 WORLD = "world, north-west-up"
@@ -19,7 +21,7 @@ MOTORS = "rotors 1..4 as the autopilot numbers them"
 
 def stacked(columns: Columns) -> NDArray[np.float64]:
     """(n, c) float64 from c columns of (n,) numbers."""
-    return np.column_stack([np.asarray(c, float) for c in columns])
+    return np.column_stack([floats(c) for c in columns])
 
 
 def vectors(columns: Columns) -> NDArray[np.float64]:
@@ -31,7 +33,7 @@ def vectors(columns: Columns) -> NDArray[np.float64]:
 
 def quaternions(columns: Columns) -> NDArray[np.float64]:
     """(n, 4) x y z w, body FLU to NWU, from columns w x y z of FRD to NED."""
-    w, x, y, z = (np.asarray(c, float) for c in columns)
+    w, x, y, z = (floats(c) for c in columns)
     return np.column_stack([x, -y, -z, w])
 
 

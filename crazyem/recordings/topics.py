@@ -66,6 +66,12 @@ class Mapped:
     origin: str = ""
 
 
+def floats(column: NDArray[np.generic]) -> NDArray[np.float64]:
+    """(n,) as float64; any NaN stays one, signalling ones of damaged files too."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(column, np.float64)
+
+
 def masked(value: NDArray[np.float64], invalid: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """The values with NaN in rows that the file calls invalid, and those rows; (n, c) and (n,)."""
     return np.where(invalid[:, None], np.nan, value), invalid
@@ -119,7 +125,7 @@ def signals_of(topics: Sequence[Topic], mapped: Sequence[Mapped]) -> tuple[dict[
     for place, (topic, column) in enumerate(raw, start=len(mapped)):
         signals[f"{topic.name}.{column}"] = SignalArray(
             topic.time,
-            np.asarray(topic.columns[column], float)[:, None],
+            floats(topic.columns[column])[:, None],
             topic.order * step + place,
             hosts[topic.name],
             unmarked[topic.name],

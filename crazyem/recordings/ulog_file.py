@@ -59,6 +59,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
     sound = scan(data)
     del data
     log = _decode(path, sound)
+    sound.data = b""  # pyulog has its own copy
     topics = _topics(log)
     if not any(topic.time.size for topic in topics):
         raise FileFormatError(f"{path}: the log holds not a single message of a topic ({sound.messages} others).")

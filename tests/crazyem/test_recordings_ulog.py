@@ -352,7 +352,7 @@ def test_truncation_at_every_byte(tmp_path: Path) -> None:
             assert offset in starts
         else:
             assert size in starts
-    assert readable > 800  # from the first data message on
+    assert readable > 700  # from the first data message on
 
 
 def test_garbage_in_the_middle_costs_only_itself(tmp_path: Path) -> None:
