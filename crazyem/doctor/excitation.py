@@ -1,0 +1,409 @@
+"""What a flight's noise lets its commands say: prewhitened regressions of acceleration on commanded force and torque.
+
+Acceleration over a step between two samples is compared with the mean thrust and torque over it, after rotor lag and
+delay. Its residual is whitened by an autoregression fitted to it (generalised least squares), so that the standard
+deviations are those of an efficient estimator under the noise that this flight really has (the Cramer-Rao bound of the
+linearised model), and widened for what correlation is left (Newey and West 1987). What noise in sampled commands costs
+is counted as in crazyem.estimation.aliasing: commands of a 500 Hz loop, logged slower, are partly noise that never
+acted. Priors on lag, delay and offsets are the estimator's; the parameter in question has none.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from crazyem.doctor.envelope import Airborne, held, sound_samples
+from crazyem.physics.lag import CAUSAL, LINEAR, fit_predictor, hold_predictor, lagged_means
+from crazyem.physics.rotations import quaternion_conjugate, quaternion_product, rotation_vector_from_quaternion
+from crazyem.physics.rotors import wrench_from_command, wrench_from_speed
+from crazyem.recordings.recording import Recording
+from crazyem.vehicle import GRAVITY, Vehicle
+
+Array = NDArray[np.float64]
+
+ORDER = 12  # of the whitening autoregression
+FINEST = 4e-3  # s; faster streams are averaged into steps of 5 ms
+COARSE = 5e-3
+LONGEST_STEP = 0.05  # s; a longer hole between two samples parts two stretches
+MOST_STEPS = 24_000  # more are sampled in blocks, and the information scaled
+BLOCK = 2_000
+ASSUMED_VOLTAGE = 3.7  # V, where none is logged
+DELAY, DELAY_SD = 3.5e-3, 2e-3  # s, prior of the estimator for commands
+SPEED_DELAY_SD = 10e-3  # s, and for measured rotor speeds
+LAG_SD = 0.7  # of the logarithm
+INERTIA_SD = 0.5
+TRIM = 0.05  # shift of the centre of mass over the arm: prior of the torque offsets
+_DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])
+_MAX_LAG = 100
+# of one iteration: logarithms of inertia and lag, delay [ms], offsets as far as they like
+_LONGEST_MOVE = np.array([0.4, 0.4, 0.4, 0.4, 5.0, np.inf, np.inf, np.inf])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inputs:
+    """Commanded wrench: time (n,) s, wrench (n, 4) N and N m, which signal it is from, whether rotor lag is to come."""
+
+    time: Array
+    wrench: Array
+    signal: str
+    lagged: bool
+    voltage_known: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Steps:
+    """Steps between samples: stretches of nodes without holes; share says which part of the flight they are."""
+
+    nodes: tuple[Array, ...]  # (k,) s each
+    values: tuple[Array, ...]  # (k, c) each
+    period: float  # s
+    share: float
+
+    @property
+    def count(self) -> int:
+        return sum(t.size - 1 for t in self.nodes)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A regression: value, what noise and what systematic error may be off by one standard deviation, all (p,)."""
+
+    value: Array
+    sd: Array
+    bias: Array
+
+    def total(self, i: int, *, stretch: float = 1.0) -> float:
+        """Standard deviation of parameter i, the random part of a flight `stretch` times as long."""
+        return math.hypot(float(self.sd[i]) / math.sqrt(stretch), float(self.bias[i]))
+
+
+def inputs_of(recording: Recording, vehicle: Vehicle) -> Inputs | str:
+    """The wrench the estimator would use, or why there is none."""
+    speed = _sound(recording, "rotor_speed")
+    if speed is not None and vehicle.rotor_constant is not None:
+        return Inputs(speed[0], wrench_from_speed(speed[1], vehicle), "rotor_speed", False, True)
+    command = _sound(recording, "motor_command")
+    if command is not None and vehicle.thrust_curve:
+        voltage = _sound(recording, "voltage")
+        volts = (
+            np.full(command[0].size, ASSUMED_VOLTAGE)
+            if voltage is None
+            else held(voltage[0], voltage[1][:, 0], command[0])
+        )
+        wrench = wrench_from_command(command[1], volts, vehicle)
+        return Inputs(command[0], wrench, "motor_command", vehicle.motor_time_constant > 0, voltage is not None)
+    asked = _sound(recording, "wrench_command")
+    if asked is not None:
+        return Inputs(asked[0], asked[1], "wrench_command", vehicle.motor_time_constant > 0, True)
+    if speed is not None:
+        return f"rotor speeds are known, but not the thrust they give (vehicle {vehicle.name} has no rotor_constant)"
+    if "motor_request" in recording.signals or "mixer_command" in recording.signals:
+        return "only what was asked of the rotors is known, not the duty that was sent to them"
+    return "there are no motor commands, rotor speeds or commanded thrust"
+
+
+def steps_of(time: Array, value: Array, air: Airborne) -> Steps | None:
+    """Stretches of samples (n, c) in the air, thinned to steps of at least 4 ms by averaging; None with too few."""
+    inside = air.covers(time)
+    time, value = time[inside], value[inside]
+    if time.size < 4 * ORDER:
+        return None
+    if np.median(np.diff(time)) < FINEST:
+        time, value = _binned(time, value)
+    keep = np.append(True, np.diff(time) > 0.0)
+    time, value = time[keep], value[keep]
+    period = float(np.median(np.diff(time))) if time.size > 1 else math.nan
+    cuts = np.flatnonzero(np.diff(time) > max(LONGEST_STEP, 3.5 * period)) + 1
+    pieces = [p for p in zip(np.split(time, cuts), np.split(value, cuts)) if p[0].size > 3 * ORDER]
+    total = sum(t.size for t, _ in pieces)
+    if total > MOST_STEPS:
+        pieces = _sampled(pieces, total)
+    if not pieces:
+        return None
+    return Steps(
+        tuple(t for t, _ in pieces), tuple(v for _, v in pieces), period, sum(t.size for t, _ in pieces) / total
+    )
+
+
+def lagged(inputs: Inputs, steps: Steps, *, tau: float, delay: float) -> list[tuple[Array, Array, Array]]:
+    """For each stretch, means of the wrench over its steps (k, 4) and their derivatives by tau and delay [1/s]."""
+    mode = CAUSAL if inputs.lagged else LINEAR
+    causal = mode == CAUSAL
+    predictor = fit_predictor(_all_between(inputs, steps)) if causal else hold_predictor()
+    result = []
+    for nodes in steps.nodes:
+        begin = int(np.searchsorted(inputs.time, nodes[0] - delay - 10.0 * max(tau, 0.02), "right")) - 1
+        first = max(begin, 0)
+        last = int(np.searchsorted(inputs.time, nodes[-1] + 0.1, "right"))
+        times = np.ascontiguousarray(inputs.time[first:last])
+        commands = np.ascontiguousarray(inputs.wrench[first:last])
+        mean, by_tau, by_delay = (np.full((nodes.size, 4), np.nan) for _ in range(3))
+        if times.size >= 2:
+            state = np.append(np.tile(commands[0], 3), times[0])
+            lagged_means(
+                times, commands, 0, times.size, predictor, nodes, 0, nodes.size, mode, tau, delay, state, mean, by_tau,
+                by_delay,
+            )  # fmt: skip
+        late = np.searchsorted(times, nodes, "right")
+        far = nodes - times[np.maximum(late - 1, 0)] > 0.1 if times.size else np.ones(nodes.size, bool)
+        mean[far | (nodes < inputs.time[0] + 0.2)] = np.nan
+        result.append((mean[1:], by_tau[1:], by_delay[1:]))
+    return result
+
+
+def rotation_fit(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | None:
+    """Joint fit of log Ixx, log Iyy, log Izz, log tau, delay [ms] and torque offsets [N m]: 8 parameters.
+
+    Args:
+        inputs: the wrench.
+        steps: of the body rate (k, 3) [rad/s].
+        vehicle: nominal inertia (start, and scale of the gyroscopic term), lag and arm.
+
+    Returns: None with too few steps.
+    """
+    nominal = np.array(vehicle.inertia)
+    unit = max(TRIM * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
+    delay_sd = (DELAY_SD if inputs.lagged else SPEED_DELAY_SD) * 1e3
+    timed = inputs.lagged
+    centre = np.array([*np.log(nominal), math.log(max(vehicle.motor_time_constant, 1e-4)), 0.0, 0.0, 0.0, 0.0])
+    centre[4] = DELAY * 1e3 if timed else 0.0
+    prior = np.array([INERTIA_SD] * 3 + [LAG_SD if timed else 1e-9, delay_sd, unit, unit, unit]) ** -2.0
+    theta = centre.copy()
+    response = [_angular_acceleration(t, w, nominal) for t, w in zip(steps.nodes, steps.values)]
+    for _ in range(8):
+        tau, delay = (math.exp(theta[3]) if timed else 0.0), theta[4] * 1e-3
+        rows = lagged(inputs, steps, tau=tau, delay=delay)
+        system = _RotationSystem(response, rows, theta, tau)
+        if system.count < 10 * ORDER:
+            return None
+        step = np.linalg.solve(system.matrix + np.diag(prior), system.score + prior * (centre - theta))
+        theta = theta + np.clip(step, -_LONGEST_MOVE, _LONGEST_MOVE)
+        theta[4] = min(max(theta[4], -20.0), 40.0)
+        if np.all(np.abs(step[:4]) < 1e-3):
+            break
+    noise = _command_noise_score(inputs, steps, system, theta, timed=timed)
+    sd, bias = np.zeros(8), np.zeros(8)
+    share = steps.share
+    for i in range(8):
+        own = prior.copy()
+        own[i] = 0.0
+        covariance = np.linalg.pinv(system.matrix / share + np.diag(own), hermitian=True)
+        inflation = system.inflation(covariance)
+        sd[i] = math.sqrt(max(covariance[i, i], 0.0)) * inflation[i]
+        # the larger of what it costs with everything else known and of what it costs with everything else free
+        together = abs(float(covariance[i] @ noise)) / share
+        bias[i] = max(together, min(float(noise[i] / max(system.matrix[i, i], 1e-300)), 1.0) if noise[i] > 0.0 else 0.0)
+    return Fit(theta, sd, bias)
+
+
+def linear_fit(response: list[Array], columns: list[Array], *, share: float = 1.0) -> Fit | None:
+    """Generalised least squares of responses (k,) on columns (k, p), stretch by stretch; None with too few rows."""
+    width = columns[0].shape[1]
+    y, x = np.concatenate(response), np.concatenate(columns)
+    good = np.isfinite(y) & np.isfinite(x).all(axis=1)
+    if good.sum() < 10 * ORDER:
+        return None
+    scale = np.sqrt(np.mean(x[good] ** 2, axis=0))
+    if not np.all(scale > 0.0):
+        return None
+    theta = np.linalg.lstsq(x[good] / scale, y[good], rcond=None)[0] / scale
+    for _ in range(4):
+        weights = _autoregression([r - c @ theta for r, c in zip(response, columns)])
+        z, f = (np.concatenate([_filtered(weights, part) for part in parts]) for parts in (response, columns))
+        good = np.isfinite(z) & np.isfinite(f).all(axis=1)
+        z, f = z[good], f[good] / scale
+        if z.size < 5 * width or np.linalg.matrix_rank(f) < width:
+            return None
+        theta = np.linalg.lstsq(f, z, rcond=None)[0] / scale
+    left = z - f @ (theta * scale)
+    variance = float(left @ left) / max(z.size - width, 1)
+    covariance = np.linalg.inv(f.T @ f) * variance
+    inflation = _inflation(f * left[:, None], covariance)
+    return Fit(theta, np.sqrt(np.diag(covariance)) / scale * inflation * math.sqrt(share), np.zeros(width))
+
+
+def rates_of_attitude(time: Array, attitude: Array) -> tuple[Array, Array]:
+    """Mean body rates (n - 1, 3) [rad/s] between attitudes (n, 4), at the middle of each step."""
+    turn = quaternion_product(quaternion_conjugate(attitude[:-1]), attitude[1:])
+    span = np.diff(time)
+    good = (span > 0.0) & (span < LONGEST_STEP)
+    rate = rotation_vector_from_quaternion(turn[good]) / span[good, None]
+    return 0.5 * (time[:-1] + time[1:])[good], rate
+
+
+class _RotationSystem:
+    """Normal equations of the rotation at one point, whitened axis by axis."""
+
+    def __init__(self, response: list[Array], rows: list[tuple[Array, Array, Array]], theta: Array, tau: float) -> None:
+        self.matrix, self.score, self.count = np.zeros((8, 8)), np.zeros(8), 0
+        self.weights: list[Array] = []
+        self.variance: list[float] = []
+        self.rate_variance: list[float] = []
+        self.terms: list[Array] = []
+        for axis in range(3):
+            inverse = math.exp(-theta[axis])
+            left, jacobian = [], []
+            for y, (mean, by_tau, by_delay) in zip(response, rows):
+                torque = mean[:, 1 + axis] + theta[5 + axis]
+                left.append(y[:, axis] - inverse * torque)
+                columns = np.zeros((torque.size, 8))
+                columns[:, axis] = -inverse * torque
+                columns[:, 3] = inverse * by_tau[:, 1 + axis] * tau
+                columns[:, 4] = inverse * by_delay[:, 1 + axis] * 1e-3
+                columns[:, 5 + axis] = inverse
+                jacobian.append(columns)
+            weights = _autoregression(left)
+            z, f = (np.concatenate([_filtered(weights, part) for part in parts]) for parts in (left, jacobian))
+            good = np.isfinite(z) & np.isfinite(f).all(axis=1)
+            z, f = z[good], f[good]
+            variance = float(np.mean(z**2)) if z.size else math.inf
+            self.weights.append(weights)
+            self.variance.append(variance)
+            self.rate_variance.append(_first_covariance(left))
+            if z.size:
+                self.matrix += f.T @ f / variance
+                self.score += f.T @ z / variance
+                self.terms.append(f * (z / variance)[:, None])
+            self.count = max(self.count, z.size)
+
+    def inflation(self, covariance: Array) -> Array:
+        """(8,) factors by which correlation left in the scores widens standard deviations; never below 1."""
+        scaled = [terms @ covariance for terms in self.terms]
+        plain = sum(np.sum(s**2, axis=0) for s in scaled)
+        wide = sum(_long_run(s) for s in scaled)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.sqrt(np.maximum(np.where(plain > 0.0, wide / plain, 1.0), 1.0))
+
+
+def _command_noise_score(inputs: Inputs, steps: Steps, system: _RotationSystem, theta: Array, *, timed: bool) -> Array:
+    """(8,) what noise in the samples of the commands adds to the score: made noise of that size, sent the same way."""
+    score = np.zeros(8)
+    if not timed:
+        return score
+    tau, delay = math.exp(theta[3]), theta[4] * 1e-3
+    nodes = np.concatenate(steps.nodes)
+    rates = np.concatenate(steps.values)
+    inside = np.concatenate([_indices(inputs, t) for t in steps.nodes])
+    if inside.size < 20:
+        return score
+    near = np.clip(np.searchsorted(nodes, inputs.time[inside]), 1, nodes.size - 1)
+    near -= inputs.time[inside] - nodes[near - 1] < nodes[near] - inputs.time[inside]
+    rng = np.random.default_rng(0)
+    noise = np.zeros_like(inputs.wrench)
+    for axis in range(3):
+        white = _white_variance(
+            inputs.wrench[inside, 1 + axis],
+            rates[near, axis],
+            rate_variance=system.rate_variance[axis] * steps.period**2,
+        )
+        noise[:, 1 + axis] = math.sqrt(white) * rng.standard_normal(inputs.time.size)
+    made = Inputs(inputs.time, noise, inputs.signal, inputs.lagged, inputs.voltage_known)
+    for mean, by_tau, by_delay in lagged(made, steps, tau=tau, delay=delay):
+        for axis in range(3):
+            inverse = math.exp(-theta[axis])
+            m, by_log_tau, by_ms = (
+                _filtered(system.weights[axis], inverse * part[:, 1 + axis])
+                for part in (mean, by_tau * tau, by_delay * 1e-3)
+            )
+            score[axis] += np.nansum(m * m) / system.variance[axis]
+            score[3] -= np.nansum(m * by_log_tau) / system.variance[axis]
+            score[4] -= np.nansum(m * by_ms) / system.variance[axis]
+    return score
+
+
+def _white_variance(command: Array, rate: Array, *, rate_variance: float) -> float:
+    """Variance of what in command samples (n,) does not persist: see crazyem.estimation.aliasing, same arithmetic."""
+    du, dw = np.convolve(command, _DIFFERENCE, "valid"), np.convolve(rate, _DIFFERENCE, "valid")
+    power = float(dw @ dw)
+    gain = float(du @ dw) / power if power > 0.0 else 0.0
+    return gain**2 * rate_variance + float(np.mean((du - gain * dw) ** 2)) / 20.0
+
+
+def _angular_acceleration(time: Array, rate: Array, inertia: Array) -> Array:
+    """(k, 3) rad/s^2 over each step, less the gyroscopic part of the nominal inertia."""
+    middle = 0.5 * (rate[1:] + rate[:-1])
+    gyroscopic = np.cross(middle, middle * inertia) / inertia
+    return np.diff(rate, axis=0) / np.diff(time)[:, None] + gyroscopic
+
+
+def _autoregression(parts: list[Array]) -> Array:
+    """(ORDER + 1,) whitening filter of residuals (k,), by the Yule-Walker equations over all stretches."""
+    covariance = np.zeros(ORDER + 1)
+    for part in parts:
+        r = np.where(np.isfinite(part), part, 0.0)
+        r = r - r.mean() if r.size else r
+        covariance += [float(r[lag:] @ r[: r.size - lag]) if r.size > lag else 0.0 for lag in range(ORDER + 1)]
+    if not covariance[0] > 0.0:
+        return np.append(1.0, np.zeros(ORDER))
+    covariance[0] *= 1.0 + 1e-6
+    toeplitz = covariance[np.abs(np.subtract.outer(np.arange(ORDER), np.arange(ORDER)))]
+    return np.append(1.0, -np.linalg.solve(toeplitz, covariance[1:]))
+
+
+def _filtered(weights: Array, part: Array) -> Array:
+    """A stretch (k,) or (k, p) through the whitening filter, without its first rows."""
+    return np.asarray(lfilter(weights, [1.0], part, axis=0))[ORDER:]
+
+
+def _first_covariance(parts: list[Array]) -> float:
+    """Variance of the measurement noise over the squared step: minus the covariance of neighbouring residuals."""
+    pairs = np.concatenate([p[1:] * p[:-1] for p in parts]) if parts else np.zeros(0)
+    pairs = pairs[np.isfinite(pairs)]
+    return max(-float(pairs.mean()), 0.0) if pairs.size else 0.0
+
+
+def _inflation(terms: Array, covariance: Array) -> Array:
+    scaled = terms @ covariance
+    plain = np.sum(scaled**2, axis=0)
+    return np.sqrt(np.maximum(_long_run(scaled) / np.where(plain > 0.0, plain, 1.0), 1.0))
+
+
+def _long_run(terms: Array) -> Array:
+    """Variance of the column sums of terms (n, p), Bartlett kernel. (p,)."""
+    n = terms.shape[0]
+    lags = min(n // 8, _MAX_LAG)
+    total = np.sum(terms**2, axis=0)
+    for lag in range(1, lags + 1):
+        total = total + 2.0 * (1.0 - lag / (lags + 1.0)) * np.einsum("ij,ij->j", terms[lag:], terms[:-lag])
+    return np.maximum(total, 0.0)
+
+
+def _binned(time: Array, value: Array) -> tuple[Array, Array]:
+    """Means over bins of 5 ms, of those at least half full."""
+    bins = np.floor((time - time[0]) / COARSE).astype(np.int64)
+    starts = np.flatnonzero(np.append(True, np.diff(bins) > 0))
+    counts = np.diff(np.append(starts, time.size))
+    usual = float(np.median(counts))
+    good = counts >= 0.5 * usual
+    return (
+        (np.add.reduceat(time, starts) / counts)[good],
+        (np.add.reduceat(value, starts, axis=0) / counts[:, None])[good],
+    )
+
+
+def _sampled(pieces: list[tuple[Array, Array]], total: int) -> list[tuple[Array, Array]]:
+    """Blocks of BLOCK samples, evenly spread over the flight, of about MOST_STEPS in all."""
+    blocks = [
+        (t[i : i + BLOCK], v[i : i + BLOCK])
+        for t, v in pieces
+        for i in range(0, t.size, BLOCK)
+        if t[i : i + BLOCK].size > 3 * ORDER
+    ]
+    wanted = np.linspace(0, len(blocks) - 1, min(len(blocks), max(MOST_STEPS // BLOCK, 1))).round().astype(int)
+    return [blocks[i] for i in np.unique(wanted)]
+
+
+def _indices(inputs: Inputs, nodes: Array) -> NDArray[np.int64]:
+    return np.arange(np.searchsorted(inputs.time, nodes[0]), np.searchsorted(inputs.time, nodes[-1], "right"))
+
+
+def _all_between(inputs: Inputs, steps: Steps) -> Array:
+    return inputs.wrench[np.concatenate([_indices(inputs, nodes) for nodes in steps.nodes])]
+
+
+def _sound(recording: Recording, name: str) -> tuple[Array, Array] | None:
+    array = recording.signals.get(name)
+    return None if array is None else sound_samples(array)

@@ -1,0 +1,419 @@
+"""What a recording could identify of its drone, and what not: a verdict, a reason and an expected error for each.
+
+The limits are those of the estimator (crazyem.estimation.verdict): 15 % is "yes"; an inertia far from any such drone's
+is not believed. The sums are in excitation.py.
+"""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.doctor import excitation
+from crazyem.doctor.envelope import Airborne, held, sound_samples
+from crazyem.doctor.excitation import Fit, Inputs, Steps
+from crazyem.physics.rotations import rotation_matrix
+from crazyem.recordings.recording import Recording
+from crazyem.vehicle import GRAVITY, Vehicle
+
+Array = NDArray[np.float64]
+
+IDENTIFIABLE = 0.15  # relative standard deviation below which a parameter counts as identified
+WEAK = 0.5  # and below which the data say anything beyond what is known of such drones anyway
+IMPLAUSIBLE = 1.5  # |log| of an inertia over the nominal beyond which it is not believed
+WINDOW = 800  # samples the estimator looks back by default
+SHORTEST = 2.0  # s in the air
+ACCELEROMETER_OFFSET = 0.02  # of gravity: 20 mg, typical zero-g offset of a BMI088
+VOLTAGE_UNKNOWN = 0.15  # of thrust: a cell between 3.2 and 4.2 V, thrust as its square
+TYPICAL_DRAG = 0.2  # 1/s, force per mass and speed: what the drag of a Crazyflie's rotors is near (Foerster 2015)
+SCALE = "only its ratio to the rotors' thrust scale is seen"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether one thing can be identified.
+
+    Attributes:
+        name: mass, Ixx, Iyy, Izz, motor_time_constant, input_delay, torque_offsets, drag or battery_law.
+        verdict: "yes", "weak" (better than nothing) or "no".
+        reason: why, one clause.
+        relative_sd: expected standard deviation from all of the flight, over the value; None where there is no answer
+            or the value may be zero.
+        window_relative_sd: the same for the estimator's default window of 800 samples.
+        sd: the same in `unit`, None where there is no answer.
+        value: about which the error was computed, in `unit`; a rough fit, not an estimate to use.
+    """
+
+    name: str
+    verdict: str
+    reason: str
+    relative_sd: float | None = None
+    window_relative_sd: float | None = None
+    sd: float | None = None
+    value: float | None = None
+    unit: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+    def line(self) -> str:
+        """For a terminal."""
+        size = ""
+        if self.relative_sd is not None:
+            size = f"{percent(self.relative_sd)}"
+        elif self.sd is not None:
+            size = f"{self.sd:.2g} {self.unit}"
+        return f"  {self.name:<20} {self.verdict:<5} {size:>12}  {self.reason}"
+
+
+def percent(share: float) -> str:
+    """A relative standard deviation for people."""
+    return f"{100 * share:.2g} %" if share < 0.995 else "over 100 %" if share > 10 else f"{100 * share:.0f} %"
+
+
+def identifiability(recording: Recording, vehicle: Vehicle, air: Airborne) -> tuple[Verdict, ...]:
+    """Verdicts on mass, inertias, lag, delay, torque offsets, drag and battery law, in this order."""
+    if air.seconds < SHORTEST:
+        why = f"only {air.seconds:.1f} s in the air"
+        return tuple(Verdict(name, "no", why) for name in NAMES)
+    inputs = excitation.inputs_of(recording, vehicle)
+    turning, turn_from = _rates(recording, air)
+    if isinstance(inputs, str):
+        rotation = tuple(Verdict(name, "no", inputs) for name in NAMES[1:7])
+        return (Verdict("mass", "no", inputs), *rotation, _drag(recording, air), Verdict("battery_law", "no", inputs))
+    fit = excitation.rotation_fit(inputs, turning, vehicle) if turning is not None else None
+    tau = math.exp(fit.value[3]) if fit is not None and inputs.lagged else vehicle.motor_time_constant
+    delay = fit.value[4] * 1e-3 if fit is not None else 0.0
+    vertical = _vertical(recording, air)
+    rotation = _rotation(fit, inputs, turning, turn_from, vehicle)
+    return (
+        _mass(vertical, inputs, tau=tau, delay=delay),
+        *rotation,
+        _drag(recording, air),
+        _battery(recording, vertical, inputs, tau=tau, delay=delay),
+    )
+
+
+NAMES = (
+    "mass", "Ixx", "Iyy", "Izz", "motor_time_constant", "input_delay", "torque_offsets", "drag", "battery_law",
+)  # fmt: skip
+
+
+def replay_objection(recording: Recording, vehicle: Vehicle) -> str:
+    """Why `crazyem replay` cannot use the recording; empty if it can."""
+    inputs = excitation.inputs_of(recording, vehicle)
+    if isinstance(inputs, str):
+        return inputs
+    lacking = [name for name in ("position", "attitude") if not _has(recording, name)]
+    lacking += [] if inputs.voltage_known else ["voltage"]
+    return f"it has no {' and no '.join(lacking)}" if lacking else ""
+
+
+# mass ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Vertical:
+    """Specific force along body z over steps: response (k,) each, and what is not known of it, relative."""
+
+    steps: Steps
+    response: list[Array]
+    source: str
+    systematic: float
+
+
+def _vertical(recording: Recording, air: Airborne) -> _Vertical | None:
+    velocity, attitude = _sound(recording, "velocity"), _sound(recording, "attitude")
+    if velocity is not None:
+        steps = excitation.steps_of(*_with_attitude(velocity, attitude), air)
+        if steps is not None:
+            response, tilts = [], []
+            for t, v in zip(steps.nodes, steps.values):
+                force = np.diff(v[:, :3], axis=0) / np.diff(t)[:, None] + np.array([0.0, 0.0, GRAVITY])
+                up = _up(0.5 * (v[1:, 3:] + v[:-1, 3:])) if attitude is not None else np.array([0.0, 0.0, 1.0])
+                response.append(np.sum(force * up, axis=1))
+                tilts.append(v[:, :2])
+            if attitude is not None:
+                return _Vertical(steps, response, "velocity and attitude", 0.0)
+            return _Vertical(steps, response, "velocity, taken as upright", _lean(steps))
+    force = _sound(recording, "specific_force")
+    if force is not None:
+        steps = excitation.steps_of(force[0], force[1], air)
+        if steps is not None:
+            mean = [0.5 * (v[1:, 2] + v[:-1, 2]) for v in steps.values]
+            return _Vertical(steps, mean, "the accelerometer alone", ACCELEROMETER_OFFSET)
+    return None
+
+
+def _mass(vertical: _Vertical | None, inputs: Inputs, *, tau: float, delay: float) -> Verdict:
+    if vertical is None:
+        return Verdict("mass", "no", "neither velocity nor specific force is known in the air")
+    thrust = _thrust(vertical, inputs, tau=tau, delay=delay)
+    fit = excitation.linear_fit(vertical.response, [f[:, None] for f in thrust], share=vertical.steps.share)
+    if fit is None or not fit.value[0] > 0.0:
+        return Verdict("mass", "no", "thrust and acceleration have no common stretch long enough")
+    mass = 1.0 / fit.value[0]
+    fixed = math.hypot(vertical.systematic, 0.0 if inputs.voltage_known else VOLTAGE_UNKNOWN)
+    random = float(fit.sd[0] * mass)
+    relative = math.hypot(random, fixed)
+    reason = f"{SCALE}; from {vertical.source}"
+    if not inputs.voltage_known:
+        reason += "; the battery voltage is not logged, which alone costs 15 %"
+    elif vertical.systematic > random:
+        reason += f", which alone may be off by {percent(vertical.systematic)}"
+    return Verdict(
+        "mass", _grade(relative), reason, relative, math.hypot(random * _stretch(vertical.steps), fixed),
+        relative * mass, mass, "kg",
+    )  # fmt: skip
+
+
+def _thrust(vertical: _Vertical, inputs: Inputs, *, tau: float, delay: float) -> list[Array]:
+    tau = tau if inputs.lagged else 0.0
+    return [mean[:, 0] for mean, _, _ in excitation.lagged(inputs, vertical.steps, tau=tau, delay=delay)]
+
+
+def _lean(steps: Steps) -> float:
+    """How far thrust may be off for want of a tilt: half the mean square of the horizontal acceleration over g."""
+    squares = [np.mean((_slow(t, v[:, :2]) / GRAVITY) ** 2) for t, v in zip(steps.nodes, steps.values)]
+    return 0.005 + float(np.max(squares))
+
+
+def _slow(time: Array, velocity: Array) -> Array:
+    """Horizontal acceleration over a fifth of a second, too long for noise to count."""
+    far = max(1, round(0.2 / float(np.median(np.diff(time)))))
+    if time.size <= far:
+        return np.zeros((1, velocity.shape[1]))
+    return (velocity[far:] - velocity[:-far]) / (time[far:] - time[:-far])[:, None]
+
+
+# rotation ------------------------------------------------------------------------------------------------------
+
+
+def _rates(recording: Recording, air: Airborne) -> tuple[Steps | None, str]:
+    rate = _sound(recording, "body_rate")
+    if rate is not None:
+        return excitation.steps_of(rate[0], rate[1], air), "body rate"
+    attitude = _sound(recording, "attitude")
+    if attitude is not None and attitude[0].size > 2:
+        return excitation.steps_of(*excitation.rates_of_attitude(*attitude), air), "attitude alone"
+    return None, ""
+
+
+def _rotation(
+    fit: Fit | None, inputs: Inputs, steps: Steps | None, turn_from: str, vehicle: Vehicle
+) -> tuple[Verdict, ...]:
+    if fit is None or steps is None:
+        why = (
+            "neither body rate nor attitude is known" if not turn_from else f"too little of the {turn_from} in the air"
+        )
+        return tuple(Verdict(name, "no", why) for name in NAMES[1:7])
+    rate = 1.0 / steps.period
+    where = f"{turn_from} at {rate:.0f} Hz, {inputs.signal} at {1.0 / float(np.median(np.diff(inputs.time))):.0f} Hz"
+    inertias = [_inertia(i, fit, inputs, steps, vehicle, where) for i in range(3)]
+    believed = all(abs(fit.value[i] - math.log(vehicle.inertia[i])) <= IMPLAUSIBLE for i in range(3))
+    return (*inertias, _lag(fit, inputs, steps, believed), _delay(fit, inputs, believed), _offsets(fit, vehicle))
+
+
+def _inertia(i: int, fit: Fit, inputs: Inputs, steps: Steps, vehicle: Vehicle, where: str) -> Verdict:
+    name, axis, value = NAMES[1 + i], "xyz"[i], math.exp(fit.value[i])
+    ratio = value / vehicle.inertia[i]
+    fixed = 0.0 if inputs.voltage_known else VOLTAGE_UNKNOWN
+    relative = math.hypot(fit.total(i), fixed)
+    window = math.hypot(fit.total(i, stretch=1.0 / _stretch(steps) ** 2), fixed)
+    verdict = _grade(relative)
+    if abs(math.log(ratio)) > IMPLAUSIBLE:
+        relative, window, verdict = max(relative, abs(math.log(ratio))), max(window, abs(math.log(ratio))), "no"
+        reason = f"the data ask for {ratio:.2g} times the nominal: the logged commands do not explain its rotation"
+    elif verdict != "yes" and fit.bias[i] > IDENTIFIABLE:
+        reason = (
+            f"the logged commands are mostly noise between their stamps: torque about {axis} that acted cannot be told "
+            "from them at this logging rate"
+        )
+    elif verdict != "yes" and fixed and fit.total(i) < IDENTIFIABLE:
+        reason = "the battery voltage is not logged, which alone costs 15 %"
+    elif verdict != "yes":
+        reason = f"too little excitation: torque about {axis} determines it only within {196 * relative:.0f} % (95 %)"
+    else:
+        reason = where
+    return Verdict(name, verdict, reason, relative, window, relative * value, value, "kg m^2")
+
+
+def _lag(fit: Fit, inputs: Inputs, steps: Steps, believed: bool) -> Verdict:
+    name = "motor_time_constant"
+    if not inputs.lagged:
+        return Verdict(name, "no", f"{inputs.signal} already includes the rotor lag", unit="s")
+    tau = math.exp(fit.value[3])
+    relative, window = fit.total(3), fit.total(3, stretch=1.0 / _stretch(steps) ** 2)
+    if not believed:
+        return Verdict(name, "no", "the logged commands do not explain the rotation", unit="s")
+    verdict = _grade(relative)
+    reason = (
+        "from the phase of rotation behind torque"
+        if verdict == "yes"
+        else f"too little excitation: commands determine it only within {196 * relative:.0f} % (95 %)"
+    )
+    return Verdict(name, verdict, reason, relative, window, relative * tau, tau, "s")
+
+
+def _delay(fit: Fit, inputs: Inputs, believed: bool) -> Verdict:
+    prior = (excitation.DELAY_SD if inputs.lagged else excitation.SPEED_DELAY_SD) * 1e3
+    own = fit.total(4)
+    together = own / math.hypot(1.0, own / prior)
+    if not believed:
+        return Verdict("input_delay", "no", "the logged commands do not explain the rotation", unit="s")
+    verdict = "yes" if together < 0.7 * prior else "weak" if together < 0.9 * prior else "no"
+    reason = (
+        "from the phase of rotation behind torque" if verdict == "yes" else "the data say no more than the prior does"
+    )
+    return Verdict("input_delay", verdict, reason, sd=own * 1e-3, value=float(fit.value[4]) * 1e-3, unit="s")
+
+
+def _offsets(fit: Fit, vehicle: Vehicle) -> Verdict:
+    unit = max(excitation.TRIM * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
+    worst = max(fit.total(i) for i in (5, 6, 7))
+    verdict = "yes" if worst < 0.7 * unit else "weak" if worst < unit else "no"
+    reason = "from the mean torque in flight, the worst of three axes"
+    return Verdict("torque_offsets", verdict, reason, sd=worst, unit="N m")
+
+
+# drag and battery ----------------------------------------------------------------------------------------------
+
+
+def _drag(recording: Recording, air: Airborne) -> Verdict:
+    velocity, attitude = _sound(recording, "velocity"), _sound(recording, "attitude")
+    if velocity is None or attitude is None:
+        return Verdict("drag", "no", "needs velocity and attitude")
+    force = _sound(recording, "specific_force")
+    response, columns, source, steps = _sideways(velocity, attitude, force, air)
+    if steps is None:
+        return Verdict("drag", "no", "too few samples of velocity and attitude in the air")
+    fit = excitation.linear_fit(response, columns, share=steps.share)
+    if fit is None:
+        return Verdict("drag", "no", "the speed does not vary")
+    value, sd = -float(fit.value[0]), float(fit.sd[0])
+    relative = sd / max(abs(value), TYPICAL_DRAG)
+    reason = f"sideways force against speed, from {source}; over {max(abs(value), TYPICAL_DRAG):.2g} 1/s"
+    return Verdict("drag", _grade(relative), reason, relative, relative * _stretch(steps), sd, value, "1/s")
+
+
+def _sideways(
+    velocity: tuple[Array, Array], attitude: tuple[Array, Array], force: tuple[Array, Array] | None, air: Airborne
+) -> tuple[list[Array], list[Array], str, Steps | None]:
+    """Horizontal body components of specific force (2 k,) and their columns: velocity and a constant an axis."""
+    time, both = _with_attitude(velocity, attitude)
+    source = "velocity and attitude"
+    if force is not None:
+        good = _near(force[0], time)
+        time, both = time[good], np.column_stack([both[good], _interpolated(force, time[good])])
+        source = "the accelerometer"
+    steps = excitation.steps_of(time, both, air)
+    response: list[Array] = []
+    columns: list[Array] = []
+    for t, v in zip(*((steps.nodes, steps.values) if steps is not None else ((), ()))):
+        matrix = rotation_matrix(_unit(0.5 * (v[1:, 3:7] + v[:-1, 3:7])))
+        moving = np.einsum("kji,kj->ki", matrix, 0.5 * (v[1:, :3] + v[:-1, :3]))
+        if v.shape[1] > 7:
+            felt = 0.5 * (v[1:, 7:] + v[:-1, 7:])
+        else:
+            world = np.diff(v[:, :3], axis=0) / np.diff(t)[:, None] + np.array([0.0, 0.0, GRAVITY])
+            felt = np.einsum("kji,kj->ki", matrix, world)
+        for axis in (0, 1):
+            constant = np.zeros((moving.shape[0], 2))
+            constant[:, axis] = 1.0
+            response.append(felt[:, axis])
+            columns.append(np.column_stack([moving[:, axis], constant]))
+    return response, columns, source, steps
+
+
+def _battery(recording: Recording, vertical: _Vertical | None, inputs: Inputs, *, tau: float, delay: float) -> Verdict:
+    name, voltage = "battery_law", _sound(recording, "voltage")
+    if inputs.signal != "motor_command" or voltage is None:
+        return Verdict(name, "no", "needs the duty sent to the rotors and the battery voltage")
+    if vertical is None:
+        return Verdict(name, "no", "neither velocity nor specific force is known in the air")
+    steps = vertical.steps
+    middle = np.concatenate(steps.nodes).mean()
+    level = math.log(float(np.median(voltage[1])))
+    columns = []
+    for nodes, thrust in zip(steps.nodes, _thrust(vertical, inputs, tau=tau, delay=delay)):
+        at = 0.5 * (nodes[1:] + nodes[:-1])
+        volts = np.log(np.maximum(held(voltage[0], voltage[1][:, 0], at), 1e-3)) - level
+        columns.append(thrust[:, None] * np.column_stack([np.ones(at.size), volts, at - middle]))
+    volts = np.concatenate([held(voltage[0], voltage[1][:, 0], nodes) for nodes in steps.nodes])
+    span = float(np.ptp(volts))
+    if span < 0.01:
+        return Verdict(name, "no", f"the voltage moves by no more than {1e3 * span:.0f} mV")
+    fit = excitation.linear_fit(vertical.response, columns, share=steps.share)
+    if fit is None or not fit.value[0] > 0.0:
+        return Verdict(name, "no", "thrust and acceleration have no common stretch long enough")
+    scale = float(fit.value[0])
+    sd, value = float(fit.sd[1]) / scale, float(fit.value[1]) / scale
+    reason = (
+        f"exponent of the voltage in thrust at a given duty, beside a drift in time; the voltage moves by "
+        f"{1e3 * span:.0f} mV"
+    )
+    return Verdict(name, _grade(sd / 2.0), reason, sd / 2.0, sd / 2.0 * _stretch(steps), sd, 2.0 + value, "")
+
+
+# helpers -------------------------------------------------------------------------------------------------------
+
+
+def _grade(relative: float) -> str:
+    return "yes" if relative < IDENTIFIABLE else "weak" if relative < WEAK else "no"
+
+
+def _stretch(steps: Steps) -> float:
+    """How much larger a random error is in one window of the estimator than in all of the flight; never below 1."""
+    return math.sqrt(max(steps.count / steps.share / WINDOW, 1.0))
+
+
+def _with_attitude(velocity: tuple[Array, Array], attitude: tuple[Array, Array] | None) -> tuple[Array, Array]:
+    """Velocity (n, 3) beside attitude (n, 4) at its stamps, where an attitude is near; or alone."""
+    if attitude is None:
+        return velocity
+    good = _near(attitude[0], velocity[0])
+    time = velocity[0][good]
+    continuous = attitude[1] * _signs(attitude[1])[:, None]
+    return time, np.column_stack([velocity[1][good], _unit(_interpolated((attitude[0], continuous), time))])
+
+
+def _near(stamps: Array, time: Array) -> NDArray[np.bool_]:
+    """Whether each time lies between two stamps that are no more than 50 ms apart."""
+    after = np.searchsorted(stamps, time, "left")
+    inside = after < stamps.size
+    after = np.minimum(after, stamps.size - 1)
+    before = np.maximum(after - 1, 0)
+    exact = stamps[after] == time
+    return inside & (exact | ((stamps[before] <= time) & (stamps[after] - stamps[before] < excitation.LONGEST_STEP)))
+
+
+def _interpolated(signal: tuple[Array, Array], at: Array) -> Array:
+    return np.column_stack([np.interp(at, signal[0], column) for column in signal[1].T])
+
+
+def _signs(attitude: Array) -> Array:
+    """+-1 (n,) that make successive quaternions neighbours."""
+    flips = np.sum(attitude[1:] * attitude[:-1], axis=1) < 0.0
+    return np.where(np.append(0, np.cumsum(flips)) % 2 == 1, -1.0, 1.0)
+
+
+def _unit(q: Array) -> Array:
+    norm = np.linalg.norm(q, axis=1, keepdims=True)
+    return q / np.where(norm > 0.0, norm, 1.0)
+
+
+def _up(attitude: Array) -> Array:
+    """Body z in the world (k, 3)."""
+    return rotation_matrix(_unit(attitude))[..., :, 2]
+
+
+def _sound(recording: Recording, name: str) -> tuple[Array, Array] | None:
+    array = recording.signals.get(name)
+    return None if array is None else sound_samples(array)
+
+
+def _has(recording: Recording, name: str) -> bool:
+    return _sound(recording, name) is not None

@@ -1,0 +1,289 @@
+"""What is in a recording: its signals, clocks and origin, how hard it flew, and what could be identified from it."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from crazyem.doctor.envelope import Envelope, airborne, envelope
+from crazyem.doctor.identifiability import Verdict, identifiability
+from crazyem.recordings.recording import Recording, SignalArray
+from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
+
+_LONGEST_TEXT = 120  # characters of a metadata value that are shown
+
+
+@dataclass(frozen=True, slots=True)
+class SignalRow:
+    """One signal.
+
+    Attributes:
+        name, quantity, unit, frame, clock, stream, source: as in `SignalArray`.
+        samples: how many.
+        start_s, end_s: first and last stamp, on the recording's time axis.
+        rate_hz: samples less one over the time from the first to the last: the mean rate, gaps included.
+        period_s: median time between samples; its inverse is the rate where nothing is lost.
+        missing_share: samples with a component that is no number in the file itself.
+        marked_share: samples that the reader marked as never measured.
+        longest_gap_s: longest time between two samples.
+    """
+
+    name: str
+    quantity: str
+    unit: str
+    frame: str
+    clock: str
+    stream: str
+    source: tuple[str, ...]
+    samples: int
+    start_s: float | None
+    end_s: float | None
+    rate_hz: float | None
+    period_s: float | None
+    missing_share: float
+    marked_share: float
+    longest_gap_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class ClockRow:
+    """One clock: its name, its signals' first and last stamp [s], and its stamps' drift against the host if known.
+
+    Attributes:
+        against_host_ppm: how much faster than the host's clock it runs, from a straight line through the arrival
+            times, in millionths; None without arrival times.
+    """
+
+    name: str
+    signals: int
+    start_s: float
+    end_s: float
+    against_host_ppm: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Inventory:
+    """What is in a recording. `to_dict` is JSON, `text` is for a terminal."""
+
+    path: str
+    source: str
+    duration_s: float
+    samples: int
+    vehicle: str
+    signals: tuple[SignalRow, ...]
+    clocks: tuple[ClockRow, ...]
+    metadata: Mapping[str, Mapping[str, str]]
+    events: Mapping[str, int]
+    envelope: Envelope
+    verdicts: tuple[Verdict, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: units in the names of the keys, None where unknown."""
+        return {
+            "path": self.path,
+            "source": self.source,
+            "duration_s": self.duration_s,
+            "samples": self.samples,
+            "vehicle": self.vehicle,
+            "signals": [_listed(asdict(row)) for row in self.signals],
+            "clocks": [asdict(row) for row in self.clocks],
+            "metadata": {section: dict(values) for section, values in self.metadata.items()},
+            "events": dict(self.events),
+            "envelope": _listed(self.envelope.to_dict()),
+            "identifiable": [verdict.to_dict() for verdict in self.verdicts],
+        }
+
+    def text(self) -> str:
+        """A readable table, plain text."""
+        head = f"{self.path}: {self.source}, {self.duration_s:.2f} s, {self.samples} samples, vehicle {self.vehicle}"
+        parts = [head, *_metadata_lines(self.metadata), "", *_signal_lines(self.signals), *_clock_lines(self.clocks)]
+        if self.events:
+            parts.append("events: " + ", ".join(f"{count} {kind}" for kind, count in self.events.items()))
+        parts += ["", *_envelope_lines(self.envelope), "", f"what it could identify, as vehicle {self.vehicle}:"]
+        parts += [verdict.line() for verdict in self.verdicts]
+        return "\n".join(parts)
+
+
+def inventory(recording: Recording, vehicle: Vehicle | None = None) -> Inventory:
+    """What is in a recording.
+
+    Args:
+        recording: any.
+        vehicle: whose rotor law and inertia to judge by; None: the one it was flown with, else by what it logs.
+    """
+    vehicle = vehicle or vehicle_for(recording)
+    air = airborne(recording)
+    kinds: dict[str, int] = {}
+    for event in recording.events:
+        kinds[event.kind] = kinds.get(event.kind, 0) + 1
+    return Inventory(
+        path=recording.path,
+        source=recording.source,
+        duration_s=recording.duration,
+        samples=len(recording),
+        vehicle=vehicle.name,
+        signals=tuple(_row(name, array) for name, array in recording.signals.items()),
+        clocks=_clocks(recording),
+        metadata=_short(recording.metadata),
+        events=kinds,
+        envelope=envelope(recording, air),
+        verdicts=identifiability(recording, vehicle, air),
+    )
+
+
+def vehicle_for(recording: Recording) -> Vehicle:
+    """The vehicle the recording was flown with; else cf21bl where only rotor speeds are known; else cf2."""
+    stored = recording.metadata.get("vehicle", {}).get("toml")
+    if stored:
+        return parse_vehicle(stored, where=f"vehicle in {recording.path}")
+    speeds = "rotor_speed" in recording.signals
+    return load_vehicle("cf21bl" if speeds else "cf2")
+
+
+def _row(name: str, array: SignalArray) -> SignalRow:
+    n = array.time.size
+    time = array.time[np.isfinite(array.time)]
+    steps = np.diff(time)
+    span = float(time.max() - time.min()) if time.size > 1 else 0.0
+    bad = ~np.isfinite(array.value).all(axis=1)
+    return SignalRow(
+        name=name,
+        quantity=array.quantity,
+        unit=array.unit,
+        frame=array.frame,
+        clock=array.clock,
+        stream=array.stream,
+        source=array.source,
+        samples=n,
+        start_s=float(time.min()) if time.size else None,
+        end_s=float(time.max()) if time.size else None,
+        rate_hz=(time.size - 1) / span if span > 0.0 else None,
+        period_s=float(np.median(steps)) if steps.size else None,
+        missing_share=float((bad & ~array.marked).mean()) if n else 0.0,
+        marked_share=float(array.marked.mean()) if n else 0.0,
+        longest_gap_s=float(steps.max()) if steps.size else None,
+    )
+
+
+def _clocks(recording: Recording) -> tuple[ClockRow, ...]:
+    by_name: dict[str, list[SignalArray]] = {}
+    for array in recording.signals.values():
+        if np.isfinite(array.time).any():
+            by_name.setdefault(array.clock, []).append(array)
+    return tuple(
+        ClockRow(
+            name,
+            len(arrays),
+            min(float(np.nanmin(a.time)) for a in arrays),
+            max(float(np.nanmax(a.time)) for a in arrays),
+            _against_host(max(arrays, key=lambda a: int(np.isfinite(a.host_time).sum()))),
+        )
+        for name, arrays in by_name.items()
+    )
+
+
+def _against_host(array: SignalArray) -> float | None:
+    """How much faster the stamps run than the host's clock [1e-6], by least squares; None with too little to tell."""
+    good = np.isfinite(array.host_time) & np.isfinite(array.time)
+    if good.sum() < 10:
+        return None
+    host = array.host_time[good] - array.host_time[good][0]
+    stamps = array.time[good] - array.time[good][0]
+    if np.ptp(host) < 1.0:
+        return None
+    host = host - host.mean()
+    return float(1e6 * (host @ (stamps - stamps.mean()) / (host @ host) - 1.0))
+
+
+def _short(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, str]]:
+    """Metadata without what is too long to read, such as whole tables and vehicle files."""
+    kept = {
+        section: {key: str(value) for key, value in values.items() if _is_short(str(value))}
+        for section, values in metadata.items()
+    }
+    return {section: values for section, values in kept.items() if values}
+
+
+def _is_short(value: str) -> bool:
+    return len(value) <= _LONGEST_TEXT and "\n" not in value
+
+
+def _listed(values: dict[str, Any]) -> dict[str, Any]:
+    """Tuples as lists, and numbers that JSON has no word for as None."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, tuple | list):
+            return [plain(item) for item in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return {key: plain(value) for key, value in values.items()}
+
+
+def _metadata_lines(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
+    return [
+        f"  {section}: " + ", ".join(f"{key} {value}" for key, value in values.items())
+        for section, values in metadata.items()
+    ]
+
+
+def _signal_lines(rows: tuple[SignalRow, ...]) -> list[str]:
+    width = max([len(row.name) for row in rows] + [6])
+    lines = [
+        f"{'signal':<{width}} {'unit':<8} {'samples':>8} {'rate Hz':>8} {'1/period':>8} {'missing':>8} {'marked':>7} "
+        f"{'gap s':>7}  clock, stream, source"
+    ]
+    for row in rows:
+        rate = "-" if row.rate_hz is None else f"{row.rate_hz:.2f}"
+        usual = f"{1.0 / row.period_s:.2f}" if row.period_s else "-"
+        gap = "-" if row.longest_gap_s is None else f"{row.longest_gap_s:.3f}"
+        origin = ", ".join(part for part in (row.clock, row.stream, _names(row.source)) if part)
+        lines.append(
+            f"{row.name:<{width}} {row.unit:<8} {row.samples:>8} {rate:>8} {usual:>8} {100 * row.missing_share:>7.1f}% "
+            f"{100 * row.marked_share:>6.1f}% {gap:>7}  {origin}"
+        )
+    return lines
+
+
+def _names(source: tuple[str, ...]) -> str:
+    return source[0] if len(source) == 1 else f"{source[0]} .. {source[-1]}" if source else ""
+
+
+def _clock_lines(rows: tuple[ClockRow, ...]) -> list[str]:
+    lines = []
+    for row in rows:
+        drift = "" if row.against_host_ppm is None else f", {row.against_host_ppm:+.0f} ppm against the host"
+        lines.append(f"clock {row.name or 'unnamed'}: {row.start_s:.3f} to {row.end_s:.3f} s{drift}")
+    return lines
+
+
+def _envelope_lines(e: Envelope) -> list[str]:
+    by = "by " + ", ".join(e.judged_by) if e.judged_by else "no signal says when; all of it counts"
+    parts = " and ".join(f"{a:.2f} to {b:.2f}" for a, b in e.airborne_intervals_s[:4])
+    more = f" and {len(e.airborne_intervals_s) - 4} more" if len(e.airborne_intervals_s) > 4 else ""
+    lines = [f"in the air: {e.airborne_s:.2f} s ({parts}{more} s; {by})" if parts else f"in the air: never ({by})"]
+    if e.speed_max_m_s is not None:
+        source = "" if e.speed_from == "velocity" else f" (from {e.speed_from})"
+        lines.append(
+            f"  speed up to {e.speed_max_m_s:.2f} m/s, rms {e.speed_rms_m_s:.2f}; vertical "
+            f"{e.vertical_speed_min_m_s:.2f} to {e.vertical_speed_max_m_s:.2f} m/s{source}"
+        )
+    if e.altitude_min_m is not None:
+        lines.append(f"  altitude {e.altitude_min_m:.2f} to {e.altitude_max_m:.2f} m")
+    if e.tilt_max_deg is not None:
+        lines.append(f"  tilt up to {e.tilt_max_deg:.1f} deg (from {e.tilt_from})")
+    if e.body_rate_max_rad_s is not None:
+        lines.append("  body rate up to " + ", ".join(f"{r:.2f}" for r in e.body_rate_max_rad_s) + " rad/s (x, y, z)")
+    if e.specific_force_max_m_s2 is not None:
+        lines.append(f"  specific force {e.specific_force_min_m_s2:.2f} to {e.specific_force_max_m_s2:.2f} m/s^2")
+    if e.acceleration_max_m_s2 is not None:
+        lines.append(f"  acceleration up to {e.acceleration_max_m_s2:.2f} m/s^2")
+    if e.voltage_min_V is not None:
+        lines.append(f"  battery {e.voltage_start_V:.2f} to {e.voltage_end_V:.2f} V, lowest {e.voltage_min_V:.2f} V")
+    if e.motor_command_max is not None and e.motor_saturated_share is not None:
+        lines.append(
+            f"  motor command up to {e.motor_command_max:.3f}; at the limit in {100 * e.motor_saturated_share:.1f} % "
+            "of the samples"
+        )
+    return lines
