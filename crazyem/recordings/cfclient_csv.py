@@ -1,17 +1,318 @@
-"""CSV files of cfclient, one a log block, merged by their stamps."""
+"""CSV files of cfclient: one a log block, merged by their stamps; a folder of them is one session, and one recording.
 
+cfclient (src/cfclient/utils/logdatawriter.py) makes a folder for each connection, <config>/logdata/YYYYmmddTHH-MM-SS,
+and in it a file <block>-YYYYmmddTHH-MM-SS.csv each time that writing of a block is switched on. The first line is
+"Timestamp" and the variables; each further line the firmware's stamp, the low 24 bits of its ms, and the values as
+Python prints them, which gives every float back exactly. Rows are in order of arrival; host times and types are not in
+the file.
+"""
+
+import contextlib
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 
-from crazyem.errors import FileFormatError
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.errors import FileFormatError, UsageError
+from crazyem.links.clock import STAMP_MODULUS
+from crazyem.recordings import motor_meaning
+from crazyem.recordings.contents import contents
+from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
+from crazyem.recordings.tables import Table, signals_from_tables
+
+_VARIABLE = re.compile(r"[A-Za-z_]\w*\.[\w\[\]]+")
+_NAME = re.compile(r"(.+)-(\d{8}T\d\d-\d\d-\d\d)\.csv(\.gz)?")
+_DATE = "%Y%m%dT%H-%M-%S"
+_ONE_SESSION = 120.0  # s between estimates of when the drone was switched on: one session, blocks started late
+_MOST_FILES = 256  # in a folder
+_MOST_SIBLINGS = 32  # looked at where one file is read alone
+_RECORDINGS = {"", ".mcap", ".ulg", ".tlog", ".db3", ".parquet"}  # endings of what would be a recording of its own
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """One file.
+
+    Attributes:
+        path: of the file.
+        block: name of the log block; the file's name where it is not as cfclient names files.
+        date: when writing was switched on, host's local time; None where the name does not say.
+        variables: names of the columns.
+        stamp: (n,) ms, unwrapped from the first.
+        values: (n, k).
+    """
+
+    path: Path
+    block: str
+    date: datetime | None
+    variables: tuple[str, ...]
+    stamp: NDArray[np.int64]
+    values: NDArray[np.float64]
 
 
 def recognises(head: bytes) -> bool:
-    """True if a file starting with these bytes is one."""
-    return False
+    """True if the first line is "Timestamp" and names like "group.variable"."""
+    return bool(_variables(_first_line(head)))
+
+
+def recognises_folder(path: Path) -> bool:
+    """True if every CSV file in a folder is of cfclient, and all are of one session.
+
+    Of one session: by file names and first stamps the drone was switched on at one time; where names do not say, no two
+    files have the same variables. A folder that holds recordings of other kinds too is a folder of recordings.
+    """
+    files = _files(path)
+    others = [f for f in path.iterdir() if f.is_file() and not f.name.startswith(".") and f not in files]
+    if not 0 < len(files) <= _MOST_FILES or any(f.suffix in _RECORDINGS for f in others):
+        return False
+    starts: list[float] = []
+    undated: list[bytes] = []
+    for file in files:
+        head = _head(file)
+        if not recognises(head):
+            return False
+        date, stamp = _named(file)[1], _first_stamp(head)
+        if date is None:
+            undated.append(_first_line(head))
+        elif stamp is not None:
+            starts.append((date - datetime(2000, 1, 1)).total_seconds() - stamp / 1000.0)
+    return len(set(undated)) == len(undated) and _spread(starts) <= _ONE_SESSION
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
-    """Read one."""
-    raise FileFormatError(f"{path}: this format cannot be read yet.")
+    """Read a folder of log blocks, or one block alone. Time is the stamp in seconds, unwrapped (`origin` is 0).
+
+    Raises: FileFormatError naming the file and line; UsageError if it cannot be read.
+    """
+    findings: list[Finding] = []
+    folder = path.is_dir()
+    parts = [_read_file(file, findings) for file in (_files(path) if folder else [path])]
+    full = [part for part in parts if part.stamp.size]
+    if not full:
+        raise FileFormatError(f"{path}: there is a header but not a single row.")
+    for part in parts:
+        if not part.stamp.size:
+            findings.append(note("integrity", f"{part.path.name} has a header and not a single row."))
+    if not folder:
+        _mention_siblings(path, findings)
+    full = _aligned(full)
+    tables = _tables(full)
+    metadata = {"cfclient": _metadata(path, full)}
+    meaning = motor_meaning.decide(tables, given=options.motor, metadata=metadata)
+    signals = signals_from_tables(tables, motor=meaning.meaning)
+    return Recording(str(path), "csv:cfclient", signals, metadata | meaning.metadata, (*findings, *meaning.findings))
+
+
+def _files(folder: Path) -> list[Path]:
+    try:
+        found = [f for f in folder.iterdir() if f.name.endswith((".csv", ".csv.gz")) and not f.name.startswith(".")]
+        return sorted(f for f in found if f.is_file())
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be read: {error.strerror or error}.") from error
+
+
+def _head(file: Path) -> bytes:
+    from crazyem.recordings.registry import head_of  # not above: the registry is what imports readers
+
+    try:
+        return head_of(file)
+    except (FileFormatError, UsageError):
+        return b""
+
+
+def _named(file: Path) -> tuple[str, datetime | None]:
+    """Block and date in a file's name."""
+    found = _NAME.fullmatch(file.name)
+    if not found:
+        return file.name.removesuffix(".gz").removesuffix(".csv"), None
+    try:
+        return found[1], datetime.strptime(found[2], _DATE)
+    except ValueError:
+        return found[1], None
+
+
+def _first_line(data: bytes) -> bytes:
+    """The first line that is not blank, without its end."""
+    return data.removeprefix(b"\xef\xbb\xbf").lstrip(b"\r\n").split(b"\n", 1)[0].strip()
+
+
+def _variables(line: bytes) -> tuple[str, ...]:
+    """Names in a header line; () if it is none."""
+    first, *names = line.decode("latin-1").split(",")
+    return tuple(names) if first == "Timestamp" and all(_VARIABLE.fullmatch(name) for name in names) else ()
+
+
+def _first_stamp(head: bytes) -> int | None:
+    rows = head.removeprefix(b"\xef\xbb\xbf").lstrip(b"\r\n").split(b"\n", 2)
+    field = rows[1].split(b",", 1)[0].strip() if len(rows) > 1 else b""
+    return int(field) if field.isdigit() and len(field) < 12 else None
+
+
+def _spread(starts: list[float]) -> float:
+    """Largest difference between times [s], those a wrap of the stamps apart being equal."""
+    wrap = STAMP_MODULUS / 1000.0
+    offsets = [(s - starts[0] + 0.5 * wrap) % wrap for s in starts]
+    return max(offsets) - min(offsets) if offsets else 0.0
+
+
+def _read_file(path: Path, findings: list[Finding]) -> _Part:
+    data = contents(path).removeprefix(b"\xef\xbb\xbf")
+    header = _first_line(data)
+    variables = _variables(header)
+    if not variables:
+        raise FileFormatError(f"{path}: the first line is not a header of cfclient (Timestamp,group.variable,...).")
+    if len(set(variables)) < len(variables):
+        raise FileFormatError(f"{path}: the header names a variable twice.")
+    start = data.index(header) + len(header)
+    body = data[start:].lstrip(b" \t\r")
+    line = data[:start].count(b"\n") + 1
+    if not body.endswith(b"\n") and b"\n" in body:
+        body, _, rest = body.rpartition(b"\n")
+        body += b"\n"
+        if rest.strip():
+            findings.append(
+                note("integrity", f"{path.name}: the last line has no end, it may be cut, and was dropped.")
+            )
+    elif not body.endswith(b"\n"):
+        body = b""
+    segments = [
+        _numbers(path, text, len(variables) + 1, line + offset)
+        for offset, text in _segments(path, header, body, line, findings)
+    ]
+    table = np.concatenate(segments)
+    stamp = table[:, 0]
+    sound = (stamp >= 0) & (stamp == np.floor(stamp)) & (stamp < 2.0**53)
+    if not sound.all():
+        raise FileFormatError(f"{path}: {stamp[int(np.argmin(sound))]:g} is not a stamp in ms.")
+    block, date = _named(path)
+    return _Part(path, block, date, variables, _unwrapped(stamp.astype(np.int64)), table[:, 1:])
+
+
+def _segments(
+    path: Path, header: bytes, body: bytes, line: int, findings: list[Finding]
+) -> Iterator[tuple[int, bytes]]:
+    """(lines before it, text) of each stretch of rows between headers: files of one block may have been joined."""
+    if b"Timestamp" not in body:
+        yield 0, body
+        return
+    lines = body.split(b"\n")
+    first, again = 0, []
+    for number, text in enumerate(lines):
+        if not text.startswith(b"Timestamp"):
+            continue
+        if text.strip() != header:
+            raise FileFormatError(f"{path}: line {line + number} is a header with other variables than the first.")
+        again.append(line + number)
+        yield first, b"\n".join(lines[first:number])
+        first = number + 1
+    yield first, b"\n".join(lines[first:])
+    if again:
+        said = (
+            f"{path.name}: the header stands {len(again)} more times (first in line {again[0]}); "
+            "what follows may be another flight."
+        )
+        advice = "Look for a clock that jumps back, and cut the file there."
+        findings.append(Finding("integrity", Grade.DEGRADES, said, advice=advice))
+
+
+def _numbers(path: Path, text: bytes, width: int, line: int) -> NDArray[np.float64]:
+    """(n, width) of comma-separated text whose first line is number `line` of the file."""
+    if not text.strip():
+        return np.empty((0, width))
+    from pyarrow import ArrowInvalid, csv, float64, py_buffer
+
+    names = [str(i) for i in range(width)]
+    try:
+        table = csv.read_csv(
+            py_buffer(text),
+            csv.ReadOptions(column_names=names, use_threads=False),
+            csv.ParseOptions(quote_char=False),
+            csv.ConvertOptions(column_types=dict.fromkeys(names, float64()), null_values=[], strings_can_be_null=False),
+        )
+    except ArrowInvalid:
+        return _plain_numbers(path, text, width, line)
+    return np.column_stack([table.column(name).to_numpy() for name in names])
+
+
+def _plain_numbers(path: Path, text: bytes, width: int, line: int) -> NDArray[np.float64]:
+    """The same a row at a time, which finds the line that is wrong, if one is."""
+    rows = []
+    for number, row in enumerate(text.split(b"\n"), start=line):
+        if not row.strip():
+            continue
+        fields = row.decode("latin-1").split(",")
+        if len(fields) != width:
+            raise FileFormatError(f"{path}: line {number} has {len(fields)} fields, the header has {width}.")
+        try:
+            if "_" in "".join(fields):
+                raise ValueError
+            rows.append([float(field) for field in fields])
+        except ValueError:
+            shown = ascii(row[:40].decode("latin-1"))
+            raise FileFormatError(f"{path}: line {number} holds something that is not a number: {shown}.") from None
+    return np.array(rows, float).reshape(len(rows), width)
+
+
+def _unwrapped(stamp: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Continuous ms: each stamp within half a wrap (8388 s) of the one before."""
+    half = STAMP_MODULUS // 2
+    steps = (np.diff(stamp) + half) % STAMP_MODULUS - half
+    return np.concatenate([stamp[:1], stamp[:1] + np.cumsum(steps)])
+
+
+def _aligned(parts: Sequence[_Part]) -> list[_Part]:
+    """Parts whose stamps continue each other: the clock may have wrapped before a later file began."""
+    parts = sorted(parts, key=lambda p: (p.date or datetime.min, p.path.name))
+    first = parts[0]
+    result = []
+    for part in parts:
+        apart = float(part.stamp[0] - first.stamp[0])
+        waited = (part.date - first.date).total_seconds() * 1000.0 if part.date and first.date else 0.0
+        wraps = round((waited - apart) / STAMP_MODULUS)
+        stamp = part.stamp + wraps * STAMP_MODULUS
+        result.append(_Part(part.path, part.block, part.date, part.variables, stamp, part.values))
+    return result
+
+
+def _tables(parts: Sequence[_Part]) -> list[Table]:
+    """A table a block, in the order of `parts`; a block written in several files is one, its gaps left as they are."""
+    blocks: dict[tuple[str, tuple[str, ...]], list[_Part]] = {}
+    for part in parts:
+        blocks.setdefault((part.block, part.variables), []).append(part)
+    stamps = [np.concatenate([p.stamp for p in group]) for group in blocks.values()]
+    # rows of a file stay in order, even where its clock jumps back
+    keys = np.concatenate([np.maximum.accumulate(s) for s in stamps])
+    order = np.empty(keys.size, np.int64)
+    order[np.argsort(keys, kind="stable")] = np.arange(keys.size)
+    tables: list[Table] = []
+    names: set[str] = set()
+    at = 0
+    for ((block, variables), group), stamp in zip(blocks.items(), stamps, strict=True):
+        name = block if block not in names else f"{block}#{len(names) + 1}"
+        names.add(name)
+        values = np.concatenate([p.values for p in group])
+        columns = {variable: values[:, i] for i, variable in enumerate(variables)}
+        tables.append(Table(name, columns, stamp / 1000.0, order[at : at + stamp.size]))
+        at += stamp.size
+    return tables
+
+
+def _mention_siblings(path: Path, findings: list[Finding]) -> None:
+    with contextlib.suppress(OSError, UsageError):
+        others = len(_files(path.parent)) - 1
+        if 0 < others < _MOST_SIBLINGS and recognises_folder(path.parent):
+            text = f"{others} more files of the session lie beside it; read the folder to have them too."
+            findings.append(note("integrity", text, files=others))
+
+
+def _metadata(path: Path, parts: Sequence[_Part]) -> dict[str, str]:
+    section = {"session": path.name if path.is_dir() else path.parent.name}
+    for part in parts:
+        section[f"file.{part.path.name}"] = f"{part.block}: {' '.join(part.variables)}"
+    return section
