@@ -15,6 +15,7 @@ from crazyem.recordings.topics import floats
 Columns = Sequence[NDArray[np.generic]]
 
 WORLD = "world, north-west-up"
+ATTITUDE = "quaternion x y z w, body (FLU) to world (north-west-up)"
 BODY = "body FLU"
 MOTORS = "rotors 1..4 as the autopilot numbers them"
 

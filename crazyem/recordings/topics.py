@@ -2,7 +2,7 @@
 
 import gzip
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -66,15 +66,51 @@ class Mapped:
     origin: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Columns of a topic that are a signal of the vocabulary: a row of a reader's table, the best source first.
+
+    Attributes:
+        convert: from c columns of (n,) to (n, c) SI.
+        invalid: (n,) True in rows that the message itself calls invalid; they become missing.
+        absent_is_nan: a NaN is the format's way to say that there is no value.
+        frame, origin: as in `Mapped`.
+    """
+
+    quantity: str
+    topic: str
+    columns: tuple[str, ...]
+    convert: Callable[[Sequence[NDArray[np.generic]]], NDArray[np.float64]]
+    invalid: Callable[[Topic], NDArray[np.bool_]] | None = None
+    absent_is_nan: bool = False
+    frame: str = ""
+    origin: str = ""
+
+    def of(self, topics: Sequence[Topic]) -> Iterator[Mapped]:
+        """The signal, from the topic if it is there and has the columns."""
+        for topic in topics:
+            if topic.name != self.topic or not set(self.columns) <= topic.columns.keys():
+                continue
+            marked = np.zeros(topic.time.size, bool) if self.invalid is None else self.invalid(topic)
+            if marked.all() and marked.size:
+                continue  # nothing of it is a value; the columns stay as they are
+            value = self.convert([topic.columns[c] for c in self.columns])
+            if marked.any():
+                value = np.where(marked[:, None], np.nan, value)
+            if self.absent_is_nan:
+                marked = marked | ~np.isfinite(value).all(axis=1)
+            yield Mapped(self.quantity, topic, value, self.columns, marked, self.frame, self.origin)
+
+
+def named(pattern: str, parts: str) -> tuple[str, ...]:
+    """Column names: the pattern with each of the parts in place of its star."""
+    return tuple(pattern.replace("*", part) for part in parts.split())
+
+
 def floats(column: NDArray[np.generic]) -> NDArray[np.float64]:
     """(n,) as float64; any NaN stays one, signalling ones of damaged files too."""
     with np.errstate(invalid="ignore"):
         return np.asarray(column, np.float64)
-
-
-def masked(value: NDArray[np.float64], invalid: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The values with NaN in rows that the file calls invalid, and those rows; (n, c) and (n,)."""
-    return np.where(invalid[:, None], np.nan, value), invalid
 
 
 def ranks(times: Sequence[NDArray[np.generic]]) -> list[NDArray[np.int64]]:

@@ -7,8 +7,7 @@ Decoding is pyulog's; `ulog_scan` decides before what of a file is sound. What b
 import contextlib
 import io
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +17,11 @@ from pyulog import ULog
 from crazyem.errors import FileFormatError
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.frd_ned import (
+    ATTITUDE,
     BODY,
     MOTORS,
     WORLD,
+    Columns,
     euler,
     euler_from_quaternions,
     quaternions,
@@ -29,11 +30,10 @@ from crazyem.recordings.frd_ned import (
 )
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
-from crazyem.recordings.topics import Mapped, Topic, damage, file_bytes, masked, ranks, signals_of, text_of
+from crazyem.recordings.topics import Source, Topic, damage, file_bytes, named, ranks
 from crazyem.recordings.ulog_scan import HEADER, MAGIC, Scan, scan, unknown_flags
 
 CLOCK = "autopilot"  # microseconds since boot
-_ATTITUDE = "quaternion x y z w, body (FLU) to world (north-west-up)"
 _RPM = 2.0 * math.pi / 60.0
 _PARAMETERS = 4000  # that are kept as metadata
 _MESSAGES = 500  # texts of the autopilot that are kept
@@ -107,131 +107,81 @@ def _stamps(data: Data) -> tuple[NDArray[np.uint64], str]:
     return (sampled, "timestamp_sample") if early.all() else (published, "timestamp")
 
 
-@dataclass(frozen=True, slots=True)
-class _Source:
-    """Columns of a topic that are a signal: a best source comes first in `_SIGNALS`."""
+def _valid(*flags: str) -> Callable[[Topic], NDArray[np.bool_]]:
+    """Rows in which one of the flags is not set; a flag that the message does not have counts as set."""
 
-    quantity: str
-    topic: str
-    columns: tuple[str, ...]
-    convert: Callable[[Topic, list[NDArray[np.generic]]], NDArray[np.float64]]
-    valid: tuple[str, ...] = ()  # flags that must all be set, else the value is missing
-    absent_is_nan: bool = False  # a NaN is the format's way to say that there is no value
-    frame: str = ""
-    origin: str = ""
-    only_if: tuple[str, int] | None = None  # a column that must have this value throughout
+    def invalid(topic: Topic) -> NDArray[np.bool_]:
+        rows = [topic.columns[flag] == 0 for flag in flags if flag in topic.columns]
+        return np.logical_or.reduce([np.zeros(topic.time.size, bool), *rows])
 
-    def of(self, topics: list[Topic]) -> Iterator[Mapped]:
-        for topic in topics:
-            if topic.name != self.topic or not set(self.columns) <= topic.columns.keys():
-                continue
-            if self.only_if is not None:
-                flag = topic.columns.get(self.only_if[0])
-                if flag is None or not (flag == self.only_if[1]).all():
-                    continue
-            value = self.convert(topic, [topic.columns[c] for c in self.columns])
-            invalid = np.zeros(topic.time.size, bool)
-            for name in self.valid:
-                if name in topic.columns:
-                    invalid |= topic.columns[name] == 0
-            value, marked = masked(value, invalid)
-            if self.absent_is_nan:
-                marked = marked | ~np.isfinite(value).all(axis=1)
-            yield Mapped(self.quantity, topic, value, self.columns, marked, self.frame, self.origin)
+    return invalid
 
 
-def _plain(topic: Topic, columns: list[NDArray[np.generic]]) -> NDArray[np.float64]:
-    return stacked(columns)
+def _other_frame(topic: Topic) -> NDArray[np.bool_]:
+    """Rows of an odometry message that are not in NED."""
+    frame = topic.columns.get("pose_frame")
+    return np.ones(topic.time.size, bool) if frame is None else frame != 1
 
 
-def _frd(topic: Topic, columns: list[NDArray[np.generic]]) -> NDArray[np.float64]:
-    return vectors(columns)
-
-
-def _turned(topic: Topic, columns: list[NDArray[np.generic]]) -> NDArray[np.float64]:
-    return quaternions(columns)
-
-
-def _angles(topic: Topic, columns: list[NDArray[np.generic]]) -> NDArray[np.float64]:
-    return euler(columns)
-
-
-def _angles_of_quaternion(topic: Topic, columns: list[NDArray[np.generic]]) -> NDArray[np.float64]:
-    return euler_from_quaternions(quaternions(columns))
-
-
-def _rad_per_s(topic: Topic, columns: list[NDArray[np.generic]]) -> NDArray[np.float64]:
+def _rad_per_s(columns: Columns) -> NDArray[np.float64]:
     return stacked(columns) * _RPM
 
 
-def _not(topic: Topic, columns: list[NDArray[np.generic]]) -> NDArray[np.float64]:
+def _not(columns: Columns) -> NDArray[np.float64]:
     return (stacked(columns) == 0).astype(float)
 
 
-def _of(pattern: str, parts: str) -> tuple[str, ...]:
-    return tuple(pattern.replace("*", part) for part in parts.split())
+def _angles_of_quaternion(columns: Columns) -> NDArray[np.float64]:
+    return euler_from_quaternions(quaternions(columns))
 
 
-_XYZ = _of("*", "x y z")
+def _odometry(topic: str, origin: str) -> tuple[Source, Source]:
+    """An estimate from outside, where it is in NED."""
+    place, turn = named("position[*]", _THREE), named("q[*]", _FOUR)
+    return (
+        Source("position", topic, place, vectors, _other_frame, absent_is_nan=True, frame=WORLD, origin=origin),
+        Source("attitude", topic, turn, quaternions, _other_frame, absent_is_nan=True, frame=ATTITUDE, origin=origin),
+    )
+
+
+_XYZ = named("*", "x y z")
 _THREE = "0 1 2"
 _FOUR = "0 1 2 3"
 
 _LOCAL = "vehicle_local_position"
 _TARGET = "vehicle_local_position_setpoint"
-_SIGNALS: tuple[_Source, ...] = (
-    _Source("position", _LOCAL, _XYZ, _frd, ("xy_valid", "z_valid"), frame=WORLD),
-    _Source("velocity", _LOCAL, _of("*", "vx vy vz"), _frd, ("v_xy_valid", "v_z_valid"), frame=WORLD),
-    _Source("attitude", "vehicle_attitude", _of("q[*]", _FOUR), _turned, frame=_ATTITUDE),
-    _Source("body_rate", "vehicle_angular_velocity", _of("xyz[*]", _THREE), _frd, frame=BODY),
-    _Source("body_rate", "sensor_combined", _of("gyro_rad[*]", _THREE), _frd, frame=BODY),
-    _Source("body_rate", "vehicle_attitude", _of("*speed", "roll pitch yaw"), _frd, frame=BODY),
-    _Source("specific_force", "sensor_combined", _of("accelerometer_m_s2[*]", _THREE), _frd, frame=BODY),
-    _Source("specific_force", "vehicle_acceleration", _of("xyz[*]", _THREE), _frd, frame=BODY),
-    _Source("rotor_speed", "esc_status", _of("esc[*].esc_rpm", _FOUR), _rad_per_s, frame=MOTORS),
-    _Source("voltage", "battery_status", ("voltage_v",), _plain),
-    _Source("setpoint_position", _TARGET, _XYZ, _frd, absent_is_nan=True, frame=WORLD),
-    _Source("setpoint_velocity", _TARGET, _of("*", "vx vy vz"), _frd, absent_is_nan=True, frame=WORLD),
-    _Source("flying", "vehicle_land_detected", ("landed",), _not, frame="1 while the autopilot does not say landed"),
-    _Source("acceleration", _LOCAL, _of("*", "ax ay az"), _frd, ("v_xy_valid", "v_z_valid"), frame=WORLD),
-    _Source("motor_request", "actuator_motors", _of("control[*]", _FOUR), _plain, absent_is_nan=True, frame=MOTORS),
-    _Source("setpoint_acceleration", _TARGET, _of("acceleration[*]", _THREE), _frd, absent_is_nan=True, frame=WORLD),
-    _Source("setpoint_acceleration", _TARGET, _of("*", "acc_x acc_y acc_z"), _frd, absent_is_nan=True, frame=WORLD),
-    _Source("setpoint_euler", "vehicle_attitude_setpoint", _of("q_d[*]", _FOUR), _angles_of_quaternion),
-    _Source("setpoint_euler", "vehicle_attitude_setpoint", _of("*_body", "roll pitch yaw"), _angles),
-    _Source(
+_SIGNALS: tuple[Source, ...] = (
+    Source("position", _LOCAL, _XYZ, vectors, _valid("xy_valid", "z_valid"), frame=WORLD),
+    Source("velocity", _LOCAL, named("*", "vx vy vz"), vectors, _valid("v_xy_valid", "v_z_valid"), frame=WORLD),
+    Source("attitude", "vehicle_attitude", named("q[*]", _FOUR), quaternions, frame=ATTITUDE),
+    Source("body_rate", "vehicle_angular_velocity", named("xyz[*]", _THREE), vectors, frame=BODY),
+    Source("body_rate", "sensor_combined", named("gyro_rad[*]", _THREE), vectors, frame=BODY),
+    Source("body_rate", "vehicle_attitude", named("*speed", "roll pitch yaw"), vectors, frame=BODY),
+    Source("specific_force", "sensor_combined", named("accelerometer_m_s2[*]", _THREE), vectors, frame=BODY),
+    Source("specific_force", "vehicle_acceleration", named("xyz[*]", _THREE), vectors, frame=BODY),
+    Source("rotor_speed", "esc_status", named("esc[*].esc_rpm", _FOUR), _rad_per_s, frame=MOTORS),
+    Source("voltage", "battery_status", ("voltage_v",), stacked),
+    Source("setpoint_position", _TARGET, _XYZ, vectors, absent_is_nan=True, frame=WORLD),
+    Source("setpoint_velocity", _TARGET, named("*", "vx vy vz"), vectors, absent_is_nan=True, frame=WORLD),
+    Source("flying", "vehicle_land_detected", ("landed",), _not, frame="1 while the autopilot does not say landed"),
+    Source("acceleration", _LOCAL, named("*", "ax ay az"), vectors, _valid("v_xy_valid", "v_z_valid"), frame=WORLD),
+    Source("motor_request", "actuator_motors", named("control[*]", _FOUR), stacked, absent_is_nan=True, frame=MOTORS),
+    Source(
+        "setpoint_acceleration", _TARGET, named("acceleration[*]", _THREE), vectors, absent_is_nan=True, frame=WORLD
+    ),
+    Source("setpoint_acceleration", _TARGET, named("*", "acc_x acc_y acc_z"), vectors, absent_is_nan=True, frame=WORLD),
+    Source("setpoint_euler", "vehicle_attitude_setpoint", named("q_d[*]", _FOUR), _angles_of_quaternion),
+    Source("setpoint_euler", "vehicle_attitude_setpoint", named("*_body", "roll pitch yaw"), euler),
+    Source(
         "setpoint_rate",
         "vehicle_rates_setpoint",
-        _of("*", "roll pitch yaw"),
-        _frd,
+        named("*", "roll pitch yaw"),
+        vectors,
         absent_is_nan=True,
         frame=BODY,
     ),
-    *(
-        source
-        for topic in ("vehicle_mocap_odometry", "vehicle_visual_odometry")
-        for source in (
-            _Source(
-                "position",
-                topic,
-                _of("position[*]", _THREE),
-                _frd,
-                absent_is_nan=True,
-                frame=WORLD,
-                origin="mocap" if "mocap" in topic else "vision",
-                only_if=("pose_frame", 1),  # NED
-            ),
-            _Source(
-                "attitude",
-                topic,
-                _of("q[*]", _FOUR),
-                _turned,
-                absent_is_nan=True,
-                frame=_ATTITUDE,
-                origin="mocap" if "mocap" in topic else "vision",
-                only_if=("pose_frame", 1),
-            ),
-        )
-    ),
+    *_odometry("vehicle_mocap_odometry", "mocap"),
+    *_odometry("vehicle_visual_odometry", "vision"),
 )
 
 
