@@ -97,9 +97,9 @@ def _table(event: EventType, values: NDArray[np.void], time: NDArray[np.float64]
 
 def _events(header: Header, order: list[NDArray[np.intp]], time: NDArray[np.float64]) -> tuple[Event, ...]:
     """Events that carry nothing but their time."""
-    bare = [(i, e) for i, e in enumerate(header.events) if not e.variables]
-    found = [Event(float(t), "log", {"name": e.name, "clock": "firmware"}) for i, e in bare for t in time[order[i]]]
-    return tuple(sorted(found, key=lambda event: event.time))
+    bare = [(i, event.name) for i, event in enumerate(header.events) if not event.variables]
+    rows = sorted((int(row), name) for i, name in bare for row in order[i])
+    return tuple(Event(float(time[row]), "log", {"name": name, "clock": "firmware"}) for row, name in rows)
 
 
 def _metadata(header: Header, order: list[NDArray[np.intp]], verdict: str) -> dict[str, str]:
