@@ -3,13 +3,15 @@
 import argparse
 import importlib
 import math
+import os
 import re
 import sys
 from collections.abc import Callable, Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from crazyem.errors import CrazyemError, UsageError
 
+_MODULES = {"import": "import_"}  # where the name of a command cannot be that of its module
 LONGEST_WINDOW = 20_000  # samples; the buffers are made at once, and an update would take seconds long before
 
 
@@ -78,13 +80,75 @@ def parser() -> argparse.ArgumentParser:
     )
 
     replay = common("replay", "run the estimator over a recording", recorded=True)
-    replay.add_argument("file", metavar="FILE", help="our MCAP, or a CSV (plain or gzip) of a known layout")
+    replay.add_argument("file", metavar="FILE", help="a recording of any known format")
+    _reading(replay)
 
     watch = common("watch", "estimate without commanding")
     watch.add_argument("uri", metavar="URI")
     watch.add_argument("--duration", type=_number(0.1, 1e6, " seconds"), metavar="S", help="s until it ends by itself")
     watch.add_argument("--record", metavar="FILE.mcap", help="record everything")
+    _on_recordings(commands)
     return top
+
+
+def _reading(p: argparse.ArgumentParser) -> None:
+    """What a reader may have to be told (`crazyem.recordings.options`)."""
+    p.add_argument("--map", metavar="FILE.toml", help="which columns of a CSV are which signals: a file or a preset")
+    p.add_argument(
+        "--motor",
+        choices=("duty", "request"),
+        help="what motor.m1..4 of an old log is: the duty sent, or the thrust requested before compensation",
+    )
+    p.add_argument(
+        "--as-published", action="store_true", help="believe a preset's publisher instead of correcting known mistakes"
+    )
+
+
+def _on_recordings(commands: Any) -> None:
+    """The commands that work on files and need neither drone nor estimator."""
+
+    def command(name: str, text: str, *, many: bool = True) -> argparse.ArgumentParser:
+        p: argparse.ArgumentParser = commands.add_parser(name, help=text, description=text)
+        if many:
+            p.add_argument("files", nargs="+", metavar="FILE", help="recordings, folders of them, or quoted patterns")
+            _reading(p)
+            p.add_argument(
+                "--jobs", type=_integer(1, 1024), metavar="N", help="processes (default: one a core, one for one file)"
+            )
+            p.add_argument("--cluster", metavar="ADDRESS", help="work on a Dask cluster: address of its scheduler")
+        p.add_argument(
+            "--json", nargs="?", const="-", metavar="FILE", help="results for programs; without FILE on standard output"
+        )
+        return p
+
+    def writes(p: argparse.ArgumentParser, metavar: str, text: str, *, required: bool = True) -> None:
+        p.add_argument("-o", "--output", required=required, metavar=metavar, help=text)
+        p.add_argument("--force", action="store_true", help="replace what is there (never a recording that is read)")
+
+    in_parts = "read in stretches of a minute, whatever the size (else only what may not fit into memory)"
+    info = command("info", "what is in recordings, how hard they flew, what could be identified from them")
+    info.add_argument("--vehicle", metavar="NAME|FILE", help="judge by this vehicle (default: the one that was flown)")
+    info.add_argument("--parts", action="store_true", help=in_parts)
+
+    doctor = command("doctor", "what is wrong with recordings, where, how bad, and what to do about it")
+    doctor.add_argument("--fix", action="store_true", help="write repairs that lose nothing into a new file")
+    writes(doctor, "OUT.mcap", "of --fix: file, or folder (default: NAME.fixed.mcap beside it)", required=False)
+    doctor.add_argument("--strict", action="store_true", help="exit code 5 if anything is unusable")
+    doctor.add_argument("--parts", action="store_true", help=in_parts)
+
+    writes(command("import", "recordings of any format into ours"), "OUT.mcap", "file; for several recordings a folder")
+
+    export = command("export", "recordings as tables: CSV or Parquet, units beside the numbers")
+    writes(export, "OUT.csv|OUT.parquet", "file; for several recordings a folder")
+    export.add_argument("--format", choices=("csv", "parquet"), help="in a folder (default: csv)")
+    export.add_argument("--parts", action="store_true", help=in_parts)
+
+    recover = command("recover", "a cut or damaged MCAP file into a valid one", many=False)
+    recover.add_argument("file", metavar="BROKEN.mcap", help="of any program; it is only read")
+    writes(recover, "OUT.mcap", "the new file")
+
+    layout = command("layout", "a Foxglove and Lichtblick layout for recordings of ours", many=False)
+    writes(layout, "FILE.json", "file (default: standard output)", required=False)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -95,8 +159,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.command == "fly" and arguments.uri is None and "://" in arguments.trajectory[-1]:
             arguments.uri = arguments.trajectory.pop()
         # Imported only now: `crazyem --help` should not wait for numba. The name is one of the parser's own.
-        command = importlib.import_module(f"crazyem.commands.{arguments.command}")
-        return int(command.run(arguments))
+        module = _MODULES.get(arguments.command, arguments.command)
+        code = int(importlib.import_module(f"crazyem.commands.{module}").run(arguments))
+        sys.stdout.flush()  # here, where a reader that has gone away can still be dealt with
+        return code
     except CrazyemError as error:
         sentence = str(error)
         print(f"crazyem: {sentence}{'' if sentence.endswith('.') else '.'}", file=sys.stderr)
@@ -104,3 +170,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("crazyem: interrupted.", file=sys.stderr)
         return 130
+    except BrokenPipeError:
+        # `| head` has seen enough; the interpreter must not complain about it when it flushes at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141

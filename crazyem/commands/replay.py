@@ -4,6 +4,7 @@ import argparse
 import time
 
 from crazyem.commands.common import new_estimator, plot_path, report, say
+from crazyem.commands.files import read_options
 from crazyem.errors import DataError
 from crazyem.live.history import History, Push
 from crazyem.live.pipeline import Pipeline
@@ -64,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     plot = plot_path(arguments, arguments.json, arguments.file)
     for path in (arguments.json, plot):
         check_writable(path)
-    recording = open_recording(arguments.file)
+    recording = open_recording(arguments.file, read_options(arguments))
     vehicle = vehicle_of(recording, arguments.vehicle)
     configured = recording.metadata.get("configuration", {})
     for name, default in (("window", "800"), ("every", "4")):

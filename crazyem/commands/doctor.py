@@ -1,0 +1,206 @@
+"""`crazyem doctor FILE...`: what is wrong with recordings, and with --fix the lossless repairs into new files."""
+
+import argparse
+import textwrap
+from pathlib import Path
+from typing import Any
+
+from crazyem.commands.batch import each, processes
+from crazyem.commands.files import find, read_options, targets
+from crazyem.commands.info import counted
+from crazyem.commands.merged import merge_findings
+from crazyem.commands.output import Report, Result
+from crazyem.errors import DataError, UsageError
+from crazyem.recordings import Finding, Grade, ReadOptions, Recording, open_recording
+from crazyem.recordings.parts import can_be_parted, is_large, open_parts
+
+_WIDTH = 110
+_SHOWN = 4  # intervals that are written out
+_WORST_FIRST = (Grade.UNUSABLE, Grade.DEGRADES, Grade.HARMLESS)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    report = Report(arguments)
+    if arguments.output is not None and not arguments.fix:
+        raise UsageError("-o is where --fix writes; without --fix nothing is written.")
+    files = find(arguments.files)
+    options = read_options(arguments)
+    outputs: list[Path | None] = [None] * len(files.found)
+    if arguments.fix:
+        outputs = [*targets(files.found, arguments.output, ".fixed.mcap", force=arguments.force)]
+    several = len(files.found) > 1
+    tasks = [
+        (str(f.path), options, None if o is None else str(o), arguments.force, arguments.parts, processes(arguments.jobs, len(files.found)),
+         several)
+        for f, o in zip(files.found, outputs, strict=True)
+    ]  # fmt: skip
+    names = [str(f.path) for f in files.found]
+    for number, result in enumerate(
+        each(diagnose, tasks, names=names, what="doctor", jobs=arguments.jobs, cluster=arguments.cluster)
+    ):
+        if number:
+            report.say("")
+        report.add(result)
+    duplicates = _duplicates(report.results) if several else []
+    for duplicate in duplicates:
+        report.say("\n" + text_of(duplicate["finding"]))
+    if several or files.skipped:
+        report.say(f"\n{_graded(report.results)}; {counted(report.results, files.skipped)}")
+    code = report.close(
+        duplicates=[d["json"] for d in duplicates],
+        skipped_files=files.skipped,
+    )
+    if code == 0 and arguments.strict and any(r.data.get("grade") == str(Grade.UNUSABLE) for r in report.results):
+        return DataError.exit_code
+    return code
+
+
+def diagnose(
+    path: str, options: ReadOptions, output: str | None, force: bool, parts: bool, jobs: int, several: bool
+) -> Result:
+    """One file. Raises as `open_recording`, and UsageError if the repaired file cannot be written."""
+    from crazyem.doctor import examine
+
+    large = parts or is_large(Path(path), jobs=jobs)
+    if large and output is None and can_be_parted(Path(path)):
+        source, start, end, found = "", None, None, []
+        for part in open_parts(path, options):
+            source = part.source
+            stamps = [a.time for a in part.signals.values() if a.time.size]
+            low, high = min(float(t.min()) for t in stamps), max(float(t.max()) for t in stamps)
+            start = low if start is None else min(start, low)
+            end = high if end is None else max(end, high)
+            found.append(examine(part))
+        findings = merge_findings(found)
+        duration = (end - start) if start is not None and end is not None else 0.0
+        return _result(path, source, duration, findings, {}, [], None)
+    recording = open_recording(path, options)
+    findings = examine(recording)
+    detail = _fingerprint(recording) if several else None
+    fixed: dict[str, Any] = {}
+    lines: list[str] = []
+    if output is not None:
+        fixed, lines = _repair(recording, findings, output, force)
+    return _result(path, recording.source, recording.duration, findings, fixed, lines, detail)
+
+
+def _fingerprint(recording: Recording) -> Any:
+    from crazyem.doctor.duplicates import fingerprint
+
+    return fingerprint(recording)
+
+
+def _repair(
+    recording: Recording, findings: tuple[Finding, ...], output: str, force: bool
+) -> tuple[dict[str, Any], list[str]]:
+    """Apply what loses nothing and write it; nothing is written where there is nothing to apply."""
+    from crazyem.doctor.fix import apply_fixes
+    from crazyem.recordings.mcap_signals import write_recording
+
+    wanted = [f for f in findings if f.fix is not None]
+    repaired, applied = apply_fixes(recording, findings)
+    # by value: a finding may come back as another object that says the same
+    done = [_key(f) for f in applied]
+    left = [f for f in wanted if _key(f) not in done]
+    result: dict[str, Any] = {
+        "output": None,
+        "applied": [f.to_dict() for f in applied],
+        "not_applied": [f.to_dict() for f in left],
+    }
+    lines = [f"applied: {_what(f)}" for f in applied] + [f"not applied: {_what(f)}" for f in left]
+    if applied:
+        write_recording(repaired, output, replace=force)
+        result["output"] = output
+        lines.append(f"written: {output}")
+    else:
+        lines.append("nothing to repair without loss; no file was written")
+    return result, lines
+
+
+def _key(finding: Finding) -> tuple[Any, ...]:
+    fix = finding.fix
+    return (finding.check, finding.signal, finding.text, None if fix is None else (fix.kind, fix.signals, fix.factor))
+
+
+def _what(finding: Finding) -> str:
+    fix = finding.fix
+    how = "" if fix is None else f" ({fix.kind} of {', '.join(fix.signals)})"
+    return f"{finding.check}{how}: {finding.text}"
+
+
+def _result(
+    path: str,
+    source: str,
+    duration: float,
+    findings: tuple[Finding, ...],
+    fixed: dict[str, Any],
+    lines: list[str],
+    detail: Any,
+) -> Result:
+    grade = next((g for g in _WORST_FIRST if any(f.grade is g for f in findings)), None)
+    data: dict[str, Any] = {
+        "source": source,
+        "duration_s": duration,
+        "grade": "sound" if grade is None else str(grade),
+        "findings": [f.to_dict() for f in findings],
+    }
+    if fixed:
+        data["fixed"] = fixed
+    counts = ", ".join(f"{n} {g}" for g in _WORST_FIRST if (n := sum(f.grade is g for f in findings)))
+    head = f"{path}: {source}, {duration:.2f} s: {counts or 'nothing found'}"
+    blocks = [head, *(text_of(f) for g in _WORST_FIRST for f in findings if f.grade is g)]
+    blocks += [_wrapped(line, "  ") for line in lines]
+    return Result(path, data, "\n".join(blocks), detail=detail)
+
+
+def text_of(finding: Finding) -> str:
+    """A finding for people: grade, check, signal and time; then what, the numbers behind it, what to do."""
+    where = f" {finding.signal}" if finding.signal else ""
+    lines = [f"  {str(finding.grade).upper():<9} {finding.check}{where}{_when(finding)}", _wrapped(finding.text)]
+    if finding.evidence:
+        lines.append(_wrapped("evidence: " + ", ".join(f"{k} {v:.6g}" for k, v in finding.evidence.items())))
+    if finding.advice:
+        lines.append(_wrapped("advice: " + finding.advice))
+    if finding.fix is not None:
+        lines.append(_wrapped(f"--fix can repair it: {finding.fix.kind} of {', '.join(finding.fix.signals)}"))
+    return "\n".join(lines)
+
+
+def _when(finding: Finding) -> str:
+    intervals = finding.intervals
+    if not intervals:
+        return ""
+    shown = ", ".join(f"{a:.3f}" if a == b else f"{a:.3f} to {b:.3f}" for a, b in intervals[:_SHOWN])
+    more = f" and {len(intervals) - _SHOWN} more" if len(intervals) > _SHOWN else ""
+    return f", at {shown} s{more}"
+
+
+def _wrapped(text: str, indent: str = " " * 12) -> str:
+    return textwrap.fill(
+        text,
+        _WIDTH,
+        initial_indent=indent,
+        subsequent_indent=indent + "  ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def _graded(results: list[Result]) -> str:
+    grades = [r.data.get("grade") for r in results if not r.error]
+    names = [*(str(g) for g in _WORST_FIRST), "sound"]
+    return "recordings by their worst finding: " + ", ".join(f"{n} {g}" for g in names if (n := grades.count(g)))
+
+
+def _duplicates(results: list[Result]) -> list[dict[str, Any]]:
+    """Flights that are in more than one of the files."""
+    from crazyem.doctor.duplicates import find_duplicates
+
+    prints = [r.detail for r in results if r.detail is not None]
+    return [_duplicate(d) for d in find_duplicates(prints)]
+
+
+def _duplicate(found: Any) -> dict[str, Any]:
+    finding = found if isinstance(found, Finding) else found.finding()
+    return {"finding": finding, "json": found.to_dict()}

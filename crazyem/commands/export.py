@@ -1,0 +1,61 @@
+"""`crazyem export FILE... -o OUT.csv|OUT.parquet`: recordings as tables for other programs, nothing resampled."""
+
+import argparse
+from pathlib import Path
+
+from crazyem.commands.batch import each, processes
+from crazyem.commands.files import find, read_options, targets
+from crazyem.commands.info import counted
+from crazyem.commands.output import Report, Result, remarks
+from crazyem.errors import UsageError
+from crazyem.recordings import ReadOptions, open_recording
+from crazyem.recordings.export import METADATA_SUFFIX, SUFFIXES, export, export_parts
+from crazyem.recordings.parts import can_be_parted, is_large, open_parts
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    report = Report(arguments)
+    files = find(arguments.files)
+    suffix = f".{arguments.format or 'csv'}"
+    outputs = targets(files.found, arguments.output, suffix, force=arguments.force)
+    for output in outputs:
+        if output.suffix.lower() not in SUFFIXES:
+            raise UsageError(f"{output}: an export ends in {' or '.join(SUFFIXES)}.")
+        if arguments.format and output.suffix.lower() != suffix:
+            raise UsageError(f"{output} does not end in {suffix}, which --format asks for.")
+    options = read_options(arguments)
+    tasks = [
+        (str(f.path), str(o), options, arguments.force, arguments.parts, processes(arguments.jobs, len(files.found)))
+        for f, o in zip(files.found, outputs, strict=True)
+    ]
+    names = [str(f.path) for f in files.found]
+    for result in each(convert, tasks, names=names, what="export", jobs=arguments.jobs, cluster=arguments.cluster):
+        report.add(result)
+    if len(files.found) > 1 or files.skipped:
+        report.say(counted(report.results, files.skipped))
+    return report.close(skipped_files=files.skipped)
+
+
+def convert(path: str, output: str, options: ReadOptions, force: bool, parts: bool, jobs: int) -> Result:
+    """One file. Raises as `open_recording`; UsageError if the result cannot be written."""
+    large = parts or is_large(Path(path), jobs=jobs)
+    if large and can_be_parted(Path(path)):
+        description = export_parts(lambda: open_parts(path, options), output, force=force)
+    else:
+        description = export(open_recording(path, options), output, force=force)
+    written = [output]
+    if output.lower().endswith(".csv"):
+        written.append(output + METADATA_SUFFIX)
+    names = [entry.name for entry in description.entries]
+    data = {
+        "output": written,
+        "source": description.source,
+        "signals": names,
+        "columns": ["time", "host_time", *(c.name for c in description.columns)],
+        "findings": [f.to_dict() for f in description.findings],
+    }
+    text = (
+        f"{path} -> {', '.join(written)}: {description.source}, {len(names)} signals in {len(data['columns'])} columns"
+    )
+    return Result(path, data, "\n".join([text, *remarks(description.findings)]))

@@ -1,0 +1,224 @@
+"""From what stands on the command line to recordings: files, folders, patterns; and where results of each go."""
+
+import glob
+import os
+import stat
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from crazyem.commands.output import complain
+from crazyem.errors import FileFormatError, UsageError
+from crazyem.recordings import ReadOptions
+from crazyem.recordings.registry import READERS, reader_of
+
+# What the reader of any CSV takes in a folder: text with commas is everywhere. A file named by the user is always read.
+_ANY_CSV, _CSV_NAMES = "CSV", (".csv", ".csv.gz", ".tsv", ".tsv.gz")
+_SUFFIXES = (".gz", ".csv", ".tsv", ".txt", ".mcap", ".ulg", ".tlog", ".bin", ".db3")
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A recording to read.
+
+    Attributes:
+        path: file, or folder if the format is a folder.
+        below: its folder below the folder that was given ("" for a file that was named): results keep that structure.
+    """
+
+    path: Path
+    below: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Files:
+    """What the arguments came to: recordings in order, and how many other files lay among them."""
+
+    found: tuple[Found, ...]
+    skipped: int = 0
+
+
+def find(arguments: Iterable[str]) -> Files:
+    """Recordings named by files, folders (searched through) and patterns; each once.
+
+    In folders and patterns, files that no reader knows are counted, not read; so are hidden ones not even counted.
+    A folder that is a recording itself (rosbag2, a cfclient session) counts as one.
+
+    Raises: UsageError if nothing is left.
+    """
+    search = _Search()
+    names = list(arguments)
+    for name in names:
+        search.argument(name)
+    if not search.found:
+        others = f" ({search.skipped} other files)" if search.skipped else ""
+        raise UsageError(f"there is no recording in {', '.join(names)}{others}.")
+    return Files(tuple(search.found), search.skipped)
+
+
+class _Search:
+    def __init__(self) -> None:
+        self.found: list[Found] = []
+        self.skipped = 0
+        self._seen: set[str] = set()
+
+    def argument(self, name: str) -> None:
+        path = Path(name)
+        if os.path.lexists(path):
+            self._named(path)
+        elif glob.has_magic(name):
+            matches = sorted(glob.glob(name, recursive=True))
+            if not matches:
+                raise UsageError(f"nothing matches {name}.")
+            for match in matches:
+                self._matched(Path(match))
+        else:
+            self._take(path, "")  # reading it says that it is not there
+
+    def _named(self, path: Path) -> None:
+        if path.is_dir():
+            self._folder(path)
+        elif path.exists() and not path.is_file():
+            raise UsageError(f"{path} is neither a file nor a folder.")
+        else:
+            self._take(path, "")
+
+    def _matched(self, path: Path) -> None:
+        if path.is_dir():
+            self._folder(path)
+        elif path.is_file() and _is_recording(path):
+            self._take(path, "")
+        else:
+            self.skipped += 1
+
+    def _folder(self, top: Path) -> None:
+        if _is_recording_folder(top):
+            self._take(top, "")
+            return
+        entered: set[tuple[int, int]] = set()  # a link to a folder above would go round for ever
+        waiting = [top]
+        while waiting:
+            folder = waiting.pop()
+            try:
+                status = folder.stat()
+                entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+            except OSError as error:
+                complain(f"{folder} cannot be read: {error.strerror}")
+                continue
+            if (status.st_dev, status.st_ino) in entered:
+                continue
+            entered.add((status.st_dev, status.st_ino))
+            inner = []
+            for entry in entries:
+                path = Path(entry.path)
+                if entry.name.startswith("."):
+                    continue
+                if _is(entry, stat.S_ISDIR):
+                    if _is_recording_folder(path):
+                        self._take(path, _below(folder, top))
+                    else:
+                        inner.append(path)
+                elif _is(entry, stat.S_ISREG) and _is_recording(path):
+                    self._take(path, _below(folder, top))
+                else:
+                    self.skipped += 1
+            waiting.extend(reversed(inner))
+
+    def _take(self, path: Path, below: str) -> None:
+        real = os.path.realpath(path)
+        if real not in self._seen:
+            self._seen.add(real)
+            self.found.append(Found(path, below))
+
+
+def _below(folder: Path, top: Path) -> str:
+    relative = str(folder.relative_to(top))
+    return "" if relative == "." else relative
+
+
+def _is(entry: os.DirEntry[str], kind: Any) -> bool:
+    """What an entry is, links followed; False for a link to nothing. Never opens it: a pipe would wait for ever."""
+    try:
+        return bool(kind(entry.stat().st_mode))
+    except OSError:
+        return False
+
+
+def _is_recording(path: Path) -> bool:
+    try:
+        reader = reader_of(path)
+    except FileFormatError:
+        # of no known format; but a damaged gzip file called .csv.gz should not vanish without a word
+        return path.name.lower().endswith(".csv.gz")
+    except UsageError:
+        return True  # cannot be opened: reading it says why
+    return reader.name != _ANY_CSV or path.name.lower().endswith(_CSV_NAMES)
+
+
+def _is_recording_folder(path: Path) -> bool:
+    try:
+        return any(reader.recognises_folder(path) for reader in READERS)
+    except OSError:
+        return False
+
+
+def read_options(arguments: Any) -> ReadOptions:
+    """--map, --motor, --as-published."""
+    return ReadOptions(arguments.map, arguments.motor, arguments.as_published)
+
+
+def stem(path: Path) -> str:
+    """The name of a recording without the suffixes of its format; dots elsewhere in the name stay."""
+    name = path.name or path.resolve().name
+    lower = name.lower()
+    while True:
+        suffix = next((s for s in _SUFFIXES if lower.endswith(s) and len(lower) > len(s)), None)
+        if suffix is None:
+            return name
+        name, lower = name[: -len(suffix)], lower[: -len(suffix)]
+
+
+def targets(found: Iterable[Found], output: str | None, suffix: str, *, force: bool) -> list[Path]:
+    """Where the result of each recording goes.
+
+    One recording: `output` itself, unless it is an existing folder. Several: `output` is a folder, made if need be, in
+    which folders below those given are kept. None: beside each recording.
+
+    Raises: UsageError if a result would replace a recording, another result, or (unless `force`) any file.
+    """
+    found = list(found)
+    inputs = {os.path.realpath(f.path) for f in found}
+    if output is not None and len(found) == 1 and not Path(output).is_dir() and not output.endswith(os.sep):
+        result = [Path(output)]
+    else:
+        result = list(_in_folder(found, output, suffix))
+    taken: dict[str, Path] = {}
+    for one, target in zip(found, result, strict=True):
+        real = os.path.realpath(target)
+        if real in inputs:
+            raise UsageError(f"{target} is a recording to be read; it is never written in place.")
+        if real in taken:
+            raise UsageError(f"{taken[real]} and {one.path} would both become {target}; convert them one at a time.")
+        taken[real] = one.path
+        if target.exists() and not force:
+            raise UsageError(f"{target} exists already (--force replaces it).")
+    for target in result:
+        try:
+            if output is not None and len(found) > 1:
+                target.parent.mkdir(parents=True, exist_ok=True)
+            if not target.parent.is_dir():
+                raise UsageError(f"cannot write {target}: {target.parent} is no folder.")
+        except OSError as error:
+            raise UsageError(f"cannot write {target}: {error.strerror or error}.") from None
+    return result
+
+
+def _in_folder(found: list[Found], output: str | None, suffix: str) -> Iterator[Path]:
+    if output is not None and Path(output).exists() and not Path(output).is_dir():
+        raise UsageError(f"{output} is not a folder; several recordings need one.")
+    places = [(f.path.parent if output is None else Path(output) / f.below) for f in found]
+    short = [place / f"{stem(f.path)}{suffix}" for place, f in zip(places, found, strict=True)]
+    for place, f, name in zip(places, found, short, strict=True):
+        # a.csv and a.mcap of one folder keep their whole names
+        yield name if short.count(name) == 1 else place / f"{f.path.name}{suffix}"

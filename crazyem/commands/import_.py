@@ -1,0 +1,52 @@
+"""`crazyem import FILE... -o OUT.mcap`: recordings of any format into ours, nothing resampled, nothing left out."""
+
+import argparse
+from typing import Any
+
+from crazyem.commands.batch import each
+from crazyem.commands.files import find, read_options, targets
+from crazyem.commands.info import counted
+from crazyem.commands.output import Report, Result, remarks
+from crazyem.recordings import ReadOptions, Recording, open_recording
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    report = Report(arguments)
+    files = find(arguments.files)
+    outputs = targets(files.found, arguments.output, ".mcap", force=arguments.force)
+    options = read_options(arguments)
+    tasks = [(str(f.path), str(o), options, arguments.force) for f, o in zip(files.found, outputs, strict=True)]
+    names = [str(f.path) for f in files.found]
+    for result in each(convert, tasks, names=names, what="import", jobs=arguments.jobs, cluster=arguments.cluster):
+        report.add(result)
+    if len(files.found) > 1 or files.skipped:
+        report.say(counted(report.results, files.skipped))
+    return report.close(skipped_files=files.skipped)
+
+
+def convert(path: str, output: str, options: ReadOptions, force: bool) -> Result:
+    """One file. Raises as `open_recording`; UsageError if the result cannot be written."""
+    from crazyem.recordings.mcap_signals import write_recording
+
+    recording = open_recording(path, options)
+    write_recording(recording, output, replace=force)
+    data = {"output": output, **summary(recording)}
+    text = f"{path} -> {output}: {recording.source}, {_counts(data)}"
+    return Result(path, data, "\n".join([text, *remarks(recording.findings)]))
+
+
+def summary(recording: Recording) -> dict[str, Any]:
+    """What went over, for JSON."""
+    return {
+        "source": recording.source,
+        "duration_s": recording.duration,
+        "signals": {name: int(array.time.size) for name, array in recording.signals.items()},
+        "samples": len(recording),
+        "events": len(recording.events),
+        "findings": [f.to_dict() for f in recording.findings],
+    }
+
+
+def _counts(data: dict[str, Any]) -> str:
+    return f"{data['duration_s']:.2f} s, {len(data['signals'])} signals, {data['samples']} samples"

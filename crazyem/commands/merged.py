@@ -1,0 +1,154 @@
+"""What parts of a recording too large for memory add up to: one inventory, one list of findings."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import fields, replace
+from typing import Any
+
+from crazyem.doctor.envelope import Envelope
+from crazyem.doctor.identifiability import Verdict
+from crazyem.doctor.inventory import ClockRow, Inventory, SignalRow
+from crazyem.recordings.finding import Finding, Grade
+
+_RANK = {"yes": 0, "weak": 1, "no": 2}
+_WORST = {Grade.UNUSABLE: 0, Grade.DEGRADES: 1, Grade.HARMLESS: 2}
+
+
+def merge_inventories(parts: Iterable[Inventory]) -> Inventory:
+    """One inventory of consecutive parts.
+
+    Counts add up and extremes are exact. A median period is that of the part with the most samples; what could be
+    identified is that of the best part, so it claims too little rather than too much.
+    """
+    total: Inventory | None = None
+    for part in parts:
+        total = part if total is None else _add(total, part)
+    if total is None:
+        raise ValueError("a recording has at least one part")
+    return total
+
+
+def _add(a: Inventory, b: Inventory) -> Inventory:
+    rows = {row.name: row for row in a.signals}
+    for row in b.signals:
+        rows[row.name] = _add_rows(rows[row.name], row) if row.name in rows else row
+    clocks = {row.name: row for row in a.clocks}
+    for clock in b.clocks:
+        clocks[clock.name] = _add_clocks(clocks[clock.name], clock) if clock.name in clocks else clock
+    starts = [row.start_s for row in rows.values() if row.start_s is not None]
+    ends = [row.end_s for row in rows.values() if row.end_s is not None]
+    return replace(
+        a,
+        duration_s=max(ends) - min(starts) if starts and ends else 0.0,
+        samples=a.samples + b.samples,
+        signals=tuple(rows.values()),
+        clocks=tuple(clocks.values()),
+        metadata={**a.metadata, **b.metadata},
+        events={kind: a.events.get(kind, 0) + b.events.get(kind, 0) for kind in (*a.events, *b.events)},
+        envelope=_add_envelopes(a.envelope, b.envelope),
+        verdicts=_best(a.verdicts, b.verdicts),
+    )
+
+
+def _add_rows(a: SignalRow, b: SignalRow) -> SignalRow:
+    samples = a.samples + b.samples
+    start = _reduced(min, a.start_s, b.start_s)
+    end = _reduced(max, a.end_s, b.end_s)
+    span = end - start if start is not None and end is not None else 0.0
+    between = b.start_s - a.end_s if a.end_s is not None and b.start_s is not None else None
+    longest = _reduced(max, a.longest_gap_s, b.longest_gap_s)
+    more = a if a.samples >= b.samples else b
+    return replace(
+        a,
+        samples=samples,
+        start_s=start,
+        end_s=end,
+        rate_hz=(samples - 1) / span if span > 0.0 else None,
+        period_s=more.period_s,
+        missing_share=_weighted(a.missing_share, a.samples, b.missing_share, b.samples),
+        marked_share=_weighted(a.marked_share, a.samples, b.marked_share, b.samples),
+        longest_gap_s=_reduced(max, longest, between),
+    )
+
+
+def _add_clocks(a: ClockRow, b: ClockRow) -> ClockRow:
+    longer = a if a.end_s - a.start_s >= b.end_s - b.start_s else b
+    return replace(
+        longer, signals=max(a.signals, b.signals), start_s=min(a.start_s, b.start_s), end_s=max(a.end_s, b.end_s)
+    )
+
+
+def _add_envelopes(a: Envelope, b: Envelope) -> Envelope:
+    """Extremes of both; shares and rms weighted by the time in the air."""
+    values: dict[str, Any] = {}
+    for field in fields(Envelope):
+        name, x, y = field.name, getattr(a, field.name), getattr(b, field.name)
+        if name == "airborne_s":
+            values[name] = x + y
+        elif name == "airborne_intervals_s":
+            values[name] = (*x, *y)
+        elif "_rms_" in name and x is not None and y is not None:
+            values[name] = math.sqrt(_weighted(x * x, a.airborne_s, y * y, b.airborne_s))
+        elif name.endswith("_share") and x is not None and y is not None:
+            values[name] = _weighted(x, a.airborne_s, y, b.airborne_s)
+        elif name.startswith("voltage_end"):
+            values[name] = x if y is None else y
+        elif "_max" in name or "_min" in name:
+            values[name] = _reduced(max if "_max" in name else min, x, y)
+        else:
+            values[name] = y if x in (None, "", ()) else x
+    return replace(a, **values)
+
+
+def _reduced(function: Any, x: Any, y: Any) -> Any:
+    """Extreme of two numbers or of tuples of them, where None is no number."""
+    if x is None or y is None:
+        return y if x is None else x
+    if isinstance(x, tuple):
+        return tuple(function(p, q) for p, q in zip(x, y, strict=True))
+    return function(x, y)
+
+
+def _weighted(x: float, a: float, y: float, b: float) -> float:
+    return (x * a + y * b) / (a + b) if a + b > 0.0 else x
+
+
+def _best(a: tuple[Verdict, ...], b: tuple[Verdict, ...]) -> tuple[Verdict, ...]:
+    best = {verdict.name: verdict for verdict in a}
+    for verdict in b:
+        known = best.get(verdict.name)
+        if known is None or _order(verdict) < _order(known):
+            best[verdict.name] = verdict
+    return tuple(best.values())
+
+
+def _order(verdict: Verdict) -> tuple[int, float]:
+    sd = verdict.relative_sd if verdict.relative_sd is not None else verdict.sd
+    return _RANK.get(str(verdict.verdict), 3), math.inf if sd is None else sd
+
+
+def merge_findings(parts: Iterable[tuple[Finding, ...]]) -> tuple[Finding, ...]:
+    """Findings of parts: one for each check and signal, as it was in the worst part, with the stretches of all.
+
+    A finding without a stretch is of its whole part; `evidence["parts"]` says in how many parts it was.
+    """
+    merged: dict[tuple[str, str], Finding] = {}
+    counts: dict[tuple[str, str], int] = {}
+    for findings in parts:
+        for key in {(f.check, f.signal) for f in findings}:
+            counts[key] = counts.get(key, 0) + 1
+        for finding in findings:
+            key = (finding.check, finding.signal)
+            known = merged.get(key)
+            if known is None:
+                merged[key] = replace(finding, fix=None)
+                continue
+            worse = finding if _WORST[finding.grade] < _WORST[known.grade] else known
+            intervals = known.intervals
+            if finding.intervals != known.intervals[-len(finding.intervals) :]:
+                intervals = (*known.intervals, *finding.intervals)
+            merged[key] = replace(worse, intervals=intervals, fix=None)
+    return tuple(
+        replace(finding, evidence={**finding.evidence, "parts": float(counts[key])}) if counts[key] > 1 else finding
+        for key, finding in sorted(merged.items(), key=lambda item: _WORST[item[1].grade])
+    )

@@ -1,0 +1,148 @@
+"""What the commands on recordings say and where: text without control characters, JSON, progress on standard error."""
+
+import argparse
+import sys
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from crazyem.errors import UsageError
+from crazyem.live.summary import check_writable, write_json
+from crazyem.recordings.finding import Finding, Grade
+
+_FIRST, _AGAIN = 1.0, 5.0  # s until progress is shown, and between its lines where they cannot overwrite each other
+
+
+def plain(text: str) -> str:
+    """Text that cannot steer a terminal: names of files and signals may hold anything."""
+    return "".join(c if c.isprintable() or c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+def put(text: str) -> None:
+    """A result, to standard output."""
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    print(plain(text).encode(encoding, "replace").decode(encoding), flush=True)
+
+
+def complain(text: str) -> None:
+    """An error that does not end the command, to standard error."""
+    sentence = plain(text).strip()
+    print(f"crazyem: {sentence}{'' if sentence.endswith('.') else '.'}", file=sys.stderr, flush=True)
+
+
+def remarks(findings: Iterable[Finding]) -> list[str]:
+    """What a reader noticed and matters, a line each; the rest is the doctor's business."""
+    return [f"  {f.grade}: {f.text}" for f in findings if f.grade is not Grade.HARMLESS]
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What a command found out about one file.
+
+    Attributes:
+        file: as given or found.
+        data: for JSON.
+        text: for people.
+        error: one sentence if it failed, else "".
+        code: exit code of that error, else 0.
+        detail: what the command itself needs further (pickled between processes, so keep it small).
+    """
+
+    file: str
+    data: Mapping[str, Any] = field(default_factory=dict)
+    text: str = ""
+    error: str = ""
+    code: int = 0
+    detail: Any = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        failed = {"error": self.error, "exit_code": self.code} if self.error else {}
+        return {"file": self.file, **self.data, **failed}
+
+
+class Report:
+    """Results as they come: text at once, JSON at the end."""
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self.json: str | None = arguments.json
+        self.results: list[Result] = []
+        check_json(self.json)
+
+    def add(self, result: Result) -> None:
+        """One more file."""
+        self.results.append(result)
+        if result.error:
+            complain(result.error)
+        else:
+            self.say(result.text)
+
+    def say(self, text: str) -> None:
+        """Text for people, unless standard output is for JSON."""
+        if text and self.json != "-":
+            put(text)
+
+    def close(self, **more: Any) -> int:
+        """Write the JSON, with `more` beside the files; returns the exit code: that of the first error."""
+        if self.json:
+            write_json({"files": [r.to_dict() for r in self.results], **more}, self.json)
+        return next((r.code for r in self.results if r.code), 0)
+
+
+def check_json(path: str | None) -> None:
+    """Refuse a --json that cannot be written, or that would replace something else.
+
+    `crazyem info --json a.csv b.csv` asks for the summary of b.csv in a.csv; nobody means that.
+    """
+    check_writable(path)
+    if path is None or path == "-":
+        return
+    target = Path(path)
+    if target.is_file() and target.stat().st_size:
+        with target.open("rb") as file:
+            start = file.read(64).lstrip()
+        if start[:1] not in (b"{", b"["):
+            raise UsageError(f"{path} exists and is no JSON file; write --json=FILE, or --json after the recordings.")
+
+
+class Progress:
+    """How far a long command is: one line that overwrites itself on a terminal, else a line now and then."""
+
+    def __init__(self, what: str, total: int) -> None:
+        self.what, self.total, self.done = what, total, 0
+        self._terminal = sys.stderr is not None and sys.stderr.isatty()
+        self._due = time.monotonic() + _FIRST
+        self._shown = False
+
+    def __enter__(self) -> "Progress":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.clear()
+
+    def step(self) -> None:
+        """One more is done."""
+        self.done += 1
+        if self.total > 1:
+            self.show(f"{self.what}: {self.done} of {self.total} files")
+
+    def show(self, text: str) -> None:
+        """The state in words, if it is time to say it."""
+        now = time.monotonic()
+        if now < self._due:
+            return
+        self._due = now + (0.2 if self._terminal else _AGAIN)
+        if self._terminal:
+            print(f"\r{plain(text)[:78]:<78}", end="", file=sys.stderr, flush=True)
+            self._shown = True
+        else:
+            print(plain(text), file=sys.stderr, flush=True)
+
+    def clear(self) -> None:
+        """Take the line off the terminal, so that other text can stand there."""
+        if self._shown:
+            print(f"\r{'':<78}\r", end="", file=sys.stderr, flush=True)
+            self._shown = False
