@@ -30,7 +30,7 @@ from crazyem.recordings.frd_ned import (
 )
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
-from crazyem.recordings.topics import Source, Topic, damage, file_bytes, named, ranks
+from crazyem.recordings.topics import Source, Topic, damage, file_bytes, named, ranks, signals_of, text_of
 from crazyem.recordings.ulog_scan import HEADER, MAGIC, Scan, scan, unknown_flags
 
 CLOCK = "autopilot"  # microseconds since boot
