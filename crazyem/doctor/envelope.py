@@ -18,6 +18,9 @@ SPLIT = 1.0  # s without a sample after which nobody knows whether it still flew
 SHORTEST = 0.3  # s; a hop shorter than this is no flight
 PAUSE = 0.5  # s; rotors slowed for less than this (a quick descent) have not stopped
 SATURATED = 0.999  # duty from which a rotor is at its limit
+IMPACT = 40.0  # m/s^2 of specific force, twice what rotors can do: the drone hit something
+_AFTER_IMPACT = 1.5  # s before the end of a flight from which an impact is its end
+_AROUND_IMPACT = 0.25  # s
 _SPEED_SPAN = 0.1  # s over which position is differenced where there is no velocity
 
 # Signals that say how hard the rotors turn, best first, and the share of a typical value in flight below which they
@@ -105,7 +108,10 @@ def airborne(recording: Recording) -> Airborne:
         used.append("position")
         inside = _off_the_ground(height[1][:, 2], turning, known=rotors is not None or flag is not None)
     runs = intervals_of(time, inside)
-    parts = [part for start, end in runs for part in _split(time, start, end)]
+    impacts = _impacts(recording)
+    if any(start <= t <= end for t in impacts for start, end in runs):
+        used.append("specific_force")
+    parts = [p for start, end in runs for part in _split(time, start, end) for p in _without_impacts(*part, impacts)]
     return Airborne(tuple((a, b) for a, b in parts if b - a >= SHORTEST), tuple(used))
 
 
@@ -236,6 +242,28 @@ def _split(time: Array, start: float, end: float) -> list[tuple[float, float]]:
     cuts = np.flatnonzero(np.diff(stamps) > SPLIT)
     starts, ends = np.append(0, cuts + 1), np.append(cuts, stamps.size - 1)
     return [(float(stamps[a]), float(stamps[b])) for a, b in zip(starts, ends)]
+
+
+def _impacts(recording: Recording) -> Array:
+    """Times (n,) at which the drone hit something."""
+    force = _sound(recording, "specific_force")
+    if force is None:
+        return np.zeros(0)
+    return force[0][np.einsum("ij,ij->i", force[1], force[1]) > IMPACT**2]
+
+
+def _without_impacts(start: float, end: float, impacts: Array) -> list[tuple[float, float]]:
+    """A stretch less what is near an impact; one shortly before the end is the end."""
+    inside = impacts[(impacts >= start) & (impacts <= end)]
+    final = inside[inside > end - _AFTER_IMPACT]
+    if final.size:
+        end = float(final[0]) - _AROUND_IMPACT
+    parts = []
+    for t in inside[inside <= end]:
+        if t - _AROUND_IMPACT > start:
+            parts.append((start, float(t) - _AROUND_IMPACT))
+        start = float(t) + _AROUND_IMPACT
+    return [(a, b) for a, b in [*parts, (start, end)] if b > a]
 
 
 def _whole(recording: Recording) -> tuple[tuple[float, float], ...]:

@@ -9,13 +9,14 @@ acted. Priors on lag, delay and offsets are the estimator's; the parameter in qu
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from crazyem.doctor.envelope import Airborne, held, sound_samples
+from crazyem.doctor.whitening import ORDER, Fit, autoregression, filtered, long_run
 from crazyem.physics.lag import CAUSAL, LINEAR, fit_predictor, hold_predictor, lagged_means
 from crazyem.physics.rotations import quaternion_conjugate, quaternion_product, rotation_vector_from_quaternion
 from crazyem.physics.rotors import wrench_from_command, wrench_from_speed
@@ -24,7 +25,6 @@ from crazyem.vehicle import GRAVITY, Vehicle
 
 Array = NDArray[np.float64]
 
-ORDER = 12  # of the whitening autoregression
 FINEST = 4e-3  # s; faster streams are averaged into steps of 5 ms
 COARSE = 5e-3
 LONGEST_STEP = 0.05  # s; a longer hole between two samples parts two stretches
@@ -37,7 +37,6 @@ LAG_SD = 0.7  # of the logarithm
 INERTIA_SD = 0.5
 TRIM = 0.05  # shift of the centre of mass over the arm: prior of the torque offsets
 _DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])
-_MAX_LAG = 100
 # of one iteration: logarithms of inertia and lag, delay [ms], offsets as far as they like
 _LONGEST_MOVE = np.array([0.4, 0.4, 0.4, 0.4, 5.0, np.inf, np.inf, np.inf])
 
@@ -65,19 +64,6 @@ class Steps:
     @property
     def count(self) -> int:
         return sum(t.size - 1 for t in self.nodes)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Fit:
-    """A regression: value, what noise and what systematic error may be off by one standard deviation, all (p,)."""
-
-    value: Array
-    sd: Array
-    bias: Array
-
-    def total(self, i: int, *, stretch: float = 1.0) -> float:
-        """Standard deviation of parameter i, the random part of a flight `stretch` times as long."""
-        return math.hypot(float(self.sd[i]) / math.sqrt(stretch), float(self.bias[i]))
 
 
 def inputs_of(recording: Recording, vehicle: Vehicle) -> Inputs | str:
@@ -155,6 +141,32 @@ def lagged(inputs: Inputs, steps: Steps, *, tau: float, delay: float) -> list[tu
 
 
 def rotation_fit(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | None:
+    """As `rotation_fit_once`, its sd widened where quarters of the flight disagree by more than their own (Birge 1932).
+
+    A model that does not hold (torque of the air, another lag in every turn) finds another inertia in every quarter.
+    """
+    fit = rotation_fit_once(inputs, steps, vehicle)
+    if fit is None:
+        return None
+    parts = [rotation_fit_once(inputs, part, vehicle) for part in quarters(steps)]
+    off = [(part.value - fit.value) / np.hypot(part.sd, part.bias) for part in parts if part is not None]
+    ratio = np.sqrt(np.mean(np.square(off), axis=0)) if len(off) > 1 else np.ones(fit.value.size)
+    return replace(fit, sd=fit.sd * np.maximum(ratio, 1.0))
+
+
+def quarters(steps: Steps) -> list[Steps]:
+    """The flight in four parts of as many samples each."""
+    edges = np.quantile(np.concatenate(steps.nodes), [0.0, 0.25, 0.5, 0.75, 1.0])
+    parts = []
+    for low, high in pairwise(edges):
+        inside = [(t >= low) & (t <= high) for t in steps.nodes]
+        kept = [(t[i], v[i]) for t, v, i in zip(steps.nodes, steps.values, inside) if i.sum() > 3 * ORDER]
+        if kept:
+            parts.append(Steps(tuple(t for t, _ in kept), tuple(v for _, v in kept), steps.period, steps.share))
+    return parts
+
+
+def rotation_fit_once(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | None:
     """Joint fit of log Ixx, log Iyy, log Izz, log tau, delay [ms] and torque offsets [N m]: 8 parameters.
 
     Args:
@@ -191,38 +203,12 @@ def rotation_fit(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | None:
         own = prior.copy()
         own[i] = 0.0
         covariance = np.linalg.pinv(system.matrix / share + np.diag(own), hermitian=True)
-        inflation = system.inflation(covariance)
+        inflation = system.inflation(np.asarray(covariance, np.float64))
         sd[i] = math.sqrt(max(covariance[i, i], 0.0)) * inflation[i]
         # the larger of what it costs with everything else known and of what it costs with everything else free
         together = abs(float(covariance[i] @ noise)) / share
         bias[i] = max(together, min(float(noise[i] / max(system.matrix[i, i], 1e-300)), 1.0) if noise[i] > 0.0 else 0.0)
     return Fit(theta, sd, bias)
-
-
-def linear_fit(response: list[Array], columns: list[Array], *, share: float = 1.0) -> Fit | None:
-    """Generalised least squares of responses (k,) on columns (k, p), stretch by stretch; None with too few rows."""
-    width = columns[0].shape[1]
-    y, x = np.concatenate(response), np.concatenate(columns)
-    good = np.isfinite(y) & np.isfinite(x).all(axis=1)
-    if good.sum() < 10 * ORDER:
-        return None
-    scale = np.sqrt(np.mean(x[good] ** 2, axis=0))
-    if not np.all(scale > 0.0):
-        return None
-    theta = np.linalg.lstsq(x[good] / scale, y[good], rcond=None)[0] / scale
-    for _ in range(4):
-        weights = _autoregression([r - c @ theta for r, c in zip(response, columns)])
-        z, f = (np.concatenate([_filtered(weights, part) for part in parts]) for parts in (response, columns))
-        good = np.isfinite(z) & np.isfinite(f).all(axis=1)
-        z, f = z[good], f[good] / scale
-        if z.size < 5 * width or np.linalg.matrix_rank(f) < width:
-            return None
-        theta = np.linalg.lstsq(f, z, rcond=None)[0] / scale
-    left = z - f @ (theta * scale)
-    variance = float(left @ left) / max(z.size - width, 1)
-    covariance = np.linalg.inv(f.T @ f) * variance
-    inflation = _inflation(f * left[:, None], covariance)
-    return Fit(theta, np.sqrt(np.diag(covariance)) / scale * inflation * math.sqrt(share), np.zeros(width))
 
 
 def rates_of_attitude(time: Array, attitude: Array) -> tuple[Array, Array]:
@@ -255,8 +241,8 @@ class _RotationSystem:
                 columns[:, 4] = inverse * by_delay[:, 1 + axis] * 1e-3
                 columns[:, 5 + axis] = inverse
                 jacobian.append(columns)
-            weights = _autoregression(left)
-            z, f = (np.concatenate([_filtered(weights, part) for part in parts]) for parts in (left, jacobian))
+            weights = autoregression(left)
+            z, f = (np.concatenate([filtered(weights, part) for part in parts]) for parts in (left, jacobian))
             good = np.isfinite(z) & np.isfinite(f).all(axis=1)
             z, f = z[good], f[good]
             variance = float(np.mean(z**2)) if z.size else math.inf
@@ -273,7 +259,7 @@ class _RotationSystem:
         """(8,) factors by which correlation left in the scores widens standard deviations; never below 1."""
         scaled = [terms @ covariance for terms in self.terms]
         plain = sum(np.sum(s**2, axis=0) for s in scaled)
-        wide = sum(_long_run(s) for s in scaled)
+        wide = sum(long_run(s) for s in scaled)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.sqrt(np.maximum(np.where(plain > 0.0, wide / plain, 1.0), 1.0))
 
@@ -305,7 +291,7 @@ def _command_noise_score(inputs: Inputs, steps: Steps, system: _RotationSystem, 
         for axis in range(3):
             inverse = math.exp(-theta[axis])
             m, by_log_tau, by_ms = (
-                _filtered(system.weights[axis], inverse * part[:, 1 + axis])
+                filtered(system.weights[axis], inverse * part[:, 1 + axis])
                 for part in (mean, by_tau * tau, by_delay * 1e-3)
             )
             score[axis] += np.nansum(m * m) / system.variance[axis]
@@ -329,46 +315,11 @@ def _angular_acceleration(time: Array, rate: Array, inertia: Array) -> Array:
     return np.diff(rate, axis=0) / np.diff(time)[:, None] + gyroscopic
 
 
-def _autoregression(parts: list[Array]) -> Array:
-    """(ORDER + 1,) whitening filter of residuals (k,), by the Yule-Walker equations over all stretches."""
-    covariance = np.zeros(ORDER + 1)
-    for part in parts:
-        r = np.where(np.isfinite(part), part, 0.0)
-        r = r - r.mean() if r.size else r
-        covariance += [float(r[lag:] @ r[: r.size - lag]) if r.size > lag else 0.0 for lag in range(ORDER + 1)]
-    if not covariance[0] > 0.0:
-        return np.append(1.0, np.zeros(ORDER))
-    covariance[0] *= 1.0 + 1e-6
-    toeplitz = covariance[np.abs(np.subtract.outer(np.arange(ORDER), np.arange(ORDER)))]
-    return np.append(1.0, -np.linalg.solve(toeplitz, covariance[1:]))
-
-
-def _filtered(weights: Array, part: Array) -> Array:
-    """A stretch (k,) or (k, p) through the whitening filter, without its first rows."""
-    return np.asarray(lfilter(weights, [1.0], part, axis=0))[ORDER:]
-
-
 def _first_covariance(parts: list[Array]) -> float:
     """Variance of the measurement noise over the squared step: minus the covariance of neighbouring residuals."""
     pairs = np.concatenate([p[1:] * p[:-1] for p in parts]) if parts else np.zeros(0)
     pairs = pairs[np.isfinite(pairs)]
     return max(-float(pairs.mean()), 0.0) if pairs.size else 0.0
-
-
-def _inflation(terms: Array, covariance: Array) -> Array:
-    scaled = terms @ covariance
-    plain = np.sum(scaled**2, axis=0)
-    return np.sqrt(np.maximum(_long_run(scaled) / np.where(plain > 0.0, plain, 1.0), 1.0))
-
-
-def _long_run(terms: Array) -> Array:
-    """Variance of the column sums of terms (n, p), Bartlett kernel. (p,)."""
-    n = terms.shape[0]
-    lags = min(n // 8, _MAX_LAG)
-    total = np.sum(terms**2, axis=0)
-    for lag in range(1, lags + 1):
-        total = total + 2.0 * (1.0 - lag / (lags + 1.0)) * np.einsum("ij,ij->j", terms[lag:], terms[:-lag])
-    return np.maximum(total, 0.0)
 
 
 def _binned(time: Array, value: Array) -> tuple[Array, Array]:

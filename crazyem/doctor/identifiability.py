@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from crazyem.doctor import excitation
 from crazyem.doctor.envelope import Airborne, held, sound_samples
-from crazyem.doctor.excitation import Fit, Inputs, Steps
+from crazyem.doctor.excitation import Inputs, Steps
+from crazyem.doctor.whitening import Fit, linear_fit
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import GRAVITY, Vehicle
@@ -22,7 +23,8 @@ Array = NDArray[np.float64]
 
 IDENTIFIABLE = 0.15  # relative standard deviation below which a parameter counts as identified
 WEAK = 0.5  # and below which the data say anything beyond what is known of such drones anyway
-IMPLAUSIBLE = 1.5  # |log| of an inertia over the nominal beyond which it is not believed
+IMPLAUSIBLE = 1.5  # |log| of an inertia over the nominal beyond which it is not believed: 3 sd of the estimator's prior
+DOUBTFUL = 1.0  # and beyond which it is taken with care
 WINDOW = 800  # samples the estimator looks back by default
 SHORTEST = 2.0  # s in the air
 ACCELEROMETER_OFFSET = 0.02  # of gravity: 20 mg, typical zero-g offset of a BMI088
@@ -152,7 +154,7 @@ def _mass(vertical: _Vertical | None, inputs: Inputs, *, tau: float, delay: floa
     if vertical is None:
         return Verdict("mass", "no", "neither velocity nor specific force is known in the air")
     thrust = _thrust(vertical, inputs, tau=tau, delay=delay)
-    fit = excitation.linear_fit(vertical.response, [f[:, None] for f in thrust], share=vertical.steps.share)
+    fit = linear_fit(vertical.response, [f[:, None] for f in thrust], share=vertical.steps.share, parts=4)
     if fit is None or not fit.value[0] > 0.0:
         return Verdict("mass", "no", "thrust and acceleration have no common stretch long enough")
     mass = 1.0 / fit.value[0]
@@ -213,35 +215,54 @@ def _rotation(
     rate = 1.0 / steps.period
     where = f"{turn_from} at {rate:.0f} Hz, {inputs.signal} at {1.0 / float(np.median(np.diff(inputs.time))):.0f} Hz"
     inertias = [_inertia(i, fit, inputs, steps, vehicle, where) for i in range(3)]
-    believed = all(abs(fit.value[i] - math.log(vehicle.inertia[i])) <= IMPLAUSIBLE for i in range(3))
-    return (*inertias, _lag(fit, inputs, steps, believed), _delay(fit, inputs, believed), _offsets(fit, vehicle))
+    far = np.abs(fit.value[:3] - np.log(vehicle.inertia))
+    believed = bool(np.all(far <= IMPLAUSIBLE))
+    doubtful = math.hypot(*far) > 1.3 * DOUBTFUL
+    return (
+        *inertias,
+        _lag(fit, inputs, steps, believed=believed, doubtful=doubtful),
+        _delay(fit, inputs, believed),
+        _offsets(fit, vehicle),
+    )
 
 
 def _inertia(i: int, fit: Fit, inputs: Inputs, steps: Steps, vehicle: Vehicle, where: str) -> Verdict:
     name, axis, value = NAMES[1 + i], "xyz"[i], math.exp(fit.value[i])
-    ratio = value / vehicle.inertia[i]
+    far = np.abs(fit.value[:3] - np.log(vehicle.inertia))
     fixed = 0.0 if inputs.voltage_known else VOLTAGE_UNKNOWN
     relative = math.hypot(fit.total(i), fixed)
     window = math.hypot(fit.total(i, stretch=1.0 / _stretch(steps) ** 2), fixed)
-    verdict = _grade(relative)
-    if abs(math.log(ratio)) > IMPLAUSIBLE:
-        relative, window, verdict = max(relative, abs(math.log(ratio))), max(window, abs(math.log(ratio))), "no"
-        reason = f"the data ask for {ratio:.2g} times the nominal: the logged commands do not explain its rotation"
-    elif verdict != "yes" and fit.bias[i] > IDENTIFIABLE:
+    verdict, reason = _grade(relative), where
+    if verdict != "yes":
+        reason = _objection(axis, relative, fit.total(i), float(fit.bias[i]))
+    if far[i] > IMPLAUSIBLE or (i < 2 and far[1 - i] > IMPLAUSIBLE):
+        worst = i if far[i] > IMPLAUSIBLE else 1 - i
+        relative, window, verdict = max(relative, float(far[worst])), max(window, float(far[worst])), "no"
+        ratio = math.exp(fit.value[worst]) / vehicle.inertia[worst]
         reason = (
-            f"the logged commands are mostly noise between their stamps: torque about {axis} that acted cannot be told "
-            "from them at this logging rate"
+            f"the data ask for {ratio:.2g} times the nominal inertia about {'xyz'[worst]}: the logged commands do not "
+            "explain its rotation"
         )
-    elif verdict != "yes" and fixed and fit.total(i) < IDENTIFIABLE:
-        reason = "the battery voltage is not logged, which alone costs 15 %"
-    elif verdict != "yes":
-        reason = f"too little excitation: torque about {axis} determines it only within {196 * relative:.0f} % (95 %)"
-    else:
-        reason = where
+    elif verdict == "yes" and (far[i] > DOUBTFUL or far.max() > IMPLAUSIBLE or math.hypot(*far) > 1.3 * DOUBTFUL):
+        times = ", ".join(f"{math.exp(f - math.log(n)):.2g}" for f, n in zip(fit.value[:3], vehicle.inertia))
+        verdict = "weak"
+        reason = f"the data ask for {times} times the nominal inertias, which is hard to believe of such a drone"
     return Verdict(name, verdict, reason, relative, window, relative * value, value, "kg m^2")
 
 
-def _lag(fit: Fit, inputs: Inputs, steps: Steps, believed: bool) -> Verdict:
+def _objection(axis: str, relative: float, random: float, bias: float) -> str:
+    """Why an inertia is not identified."""
+    if bias > IDENTIFIABLE:
+        return (
+            f"the logged commands are mostly noise between their stamps: torque about {axis} that acted cannot be told "
+            "from them at this logging rate"
+        )
+    if random < IDENTIFIABLE:
+        return "the battery voltage is not logged, which alone costs 15 %"
+    return f"too little excitation: torque about {axis} determines it only within {196 * relative:.0f} % (95 %)"
+
+
+def _lag(fit: Fit, inputs: Inputs, steps: Steps, *, believed: bool, doubtful: bool) -> Verdict:
     name = "motor_time_constant"
     if not inputs.lagged:
         return Verdict(name, "no", f"{inputs.signal} already includes the rotor lag", unit="s")
@@ -249,12 +270,11 @@ def _lag(fit: Fit, inputs: Inputs, steps: Steps, believed: bool) -> Verdict:
     relative, window = fit.total(3), fit.total(3, stretch=1.0 / _stretch(steps) ** 2)
     if not believed:
         return Verdict(name, "no", "the logged commands do not explain the rotation", unit="s")
-    verdict = _grade(relative)
-    reason = (
-        "from the phase of rotation behind torque"
-        if verdict == "yes"
-        else f"too little excitation: commands determine it only within {196 * relative:.0f} % (95 %)"
-    )
+    verdict, reason = _grade(relative), "from the phase of rotation behind torque"
+    if verdict != "yes":
+        reason = f"too little excitation: commands determine it only within {196 * relative:.0f} % (95 %)"
+    elif doubtful:
+        verdict, reason = "weak", "the inertias that go with it are hard to believe"
     return Verdict(name, verdict, reason, relative, window, relative * tau, tau, "s")
 
 
@@ -290,7 +310,7 @@ def _drag(recording: Recording, air: Airborne) -> Verdict:
     response, columns, source, steps = _sideways(velocity, attitude, force, air)
     if steps is None:
         return Verdict("drag", "no", "too few samples of velocity and attitude in the air")
-    fit = excitation.linear_fit(response, columns, share=steps.share)
+    fit = linear_fit(response, columns, share=steps.share)
     if fit is None:
         return Verdict("drag", "no", "the speed does not vary")
     value, sd = -float(fit.value[0]), float(fit.sd[0])
@@ -346,7 +366,7 @@ def _battery(recording: Recording, vertical: _Vertical | None, inputs: Inputs, *
     span = float(np.ptp(volts))
     if span < 0.01:
         return Verdict(name, "no", f"the voltage moves by no more than {1e3 * span:.0f} mV")
-    fit = excitation.linear_fit(vertical.response, columns, share=steps.share)
+    fit = linear_fit(vertical.response, columns, share=steps.share)
     if fit is None or not fit.value[0] > 0.0:
         return Verdict(name, "no", "thrust and acceleration have no common stretch long enough")
     scale = float(fit.value[0])
