@@ -1,0 +1,102 @@
+"""Tables of firmware variables as signals: the best source wins, nothing is lost, what can be shared is shared."""
+
+import numpy as np
+import pytest
+
+from crazyem.recordings.recording import Recording
+from crazyem.recordings.tables import Table, signals_from_tables
+
+N = 6
+
+
+def table(name, names, *, start=0, values=None, host=None, dtype=np.float32):
+    time = 1.0 + 0.01 * np.arange(N)
+    columns = {n: np.arange(N).astype(dtype) + i for i, n in enumerate(names)} | (values or {})
+    return Table(name, columns, time, start + 2 * np.arange(N), host_time=host)
+
+
+def gyro(prefix="gyro."):
+    return [prefix + axis for axis in "xyz"]
+
+
+def test_best_source_wins_and_the_other_stays_under_its_own_name():
+    compressed = table("z", [f"stateEstimateZ.{a}" for a in "xyz"], dtype=np.int16)
+    plain = table("f", [f"stateEstimate.{a}" for a in "xyz"], start=1)
+    signals = signals_from_tables([compressed, plain], motor=None)
+    assert signals["position"].stream == "f"
+    assert signals["position"].source == ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z")
+    assert signals["stateEstimateZ.x"].value[:, 0].tolist() == list(range(N))
+    assert signals["stateEstimateZ.x"].unit == "mm"
+    assert set(signals) == {"position", *(f"stateEstimateZ.{a}" for a in "xyz")}
+
+
+def test_one_variable_in_two_tables_is_kept_twice():
+    signals = signals_from_tables([table("a", ["pm.vbat", "x.y"]), table("b", ["pm.vbat", "x.y"])], motor=None)
+    assert set(signals) == {"voltage", "pm.vbat", "x.y@a", "x.y@b"}
+    assert signals["voltage"].stream == "a"
+    assert signals["pm.vbat"].stream == "b"
+
+
+def test_a_name_of_the_vocabulary_is_no_signal_of_it():
+    signals = signals_from_tables([table("event", ["position", "voltage"])], motor=None)
+    assert set(signals) == {"position@event", "voltage@event"}
+    assert signals["voltage@event"].quantity == ""
+
+
+def test_tables_of_one_name_lose_nothing():
+    signals = signals_from_tables([table("a", ["x.y"]), table("a", ["x.y"]), table("a", ["pm.vbat"])], motor=None)
+    assert sorted(array.source[0] for array in signals.values()) == ["pm.vbat", "x.y", "x.y"]
+
+
+@pytest.mark.parametrize(
+    ("motor", "expected"),
+    [("duty", {"motor_command"}), ("request", {"motor_request"}), (None, {f"motor.m{i}" for i in (1, 2, 3, 4)})],
+)
+def test_motor_as_told(motor, expected):
+    assert set(signals_from_tables([table("a", [f"motor.m{i}" for i in (1, 2, 3, 4)])], motor=motor)) == expected
+
+
+def test_pwm_is_the_command_whatever_motor_is():
+    names = [f"motor.m{i}" for i in (1, 2, 3, 4)] + [f"pwm.m{i}_pwm" for i in (1, 2, 3, 4)]
+    for motor, more in (("duty", "motor.m1"), ("request", "motor_request"), (None, "motor.m1")):
+        signals = signals_from_tables([table("a", names)], motor=motor)
+        assert signals["motor_command"].source[0] == "pwm.m1_pwm"
+        assert more in signals
+
+
+def test_samples_come_in_the_order_of_the_rows():
+    one = table("a", [*gyro(), *gyro("acc.")])
+    two = table("b", ["pm.vbat", "x.y"], start=1)
+    signals = signals_from_tables([one, two], motor=None)
+    samples = list(Recording("p", "s", signals).samples())
+    assert [s.signal for s in samples[:3]] == ["body_rate", "specific_force", "voltage"]
+    assert [s.signal for s in samples] == ["body_rate", "specific_force", "voltage"] * N
+    orders = np.concatenate([signals[n].order for n in ("body_rate", "specific_force", "voltage")])
+    assert np.unique(orders).size == orders.size
+    assert np.array_equal(np.argsort(signals["x.y"].order), np.arange(N))
+
+
+def test_only_a_nan_of_ours_is_marked():
+    rpm = {f"motor.m{i}_rpm": np.full(N, 1000.0) for i in (1, 2, 3, 4)}
+    rpm["motor.m2_rpm"][1] = 65535  # the firmware's "missing"
+    rpm["motor.m3_rpm"][4] = np.nan  # the file's own
+    signal = signals_from_tables([table("a", [], values=rpm)], motor=None)["rotor_speed"]
+    assert np.isnan(signal.value[[1, 4]]).any(axis=1).all()
+    assert signal.marked.tolist() == [False, True, False, False, False, False]
+
+
+def test_what_a_table_has_in_common_is_held_once():
+    signals = signals_from_tables([table("a", [*gyro(), "x.y", "x.z"])], motor=None)
+    a, b, c = signals["body_rate"], signals["x.y"], signals["x.z"]
+    for other in (b, c):
+        assert other.time is a.time
+        assert other.host_time is a.host_time
+        assert other.marked is a.marked
+    assert b.order is c.order
+    assert np.isnan(a.host_time).all()
+
+
+def test_host_times_are_kept():
+    host = 1.7e9 + np.arange(N)
+    signals = signals_from_tables([table("a", ["x.y"], host=host)], motor=None)
+    assert signals["x.y"].host_time is host
