@@ -32,6 +32,26 @@ _UNITS: tuple[tuple[str, str], ...] = (
     (r"ext_pos\.[XYZ]|locSrv\.[xyz]", "m"),
     (r"ctrltarget\.(roll|pitch)", "deg"),
     (r"ctrltarget\.yaw", "deg/s"),
+    (r"ctrltarget\.[xyz]", "m"),
+    (r"ctrltarget\.v[xyz]", "m/s"),
+    (r"ctrltarget\.a[xyz]", "m/s^2"),
+    (r"ctrltargetZ\.[xyz]", "mm"),
+    (r"ctrltargetZ\.v[xyz]", "mm/s"),
+    (r"ctrltargetZ\.a[xyz]", "mm/s^2"),
+    (r"stabilizer\.(roll|pitch|yaw)", "deg"),
+    # PWM counts, 65535 being full; stabilizer.thrust is one only under some controllers
+    (r"motor\.m\d(req)?|pwm\.m\d_pwm", "count"),
+    (r"(controller|ctrlMel|ctrlINDI)\.cmd_(thrust|roll|pitch|yaw)|controller\.(actuatorThrust|ctr_yaw)", "count"),
+    (r"ctrl(Lee|Lqg)\.thrustSi", "N"),
+    (r"ctrl(Lee|Lqg)\.torque[xyz]", "N m"),
+    (r"ctrlLee\.error_pos[xyz]", "m"),
+    (r"ctrlLee\.error_vel[xyz]", "m/s"),
+    (r"ctrlLee\.omegar?[xyz]", "rad/s"),
+    (r"ctrlLee\.rpyd?[xyz]", "rad"),
+    (r"kalman\.state[XYZ]", "m"),
+    (r"kalman\.stateP[XYZ]", "m/s"),
+    (r"kalman\.var[XYZ]", "m^2"),
+    (r"kalman\.varP[XYZ]", "m^2/s^2"),
 )
 _COMPILED = tuple((re.compile(pattern), unit) for pattern, unit in _UNITS)
 

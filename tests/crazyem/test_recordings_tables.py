@@ -5,6 +5,7 @@ import pytest
 
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.tables import Table, signals_from_tables
+from crazyem.signals.firmware_units import unit_of
 
 N = 6
 
@@ -100,3 +101,25 @@ def test_host_times_are_kept():
     host = 1.7e9 + np.arange(N)
     signals = signals_from_tables([table("a", ["x.y"], host=host)], motor=None)
     assert signals["x.y"].host_time is host
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("motor.m1", "count"),
+        ("motor.m4req", "count"),
+        ("motor.m2_rpm", "rpm"),
+        ("pwm.m3_pwm", "count"),
+        ("pm.vbatMV", "mV"),
+        ("stateEstimate.ax", "g"),
+        ("stateEstimateZ.az", "mm/s^2"),
+        ("ctrltarget.ax", "m/s^2"),
+        ("ctrltarget.yaw", "deg/s"),
+        ("ctrlLee.torquez", "N m"),
+        ("ctrlLee.omegarx", "rad/s"),
+        ("gyro.xRaw", ""),
+        ("mode", ""),
+    ],
+)
+def test_units_of_variables_outside_the_vocabulary(name, unit):
+    assert unit_of(name) == unit
