@@ -1,9 +1,274 @@
-"""Check: clock wraps, jumps, drift; nominal against real rate."""
+"""Check: clock wraps, jumps and drift, stamps out of order or twice, and nominal against real rate."""
 
-from crazyem.recordings.finding import Finding
+import itertools
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.doctor.streams import Cadence, Stream, cadence, listed, longest, streams
+from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording
+
+Column = NDArray[np.float64]
+
+# Counters that overflow: name -> seconds until they start again
+WRAPS: dict[str, float] = {
+    "24 bits of milliseconds": 2.0**24 * 1e-3,
+    "32 bits of milliseconds": 2.0**32 * 1e-3,
+    "32 bits of microseconds": 2.0**32 * 1e-6,
+    "16 bits of milliseconds": 2.0**16 * 1e-3,
+}
+RESTART = 1.0  # s back from which a clock was set or started again; less is a record out of order
+OFF_NOMINAL = 0.002  # relative deviation of the rate worth a word
+WRONG_NOMINAL = 0.1  # from which a claimed rate is wrong
+_NICE = (1, 2, 4, 5, 8, 10, 12.5, 20, 25, 30, 40, 50, 60, 100, 120, 125, 200, 240, 250, 300, 400, 500, 800, 1000, 2000)
+JUMP = 0.3  # s by which two clocks may part from one packet to the next: a radio link stalls for less
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
-    return []
+    """Findings per stream, and for the drone's clock against the host's."""
+    found = []
+    rates: dict[tuple[float, float], list[str]] = {}
+    drifts: dict[str, tuple[int, list[Finding]]] = {}  # of each clock, from the stream that tells most
+    for stream in streams(recording):
+        if stream.time.size < 2:
+            continue
+        found += _order(stream)
+        _rate(stream, recording.metadata, rates)
+        arrivals = _arrivals(stream)
+        if arrivals is None:
+            continue
+        found += _jumps(stream, *arrivals)
+        if arrivals[0].size > drifts.get(stream.clock, (0, []))[0]:
+            drifts[stream.clock] = (arrivals[0].size, _drift(arrivals[0], arrivals[1]))
+    found += [_rate_finding(nominal, real, names) for (nominal, real), names in rates.items()]
+    return [*found, *(finding for _, findings in drifts.values() for finding in findings)]
+
+
+# -- order ------------------------------------------------------------------------------------------------------------
+
+
+def _order(stream: Stream) -> list[Finding]:
+    steps = np.diff(stream.time)
+    found = []
+    if (steps < 0).any():
+        rhythm = cadence(stream.time)
+        period = rhythm.period if rhythm.period > 0 else float(np.median(np.abs(steps)))
+        wrapped = np.zeros(steps.size, bool)
+        for words, span in WRAPS.items():
+            # the next stamp comes a period or a gap after the one before, modulo the counter
+            rows = np.flatnonzero((steps < -0.5 * span) & (steps >= -span) & ~wrapped)
+            if rows.size:
+                wrapped[rows] = True
+                found.append(_wrap(stream, rows + 1, span, words, period))
+        back = np.flatnonzero((steps <= -RESTART) & ~wrapped)
+        late = np.flatnonzero((steps < 0) & (steps > -RESTART) & ~wrapped)
+        if back.size:
+            found.append(_restart(stream, back))
+        if late.size:
+            found.append(_late(stream, late, clean=not back.size and not wrapped.any()))
+    twice = np.flatnonzero(steps == 0)
+    if twice.size and not stream.commanded:
+        found.append(_twice(stream, twice))
+    return found
+
+
+def _wrap(stream: Stream, rows: NDArray[np.int64], span: float, words: str, period: float) -> Finding:
+    at = [(float(stream.time[i - 1]), float(stream.time[i - 1])) for i in rows]
+    step = float(np.median(stream.time[rows] - stream.time[rows - 1])) + span
+    return Finding(
+        "clocks",
+        Grade.DEGRADES,
+        f"{stream.name}: the clock overflows {len(rows)} times and starts again from zero: a counter of {words}.",
+        signal=stream.names[0] if len(stream.names) == 1 else "",
+        intervals=longest(at),
+        evidence={"wraps": len(rows), "wrap_s": span, "step_across_s": step, "period_s": period},
+        advice="Unwrap it (--fix).",
+        fix=Fix("unwrap", stream.names, factor=(span,) * len(rows), rows=rows.astype(np.int64)),
+    )
+
+
+def _restart(stream: Stream, rows: NDArray[np.int64]) -> Finding:
+    back = stream.time[rows] - stream.time[rows + 1]
+    return Finding(
+        "clocks",
+        Grade.UNUSABLE,
+        f"{stream.name}: the clock goes back {len(rows)} times, by up to {back.max():.3f} s: "
+        "it was set, or the drone restarted.",
+        signal=stream.names[0] if len(stream.names) == 1 else "",
+        intervals=longest((float(stream.time[i + 1]), float(stream.time[i])) for i in rows),
+        evidence={"jumps": len(rows), "largest_s": float(back.max()), "first_row": int(rows[0]) + 1},
+        advice="Cut the recording there and use the parts as recordings of their own.",
+    )
+
+
+def _late(stream: Stream, rows: NDArray[np.int64], *, clean: bool) -> Finding:
+    back = stream.time[rows] - stream.time[rows + 1]
+    share = rows.size / stream.time.size
+    return Finding(
+        "clocks",
+        Grade.DEGRADES,
+        f"{stream.name}: {rows.size} records ({100 * share:.2g} %) are out of order, "
+        f"by up to {1000 * back.max():.1f} ms.",
+        signal=stream.names[0] if len(stream.names) == 1 else "",
+        intervals=longest((float(stream.time[i + 1]), float(stream.time[i])) for i in rows),
+        evidence={"records": int(rows.size), "share": share, "largest_s": float(back.max())},
+        advice="Sort by stamp (--fix)." if clean else "Deal with the jumps of the clock first.",
+        fix=Fix("sort", stream.names) if clean else None,
+    )
+
+
+def _twice(stream: Stream, rows: NDArray[np.int64]) -> Finding:
+    alike = np.ones(rows.size, bool)
+    for array in stream.arrays:
+        before, after = array.value[rows], array.value[rows + 1]
+        alike &= ((before == after) | (np.isnan(before) & np.isnan(after))).all(axis=1)
+    share = rows.size / stream.time.size
+    copies = int(alike.sum())
+    all_copies = copies == rows.size
+    return Finding(
+        "clocks",
+        Grade.DEGRADES if share > 0.01 else Grade.HARMLESS,
+        f"{stream.name}: {rows.size} records ({100 * share:.2g} %) carry the stamp of the record before, "
+        + ("with the same values." if all_copies else f"{rows.size - copies} of them with other values."),
+        signal=stream.names[0] if len(stream.names) == 1 else "",
+        intervals=longest((float(stream.time[i]), float(stream.time[i])) for i in rows),
+        evidence={"records": int(rows.size), "share": share, "copies": copies},
+        advice="Mark the copies as missing (--fix)."
+        if copies
+        else "Their time is known to one step of the clock only.",
+        fix=Fix("mark", stream.names, rows=rows[alike].astype(np.int64) + 1) if copies else None,
+    )
+
+
+# -- rate -------------------------------------------------------------------------------------------------------------
+
+
+def _rate(
+    stream: Stream, metadata: Mapping[str, Mapping[str, str]], rates: dict[tuple[float, float], list[str]]
+) -> None:
+    """Note a stream whose rate is not what was asked for, or not quite a round number."""
+    time = stream.time
+    if (np.diff(time) < 0).any():
+        return
+    rhythm = cadence(time)
+    if not rhythm.regular or time.size < 100 or stream.commanded:
+        return
+    real = 1.0 / rhythm.period
+    claimed = _claimed(metadata, stream.name)
+    nominal = claimed if claimed is not None else min(_NICE, key=lambda rate: abs(math.log(real / rate)))
+    deviation = real / nominal - 1.0
+    limit = WRONG_NOMINAL if claimed is None else math.inf
+    if max(OFF_NOMINAL, 4.0 * _uncertainty(time, rhythm)) < abs(deviation) < limit:
+        key = next((k for k in rates if k[0] == nominal and abs(k[1] / real - 1.0) < 5e-4), (nominal, real))
+        rates.setdefault(key, []).append(stream.name)
+
+
+def _uncertainty(time: Column, rhythm: Cadence) -> float:
+    """Relative error of the period: windows of sixteen samples, each as uncertain as the jitter."""
+    return rhythm.jitter / (rhythm.period * 16.0 * math.sqrt(max(time.size / 16.0, 1.0)))
+
+
+def _claimed(metadata: Mapping[str, Mapping[str, str]], stream: str) -> float | None:
+    claims = metadata.get("claims", {})
+    for key in (f"{stream}.rate_hz", "rate_hz"):
+        try:
+            rate = float(claims[key])
+        except (KeyError, TypeError, ValueError):
+            continue
+        if math.isfinite(rate) and rate > 0:
+            return rate
+    return None
+
+
+def _rate_finding(nominal: float, real: float, names: list[str]) -> Finding:
+    percent = 100.0 * (real / nominal - 1.0)
+    wrong = abs(percent) > 100.0 * WRONG_NOMINAL
+    return Finding(
+        "clocks",
+        Grade.DEGRADES if wrong else Grade.HARMLESS,
+        f"{listed(names)}: really {real:.4g} Hz, {abs(percent):.2f} % {'faster' if percent > 0 else 'slower'} than "
+        f"{nominal:g} Hz.",
+        evidence={"nominal_hz": nominal, "real_hz": real, "deviation_percent": percent},
+        advice="Use the stamps; never count rows as time.",
+    )
+
+
+# -- against the host -------------------------------------------------------------------------------------------------
+
+
+def _arrivals(stream: Stream) -> tuple[Column, Column, NDArray[np.int64]] | None:
+    """Stamps, arrivals less stamps, and rows, where the host stamped arrivals; None where there is nothing to see."""
+    array = stream.arrays[0]
+    known = np.isfinite(array.host_time)
+    if stream.clock == "host" or stream.commanded or known.sum() < 100:
+        return None
+    time, host = stream.time[known], array.host_time[known]
+    offset = (host - host[0]) - (time - time[0])
+    if np.abs(offset).max() < 1e-6 or (np.diff(time) < 0).any():
+        return None
+    return time, offset, np.flatnonzero(known)
+
+
+def _jumps(stream: Stream, time: Column, offset: Column, rows: NDArray[np.int64]) -> list[Finding]:
+    # a late packet leaves the line and comes back; a jump stays: compare the medians of what is around
+    candidates = np.flatnonzero(np.abs(np.diff(offset)) > JUMP)
+    sizes = []
+    for i in candidates[:1000]:
+        before, after = offset[max(0, i - 20) : i + 1], offset[i + 1 : i + 41]
+        # packets that queued up arrive late, never early: the earliest arrivals show the clocks
+        size = float(after.min() - before.min())
+        if abs(size) > JUMP:
+            sizes.append((int(i), size))
+    if not sizes:
+        return []
+    worst = max(sizes, key=lambda pair: abs(pair[1]))
+    forward = worst[1] < 0
+    return [
+        Finding(
+            "clocks",
+            Grade.DEGRADES,
+            f"{stream.name}: the drone's clock jumps {len(sizes)} times against the host's, at most by "
+            f"{abs(worst[1]):.3f} s {'ahead' if forward else 'back'}.",
+            intervals=longest((float(time[i]), float(time[i + 1])) for i, _ in sizes),
+            evidence={"jumps": len(sizes), "largest_s": -worst[1]},
+            advice="Take the jumps out (--fix), or use the parts between them.",
+            fix=Fix(
+                "unwrap",
+                stream.names,
+                factor=tuple(size for _, size in sizes),
+                rows=np.array([rows[i + 1] for i, _ in sizes], np.int64),
+            ),
+        )
+    ]
+
+
+def _drift(time: Column, offset: Column) -> list[Finding]:
+    """Slope of the earliest arrivals of each of twenty spans: delays only ever add."""
+    duration = float(time[-1] - time[0])
+    if duration < 5.0 or np.abs(np.diff(offset)).max() > JUMP:
+        return []
+    edges = np.searchsorted(time, np.linspace(time[0], time[-1], 21))
+    picks = [a + int(np.argmin(offset[a:b])) for a, b in itertools.pairwise(edges.tolist()) if b > a]
+    if len(picks) < 8:
+        return []
+    x, y = time[picks], offset[picks]
+    line, covariance = np.polyfit(x - x.mean(), y, 1, cov=True)
+    slope = float(line[0])
+    deviation = 2.1 * float(np.sqrt(covariance[0, 0]))  # 95 % of Student's t at 18 degrees of freedom
+    apart = abs(slope) * duration
+    if abs(slope) < 2.0 * deviation or apart < 0.005 or abs(slope) < 2e-5:
+        return []
+    ppm = -1e6 * slope
+    return [
+        Finding(
+            "clocks",
+            Grade.DEGRADES if apart > 0.02 else Grade.HARMLESS,
+            f"The drone's clock runs {abs(ppm):.0f} ppm {'fast' if ppm > 0 else 'slow'} against the host's: "
+            f"{1000 * apart:.1f} ms over the recording.",
+            evidence={"drift_ppm": ppm, "ci95_ppm": 1e6 * deviation, "apart_s": apart, "duration_s": duration},
+            advice="Compare streams of the two clocks only after a fit of offset and drift.",
+        )
+    ]

@@ -1,9 +1,258 @@
-"""Check: crash, upset, never left the ground."""
+"""Check: was there a flight at all, how did it begin and end, did the drone tip over or crash.
 
-from crazyem.recordings.finding import Finding
+A landing is rough by nature: 50 to 120 m/s^2 and 20 rad/s at the touch of the ground are normal. So a crash is told by what
+a landing does not have: a fast fall or slide into the ground, a drone that ends on its side, rotors cut at height.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.doctor.streams import Airtime, Intervals, airtime, inside, longest, ordered, runs
+from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording
+
+UPSET = 90.0  # degrees of tilt
+LYING = 60.0  # degrees of tilt at rest
+FAST = 1.2  # m/s into the ground; a controller lands at up to 0.8, a drop from 5 cm ends at 1.0
+DROPPED = 0.4  # m above ground at which rotors stop
+AT_EDGE = 0.3  # s from the ends of the recording
+_UP = ("position", "attitude", "specific_force")
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
+    """No flight, a recording that is cut, upsets and crashes."""
+    flight = airtime(recording)
+    if flight is None:
+        return []
+    if not flight.airborne:
+        return [_no_flight(flight)]
+    tilt = _tilt(recording)
+    found = _upsets(flight, tilt)
+    lying = _lying(recording, flight, tilt)
+    found += lying
+    if not lying:
+        found += _impacts(recording, flight)
+        found += _drops(recording, flight)
+    return [*found, *_course(flight)]
+
+
+def _no_flight(flight: Airtime) -> Finding:
+    turned = bool(flight.lifting)
+    evidence = {"climbed_m": flight.climbed} if math.isfinite(flight.climbed) else {}
+    text = "The rotors turned, but the drone did not leave the ground." if turned else "The drone never flew."
+    return Finding(
+        "flight",
+        Grade.UNUSABLE,
+        text,
+        evidence=evidence,
+        advice="There is nothing to estimate from; use another recording.",
+    )
+
+
+def _course(flight: Airtime) -> list[Finding]:
+    """Where a recording begins or ends in the air, or holds several flights: the times in the air."""
+    starts = flight.airborne[0][0] - flight.begin < AT_EDGE
+    ends = flight.end - flight.airborne[-1][1] < AT_EDGE
+    count = len(flight.airborne)
+    remarks = []
+    if count > 1:
+        remarks.append(f"holds {count} flights")
+    if starts:
+        remarks.append("begins in the air")
+    if ends:
+        remarks.append("ends in the air")
+    if not remarks:
+        return []
+    total = sum(b - a for a, b in flight.airborne)
+    evidence = {"airborne_s": total, "flights": float(count)}
+    if not starts:
+        evidence["take_off_s"] = flight.airborne[0][0]
+    if not ends:
+        evidence["landing_s"] = flight.airborne[-1][1]
+    return [
+        Finding(
+            "flight",
+            Grade.HARMLESS,
+            f"The recording {' and '.join(remarks)}; {total:.1f} s in the air.",
+            intervals=longest(flight.airborne),
+            evidence=evidence,
+            advice="Nothing to do.",
+        )
+    ]
+
+
+# -- attitude ---------------------------------------------------------------------------------------------------------
+
+
+def _tilt(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """(n,) times and angles between the body's and the world's vertical in degrees, from the attitude."""
+    array = recording.signals.get("attitude")
+    if array is None:
+        return None
+    time, q = ordered(array)
+    norm = np.einsum("ij,ij->i", q, q)
+    sound = norm > 0.5
+    time, q, norm = time[sound], q[sound], norm[sound]
+    if time.size < 10:
+        return None
+    up = 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2) / norm
+    return time, np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))
+
+
+def _upsets(flight: Airtime, tilt: tuple[NDArray[np.float64], NDArray[np.float64]] | None) -> list[Finding]:
+    if tilt is None:
+        return []
+    time, angle = tilt
+    rows = inside(time, flight.airborne) & (angle > UPSET)
+    # one wild sample is a bad number, not a roll-over
+    for first, last in runs(rows):
+        if last - first < 3:
+            rows[first:last] = False
+    if not rows.any():
+        return []
+    spans = [(float(time[a]), float(time[b - 1])) for a, b in runs(rows)]
+    return [
+        Finding(
+            "flight",
+            Grade.DEGRADES,
+            f"The drone is upside down in the air {len(spans)} times (tilt up to {angle[rows].max():.0f} degrees).",
+            intervals=longest(spans),
+            evidence={
+                "tilt_deg": float(angle[rows].max()),
+                "times": len(spans),
+                "lasting_s": sum(b - a for a, b in spans),
+            },
+            advice="If that was no flip on purpose, use the flight before it only.",
+        )
+    ]
+
+
+def _lying(
+    recording: Recording, flight: Airtime, tilt: tuple[NDArray[np.float64], NDArray[np.float64]] | None
+) -> list[Finding]:
+    """On its side or back after the rotors stopped: from the attitude, or from the direction of gravity at rest."""
+    end = flight.lifting[-1][1]
+    angles = []
+    if tilt is not None:
+        angles.append((tilt[0], tilt[1], "attitude"))
+    array = recording.signals.get("specific_force")
+    if array is not None:
+        time, force = ordered(array)
+        size = np.linalg.norm(force, axis=1)
+        rest = (size > 8.0) & (size < 11.6)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            angle = np.degrees(np.arccos(np.clip(force[:, 2] / size, -1.0, 1.0)))
+        angles.append((time[rest], angle[rest], "specific force"))
+    for time, angle, words in angles:
+        after = angle[time > end + 0.3]
+        # the rest must last: a fifth of a second and half of what is left
+        if after.size >= 10 and float(np.median(after)) > LYING:
+            last = float(np.median(after[after.size // 2 :]))
+            if last < LYING:
+                continue
+            moment = float(time[np.searchsorted(time, end)])
+            return [
+                Finding(
+                    "flight",
+                    Grade.DEGRADES,
+                    f"The drone crashed: after the rotors stopped it lies tilted by {last:.0f} degrees.",
+                    intervals=((max(end - 1.0, flight.begin), moment),),
+                    evidence={"rest_tilt_deg": last, "rotors_stop_s": end, **_violence(recording, end)},
+                    advice=f"Use the flight up to about {end - 1.0:.1f} s (told by the {words}).",
+                )
+            ]
     return []
+
+
+def _violence(recording: Recording, end: float) -> dict[str, float]:
+    """Largest specific force and body rate within a second of the end."""
+    numbers = {}
+    for name, key in (("specific_force", "peak_m_s2"), ("body_rate", "peak_rad_s")):
+        array = recording.signals.get(name)
+        if array is not None:
+            rows = (array.time > end - 1.0) & (array.time < end + 1.0)
+            size = np.linalg.norm(array.value[rows], axis=1)
+            if np.isfinite(size).any():
+                numbers[key] = float(np.nanmax(size))
+    return numbers
+
+
+# -- ground -----------------------------------------------------------------------------------------------------------
+
+
+def _path(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    for name, array in recording.signals.items():
+        if name == "position" or array.quantity == "position":
+            time, value = ordered(array)
+            if time.size > 20:
+                return time, value
+    return None
+
+
+def _impacts(recording: Recording, flight: Airtime) -> list[Finding]:
+    """Speed of the approach to the ground, over the last tenth of a second before it."""
+    path = _path(recording)
+    if path is None or not math.isfinite(flight.ground):
+        return []
+    time, position = path
+    hits: list[tuple[float, float]] = []
+    for start, end in flight.airborne:
+        rows = np.flatnonzero((time > start + 0.5) & (time < end + 0.5))
+        if rows.size < 20:
+            continue
+        z = position[rows, 2] - flight.ground
+        low = np.flatnonzero((z[1:] < 0.06) & (z[:-1] >= 0.06))
+        for k in low:
+            i = rows[k]
+            j = int(np.searchsorted(time, time[i] - 0.1))
+            if 0 <= j < i and time[i] - time[j] < 0.2:
+                fall = float(np.linalg.norm(position[i] - position[j]) / (time[i] - time[j]))
+                down = float((position[j, 2] - position[i, 2]) / (time[i] - time[j]))
+                if fall > FAST and down > 0.5 * FAST:
+                    hits.append((float(time[i]), fall))
+    if not hits:
+        return []
+    when, speed = max(hits, key=lambda hit: hit[1])
+    spans: Intervals = tuple((t - 0.1, t + 0.5) for t, _ in hits)
+    return [
+        Finding(
+            "flight",
+            Grade.DEGRADES,
+            f"The drone hits the ground at {speed:.1f} m/s.",
+            intervals=longest(spans),
+            evidence={"speed_m_s": speed, "time_s": when, **_violence(recording, when)},
+            advice=f"Use the flight up to about {when - 0.1:.1f} s; estimates of the onboard filter suffer from such a shock.",
+        )
+    ]
+
+
+def _drops(recording: Recording, flight: Airtime) -> list[Finding]:
+    """Rotors that stop at height: cut by hand, by the supervisor, or by an empty battery."""
+    path = _path(recording)
+    if path is None or not math.isfinite(flight.ground):
+        return []
+    time, position = path
+    found = []
+    for _, end in flight.lifting:
+        if flight.end - end < AT_EDGE:
+            continue
+        i = int(np.searchsorted(time, end))
+        if i >= time.size or abs(float(time[i]) - end) > 0.1:
+            continue
+        height = float(position[i, 2]) - flight.ground
+        later = position[(time > end) & (time < end + 1.0), 2]
+        fell = height - (float(later.min()) - flight.ground) if later.size else 0.0
+        if height > DROPPED and fell > 0.5 * height:
+            found.append(
+                Finding(
+                    "flight",
+                    Grade.DEGRADES,
+                    f"The rotors stop {height:.2f} m above the ground, and the drone falls.",
+                    intervals=((end, min(end + 1.0, flight.end)),),
+                    evidence={"height_m": height, "time_s": end, **_violence(recording, end)},
+                    advice=f"Use the flight up to {end:.1f} s.",
+                )
+            )
+    return found

@@ -1,9 +1,254 @@
-"""Check: frozen and stuck channels."""
+"""Check: channels that never change though they should, or stick for a while in flight; columns that are not in use."""
 
-from crazyem.recordings.finding import Finding
-from crazyem.recordings.recording import Recording
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.doctor.streams import Airtime, airtime, inside, listed, longest, runs
+from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.recording import Recording, SignalArray
+
+Flags = NDArray[np.bool_]
+
+# Shortest stretch without any change that counts as stuck [s]: noise moves inertial sensors at every sample, while a
+# pose in millimetres, or a quaternion in 0.16 degrees, may stay for a while in a hover.
+SHORTEST: dict[str, float] = {
+    "body_rate": 0.2,
+    "specific_force": 0.2,
+    "acceleration": 0.2,
+    "rotor_speed": 0.3,
+    "motor_command": 0.5,
+    "position": 0.3,
+    "velocity": 0.3,
+    "attitude": 0.3,
+    "euler": 0.3,
+}
+LEAST_SAMPLES = 10
+UNUSUAL = 6.0  # times the longest of 99 % of the channel's own still stretches
+NOTED = 0.02  # share of the flight
+_INERTIAL = frozenset({"body_rate", "specific_force", "acceleration"})
+_MOVED = {"position": 0.03, "velocity": 0.15, "attitude": 0.03, "euler": 0.03}  # m, m/s, rad meanwhile, as others say
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
-    return []
+    """Whole signals and single components that stand still in flight; constant columns, in one finding."""
+    flight = airtime(recording)
+    found = []
+    stuck: list[_Stuck] = []
+    idle: list[str] = []
+    for name, array in recording.signals.items():
+        if array.time.size < 20:
+            continue
+        if not array.quantity:
+            if _constant(array.value):
+                idle.append(name)
+        elif array.quantity in SHORTEST:
+            stuck += _signal(recording, name, array, flight)
+        elif array.quantity == "voltage" and _constant(array.value) and flight is not None and flight.airborne:
+            found.append(_flat_voltage(name, array))
+    while stuck:
+        first = stuck.pop(0)
+        alike = [other for other in stuck if _alike(first, other)]
+        stuck = [other for other in stuck if other not in alike]
+        found.append(_finding([first, *alike]))
+    if idle:
+        found.append(_idle(idle))
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stuck:
+    """A signal, or one component of it, in the stretches (first row, row after the last) in which it stands still."""
+
+    name: str
+    array: SignalArray
+    component: str
+    stretches: list[tuple[int, int]]
+    flying: Flags
+
+    @property
+    def spans(self) -> list[tuple[float, float]]:
+        return [(float(self.array.time[a]), float(self.array.time[b - 1])) for a, b in self.stretches]
+
+
+def _alike(one: _Stuck, other: _Stuck) -> bool:
+    """True if two signals of one table stood still together: then the log did, not a sensor."""
+    if one.array.stream != other.array.stream or not one.array.stream or one.component or other.component:
+        return False
+    a, b = (max(x.spans, key=lambda span: span[1] - span[0]) for x in (one, other))
+    common = min(a[1], b[1]) - max(a[0], b[0])
+    return one.array.time.size == other.array.time.size and common > 0.8 * max(a[1] - a[0], b[1] - b[0])
+
+
+def _constant(value: NDArray[np.float64]) -> bool:
+    """True if all there is of a signal is one value."""
+    for column in value.T:
+        sound = column[np.isfinite(column)]
+        if sound.size == 0 or sound[0] != sound[-1] or (sound != sound[0]).any():
+            return False
+    return True
+
+
+def _idle(names: list[str]) -> Finding:
+    return Finding(
+        "frozen",
+        Grade.HARMLESS,
+        f"{listed(names)}: never {'changes' if len(names) == 1 else 'change'}; not in use in this flight.",
+        evidence={"columns": len(names)},
+        advice="Nothing to do, unless you expected them to change.",
+    )
+
+
+def _flat_voltage(name: str, array: SignalArray) -> Finding:
+    return Finding(
+        "frozen",
+        Grade.HARMLESS,
+        f"{name} is {float(np.nanmax(array.value)):.3f} V throughout, though rotors load a battery.",
+        signal=name,
+        evidence={"voltage_V": float(np.nanmax(array.value))},
+        advice="A supply or a simulation? Otherwise the thrust from duty and voltage is off as the battery sags.",
+    )
+
+
+def _signal(recording: Recording, name: str, array: SignalArray, flight: Airtime | None) -> list[_Stuck]:
+    """Stuck stretches of all components together, then of single ones of sensors."""
+    if flight is None or not flight.airborne:
+        return []
+    flying = inside(array.time, flight.airborne)
+    if flying.sum() < LEAST_SAMPLES:
+        return []
+    still = [_still(column) & flying for column in array.value.T]
+    together = np.logical_and.reduce(still)
+    least = SHORTEST[array.quantity]
+    found = []
+    stuck = _stretches(array, together, least)
+    stuck = [span for span in stuck if _others_moved(recording, name, array, span)]
+    if stuck:
+        found.append(_Stuck(name, array, "", stuck, flying))
+    if array.quantity in _INERTIAL or array.quantity == "rotor_speed":
+        whole = np.zeros(array.time.size, bool)
+        for first, last in stuck:
+            whole[first:last] = True
+        for component, flags in zip(array.components, still, strict=True) if array.components else ():
+            alone = _stretches(array, flags & ~whole, least)
+            alone = [s for s in alone if _company(array, s) and _others_moved(recording, name, array, s)]
+            if alone:
+                found.append(_Stuck(name, array, component, alone, flying))
+    return found
+
+
+def _still(column: NDArray[np.float64]) -> Flags:
+    """(n,) True for samples equal to the one before."""
+    same = np.zeros(column.size, bool)
+    same[1:] = column[1:] == column[:-1]
+    return same
+
+
+def _stretches(array: SignalArray, flags: Flags, least: float) -> list[tuple[int, int]]:
+    """(first row, row after the last) of unusually long still stretches; the first row is the last true sample."""
+    spans = runs(flags)
+    if not spans.size:
+        return []
+    lengths = spans[:, 1] - spans[:, 0]
+    enough = (array.time[spans[:, 1] - 1] - array.time[spans[:, 0] - 1] >= least) & (lengths >= LEAST_SAMPLES)
+    if not enough.any():
+        return []
+    # the channel's habit, from its other stretches: a coarse one stays often, and for long
+    others = lengths[~enough]
+    habit = float(np.percentile(others, 99)) if others.size else 0.0
+    enough &= lengths >= UNUSUAL * habit
+    return [(int(a) - 1, int(b)) for a, b in spans[enough]]
+
+
+def _company(array: SignalArray, span: tuple[int, int]) -> bool:
+    """True if the other components change often enough meanwhile: one that stands still while new samples came."""
+    part = array.value[span[0] : span[1]]
+    return int((part[1:] != part[:-1]).any(axis=1).sum()) >= LEAST_SAMPLES
+
+
+def _others_moved(recording: Recording, name: str, array: SignalArray, span: tuple[int, int]) -> bool:
+    """True if something else shows that this signal should have changed; inertial sensors always should."""
+    start, end = float(array.time[span[0]]), float(array.time[span[1] - 1])
+    quantity = array.quantity
+    if quantity in _INERTIAL:
+        return True
+    if quantity in ("motor_command", "rotor_speed"):
+        other = "rotor_speed" if quantity == "motor_command" else "motor_command"
+        spread = _spread(recording, other, start, end)
+        if math.isnan(spread):
+            return quantity == "motor_command"
+        return spread > (30.0 if other == "rotor_speed" else 0.03)
+    if quantity == "position":
+        moved = _travelled(recording, "velocity", start, end)
+    elif quantity == "velocity":
+        moved = _spread(recording, "acceleration", start, end) * (end - start) * 0.25
+        if math.isnan(moved):
+            moved = _bent(recording, start, end)
+    else:
+        moved = _travelled(recording, "body_rate", start, end)
+    if math.isnan(moved):
+        # nobody to ask: other measurements of the same quantity
+        for label, other_array in recording.signals.items():
+            if label != name and other_array.quantity == quantity:
+                moved = _spread(recording, label, start, end)
+                break
+    return end - start > 1.0 if math.isnan(moved) else moved > _MOVED[quantity]
+
+
+def _between(array: SignalArray, start: float, end: float) -> NDArray[np.float64]:
+    rows = (array.time >= start) & (array.time <= end)
+    value = array.value[rows]
+    return value[np.isfinite(value).all(axis=1)]
+
+
+def _spread(recording: Recording, name: str, start: float, end: float) -> float:
+    """Largest range of a component within an interval; NaN without samples."""
+    array = recording.signals.get(name)
+    value = _between(array, start, end) if array is not None else np.empty((0, 1))
+    return float(np.ptp(value, axis=0).max()) if value.shape[0] > 2 else math.nan
+
+
+def _travelled(recording: Recording, name: str, start: float, end: float) -> float:
+    """Length of the integral of a rate over an interval; NaN without samples."""
+    array = recording.signals.get(name)
+    value = _between(array, start, end) if array is not None else np.empty((0, 1))
+    return float(np.linalg.norm(value.mean(axis=0))) * (end - start) if value.shape[0] > 2 else math.nan
+
+
+def _bent(recording: Recording, start: float, end: float) -> float:
+    """Change of the mean velocity between the halves of an interval, from the position; NaN without samples."""
+    array = recording.signals.get("position")
+    value = _between(array, start, end) if array is not None else np.empty((0, 1))
+    if value.shape[0] < 6:
+        return math.nan
+    half = value.shape[0] // 2
+    change = (value[-1] - value[half]) - (value[half] - value[0])
+    return float(np.linalg.norm(change)) / max(0.5 * (end - start), 1e-6)
+
+
+def _finding(stuck: list[_Stuck]) -> Finding:
+    first = stuck[0]
+    array = first.array
+    rows = np.zeros(array.time.size, bool)
+    for start, end in first.stretches:
+        rows[start + 1 : end] = True
+    share = float((rows & first.flying).sum()) / float(first.flying.sum())
+    lasting = max(b - a for a, b in first.spans)
+    count = len(first.stretches)
+    times = "once" if count == 1 else f"{count} times"
+    names = [s.name for s in stuck]
+    together = len(stuck) > 1
+    label = listed(names) if together else f"{first.name} {first.component}".strip()
+    return Finding(
+        "frozen",
+        Grade.UNUSABLE if share > 0.5 else Grade.DEGRADES,
+        f"{label} {'stand' if together else 'stands'} still {times} in flight, for {100 * share:.2g} % of it "
+        f"(the longest {lasting:.2f} s)" + (": the log stood still, not the drone." if together else "."),
+        signal="" if together else first.name,
+        intervals=longest(first.spans),
+        evidence={"stretches": count, "share": share, "longest_s": lasting, "samples": int(rows.sum())},
+        advice="Mark the repeats as missing (--fix) and look at the sensor or the log.",
+        fix=Fix("mark", tuple(names), rows=np.flatnonzero(rows)),
+    )

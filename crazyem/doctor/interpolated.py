@@ -1,9 +1,139 @@
-"""Check: samples on straight lines, never measured."""
+"""Check: samples on straight lines through time, never measured, that no reader has marked.
 
-from crazyem.recordings.finding import Finding
-from crazyem.recordings.recording import Recording
+A measured signal is never exactly straight. Three samples in a row count as straight if the middle one is off the line
+by less than 1e-4 of the change (stamps are rounded, too) plus the signal's own resolution. Smooth signals at high rates
+come close to that without being interpolated; then near misses are as frequent as hits, and nothing is reported.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.doctor.streams import COMMANDED, cadence, graded, places, runs
+from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.recording import Recording, SignalArray
+
+STRAIGHT = 1e-4  # of the change over two steps
+NEAR = 1e-3  # a near miss
+COARSE = 1000.0  # steps over two samples, in units of the resolution, below which nothing can be said
+NOTED = 0.05  # share of samples from which results suffer
+DRAWN = 0.5  # share of the moving samples from which the whole signal was drawn from a slower one
+_SLOW = frozenset({"voltage"})  # varies so slowly that straight lines do it no harm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Straightness:
+    """(n,) flags of the samples of one signal: `on` lies on the line between its neighbours, `near` almost, and the
+    signal moves there; `bend`: it is off that line."""
+
+    on: NDArray[np.bool_]
+    near: NDArray[np.bool_]
+    bend: NDArray[np.bool_]
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
-    return []
+    """Runs of interpolated samples and whole signals drawn up from a slower rate, one signal at a time."""
+    found = []
+    for name, array in recording.signals.items():
+        if array.quantity and array.quantity not in COMMANDED and array.time.size >= 8:
+            found += _signal(name, array)
+    return found
+
+
+def straightness(time: NDArray[np.float64], value: NDArray[np.float64]) -> Straightness:
+    """Which samples lie on the line between their neighbours.
+
+    Args:
+        time: (n,) s, increasing; may be uneven.
+        value: (n, c), any unit; a component that does not move is no evidence, one that moves off the line is.
+    """
+    n = time.size
+    span = time[2:] - time[:-2]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        part = (time[1:-1] - time[:-2]) / span
+    bend = np.zeros(n, bool)
+    off_near = np.zeros(n, bool)
+    moving = np.zeros(n, np.int8)
+    with np.errstate(invalid="ignore"):
+        for column in value.T:
+            resolution = _resolution(column)
+            change = column[2:] - column[:-2]
+            deviation = np.abs(column[1:-1] - column[:-2] - part * change)
+            np.abs(change, out=change)
+            bend[1:-1] |= ~(deviation <= STRAIGHT * change + resolution)
+            off_near[1:-1] |= ~(deviation <= NEAR * change + resolution)
+            moving[1:-1] += change > COARSE * resolution
+    # two components on a line are evidence; one alone only if its neighbour in time is on it too
+    on = (moving > 0) & ~bend
+    alone = on & (moving == 1)
+    lonely = alone.copy()
+    lonely[1:] &= ~on[:-1]
+    lonely[:-1] &= ~on[1:]
+    near = (moving > 0) & ~off_near & bend
+    bend[[0, -1]] = False
+    return Straightness(on & ~lonely, near, bend)
+
+
+def _resolution(column: NDArray[np.float64]) -> float:
+    """The step in which a column can change, from above: the least difference of some thousand of its values."""
+    some = column[:: max(1, column.size // 4000)]
+    values = np.unique(some[np.isfinite(some)])
+    return float(np.diff(values).min()) if values.size > 1 else 0.0
+
+
+def _signal(name: str, array: SignalArray) -> list[Finding]:
+    time, value = array.time, array.value
+    if (time[1:] <= time[:-1]).any():
+        keep = np.concatenate([[True], time[1:] > np.maximum.accumulate(time)[:-1]])
+        rows = np.flatnonzero(keep)
+        time, value = time[rows], value[rows]
+    else:
+        rows = np.arange(time.size)
+    if time.size < 8:
+        return []
+    line = straightness(time, value)
+    hits, misses = int(line.on.sum()), int(line.near.sum())
+    # a smooth signal has nine near misses for every hit by chance
+    if hits < 2 or hits < 0.5 * misses:
+        return []
+    present = int(np.isfinite(value).all(axis=1).sum())
+    share = hits / present
+    wide = line.on.copy()
+    wide[1:] |= line.on[:-1]
+    wide[:-1] |= line.on[1:]
+    spans = runs(wide)
+    lasting = float((time[spans[:, 1] - 1] - time[spans[:, 0]]).max())
+    moving = hits + int((line.bend & np.isfinite(value).all(axis=1)).sum())
+    evidence = {"samples": hits, "share": share, "runs": len(spans), "longest_s": lasting}
+    fix = Fix("mark", (name,), rows=rows[np.flatnonzero(line.on)])
+    if hits > DRAWN * moving:
+        duration = float(time[-1] - time[0])
+        knots = runs(line.bend)
+        beat = cadence(time[knots[:, 0]]).period if len(knots) else 0.0
+        rate = 1.0 / beat if beat > 0 else len(knots) / max(duration, 1e-9)
+        stored = (time.size - 1) / max(duration, 1e-9)
+        return [
+            Finding(
+                "interpolated",
+                Grade.HARMLESS if array.quantity in _SLOW else Grade.DEGRADES,
+                f"{name} was measured at about {rate:.3g} Hz and drawn with straight lines to {stored:.0f} Hz.",
+                signal=name,
+                evidence={**evidence, "rate_hz": rate, "stored_hz": stored},
+                advice="Mark the samples in between as missing (--fix); they hold nothing new.",
+                fix=fix,
+            )
+        ]
+    return [
+        Finding(
+            "interpolated",
+            graded(share, degrades=NOTED, unusable=0.6),
+            f"{100 * share:.2g} % of {name} lie on straight lines ({len(spans)} runs, the longest {lasting:.2f} s): "
+            "drawn across lost samples, not measured.",
+            signal=name,
+            intervals=places(time, wide),
+            evidence=evidence,
+            advice="Mark them as missing (--fix).",
+            fix=fix,
+        )
+    ]

@@ -1,9 +1,161 @@
-"""Check: values that are no numbers or cannot be."""
+"""Check: values that are no numbers, and values that no drone can have."""
 
-from crazyem.recordings.finding import Finding
-from crazyem.recordings.recording import Recording
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.doctor.streams import listed, places
+from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.recording import Recording, SignalArray
+
+Rows = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """What a quantity can be.
+
+    Attributes:
+        measure: (n, c) values to (n,) numbers that are compared.
+        low, high: bounds; outside is impossible.
+        words: what is impossible about it.
+    """
+
+    measure: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    low: float
+    high: float
+    words: str
+
+
+def _norm(value: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.sqrt(np.einsum("ij,ij->i", value, value))
+
+
+def _largest(value: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.abs(value).max(axis=1)
+
+
+def _extreme(value: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The component that is furthest from the middle of 0..1."""
+    low, high = value.min(axis=1), value.max(axis=1)
+    return np.where(high - 0.5 > 0.5 - low, high, low)
+
+
+# Wide: only what no drone of this kind can do. Gyros end at 35 (70) rad/s, accelerometers at 24 (32) g an axis, the
+# fastest small rotors at 6000 rad/s; one to six cells give 2 to 26 V; smallest-three quaternions are unit within 0.002.
+LIMITS: dict[str, Limit] = {
+    "position": Limit(_largest, 0.0, 1e4, "further than 10 km from the origin"),
+    "velocity": Limit(_largest, 0.0, 150.0, "faster than 150 m/s"),
+    "attitude": Limit(_norm, 0.98, 1.02, "not of unit length"),
+    "body_rate": Limit(_largest, 0.0, 100.0, "faster than 100 rad/s"),
+    "specific_force": Limit(_largest, 0.0, 400.0, "more than 400 m/s^2"),
+    "acceleration": Limit(_largest, 0.0, 400.0, "more than 400 m/s^2"),
+    "motor_command": Limit(_extreme, -1e-6, 1.0 + 1e-6, "outside 0..1"),
+    "rotor_speed": Limit(_largest, 0.0, 8000.0, "faster than 8000 rad/s"),
+    "voltage": Limit(lambda value: value[:, 0], 2.0, 26.0, "outside 2..26 V"),
+}
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
-    return []
+    """NaN and infinities that are the file's own, impossible values, stamps that are no numbers."""
+    found: list[Finding] = []
+    unmapped: list[tuple[str, int]] = []
+    for name, array in recording.signals.items():
+        if array.time.size == 0:
+            continue
+        found += _stamps(name, array)
+        sound = _finite(array.value)
+        bad = ~sound & ~array.marked
+        if bad.any():
+            if array.quantity or "@" in name:
+                found.append(_not_numbers(name, array, bad))
+            else:
+                unmapped.append((name, int(bad.sum())))
+        limit = LIMITS.get(array.quantity)
+        if limit is not None:
+            found += _impossible(name, array, limit, sound)
+    if unmapped:
+        names = [name for name, _ in unmapped]
+        found.append(
+            Finding(
+                "numbers",
+                Grade.HARMLESS,
+                f"{listed(names)} hold values that are no numbers; nothing here uses these columns.",
+                evidence={"columns": len(names), "samples": sum(count for _, count in unmapped)},
+            )
+        )
+    return found
+
+
+def _finite(value: NDArray[np.float64]) -> Rows:
+    """(n,) True where all components are finite; column by column, which is fastest."""
+    sound = np.isfinite(value[:, 0])
+    for column in range(1, value.shape[1]):
+        sound &= np.isfinite(value[:, column])
+    return sound
+
+
+def _stamps(name: str, array: SignalArray) -> list[Finding]:
+    bad = ~np.isfinite(array.time)
+    if not bad.any():
+        return []
+    return [
+        Finding(
+            "numbers",
+            Grade.UNUSABLE,
+            f"{name} has {int(bad.sum())} samples whose stamp is not a number.",
+            signal=name,
+            evidence={"samples": int(bad.sum()), "share": float(bad.mean())},
+            advice="Remove these rows from the source; a sample without a time says nothing.",
+        )
+    ]
+
+
+def _not_numbers(name: str, array: SignalArray, bad: Rows) -> Finding:
+    share = float(bad.mean())
+    return Finding(
+        "numbers",
+        Grade.UNUSABLE if share > 0.5 else Grade.DEGRADES,
+        f"{name} is not a number in {int(bad.sum())} of {bad.size} samples, and the file does not say why.",
+        signal=name,
+        intervals=places(array.time, bad),
+        evidence={"samples": int(bad.sum()), "share": share},
+        advice="Mark them as missing (--fix); a replay refuses them otherwise.",
+        fix=Fix("mark", (name,), rows=np.flatnonzero(bad)),
+    )
+
+
+def _impossible(name: str, array: SignalArray, limit: Limit, sound: Rows) -> list[Finding]:
+    with np.errstate(invalid="ignore", over="ignore"):
+        measure = limit.measure(array.value)
+        bad = ((measure < limit.low) | (measure > limit.high)) & sound
+    if not bad.any():
+        return []
+    share = float(bad.mean())
+    good = measure[sound & ~bad]
+    worst = measure[bad]
+    worst_value = float(worst[int(np.argmax(np.abs(worst - 0.5 * (limit.low + limit.high))))])
+    advice = "Mark them as missing (--fix); look at what wrote them."
+    fix: Fix | None = Fix("mark", (name,), rows=np.flatnonzero(bad))
+    if share > 0.2:
+        advice, fix = "Check the unit and what the column means; do not use the signal as it is.", None
+        if array.quantity == "voltage" and 2.0 <= float(np.median(measure[sound])) / 1000.0 <= 26.0:
+            advice = "The numbers are millivolts; scale by 0.001 (--fix)."
+            fix = Fix("scale", (name,), factor=(0.001,))
+    evidence = {"samples": int(bad.sum()), "share": share, "worst": worst_value}
+    if good.size:
+        evidence["largest_possible"] = float(good.max())
+    return [
+        Finding(
+            "numbers",
+            Grade.UNUSABLE if share > 0.2 else Grade.DEGRADES,
+            f"{name} is {limit.words} in {int(bad.sum())} of {bad.size} samples (worst {worst_value:.4g}).",
+            signal=name,
+            intervals=places(array.time, bad),
+            evidence=evidence,
+            advice=advice,
+            fix=fix,
+        )
+    ]

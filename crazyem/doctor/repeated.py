@@ -1,9 +1,173 @@
-"""Check: repeated samples."""
+"""Check: rows and values stored again without a new measurement, and the rate at which there really was one.
 
-from crazyem.recordings.finding import Finding
-from crazyem.recordings.recording import Recording
+A coarse signal of a drone that hovers repeats by chance. So only fine signals are believed: those whose steps are rarely
+as small as a few of their own resolutions. Coarse ones that repeat together with a fine one came in the same packet.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.doctor.streams import (
+    COMMANDED,
+    Airtime,
+    Stream,
+    airtime,
+    cadence,
+    inside,
+    listed,
+    places,
+    runs,
+    same_as_before,
+    streams,
+)
+from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.recording import Recording, SignalArray
+
+Rows = NDArray[np.bool_]
+
+LEAST = 0.01  # share of repeated rows worth a word
+NOTED = 0.05  # from which results suffer: a repeat is a wrong value of the age of one sample
+FINE = 0.05  # share of the steps of a fine component that are within four resolutions
+TOGETHER = 0.9  # share of common repeats from which signals came in one packet
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
-    return []
+    """Repeated rows of each stream, then signals that are held between slower measurements of their own."""
+    flight = airtime(recording)
+    found = []
+    for stream in streams(recording):
+        found += _stream(stream, flight)
+    return found
+
+
+def _stream(stream: Stream, flight: Airtime | None) -> list[Finding]:
+    time = stream.time
+    stored = cadence(time).period
+    considered = np.ones(time.size, bool)
+    if flight is not None and flight.airborne:
+        considered = inside(time, flight.airborne)
+    if considered.sum() < 50 or not stored > 0:
+        return []
+    considered[0] = False
+    same: dict[str, Rows] = {}
+    fine: list[str] = []
+    found = []
+    for name, array in zip(stream.names, stream.arrays, strict=True):
+        if not array.quantity or array.quantity in COMMANDED:
+            continue
+        flags = same_as_before(array.value) & considered & ~_resting(array)
+        beat = _hold(flags, considered & np.isfinite(array.value).all(axis=1))
+        if beat is not None and flags.sum() >= 0.3 * considered.sum() and not _creeps(array):
+            found.append(_held_finding(name, float(flags[considered].mean()), 1.0 / stored, beat))
+            continue
+        same[name] = flags
+        if _is_fine(array, considered):
+            fine.append(name)
+    whole = np.logical_and.reduce([same[name] for name in fine]) if fine else np.zeros(time.size, bool)
+    rest = {name: same[name] & ~whole for name in fine}
+    if whole.sum() >= LEAST * considered.sum():
+        names = [name for name in same if name in fine or _follows(same[name], whole)]
+        found.append(_finding(names, time, whole, considered, 1.0 / stored, whole_table=len(fine) > 1))
+    while rest:
+        first, rows = rest.popitem()
+        group = [first, *(name for name in rest if _follows(rest[name], rows) and _follows(rows, rest[name]))]
+        for name in group[1:]:
+            rest.pop(name)
+        if rows.sum() >= 2.0 * LEAST * considered.sum():
+            names = [n for n in same if n in group or (n not in fine and _follows(same[n], rows))]
+            found.append(_finding(names, time, rows, considered, 1.0 / stored, whole_table=False))
+    return found
+
+
+def _follows(flags: Rows, rows: Rows) -> bool:
+    """True if a signal repeats in (nearly) all of the rows."""
+    return bool((flags & rows).sum() >= TOGETHER * rows.sum())
+
+
+def _resting(array: SignalArray) -> Rows:
+    """Commands at their least or greatest value may stay there."""
+    if array.quantity not in ("motor_command", "motor_request"):
+        return np.zeros(array.time.size, bool)
+    low, high = np.nanmin(array.value), np.nanmax(array.value)
+    return ((array.value == low) | (array.value == high)).all(axis=1)
+
+
+def _is_fine(array: SignalArray, considered: Rows) -> bool:
+    """True if the signal cannot repeat by chance: (almost) none of its steps is as small as its resolution.
+
+    Three components of a compressed quaternion are coarse and the fourth follows from them, so three must be fine.
+    """
+    rows = np.flatnonzero(considered)
+    rows = rows[:: max(1, rows.size // 20_000)]
+    fine = 0
+    for column in array.value.T:
+        steps = np.abs(column[rows] - column[rows - 1])
+        steps = steps[steps > 1e-9 * max(float(np.nanmax(np.abs(column[rows]), initial=0.0)), 1e-12)]
+        if steps.size > 20:
+            fine += bool((steps <= 4.0 * steps.min()).mean() <= FINE)
+    return fine >= (3 if array.quantity == "attitude" else 1)
+
+
+def _hold(same: Rows, considered: Rows) -> float | None:
+    """Rows between changes if they come in a regular beat of at least 1.5, else None."""
+    changes = np.flatnonzero(~same & considered)
+    if changes.size < 10:
+        return None
+    beats = np.diff(changes)
+    for beat in sorted({float(np.percentile(beats, 10)), float(np.median(beats))}):
+        if beat < 1.5:
+            continue
+        # a value that happens to stay the same makes a beat of two
+        tolerance = max(1.0 if beat > 4 else 0.1, 0.2 * beat)
+        single = np.abs(beats - beat) <= tolerance
+        exact = float(beats[single].mean())
+        multiple = np.maximum(np.round(beats / exact), 1.0)
+        good = np.abs(beats - multiple * exact) <= tolerance * multiple
+        if good.mean() >= 0.8 and single.mean() >= 0.3:
+            return exact
+    return None
+
+
+def _creeps(array: SignalArray) -> bool:
+    """True if a signal moves a single resolution at a time: then the beat is that of the slope, not of a sensor."""
+    steps = np.abs(np.diff(array.value[:, 0]))
+    steps = steps[steps > 0]
+    return steps.size < 10 or bool((steps <= 1.5 * steps.min()).mean() > 0.6)
+
+
+def _held_finding(name: str, share: float, stored: float, beat: float) -> Finding:
+    rate = stored / beat
+    return Finding(
+        "repeated",
+        Grade.HARMLESS,
+        f"{name} is measured at about {rate:.0f} Hz and held in between (stored at {stored:.0f} Hz).",
+        signal=name,
+        evidence={"share": share, "rate_hz": rate, "stored_hz": stored},
+        advice="Count it at its real rate.",
+    )
+
+
+def _finding(
+    names: list[str], time: NDArray[np.float64], rows: Rows, considered: Rows, stored: float, *, whole_table: bool
+) -> Finding:
+    share = float(rows[considered].mean())
+    rate = stored * (1.0 - share)
+    lengths = np.diff(runs(rows), axis=1)
+    what = "whole rows" if whole_table else "values"
+    return Finding(
+        "repeated",
+        Grade.DEGRADES if share > NOTED else Grade.HARMLESS,
+        f"{100 * share:.2g} % of the {what} of {listed(names)} in flight repeat the one before: "
+        f"stored at {stored:.0f} Hz, measured at about {rate:.0f} Hz.",
+        signal=names[0] if len(names) == 1 else "",
+        intervals=places(time, rows),
+        evidence={
+            "samples": int(rows.sum()),
+            "share": share,
+            "rate_hz": rate,
+            "stored_hz": stored,
+            "longest_samples": float(lengths.max()),
+        },
+        advice="Mark the repeats as missing (--fix); they are old values with a new stamp.",
+        fix=Fix("mark", tuple(names), rows=np.flatnonzero(rows)),
+    )

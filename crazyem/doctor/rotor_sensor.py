@@ -1,9 +1,248 @@
-"""Check: a rotor speed sensor that counts half or drops to zero."""
+"""Check: a rotor speed sensor that counts a fraction or a multiple of the turns, drops to zero, or has nothing to say.
 
-from crazyem.recordings.finding import Finding
-from crazyem.recordings.recording import Recording
+A rotor cannot halve its speed within a hundredth of a second, a sensor can. So a stretch is a fault if the speed leaps
+by the fraction where it begins, leaps back where it ends, and lies meanwhile near that fraction of what the duty, or
+the other rotors, make one expect. A fraction for the whole flight is told from the expectation alone.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.doctor.streams import Intervals, airtime, cadence, inside, listed, longest, ordered, runs
+from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.recording import Recording, SignalArray
+
+FRACTIONS: dict[str, float] = {
+    "a quarter": 1 / 4,
+    "a third": 1 / 3,
+    "half": 1 / 2,
+    "twice": 2.0,
+    "three times": 3.0,
+}
+CONSTANT: dict[str, float] = {**FRACTIONS, "two thirds": 2 / 3, "three quarters": 3 / 4, "one and a half times": 3 / 2}
+LEAP = 0.15  # relative deviation of a leap from the fraction
+NEAR = 0.35  # relative deviation from the expected speed meanwhile: rotors lag, and rotors differ
+EXACT = 0.07  # the same for a whole flight
+SLOWEST = 0.025  # s between samples, from which a real change may look like a leap
+NOTED = 0.01  # share of the flight
+ZERO = 0.1  # of what is expected: standing still
+_MOST_LEAPS = 5000
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
-    return []
+    """Findings for each rotor of each rotor_speed signal, within the time in the air."""
+    flight = airtime(recording)
+    if flight is None or not flight.lifting:
+        return []
+    inner: Intervals = tuple((a + 0.3, b - 0.3) for a, b in flight.lifting if b - a > 1.0)
+    found = []
+    for name, array in recording.signals.items():
+        if array.quantity == "rotor_speed" and array.time.size >= 50:
+            rows = inside(array.time, inner)
+            if rows.sum() >= 50:
+                found += _signal(recording, name, array, rows)
+    return found
+
+
+def _signal(recording: Recording, name: str, array: SignalArray, rows: NDArray[np.bool_]) -> list[Finding]:
+    speed = array.value
+    expected = _expected(recording, array, rows)
+    if expected is None:
+        return []
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.abs(speed) / expected
+    found: list[Finding] = []
+    sampled = cadence(array.time).period < SLOWEST
+    for rotor in range(speed.shape[1]):
+        own = ratio[:, rotor]
+        whole = _whole_flight(own[rows])
+        if whole:
+            found.append(_constant(name, array, rotor, whole, float(np.nanmedian(own[rows]))))
+        elif sampled:
+            zero = _stopped(array.time, np.abs(speed[:, rotor]), own, rows)
+            if zero.any():
+                found.append(_finding(name, array, rotor, zero, "zero", 0.0, rows))
+            for words, fraction in FRACTIONS.items():
+                flags = _leaping(array.time, np.abs(speed[:, rotor]), own, rows, fraction)
+                if flags.any():
+                    found.append(_finding(name, array, rotor, flags, words, fraction, rows))
+    return [*found, *_missing(name, array, rows)]
+
+
+def _expected(recording: Recording, array: SignalArray, rows: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+    """(n, c) rad/s each rotor should have; None if nothing tells."""
+    speed = np.abs(array.value)
+    command = recording.signals.get("motor_command")
+    if command is not None and command.value.shape[1] == speed.shape[1] and command.time.size >= 50:
+        time, duty = ordered(command)
+        volts = np.ones(time.size)
+        if "voltage" in recording.signals:
+            when, voltage = ordered(recording.signals["voltage"])
+            if when.size > 1:
+                volts = np.interp(time, when, voltage[:, 0])
+        if time.size >= 50:
+            drive = np.column_stack([np.interp(array.time, time, column * volts) for column in duty.T])
+            return _law(drive, speed, rows)
+    return _from_the_others(speed, rows)
+
+
+def _law(drive: NDArray[np.float64], speed: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Speed = a + b drive, one law for all rotors (a rotor that counts half all the time must not fit its own).
+
+    Median slopes over pairs (Theil-Sen on a thinned sample): half of the samples may be wrong.
+    """
+    x, y = drive[rows].ravel(), speed[rows].ravel()
+    sound = np.isfinite(x) & np.isfinite(y) & (y > 0)
+    x, y = x[sound], y[sound]
+    if x.size < 20:
+        return np.full(speed.shape, np.nan)
+    thin = np.random.default_rng(0).integers(0, x.size, (4000, 2))
+    dx = x[thin[:, 0]] - x[thin[:, 1]]
+    dy = y[thin[:, 0]] - y[thin[:, 1]]
+    apart = np.abs(dx) > 0.1 * float(np.percentile(x, 95))
+    slope = float(np.median(dy[apart] / dx[apart])) if apart.sum() > 50 else 0.0
+    if slope <= 0:
+        slope = 0.0
+    level = float(np.median(y - slope * x))
+    expected: NDArray[np.float64] = np.maximum(level + slope * drive, 0.2 * float(np.median(y)))
+    return expected
+
+
+def _from_the_others(speed: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+    """The median of the other rotors."""
+    count = speed.shape[1]
+    if count < 3:
+        return None
+    expected = np.full(speed.shape, np.nan)
+    for rotor in range(count):
+        others = np.delete(speed, rotor, axis=1)
+        sound = np.isfinite(others).all(axis=1)
+        expected[sound, rotor] = np.median(others[sound], axis=1)
+    return expected
+
+
+def _leaping(
+    time: NDArray[np.float64],
+    speed: NDArray[np.float64],
+    ratio: NDArray[np.float64],
+    rows: NDArray[np.bool_],
+    fraction: float,
+) -> NDArray[np.bool_]:
+    """(n,) True within stretches at a fraction of the expected speed that begin and end with a leap."""
+    flags = np.zeros(time.size, bool)
+    known = np.flatnonzero(rows & np.isfinite(speed) & (speed > 0) & np.isfinite(ratio))
+    if known.size < 3:
+        return flags
+    period = float(np.median(np.diff(time)))
+    leap = speed[known[1:]] / speed[known[:-1]]
+    close = np.diff(time[known]) < 3.5 * period
+    starts = np.flatnonzero((np.abs(leap / fraction - 1.0) < LEAP) & close)
+    ends = np.flatnonzero((np.abs(leap * fraction - 1.0) < LEAP) & close)
+    near = np.abs(ratio[known] / fraction - 1.0) < NEAR
+    normal = np.abs(ratio[known] - 1.0) < NEAR
+    after = 0
+    for start in starts[:_MOST_LEAPS]:
+        if start < after or not normal[start]:
+            continue
+        later = ends[ends > start]
+        # up to the leap back, or to the end of the flight
+        end = int(later[0]) if later.size else known.size - 1
+        within = slice(start + 1, end + 1)
+        if near[within].mean() > 0.8 and (not later.size or normal[min(end + 1, known.size - 1)]):
+            flags[known[start + 1] : known[end] + 1] = True
+            after = end + 1
+    return flags & rows & np.isfinite(speed)
+
+
+def _stopped(
+    time: NDArray[np.float64], speed: NDArray[np.float64], ratio: NDArray[np.float64], rows: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """(n,) True where the speed is about zero right after it was not."""
+    flags = np.zeros(time.size, bool)
+    with np.errstate(invalid="ignore"):
+        low = rows & (ratio < ZERO)
+    for first, last in runs(low):
+        before = ratio[max(first - 1, 0)]
+        if first > 0 and before > 0.5 and np.isfinite(speed[first]):
+            flags[first:last] = True
+    return flags
+
+
+def _whole_flight(ratio: NDArray[np.float64]) -> str:
+    """The fraction that a rotor counts all the time, "" if it counts right."""
+    sound = ratio[np.isfinite(ratio)]
+    if sound.size < 50:
+        return ""
+    middle = float(np.median(sound))
+    for words, fraction in CONSTANT.items():
+        if abs(middle / fraction - 1.0) < EXACT and (np.abs(sound / middle - 1.0) < 0.2).mean() > 0.8:
+            return words
+    return ""
+
+
+def _constant(name: str, array: SignalArray, rotor: int, words: str, ratio: float) -> Finding:
+    factor = [1.0] * array.value.shape[1]
+    factor[rotor] = 1.0 / CONSTANT[words]
+    return Finding(
+        "rotor_sensor",
+        Grade.DEGRADES,
+        f"The speed sensor of m{rotor + 1} counts {words} of the turns all the time.",
+        signal=name,
+        evidence={"rotor": rotor + 1, "ratio": ratio, "share": 1.0},
+        advice=f"Check its number of poles or blades; scale m{rotor + 1} by {factor[rotor]:.3g} (--fix).",
+        fix=Fix("scale", (name,), factor=tuple(factor)),
+    )
+
+
+def _finding(
+    name: str,
+    array: SignalArray,
+    rotor: int,
+    flags: NDArray[np.bool_],
+    words: str,
+    fraction: float,
+    rows: NDArray[np.bool_],
+) -> Finding:
+    share = float(flags.sum()) / float(rows.sum())
+    spans = [(float(array.time[a]), float(array.time[b - 1])) for a, b in runs(flags)]
+    what = "drops to zero while the rotor must turn" if fraction == 0.0 else f"counts {words} of the turns"
+    return Finding(
+        "rotor_sensor",
+        Grade.DEGRADES if share >= NOTED else Grade.HARMLESS,
+        f"The speed sensor of m{rotor + 1} {what} in {len(spans)} stretches, {100 * share:.2g} % of the flight.",
+        signal=name,
+        intervals=longest(spans),
+        evidence={
+            "rotor": rotor + 1,
+            "ratio": fraction,
+            "share": share,
+            "samples": int(flags.sum()),
+            "stretches": len(spans),
+            "longest_s": max(b - a for a, b in spans),
+        },
+        advice="Mark these samples as missing (--fix).",
+        fix=Fix("mark", (name,), rows=np.flatnonzero(flags)),
+    )
+
+
+def _missing(name: str, array: SignalArray, rows: NDArray[np.bool_]) -> list[Finding]:
+    """What the sensor itself said it does not know, a finding for all rotors."""
+    nan = ~np.isfinite(array.value)
+    flags = nan.any(axis=1) & array.marked & rows
+    if not flags.any():
+        return []
+    counts = nan[flags].sum(axis=0)
+    share = float(flags.sum()) / float(rows.sum())
+    spans = [(float(array.time[a]), float(array.time[b - 1])) for a, b in runs(flags)]
+    which = [f"m{i + 1} {int(count)}" for i, count in enumerate(counts) if count]
+    return [
+        Finding(
+            "rotor_sensor",
+            Grade.DEGRADES if share > 0.05 else Grade.HARMLESS,
+            f"{name} is missing in {int(flags.sum())} samples in the air ({100 * share:.2g} %; {listed(which)}).",
+            signal=name,
+            intervals=longest(spans),
+            evidence={"samples": int(flags.sum()), "share": share, "longest_s": max(b - a for a, b in spans)},
+            advice="Nothing to repair; they are treated as missing.",
+        )
+    ]

@@ -1,9 +1,142 @@
-"""Check: rotors at their limit."""
+"""Check: rotors at their upper or lower limit in flight."""
 
-from crazyem.recordings.finding import Finding
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.doctor.streams import Airtime, Intervals, airtime, inside, longest, ordered, runs
+from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording
+
+FULL = 0.999  # of the greatest duty
+NOTED = 0.005  # share of the flight from which thrust and torque are not what was asked for
+LOW_CELL = 3.3  # V a cell under load
+_CEILING_RUN = 3  # samples at exactly the same greatest value: a cap, not a maximum
+_WORDS = {"motor_command": "duty", "motor_request": "thrust request"}
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
-    return []
+    """Upper limit, and lower limit while airborne, of commanded duty and of requested thrust, a rotor at a time."""
+    flight = airtime(recording)
+    found = []
+    for name in ("motor_command", "motor_request"):
+        array = recording.signals.get(name)
+        if array is None or array.time.size < 20:
+            continue
+        time, value = ordered(array)
+        airborne = flight.airborne if flight is not None else ()
+        rows = inside(time, airborne)
+        if rows.sum() >= 20:
+            found += _upper(recording, name, time, value, rows)
+            found += _lower(name, time, value, rows, flight)
+    return found
+
+
+def _upper(
+    recording: Recording, name: str, time: NDArray[np.float64], value: NDArray[np.float64], rows: NDArray[np.bool_]
+) -> list[Finding]:
+    flags = np.zeros(value.shape, bool)
+    ceilings = []
+    for rotor, column in enumerate(value.T):
+        top = float(column[rows].max())
+        if top >= FULL:
+            flags[:, rotor] = (column >= FULL) & rows
+        elif top > 0.5 and _is_ceiling((column == top) & rows, rows):
+            flags[:, rotor] = (column == top) & rows
+            ceilings.append(top)
+    shares = flags[rows].mean(axis=0)
+    if not flags.any():
+        return []
+    any_rotor = flags.any(axis=1)
+    share = float(any_rotor[rows].mean())
+    spans = _merged(time, any_rotor)
+    lasting = max(b - a for a, b in spans)
+    evidence: dict[str, float] = {"share": share, "longest_s": lasting}
+    evidence |= {f"share_m{i + 1}": float(s) for i, s in enumerate(shares)}
+    if ceilings:
+        evidence["ceiling"] = min(ceilings)
+    words = ", ".join(f"m{i + 1} {100 * s:.2g} %" for i, s in enumerate(shares) if s > 0)
+    text = f"The {_WORDS[name]} of a rotor is at its upper limit in {100 * share:.2g} % of the flight ({words})"
+    volts = _voltage(recording, time[any_rotor])
+    if np.isfinite(volts):
+        evidence["voltage_V"] = volts
+        if volts / max(1, round(volts / 3.8)) < LOW_CELL:
+            text += f", on a low battery ({volts:.2f} V)"
+    return [
+        Finding(
+            "saturation",
+            Grade.DEGRADES if share >= NOTED else Grade.HARMLESS,
+            text + ".",
+            signal=name,
+            intervals=longest(spans),
+            evidence=evidence,
+            advice="The controller did not get what it asked for: the firmware takes the excess of one rotor from all "
+            "four. Use the duty that was sent, not the thrust asked for, and charge the battery or fly gentler.",
+        )
+    ]
+
+
+def _is_ceiling(at_top: NDArray[np.bool_], rows: NDArray[np.bool_]) -> bool:
+    """True if the greatest value is met too often, and for too long at a time, for a maximum."""
+    spans = runs(at_top)
+    return bool(at_top.sum() >= max(10, 0.002 * rows.sum())) and bool((spans[:, 1] - spans[:, 0]).max() >= _CEILING_RUN)
+
+
+def _lower(
+    name: str,
+    time: NDArray[np.float64],
+    value: NDArray[np.float64],
+    rows: NDArray[np.bool_],
+    flight: Airtime | None,
+) -> list[Finding]:
+    """Rotors at idle or off while airborne, but not in the first and last half second, when they start and stop."""
+    inner: Intervals = tuple((a + 0.5, b - 0.5) for a, b in (flight.airborne if flight else ()) if b - a > 1.5)
+    rows = rows & inside(time, inner)
+    if rows.sum() < 20:
+        return []
+    flags = np.zeros(value.shape, bool)
+    floor = float(value.min())
+    running = value[value > 0.02]
+    idle = float(running.min()) if running.size else floor
+    for rotor, column in enumerate(value.T):
+        low = column[rows].min()
+        # a floor is a value that all four share: idle or zero
+        if low <= max(idle, floor) * (1.0 + 1e-6) and low < 0.35:
+            flags[:, rotor] = (column <= low * (1.0 + 1e-6)) & rows
+    any_rotor = flags.any(axis=1)
+    share = float(any_rotor[rows].mean())
+    if any_rotor.sum() < 3 or share < 5e-4:
+        return []
+    shares = flags[rows].mean(axis=0)
+    spans = _merged(time, any_rotor)
+    words = ", ".join(f"m{i + 1} {100 * s:.2g} %" for i, s in enumerate(shares) if s > 0)
+    return [
+        Finding(
+            "saturation",
+            Grade.DEGRADES if share >= 4.0 * NOTED else Grade.HARMLESS,
+            f"The {_WORDS[name]} of a rotor is at its lower limit in {100 * share:.2g} % of the flight ({words}).",
+            signal=name,
+            intervals=longest(spans),
+            evidence={
+                "share": share,
+                "longest_s": max(b - a for a, b in spans),
+                "floor": float(value[any_rotor].min()),
+                **{f"share_m{i + 1}": float(s) for i, s in enumerate(shares)},
+            },
+            advice="At idle the thrust law is least certain; leave these stretches out of fits of the thrust curve.",
+        )
+    ]
+
+
+def _merged(time: NDArray[np.float64], flags: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    return [(float(time[a]), float(time[b - 1])) for a, b in runs(flags)]
+
+
+def _voltage(recording: Recording, times: NDArray[np.float64]) -> float:
+    """Median voltage at these times; NaN without a voltage on the same clock."""
+    array = recording.signals.get("voltage")
+    if array is None or array.time.size < 2:
+        return float("nan")
+    time, value = ordered(array)
+    if time.size < 2:
+        return float("nan")
+    return float(np.median(np.interp(times, time, value[:, 0])))

@@ -1,0 +1,291 @@
+"""What the stream checks share: signals sampled together, their real cadence, runs of rows, and when the drone flew."""
+
+import math
+import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.recordings.finding import Grade, intervals_of
+from crazyem.recordings.recording import Recording, SignalArray
+
+MOST_INTERVALS = 50  # a finding names at most this many places, the longest ones; its evidence counts all
+Intervals = tuple[tuple[float, float], ...]
+
+# What a drone is told or wants, rather than what was measured: may be straight, constant or stepped in good health.
+COMMANDED = frozenset(
+    {
+        "setpoint_position",
+        "setpoint_velocity",
+        "setpoint_acceleration",
+        "setpoint_euler",
+        "setpoint_rate",
+        "wrench_command",
+        "mixer_command",
+        "flying",
+    }
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stream:
+    """Signals that were sampled together.
+
+    Attributes:
+        name: for people: the name of the log block, table or topic, else the names of its signals.
+        names: of its signals.
+        arrays: of its signals, one time axis.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    arrays: tuple[SignalArray, ...]
+
+    @property
+    def time(self) -> NDArray[np.float64]:
+        return self.arrays[0].time
+
+    @property
+    def clock(self) -> str:
+        return self.arrays[0].clock
+
+    @property
+    def commanded(self) -> bool:
+        """True if nothing in it was measured."""
+        return all(array.quantity in COMMANDED for array in self.arrays)
+
+
+def streams(recording: Recording) -> list[Stream]:
+    """Signals grouped by common time axis; those with a stamp that is not a number are left out."""
+    keys: dict[int, tuple[int, int]] = {}  # of a time axis: by its bytes; signals of a table mostly share the array
+    groups: dict[tuple[str, str, tuple[int, int]], list[str]] = {}
+    for name, array in recording.signals.items():
+        if array.time.size == 0:
+            continue
+        if id(array.time) not in keys:
+            finite = bool(np.isfinite(array.time).all())
+            checksum = zlib.crc32(np.ascontiguousarray(array.time).data) if finite else -1
+            keys[id(array.time)] = (array.time.size, checksum)
+        if keys[id(array.time)][1] >= 0:
+            groups.setdefault((array.clock, array.stream, keys[id(array.time)]), []).append(name)
+    found = []
+    for (_, label, _), names in groups.items():
+        arrays = tuple(recording.signals[name] for name in names)
+        found.append(Stream(label or listed(names), tuple(names), arrays))
+    return found
+
+
+def listed(names: Sequence[str], most: int = 4) -> str:
+    """ "a, b and 3 more"."""
+    if len(names) <= most:
+        return ", ".join(names)
+    return f"{', '.join(names[: most - 1])} and {len(names) - most + 1} more"
+
+
+@dataclass(frozen=True, slots=True)
+class Cadence:
+    """How often a stream comes.
+
+    Attributes:
+        period: s between samples when none is lost; NaN with fewer than eight samples.
+        jitter: s, median deviation of an interval from the period.
+        regular: True if the stream keeps to the period (but for losses); False for events.
+    """
+
+    period: float
+    jitter: float
+    regular: bool
+
+
+def cadence(time: NDArray[np.float64]) -> Cadence:
+    """The period of a stream from (n,) stamps in order, also if half of the samples were lost.
+
+    Random loss stretches intervals to multiples of the period, of which the period itself stays the most frequent.
+    """
+    steps = np.diff(time)
+    steps = steps[steps > 0]
+    if steps.size < 7:
+        return Cadence(math.nan, math.nan, False)
+    middle = float(np.median(steps))
+    bins = np.log(np.clip(steps / middle, 0.05, 20.0)) / 0.08
+    counts = np.bincount(np.round(bins).astype(np.int64) + 40, minlength=81).astype(float)
+    smooth = np.convolve(counts, [0.5, 1.0, 0.5], mode="same")
+    mode = middle * math.exp(0.08 * (int(np.argmax(smooth)) - 40))
+    near = steps[np.abs(steps - mode) <= 0.25 * mode]
+    period = float(np.median(near)) if near.size else middle
+    near = steps[np.abs(steps - period) <= 0.2 * period]
+    period = _refined(time, float(near.mean()) if near.size else period)
+    multiple = np.maximum(np.round(steps / period), 1.0)
+    off = np.abs(steps - multiple * period)
+    regular = bool((off <= 0.3 * period).mean() >= 0.75) and bool((np.abs(steps - period) <= 0.3 * period).mean() > 0.2)
+    return Cadence(period, float(np.median(np.abs(steps - period))), regular)
+
+
+def _refined(time: NDArray[np.float64], period: float) -> float:
+    """The period over windows of sixteen samples: coarse stamps and jitter average out, losses are whole periods."""
+    if time.size < 40:
+        return period
+    spans = (time[16:] - time[:-16])[:: max(1, time.size // 50_000)]
+    count = np.round(spans / period)
+    spans = spans[count >= 8]
+    return float(np.median(spans / count[count >= 8])) if spans.size else period
+
+
+def runs(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(k, 2) first row and row after the last of each run of True in (n,) flags."""
+    edges = np.flatnonzero(flags[1:] != flags[:-1]) + 1 if flags.size else np.empty(0, np.int64)
+    if flags.size and flags[0]:
+        edges = np.concatenate([[0], edges])
+    if edges.size % 2:
+        edges = np.concatenate([edges, [flags.size]])
+    return edges.reshape(-1, 2).astype(np.int64)
+
+
+def longest(intervals: Iterable[tuple[float, float]]) -> Intervals:
+    """The longest `MOST_INTERVALS`, in order of time."""
+    kept = sorted(intervals, key=lambda span: span[0] - span[1])[:MOST_INTERVALS]
+    return tuple(sorted((float(a), float(b)) for a, b in kept))
+
+
+def places(time: NDArray[np.float64], flags: NDArray[np.bool_]) -> Intervals:
+    """Intervals of the runs of True, the longest ones."""
+    return longest((float(time[a]), float(time[b - 1])) for a, b in runs(flags))
+
+
+def same_as_before(value: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(n,) True where a row of (n, c) equals the one before in every component; NaN equals nothing."""
+    same = np.zeros(value.shape[0], bool)
+    if value.shape[0] > 1:
+        same[1:] = value[1:, 0] == value[:-1, 0]
+        for column in range(1, value.shape[1]):
+            same[1:] &= value[1:, column] == value[:-1, column]
+    return same
+
+
+def inside(time: NDArray[np.float64], intervals: Intervals) -> NDArray[np.bool_]:
+    """(n,) True where a time lies in one of the intervals."""
+    flags = np.zeros(time.size, bool)
+    for start, end in intervals:
+        flags |= (time >= start) & (time <= end)
+    return flags
+
+
+def ordered(array: SignalArray, *, finite: bool = True) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(n,) times and (n, c) values with increasing times; rows with NaN dropped if `finite`. No copy if avoidable."""
+    time, value = array.time, array.value
+    keep = np.isfinite(time)
+    if finite:
+        keep &= np.isfinite(value).all(axis=1)
+    if not keep.all():
+        time, value = time[keep], value[keep]
+    if time.size > 1 and (time[1:] < time[:-1]).any():
+        order = np.argsort(time, kind="stable")
+        time, value = time[order], value[order]
+    return time, value
+
+
+def graded(share: float, *, degrades: float, unusable: float = math.inf) -> Grade:
+    """By the share of samples concerned."""
+    if share >= unusable:
+        return Grade.UNUSABLE
+    return Grade.DEGRADES if share >= degrades else Grade.HARMLESS
+
+
+# -- when the drone flew ----------------------------------------------------------------------------------------------
+
+SHORTEST_FLIGHT = 0.4  # s of lift; less is a hop or a test of the rotors
+LONGEST_FALL = 0.6  # s without lift that a manoeuvre may have
+LIFTED = 0.03  # m above the ground
+_LIFT_SIGNALS = ("motor_command", "motor_request", "rotor_speed", "wrench_command", "mixer_command")
+
+
+@dataclass(frozen=True, slots=True)
+class Airtime:
+    """When the drone flew.
+
+    Attributes:
+        lifting: intervals in which the rotors carried about the weight [s].
+        airborne: the same, less the time before it left the ground and after it came back, where a position tells.
+        ground: height of the ground in the frame of the position [m]; NaN where unknown.
+        peak: greatest thrust as a share of what the signal can say (duty squared, ...), for "never left the ground".
+        climbed: m, range of height; NaN without a position.
+        begin, end: s, of what the rotors said.
+    """
+
+    lifting: Intervals
+    airborne: Intervals
+    ground: float
+    peak: float
+    climbed: float
+    begin: float
+    end: float
+
+
+def airtime(recording: Recording) -> Airtime | None:
+    """When the drone flew, from rotors and height; None if the recording has neither."""
+    height = _height(recording)
+    for name in _LIFT_SIGNALS:
+        if name in recording.signals:
+            time, value = ordered(recording.signals[name])
+            if time.size > 10:
+                return _from_rotors(name, time, value, height)
+    if height is None:
+        return None
+    time, z = height
+    ground = float(np.percentile(z, 2))
+    flags = z > ground + 0.1
+    found = _closed(time, flags) if np.ptp(z) > 0.15 else ()
+    return Airtime(found, found, ground, math.nan, float(np.ptp(z)), float(time[0]), float(time[-1]))
+
+
+def _height(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    for name, array in recording.signals.items():
+        if array.quantity == "position" or name == "position":
+            time, value = ordered(array)
+            if time.size > 10:
+                return time, value[:, 2]
+    return None
+
+
+def _from_rotors(
+    name: str,
+    time: NDArray[np.float64],
+    value: NDArray[np.float64],
+    height: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
+) -> Airtime:
+    thrust = value[:, 0] if name in ("wrench_command", "mixer_command") else value.mean(axis=1)
+    thrust = np.maximum(thrust, 0.0)
+    if name in ("motor_command", "rotor_speed"):
+        thrust = thrust * thrust  # about: thrust grows with the square of duty and of speed
+    peak = float(np.percentile(thrust, 99))
+    floor = {"motor_command": 0.03, "motor_request": 0.1, "rotor_speed": 200.0**2, "mixer_command": 3000.0}
+    lifting: Intervals = ()
+    if peak > floor.get(name, 1e-3):
+        level = float(np.median(thrust[thrust > 0.4 * peak]))  # near hover: most of a flight is
+        lifting = _closed(time, thrust > 0.3 * level)
+    if height is None:
+        return Airtime(lifting, lifting, math.nan, peak, math.nan, float(time[0]), float(time[-1]))
+    when, z = height
+    resting = ~inside(when, tuple((a - 0.5, b + 2.0) for a, b in lifting))
+    ground = float(np.median(z[resting])) if resting.sum() >= 5 else float(z.min())
+    airborne = []
+    for start, end in lifting:
+        rows = np.flatnonzero((when >= start) & (when <= end) & (z > ground + LIFTED))
+        if rows.size:
+            airborne.append((float(when[rows[0]]), float(when[rows[-1]])))
+        elif not ((when >= start) & (when <= end)).any():
+            airborne.append((start, end))
+    return Airtime(lifting, tuple(airborne), ground, peak, float(np.ptp(z)), float(time[0]), float(time[-1]))
+
+
+def _closed(time: NDArray[np.float64], flags: NDArray[np.bool_]) -> Intervals:
+    """Runs of True with short breaks closed and short runs dropped."""
+    merged: list[tuple[float, float]] = []
+    for start, end in intervals_of(time, flags):
+        if merged and start - merged[-1][1] <= LONGEST_FALL:
+            merged[-1] = (merged[-1][0], end)
+        else:
+            merged.append((start, end))
+    return tuple(span for span in merged if span[1] - span[0] >= SHORTEST_FLIGHT)
