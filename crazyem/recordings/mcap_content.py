@@ -1,8 +1,8 @@
 """What the messages of our MCAP files add up to: tables of log blocks, streams of signals, events, metadata."""
 
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,45 +20,60 @@ _STEP = MOST_SIGNALS + 1  # places in the processing order for each message of a
 _KINDS = {schema: kind for kind, (_, schema) in EVENTS.items()}
 
 
-@dataclass
 class _Rows:
-    """Messages of one channel with fixed length, as they come."""
+    """Messages of one channel with fixed length, as they come, taken apart into groups of fields.
 
-    codec: FixedMessages
-    parts: list[NDArray[Any]] = field(default_factory=list)
-    places: list[NDArray[np.int64]] = field(default_factory=list)
+    Args:
+        codec: of the messages.
+        groups: number of fields in each group, in their order; a group has one type.
+        expected: number of messages, as far as known: saves moving the arrays while they grow.
+    """
+
+    def __init__(self, codec: FixedMessages, groups: Sequence[int], expected: int) -> None:
+        self.codec = codec
+        ends = np.cumsum(groups).tolist()
+        self._groups = list(zip([0, *ends[:-1]], ends, strict=True))
+        none, _ = codec.decode(np.empty(0, np.uint8), np.empty(0, np.int64))
+        kinds = [none.dtype[first] if last > first else np.dtype(float) for first, last in self._groups]
+        self._arrays = [
+            np.empty((expected, last - first), kind) for (first, last), kind in zip(self._groups, kinds, strict=True)
+        ]
+        self._places = np.empty((expected, 1), np.int64)
+        self._size = 0
 
     def add(self, data: NDArray[np.uint8], messages: NDArray[np.int64], places: NDArray[np.int64]) -> int:
         """Take messages (rows of `Scan.messages`) at `places` in the file; returns how many are not sound."""
         right = messages[:, 1] == self.codec.size
         rows, sound = self.codec.decode(data, messages[right, 0])
-        self.parts.append(rows[sound])
-        self.places.append(places[right][sound])
+        rows = rows[sound]
+        start, self._size = self._size, self._size + rows.size
+        for number, (first, last) in enumerate(self._groups):
+            self._arrays[number] = _grown(self._arrays[number], self._size)
+            for i in range(first, last):
+                self._arrays[number][start : self._size, i - first] = rows[str(i)]
+        self._places = _grown(self._places, self._size)
+        self._places[start : self._size, 0] = places[right][sound]
         return len(messages) - int(sound.sum())
 
-    def column(self, number: int) -> NDArray[Any]:
-        """(n,) values of a field, from 0."""
-        parts = [part[str(number)] for part in self.parts]
-        return np.concatenate(parts) if parts else self.codec.decode(np.empty(0, np.uint8), np.empty(0, np.int64))[0][
-            str(number)
-        ].copy()  # fmt: skip
+    def take(self) -> tuple[list[NDArray[Any]], NDArray[np.int64]]:
+        """(n, fields) values of each group and (n,) places in the file; handed over, not kept."""
+        arrays = [_trimmed(array, self._size) for array in self._arrays]
+        places = _trimmed(self._places, self._size)[:, 0]
+        self._arrays = [np.empty((0, array.shape[1]), array.dtype) for array in arrays]
+        self._places, self._size = np.empty((0, 1), np.int64), 0
+        return arrays, places
 
-    def columns(self, first: int, last: int) -> NDArray[np.float64]:
-        """(n, last - first) values of fields."""
-        size = sum(part.size for part in self.parts)
-        values = np.empty((size, last - first))
-        at = 0
-        for part in self.parts:
-            for i in range(first, last):
-                values[at : at + part.size, i - first] = part[str(i)]
-            at += part.size
-        return values
 
-    def place(self) -> NDArray[np.int64]:
-        return np.concatenate(self.places) if self.places else np.empty(0, np.int64)
+def _grown(array: NDArray[Any], size: int) -> NDArray[Any]:
+    if size <= len(array):
+        return array
+    larger = np.empty((max(size, len(array) * 3 // 2), array.shape[1]), array.dtype)
+    larger[: len(array)] = array
+    return larger
 
-    def clear(self) -> None:
-        self.parts, self.places = [], []
+
+def _trimmed(array: NDArray[Any], size: int) -> NDArray[Any]:
+    return array[:size] if len(array) - size < len(array) // 16 else array[:size].copy()
 
 
 @dataclass
@@ -69,18 +84,16 @@ class _BlockChannel:
 
     def table(self) -> Table:
         names = [v.name for v in self.block.variables]
-        values = self.rows.columns(2, 2 + len(names))
-        table = Table(
+        (stamp, host_time, values), places = self.rows.take()
+        return Table(
             name=f"log/{self.block.identifier}",
             columns={name: values[:, i] for i, name in enumerate(names)},
-            time=self.rows.column(0) / 1000.0,
-            order=self.rows.place(),
-            host_time=self.rows.column(1),
+            time=stamp[:, 0] / 1000.0,
+            order=places,
+            host_time=host_time[:, 0],
             clock="firmware",
             ctypes={v.name: v.ctype for v in self.block.variables},
         )
-        self.rows.clear()
-        return table
 
 
 @dataclass
@@ -90,20 +103,19 @@ class _StreamChannel:
 
     def signals(self) -> list[tuple[int, str, SignalArray]]:
         """Index, name and array of each signal."""
-        time, host_time, marked = (self.rows.column(i) for i in range(3))
-        place = self.rows.place() * _STEP
-        back = np.argsort(self.rows.column(3), kind="stable") if self.layout.rows else slice(None)
-        found, at = [], self.layout.first
-        time, host_time = time[back], host_time[back]
+        arrays, place = self.rows.take()
+        place *= _STEP
+        fixed, values = [a[:, 0] for a in arrays[: self.layout.first]], arrays[self.layout.first :]
+        back = np.argsort(fixed[3], kind="stable") if self.layout.rows else slice(None)
+        time, host_time, marked = (column[back] for column in fixed[:3])
+        found = []
         for bit, column in enumerate(self.layout.signals):
-            value = self.rows.columns(at, at + column.width)
-            at += column.width
             array = SignalArray(
                 time,
-                value[back],
+                values[bit][back],
                 (place + bit)[back],
                 host_time,
-                ((marked >> np.uint64(bit)) & np.uint64(1)).astype(bool)[back],
+                (marked & np.uint64(1 << bit)) != 0,
                 quantity=column.quantity,
                 unit=column.unit,
                 frame=column.frame,
@@ -112,12 +124,14 @@ class _StreamChannel:
                 source=column.source,
             )
             found.append((column.index, column.name, array))
-        self.rows.clear()
         return found
 
 
 class Content:
     """Takes the parts of a file in order.
+
+    Args:
+        expected: number of messages of each channel, as far as known.
 
     Attributes:
         events: so far; the caller may take them away.
@@ -126,7 +140,8 @@ class Content:
         messages: so far.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, expected: Mapping[int, int] | None = None) -> None:
+        self._expected = expected or {}
         self.events: list[Event] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self.unreadable = 0
@@ -174,11 +189,15 @@ class Content:
                     raise ValueError("too many variables")
                 number = record.metadata.get("session", "1")
                 session = int(number) if number.isdecimal() and len(number) < 6 else 1
-                rows = _Rows(schemas.BlockCodec(block).table())
+                rows = _Rows(
+                    schemas.BlockCodec(block).table(), [1, 1, len(block.variables)], self._expected.get(record.id, 0)
+                )
                 self._blocks[record.id] = _BlockChannel(block, session, rows)
             elif name.startswith("crazyem.signals."):
                 layout = StreamLayout.from_metadata(record.metadata)
-                self._streams[record.id] = _StreamChannel(layout, _Rows(layout.messages))
+                expected = self._expected.get(record.id, 0)
+                groups = [*(1 for _ in range(layout.first)), *(s.width for s in layout.signals)]
+                self._streams[record.id] = _StreamChannel(layout, _Rows(layout.messages, groups, expected))
             elif name in _KINDS and record.topic == EVENTS[_KINDS[name]][0]:
                 self._kinds[record.id] = (_KINDS[name], schemas.message_class(name))
             elif name == OTHER_EVENTS[1]:

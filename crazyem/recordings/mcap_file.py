@@ -1,7 +1,7 @@
 """Reading our own recordings (MCAP), whole or cut off: every complete chunk counts, in the order it was written."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from crazyem.errors import FileFormatError
@@ -11,6 +11,7 @@ from crazyem.recordings.mcap_findings import OWN_METADATA, finding_of, findings_
 from crazyem.recordings.mcap_messages import PROFILE
 from crazyem.recordings.mcap_scan import MAGIC, Loss, Problem
 from crazyem.recordings.mcap_survey import Part, from_summary, parts, profile_of
+from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.tables import Table, signals_from_tables
@@ -45,7 +46,7 @@ def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Itera
 
     Raises: as `read`, with the first part.
     """
-    reading = _Reading(path, options)
+    reading = _Reading(path, options, in_parts=True)
     if not reading.announced:  # cut off: without a summary, what is in the file is known only after a look at all of it
         for part in parts(path, []):
             reading.announced.extend(part.announced)
@@ -71,16 +72,17 @@ def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Itera
 class _Reading:
     """One pass over a file."""
 
-    def __init__(self, path: Path, options: ReadOptions) -> None:
+    def __init__(self, path: Path, options: ReadOptions, *, in_parts: bool = False) -> None:
         self.path, self.options = path, options
-        self.content = Content()
         self.problems: list[Problem] = []
-        self.announced = from_summary(path)
+        self.announced, counts = from_summary(path)
+        self.content = Content({} if in_parts else counts)
         self._lost: dict[int, int] = {}  # number of the problem -> messages
         self._sequence = 0
         self._samples = False
         self._motor: str | None = None
         self._told: list[Finding] = []
+        self._decided: Mapping[str, Mapping[str, str]] = {}
 
     def parts(self) -> Iterator[Part]:
         # a damaged chunk may have held announcements that the summary repeats
@@ -121,6 +123,7 @@ class _Reading:
             raise FileFormatError(f"{self.path} is a recording without a single sample.")
         events, self.content.events = tuple(self.content.events), []
         metadata = {name: entries for name, entries in self.content.metadata.items() if name != OWN_METADATA}
+        metadata.update({name: dict(entries) for name, entries in self._decided.items()})
         origin, source, imported = _imported(own)
         return Recording(
             str(self.path),
@@ -142,10 +145,14 @@ class _Reading:
             found.append({name: array for name, array in signals.items() if array.time.size})
         return join(found)
 
-    def _meaning(self, tables: Iterable[Table]) -> str | None:
-        """What motor.m1..4 is, decided once for a file."""
+    def _meaning(self, tables: Sequence[Table]) -> str:
+        """What motor.m1..4 is, decided once for a file; where nothing tells, what it was taken for in flight."""
         if self._motor is None:
-            self._motor = self.options.motor or "duty"
+            decided = decide(tables, given=self.options.motor, metadata=self.content.metadata)
+            if any("motor.m1" in table.columns for table in tables):
+                self._told = [f for f in decided.findings if f.grade is not Grade.HARMLESS]
+                self._decided = decided.metadata
+            self._motor = decided.meaning or "duty"
         return self._motor
 
     def _findings(self) -> tuple[Finding, ...]:

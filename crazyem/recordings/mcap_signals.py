@@ -354,13 +354,14 @@ def _poses(output: Output, recording: Recording, ranks: Mapping[str, NDArray[np.
     turns = np.argsort(ranks["attitude"])
     turns = turns[whole[turns]]
     log_times = clock.of(position.time, position.host_time)
+    known = ranks["attitude"][turns]
     extras, newest = [], -math.inf
     for row in np.argsort(ranks["position"]).tolist():
         time = float(position.time[row])
         if not abs(time - newest) >= POSE_EVERY:
             continue
         # the attitude known by then; the sample after the position if it was taken at the same time
-        at = int(np.searchsorted(ranks["attitude"][turns], ranks["position"][row] + 1, side="right")) - 1
+        at = int(np.searchsorted(known, ranks["position"][row] + 1, side="right")) - 1
         if at < 0 or not np.isfinite(position.value[row]).all():
             continue
         newest = time

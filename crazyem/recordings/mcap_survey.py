@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings import mcap_scan
-from crazyem.recordings.mcap_scan import HEAD, MAGIC, Loss, PackedChunk, Problem, Record, Scan
+from crazyem.recordings.mcap_scan import HEAD, MAGIC, MESSAGE_HEAD, Loss, PackedChunk, Problem, Record, Scan
 
 RATIO = 400  # a file that unpacks to more than this many times its size (and 64 MiB) is a bomb; flights have 2 to 30
 _BATCH = 256 * 1024  # bytes of records outside chunks that are looked at together
@@ -135,10 +135,11 @@ def profile_of(head: bytes) -> str | None:
     return head[start + 4 : start + 4 + length].decode("utf-8", "replace") if length < 1024 else None
 
 
-def from_summary(path: Path) -> list[Any]:
-    """Schemas and channels that the summary at the end of a file repeats; [] if there is none."""
+def from_summary(path: Path) -> tuple[list[Any], dict[int, int]]:
+    """Schemas and channels that the summary of a file repeats, and the messages of each channel; empty without one."""
     tail = HEAD.size + 20 + len(MAGIC)
-    found = []
+    found: list[Any] = []
+    counts: dict[int, int] = {}
     try:
         with path.open("rb") as stream:
             size = stream.seek(0, 2)
@@ -147,19 +148,31 @@ def from_summary(path: Path) -> list[Any]:
             footer = parse(mcap_scan.FOOTER, end[HEAD.size :]) if end.endswith(MAGIC) else None
             start = footer.summary_start if footer else 0
             if not 0 < start < size or size - start > mcap_scan.LARGEST_RECORD:
-                return []
+                return [], {}
             stream.seek(start)
             data = stream.read(size - start - tail)
     except OSError:
-        return []
+        return [], {}
     at = 0
     while at + HEAD.size <= len(data):
         opcode, length = HEAD.unpack_from(data, at)
         content = data[at + HEAD.size : at + HEAD.size + length]
         if opcode in (mcap_scan.SCHEMA, mcap_scan.CHANNEL) and len(content) == length:
             found.append(parse(opcode, content))
+        elif opcode == mcap_scan.STATISTICS and len(content) == length:
+            counts = _counts(content, RATIO * size)
         at += HEAD.size + length
-    return [record for record in found if record is not None]
+    return [record for record in found if record is not None], counts
+
+
+def _counts(data: bytes, most: int) -> dict[int, int]:
+    """Messages of each channel out of a statistics record; {} if they could not be in `most` bytes."""
+    pairs = data[46:]
+    counts = {
+        int.from_bytes(pairs[i : i + 2], "little"): int.from_bytes(pairs[i + 2 : i + 10], "little")
+        for i in range(0, len(pairs) - 9, 10)
+    }
+    return counts if sum(counts.values()) * MESSAGE_HEAD.size <= most else {}
 
 
 def index_of(messages: NDArray[np.int64]) -> dict[int, NDArray[np.uint64]]:

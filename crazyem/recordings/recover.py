@@ -110,7 +110,7 @@ def _copy(source: Path, head: bytes, output: Output) -> Report:
     report = Report(profile=profile or "")
     output.start(report.profile, "crazyem recover")
     # a damaged chunk may have held announcements that only the summary repeats
-    known = {(type(r).__name__, r.id): r for r in from_summary(source)}
+    known = {(type(r).__name__, r.id): r for r in from_summary(source)[0]}
     counter = _Sequence()
     seen: set[tuple[str, int]] = set()
     summary = False
