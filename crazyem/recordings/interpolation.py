@@ -1,10 +1,13 @@
-"""Finding samples that were never measured: a stream resampled by straight lines across lost packets."""
+"""Streams that somebody resampled by straight lines: finding what was never measured, recovering what was."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 RELATIVE_TOLERANCE = 1e-4  # of the change over two steps; measured values sit below 1e-5, noise far above 1e-2
 ABSOLUTE_TOLERANCE = 4e-9  # decimals of the file: nine digits, rounded
+_CHUNK = 1 << 16  # rows looked at together, to bound memory
 
 
 def interpolated_rows(
@@ -29,19 +32,110 @@ def interpolated_rows(
     """
     n = time.size
     rows = np.zeros(n, bool)
-    if n < 3:
-        return rows
+    for start in range(0, max(n - 2, 0), _CHUNK):
+        part = slice(start, min(start + _CHUNK + 2, n))
+        centres = _centres(time[part], values[part], relative_tolerance, absolute_tolerance)
+        for shift in (0, 1, 2):
+            rows[start + shift : start + shift + centres.size] |= centres
+    return rows
+
+
+def _centres(
+    time: NDArray[np.float64], values: NDArray[np.float64], relative_tolerance: float, absolute_tolerance: float
+) -> NDArray[np.bool_]:
+    """(n - 2,) whether each row but the first and last lies on the line through its neighbours, and moves."""
     span = time[2:] - time[:-2]
     share = np.where(span > 0, (time[1:-1] - time[:-2]) / np.where(span > 0, span, 1.0), np.nan)
-    change = values[2:] - values[:-2]
-    deviation = np.abs(values[1:-1] - values[:-2] - share[:, None] * change)
-    tolerance = absolute_tolerance + relative_tolerance * np.abs(change)
     with np.errstate(invalid="ignore"):
-        on_line = (deviation <= tolerance).all(axis=1)
+        change = values[2:] - values[:-2]
+        deviation = np.abs(values[1:-1] - values[:-2] - share[:, None] * change)
+        on_line = (deviation <= absolute_tolerance + relative_tolerance * np.abs(change)).all(axis=1)
         # A change near the rounding of the file would pass as straight whatever it did.
         moving = (np.abs(change) > 1e3 * absolute_tolerance).any(axis=1)
-    centres = on_line & moving
-    rows[1:-1] |= centres
-    rows[:-2] |= centres
-    rows[2:] |= centres
-    return rows
+    return on_line & moving
+
+
+CONTEXT = 32  # rows on either side that decide what a row is; no rule below looks further
+_LONGEST_GROUP = 8  # rows off every line that still are corners; more of them are measured rows
+_SHARE_OUTSIDE = 0.02  # of a row's interval that a corner may lie outside it, for rounding
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corners:
+    """The samples of a slow stream that somebody drew onto faster rows by straight lines.
+
+    Attributes:
+        row: (m,) the last row at or before each sample, increasing.
+        time: (m,) s.
+        value: (m,)
+    """
+
+    row: NDArray[np.int64]
+    time: NDArray[np.float64]
+    value: NDArray[np.float64]
+
+
+def corners(
+    time: NDArray[np.float64],
+    value: NDArray[np.float64],
+    *,
+    starts: bool = True,
+    ends: bool = True,
+    absolute_tolerance: float = ABSOLUTE_TOLERANCE,
+) -> Corners:
+    """Recover the samples from which a polygon was drawn: where two of its lines meet, between two rows or on one.
+
+    The corner between rows k and k+1 is where the line through k-1 and k meets the line through k+1 and k+2. A sample
+    in the middle of a straight stretch cannot be told from the line; it leaves no trace and is not recovered. Where no
+    lines are (more than eight rows in a row lie on none), the rows are the samples.
+
+    Args:
+        time: (n,) s, may be unevenly spaced.
+        value: (n,)
+        starts, ends: whether row 0 and row n-1 are the first and last there are.
+        absolute_tolerance: deviation from a line that still counts as none; the rounding of the file.
+    """
+    n = time.size
+    if n < 4:
+        return Corners(np.arange(n), time.copy(), value.copy())
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
+        deviation = np.abs(value[1:-1] - value[:-2] - share * (value[2:] - value[:-2]))
+    off = np.zeros(n, bool)
+    off[1:-1] = ~(deviation <= absolute_tolerance)  # NaN is off every line
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], off, [False]]).astype(np.int8)))
+    begin, length = edges[::2], edges[1::2] - edges[::2]
+    pairs = [
+        (begin[length == size, None] + np.arange(0, size, 2)[None, :]).ravel()
+        for size in range(2, _LONGEST_GROUP + 1, 2)
+    ]
+    before = np.sort(np.concatenate(pairs)).astype(np.int64)
+    met, where = _meeting(time, value, before)
+    measured = np.zeros(n, bool)
+    measured[begin[length == 1]] = True  # a corner on a row
+    measured[before[~met]] = measured[before[~met] + 1] = True
+    for first, count in zip(begin[length > _LONGEST_GROUP], length[length > _LONGEST_GROUP], strict=True):
+        last = first + count
+        measured[first - (starts and first == 1) : last + (ends and last == n - 1)] = True
+    if starts and value[0] == value[1] == value[2]:
+        measured[0] = True  # held from before the first row: nothing was drawn there
+    rows = np.flatnonzero(measured)
+    row = np.concatenate([rows, before[met]])
+    stamp = np.concatenate([time[rows], where[met, 0]])
+    level = np.concatenate([value[rows], where[met, 1]])
+    place = np.argsort(row, kind="stable")
+    return Corners(row[place], stamp[place], level[place])
+
+
+def _meeting(
+    time: NDArray[np.float64], value: NDArray[np.float64], k: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Whether the lines before row k and after row k+1 meet between those rows, and (time, value) where."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        left = (value[k] - value[k - 1]) / (time[k] - time[k - 1])
+        right = (value[k + 2] - value[k + 1]) / (time[k + 2] - time[k + 1])
+        step = time[k + 1] - time[k]
+        share = (value[k + 1] - value[k] - right * step) / (left - right) / step
+        met = (share > -_SHARE_OUTSIDE) & (share < 1.0 + _SHARE_OUTSIDE) & (step > 0)
+    share = np.clip(np.where(met, share, 0.0), 0.0, 1.0)
+    return met, np.stack([time[k] + share * step, value[k] + left * share * step], axis=1)

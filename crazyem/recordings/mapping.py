@@ -4,34 +4,29 @@ import functools
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
-from crazyem.errors import FileFormatError
-from crazyem.signals.sample import SIGNALS
-from crazyem.signals.vocabulary import STANDARD_GRAVITY
+from crazyem.errors import FileFormatError, UsageError
+from crazyem.recordings.mapping_units import is_electrical, time_divisor, unit_factor
+from crazyem.signals.sample import SIGNALS, components
 
-# unit in a file -> factor to SI
-UNITS: dict[str, float] = {
-    "1": 1.0,
-    "s": 1.0,
-    "ms": 1e-3,
-    "us": 1e-6,
-    "m": 1.0,
-    "mm": 1e-3,
-    "m/s": 1.0,
-    "mm/s": 1e-3,
-    "m/s^2": 1.0,
-    "g": STANDARD_GRAVITY,
-    "rad/s": 1.0,
-    "deg/s": math.pi / 180.0,
-    "rpm": 2.0 * math.pi / 60.0,
-    "pwm": 1.0 / 65535.0,
-    "V": 1.0,
-    "mV": 1e-3,
-    "N": 1.0,
-}
+BODY_AXES, WORLD_AXES = ("FLU", "FRD"), ("ENU", "NED")
+_MOTORS = ("motor_command", "motor_request", "rotor_speed")
+_ANGLES = ("euler", "setpoint_euler")
+_LARGEST = 1_000_000  # bytes of a mapping file: nobody writes more by hand
+
+_TOP = {
+    "name", "title", "layout", "recognise", "time", "claims", "units", "packets", "signals", "host_signals", "columns",
+}  # fmt: skip
+_TIME = {"column", "unit", "clock", "rate_hz"}
+_CLAIMABLE = {"unit", "frame", "sign", "scale", "order", "direction"}
+_ENTRY = _CLAIMABLE | {
+    "columns", "variables", "packet", "stream", "clock", "missing", "above", "hold", "rotors", "pole_pairs", "attitude",
+    "corners", "published",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,103 +34,362 @@ class SignalColumns:
     """Columns of one signal.
 
     Attributes:
-        columns: one a component.
-        scale: factor to SI, sign included, one a component.
+        quantity: key of `SIGNALS`; the name of the signal up to its "@".
+        columns: in the order of the signal's components. Three for an attitude given as roll, pitch, yaw.
+        scale: factor to SI, sign included, one a column.
         packet: name of the onboard packet the columns came in, if the file's publisher interpolated it; else None.
+        stream: signals of one stream were sampled together.
+        clock: name of the clock of the stamps; None: the clock of the file's rows.
+        frame: frame in which a vector is given, if not the signal's own: "body" or "world"; else "".
+        axes: of the given frames: ("FRD", "NED") and the like; ours are FLU and ENU.
+        inverted: the rotation given takes the world to the body.
+        attitude: the signal whose attitude turns a vector of the other frame.
+        missing: values that mean "not measured".
+        empty_is_missing: fields without a number mean the same, by the publisher's own account.
         above: the signal is 1 where any column exceeds this, else 0 (for `flying`); None for plain columns.
         hold: s for which such a 1 is kept.
+        corners: a slower stream that was drawn onto the rows by straight lines: its own samples are the corners.
     """
 
+    quantity: str
     columns: tuple[str, ...]
     scale: tuple[float, ...]
     packet: str | None = None
+    stream: str = ""
+    clock: str | None = None
+    frame: str = ""
+    axes: tuple[str, str] = ("FLU", "ENU")
+    inverted: bool = False
+    attitude: str = "attitude"
+    missing: tuple[float, ...] = ()
+    empty_is_missing: bool = False
     above: float | None = None
     hold: float = 0.0
+    corners: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class CsvMapping:
-    """A CSV format: how to recognise it by its header, and what is in it (see recordings/mappings/*.toml)."""
+    """A CSV format: how to recognise it by its header, and what is in it (docs/formats/csv.md).
+
+    Attributes:
+        name, title: for people.
+        layout: "wide" (a row an instant) or "long" (a row a variable).
+        recognise: columns by which the format is told.
+        time: name of the time column, and what its stamps are divided by to have seconds; "" with `rate`.
+        rate: Hz at which rows without stamps were taken, else NaN.
+        clock: name of the clock of the rows; "host" means seconds since the epoch.
+        signals: signal name -> its columns, as they really are.
+        published: the same, as the publisher says; differs from `signals` where the publisher is wrong.
+        columns: of the long form: what each of its columns is.
+        units: of columns that are no signal.
+        packets: packet -> columns that are no signal but came in it.
+        claims: what the publisher says of the whole recording, e.g. mass_kg.
+    """
 
     name: str
     title: str
-    layout: str  # "wide" (a row an instant) or "long" (a row a variable)
+    layout: str
     recognise: tuple[str, ...]
     time: tuple[str, float]
     signals: Mapping[str, SignalColumns]
     columns: Mapping[str, str]
+    published: Mapping[str, SignalColumns] = field(default_factory=dict)
+    rate: float = math.nan
+    clock: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
+    packets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    claims: Mapping[str, str] = field(default_factory=dict)
 
 
 def load_mapping(text: str, where: str) -> CsvMapping:
     """A mapping from its TOML text; `where` names it in error messages. Raises FileFormatError naming the key."""
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise FileFormatError(f"{where}: not valid TOML ({error}).") from error
-    layout = _get(table, "layout", str, where)
+    _known(table, _TOP, where)
+    layout = _get(table, "layout", str, where, "wide")
     if layout not in ("wide", "long"):
         raise FileFormatError(f'{where}: layout must be "wide" or "long", not "{layout}".')
-    key = "signals" if layout == "wide" else "host_signals"
-    signals = {
-        name: _signal(name, entry, f"{where}: {key}.{name}", "columns" if layout == "wide" else "variables")
-        for name, entry in table.get(key, {}).items()
-    }
-    time = table.get("time", {})
-    columns = table.get("columns", {})
+    key, columns_key = ("signals", "columns") if layout == "wide" else ("host_signals", "variables")
+    entries = _get(table, key, dict, where, {})
+    for name, entry in entries.items():
+        if not isinstance(entry, dict):
+            raise FileFormatError(f"{where}: {key}.{name} must be a table.")
+    signals = {n: _signal(n, e, f"{where}: {key}.{n}", columns_key) for n, e in entries.items()}
+    published = {n: _signal(n, _claimed(e), f"{where}: {key}.{n}", columns_key) for n, e in entries.items()}
+    time = _get(table, "time", dict, where, {})
+    _known(time, _TIME, f"{where}: time")
+    columns = _texts(table, "columns", where)
+    rate = _number(time, "rate_hz", f"{where}: time", math.nan)
     if layout == "long":
         for needed in ("host_time", "block", "stamp_ms", "name", "value"):
             _get(columns, needed, str, f"{where}: columns")
-    else:
+    elif "rate_hz" not in time:
         _get(time, "column", str, f"{where}: time")
+    elif not (0.0 < rate < math.inf) or "column" in time:
+        raise FileFormatError(f"{where}: time needs a column, or a positive rate_hz for rows without stamps.")
+    name = _get(table, "name", str, where, Path(where).stem)
     return CsvMapping(
-        name=_get(table, "name", str, where),
-        title=_get(table, "title", str, where),
+        name=name,
+        title=_get(table, "title", str, where, name),
         layout=layout,
-        recognise=tuple(_get(table, "recognise", list, where)),
-        time=(time.get("column", ""), _unit(time.get("unit", "s"), f"{where}: time.unit")),
+        recognise=_names(table, "recognise", where, ()),
+        time=(
+            _get(time, "column", str, f"{where}: time", ""),
+            time_divisor(_get(time, "unit", str, f"{where}: time", "s"), f"{where}: time.unit"),
+        ),
         signals=signals,
         columns=columns,
+        published=published,
+        rate=rate,
+        clock=_get(time, "clock", str, f"{where}: time", ""),
+        units=_texts(table, "units", where),
+        packets={p: _names(table["packets"], p, f"{where}: packets") for p in _get(table, "packets", dict, where, {})},
+        claims={k: str(v).lower() if isinstance(v, bool) else str(v) for k, v in _claims(table, where).items()},
     )
 
 
 @functools.cache
 def known_mappings() -> tuple[CsvMapping, ...]:
-    """The mappings that ship with crazyem."""
+    """The mappings that ship with crazyem, the most demanding first."""
     folder = resources.files("crazyem.recordings") / "mappings"
     files = sorted((f for f in folder.iterdir() if f.name.endswith(".toml")), key=lambda f: f.name)
-    return tuple(load_mapping(f.read_text(encoding="utf-8"), f.name) for f in files)
+    loaded = (load_mapping(f.read_text(encoding="utf-8"), f.name) for f in files)
+    return tuple(sorted(loaded, key=lambda m: -len(m.recognise)))
 
 
-def _signal(name: str, entry: Mapping[str, Any], where: str, key: str) -> SignalColumns:
-    if name not in SIGNALS:
-        raise FileFormatError(f"{where}: no such signal; known are {', '.join(SIGNALS)}.")
-    columns = tuple(_get(entry, key, list, where))
-    components = SIGNALS[name][0]
-    above = entry.get("above")
-    if above is None and len(columns) != components:
-        raise FileFormatError(f"{where}.{key}: {name} has {components} components, not {len(columns)}.")
-    factor = _unit(entry.get("unit", "1"), f"{where}.unit") * float(entry.get("scale", 1.0))
-    signs = entry.get("sign", [1] * len(columns))
-    if len(signs) != len(columns) or any(s not in (1, -1) for s in signs):
-        raise FileFormatError(f"{where}.sign: needs 1 or -1 for each of the {len(columns)} columns.")
-    return SignalColumns(
-        columns=columns,
-        scale=tuple(factor * s for s in signs),
-        packet=entry.get("packet"),
-        above=None if above is None else float(above),
-        hold=float(entry.get("hold", 0.0)),
+def mapping_for(header: tuple[str, ...], given: str | None, path: Path) -> CsvMapping:
+    """The mapping of a file with this header.
+
+    Args:
+        given: name of a shipped mapping (or what comes before its "_": "nanodrone"), or path of a TOML file; None: by
+            the header.
+        path: of the file, for messages.
+
+    Raises: UsageError if there is no such mapping file, FileFormatError if it is broken or the header is not known.
+    """
+    shipped = {mapping.name: mapping for mapping in known_mappings()}
+    columns = set(header)
+    family = [m for m in known_mappings() if given is None or m.name == given or m.name.startswith(f"{given}_")]
+    if given is not None and not family:
+        return load_mapping(_text_of(Path(given), shipped), given)
+    for mapping in family:
+        if given == mapping.name or (mapping.recognise and columns.issuperset(mapping.recognise)):
+            return mapping
+    known = ", ".join(m.title for m in known_mappings())
+    shown = ", ".join(name[:40] for name in header[:6])
+    raise FileFormatError(
+        f"{path}: the columns ({shown}, ...) are of no known format ({known}); say what they are with --map FILE.toml."
     )
 
 
-def _unit(name: str, where: str) -> float:
-    if name not in UNITS:
-        raise FileFormatError(f'{where}: unknown unit "{name}"; known are {", ".join(UNITS)}.')
-    return UNITS[name]
+def _text_of(path: Path, shipped: Mapping[str, CsvMapping]) -> str:
+    try:
+        with path.open("rb") as file:
+            raw = file.read(_LARGEST + 1)
+        if len(raw) > _LARGEST:
+            raise FileFormatError(f"{path}: no mapping is larger than {_LARGEST} bytes.")
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{path}: not a text file (byte {error.start} is not UTF-8).") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        names = ", ".join(shipped)
+        raise UsageError(f"{path}: this mapping cannot be read ({reason}); shipped ones are {names}.") from error
 
 
-def _get(table: Mapping[str, Any], key: str, kind: type, where: str) -> Any:
+def _claimed(entry: Mapping[str, Any]) -> dict[str, Any]:
+    published = entry.get("published", {})
+    return {**entry, **published} if isinstance(published, dict) else dict(entry)
+
+
+def _signal(name: str, entry: Mapping[str, Any], where: str, key: str) -> SignalColumns:
+    quantity, at, origin = name.partition("@")
+    if quantity not in SIGNALS or (at and not origin):
+        raise FileFormatError(f"{where}: no such signal; known are {', '.join(SIGNALS)}.")
+    _known(entry, _ENTRY, where)
+    _known(_get(entry, "published", dict, where, {}), _CLAIMABLE, f"{where}.published")
+    columns = _names(entry, key, where)
+    above = _number(entry, "above", where, None)
+    if above is None:
+        columns, order = _ordered(quantity, columns, entry, where, key)
+    else:
+        order = tuple(range(len(columns)))
+    signs = _get(entry, "sign", list, where, [1] * len(columns))
+    if len(signs) != len(columns) or any(s not in (1, -1) for s in signs):
+        raise FileFormatError(f"{where}.sign: needs 1 or -1 for each of the {len(columns)} columns.")
+    frame, axes = _frame(quantity, entry, where)
+    missing = entry.get("missing", [])
+    missing = missing if isinstance(missing, list) else [missing]
+    if any(m != "" and (isinstance(m, bool) or not isinstance(m, (int, float))) for m in missing):
+        raise FileFormatError(f'{where}.missing: must be numbers, or "" for fields without a number.')
+    direction = _get(entry, "direction", str, where, "body to world")
+    if direction not in ("body to world", "world to body"):
+        raise FileFormatError(f'{where}.direction: must be "body to world" or "world to body", not "{direction}".')
+    packet = _get(entry, "packet", str, where, None)
+    factors = _factors(quantity, len(columns), entry, above, where)
+    corners = bool(_get(entry, "corners", bool, where, False))
+    if corners and len(columns) != 1:
+        raise FileFormatError(f"{where}.corners: only for signals of one column.")
+    return SignalColumns(
+        quantity=quantity,
+        columns=columns,
+        # factors, signs and scales are written in the order of the file's columns
+        scale=tuple(float(factors[i] * signs[i]) for i in order),
+        packet=packet,
+        stream=_get(entry, "stream", str, where, packet or "rows"),
+        clock=_get(entry, "clock", str, where, None),
+        frame=frame,
+        axes=axes,
+        inverted=direction == "world to body",
+        attitude=_get(entry, "attitude", str, where, "attitude"),
+        missing=tuple(float(m) for m in missing if m != ""),
+        empty_is_missing="" in missing,
+        above=above,
+        hold=_number(entry, "hold", where, 0.0) or 0.0,
+        corners=corners,
+    )
+
+
+def _ordered(
+    quantity: str, columns: tuple[str, ...], entry: Mapping[str, Any], where: str, key: str
+) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """Columns in the order of the signal's components, and which of the columns given each is."""
+    count = SIGNALS[quantity][0]
+    labels = components(quantity)
+    if quantity == "attitude" and len(columns) == 3:
+        count, labels = 3, components("euler")
+    if len(columns) != count:
+        raise FileFormatError(f"{where}.{key}: {quantity} has {count} components, not {len(columns)}.")
+    given: tuple[str, ...] = labels
+    if "rotors" in entry:
+        if quantity not in _MOTORS:
+            raise FileFormatError(f"{where}.rotors: only for motor_command, motor_request and rotor_speed.")
+        given = tuple(f"m{r}" for r in _get(entry, "rotors", list, where))
+    elif "order" in entry:
+        text = _get(entry, "order", str, where)
+        given = tuple(text) if len(text) == count == 4 else tuple(text.replace(",", " ").split())
+    if sorted(given) != sorted(labels):
+        what = "rotors" if "rotors" in entry else "order"
+        raise FileFormatError(f"{where}.{what}: must name each of {', '.join(labels) or 'one component'} once.")
+    order = tuple(given.index(label) for label in labels) if labels else (0,)
+    return tuple(columns[i] for i in order), order
+
+
+def _factors(quantity: str, count: int, entry: Mapping[str, Any], above: float | None, where: str) -> tuple[float, ...]:
+    """Factor to SI of each column, in the order of the file's columns."""
+    units = entry.get("unit", "")
+    units = units if isinstance(units, list) else [units] * count
+    scales = entry.get("scale", 1.0)
+    scales = scales if isinstance(scales, list) else [scales] * count
+    if len(units) != count or not all(isinstance(u, str) for u in units):
+        raise FileFormatError(f"{where}.unit: must be a text, or one for each of the {count} columns.")
+    if len(scales) != count or not all(_is_number(s) and s != 0 for s in scales):
+        raise FileFormatError(f"{where}.scale: must be a number other than 0, or one for each of the {count} columns.")
+    if above is not None:
+        return tuple(float(s) for s in scales)
+    pairs = _number(entry, "pole_pairs", where, None)
+    if any(map(is_electrical, units)) and not (pairs and pairs > 0):
+        raise FileFormatError(f"{where}.pole_pairs: erpm needs the number of pole pairs of the motor.")
+    if pairs and not all(map(is_electrical, units)):
+        raise FileFormatError(f"{where}.pole_pairs: only for the unit erpm.")
+    turned = "euler" if quantity == "attitude" and count == 3 else quantity
+    order = _component_order(turned, entry, count)
+    if "unit" not in entry:
+        ours = SIGNALS[turned][1].split(", ")
+        units = [ours[min(c, len(ours) - 1)] for c in order]
+    factors = [unit_factor(u, turned, c, f"{where}.unit") for u, c in zip(units, order, strict=True)]
+    return tuple(f * float(s) / (pairs or 1.0) for f, s in zip(factors, scales, strict=True))
+
+
+def _component_order(quantity: str, entry: Mapping[str, Any], count: int) -> list[int]:
+    """Which component each of the file's columns is (only a wrench has components of different kinds)."""
+    if quantity != "wrench_command" or "order" not in entry:
+        return list(range(count))
+    return [components(quantity).index(label) for label in entry["order"].replace(",", " ").split()]
+
+
+def _frame(quantity: str, entry: Mapping[str, Any], where: str) -> tuple[str, tuple[str, str]]:
+    """("body", "world" or "" for the signal's own frame, axes of body and world)."""
+    words = _get(entry, "frame", str, where, "").replace("to", " ").replace(",", " ").split()
+    own = "body" if "body" in SIGNALS[quantity][2] else "world"
+    turns = quantity == "attitude" or quantity in _ANGLES
+    frame, body, world = "", "FLU", "ENU"
+    for word in words:
+        if word in BODY_AXES:
+            body = word
+        elif word in WORLD_AXES:
+            world = word
+        elif word not in ("body", "world"):
+            known = ", ".join(("body", "world", *BODY_AXES, *WORLD_AXES))
+            raise FileFormatError(f'{where}.frame: unknown frame "{word}"; known are {known}.')
+        frame = "body" if word in ("body", *BODY_AXES) else "world"
+    if words and ("world" not in SIGNALS[quantity][2] and "body" not in SIGNALS[quantity][2]):
+        raise FileFormatError(f"{where}.frame: {quantity} has no frame.")
+    if turns:
+        if (body == "FRD") != (world == "NED") and quantity != "attitude":
+            raise FileFormatError(f'{where}.frame: angles are either "FLU to ENU" or "FRD to NED".')
+        return "", (body, world)
+    if len({"body" if w in ("body", *BODY_AXES) else "world" for w in words}) > 1:
+        raise FileFormatError(f"{where}.frame: {quantity} is given either in the body or in the world, not in both.")
+    if frame and frame != own and not quantity.startswith(("position", "setpoint_position", "wrench")):
+        return frame, (body, world)
+    if frame and frame != own:
+        raise FileFormatError(f"{where}.frame: {quantity} is given in the {own}, nothing else makes sense.")
+    return "", (body, world)
+
+
+def _claims(table: Mapping[str, Any], where: str) -> Mapping[str, Any]:
+    claims = _get(table, "claims", dict, where, {})
+    for key, value in claims.items():
+        if not isinstance(value, (str, int, float, bool)):
+            raise FileFormatError(f"{where}: claims.{key} must be a number, a text, true or false.")
+    return claims
+
+
+def _known(table: Mapping[str, Any], known: set[str], where: str) -> None:
+    for key in table:
+        if key not in known:
+            raise FileFormatError(f"{where}: unknown key {key!r:.60}; known are {', '.join(sorted(known))}.")
+
+
+_NEEDED = object()
+
+
+def _get(table: Mapping[str, Any], key: str, kind: type, where: str, default: Any = _NEEDED) -> Any:
     if key not in table:
-        raise FileFormatError(f"{where}: the key {key} is missing.")
+        if default is _NEEDED:
+            raise FileFormatError(f"{where}: the key {key} is missing.")
+        return default
     if not isinstance(table[key], kind):
-        raise FileFormatError(f"{where}: {key} must be a {kind.__name__}.")
+        names = {dict: "table", str: "text", bool: "true or false"}
+        raise FileFormatError(f"{where}: {key} must be a {names.get(kind, kind.__name__)}.")
     return table[key]
+
+
+def _names(table: Mapping[str, Any], key: str, where: str, default: Any = _NEEDED) -> tuple[str, ...]:
+    names = tuple(_get(table, key, list, where, default))
+    if not all(isinstance(n, str) for n in names):
+        raise FileFormatError(f"{where}: {key} must be a list of texts.")
+    return names
+
+
+def _texts(table: Mapping[str, Any], key: str, where: str) -> dict[str, str]:
+    texts = _get(table, key, dict, where, {})
+    for name, value in texts.items():
+        if not isinstance(value, str):
+            raise FileFormatError(f"{where}: {key}.{name} must be a text.")
+    return dict(texts)
+
+
+def _number(table: Mapping[str, Any], key: str, where: str, default: float | None) -> Any:
+    value = table.get(key, default)
+    if value is not default and not _is_number(value):
+        raise FileFormatError(f"{where}.{key}: must be a finite number.")
+    return value if value is None else float(value)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,175 @@
+"""CSV in long form, a row a variable: log packets of a Crazyflie as a recorder wrote them down, raw values by name."""
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from crazyem.errors import FileFormatError
+from crazyem.links.clock import StampUnwrapper
+from crazyem.recordings.csv_text import Damage, Header, split_fields, text_blocks, to_number
+from crazyem.recordings.csv_wide import damage_notes
+from crazyem.recordings.finding import Finding, Grade, note
+from crazyem.recordings.mapping import CsvMapping
+from crazyem.recordings.motor_meaning import decide
+from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.recording import Recording, SignalArray
+from crazyem.recordings.tables import Table, signals_from_tables
+from crazyem.signals.sample import SIGNALS
+
+_LARGEST_STAMP = 2.0**53  # ms
+
+
+@dataclass(slots=True)
+class _Packets:
+    """Packets of one block with one list of variables, as they came."""
+
+    time: list[float] = field(default_factory=list)
+    order: list[int] = field(default_factory=list)
+    host_time: list[float] = field(default_factory=list)
+    values: list[list[float]] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class _Packet:
+    """Consecutive rows that share block, stamp and arrival."""
+
+    line: int
+    key: tuple[str, str, str]
+    names: list[str]
+    values: list[float]
+
+
+def read_long(path: Path, header: Header, mapping: CsvMapping, options: ReadOptions) -> Recording:
+    """Read a CSV in long form. Raises FileFormatError naming the file and what is wrong with it."""
+    gone = next((c for c in mapping.columns.values() if c not in header.names), None)
+    if gone is not None:
+        raise FileFormatError(f"{path}: the column {gone} is missing.")
+    damage = Damage()
+    found = _collected(path, header, mapping, damage)
+    layouts: dict[str, tuple[str, ...]] = {}
+    most = Counter({key: len(packets.order) for key, packets in found.items()})
+    for block, names in sorted(found, key=lambda key: -most[key]):
+        layouts.setdefault(block, names)
+    tables = [_table(block, names, found[block, names]) for block, names in found if layouts[block] == names]
+    if not tables:
+        raise FileFormatError(f"{path}: there is a header but not a single sample.")
+    torn = sum(most.values()) - sum(most[key] for key in layouts.items())
+    findings: list[Finding] = damage_notes(damage)
+    if torn:
+        text = f"{torn} packets were incomplete and were dropped."
+        grade = Grade.DEGRADES if 100 * torn > sum(most.values()) else Grade.HARMLESS
+        findings.append(note("integrity", text, grade, packets=float(torn)))
+    metadata = {
+        "csv": {"mapping": mapping.name, "title": mapping.title},
+        "blocks": {block: " ".join(names) for block, names in layouts.items()},
+    }
+    meaning = decide(tables, given=options.motor, metadata=metadata)
+    signals = signals_from_tables(tables, motor=meaning.meaning)
+    for name, source in mapping.signals.items():
+        signals = _with_host_signal(signals, name, source.columns, source.scale)
+    metadata.update(meaning.metadata)
+    if mapping.claims:
+        metadata["claims"] = dict(mapping.claims)
+    return Recording(str(path), f"csv:{mapping.name}", signals, metadata, (*findings, *meaning.findings))
+
+
+def _collected(
+    path: Path, header: Header, mapping: CsvMapping, damage: Damage
+) -> dict[tuple[str, tuple[str, ...]], _Packets]:
+    """All packets by (block, variables). What the host said itself is put at the newest firmware stamp seen."""
+    host_variables = {name for signal in mapping.signals.values() for name in signal.columns}
+    found: dict[tuple[str, tuple[str, ...]], _Packets] = {}
+    unwrapper = StampUnwrapper()
+    now = math.nan
+    for order, packet in enumerate(_packets(path, header, mapping, damage)):
+        host_text, block, stamp_text = packet.key
+        try:
+            host_time = to_number(host_text)
+        except ValueError:
+            damage.drop(packet.line, f'line {packet.line}: "{host_text[:20]}" is not a number')
+            continue
+        if not host_variables.issuperset(packet.names):
+            try:
+                stamp = to_number(stamp_text)
+            except ValueError:
+                stamp = math.nan
+            if not abs(stamp) < _LARGEST_STAMP:
+                damage.drop(packet.line, f'line {packet.line}: "{stamp_text[:20]}" is not a firmware stamp')
+                damage.check(path)
+                continue
+            now = unwrapper.unwrap(int(stamp)) / 1000.0
+            time = now
+        elif math.isfinite(now):
+            time = now
+        else:
+            continue  # nothing from the firmware yet, so no time to put it at
+        packets = found.setdefault((block, tuple(packet.names)), _Packets())
+        packets.time.append(time)
+        packets.order.append(order)
+        packets.host_time.append(host_time)
+        packets.values.append(packet.values)
+    damage.check(path)
+    return found
+
+
+def _packets(path: Path, header: Header, mapping: CsvMapping, damage: Damage) -> Iterator[_Packet]:
+    at = {key: header.names.index(column) for key, column in mapping.columns.items()}
+    h, b, s, n, v = (at[key] for key in ("host_time", "block", "stamp_ms", "name", "value"))
+    packet: _Packet | None = None
+    line = 0
+    for block in text_blocks(path, damage):
+        for raw in block.split(b"\n")[:-1]:
+            line += 1
+            if line == 1 or not raw.strip():
+                continue
+            fields = split_fields(raw, header.delimiter)
+            if len(fields) != len(header.names):
+                damage.drop(line, f"line {line} has {len(fields)} fields, the header has {len(header.names)}")
+                continue
+            try:
+                value = to_number(fields[v], header.decimal)
+            except ValueError:
+                damage.drop(line, f'line {line}, column {header.names[v]}: "{fields[v][:20]}" is not a number')
+                continue
+            damage.rows += 1
+            key = (fields[h], fields[b], fields[s])
+            if packet is not None and packet.key == key and fields[n] not in packet.names:
+                packet.names.append(fields[n])
+                packet.values.append(value)
+                continue
+            if packet is not None:
+                yield packet
+            packet = _Packet(line, key, [fields[n]], [value])
+        damage.check(path)
+    if packet is not None:
+        yield packet
+
+
+def _table(block: str, names: tuple[str, ...], packets: _Packets) -> Table:
+    values = np.array(packets.values, float)
+    return Table(
+        block,
+        {name: values[:, i] for i, name in enumerate(names)},
+        np.array(packets.time),
+        np.array(packets.order, np.int64),
+        np.array(packets.host_time),
+    )
+
+
+def _with_host_signal(
+    signals: dict[str, SignalArray], name: str, variables: tuple[str, ...], scale: tuple[float, ...]
+) -> dict[str, SignalArray]:
+    """The signals, with one that the host logged variable by variable put together (it replaces what it is made of)."""
+    parts = [next((k for k, a in signals.items() if a.source == (v,) and not a.quantity), None) for v in variables]
+    arrays = [signals[key] for key in parts if key is not None]
+    if len(arrays) != len(variables) or any(a.time is not arrays[0].time for a in arrays):
+        return signals
+    value = np.column_stack([a.value[:, 0] * f for a, f in zip(arrays, scale, strict=True)])
+    unit, frame = SIGNALS[name][1:]
+    whole = replace(arrays[0], value=value, quantity=name, unit=unit, frame=frame, source=variables)
+    rest = {key: array for key, array in signals.items() if key not in parts and key != name}
+    return {name: whole, **rest}

@@ -1,0 +1,296 @@
+"""From the columns of a wide CSV to signals, by its mapping: units, signs, frames, missing values, lost packets."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.recordings.finding import Finding, Grade, intervals_of
+from crazyem.recordings.frd_ned import quaternions_from_euler
+from crazyem.recordings.interpolation import corners, interpolated_rows
+from crazyem.recordings.mapping import SignalColumns
+from crazyem.recordings.recording import SignalArray
+from crazyem.signals.sample import SIGNALS
+
+Array = NDArray[np.float64]
+_HARMLESS_SHARE = 0.05  # of rows drawn across lost packets
+_HALF = math.sqrt(0.5)
+_NED_TO_ENU = (_HALF, _HALF, 0.0, 0.0)  # x y z w: half a turn about the bisector of north and east
+_FLU_TO_FRD = (1.0, 0.0, 0.0, 0.0)  # half a turn about x
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What to make of the columns of one file.
+
+    Attributes:
+        signals: name -> columns; those of the vocabulary first, in its order.
+        raw: columns that are no signal: column -> (name of the signal, unit, packet or None).
+        packets: packet -> all columns that came in it.
+        clock: name of the clock of the rows; "host" means that stamps are host times.
+    """
+
+    signals: Mapping[str, SignalColumns]
+    raw: Mapping[str, tuple[str, str, str | None]]
+    packets: Mapping[str, tuple[str, ...]]
+    clock: str
+
+
+@dataclass(slots=True)
+class Rows:
+    """Some rows of a file, with neighbours on either side that help to judge them.
+
+    Attributes:
+        stamp: (n,) s on the clock of the rows.
+        origin: s; `stamp - origin` is what signals get as time.
+        columns: name -> (n,)
+        keep: rows first..last-1 of these become signals, the others are neighbours.
+        number: of row `keep[0]` in the file, from 0.
+        starts, ends: whether these rows hold the first and the last row of the file.
+        flown: signal -> stamp of the last row before these in which its columns exceeded its threshold.
+    """
+
+    stamp: Array
+    origin: float
+    columns: dict[str, Array]
+    keep: tuple[int, int]
+    number: int = 0
+    starts: bool = True
+    ends: bool = True
+    flown: dict[str, float] = field(default_factory=dict)
+
+
+def signals_of(layout: Layout, rows: Rows) -> tuple[dict[str, SignalArray], list[Finding]]:
+    """The signals of the kept rows, and what was found of interpolated stretches in them."""
+    first, last = rows.keep
+    time = rows.stamp - rows.origin
+    straight = {}
+    findings = []
+    for packet, members in layout.packets.items():
+        table = np.column_stack([rows.columns[c] for c in members])
+        straight[packet] = interpolated_rows(time, table)[first:last]
+        names = [n for n, s in layout.signals.items() if s.packet == packet]
+        if straight[packet].any():
+            findings.append(_lost(packet, names, time[first:last], straight[packet]))
+    kept = _Kept(layout, rows, time, straight)
+    step = len(layout.signals) + 1
+    signals = {}
+    for place, (name, source) in enumerate(layout.signals.items()):
+        if source.corners:
+            signals[name] = kept.slow(source, place, step)
+        else:
+            value, marked = kept.values(name, source)
+            signals[name] = kept.array(value, marked, place, step, source)
+    for column, (name, unit, raw_packet) in layout.raw.items():
+        signals[name] = kept.raw(column, unit, raw_packet, step)
+    return signals, findings
+
+
+def _lost(packet: str, names: list[str], time: Array, rows: NDArray[np.bool_]) -> Finding:
+    intervals = intervals_of(time, rows)
+    share = float(rows.mean())
+    longest = max(b - a for a, b in intervals)
+    return Finding(
+        "interpolated",
+        Grade.DEGRADES if share > _HARMLESS_SHARE else Grade.HARMLESS,
+        f"{100.0 * share:.1f} % of the {packet} samples lie on straight lines drawn across lost packets "
+        f"(the longest {longest:.2f} s); they are treated as missing.",
+        signal=names[0] if names else "",
+        intervals=intervals,
+        evidence={"share": share, "longest_s": longest, "rows": float(rows.sum())},
+        advice=f"Nothing to do; {', '.join(names) or packet} is missing there.",
+    )
+
+
+class _Kept:
+    """The kept rows on their way to signals; arrays that signals share are made once."""
+
+    def __init__(self, layout: Layout, rows: Rows, time: Array, straight: Mapping[str, NDArray[np.bool_]]) -> None:
+        first, last = rows.keep
+        self.layout, self.rows, self.straight = layout, rows, straight
+        self.slice = slice(first, last)
+        self.whole_time = time
+        self.time = time[self.slice].copy()
+        self.count = last - first
+        self.number = rows.number + np.arange(self.count)
+        self.host = rows.stamp[self.slice].copy() if layout.clock == "host" else np.full(self.count, np.nan)
+        self.unmarked = np.zeros(self.count, bool)
+        self._turned: dict[str, tuple[Array, NDArray[np.bool_]]] = {}
+        self._raw_order: NDArray[np.int64] | None = None
+
+    def column(self, name: str) -> Array:
+        return self.rows.columns[name][self.slice]
+
+    def array(
+        self, value: Array, marked: NDArray[np.bool_], place: int, step: int, source: SignalColumns
+    ) -> SignalArray:
+        return SignalArray(
+            self.time,
+            value,
+            self.number * step + place,
+            self.host,
+            marked,
+            quantity=source.quantity,
+            unit=SIGNALS[source.quantity][1],
+            frame=SIGNALS[source.quantity][2],
+            clock=self.layout.clock if source.clock is None else source.clock,
+            stream=source.stream,
+            source=source.columns,
+        )
+
+    def raw(self, column: str, unit: str, packet: str | None, step: int) -> SignalArray:
+        """A column as it stands; all of them have the last place of their row."""
+        if self._raw_order is None:
+            self._raw_order = self.number * step + step - 1
+        value = self.column(column)[:, None].copy()
+        marked = self.unmarked
+        if packet is not None and self.straight[packet].any():
+            marked = self.straight[packet]
+            value[marked] = np.nan
+        return SignalArray(
+            self.time,
+            value,
+            self._raw_order,
+            self.host,
+            marked,
+            unit=unit,
+            clock=self.layout.clock,
+            stream=packet or "rows",
+            source=(column,),
+        )
+
+    def slow(self, source: SignalColumns, place: int, step: int) -> SignalArray:
+        """A stream that was drawn onto the rows by straight lines: the samples it was drawn from."""
+        first, last = self.rows.keep
+        found = corners(
+            self.whole_time,
+            self.rows.columns[source.columns[0]],
+            starts=self.rows.starts,
+            ends=self.rows.ends,
+        )
+        mine = (found.row >= first) & (found.row < last)
+        time = found.time[mine]
+        value = found.value[mine, None] * source.scale[0]
+        missing = self._missing(source, found.value[mine, None])
+        value[missing] = np.nan
+        return SignalArray(
+            time,
+            value,
+            (found.row[mine] - first + self.rows.number) * step + place,
+            time + self.rows.origin if self.layout.clock == "host" else np.full(time.size, np.nan),
+            missing[:, 0],
+            quantity=source.quantity,
+            unit=SIGNALS[source.quantity][1],
+            frame=SIGNALS[source.quantity][2],
+            clock=self.layout.clock if source.clock is None else source.clock,
+            stream=source.stream,
+            source=source.columns,
+        )
+
+    def values(self, name: str, source: SignalColumns) -> tuple[Array, NDArray[np.bool_]]:
+        """(n, c) SI, our frames, NaN where missing; (n,) where that is ours."""
+        if source.above is not None:
+            return self._held(name, source), self.unmarked
+        if source.quantity == "attitude":
+            value, marked = self.attitude(name, source)
+        else:
+            value, marked = self._scaled(source)
+            value = self._framed(value, source)
+            if source.frame and source.attitude in self.layout.signals:
+                turn, unknown = self.attitude(source.attitude, self.layout.signals[source.attitude])
+                sign = -1.0 if source.frame == "world" else 1.0
+                value = _rotated(turn * [sign, sign, sign, 1.0], value)
+                marked = marked | unknown
+        if source.packet is not None:
+            lost = self.straight[source.packet]
+            if lost.any():
+                value = value.copy()
+                value[lost] = np.nan
+                marked = marked | lost
+        return value, marked
+
+    def attitude(self, name: str, source: SignalColumns) -> tuple[Array, NDArray[np.bool_]]:
+        """(n, 4) x y z w, body FLU to world, as it stands in the row (interpolated or not)."""
+        if name not in self._turned:
+            value, marked = self._scaled(source)
+            if len(source.columns) == 3:
+                value = quaternions_from_euler(value)
+            if source.inverted:
+                value = value * [-1.0, -1.0, -1.0, 1.0]
+            if source.axes[1] == "NED":
+                value = _product(np.array([_NED_TO_ENU]), value)
+            if source.axes[0] == "FRD":
+                value = _product(value, np.array([_FLU_TO_FRD]))
+            self._turned[name] = value, marked
+        return self._turned[name]
+
+    def _scaled(self, source: SignalColumns) -> tuple[Array, NDArray[np.bool_]]:
+        value = np.column_stack([self.column(c) for c in source.columns])
+        if not (source.missing or source.empty_is_missing):
+            value *= source.scale
+            return value, self.unmarked
+        missing = self._missing(source, value)
+        theirs = np.isnan(value) & ~missing
+        value *= source.scale
+        value[missing] = np.nan
+        return value, np.asarray(missing.any(axis=1) & ~theirs.any(axis=1))
+
+    @staticmethod
+    def _missing(source: SignalColumns, value: Array) -> NDArray[np.bool_]:
+        missing = np.isin(value, source.missing) if source.missing else np.zeros(value.shape, bool)
+        return missing | np.isnan(value) if source.empty_is_missing else missing
+
+    @staticmethod
+    def _framed(value: Array, source: SignalColumns) -> Array:
+        """Vectors and angles to FLU and ENU, whichever of the two they are given in."""
+        body, world = source.axes
+        if source.quantity.endswith("euler"):
+            if body == "FRD":
+                return value * [1.0, -1.0, -1.0] + [0.0, 0.0, 0.5 * math.pi]
+            return value
+        if value.shape[1] == 4 and body == "FRD":
+            return value * [-1.0, 1.0, -1.0, -1.0]  # thrust counts along the rotors' axis, up
+        if body == "FRD":
+            return value * [1.0, -1.0, -1.0]
+        if world == "NED":
+            return value[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+        return value
+
+    def _held(self, name: str, source: SignalColumns) -> Array:
+        """1 where any column exceeded the threshold within the last `hold` seconds, else 0."""
+        assert source.above is not None
+        table = np.column_stack([self.column(c) * f for c, f in zip(source.columns, source.scale, strict=True)])
+        on = (table > source.above).any(axis=1)
+        stamp = self.rows.stamp[self.slice]
+        # stamps as they are in the file decide, not times since the origin: the same in every part of a file
+        since = np.maximum.accumulate(np.where(on, stamp, -math.inf))
+        since = np.maximum(since, self.rows.flown.get(name, -math.inf))
+        if self.count:
+            self.rows.flown[name] = float(since[-1])
+        return (stamp - since <= source.hold).astype(float)[:, None]
+
+
+def _product(a: Array, b: Array) -> Array:
+    """(n, 4) quaternion product a b, x y z w."""
+    ax, ay, az, aw = a.T
+    bx, by, bz, bw = b.T
+    return np.stack(
+        [
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ],
+        axis=1,
+    )
+
+
+def _rotated(quaternion: Array, vector: Array) -> Array:
+    """(n, 3) vectors turned by (n, 4) quaternions of any length but 0 (NaN for that), x y z w."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        unit = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+        axis, scalar = unit[:, :3], unit[:, 3:]
+        side = 2.0 * np.cross(axis, vector)
+        return vector + scalar * side + np.cross(axis, side)

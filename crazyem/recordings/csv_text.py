@@ -1,0 +1,358 @@
+"""CSV text to columns of doubles, a block at a time: plain or gzip, in bounded memory, damaged lines by line number.
+
+Blocks go through pyarrow, which rounds correctly and is fast. A block it objects to, or counts differently, is parsed
+again line by line here, so that every complaint has a line and a column and one bad line costs that line only.
+"""
+
+import csv
+import gzip
+import io
+import math
+import zlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv
+from numpy.typing import NDArray
+
+from crazyem.errors import FileFormatError, UsageError
+
+BLOCK_BYTES = 4 << 20
+LONGEST_LINE = 1 << 20  # bytes
+MOST_COLUMNS = 4096
+LARGEST_RATIO = 200  # of text to gzip; flights reach 20, constant columns 100
+_SMALL = 64 << 20  # bytes of text below which no ratio is held against a file
+_SNIFFED = 100  # lines looked at to tell numbers from words
+_DELIMITERS = (",", ";", "\t")
+_NOTHING = ("", "nan", "null", "none", "na", "n/a", "#n/a")
+_NULLS = sorted({form for n in _NOTHING for form in (n, n.upper(), n.capitalize())} | {"NaN"})
+_WORDS = {"true": 1.0, "false": 0.0}
+
+Columns = dict[int, NDArray[np.float64]]
+
+
+@dataclass(slots=True)
+class Damage:
+    """What was wrong with the text, counted while reading."""
+
+    rows: int = 0  # read
+    dropped: int = 0  # lines that are no rows
+    lines: list[int] = field(default_factory=list)  # the first few of them
+    first: str = ""  # what was wrong with the first
+    words: dict[int, int] = field(default_factory=dict)  # column -> values in it that are no numbers
+    cut_line: bool = False  # the last line has no end
+    cut_gzip: bool = False  # the file ends within a gzip stream
+
+    def drop(self, line: int, what: str) -> None:
+        """Count a line that is no row."""
+        self.dropped += 1
+        self.first = self.first or what
+        if len(self.lines) < 5:
+            self.lines.append(line)
+
+    def check(self, path: Path) -> None:
+        """Raise FileFormatError if more than 1 % of the lines so far are damaged: that is another kind of file."""
+        if 100 * self.dropped > self.rows + self.dropped:
+            raise FileFormatError(f"{path}: {self.first}.")
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """The first line, and what the lines after it are written in.
+
+    Attributes:
+        names: of the columns, made unique.
+        repeated: names that occurred more than once.
+        delimiter, decimal: characters.
+        words: columns of words (neither numbers nor true/false), told by the first lines.
+        flags: columns of true and false.
+        hollow: columns without a name and without a value in the first lines.
+    """
+
+    names: tuple[str, ...]
+    repeated: tuple[str, ...]
+    delimiter: str
+    decimal: str
+    words: frozenset[int]
+    flags: frozenset[int]
+    hollow: frozenset[int]
+
+
+def split_header(line: str) -> tuple[list[str], str]:
+    """Names in a header line, and their delimiter: the most frequent of comma, semicolon and tab."""
+    delimiter = max(_DELIMITERS, key=line.count)
+    try:
+        fields = next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter), [])
+    except csv.Error:
+        return [], delimiter
+    return [name.strip() for name in fields], delimiter
+
+
+def read_header(path: Path) -> Header:
+    """Header and dialect of a CSV file. Raises FileFormatError, UsageError."""
+    block = next(text_blocks(path, Damage(), size=LONGEST_LINE), b"")
+    if not block:
+        raise FileFormatError(f"{path}: there is a header but not a single sample.")
+    lines = block.split(b"\n", _SNIFFED + 1)
+    try:
+        given, delimiter = split_header(lines[0].decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{path} is not a text file (byte {error.start} is not UTF-8).") from error
+    if len(given) > MOST_COLUMNS:
+        raise FileFormatError(f"{path}: the header has {len(given)} columns, more than {MOST_COLUMNS}.")
+    rows = [split_fields(line, delimiter) for line in lines[1:-1] if line.strip()]
+    rows = [row for row in rows if len(row) == len(given)]
+    texts = [text for row in rows for text in row]
+    comma = delimiter == ";" and any("," in t for t in texts) and not any("." in t for t in texts)
+    decimal = "," if comma else "."
+    words, flags, hollow = set(), set(), set()
+    for column, name in enumerate(given):
+        values = [row[column].strip() for row in rows]
+        values = [v for v in values if v.lower() not in _NOTHING]
+        bad = sum(not _is_number(v, decimal) for v in values)
+        if 2 * bad > len(values):
+            words.add(column)
+        elif values and all(v.lower() in _WORDS for v in values):
+            flags.add(column)
+        elif not values and not name:
+            hollow.add(column)
+    names, repeated = _unique(given)
+    return Header(names, repeated, delimiter, decimal, frozenset(words), frozenset(flags), frozenset(hollow))
+
+
+def read_columns(
+    path: Path, header: Header, needed: Iterable[int], wanted: Iterable[int], damage: Damage, *, stamp: int | None
+) -> Iterator[Columns]:
+    """Columns of the file as doubles, block after block of rows; empty fields are NaN, true and false 1 and 0.
+
+    Args:
+        needed: columns whose values must be numbers: a line where one is not is dropped and counted.
+        wanted: further columns; a value that is no number becomes NaN and is counted.
+        damage: filled in on the way.
+        stamp: the column that must be finite in every row, or None.
+
+    Raises: FileFormatError if more than 1 % of the lines so far are damaged, or the file cannot be unpacked.
+    """
+    needed = tuple(needed)
+    columns = (*needed, *(c for c in wanted if c not in needed))
+    line = 2
+    for number, whole in enumerate(text_blocks(path, damage)):
+        block = whole.partition(b"\n")[2] if number == 0 else whole
+        if not block.strip():
+            line += block.count(b"\n")
+            continue
+        parsed = _fast(block, header, columns)
+        # rows without a stamp are a matter for the slow path, which knows their lines
+        if parsed is None or (stamp is not None and not np.isfinite(parsed[stamp]).all()):
+            parsed = _careful(block, line, header, needed, columns, damage, stamp)
+        line += block.count(b"\n")
+        rows = parsed[columns[0]].size if columns else 0
+        damage.rows += rows
+        damage.check(path)
+        if rows:
+            yield parsed
+
+
+def text_blocks(path: Path, damage: Damage, size: int = BLOCK_BYTES) -> Iterator[bytes]:
+    """Whole lines, about `size` bytes at a time; what follows the last line end is dropped and noted.
+
+    A gzip file is unpacked as it is read, never at once. One that ends early gives what was packed before its end.
+
+    Raises: FileFormatError if a line is too long, a gzip file is damaged or unpacks to something absurdly large;
+        UsageError if the file cannot be read.
+    """
+    rest = b""
+    try:
+        with path.open("rb") as raw:
+            packed = raw.read(2) == b"\x1f\x8b"
+            raw.seek(0)
+            source: IO[bytes] = gzip.GzipFile(fileobj=raw) if packed else raw  # type: ignore[assignment]
+            total = 0
+            while True:
+                chunk, ended = _chunk(source, size, packed)
+                damage.cut_gzip |= ended
+                total += len(chunk)
+                if packed and total > _SMALL and total > LARGEST_RATIO * raw.tell():
+                    raise FileFormatError(
+                        f"{path}: the gzip file unpacks to more than {LARGEST_RATIO} times its size; it is not read."
+                    )
+                if not chunk:
+                    break
+                block, newline, rest_of_it = (rest + chunk).rpartition(b"\n")
+                rest = rest_of_it
+                if len(rest) > LONGEST_LINE:
+                    raise FileFormatError(f"{path}: there is a line of more than {LONGEST_LINE} bytes.")
+                if newline:
+                    yield block + newline
+                if ended:
+                    break
+    except (gzip.BadGzipFile, zlib.error) as error:
+        raise FileFormatError(f"{path} is not a readable gzip file ({error}).") from error
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
+    damage.cut_line = bool(rest.strip())
+
+
+def _chunk(source: IO[bytes], size: int, packed: bool) -> tuple[bytes, bool]:
+    """Up to `size` bytes, and whether the gzip stream broke off there."""
+    if not packed:
+        return source.read(size), False
+    parts: list[bytes] = []
+    held = 0
+    try:
+        while held < size:
+            part = source.read(min(1 << 13, size - held))  # small bites: a stream that breaks off loses one of them
+            if not part:
+                break
+            parts.append(part)
+            held += len(part)
+    except EOFError:
+        return b"".join(parts), True
+    return b"".join(parts), False
+
+
+def _fast(block: bytes, header: Header, columns: tuple[int, ...]) -> Columns | None:
+    """The block by pyarrow; None if it objects, or sees another number of rows than there are lines."""
+    names = [str(i) for i in range(len(header.names))]
+    types = {str(c): pa.string() if c in header.flags else pa.float64() for c in columns}
+    try:
+        table = pyarrow.csv.read_csv(
+            pa.BufferReader(block),
+            read_options=pyarrow.csv.ReadOptions(column_names=names, use_threads=False, block_size=len(block) + 1),
+            parse_options=pyarrow.csv.ParseOptions(delimiter=header.delimiter),
+            convert_options=pyarrow.csv.ConvertOptions(
+                check_utf8=False,
+                column_types=types,
+                include_columns=[str(c) for c in columns],
+                null_values=_NULLS,
+                strings_can_be_null=True,
+                decimal_point=header.decimal,
+            ),
+        )
+    except (pa.ArrowException, ValueError):
+        return None
+    if table.num_rows != block.count(b"\n"):
+        return None
+    result = {}
+    for c in columns:
+        column = table.column(str(c))
+        if c in header.flags:
+            value = _flags(column)
+            if value is None:
+                return None
+            result[c] = value
+        else:
+            result[c] = column.to_numpy()
+    return result
+
+
+def _flags(column: pa.ChunkedArray) -> NDArray[np.float64] | None:
+    """1 and 0 for true and false, NaN for nothing; None if there are other words."""
+    try:
+        low = pc.utf8_lower(pc.utf8_trim_whitespace(column))
+    except pa.ArrowException:
+        return None
+    true, false = pc.equal(low, "true"), pc.equal(low, "false")
+    if pc.any(pc.and_(pc.invert(true), pc.invert(false))).as_py():
+        return None
+    return pc.cast(true, pa.float64()).to_numpy()
+
+
+def _careful(
+    block: bytes,
+    line: int,
+    header: Header,
+    needed: tuple[int, ...],
+    columns: tuple[int, ...],
+    damage: Damage,
+    stamp: int | None,
+) -> Columns:
+    """The block line by line: the reference that says what a row is."""
+    rows: list[list[float]] = []
+    for number, raw in enumerate(block.split(b"\n")[:-1], start=line):
+        if not raw.strip():
+            continue
+        fields = split_fields(raw, header.delimiter)
+        if len(fields) != len(header.names):
+            damage.drop(number, f"line {number} has {len(fields)} fields, the header has {len(header.names)}")
+            continue
+        row = []
+        odd = []
+        for place, c in enumerate(columns):
+            try:
+                row.append(to_number(fields[c], header.decimal))
+            except ValueError:
+                if place < len(needed):
+                    damage.drop(number, f"line {number}, column {header.names[c]}: {_shown(fields[c])} is not a number")
+                    break
+                row.append(math.nan)
+                odd.append(c)
+        else:
+            if stamp is not None and not math.isfinite(row[columns.index(stamp)]):
+                damage.drop(number, f"line {number} has no time (column {header.names[stamp]})")
+                continue
+            rows.append(row)
+            for c in odd:
+                damage.words[c] = damage.words.get(c, 0) + 1
+    table = np.array(rows, float).reshape(len(rows), len(columns))
+    return {c: np.ascontiguousarray(table[:, i]) for i, c in enumerate(columns)}
+
+
+def to_number(text: str, decimal: str = ".") -> float:
+    """A field as a double: NaN for nothing and for "NaN", 1 and 0 for true and false. Raises ValueError."""
+    text = text.strip()
+    low = text.lower()
+    if low in _NOTHING:
+        return math.nan
+    if low in _WORDS:
+        return _WORDS[low]
+    if "_" in text or (decimal != "." and "." in text):
+        raise ValueError(text)
+    return float(text.replace(decimal, "."))
+
+
+def _is_number(text: str, decimal: str) -> bool:
+    try:
+        to_number(text, decimal)
+    except ValueError:
+        return False
+    return True
+
+
+def split_fields(line: bytes, delimiter: str) -> list[str]:
+    """Fields of one line without its end; [] if its quotes make no sense."""
+    text = line.decode("utf-8", "replace").rstrip("\r")
+    if '"' not in text:
+        return text.split(delimiter)
+    try:
+        return next(csv.reader(io.StringIO(text), delimiter=delimiter), [])
+    except csv.Error:
+        return []
+
+
+def _shown(text: str) -> str:
+    short = "".join(c if c.isprintable() else "?" for c in text[:20])
+    return f'"{short}"'
+
+
+def _unique(names: list[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names with "#2" added to the second of a kind, "column 3" for one without a name; those that were repeated."""
+    seen: set[str] = set()
+    result, repeated = [], []
+    for place, given in enumerate(names, start=1):
+        name = given or f"column {place}"
+        count = 1
+        unique = name
+        while unique in seen:
+            count += 1
+            unique = f"{name}#{count}"
+        if count > 1:
+            repeated.append(name)
+        seen.add(unique)
+        result.append(unique)
+    return tuple(result), tuple(dict.fromkeys(repeated))

@@ -1,0 +1,299 @@
+"""Wide CSV files, a row an instant: read at once, or in parts when they are larger than memory."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.errors import FileFormatError
+from crazyem.recordings.csv_signals import Layout, Rows, signals_of
+from crazyem.recordings.csv_text import Columns, Damage, Header, read_columns
+from crazyem.recordings.finding import Finding, Grade, note
+from crazyem.recordings.interpolation import CONTEXT
+from crazyem.recordings.mapping import CsvMapping, SignalColumns
+from crazyem.recordings.recording import Recording
+from crazyem.signals.sample import SIGNALS
+
+Array = NDArray[np.float64]
+_MOST_ROWS = 500_000  # in a part, whatever their stamps say
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """Everything that is known before the first row is read."""
+
+    path: Path
+    header: Header
+    mapping: CsvMapping
+    layout: Layout
+    stamp: int | None
+    needed: tuple[int, ...]
+    wanted: tuple[int, ...]
+    notes: tuple[Finding, ...]
+    as_published: bool
+
+
+@dataclass(slots=True)
+class _Held:
+    """Rows read and not yet handed out, column by column."""
+
+    blocks: list[Columns] = field(default_factory=list)
+    rows: int = 0
+
+    def add(self, block: Columns) -> None:
+        self.blocks.append(block)
+        self.rows += next(iter(block.values())).size
+
+    def joined(self) -> Columns:
+        """One array a column; the blocks are let go one column after the other."""
+        if len(self.blocks) > 1:
+            whole = {c: np.concatenate([block.pop(c) for block in self.blocks]) for c in tuple(self.blocks[0])}
+            self.blocks = [whole]
+        return self.blocks[0]
+
+
+def read_wide(path: Path, header: Header, mapping: CsvMapping, *, as_published: bool) -> Recording:
+    """The whole file. Raises FileFormatError."""
+    plan = _planned(path, header, mapping, as_published)
+    damage = Damage()
+    held = _Held()
+    for block in read_columns(path, header, plan.needed, plan.wanted, damage, stamp=plan.stamp):
+        held.add(block)
+    if not held.rows:
+        raise FileFormatError(f"{path}: there is a header but not a single sample.")
+    columns = held.joined()
+    held.blocks = []
+    stamp = _stamps(plan, columns, held.rows, 0)
+    first = float(stamp[0])
+    origin = first if _reversible(stamp, first) else 0.0
+    rows = Rows(stamp, origin, _named(plan, columns), (0, stamp.size))
+    columns.clear()
+    return _recording(plan, rows, damage, last=True)
+
+
+def read_wide_parts(
+    path: Path, header: Header, mapping: CsvMapping, *, as_published: bool, seconds: float
+) -> Iterator[Recording]:
+    """The file in parts of about `seconds`; joined they are what `read_wide` gives. Raises FileFormatError."""
+    plan = _planned(path, header, mapping, as_published)
+    origin = _origin(plan)
+    damage = Damage()
+    before: Columns = {}  # the last rows of the part before, as neighbours
+    flown: dict[str, float] = {}
+    number = 0
+    for part, after, ends in _parts(plan, damage, seconds):
+        rows = next(iter(part.values())).size
+        window = _concatenated([b for b in (before, part, after) if b])
+        lead = next(iter(before.values())).size if before else 0
+        total = next(iter(window.values())).size
+        stamp = _stamps(plan, window, total, number - lead)
+        yield _recording(
+            plan,
+            Rows(
+                stamp,
+                origin,
+                _named(plan, window),
+                (lead, lead + rows),
+                number,
+                starts=number - lead == 0,
+                ends=ends,
+                flown=flown,
+            ),
+            damage,
+            last=ends,
+        )
+        number += rows
+        end = lead + rows
+        before = {c: window[c][max(0, end - CONTEXT) : end].copy() for c in window}
+
+
+def _parts(plan: _Plan, damage: Damage, seconds: float) -> Iterator[tuple[Columns, Columns, bool]]:
+    """(rows of a part, some rows after it, whether the file ends with them)."""
+    held = _Held()
+    number = 0
+    for block in read_columns(plan.path, plan.header, plan.needed, plan.wanted, damage, stamp=plan.stamp):
+        held.add(block)
+        while held.rows > CONTEXT:
+            cut = _cut(plan, held, number, seconds)
+            if cut is None:
+                break
+            part, rest = _split(held.joined(), cut)
+            number += cut
+            held = _Held()
+            held.add(rest)
+            yield part, {c: v[:CONTEXT] for c, v in rest.items()}, False
+    if not held.rows and not number:
+        raise FileFormatError(f"{plan.path}: there is a header but not a single sample.")
+    if held.rows:
+        # what was kept back may be several parts, since neighbours were waited for
+        while (cut := _cut(plan, held, number, seconds, neighbours=1)) is not None:
+            part, rest = _split(held.joined(), cut)
+            number += cut
+            held = _Held()
+            held.add(rest)
+            yield part, {c: v[:CONTEXT] for c, v in rest.items()}, False
+        yield held.joined(), {}, True
+
+
+def _cut(plan: _Plan, held: _Held, number: int, seconds: float, neighbours: int = CONTEXT) -> int | None:
+    """Rows that make the next part, None if it is not complete yet."""
+    stamp = _stamps(plan, held.joined(), held.rows, number)
+    late = stamp >= stamp[0] + seconds
+    cut = min(int(np.argmax(late)) if late.any() else held.rows + 1, _MOST_ROWS)
+    return max(cut, 1) if cut + neighbours <= held.rows else None
+
+
+def _split(columns: Columns, cut: int) -> tuple[Columns, Columns]:
+    return {c: v[:cut] for c, v in columns.items()}, {c: v[cut:].copy() for c, v in columns.items()}
+
+
+def _concatenated(parts: list[Columns]) -> Columns:
+    return {c: np.concatenate([part[c] for part in parts]) for c in parts[0]}
+
+
+def _origin(plan: _Plan) -> float:
+    """The first stamp if all stamps can be told from their distance to it, else 0: one pass over the stamps alone."""
+    if plan.stamp is None:
+        return 0.0
+    first = math.nan
+    # with the same lines dropped as in the pass over all columns, or their stamps would count
+    for block in read_columns(plan.path, plan.header, plan.needed, (), Damage(), stamp=plan.stamp):
+        stamp = block[plan.stamp] / plan.mapping.time[1]
+        first = float(stamp[0]) if math.isnan(first) else first
+        if not _reversible(stamp, first):
+            return 0.0
+    return 0.0 if math.isnan(first) else first
+
+
+def _reversible(stamp: Array, first: float) -> bool:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool((first + (stamp - first) == stamp).all())
+
+
+def _stamps(plan: _Plan, columns: Columns, rows: int, number: int) -> Array:
+    if plan.stamp is None:
+        return (number + np.arange(rows)) / plan.mapping.rate
+    return columns[plan.stamp] / plan.mapping.time[1]
+
+
+def _named(plan: _Plan, columns: Columns) -> dict[str, Array]:
+    return {plan.header.names[c]: values for c, values in columns.items()}
+
+
+def _planned(path: Path, header: Header, mapping: CsvMapping, as_published: bool) -> _Plan:
+    given = mapping.published if as_published else mapping.signals
+    present = set(header.names)
+    notes = [
+        note("mapping", f"The file has no columns for {name}.")
+        for name, s in given.items()
+        if not present.issuperset(s.columns)
+    ]
+    signals = _in_order({n: s for n, s in given.items() if present.issuperset(s.columns)})
+    if not signals and given:
+        name, source = next(iter(given.items()))
+        gone = next(c for c in source.columns if c not in present)
+        raise FileFormatError(
+            f"{path}: no signal of the mapping {mapping.name} is in the file; "
+            f"{name}, for one, needs the column {gone[:60]}."
+        )
+    for name, source in signals.items():
+        if source.frame and source.attitude not in signals:
+            raise FileFormatError(
+                f"{path}: {name} is given in the {source.frame} frame, but there is no {source.attitude} to turn it."
+            )
+    at = {name: place for place, name in enumerate(header.names)}
+    time = mapping.time[0]
+    if time and time not in at:
+        raise FileFormatError(f"{path}: the column {time}, which has the time, is missing.")
+    stamp = at[time] if time else None
+    if stamp is None:
+        notes.append(
+            note(
+                "mapping", f"There are no stamps; rows are taken to be {1.0 / mapping.rate:g} s apart.", Grade.DEGRADES
+            )
+        )
+    if header.repeated:
+        notes.append(note("mapping", f"Columns occur more than once: {_some(header.repeated)}; the first one counts."))
+    needed = dict.fromkeys(([] if stamp is None else [stamp]) + [at[c] for s in signals.values() for c in s.columns])
+    rest = [c for c in range(len(header.names)) if c not in needed and c not in header.hollow]
+    words = [header.names[c] for c in rest if c in header.words]
+    if words:
+        notes.append(note("mapping", f"Columns of words are not kept: {_some(words)}."))
+    wanted = tuple(c for c in rest if c not in header.words)
+    packet_of = {c: p for p, members in mapping.packets.items() for c in members}
+    taken = set(signals)
+    raw = {}
+    for c in wanted:
+        column = header.names[c]
+        name = f"column:{column}" if column in taken or column.partition("@")[0] in SIGNALS else column
+        taken.add(name)
+        raw[column] = (name, mapping.units.get(column, ""), packet_of.get(column))
+    packets = {
+        p: tuple(dict.fromkeys(c for s in signals.values() if s.packet == p for c in s.columns))
+        + tuple(c for c in mapping.packets.get(p, ()) if c in raw)
+        for p in dict.fromkeys([*(s.packet for s in signals.values() if s.packet), *mapping.packets])
+    }
+    layout = Layout(signals, raw, {p: members for p, members in packets.items() if members}, mapping.clock)
+    return _Plan(path, header, mapping, layout, stamp, tuple(needed), wanted, tuple(notes), as_published)
+
+
+def _in_order(signals: dict[str, SignalColumns]) -> dict[str, SignalColumns]:
+    """The vocabulary's own signals first, in its order, as the live loop sees them; then further measurements."""
+    first = [name for name in SIGNALS if name in signals]
+    return {name: signals[name] for name in [*first, *(n for n in signals if n not in SIGNALS)]}
+
+
+def _recording(plan: _Plan, rows: Rows, damage: Damage, *, last: bool) -> Recording:
+    start = float(rows.stamp[rows.keep[0]]) if plan.stamp is not None else math.nan
+    signals, findings = signals_of(plan.layout, rows)
+    notes = (*plan.notes, *_noted(plan, damage)) if last else plan.notes
+    metadata = {
+        "csv": {
+            "mapping": plan.mapping.name,
+            "title": plan.mapping.title,
+            "as_published": str(plan.as_published).lower(),
+            "start_time": "" if math.isnan(start) else repr(start),
+        }
+    }
+    if plan.mapping.claims:
+        metadata["claims"] = dict(plan.mapping.claims)
+    return Recording(
+        str(plan.path),
+        f"csv:{plan.mapping.name}",
+        signals,
+        metadata,
+        (*notes, *findings),
+        origin=rows.origin,
+    )
+
+
+def _noted(plan: _Plan, damage: Damage) -> list[Finding]:
+    """What was wrong with the text of the file."""
+    notes = damage_notes(damage)
+    for column, count in damage.words.items():
+        name = plan.header.names[column]
+        notes.append(note("integrity", f"{count} values in column {name} are no numbers.", count=float(count)))
+    return notes
+
+
+def damage_notes(damage: Damage) -> list[Finding]:
+    """What was wrong with the lines of a file."""
+    notes = []
+    if damage.dropped:
+        where = ", ".join(map(str, damage.lines)) + (", ..." if damage.dropped > len(damage.lines) else "")
+        text = f"{damage.dropped} damaged lines were dropped (line {where}): {damage.first}."
+        notes.append(note("integrity", text, Grade.DEGRADES, lines=float(damage.dropped)))
+    if damage.cut_gzip:
+        text = "The gzip file ends early; what was packed before its end was read."
+        notes.append(note("integrity", text, Grade.DEGRADES))
+    if damage.cut_line and not damage.cut_gzip:
+        notes.append(note("integrity", "The last line is cut short and was dropped."))
+    return notes
+
+
+def _some(names: tuple[str, ...] | list[str]) -> str:
+    shown = ", ".join(name[:40] for name in names[:8])
+    return shown + (f" and {len(names) - 8} more" if len(names) > 8 else "")

@@ -1,0 +1,154 @@
+"""Units that people write in recordings: what kind of quantity each measures, and the factor to SI."""
+
+import math
+
+from crazyem.errors import FileFormatError
+from crazyem.signals.sample import SIGNALS
+from crazyem.signals.vocabulary import STANDARD_GRAVITY
+
+_TURN = 2.0 * math.pi
+_DEGREE = math.pi / 180.0
+_FOOT = 0.3048
+_FORCE_OF_GRAM = 9.80665e-3  # N, the standard definition; g as an acceleration is the firmware's 9.81
+
+# kind of quantity -> unit -> factor to SI
+_KINDS: dict[str, dict[str, float]] = {
+    "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "um": 1e-6, "km": 1e3, "ft": _FOOT, "in": 0.0254},
+    "speed": {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1.0 / 3.6, "ft/s": _FOOT},
+    "acceleration": {
+        "m/s^2": 1.0,
+        "mm/s^2": 1e-3,
+        "cm/s^2": 1e-2,
+        "g": STANDARD_GRAVITY,
+        "mg": 1e-3 * STANDARD_GRAVITY,
+    },
+    "angle": {"rad": 1.0, "mrad": 1e-3, "deg": _DEGREE, "cdeg": 1e-2 * _DEGREE, "rev": _TURN},
+    "angular rate": {
+        "rad/s": 1.0,
+        "mrad/s": 1e-3,
+        "deg/s": _DEGREE,
+        "mdeg/s": 1e-3 * _DEGREE,
+        "rpm": _TURN / 60.0,
+        "erpm": _TURN / 60.0,  # of the electrical turn: needs the number of pole pairs
+        "krpm": _TURN / 60e-3,
+        "Hz": _TURN,
+    },
+    "voltage": {"V": 1.0, "mV": 1e-3, "cV": 1e-2},
+    "force": {"N": 1.0, "mN": 1e-3, "gf": _FORCE_OF_GRAM, "kgf": 1e3 * _FORCE_OF_GRAM},
+    "torque": {"N m": 1.0, "mN m": 1e-3, "uN m": 1e-6, "gf cm": 1e-2 * _FORCE_OF_GRAM},
+    "ratio": {"1": 1.0, "%": 1e-2, "pwm": 1.0 / 65535.0, "pwm8": 1.0 / 255.0},
+    "count": {"1": 1.0, "pwm": 1.0},
+    "number": {"1": 1.0},
+}
+
+_TIMES: dict[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1.0 / 60.0, "h": 1.0 / 3600.0}
+
+_KIND_OF_UNIT = {"m": "length", "m/s": "speed", "m/s^2": "acceleration", "rad": "angle", "rad/s": "angular rate"}
+
+# other spellings of the same
+_SPELLINGS: dict[str, str] = {
+    "": "1",
+    "-": "1",
+    "percent": "%",
+    "meter": "m",
+    "meters": "m",
+    "metre": "m",
+    "metres": "m",
+    "µm": "um",
+    "kph": "km/h",
+    "m s^-1": "m/s",
+    "mps": "m/s",
+    "m/s2": "m/s^2",
+    "m/s/s": "m/s^2",
+    "m/s**2": "m/s^2",
+    "m/s²": "m/s^2",
+    "m s^-2": "m/s^2",
+    "mm/s2": "mm/s^2",
+    "mm/s²": "mm/s^2",
+    "G": "g",
+    "gee": "g",
+    "radian": "rad",
+    "radians": "rad",
+    "degree": "deg",
+    "degrees": "deg",
+    "°": "deg",
+    "rad s^-1": "rad/s",
+    "degrees/s": "deg/s",
+    "°/s": "deg/s",
+    "dps": "deg/s",
+    "RPM": "rpm",
+    "rev/min": "rpm",
+    "eRPM": "erpm",
+    "ERPM": "erpm",
+    "rev/s": "Hz",
+    "rps": "Hz",
+    "hz": "Hz",
+    "volt": "V",
+    "volts": "V",
+    "v": "V",
+    "Nm": "N m",
+    "N*m": "N m",
+    "mNm": "mN m",
+    "uNm": "uN m",
+    "µN m": "uN m",
+    "µs": "us",
+    "sec": "s",
+    "seconds": "s",
+    "PWM": "pwm",
+    "duty": "1",
+    "ratio": "1",
+}
+
+
+def kind_of(quantity: str, component: int) -> str:
+    """What a component of a vocabulary signal measures: "length", "speed", "ratio", ..."""
+    if quantity == "wrench_command":
+        return "force" if component == 0 else "torque"
+    if quantity == "voltage":
+        return "voltage"
+    if quantity in ("motor_command", "motor_request"):
+        return "ratio"
+    if quantity == "mixer_command":
+        return "count"
+    return _KIND_OF_UNIT.get(SIGNALS[quantity][1], "number")
+
+
+def unit_factor(unit: str, quantity: str, component: int, where: str) -> float:
+    """Factor from `unit` to the SI unit of a component of a signal.
+
+    Raises: FileFormatError, one sentence that begins with `where`, if the unit is unknown or measures something else.
+    """
+    kind = kind_of(quantity, component)
+    known = _KINDS[kind]
+    name = _spelled(unit)
+    if name in known:
+        return known[name]
+    others = [k for k, units in _KINDS.items() if name in units]
+    if others:
+        raise FileFormatError(
+            f'{where}: "{unit}" is a unit of {others[0]}, but {quantity} is {_article(kind)} '
+            f"(units: {', '.join(known)})."
+        )
+    raise FileFormatError(f'{where}: unknown unit "{unit}"; known for {quantity} are {", ".join(known)}.')
+
+
+def time_divisor(unit: str, where: str) -> float:
+    """What to divide stamps in `unit` by to have seconds. Raises FileFormatError for an unknown unit of time."""
+    name = _spelled(unit)
+    if name not in _TIMES:
+        raise FileFormatError(f'{where}: unknown unit "{unit}" of time; known are {", ".join(_TIMES)}.')
+    return _TIMES[name]
+
+
+def is_electrical(unit: str) -> bool:
+    """Whether a unit counts turns of the electrical field, so that the number of pole pairs is needed."""
+    return _spelled(unit) == "erpm"
+
+
+def _spelled(unit: str) -> str:
+    text = unit.strip()
+    return _SPELLINGS.get(text, text)
+
+
+def _article(kind: str) -> str:
+    return f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
