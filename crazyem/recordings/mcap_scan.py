@@ -149,6 +149,8 @@ def _consistent(opcode: int, data: bytes) -> bool:
     try:
         if opcode == CHUNK:
             parse_chunk(data)
+        elif _is_chunk(data):
+            return False  # of a chunk only the opcode is damaged
         elif opcode == MESSAGE_INDEX:
             return len(data) >= 6 and int.from_bytes(data[2:6], "little") == len(data) - 6
         elif opcode == METADATA:
@@ -157,6 +159,18 @@ def _consistent(opcode: int, data: bytes) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _is_chunk(data: bytes) -> bool:
+    if len(data) < _CHUNK_HEAD.size + 8:
+        return False
+    name = int.from_bytes(data[28:32], "little")
+    at = _CHUNK_HEAD.size + name + 8
+    return (
+        name in (0, 3, 4)
+        and data[28 + 4 : 32 + name] in (b"", b"lz4", b"zstd")
+        and (int.from_bytes(data[at - 8 : at], "little") == len(data) - at)
+    )
 
 
 def _next_chunk(stream: BinaryIO, offset: int, size: int) -> int | None:

@@ -1,6 +1,7 @@
 """What an MCAP file holds, part by part: chunks unpacked and checked, announcements parsed, losses located."""
 
 import io
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -151,6 +152,8 @@ def from_summary(path: Path) -> tuple[list[Any], dict[int, int]]:
                 return [], {}
             stream.seek(start)
             data = stream.read(size - start - tail)
+            if footer.summary_crc and zlib.crc32(end[: HEAD.size + 16], zlib.crc32(data)) != footer.summary_crc:
+                return [], {}
     except OSError:
         return [], {}
     at = 0

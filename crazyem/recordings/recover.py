@@ -6,11 +6,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings import mcap_scan
 from crazyem.recordings.mcap_messages import PROFILE
 from crazyem.recordings.mcap_output import Output
-from crazyem.recordings.mcap_scan import HEAD, MAGIC, Loss, Problem
+from crazyem.recordings.mcap_scan import HEAD, MAGIC, Loss, Problem, Scan
 from crazyem.recordings.mcap_survey import Part, from_summary, index_of, parse, parts, profile_of
 
 
@@ -166,17 +169,40 @@ def _restore(output: Output, part: Part, known: dict[tuple[str, int], Any], seen
 def _messages(output: Output, part: Part, report: Report) -> None:
     """A chunk goes over as it stands, byte for byte; records outside chunks into chunks."""
     assert part.scan is not None
-    index = index_of(part.scan.messages)
+    messages = part.scan.messages
+    defined = np.isin(messages[:, 2], _defined(output))
+    if not defined.all():
+        why = f"{int((~defined).sum())} messages of channels that nothing announces any more"
+        report.problems.append(Problem(Loss.DAMAGED, part.record.offset, part.record.end, why))
+        _rewrite(output, part.scan, messages[defined])
+    index = index_of(messages[defined])
     if not index:
+        output.announce_again()
         return
-    report.messages += len(part.scan.messages)
+    report.messages += int(defined.sum())
     report.chunks += 1
+    if not defined.all():
+        return
     if part.chunk is not None:
         chunk = part.chunk
         output.flush_announcements()
         output.chunk(chunk.compression, bytes(chunk.packed), size=chunk.size, crc=chunk.crc, index=index)
     else:
         output.messages(part.scan.data.tobytes(), index)
+
+
+def _defined(output: Output) -> list[int]:
+    """Channels whose messages a reader can decode, as far as announced."""
+    schemas = output.book.schemas
+    return [i for i, (schema, _, _, _) in output.book.channels.items() if schema == 0 or schema in schemas]
+
+
+def _rewrite(output: Output, scan: Scan, messages: NDArray[np.int64]) -> None:
+    """Some messages of a chunk into another."""
+    records = [scan.data[offset - 31 : offset + length].tobytes() for offset, length, *_ in messages.tolist()]
+    if records:
+        packed = b"".join(records)
+        output.messages(packed, index_of(mcap_scan.scan(packed).messages))
 
 
 def _attachment(source: Path, part: Part, output: Output) -> int:
