@@ -30,11 +30,11 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.fix:
         outputs = [*targets(files.found, arguments.output, ".fixed.mcap", force=arguments.force)]
     several = len(files.found) > 1
+    jobs = processes(arguments.jobs, len(files.found))
     tasks = [
-        (str(f.path), options, None if o is None else str(o), arguments.force, arguments.parts, processes(arguments.jobs, len(files.found)),
-         several)
+        (str(f.path), options, None if o is None else str(o), arguments.force, arguments.parts, jobs, several)
         for f, o in zip(files.found, outputs, strict=True)
-    ]  # fmt: skip
+    ]
     names = [str(f.path) for f in files.found]
     for number, result in enumerate(
         each(diagnose, tasks, names=names, what="doctor", jobs=arguments.jobs, cluster=arguments.cluster)

@@ -55,7 +55,7 @@ def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Itera
     rows = 0
     for block in table.blocks():
         held.append(block)
-        if not block.time[-1] - held[0].time[0] < seconds:
+        if not float(block.time[-1]) - float(held[0].time[0]) < seconds:
             yield table.recording(held, rows)
             rows += sum(b.time.size for b in held)
             held = []
@@ -221,7 +221,7 @@ def _guessed(titles: list[str]) -> Description:
     while pairs:
         name, unit = pairs[0]
         entry = _vocabulary_entry(names[len(names) - len(pairs) :]) or SignalEntry(
-            name, ("",), name if SIGNALS.get(name, (0,))[0] == 1 else "", unit, "", "", "", (name,)
+            name, ("",), *_scalar(name, unit), "", "", (name,)
         )
         del pairs[: len(entry.parts)]
         if pairs and pairs[0][0] == f"{entry.name}_{MARKED}":
@@ -229,6 +229,13 @@ def _guessed(titles: list[str]) -> Description:
             entry = replace(entry, marked=True)
         entries.append(entry)
     return Description("exported csv", tuple(entries))
+
+
+def _scalar(name: str, unit: str) -> tuple[str, str, str]:
+    """Quantity, unit and frame of a column that is a signal of its own."""
+    quantity = name.split("@", maxsplit=1)[0]
+    count, known, frame = SIGNALS.get(quantity, (0, "", ""))
+    return (quantity, unit, frame) if count == 1 and unit == known else ("", unit, "")
 
 
 def _vocabulary_entry(names: list[str]) -> SignalEntry | None:
@@ -298,6 +305,8 @@ class _WholeLines(io.RawIOBase):
 
     def _more(self) -> bytes:
         try:
+            if isinstance(self.file, gzip.GzipFile):
+                return self.file.read1(_BLOCK)  # unlike read, hands out what it has before it comes to the damage
             return self.file.read(_BLOCK)
         except (EOFError, gzip.BadGzipFile, zlib.error) as error:
             self.damage = f"The gzip file is damaged ({error}); the whole lines before that were read."

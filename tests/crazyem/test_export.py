@@ -1,0 +1,421 @@
+"""Export to CSV and Parquet and back: no sample, stamp, mark or unit is lost; read a second time by plain slow code."""
+
+import csv
+import gzip
+import json
+import math
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_flight import made_flight
+
+from crazyem.errors import CrazyemError, FileFormatError, UsageError
+from crazyem.recordings import Event, Finding, Fix, Grade, ReadOptions, Recording, SignalArray, open_recording
+from crazyem.recordings.export import METADATA_SUFFIX, export, export_parts
+from crazyem.recordings.exported_csv import read, read_parts
+from crazyem.recordings.parts import free_memory, is_large, open_parts
+from crazyem.signals.sample import SIGNALS
+
+ODD = [
+    "pm.vbatMV", "a,b", 'quote"d', "two\nlines", "tab\t", "Größe", "time", "host_time", "position_x", "x [m]", "",
+    " ", "\x1b[31m", "a", "a#2", "a_marked", "a_0", "\ud800", "=1+1", "position_marked", "nan",
+]  # fmt: skip
+KNOWN = ["position", "position@mocap", "voltage", "attitude", "motor_command", "wrench_command"]
+numbers = st.floats(width=64) | st.sampled_from([math.nan, -0.0, 5e-324, 0.1 + 0.2, 1e300, 123456789.123456789])
+
+
+@st.composite
+def recordings(draw: st.DrawFn) -> Recording:
+    """Streams of several rates whose rows interleave in any order, with NaN, marks and names of all sorts."""
+    names = draw(st.lists(st.sampled_from(KNOWN + ODD), unique=True, min_size=1, max_size=6))
+    streams = draw(st.lists(st.integers(0, 2), min_size=len(names), max_size=len(names)))
+    lengths = [draw(st.integers(0, 5)) for _ in range(3)]
+    lengths[streams[0]] = max(1, lengths[streams[0]])
+    turns = draw(st.permutations([s for s in range(3) for _ in range(lengths[s])]))
+    rows = {s: np.array([i for i, turn in enumerate(turns) if turn == s], np.int64) for s in range(3)}
+    times = {s: draw_array(draw, lengths[s], st.sampled_from([0.0, 0.01, 1.5, math.nan]) | numbers) for s in range(3)}
+    hosts = {s: draw_array(draw, lengths[s], st.sampled_from([math.nan, 1.7e9, 1.7e9 + 1e-6])) for s in range(3)}
+    signals = {}
+    for place, (name, stream) in enumerate(zip(names, streams, strict=True)):
+        clock = draw(st.sampled_from(["", "firmware", "host"]))
+        quantity = name.split("@")[0] if name in KNOWN else ""
+        count = SIGNALS[quantity][0] if quantity else draw(st.integers(1, 3))
+        unit, frame = (
+            SIGNALS[quantity][1:] if quantity else (draw(st.sampled_from(["", "mm", "%", "a]b", "m, [s]"])), "")
+        )
+        n = lengths[stream]
+        value = draw_array(draw, n * count, numbers).reshape(n, count)
+        marked = np.array(draw(st.lists(st.booleans(), min_size=n, max_size=n)), bool)
+        signals[name] = SignalArray(
+            times[stream], value, rows[stream] * 7 + place, hosts[stream], marked, quantity, unit, frame,
+            clock, f"stream {stream}", tuple(f"{name}.{i}" for i in range(count)),
+        )  # fmt: skip
+    event = Event(draw(st.floats(0, 2e9)), "log", {"message": draw(st.text(max_size=5)), "x": draw(numbers)})
+    fix = Fix("mark", tuple(names[:1]), (draw(numbers),), np.array([1, 5], np.int64))
+    finding = Finding("gaps", Grade.DEGRADES, "Odd.", names[0], ((0.5, math.inf),), {"share": math.nan}, "Mind.", fix)
+    metadata = {"vehicle": {"toml": 'name = "x"\n', "ü": draw(st.text(max_size=5))}}
+    return Recording("there", "made:up", signals, metadata, (finding,), (event,), draw(st.floats(-1e9, 1e9)))
+
+
+def draw_array(draw: st.DrawFn, n: int, elements: st.SearchStrategy[float]) -> np.ndarray:
+    return np.array(draw(st.lists(elements, min_size=n, max_size=n)), float)
+
+
+def word(x: float) -> str:
+    """A double to the last bit, the sign of zero included; every NaN alike."""
+    return "nan" if math.isnan(x) else float(x).hex()
+
+
+def sequence(recording: Recording) -> list[tuple[Any, ...]]:
+    """Every sample in processing order, all of it: what must not change."""
+    samples = []
+    for place, (name, a) in enumerate(recording.signals.items()):
+        for i in range(a.time.size):
+            values = tuple(word(x) for x in a.value[i].tolist())
+            one = (name, word(a.time[i]), values, word(a.host_time[i]), bool(a.marked[i]))
+            samples.append(((int(a.order[i]), place), one))
+    return [one for _, one in sorted(samples, key=lambda s: s[0])]
+
+
+def about(recording: Recording) -> dict[str, tuple[Any, ...]]:
+    return {
+        n: (a.quantity, a.unit, a.frame, a.clock, a.stream, a.source, a.value.shape)
+        for n, a in recording.signals.items()
+    }
+
+
+def same(a: Recording, b: Recording) -> None:
+    """Equal in all but the path, and the numbers (not the sequence) in `order`."""
+    assert about(a) == about(b)
+    assert list(a.signals) == list(b.signals)
+    assert sequence(a) == sequence(b)
+    assert (a.source, a.metadata, word(a.origin)) == (b.source, b.metadata, word(b.origin))
+    assert repr([(e.time, e.kind, e.data) for e in a.events]) == repr([(e.time, e.kind, e.data) for e in b.events])
+    assert repr([finding_words(f) for f in a.findings]) == repr([finding_words(f) for f in b.findings])
+
+
+def finding_words(f: Finding) -> tuple[Any, ...]:
+    fix = None if f.fix is None else (f.fix.kind, f.fix.signals, f.fix.factor, np.asarray(f.fix.rows).tolist())
+    return (f.check, str(f.grade), f.text, f.signal, f.intervals, dict(f.evidence), f.advice, fix)
+
+
+def slow(path: Path) -> Iterator[tuple[Any, ...]]:
+    """The samples of an exported CSV in order, cell by cell, with the standard library and the description alone."""
+    description = json.loads(Path(f"{path}{METADATA_SUFFIX}").read_text())
+    entries = description["notes"][0]["crazyem"]["signals"]
+    with path.open(encoding="utf-8", newline="") as file:
+        reader = csv.reader(file)
+        titles = next(reader)
+        assert titles == [column["titles"] for column in description["tableSchema"]["columns"]]
+        for row in reader:
+            time, host, place = row[0], row[1], 2
+            for entry in entries:
+                count = len(entry["components"])
+                cells = row[place : place + count]
+                place += count
+                flag = row[place] if entry["marked"] else "0" if all(cells) else ""
+                place += bool(entry["marked"])
+                assert all(cells) or not any(cells)
+                assert bool(flag) == any(cells)
+                if any(cells):
+                    values = tuple(word(float(c)) for c in cells)
+                    yield entry["name"], word(float(time)), values, word(float(host or "nan")), flag == "1"
+
+
+@settings(max_examples=150, deadline=None)
+@given(recordings())
+def test_round_trip_through_csv_loses_nothing(recording: Recording) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "out.csv"
+        export(recording, path)
+        same(recording, open_recording(path))
+        assert list(slow(path)) == sequence(recording)
+        again = Path(folder) / "again.csv"
+        export(open_recording(path), again)
+        assert again.read_bytes() == path.read_bytes()
+
+
+@settings(max_examples=100, deadline=None)
+@given(recordings())
+def test_parquet_holds_every_sample(recording: Recording) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "out.parquet"
+        export(recording, path)
+        table = pq.read_table(path)
+    told = json.loads(table.schema.metadata[b"crazyem"])["signals"]
+    columns = [c.to_pylist() for c in table.columns]
+    assert len(set(table.column_names)) == len(columns)
+    found = []
+    for i in range(table.num_rows):
+        place = 2
+        for entry in told:
+            cells = [columns[place + k][i] for k in range(len(entry["components"]))]
+            place += len(cells)
+            marked = bool(columns[place][i]) if entry["marked"] else False
+            place += bool(entry["marked"])
+            if cells[0] is not None:
+                host = columns[1][i]
+                values = tuple(word(c) for c in cells)
+                found.append(
+                    (entry["name"], word(columns[0][i]), values, word(math.nan if host is None else host), marked)
+                )
+    assert found == sequence(recording)
+
+
+def test_streams_of_different_rates_stay_apart(tmp_path: Path) -> None:
+    recording = made_flight(seconds=3.0, more=["mocap"])
+    export(recording, tmp_path / "f.csv")
+    table = pd.read_csv(tmp_path / "f.csv")
+    assert list(table.columns[:5]) == [
+        "time [s]",
+        "host_time [s]",
+        "position_x [m]",
+        "position_y [m]",
+        "position_z [m]",
+    ]
+    for column, name in (("body_rate_x [rad/s]", "body_rate"), ("voltage [V]", "voltage")):
+        rows = table[table[column].notna()]
+        assert np.array_equal(rows["time [s]"].to_numpy(), recording.signals[name].time)
+        assert np.array_equal(rows[column].to_numpy(), recording.signals[name].value[:, 0])
+
+
+def test_pandas_finds_the_units_in_parquet(tmp_path: Path) -> None:
+    recording = made_flight(seconds=3.0)
+    export(recording, tmp_path / "f.parquet")
+    table = pd.read_parquet(tmp_path / "f.parquet")
+    assert table.attrs["units"]["body_rate_x"] == "rad/s"
+    assert table.attrs["frames"]["body_rate_x"] == "body FLU"
+    assert table.attrs["clocks"]["position_x"] == "firmware"
+    assert table.attrs["recording"] == "made"
+    rate = table["body_rate_z"].dropna()
+    assert np.array_equal(rate.to_numpy(), recording.signals["body_rate"].value[:, 2])
+    field = pq.read_schema(tmp_path / "f.parquet").field("specific_force_x")
+    assert field.metadata[b"unit"] == b"m/s^2"
+
+
+def test_csvw_description_names_every_column(tmp_path: Path) -> None:
+    recording = made_flight(seconds=1.0)
+    export(recording, tmp_path / "f.csv")
+    told = json.loads((tmp_path / f"f.csv{METADATA_SUFFIX}").read_text())
+    assert told["@context"] == "http://www.w3.org/ns/csvw"
+    assert told["url"] == "f.csv"
+    columns = {c["titles"]: c for c in told["tableSchema"]["columns"]}
+    assert columns["specific_force_z [m/s^2]"]["schema:unitText"] == "m/s^2"
+    assert columns["specific_force_z [m/s^2]"]["dc:description"] == "body FLU"
+    assert len({c["name"] for c in columns.values()}) == len(columns)
+
+
+def test_without_its_description_the_numbers_and_units_stay(tmp_path: Path) -> None:
+    recording = made_flight(seconds=1.0, more=["mocap"])
+    marked = np.zeros(recording.signals["voltage"].time.size, bool)
+    marked[3] = True
+    recording = replace(
+        recording, signals={**recording.signals, "voltage": replace(recording.signals["voltage"], marked=marked)}
+    )
+    path = tmp_path / "f.csv"
+    export(recording, path)
+    Path(f"{path}{METADATA_SUFFIX}").unlink()
+    found = open_recording(path)
+    assert sequence(found) == sequence(recording)
+    for name, array in found.signals.items():
+        assert (array.quantity, array.unit, array.frame) == (
+            recording.signals[name].quantity, recording.signals[name].unit, recording.signals[name].frame,
+        )  # fmt: skip
+    assert [f.grade for f in found.findings] == [Grade.DEGRADES]
+
+
+def test_a_description_of_another_file_is_not_believed(tmp_path: Path) -> None:
+    export(made_flight(seconds=1.0), tmp_path / "a.csv")
+    export(made_flight(seconds=1.0, more=["rpm"]), tmp_path / "b.csv")
+    beside = Path(f"{tmp_path / 'a.csv'}{METADATA_SUFFIX}")
+    beside.write_bytes(Path(f"{tmp_path / 'b.csv'}{METADATA_SUFFIX}").read_bytes())
+    assert any("other columns" in f.text for f in open_recording(tmp_path / "a.csv").findings)
+
+
+def test_parts_add_up_to_the_whole(tmp_path: Path) -> None:
+    recording = made_flight(seconds=120.0, more=["rpm"])
+    path, second = tmp_path / "f.csv", tmp_path / "g.csv"
+    export(recording, path)
+    whole = read(path, ReadOptions())
+    parts = list(read_parts(path, ReadOptions(), seconds=20.0))
+    assert len(parts) > 1
+    joined = {
+        name: replace(
+            array,
+            **{
+                field: np.concatenate([getattr(p.signals[name], field) for p in parts])
+                for field in ("time", "value", "order", "host_time", "marked")
+            },
+        )
+        for name, array in parts[0].signals.items()
+    }
+    for name, array in whole.signals.items():
+        for field in ("time", "value", "order", "marked"):
+            assert np.array_equal(getattr(joined[name], field), getattr(array, field)), (name, field)
+    export_parts(lambda: open_parts(path), second)
+    assert second.read_bytes() == path.read_bytes()
+    same(whole, open_recording(second))
+
+
+def test_nothing_is_written_over_or_left_half(tmp_path: Path) -> None:
+    recording = made_flight(seconds=1.0)
+    path = tmp_path / "f.csv"
+    path.write_text("mine")
+    with pytest.raises(UsageError, match="exists already"):
+        export(recording, path)
+    assert path.read_text() == "mine"
+    export(recording, path, force=True)
+    assert path.read_text().startswith("time [s],")
+
+    def broken() -> Iterator[Recording]:
+        yield recording
+        raise FileFormatError("cut.")
+
+    with pytest.raises(FileFormatError):
+        export_parts(broken, tmp_path / "g.parquet")
+    with pytest.raises(UsageError, match=r"ends in \.csv or \.parquet"):
+        export(recording, tmp_path / "f.xlsx")
+    with pytest.raises(UsageError, match="cannot write"):
+        export(recording, tmp_path / "none" / "f.csv")
+    (tmp_path / "d.csv").mkdir()
+    with pytest.raises(UsageError, match="directory"):
+        export(recording, tmp_path / "d.csv")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["d.csv", "f.csv", f"f.csv{METADATA_SUFFIX}"]
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("exported") / "f.csv"
+    export(made_flight(seconds=1.0), path)
+    return path
+
+
+def test_cut_anywhere_it_is_read_to_its_last_whole_line(exported: Path, tmp_path: Path) -> None:
+    data, beside = exported.read_bytes(), Path(f"{exported}{METADATA_SUFFIX}").read_bytes()
+    whole = sequence(open_recording(exported))
+    path = tmp_path / "f.csv"
+    Path(f"{path}{METADATA_SUFFIX}").write_bytes(beside)
+    header = data.index(b"\n") + 1
+    for end in range(header, len(data), 997):
+        path.write_bytes(data[:end])
+        if b"\n" not in data[header:end]:
+            with pytest.raises(FileFormatError, match="not a single sample"):
+                open_recording(path)
+            continue
+        found = open_recording(path)
+        assert sequence(found) == whole[: len(sequence(found))]
+        assert bool(found.findings) == (data[end - 1 : end] != b"\n")
+
+
+def test_packed_it_is_read_as_well(exported: Path, tmp_path: Path) -> None:
+    packed = gzip.compress(exported.read_bytes())
+    path = tmp_path / "f.csv.gz"
+    path.write_bytes(packed)
+    (tmp_path / f"f.csv{METADATA_SUFFIX}").write_bytes(Path(f"{exported}{METADATA_SUFFIX}").read_bytes())
+    whole = sequence(open_recording(exported))
+    assert sequence(read(path, ReadOptions())) == whole
+    path.write_bytes(packed[: len(packed) // 2])
+    found = read(path, ReadOptions())
+    assert 0 < len(sequence(found)) < len(whole)
+    assert sequence(found) == whole[: len(sequence(found))]
+    assert "damaged" in found.findings[0].text
+
+
+def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "f.csv.gz"
+    with gzip.open(path, "wb", compresslevel=9) as file:
+        file.write(b"time [s],host_time [s],voltage [V]\n")
+        for _ in range(200):
+            file.write(b"0,,1\n" * 100_000)
+    with pytest.raises(FileFormatError, match="unpacks to far more"):
+        read(path, ReadOptions())
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("time [s],host_time [s],voltage [V]\n0,,4\nsoon,,4\n", "soon"),
+        ("time [s],host_time [s],voltage [V]\n0,,4\n1,,4,5\n", "Expected 3 columns, got 4"),
+        ("time [s],host_time [s],voltage [V]\n0,,4\n,,4\n", "row 3 has no time"),
+        ("time [s],host_time [s],voltage [V]\n", "not a single sample"),
+        ("time [s],host_time [s]\n0,\n", "not the header"),
+        ('time [s],host_time [s],"voltage\n0,,4\n', "line 1"),
+    ],
+)
+def test_a_damaged_line_is_named(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "f.csv"
+    path.write_text(text)
+    with pytest.raises(FileFormatError, match=says) as caught:
+        read(path, ReadOptions())
+    assert str(path) in str(caught.value)
+
+
+def complaint(path: Path) -> str:
+    """The kind of error that reading ends with, which names the file; "" if it was read."""
+    try:
+        read(path, ReadOptions())
+    except CrazyemError as error:
+        if path.name not in str(error):
+            raise
+        return type(error).__name__
+    return ""
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_a_damaged_description_is_one_sentence(exported: Path, data: st.DataObject) -> None:
+    """Any value of the description replaced by any other: read, or refused with the file's name."""
+    told = json.loads(Path(f"{exported}{METADATA_SUFFIX}").read_text())
+    junk = st.none() | st.integers() | st.floats() | st.text(max_size=3) | st.just([]) | st.just({}) | st.just([[1, 2]])
+    node = told["notes"][0]
+    key: Any = "crazyem"
+    while isinstance(node[key], dict | list) and node[key] and data.draw(st.booleans()):
+        node = node[key]
+        key = data.draw(st.sampled_from(sorted(node) if isinstance(node, dict) else list(range(len(node)))))
+    node[key] = data.draw(junk)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "f.csv"
+        path.write_bytes(exported.read_bytes())
+        Path(f"{path}{METADATA_SUFFIX}").write_text(json.dumps(told))
+        assert complaint(path) in ("", "FileFormatError")
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_damaged_bytes_are_one_sentence(exported: Path, data: st.DataObject) -> None:
+    content = bytearray(exported.read_bytes()[: data.draw(st.integers(0, 4000))])
+    for _ in range(data.draw(st.integers(1, 5))):
+        at = data.draw(st.integers(0, len(content)))
+        content[at:at] = data.draw(st.binary(max_size=6))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "f.csv"
+        path.write_bytes(bytes(content))
+        complaint(path)
+
+
+def test_what_is_large_depends_on_the_memory_that_is_free(tmp_path: Path) -> None:
+    path = tmp_path / "f.bin"
+    path.write_bytes(b"x")
+    assert not is_large(path)
+    with path.open("r+b") as file:
+        file.truncate(int(free_memory() * 0.3))  # a hole, takes no space
+    assert is_large(path)
+    assert is_large(path, jobs=4)
+    assert not is_large(tmp_path)
+
+
+def test_a_format_without_parts_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "f.csv"
+    export(made_flight(seconds=1.0), path)
+    assert len(list(open_parts(path))) == 1
+    with pytest.raises(UsageError, match="no such file"):
+        list(open_parts(tmp_path / "none.csv"))
