@@ -113,6 +113,11 @@ def floats(column: NDArray[np.generic]) -> NDArray[np.float64]:
         return np.asarray(column, np.float64)
 
 
+def seconds(count: NDArray[np.generic], per_second: float = 1e6) -> NDArray[np.float64]:
+    """(n,) s from whole microseconds (or another part of a second): the nearest double to each."""
+    return np.asarray(floats(count) / per_second, np.float64)
+
+
 def ranks(times: Sequence[NDArray[np.generic]]) -> list[NDArray[np.int64]]:
     """Position of each row of each topic when all rows are sorted by time; equal times in the order of the topics."""
     sizes = [t.size for t in times]

@@ -30,7 +30,7 @@ from crazyem.recordings.frd_ned import (
 )
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
-from crazyem.recordings.topics import Source, Topic, damage, file_bytes, named, ranks, signals_of, text_of
+from crazyem.recordings.topics import Source, Topic, damage, file_bytes, named, ranks, seconds, signals_of, text_of
 from crazyem.recordings.ulog_scan import HEADER, MAGIC, Scan, scan, unknown_flags
 
 CLOCK = "autopilot"  # microseconds since boot
@@ -88,8 +88,7 @@ def _topics(log: ULog) -> list[Topic]:
         chars = {f.field_name for f in d.field_data if f.type_str == "char"}
         columns = {k: v for k, v in d.data.items() if k != used and k not in chars and "_padding" not in k}
         units = {k: "us" for k in columns if k.rpartition(".")[2] in ("timestamp", "timestamp_sample")}
-        time = np.asarray(stamp.astype(np.float64) * 1e-6)
-        topics.append(Topic(name, columns, time, order, clock=CLOCK, units=units))
+        topics.append(Topic(name, columns, seconds(stamp), order, clock=CLOCK, units=units))
     return topics
 
 
@@ -190,8 +189,8 @@ def _integrity(sound: Scan, topics: list[Topic], log: ULog) -> list[Finding]:
     for name, reason in sorted(sound.refused.items())[:20]:
         found.append(note("integrity", f"The topic {text_of(name)} is not read: {reason}.", Grade.DEGRADES))
     if log.dropouts:
-        intervals = tuple((d.timestamp * 1e-6, d.timestamp * 1e-6 + d.duration * 1e-3) for d in log.dropouts)
-        total, longest = sum(d.duration for d in log.dropouts) * 1e-3, max(d.duration for d in log.dropouts) * 1e-3
+        intervals = tuple((d.timestamp / 1e6, d.timestamp / 1e6 + d.duration / 1e3) for d in log.dropouts)
+        total, longest = sum(d.duration for d in log.dropouts) / 1e3, max(d.duration for d in log.dropouts) / 1e3
         found.append(
             Finding(
                 "gaps",
@@ -222,11 +221,10 @@ def _metadata(log: ULog) -> dict[str, dict[str, str]]:
     info |= {"version": version} if version else {}
     parameters = {text_of(k): repr(v) for k, v in list(log.initial_parameters.items())[:_PARAMETERS]}
     changed = {
-        f"{i} {t * 1e-6:.6f} s {text_of(k)}": repr(v)
-        for i, (t, k, v) in enumerate(log.changed_parameters[:_PARAMETERS])
+        f"{i} {t / 1e6:.6f} s {text_of(k)}": repr(v) for i, (t, k, v) in enumerate(log.changed_parameters[:_PARAMETERS])
     }
     texts = {
-        f"{i} {m.timestamp * 1e-6:.6f} s {m.log_level_str()}": text_of(m.message)
+        f"{i} {m.timestamp / 1e6:.6f} s {m.log_level_str()}": text_of(m.message)
         for i, m in enumerate(log.logged_messages[:_MESSAGES])
     }
     sections = {"ulog": info, "parameters": parameters, "changed_parameters": changed, "messages": texts}

@@ -1,0 +1,175 @@
+"""Frames of a MAVLink telemetry log: found, checked and unpacked in bulk, with pymavlink's message definitions.
+
+A tlog is a run of [time of arrival, 8 bytes, big-endian, microseconds since 1970][MAVLink 1 or 2 frame]. pymavlink
+decodes one message at a time into an object; here the frames of one message are unpacked together, by numpy, with the
+types, order and checksum seed that pymavlink knows. Source: mavlink.io/en/guide/serialization.html.
+"""
+
+import binascii
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pymavlink.dialects.v20 import ardupilotmega
+
+MESSAGES: Mapping[int, Any] = ardupilotmega.mavlink_map
+_EARLIEST = 946_684_800_000_000  # us: the year 2000
+_LATEST = 4_102_444_800_000_000  # us: the year 2100
+_V1, _V2 = 0xFE, 0xFD
+_SIGNED = 1
+_SIGNATURE = 13  # bytes
+_REVERSED = bytes(int(f"{i:08b}"[::-1], 2) for i in range(256))
+_MARK = re.compile(b"[\xfd\xfe]")
+_TYPE = re.compile(r"(\d*)([a-zA-Z])")
+
+Key = tuple[int, int, int]  # system, component, message
+
+
+@dataclass(slots=True)
+class Frames:
+    """Sound frames of one message from one component: arrival [us], place in the file, sequence number, payload."""
+
+    stamps: list[int] = field(default_factory=list)
+    places: list[int] = field(default_factory=list)
+    sequence: list[int] = field(default_factory=list)
+    payloads: list[bytes] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class Frameset:
+    """What a log holds.
+
+    Attributes:
+        frames: by system, component and message.
+        skipped: (offset, count) of each run of bytes that is no sound frame.
+        unknown: frames of messages that pymavlink does not know; they cannot be checked nor read.
+        total: sound frames.
+    """
+
+    frames: dict[Key, Frames] = field(default_factory=dict)
+    skipped: list[tuple[int, int]] = field(default_factory=list)
+    unknown: int = 0
+    total: int = 0
+
+
+def checksum(data: bytes) -> int:
+    """CRC-16/MCRF4XX, the checksum of MAVLink: the reflected twin of the CCITT polynomial that binascii has in C."""
+    straight = binascii.crc_hqx(data.translate(_REVERSED), 0xFFFF)
+    return _REVERSED[straight & 0xFF] << 8 | _REVERSED[straight >> 8]
+
+
+def scan(data: bytes, at_most: int | None = None) -> Frameset:
+    """All sound frames of a log, or the first `at_most`."""
+    found = Frameset()
+    position, size = 0, len(data)
+    while position < size and (at_most is None or found.total < at_most):
+        after = _frame(data, position, found)
+        if after:
+            position = after
+            continue
+        again = _resume(data, position)
+        found.skipped.append((position, again - position))
+        position = again
+    return found
+
+
+def _frame(data: bytes, at: int, found: Frameset | None) -> int:
+    """Byte after the frame at `at`, 0 if there is no sound one; takes it up into `found`."""
+    if at + 8 + 8 > len(data):
+        return 0
+    stamp = int.from_bytes(data[at : at + 8], "big")
+    if not _EARLIEST < stamp < _LATEST:
+        return 0
+    magic, length = data[at + 8], data[at + 9]
+    if magic == _V2:
+        if at + 8 + 12 > len(data) or data[at + 10] & ~_SIGNED:
+            return 0
+        start = at + 18
+        after = start + length + 2 + (_SIGNATURE if data[at + 10] else 0)
+        key = (data[at + 13], data[at + 14], int.from_bytes(data[at + 15 : at + 18], "little"))
+        sequence = data[at + 12]
+    elif magic == _V1:
+        start = at + 14
+        after = start + length + 2
+        key = (data[at + 11], data[at + 12], data[at + 13])
+        sequence = data[at + 10]
+    else:
+        return 0
+    if after > len(data):
+        return 0
+    message = MESSAGES.get(key[2])
+    end = start + length
+    if message is None:
+        if not _looks_like_frame(data, after):
+            return 0
+        if found is not None:
+            found.unknown += 1
+            found.total += 1
+        return after
+    if checksum(data[at + 9 : end] + bytes((message.crc_extra,))) != data[end] | data[end + 1] << 8:
+        return 0
+    if found is not None:
+        frames = found.frames.get(key)
+        if frames is None:
+            frames = found.frames[key] = Frames()
+        frames.stamps.append(stamp)
+        frames.places.append(found.total)
+        frames.sequence.append(sequence)
+        frames.payloads.append(data[start:end])
+        found.total += 1
+    return after
+
+
+def _looks_like_frame(data: bytes, at: int) -> bool:
+    """True at the end of the log, or where a time of arrival and the start of a frame are."""
+    if at == len(data):
+        return True
+    if at + 9 > len(data):
+        return False
+    return _EARLIEST < int.from_bytes(data[at : at + 8], "big") < _LATEST and data[at + 8] in (_V1, _V2)
+
+
+def _resume(data: bytes, damaged: int) -> int:
+    """The next place after `damaged` with a sound frame; the end of the log if there is none."""
+    for mark in _MARK.finditer(data, damaged + 9):
+        if _frame(data, mark.start() - 8, None):
+            return mark.start() - 8
+    return len(data)
+
+
+def columns_of(message: Any, payloads: list[bytes]) -> dict[str, NDArray[np.generic]]:
+    """Fields of all frames of one message, in the types in which they were sent: name -> (n,).
+
+    An array becomes a column an element, "voltages[0]"; text stays one column of bytes. MAVLink 2 cuts zeros off the
+    end of a payload, and MAVLink 1 knows no extension fields: what is not there is 0.
+    """
+    names: list[str] = []
+    kinds: list[Any] = []
+    for field_name, (count, code) in zip(message.ordered_fieldnames, _layout(message), strict=True):
+        if code == "s":
+            names.append(field_name)
+            kinds.append(f"S{count}")
+        elif count == 1:
+            names.append(field_name)
+            kinds.append("<" + code)
+        else:
+            names += [f"{field_name}[{i}]" for i in range(count)]
+            kinds += ["<" + code] * count
+    dtype = np.dtype(list(zip(names, kinds, strict=True)))
+    size = dtype.itemsize
+    table = np.frombuffer(b"".join([p[:size].ljust(size, b"\0") for p in payloads]), dtype)
+    return {name: table[name] for name in names}
+
+
+def _layout(message: Any) -> list[tuple[int, str]]:
+    """Count and struct letter of each field, in the order in which they are sent."""
+    return [(int(count or 1), code) for count, code in _TYPE.findall(message.unpacker.format)]
+
+
+def units_of(message: Any, columns: Mapping[str, object]) -> dict[str, str]:
+    """Units of the columns, as the MAVLink definitions give them."""
+    units = {name: unit.replace("/s/s", "/s^2") for name, unit in message.fieldunits_by_name.items()}
+    return {c: units[c.partition("[")[0]] for c in columns if c.partition("[")[0] in units}
