@@ -32,6 +32,7 @@ def check(recording: Recording) -> list[Finding]:
     found = []
     rates: dict[tuple[float, float], list[str]] = {}
     drifts: dict[str, tuple[int, list[Finding]]] = {}  # of each clock, from the stream that tells most
+    several = len({array.clock for array in recording.signals.values()}) > 1
     for stream in streams(recording):
         if stream.time.size < 2:
             continue
@@ -42,7 +43,7 @@ def check(recording: Recording) -> list[Finding]:
             continue
         found += _jumps(stream, *arrivals)
         if arrivals[0].size > drifts.get(stream.clock, (0, []))[0]:
-            drifts[stream.clock] = (arrivals[0].size, _drift(arrivals[0], arrivals[1]))
+            drifts[stream.clock] = (arrivals[0].size, _drift(arrivals[0], arrivals[1], several=several))
     found += [_rate_finding(nominal, real, names) for (nominal, real), names in rates.items()]
     return [*found, *(finding for _, findings in drifts.values() for finding in findings)]
 
@@ -154,10 +155,10 @@ def _rate(
     if (np.diff(time) < 0).any():
         return
     rhythm = cadence(time)
-    if not rhythm.regular or time.size < 100 or stream.commanded:
+    if not rhythm.regular or time.size < 100 or stream.commanded or stream.slow:
         return
     real = 1.0 / rhythm.period
-    claimed = _claimed(metadata, stream.name)
+    claimed = _claimed(metadata, stream.name, real)
     nominal = claimed if claimed is not None else min(_NICE, key=lambda rate: abs(math.log(real / rate)))
     deviation = real / nominal - 1.0
     limit = WRONG_NOMINAL if claimed is None else math.inf
@@ -171,14 +172,15 @@ def _uncertainty(time: Column, rhythm: Cadence) -> float:
     return rhythm.jitter / (rhythm.period * 16.0 * math.sqrt(max(time.size / 16.0, 1.0)))
 
 
-def _claimed(metadata: Mapping[str, Mapping[str, str]], stream: str) -> float | None:
+def _claimed(metadata: Mapping[str, Mapping[str, str]], stream: str, real: float) -> float | None:
+    """The rate that the source claims for the stream, or for the whole table if the stream comes near it."""
     claims = metadata.get("claims", {})
-    for key in (f"{stream}.rate_hz", "rate_hz"):
+    for key, near in ((f"{stream}.rate_hz", math.inf), ("rate_hz", 0.4)):
         try:
             rate = float(claims[key])
         except (KeyError, TypeError, ValueError):
             continue
-        if math.isfinite(rate) and rate > 0:
+        if math.isfinite(rate) and rate > 0 and abs(real / rate - 1.0) < near:
             return rate
     return None
 
@@ -245,7 +247,7 @@ def _jumps(stream: Stream, time: Column, offset: Column, rows: NDArray[np.int64]
     ]
 
 
-def _drift(time: Column, offset: Column) -> list[Finding]:
+def _drift(time: Column, offset: Column, *, several: bool) -> list[Finding]:
     """Slope of the earliest arrivals of each of twenty spans: delays only ever add."""
     duration = float(time[-1] - time[0])
     if duration < 5.0 or np.abs(np.diff(offset)).max() > JUMP:
@@ -265,7 +267,7 @@ def _drift(time: Column, offset: Column) -> list[Finding]:
     return [
         Finding(
             "clocks",
-            Grade.DEGRADES if apart > 0.02 else Grade.HARMLESS,
+            Grade.DEGRADES if several and apart > 0.02 else Grade.HARMLESS,
             f"The drone's clock runs {abs(ppm):.0f} ppm {'fast' if ppm > 0 else 'slow'} against the host's: "
             f"{1000 * apart:.1f} ms over the recording.",
             evidence={"drift_ppm": ppm, "ci95_ppm": 1e6 * deviation, "apart_s": apart, "duration_s": duration},

@@ -1,7 +1,7 @@
 """Check: was there a flight at all, how did it begin and end, did the drone tip over or crash.
 
-A landing is rough by nature: 50 to 120 m/s^2 and 20 rad/s at the touch of the ground are normal. So a crash is told by what
-a landing does not have: a fast fall or slide into the ground, a drone that ends on its side, rotors cut at height.
+A landing is rough by nature: 50 to 120 m/s^2 and 20 rad/s at the touch of the ground are normal. So a crash is told by
+what a landing does not have: a fast fall or slide into the ground, a drone that ends on its side, rotors cut at height.
 """
 
 import math
@@ -15,10 +15,9 @@ from crazyem.recordings.recording import Recording
 
 UPSET = 90.0  # degrees of tilt
 LYING = 60.0  # degrees of tilt at rest
-FAST = 1.2  # m/s into the ground; a controller lands at up to 0.8, a drop from 5 cm ends at 1.0
+FAST = 1.5  # m/s into the ground; a controller lands at up to 0.8, a drop from 10 cm ends at 1.4
+APPROACH = 0.05  # s before the ground, over which that speed is taken
 DROPPED = 0.4  # m above ground at which rotors stop
-AT_EDGE = 0.3  # s from the ends of the recording
-_UP = ("position", "attitude", "specific_force")
 
 
 def check(recording: Recording) -> list[Finding]:
@@ -53,16 +52,16 @@ def _no_flight(flight: Airtime) -> Finding:
 
 def _course(flight: Airtime) -> list[Finding]:
     """Where a recording begins or ends in the air, or holds several flights: the times in the air."""
-    starts = flight.airborne[0][0] - flight.begin < AT_EDGE
-    ends = flight.end - flight.airborne[-1][1] < AT_EDGE
+    starts = flight.lifting[0][0] <= flight.begin
+    ends = flight.lifting[-1][1] >= flight.end
     count = len(flight.airborne)
     remarks = []
     if count > 1:
         remarks.append(f"holds {count} flights")
     if starts:
-        remarks.append("begins in the air")
+        remarks.append("begins with rotors at work")
     if ends:
-        remarks.append("ends in the air")
+        remarks.append("ends with rotors at work")
     if not remarks:
         return []
     total = sum(b - a for a, b in flight.airborne)
@@ -206,24 +205,26 @@ def _impacts(recording: Recording, flight: Airtime) -> list[Finding]:
         low = np.flatnonzero((z[1:] < 0.06) & (z[:-1] >= 0.06))
         for k in low:
             i = rows[k]
-            j = int(np.searchsorted(time, time[i] - 0.1))
-            if 0 <= j < i and time[i] - time[j] < 0.2:
-                fall = float(np.linalg.norm(position[i] - position[j]) / (time[i] - time[j]))
-                down = float((position[j, 2] - position[i, 2]) / (time[i] - time[j]))
-                if fall > FAST and down > 0.5 * FAST:
-                    hits.append((float(time[i]), fall))
+            j = min(int(np.searchsorted(time, time[i] - APPROACH)), int(i) - 1)
+            lasting = float(time[i] - time[j])
+            if 0.0 < lasting < 3.0 * APPROACH:
+                speed = float(np.linalg.norm(position[i] - position[j])) / lasting
+                down = float(position[j, 2] - position[i, 2]) / lasting
+                if speed > FAST and down > 0.5 * FAST:
+                    hits.append((float(time[i]), speed))
     if not hits:
         return []
     when, speed = max(hits, key=lambda hit: hit[1])
     spans: Intervals = tuple((t - 0.1, t + 0.5) for t, _ in hits)
+    over = all(end < hits[0][0] for _, end in flight.lifting)
     return [
         Finding(
             "flight",
-            Grade.DEGRADES,
-            f"The drone hits the ground at {speed:.1f} m/s.",
+            Grade.HARMLESS if over else Grade.DEGRADES,
+            f"The drone hits the ground at {speed:.1f} m/s{', its rotors already stopped' if over else ''}.",
             intervals=longest(spans),
             evidence={"speed_m_s": speed, "time_s": when, **_violence(recording, when)},
-            advice=f"Use the flight up to about {when - 0.1:.1f} s; estimates of the onboard filter suffer from such a shock.",
+            advice=f"Use the flight up to about {when - 0.1:.1f} s; the onboard filter suffers from such a shock.",
         )
     ]
 
@@ -236,12 +237,15 @@ def _drops(recording: Recording, flight: Airtime) -> list[Finding]:
     time, position = path
     found = []
     for _, end in flight.lifting:
-        if flight.end - end < AT_EDGE:
+        if flight.end - end < 0.3:
             continue
         i = int(np.searchsorted(time, end))
         if i >= time.size or abs(float(time[i]) - end) > 0.1:
             continue
         height = float(position[i, 2]) - flight.ground
+        before = position[(time > end - 0.2) & (time <= end)]
+        if before.shape[0] < 3 or not (before[1:] != before[:-1]).any():
+            continue  # the log stood still: nobody knows when they stopped
         later = position[(time > end) & (time < end + 1.0), 2]
         fell = height - (float(later.min()) - flight.ground) if later.size else 0.0
         if height > DROPPED and fell > 0.5 * height:

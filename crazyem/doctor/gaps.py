@@ -1,5 +1,7 @@
 """Check: gaps and dropped records, each stream against its own period; pauses of the whole recording apart."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,7 @@ from crazyem.recordings.recording import Recording
 PAUSE = 1.0  # s of silence of everything: the recorder stood still, or the link was gone
 NOTED = 0.05  # share of records lost from which results suffer
 LONG = 0.1  # s: longer than a drone's attitude lasts without measurement
+SAME_MOMENT = 0.6  # s
 _AROUND = 3  # neighbouring intervals over which a late record may catch up
 
 
@@ -24,14 +27,19 @@ def check(recording: Recording) -> list[Finding]:
         found.append(_pause_finding(pauses))
     begin = min(float(s.time.min()) for s in groups)
     end = max(float(s.time.max()) for s in groups)
+    axes: dict[tuple[str, int, float, float, float], list[Stream]] = {}
     for stream in groups:
-        time = np.sort(stream.time) if (np.diff(stream.time) < 0).any() else stream.time
+        if not stream.commanded:
+            axes.setdefault(stream.axis, []).append(stream)
+    ends: list[_End] = []
+    for sharing in axes.values():
+        time = np.sort(sharing[0].time) if (np.diff(sharing[0].time) < 0).any() else sharing[0].time
         rhythm = cadence(time)
-        if not rhythm.regular or stream.commanded:
-            continue
-        found += _drops(stream, time, rhythm, pauses)
-        found += _ends(stream, time, rhythm, begin, end)
-    return found
+        if rhythm.regular:
+            found += _drops(sharing, time, rhythm, pauses)
+            for stream in sharing:
+                ends += _ends(stream, rhythm, begin, end)
+    return found + _end_findings(ends, end - begin)
 
 
 def lost_records(time: NDArray[np.float64], period: float) -> NDArray[np.int64]:
@@ -85,7 +93,7 @@ def _pause_finding(pauses: Intervals) -> Finding:
     )
 
 
-def _drops(stream: Stream, time: NDArray[np.float64], rhythm: Cadence, pauses: Intervals) -> list[Finding]:
+def _drops(sharing: list[Stream], time: NDArray[np.float64], rhythm: Cadence, pauses: Intervals) -> list[Finding]:
     lost = lost_records(time, rhythm.period)
     if pauses:
         starts = np.array([a for a, _ in pauses])
@@ -103,13 +111,16 @@ def _drops(stream: Stream, time: NDArray[np.float64], rhythm: Cadence, pauses: I
     grade = graded(share, degrades=NOTED, unusable=0.6)
     if grade is Grade.HARMLESS and lasting > max(LONG, 3.0 * rhythm.period):
         grade = Grade.DEGRADES
+    names = [name for stream in sharing for name in stream.names]
+    if all(stream.slow for stream in sharing):
+        grade = Grade.HARMLESS
     return [
         Finding(
             "gaps",
             grade,
-            f"{stream.name}: {_number(count, 'record')} ({100 * share:.2g} %) missing in "
-            f"{_number(rows.size, 'place')}, the longest gap {1000 * lasting:.0f} ms.",
-            signal=stream.names[0] if len(stream.names) == 1 else "",
+            f"{listed([stream.name for stream in sharing])}: {_number(count, 'record')} ({100 * share:.2g} %) missing "
+            f"in {_number(rows.size, 'place')}, the longest gap {1000 * lasting:.0f} ms.",
+            signal=names[0] if len(names) == 1 else "",
             intervals=longest((float(time[i]), float(time[i + 1])) for i in rows),
             evidence={
                 "lost": count,
@@ -127,32 +138,52 @@ def _number(count: int, word: str) -> str:
     return f"{count} {word}" if count == 1 else f"{count} {word}s"
 
 
-def _ends(stream: Stream, time: NDArray[np.float64], rhythm: Cadence, begin: float, end: float) -> list[Finding]:
-    """A stream that covers less than the recording, or whose values are missing from some time on."""
-    spans: dict[tuple[float, float], list[str]] = {}
-    for name, array in zip(stream.names, stream.arrays, strict=True):
-        there = np.isfinite(array.value).any(axis=1)
-        if there.any():
-            when = array.time[there]
-            spans.setdefault((float(when.min()), float(when.max())), []).append(name)
+@dataclass(frozen=True, slots=True)
+class _End:
+    """Where signals have no values at the start or the end of the recording."""
+
+    last: bool
+    start: float
+    end: float
+    names: tuple[str, ...]
+
+
+def _ends(stream: Stream, rhythm: Cadence, begin: float, end: float) -> list[_End]:
+    """Signals that cover less than the recording."""
+    least = max(1.0, 20.0 * rhythm.period)
     found = []
-    for (first, last), names in spans.items():
-        least = max(1.0, 20.0 * rhythm.period)
-        for silent, (a, b), words in (
-            (end - last, (last, end), f"no values in the last {end - last:.1f} s of the recording"),
-            (first - begin, (begin, first), f"no values in the first {first - begin:.1f} s of the recording"),
-        ):
-            if silent > least:
-                share = silent / max(end - begin, 1e-9)
-                found.append(
-                    Finding(
-                        "gaps",
-                        graded(share, degrades=0.1),
-                        f"{listed(names)}: {words}.",
-                        signal=names[0] if len(names) == 1 else "",
-                        intervals=((a, b),),
-                        evidence={"silent_s": silent, "share": share},
-                        advice="Use only the part of the flight in which all needed signals are there.",
-                    )
-                )
+    for name, array in zip(stream.names, stream.arrays, strict=True):
+        there = np.flatnonzero(np.isfinite(array.value).any(axis=1))
+        if there.size and array.quantity:
+            first, last = float(array.time[there].min()), float(array.time[there].max())
+            if end - last > least:
+                found.append(_End(True, last, end, (name,)))
+            if first - begin > least:
+                found.append(_End(False, begin, first, (name,)))
+    return found
+
+
+def _end_findings(ends: list[_End], duration: float) -> list[Finding]:
+    """One finding for the signals that fall silent, or come, at about the same time."""
+    found = []
+    while ends:
+        one = ends[0]
+        close = [
+            e for e in ends if e.last == one.last and abs(e.start - one.start) + abs(e.end - one.end) < SAME_MOMENT
+        ]
+        ends = [e for e in ends if e not in close]
+        names = [name for e in close for name in e.names]
+        silent = max(e.end - e.start for e in close)
+        share = silent / max(duration, 1e-9)
+        found.append(
+            Finding(
+                "gaps",
+                graded(share, degrades=0.1),
+                f"{listed(names)}: no values in the {'last' if one.last else 'first'} {silent:.1f} s of the recording.",
+                signal=names[0] if len(names) == 1 else "",
+                intervals=((min(e.start for e in close), max(e.end for e in close)),),
+                evidence={"silent_s": silent, "share": share, "signals": len(names)},
+                advice="Use only the part of the flight in which all needed signals are there.",
+            )
+        )
     return found

@@ -97,6 +97,8 @@ def _signal(name: str, array: SignalArray) -> list[Finding]:
     # a smooth signal has nine near misses for every hit by chance
     if hits < 2 or hits < 0.5 * misses:
         return []
+    if array.marked.any() and hits < NOTED * time.size:
+        return []  # the reader has dealt with this signal, by its own rule
     present = int(np.isfinite(value).all(axis=1).sum())
     share = hits / present
     wide = line.on.copy()

@@ -1,7 +1,8 @@
 """Check: rows and values stored again without a new measurement, and the rate at which there really was one.
 
-A coarse signal of a drone that hovers repeats by chance. So only fine signals are believed: those whose steps are rarely
-as small as a few of their own resolutions. Coarse ones that repeat together with a fine one came in the same packet.
+A coarse signal of a drone that hovers repeats by chance. So only fine signals are believed: those whose steps
+are rarely as small as a few of their own resolutions. Coarse ones that repeat together with a fine one came in the same
+packet.
 """
 
 import numpy as np

@@ -46,7 +46,7 @@ def _upper(
     shares = flags[rows].mean(axis=0)
     if not flags.any():
         return []
-    any_rotor = flags.any(axis=1)
+    any_rotor: NDArray[np.bool_] = np.logical_or.reduce(flags, axis=1)
     share = float(any_rotor[rows].mean())
     spans = _merged(time, any_rotor)
     lasting = max(b - a for a, b in spans)
@@ -102,7 +102,7 @@ def _lower(
         # a floor is a value that all four share: idle or zero
         if low <= max(idle, floor) * (1.0 + 1e-6) and low < 0.35:
             flags[:, rotor] = (column <= low * (1.0 + 1e-6)) & rows
-    any_rotor = flags.any(axis=1)
+    any_rotor: NDArray[np.bool_] = np.logical_or.reduce(flags, axis=1)
     share = float(any_rotor[rows].mean())
     if any_rotor.sum() < 3 or share < 5e-4:
         return []

@@ -48,6 +48,12 @@ class Stream:
         return self.arrays[0].time
 
     @property
+    def axis(self) -> tuple[str, int, float, float, float]:
+        """Equal for streams that share their stamps, as those of one resampled table do."""
+        t = self.time
+        return (self.clock, t.size, float(t[0]), float(t[-1]), float(t.sum()))
+
+    @property
     def clock(self) -> str:
         return self.arrays[0].clock
 
@@ -55,6 +61,11 @@ class Stream:
     def commanded(self) -> bool:
         """True if nothing in it was measured."""
         return all(array.quantity in COMMANDED for array in self.arrays)
+
+    @property
+    def slow(self) -> bool:
+        """True if it varies so slowly that a lost sample does not matter: the voltage alone."""
+        return all(array.quantity == "voltage" for array in self.arrays)
 
 
 def streams(recording: Recording) -> list[Stream]:
@@ -198,6 +209,7 @@ def graded(share: float, *, degrades: float, unusable: float = math.inf) -> Grad
 SHORTEST_FLIGHT = 0.4  # s of lift; less is a hop or a test of the rotors
 LONGEST_FALL = 0.6  # s without lift that a manoeuvre may have
 LIFTED = 0.03  # m above the ground
+_RAW_MOTORS = ("motor.m1", "motor.m2", "motor.m3", "motor.m4")
 _LIFT_SIGNALS = ("motor_command", "motor_request", "rotor_speed", "wrench_command", "mixer_command")
 
 
@@ -231,6 +243,13 @@ def airtime(recording: Recording) -> Airtime | None:
             time, value = ordered(recording.signals[name])
             if time.size > 10:
                 return _from_rotors(name, time, value, height)
+    raw = [recording.signals[name] for name in _RAW_MOTORS if name in recording.signals]
+    if len(raw) == len(_RAW_MOTORS) and len({array.time.size for array in raw}) == 1 and raw[0].time.size > 10:
+        # duty or request: nobody knows which, but both say when the rotors carried
+        value = np.column_stack([array.value[:, 0] for array in raw]) / 65535.0
+        sound = np.isfinite(value).all(axis=1) & np.isfinite(raw[0].time)
+        if sound.sum() > 10 and (np.diff(raw[0].time[sound]) >= 0).all():
+            return _from_rotors("motor_command", raw[0].time[sound], value[sound], height)
     if height is None:
         return None
     time, z = height
@@ -268,8 +287,12 @@ def _from_rotors(
     if height is None:
         return Airtime(lifting, lifting, math.nan, peak, math.nan, float(time[0]), float(time[-1]))
     when, z = height
-    resting = ~inside(when, tuple((a - 0.5, b + 2.0) for a, b in lifting))
-    ground = float(np.median(z[resting])) if resting.sum() >= 5 else float(z.min())
+    known = (when >= time[0]) & (when <= time[-1] + 0.5)
+    resting = known & ~inside(when, tuple((a - 0.1, b + 0.5) for a, b in lifting))
+    climbed = float(np.ptp(z))
+    if resting.sum() < 5:  # the rotors never rest: the recording does not show the ground
+        return Airtime(lifting, lifting, math.nan, peak, climbed, float(time[0]), float(time[-1]))
+    ground = float(np.median(z[resting]))
     airborne = []
     for start, end in lifting:
         rows = np.flatnonzero((when >= start) & (when <= end) & (z > ground + LIFTED))
@@ -277,7 +300,7 @@ def _from_rotors(
             airborne.append((float(when[rows[0]]), float(when[rows[-1]])))
         elif not ((when >= start) & (when <= end)).any():
             airborne.append((start, end))
-    return Airtime(lifting, tuple(airborne), ground, peak, float(np.ptp(z)), float(time[0]), float(time[-1]))
+    return Airtime(lifting, tuple(airborne), ground, peak, climbed, float(time[0]), float(time[-1]))
 
 
 def _closed(time: NDArray[np.float64], flags: NDArray[np.bool_]) -> Intervals:
