@@ -2,7 +2,7 @@
 
 A record's length is known from its id only, so records must be walked from the first to the last. Logs are long runs of
 one kind with few others between them, so a run is taken in one comparison; where kinds alternate, the walk is a plain
-loop (0.2 us a record).
+loop (0.3 us a record).
 """
 
 from array import array
@@ -37,33 +37,39 @@ class Records:
 
 def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int) -> Records:
     """Every whole record of `data[begin:end]`, up to the first that is cut off or of an unknown kind."""
-    kinds = {event.identifier: i for i, event in enumerate(events)}
-    sizes = [event.layout.itemsize for event in events]
-    start, kind = array("q"), array("H")
-    at, previous, streak = begin, -1, 0
-    unknown: int | None = None
-    while at + 2 <= end:
-        identifier = data[at] | data[at + 1] << 8
-        found = kinds.get(identifier)
-        if found is None:
-            unknown = identifier
+    sizes = {event.identifier.to_bytes(2, "little"): event.layout.itemsize for event in events}
+    start = array("q")
+    append = start.append
+    at, previous, streak = begin, b"", 0
+    while True:
+        identifier = data[at : at + 2]
+        size = sizes.get(identifier)
+        if size is None or at + size > end:
             break
-        size = sizes[found]
-        if at + size > end:
-            break
-        streak = streak + 1 if found == previous else 1
-        previous = found
+        if identifier != previous:
+            previous, streak = identifier, 0
+        streak += 1
         if streak < _STREAK:
-            start.append(at)
-            kind.append(found)
+            append(at)
             at += size
             continue
-        run = _run(data, at, end, size, identifier)
+        run = _run(data, at, end, size, int.from_bytes(identifier, "little"))
         start.frombytes(np.arange(at, at + run * size, size, dtype=np.int64).tobytes())
-        kind.frombytes(np.full(run, found, np.uint16).tobytes())
         at += run * size
         streak = _STREAK - 1 if run == _WINDOW else 0  # a full window: the run may go on
-    return Records(np.frombuffer(start, np.int64), np.frombuffer(kind, np.uint16), at, unknown)
+    starts = np.frombuffer(start, np.int64)
+    unknown = int.from_bytes(identifier, "little") if size is None and at + 2 <= end else None
+    return Records(starts, _kinds(data, events, starts), at, unknown)
+
+
+def _kinds(data: bytes, events: tuple[EventType, ...], start: NDArray[np.int64]) -> NDArray[np.uint16]:
+    """(n,) index of the event type of each record."""
+    if len(events) == 1:
+        return np.zeros(start.size, np.uint16)
+    index = np.zeros(1 << 16, np.uint16)
+    index[[event.identifier for event in events]] = np.arange(len(events))
+    source = np.frombuffer(data, np.uint8)
+    return index[source[start] | source[start + 1].astype(np.uint16) << 8]
 
 
 def _run(data: bytes, at: int, end: int, size: int, identifier: int) -> int:
