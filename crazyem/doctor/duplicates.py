@@ -1,0 +1,321 @@
+"""Flights that are in a folder twice: whole or trimmed copies, with other clocks, units or formats.
+
+A fingerprint is made of turning points: instants at which a measured channel is highest or lowest among its neighbours.
+Three of them in a row give two spans of time and the ratio of two changes of value; rounded, these are a number that no
+shift of the clock and no unit, sign or offset of the channel changes, and that its noise makes rare. Two flights that
+share many such numbers, all at one distance in time, are one flight; two flights along one trajectory share some, at
+all distances. Setpoints are left out: they are equal in different flights.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+from crazyem.doctor.envelope import sound_samples
+from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.recording import Recording, SignalArray
+
+Array = NDArray[np.float64]
+Hashes = NDArray[np.uint32]
+
+NEIGHBOURS = 6  # samples on each side that a turning point stands out from
+SPAN_STEP = 0.005  # s, rounding of the spans
+RATIO_STEP = 0.1  # rounding of the logarithm of the ratio; there are two roundings, half a step apart
+PER_SECOND = 40.0  # numbers kept, of those there are, chosen by their own value so that copies choose alike
+MOST = 60_000  # numbers kept of a very long flight
+LARGE_GROUP = 16  # files that share a number, from which on not every pair of them is looked at
+TOLERANCE = 0.02  # s within which distances in time agree
+FEWEST = 20  # numbers in common at one distance
+SHARE = 0.15  # of the numbers in the common stretch that must be in common
+_CHANNELS = 12
+_CHANNELS_LARGE = 5  # for recordings with more than _LARGE rows a channel
+_LARGE = 150_000
+_PREFERRED = (
+    "body_rate", "specific_force", "motor_command", "velocity", "position", "rotor_speed", "attitude", "motor_request",
+    "mixer_command", "acceleration", "euler",
+)  # fmt: skip
+_NEVER = ("setpoint", "sp_", "ctrltarget", "ref")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fingerprint:
+    """What a flight is recognised by.
+
+    Attributes:
+        path: of the recording.
+        start_s, end_s: of its time axis.
+        hashes: (n,) numbers, see above.
+        times: (n,) s at which they are.
+    """
+
+    path: str
+    start_s: float
+    end_s: float
+    hashes: Hashes
+    times: Array
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "path": self.path,
+            "start_s": self.start_s,
+            "end_s": self.end_s,
+            "hashes": self.hashes.tolist(),
+            "times": self.times.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "Fingerprint":
+        """Inverse of `to_dict`."""
+        hashes, times = np.array(data["hashes"], np.uint32), np.array(data["times"], float)
+        return cls(str(data["path"]), float(data["start_s"]), float(data["end_s"]), hashes, times)
+
+
+@dataclass(frozen=True, slots=True)
+class Duplicate:
+    """Two recordings of one flight.
+
+    Attributes:
+        first, second: paths, the longer recording first.
+        overlap_s: how long the common stretch is.
+        offset_s: time in the second recording less time in the first, at one instant.
+        share_first, share_second: of each recording that is common.
+        start_s, end_s: of the common stretch, on the time axis of the first.
+        matches: numbers in common.
+    """
+
+    first: str
+    second: str
+    overlap_s: float
+    offset_s: float
+    share_first: float
+    share_second: float
+    start_s: float
+    end_s: float
+    matches: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+    def finding(self) -> Finding:
+        """For people, on the time axis of the first recording."""
+        if self.share_first > 0.98 and self.share_second > 0.98:
+            what = f"{self.second} is the same flight as {self.first}"
+        elif self.share_second > 0.98:
+            what = f"{self.second} is a part of {self.first}"
+        else:
+            what = f"{self.second} and {self.first} have a part in common"
+        return Finding(
+            "duplicate",
+            Grade.DEGRADES,
+            f"{what}: {self.overlap_s:.1f} s, {self.offset_s:+.3f} s apart on their time axes.",
+            intervals=((self.start_s, self.end_s),),
+            evidence={
+                "overlap_s": self.overlap_s,
+                "offset_s": self.offset_s,
+                "share_first": self.share_first,
+                "share_second": self.share_second,
+                "matches": self.matches,
+            },
+            advice="Use one of them only: as two they count one flight twice, in training and test they leak.",
+        )
+
+
+def fingerprint(recording: Recording) -> Fingerprint:
+    """What the recording is recognised by; without noisy measurements it is empty and nothing is ever found."""
+    hashes, times = [np.zeros(0, np.uint32)], [np.zeros(0)]
+    for time, value in _channels(recording):
+        h, t = _numbers(time, value)
+        hashes.append(h)
+        times.append(t)
+    hashed, at = np.concatenate(hashes), np.concatenate(times)
+    stamps = [a.time[np.isfinite(a.time)] for a in recording.signals.values()]
+    stamps = [t for t in stamps if t.size]
+    start = min((float(t.min()) for t in stamps), default=0.0)
+    end = max((float(t.max()) for t in stamps), default=0.0)
+    if at.size:
+        rate = at.size / max(end - start, 1.0)
+        thin = max(0, math.ceil(math.log2(rate / PER_SECOND))) if rate > PER_SECOND else 0
+        while hashed.size * 2.0**-thin > MOST:
+            thin += 1
+        keep = hashed < np.uint32(min(2.0 ** (32 - thin), 2.0**32 - 1))
+        hashed, at = hashed[keep], at[keep]
+    return Fingerprint(recording.path, start, end, hashed, at)
+
+
+def find_duplicates(fingerprints: Sequence[Fingerprint] | Iterable[Fingerprint]) -> list[Duplicate]:
+    """Pairs of recordings of one flight, the most in common first.
+
+    Of several copies each is paired with the longest; the pairs among the rest, which follow, are left out.
+    """
+    prints = sorted(fingerprints, key=lambda p: (p.start_s - p.end_s, p.path))
+    votes = _votes(prints)
+    found: list[Duplicate] = []
+    partners: dict[int, set[int]] = {}
+    for (a, b), offsets in sorted(votes.items()):
+        if partners.get(a, set()) & partners.get(b, set()):
+            continue
+        duplicate = _judge(prints[a], prints[b], offsets)
+        if duplicate is not None:
+            found.append(duplicate)
+            partners.setdefault(b, set()).add(a)
+    return sorted(found, key=lambda d: (-d.overlap_s, d.first, d.second))
+
+
+def _channels(recording: Recording) -> list[tuple[Array, Array]]:
+    """Times (n,) and values (n,) of the channels to look at, measurements of the vocabulary first."""
+    names = sorted(recording.signals, key=lambda name: _rank(name, recording.signals[name]))
+    chosen: list[tuple[Array, Array]] = []
+    for name in names:
+        array = recording.signals[name]
+        low = name.lower()
+        if any(low.startswith(word) or f".{word}" in low for word in _NEVER) or array.quantity.startswith("setpoint"):
+            continue
+        found = sound_samples(array)
+        if found is None or found[0].size < 8 * NEIGHBOURS:
+            continue
+        for column in found[1].T:
+            if len(chosen) >= (_CHANNELS_LARGE if found[0].size > _LARGE else _CHANNELS):
+                return chosen
+            chosen.append((found[0], column))
+    return chosen
+
+
+def _rank(name: str, array: SignalArray) -> tuple[int, str]:
+    quantity = array.quantity
+    place = _PREFERRED.index(quantity) if quantity in _PREFERRED else len(_PREFERRED)
+    return (2 * place + ("@" in name), name)
+
+
+def _numbers(time: Array, value: Array) -> tuple[Hashes, Array]:
+    """The numbers (n,) of one channel and their times (n,)."""
+    fresh = np.append(True, value[1:] != value[:-1])  # held values are one sample
+    time, value = time[fresh], value[fresh]
+    if value.size < 4 * NEIGHBOURS:
+        return np.zeros(0, np.uint32), np.zeros(0)
+    size = 2 * NEIGHBOURS + 1
+    turning = (value == maximum_filter1d(value, size)) | (value == minimum_filter1d(value, size))
+    turning[:NEIGHBOURS] = turning[-NEIGHBOURS:] = False  # what stands out at an end may be nothing in a longer copy
+    t, v = time[turning], value[turning]
+    if t.size < 3:
+        return np.zeros(0, np.uint32), np.zeros(0)
+    spans, steps = np.round(np.diff(t) / SPAN_STEP), np.diff(v)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.log(np.abs(steps[1:] / steps[:-1])) / RATIO_STEP
+    good = np.isfinite(ratio) & (np.abs(ratio) < 1e3) & (spans[1:] < 1e5) & (spans[:-1] < 1e5)
+    against = (steps[1:] * steps[:-1] < 0.0)[good].astype(np.uint64)
+    parts = []
+    for shifted in (0, 1):
+        rounded = np.floor(ratio[good] + 0.5 * shifted).astype(np.int64) + 2_000
+        words = (spans[:-1][good].astype(np.uint64), spans[1:][good].astype(np.uint64), rounded.astype(np.uint64))
+        parts.append(_mixed(*words, 2 * against + np.uint64(shifted)))
+    return np.concatenate(parts), np.tile(t[1:-1][good], 2)
+
+
+def _mixed(*words: NDArray[np.uint64]) -> Hashes:
+    """A well mixed 32-bit number of some words (multiplications by odd constants; overflow is meant)."""
+    state = np.full(words[0].shape, 0x9E3779B97F4A7C15, np.uint64)
+    for word in words:
+        state = (state ^ word) * np.uint64(0xBF58476D1CE4E5B9)
+        state ^= state >> np.uint64(29)
+        state *= np.uint64(0x94D049BB133111EB)
+        state ^= state >> np.uint64(32)
+    return (state & np.uint64(0xFFFFFFFF)).astype(np.uint32)
+
+
+def _votes(prints: Sequence[Fingerprint]) -> dict[tuple[int, int], Array]:
+    """For each pair of prints with enough numbers in common, the distances in time (n,) between them."""
+    if not prints:
+        return {}
+    owner = np.repeat(np.arange(len(prints)), [p.hashes.size for p in prints])
+    hashes = np.concatenate([p.hashes for p in prints])
+    times = np.concatenate([p.times for p in prints])
+    place = np.lexsort((owner, hashes))
+    hashes, owner, times = hashes[place], owner[place], times[place]
+    edges = np.flatnonzero(np.append(True, hashes[1:] != hashes[:-1]))
+    start = np.repeat(edges, np.diff(np.append(edges, hashes.size)))
+    rows = np.arange(hashes.size)
+    firsts, seconds = [], []
+    for back in range(1, LARGE_GROUP):  # each with the ones before it in its group
+        other = rows - back
+        inside = other >= start
+        if not inside.any():
+            break
+        firsts.append(other[inside])
+        seconds.append(rows[inside])
+    far = rows - start >= LARGE_GROUP  # and of large groups with its first
+    firsts.append(start[far])
+    seconds.append(rows[far])
+    a, b = np.concatenate(firsts), np.concatenate(seconds)
+    apart = owner[a] != owner[b]
+    a, b = a[apart], b[apart]
+    pair = owner[a].astype(np.int64) * len(prints) + owner[b]
+    distance = times[b] - times[a]
+    place = np.argsort(pair, kind="stable")
+    pair, distance = pair[place], distance[place]
+    edges = np.flatnonzero(np.append(True, pair[1:] != pair[:-1])) if pair.size else np.zeros(0, int)
+    ends = np.append(edges[1:], pair.size)
+    return {divmod(int(pair[i]), len(prints)): np.sort(distance[i:j]) for i, j in zip(edges, ends) if j - i >= FEWEST}
+
+
+def _judge(first: Fingerprint, second: Fingerprint, distances: Array) -> Duplicate | None:
+    """Whether so many numbers are in common at one distance that it is one flight."""
+    upper = np.searchsorted(distances, distances + TOLERANCE, "right")
+    counts = upper - np.arange(distances.size)
+    best = int(np.argmax(counts))
+    if counts[best] < FEWEST:
+        return None
+    offset = float(np.median(distances[best : upper[best]]))
+    start = max(first.start_s, second.start_s - offset)
+    end = min(first.end_s, second.end_s - offset)
+    if not end > start:
+        return None
+    matched, seen = _matches(first, second, offset)
+    if matched.size < FEWEST:
+        return None
+    # the stretch reaches to the ends of the files unless the numbers in common end long before
+    reach = 5.0 * max(float(np.median(np.diff(np.sort(matched)))), 0.2)
+    low = start if matched.min() - start < max(reach, 2.0) else float(matched.min())
+    high = end if end - matched.max() < max(reach, 2.0) else float(matched.max())
+    inside = (seen >= low) & (seen <= high)
+    if not high > low or matched.size < SHARE * inside.sum():
+        return None
+    length = high - low
+    return Duplicate(
+        first=first.path,
+        second=second.path,
+        overlap_s=length,
+        offset_s=offset,
+        share_first=min(length / max(first.end_s - first.start_s, 1e-9), 1.0),
+        share_second=min(length / max(second.end_s - second.start_s, 1e-9), 1.0),
+        start_s=low,
+        end_s=high,
+        matches=int(matched.size),
+    )
+
+
+def _matches(first: Fingerprint, second: Fingerprint, offset: float) -> tuple[Array, Array]:
+    """Times in the first of numbers that the second has at that distance, and of all numbers of the poorer print."""
+    keys = [p.hashes.astype(np.int64) for p in (first, second)]
+    place = np.lexsort((second.times, keys[1]))
+    hashes, times = keys[1][place], second.times[place] - offset
+    # one search for both: numbers far apart, times within a number
+    scale = 1.0 / (4.0 * (abs(first.end_s - first.start_s) + abs(second.end_s - second.start_s) + abs(offset) + 1.0))
+    middle = 0.5 * (first.start_s + first.end_s)
+    sorted_keys = hashes + scale * (times - middle)
+    wanted = keys[0] + scale * (first.times - middle)
+    near = np.searchsorted(sorted_keys, wanted)
+    hit = np.zeros(first.times.size, bool)
+    for side in (near - 1, near):
+        at = np.clip(side, 0, max(hashes.size - 1, 0))
+        hit |= (hashes[at] == keys[0]) & (np.abs(times[at] - first.times) < TOLERANCE)
+    poorer = first.times if first.times.size / max(first.end_s - first.start_s, 1.0) <= second.times.size / max(
+        second.end_s - second.start_s, 1.0
+    ) else second.times - offset  # fmt: skip
+    return first.times[hit], poorer

@@ -1,0 +1,249 @@
+"""Lossless repairs of a recording, one finding at a time, each believed only if the check that found it is then silent.
+
+A repair makes a new recording and says in its metadata, section "fixes", what was done, in enough detail to undo it.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.doctor.envelope import sound_samples
+from crazyem.doctor.examine import CHECKS
+from crazyem.physics.rotations import rotation_matrix
+from crazyem.recordings.finding import Finding, Fix
+from crazyem.recordings.recording import Recording, SignalArray
+
+Array = NDArray[np.float64]
+Signals = dict[str, SignalArray]
+
+# What names rows comes first, while they are still where they were found; then times, since what compares signals needs
+# them; then values; then frames, which need an attitude in order.
+ORDER = ("mark", "unwrap", "sort", "shift", "scale", "world_to_body")
+_TIMES = ("unwrap", "sort", "shift")
+_ATTITUDE_REACH = 0.1  # s between an attitude and what it rotates
+
+
+def apply_fixes(recording: Recording, findings: Iterable[Finding]) -> tuple[Recording, tuple[Finding, ...]]:
+    """Repair what can be repaired without loss.
+
+    A finding of a check of the doctor is looked for again before and after its repair: one that another repair has
+    settled already is left alone, and a repair after which it is still found is taken back. Findings of readers cannot
+    be looked for again; their repairs are applied as they are.
+
+    Args:
+        recording: never changed.
+        findings: of `examine`, or some of them; those without a fix are passed over.
+
+    Returns: the repaired recording (the same if nothing was applied), and the findings whose repairs are in it.
+    """
+    wanted = sorted((f for f in findings if _possible(recording, f.fix)), key=lambda f: ORDER.index(f.fix.kind))  # type: ignore[union-attr]
+    applied: list[Finding] = []
+    for finding in wanted:
+        current = _again(recording, finding)
+        if current is None or not _possible(recording, current.fix):
+            continue
+        repaired = repair(recording, current)
+        if _checkable(finding) and _again(repaired, finding) is not None:
+            continue
+        recording = repaired
+        applied.append(finding)
+    if applied:
+        done = {id(f) for f in applied}
+        recording = replace(recording, findings=tuple(f for f in recording.findings if id(f) not in done))
+    return recording, tuple(applied)
+
+
+def repair(recording: Recording, finding: Finding) -> Recording:
+    """The recording with one finding's fix applied and noted, not verified."""
+    fix = finding.fix
+    assert fix is not None
+    signals: Signals = dict(recording.signals)
+    for name in fix.signals:
+        signals[name] = _KINDS[fix.kind](signals[name], fix, recording)
+    if fix.kind in _TIMES:
+        signals = _merged(_own_streams(signals, recording.signals, fix))
+    return replace(recording, signals=signals, metadata=_noted(recording.metadata, finding))
+
+
+def _again(recording: Recording, finding: Finding) -> Finding | None:
+    """The finding as it is made now: None if its check no longer makes it, itself if it cannot be made again."""
+    if not _checkable(finding):
+        return finding
+    check = next(c for c in CHECKS if c.module == finding.check)
+    return next((f for f in check.run(recording) if _same(f, finding)), None)
+
+
+def _checkable(finding: Finding) -> bool:
+    return any(check.module == finding.check for check in CHECKS)
+
+
+def _same(one: Finding, other: Finding) -> bool:
+    """Whether two findings ask for a repair of one kind of the same signals."""
+    a, b = one.fix, other.fix
+    if a is None or b is None or one.check != other.check or one.signal != other.signal:
+        return False
+    return a.kind == b.kind and set(a.signals) == set(b.signals)
+
+
+def _possible(recording: Recording, fix: Fix | None) -> bool:
+    """Whether a fix is well formed and can be undone."""
+    if fix is None or fix.kind not in _KINDS or not fix.signals:
+        return False
+    arrays = [recording.signals.get(name) for name in fix.signals]
+    if any(a is None for a in arrays) or not all(math.isfinite(f) for f in fix.factor):
+        return False
+    for array in arrays:
+        assert array is not None
+        rows = fix.rows
+        if rows is not None and rows.size and (rows.min() < 0 or rows.max() >= array.time.size):
+            return False
+        if fix.kind == "scale" and (len(fix.factor) not in (1, array.value.shape[1]) or 0.0 in fix.factor):
+            return False
+        if fix.kind == "world_to_body" and (array.value.shape[1] != 3 or "attitude" not in recording.signals):
+            return False
+    if fix.kind == "shift":
+        return len(fix.factor) == 1
+    if fix.kind == "unwrap":
+        return fix.rows is not None and len(fix.factor) == fix.rows.size
+    return fix.kind != "mark" or fix.rows is not None
+
+
+# kinds ---------------------------------------------------------------------------------------------------------
+
+
+def _scale(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
+    factor = np.broadcast_to(np.array(fix.factor, float), (array.value.shape[1],))
+    return replace(array, value=_on_rows(array.value, array.value * factor, fix.rows))
+
+
+def _shift(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
+    return replace(array, time=_on_rows(array.time, array.time + fix.factor[0], fix.rows))
+
+
+def _unwrap(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
+    assert fix.rows is not None
+    steps = np.zeros(array.time.size)
+    np.add.at(steps, fix.rows, np.array(fix.factor, float))
+    return replace(array, time=array.time + np.cumsum(steps))
+
+
+def _mark(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
+    assert fix.rows is not None
+    value, marked = array.value.copy(), array.marked.copy()
+    value[fix.rows], marked[fix.rows] = np.nan, True
+    return replace(array, value=value, marked=marked)
+
+
+def _sort(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
+    place = np.argsort(array.time, kind="stable")
+    return replace(
+        array,
+        time=array.time[place],
+        value=array.value[place],
+        order=array.order[place],
+        host_time=array.host_time[place],
+        marked=array.marked[place],
+    )
+
+
+def _world_to_body(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
+    """Rotated by the attitude at its stamps; what has no attitude within 0.1 s becomes missing."""
+    attitude = sound_samples(recording.signals["attitude"])
+    if attitude is None:
+        return array
+    matrix = rotation_matrix(_attitude_at(*attitude, array.time))
+    turned = np.einsum("kji,kj->ki", matrix, array.value)
+    lost = ~np.isfinite(turned).all(axis=1) & np.isfinite(array.value).all(axis=1)
+    if fix.rows is not None:
+        inside = np.zeros(array.time.size, bool)
+        inside[fix.rows] = True
+        lost &= inside
+    return replace(array, value=_on_rows(array.value, turned, fix.rows), marked=array.marked | lost)
+
+
+_KINDS: dict[str, Callable[[SignalArray, Fix, Recording], SignalArray]] = {
+    "scale": _scale,
+    "shift": _shift,
+    "unwrap": _unwrap,
+    "mark": _mark,
+    "sort": _sort,
+    "world_to_body": _world_to_body,
+}
+
+
+def _on_rows(old: Array, new: Array, rows: NDArray[np.int64] | None) -> Array:
+    if rows is None:
+        return new
+    result = old.copy()
+    result[rows] = new[rows]
+    return result
+
+
+def _attitude_at(stamps: Array, attitude: Array, time: Array) -> Array:
+    """Unit quaternions (n, 4) at times (n,), between neighbours; NaN where none is near."""
+    flips = np.append(0, np.cumsum(np.sum(attitude[1:] * attitude[:-1], axis=1) < 0.0))
+    continuous = attitude * np.where(flips % 2 == 1, -1.0, 1.0)[:, None]
+    mixed = np.column_stack([np.interp(time, stamps, column) for column in continuous.T])
+    mixed /= np.linalg.norm(mixed, axis=1, keepdims=True)
+    after = np.minimum(np.searchsorted(stamps, time), stamps.size - 1)
+    before = np.maximum(after - 1, 0)
+    reach = np.minimum(np.abs(stamps[after] - time), np.abs(stamps[before] - time))
+    mixed[~(reach <= _ATTITUDE_REACH)] = np.nan
+    return mixed
+
+
+# after times have changed ----------------------------------------------------------------------------------------
+
+
+def _own_streams(signals: Signals, before: Mapping[str, SignalArray], fix: Fix) -> Signals:
+    """Signals that no longer share the stamps of their stream get a stream of their own."""
+    changed = set(fix.signals)
+    for stream in {before[name].stream for name in changed}:
+        members = {name for name, array in before.items() if array.stream == stream}
+        if stream and not members <= changed:
+            for name in members & changed:
+                signals[name] = replace(signals[name], stream=f"{stream} {fix.kind}")
+    return signals
+
+
+def _merged(signals: Signals) -> Signals:
+    """Processing order by time, what was equal in time as it was before."""
+    arrays = list(signals.values())
+    time = np.concatenate([a.time for a in arrays])
+    order = np.concatenate([a.order for a in arrays])
+    rank = np.empty(time.size, np.int64)
+    rank[np.lexsort((order, time))] = np.arange(time.size)
+    parts = np.split(rank, np.cumsum([a.time.size for a in arrays])[:-1])
+    return {name: replace(a, order=part) for (name, a), part in zip(signals.items(), parts)}
+
+
+# provenance ----------------------------------------------------------------------------------------------------
+
+
+def _noted(metadata: Mapping[str, Mapping[str, str]], finding: Finding) -> dict[str, Mapping[str, str]]:
+    fix = finding.fix
+    assert fix is not None
+    fixes = dict(metadata.get("fixes", {}))
+    entry = {
+        "check": finding.check,
+        "kind": fix.kind,
+        "signals": list(fix.signals),
+        "factor": [float(f) for f in fix.factor],
+        "rows": None if fix.rows is None else runs(fix.rows) if fix.kind != "unwrap" else fix.rows.tolist(),
+        "text": finding.text,
+    }
+    fixes[f"{len(fixes) + 1:03d}"] = json.dumps(entry)
+    return {**metadata, "fixes": fixes}
+
+
+def runs(rows: NDArray[np.int64]) -> list[list[int]]:
+    """Sample numbers as [first, last] of each run of neighbours."""
+    rows = np.unique(rows)
+    if not rows.size:
+        return []
+    cuts = np.flatnonzero(np.diff(rows) > 1)
+    return [[int(a), int(b)] for a, b in zip(rows[np.append(0, cuts + 1)], rows[np.append(cuts, rows.size - 1)])]
