@@ -1,0 +1,174 @@
+"""A layout for Foxglove and Lichtblick that shows a flight: pose, parameters, residuals, link, motors, voltage."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from crazyem.recordings.mcap_messages import WORLD
+
+_COLOURS = ("#4e98e2", "#f5774d", "#6ac27c", "#b678d9")
+
+
+def foxglove_layout(topics: Mapping[str, Sequence[str]] | None = None) -> dict[str, Any]:
+    """The layout, ready for JSON; import it in the viewer's layout menu.
+
+    Args:
+        topics: topic -> field names of a recording, to plot what it has (`topics_of`); None: the topics of a flight
+            recorded by `crazyem fly` or `crazyem watch`.
+    """
+    motors = _found(topics, "motor_command_m{}", "motor_m{}", "/log/1")
+    voltage = _found(topics, "voltage", "pm_vbatMV", "/log/1")
+    panels: dict[str, Any] = {
+        "3D!pose": _scene(),
+        "Plot!mass": _plot("mass [kg], 95 % interval", _interval("mass")),
+        "Plot!inertia": _plot(
+            "inertia [kg m^2], 95 % intervals",
+            [path for i, n in enumerate(("Ixx", "Iyy", "Izz")) for path in _interval(n, _COLOURS[i])],
+        ),
+        "Plot!lag": _plot("motor time constant [s], 95 % interval", _interval("motor_time_constant", _COLOURS[3])),
+        "Plot!position_residual": _plot("position residual [m]", _residual("position")),
+        "Plot!attitude_residual": _plot("attitude residual [rad]", _residual("attitude")),
+        "Plot!rate_residual": _plot("body rate residual [rad/s]", _residual("body_rate")),
+        "Plot!link": _plot(
+            "link: packets a second, late, lost",
+            [
+                _path("/link.rate", "packets a second", 0),
+                _path("/link.lost", "lost", 1),
+                _path("/link.late", "late", 2),
+            ],
+        ),
+        "Plot!latency": _plot("link: delay over the promptest packets [s]", [_path("/link.latency", "delay", 0)]),
+        "Plot!motors": _plot(
+            "motor commands", [_path(motors.format(i), f"m{i}", i - 1) for i in (1, 2, 3, 4)] if motors else []
+        ),
+        "Plot!voltage": _plot("battery voltage", [_path(voltage, "voltage", 0)] if voltage else []),
+        "RawMessages!estimate": {"topicPath": "/estimate", "diffEnabled": False, "expansion": "all"},
+        "RosOut!log": {"topicToRender": "/events", "searchTerms": [], "minLogLevel": 1},
+    }
+    tabs = (
+        ("Estimate", _columns(_columns("Plot!mass", "Plot!inertia"), "Plot!lag")),
+        ("Residuals", _columns(_columns("Plot!position_residual", "Plot!attitude_residual"), "Plot!rate_residual")),
+        ("Link and power", _columns(_columns("Plot!link", "Plot!latency"), _columns("Plot!motors", "Plot!voltage"))),
+        ("Messages", "RawMessages!estimate"),
+    )
+    panels["Tab!right"] = {"activeTabIdx": 0, "tabs": [{"title": title, "layout": layout} for title, layout in tabs]}
+    return {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": {
+            "direction": "row",
+            "first": {"direction": "column", "first": "3D!pose", "second": "RosOut!log", "splitPercentage": 70},
+            "second": "Tab!right",
+            "splitPercentage": 45,
+        },
+    }
+
+
+def topics_of(announced: Sequence[Any]) -> dict[str, list[str]]:
+    """Topic -> field names of the protobuf channels among schemas and channels (records of the mcap library)."""
+    from google.protobuf import descriptor_pb2
+
+    schemas = {record.id: record for record in announced if not hasattr(record, "topic")}
+    found: dict[str, list[str]] = {}
+    for channel in announced:
+        schema = schemas.get(getattr(channel, "schema_id", -1)) if hasattr(channel, "topic") else None
+        if schema is None or schema.encoding != "protobuf":
+            continue
+        try:
+            files = descriptor_pb2.FileDescriptorSet.FromString(schema.data).file
+        except Exception:  # protobuf's DecodeError has no public base across its back ends
+            continue
+        for file in files:
+            for message in file.message_type:
+                if f"{file.package}.{message.name}" == schema.name:
+                    found[channel.topic] = [field.name for field in message.field]
+    return found
+
+
+def _found(topics: Mapping[str, Sequence[str]] | None, signal: str, variable: str, topic: str) -> str:
+    """Path of a signal of an imported recording, or of a variable of a log block; "" if the recording has neither."""
+    if topics is None:
+        return f"{topic}.{variable}"
+    for field in (signal, variable):
+        for name, fields in topics.items():
+            if field.format(1) in fields:
+                return f"{name}.{field}"
+    return ""
+
+
+def _interval(name: str, colour: str = _COLOURS[0]) -> list[dict[str, Any]]:
+    """The value and both ends of the interval of a parameter."""
+    where = f'/estimate.parameters[:]{{name=="{name}"}}'
+    return [
+        _path(f"{where}.value", name, colour=colour),
+        _path(f"{where}.ci95_low", f"{name}, low", colour=colour, width=0.75),
+        _path(f"{where}.ci95_high", f"{name}, high", colour=colour, width=0.75),
+    ]
+
+
+def _residual(what: str) -> list[dict[str, Any]]:
+    """Three components and the standard deviation expected of the first."""
+    paths = [_path(f"/residual.{what}_{axis}", axis, i) for i, axis in enumerate("xyz")]
+    return [*paths, _path(f"/residual.{what}_x_sd", "expected sd of x", colour="#888888")]
+
+
+def _path(value: str, label: str, number: int = 0, *, colour: str = "", width: float = 1.5) -> dict[str, Any]:
+    return {
+        "value": value,
+        "label": label,
+        "enabled": True,
+        "timestampMethod": "receiveTime",
+        "color": colour or _COLOURS[number],
+        "lineSize": width,
+        "showLine": True,
+    }
+
+
+def _plot(title: str, paths: list[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "foxglovePanelTitle": title,
+        "title": title,
+        "paths": paths,
+        "showXAxisLabels": True,
+        "showYAxisLabels": True,
+        "showLegend": True,
+        "legendDisplay": "floating",
+        "showPlotValuesInLegend": True,
+        "isSynced": True,
+        "xAxisVal": "timestamp",
+        "sidebarDimension": 240,
+    }
+
+
+def _scene() -> dict[str, Any]:
+    return {
+        "foxglovePanelTitle": "pose",
+        "followTf": WORLD,
+        "followMode": "follow-none",
+        "cameraState": {
+            "perspective": True,
+            "distance": 5,
+            "phi": 60,
+            "thetaOffset": 45,
+            "targetOffset": [0, 0, 0.5],
+            "target": [0, 0, 0],
+            "targetOrientation": [0, 0, 0, 1],
+            "fovy": 45,
+            "near": 0.01,
+            "far": 500,
+        },
+        "scene": {"transforms": {"axisScale": 0.3, "labelSize": 0.05}},
+        "transforms": {"frame:world": {"visible": True}, "frame:crazyflie": {"visible": True}},
+        "topics": {"/pose": {"visible": True, "type": "axis", "axisScale": 0.2}},
+        "layers": {
+            "grid": {"layerId": "foxglove.Grid", "visible": True, "frameId": WORLD, "size": 10, "divisions": 10}
+        },
+        "publish": {},
+        "imageMode": {},
+    }
+
+
+def _columns(first: Any, second: Any) -> dict[str, Any]:
+    """One above the other."""
+    return {"direction": "column", "first": first, "second": second}

@@ -1,0 +1,114 @@
+"""The viewer's layout: every path in it is in the messages we write, every panel is placed, once."""
+
+import json
+import re
+
+import pytest
+from test_mcap_signals import flight
+
+from crazyem.live.session import block_plan
+from crazyem.recordings import schemas
+from crazyem.recordings.layout import foxglove_layout, topics_of
+from crazyem.recordings.mcap_messages import EVENTS
+from crazyem.recordings.mcap_signals import write_recording
+from crazyem.recordings.mcap_survey import from_summary
+from crazyem.signals.packet import Block, Variable
+from crazyem.signals.vocabulary import MOTOR_BLOCK, ROTOR_SPEED_BLOCK
+
+PATH = re.compile(r"(?P<topic>(?:/\w+)+)\.(?P<fields>.+)")
+FILTER = re.compile(r'\[:\]\{(?P<key>\w+)=="(?P<value>\w+)"\}')
+
+
+def paths(layout):
+    return [path["value"] for panel in layout["configById"].values() for path in panel.get("paths", ())]
+
+
+def placed(node):
+    if isinstance(node, str):
+        return [node]
+    return [name for key in ("first", "second") for name in placed(node[key])]
+
+
+def descriptor_of(topic):
+    schema = dict(EVENTS.values())[topic]
+    return schemas.message_class(schema).DESCRIPTOR
+
+
+def resolve(descriptor, fields):
+    """Walk a path such as `parameters[:]{name=="mass"}.value` through a message; raises KeyError."""
+    for part in re.sub(FILTER, lambda m: f"[{m['key']}]", fields).split("."):
+        name, _, key = part.partition("[")
+        field = descriptor.fields_by_name[name]
+        descriptor = field.message_type
+        if key:
+            assert key.rstrip("]") in descriptor.fields_by_name
+    return field
+
+
+def test_every_path_is_in_the_messages():
+    found = paths(foxglove_layout())
+    assert len(found) > 20
+    for path in found:
+        match = PATH.fullmatch(path)
+        topic, fields = match["topic"], match["fields"]
+        if topic.startswith("/log/"):
+            continue
+        assert resolve(descriptor_of(topic), fields).type in (1, 3, 5), path  # a number
+
+
+@pytest.mark.parametrize("rotors", [False, True])
+def test_log_paths_are_in_the_blocks_of_a_flight(rotors):
+    """The motors' block is the second of the plan; each fits one packet, so blocks are numbered as planned."""
+    from crazyem.links.packing import pack
+
+    available = [
+        f"stateEstimateZ.{n}" for n in ["x", "y", "z", "vx", "vy", "vz", "quat", "rateRoll", "ratePitch", "rateYaw"]
+    ]
+    available += [*MOTOR_BLOCK, *(ROTOR_SPEED_BLOCK if rotors else ())]
+    types = dict.fromkeys(available, "uint16_t") | {"stateEstimateZ.quat": "uint32_t"}
+    numbered = []
+    for variables in block_plan(available):
+        numbered += pack(variables, types, 10, first_identifier=len(numbered))
+    names = {f"/log/{b.identifier}": schemas.BlockCodec(b).schema_data() for b in numbered}
+    for path in paths(foxglove_layout()):
+        if path.startswith("/log/"):
+            topic, field = path.split(".")
+            assert field.encode() in names[topic]
+
+
+def test_panels_are_placed_once_and_it_is_json():
+    layout = json.loads(json.dumps(foxglove_layout(), allow_nan=False))
+    shown = placed(layout["layout"])
+    for panel in layout["configById"].values():
+        for tab in panel.get("tabs", ()):
+            shown += placed(tab["layout"])
+    assert sorted(shown) == sorted(layout["configById"])
+    kinds = {name.split("!")[0] for name in shown}
+    assert kinds == {"3D", "Plot", "RawMessages", "RosOut", "Tab"}
+    for name in ("mass", "Ixx", "Iyy", "Izz", "motor_time_constant"):
+        for field in ("value", "ci95_low", "ci95_high"):
+            assert f'/estimate.parameters[:]{{name=="{name}"}}.{field}' in paths(layout)
+
+
+def test_a_layout_for_an_imported_recording(tmp_path):
+    path = tmp_path / "f.mcap"
+    write_recording(flight(), path)
+    topics = topics_of(from_summary(path)[0])
+    assert "voltage" in topics["/signals/power"]
+    found = paths(foxglove_layout(topics))
+    assert "/signals/power.voltage" in found
+    assert not [p for p in found if "motor_m" in p]  # it has no motor commands
+
+
+def test_topics_of_log_blocks():
+    from mcap.records import Channel, Schema
+
+    codec = schemas.BlockCodec(Block(3, (Variable("pm.vbatMV", "uint16_t"),), 10))
+    announced = [
+        Schema(id=1, data=codec.schema_data(), encoding="protobuf", name=codec.schema_name),
+        Channel(id=1, topic="/log/3", message_encoding="protobuf", metadata={}, schema_id=1),
+        Schema(id=2, data=b"\xff\xff", encoding="protobuf", name="x"),
+        Channel(id=2, topic="/x", message_encoding="protobuf", metadata={}, schema_id=2),
+    ]
+    assert topics_of(announced) == {"/log/3": ["firmware_time_ms", "host_time", "pm_vbatMV"]}
+    assert "/log/3.pm_vbatMV" in paths(foxglove_layout(topics_of(announced)))
