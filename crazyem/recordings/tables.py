@@ -102,10 +102,10 @@ class _Shared:
     ) -> SignalArray:
         """A signal of this table; `columns`: what a vocabulary signal was converted from."""
         marked = self._unmarked
-        missing = ~np.isfinite(value).all(axis=1) if columns else marked
-        if missing.any():
+        if columns and not (finite := np.isfinite(value)).all():
             # a NaN that decoding made of valid values (a rotor speed of 65535 is "missing") is ours, not the file's
-            marked = missing & np.logical_and.reduce([np.isfinite(np.asarray(c, float)) for c in columns])
+            sound = np.logical_and.reduce([np.isfinite(np.asarray(c, float)) for c in columns])
+            marked = sound & ~finite.all(axis=1)
         if place not in self._orders:
             self._orders[place] = self.table.order * step + place
         unit, frame = SIGNALS[quantity][1:] if quantity else (unit_of(source[0]), "")

@@ -64,12 +64,13 @@ def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int) -> 
 
 def _kinds(data: bytes, events: tuple[EventType, ...], start: NDArray[np.int64]) -> NDArray[np.uint16]:
     """(n,) index of the event type of each record."""
-    if len(events) == 1:
-        return np.zeros(start.size, np.uint16)
-    index = np.zeros(1 << 16, np.uint16)
-    index[[event.identifier for event in events]] = np.arange(len(events))
-    source = np.frombuffer(data, np.uint8)
-    return index[source[start] | source[start + 1].astype(np.uint16) << 8]
+    kinds = np.zeros(start.size, np.uint16)
+    if len(events) > 1:
+        source = np.frombuffer(data, np.uint8)
+        identifiers = source[start] | source[start + 1].astype(np.uint16) << 8
+        for i, event in enumerate(events):
+            kinds[identifiers == event.identifier] = i
+    return kinds
 
 
 def _run(data: bytes, at: int, end: int, size: int, identifier: int) -> int:
