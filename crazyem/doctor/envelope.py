@@ -198,7 +198,7 @@ def sound_samples(array: SignalArray) -> tuple[Array, Array] | None:
     """Times (n,) and values (n, c) of the samples that are numbers, in order of time; None if there are none."""
     if not array.time.size or array.value.ndim != 2 or not array.value.shape[1]:
         return None
-    good = np.isfinite(array.value).all(axis=1) & np.isfinite(array.time)
+    good = sound_rows(array.value) & np.isfinite(array.time)
     time, value = (array.time, array.value) if good.all() else (array.time[good], array.value[good])
     if not time.size:
         return None
@@ -216,6 +216,12 @@ def _without_pauses(time: Array, turning: NDArray[np.bool_]) -> NDArray[np.bool_
         if turning[stop] and time[start + 1] - time[stop] < PAUSE:
             result[stop + 1 : start + 1] = True
     return result
+
+
+def sound_rows(value: Array) -> NDArray[np.bool_]:
+    """(n,) whether all components of (n, c) are numbers; their sum tells, several times faster than each of them."""
+    with np.errstate(all="ignore"):
+        return np.isfinite(value @ np.full(value.shape[1], 2.0**-10))
 
 
 def _off_the_ground(z: Array, turning: NDArray[np.bool_], *, known: bool) -> NDArray[np.bool_]:

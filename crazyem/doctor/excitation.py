@@ -28,8 +28,8 @@ Array = NDArray[np.float64]
 FINEST = 4e-3  # s; faster streams are averaged into steps of 5 ms
 COARSE = 5e-3
 LONGEST_STEP = 0.05  # s; a longer hole between two samples parts two stretches
-MOST_STEPS = 24_000  # more are sampled in blocks, and the information scaled
-BLOCK = 2_000
+MOST_STEPS = 8_000  # more are sampled in blocks, and the information scaled
+BLOCK = 1_000
 ASSUMED_VOLTAGE = 3.7  # V, where none is logged
 DELAY, DELAY_SD = 3.5e-3, 2e-3  # s, prior of the estimator for commands
 SPEED_DELAY_SD = 10e-3  # s, and for measured rotor speeds
@@ -97,8 +97,7 @@ def steps_of(time: Array, value: Array, air: Airborne) -> Steps | None:
     time, value = time[inside], value[inside]
     if time.size < 4 * ORDER:
         return None
-    if np.median(np.diff(time)) < FINEST:
-        time, value = _binned(time, value)
+    time, value = thinned(time, value)
     keep = np.append(True, np.diff(time) > 0.0)
     time, value = time[keep], value[keep]
     period = float(np.median(np.diff(time))) if time.size > 1 else math.nan
@@ -114,11 +113,13 @@ def steps_of(time: Array, value: Array, air: Airborne) -> Steps | None:
     )
 
 
-def lagged(inputs: Inputs, steps: Steps, *, tau: float, delay: float) -> list[tuple[Array, Array, Array]]:
+def lagged(
+    inputs: Inputs, steps: Steps, *, tau: float, delay: float, predictor: Array | None = None
+) -> list[tuple[Array, Array, Array]]:
     """For each stretch, means of the wrench over its steps (k, 4) and their derivatives by tau and delay [1/s]."""
     mode = CAUSAL if inputs.lagged else LINEAR
-    causal = mode == CAUSAL
-    predictor = fit_predictor(_all_between(inputs, steps)) if causal else hold_predictor()
+    if predictor is None:
+        predictor = predictor_of(inputs, steps)
     result = []
     for nodes in steps.nodes:
         begin = int(np.searchsorted(inputs.time, nodes[0] - delay - 10.0 * max(tau, 0.02), "right")) - 1
@@ -138,6 +139,11 @@ def lagged(inputs: Inputs, steps: Steps, *, tau: float, delay: float) -> list[tu
         mean[far | (nodes < inputs.time[0] + 0.2)] = np.nan
         result.append((mean[1:], by_tau[1:], by_delay[1:]))
     return result
+
+
+def predictor_of(inputs: Inputs, steps: Steps) -> Array:
+    """How the next command follows from those before, in these stretches: see crazyem.physics.lag."""
+    return fit_predictor(_all_between(inputs, steps)) if inputs.lagged else hold_predictor()
 
 
 def rotation_fit(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | None:
@@ -185,9 +191,10 @@ def rotation_fit_once(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | N
     prior = np.array([INERTIA_SD] * 3 + [LAG_SD if timed else 1e-9, delay_sd, unit, unit, unit]) ** -2.0
     theta = centre.copy()
     response = [_angular_acceleration(t, w, nominal) for t, w in zip(steps.nodes, steps.values)]
+    predictor = predictor_of(inputs, steps)
     for _ in range(8):
         tau, delay = (math.exp(theta[3]) if timed else 0.0), theta[4] * 1e-3
-        rows = lagged(inputs, steps, tau=tau, delay=delay)
+        rows = lagged(inputs, steps, tau=tau, delay=delay, predictor=predictor)
         system = _RotationSystem(response, rows, theta, tau)
         if system.count < 10 * ORDER:
             return None
@@ -203,8 +210,7 @@ def rotation_fit_once(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | N
         own = prior.copy()
         own[i] = 0.0
         covariance = np.linalg.pinv(system.matrix / share + np.diag(own), hermitian=True)
-        inflation = system.inflation(np.asarray(covariance, np.float64))
-        sd[i] = math.sqrt(max(covariance[i, i], 0.0)) * inflation[i]
+        sd[i] = math.sqrt(max(covariance[i, i], 0.0)) * system.inflation(np.asarray(covariance[:, i], float))
         # the larger of what it costs with everything else known and of what it costs with everything else free
         together = abs(float(covariance[i] @ noise)) / share
         bias[i] = max(together, min(float(noise[i] / max(system.matrix[i, i], 1e-300)), 1.0) if noise[i] > 0.0 else 0.0)
@@ -255,13 +261,12 @@ class _RotationSystem:
                 self.terms.append(f * (z / variance)[:, None])
             self.count = max(self.count, z.size)
 
-    def inflation(self, covariance: Array) -> Array:
-        """(8,) factors by which correlation left in the scores widens standard deviations; never below 1."""
-        scaled = [terms @ covariance for terms in self.terms]
-        plain = sum(np.sum(s**2, axis=0) for s in scaled)
-        wide = sum(long_run(s) for s in scaled)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.sqrt(np.maximum(np.where(plain > 0.0, wide / plain, 1.0), 1.0))
+    def inflation(self, weights: Array) -> float:
+        """Factor by which correlation left in the scores widens the error of `weights @ score`; never below 1."""
+        scaled = [terms @ weights[:, None] for terms in self.terms]
+        plain = sum(float(np.sum(s**2)) for s in scaled)
+        wide = sum(float(long_run(s)[0]) for s in scaled)
+        return math.sqrt(max(wide / plain, 1.0)) if plain > 0.0 else 1.0
 
 
 def _command_noise_score(inputs: Inputs, steps: Steps, system: _RotationSystem, theta: Array, *, timed: bool) -> Array:
@@ -285,7 +290,7 @@ def _command_noise_score(inputs: Inputs, steps: Steps, system: _RotationSystem, 
             rates[near, axis],
             rate_variance=system.rate_variance[axis] * steps.period**2,
         )
-        noise[:, 1 + axis] = math.sqrt(white) * rng.standard_normal(inputs.time.size)
+        noise[inside, 1 + axis] = math.sqrt(white) * rng.standard_normal(inside.size)
     made = Inputs(inputs.time, noise, inputs.signal, inputs.lagged, inputs.voltage_known)
     for mean, by_tau, by_delay in lagged(made, steps, tau=tau, delay=delay):
         for axis in range(3):
@@ -322,13 +327,14 @@ def _first_covariance(parts: list[Array]) -> float:
     return max(-float(pairs.mean()), 0.0) if pairs.size else 0.0
 
 
-def _binned(time: Array, value: Array) -> tuple[Array, Array]:
-    """Means over bins of 5 ms, of those at least half full."""
+def thinned(time: Array, value: Array) -> tuple[Array, Array]:
+    """A stream (n,), (n, c) as it is, or as means over bins of 5 ms (those at least half full) if it is faster."""
+    if time.size < 2 or np.median(np.diff(time)) >= FINEST:
+        return time, value
     bins = np.floor((time - time[0]) / COARSE).astype(np.int64)
     starts = np.flatnonzero(np.append(True, np.diff(bins) > 0))
     counts = np.diff(np.append(starts, time.size))
-    usual = float(np.median(counts))
-    good = counts >= 0.5 * usual
+    good = counts >= 0.5 * float(np.median(counts))
     return (
         (np.add.reduceat(time, starts) / counts)[good],
         (np.add.reduceat(value, starts, axis=0) / counts[:, None])[good],

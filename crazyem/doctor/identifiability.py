@@ -394,6 +394,7 @@ def _with_attitude(velocity: tuple[Array, Array], attitude: tuple[Array, Array] 
     """Velocity (n, 3) beside attitude (n, 4) at its stamps, where an attitude is near; or alone."""
     if attitude is None:
         return velocity
+    velocity = excitation.thinned(*velocity)
     good = _near(attitude[0], velocity[0])
     time = velocity[0][good]
     continuous = attitude[1] * _signs(attitude[1])[:, None]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from crazyem.doctor.envelope import Envelope, airborne, envelope
+from crazyem.doctor.envelope import Envelope, airborne, envelope, sound_rows
 from crazyem.doctor.identifiability import Verdict, identifiability
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
@@ -147,7 +147,7 @@ def _row(name: str, array: SignalArray) -> SignalRow:
     time = array.time[np.isfinite(array.time)]
     steps = np.diff(time)
     span = float(time.max() - time.min()) if time.size > 1 else 0.0
-    bad = ~np.isfinite(array.value).all(axis=1)
+    bad = ~sound_rows(array.value)
     return SignalRow(
         name=name,
         quantity=array.quantity,
