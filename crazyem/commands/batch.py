@@ -3,6 +3,7 @@
 import contextlib
 import importlib
 import os
+import signal
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -69,9 +70,12 @@ def _parallel(calls: list[Any], count: int, cluster: str | None, stack: contextl
         stack.enter_context(joblib.parallel_config("dask", wait_for_workers_timeout=CONNECT_SECONDS))
         count = -1
     pool = joblib.Parallel(n_jobs=count, return_as="generator")
+    with _workers_deaf_to_interrupts():
+        results = pool(joblib.delayed(_guarded)(*call) for call in calls)
     finished = False
     try:
-        yield from pool(joblib.delayed(_guarded)(*call) for call in calls)
+        for result in results:  # noqa: UP028 (`yield from` would close `results` before the finally below can)
+            yield result
         finished = True
     except CrazyemError:
         raise
@@ -82,8 +86,26 @@ def _parallel(calls: list[Any], count: int, cluster: str | None, stack: contextl
         why = "out of memory? --jobs 1 needs the least" if died else f"{type(error).__name__}: {error}"
         raise CrazyemError(f"a worker process ended before its work was done ({why}).") from None
     finally:
-        if not finished and cluster is None:
-            _end_workers()
+        if not finished:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that work was cancelled is what was wanted
+                results.close()
+            if cluster is None:
+                _end_workers()
+
+
+@contextlib.contextmanager
+def _workers_deaf_to_interrupts() -> Iterator[None]:
+    """Processes started here ignore Ctrl-C, which the terminal sends to them too; this process deals with it."""
+    try:
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    except ValueError:  # not the main thread: no Ctrl-C comes here
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _end_workers() -> None:

@@ -108,7 +108,8 @@ def _repair(
         "applied": [f.to_dict() for f in applied],
         "not_applied": [f.to_dict() for f in left],
     }
-    lines = [f"applied: {_what(f)}" for f in applied] + [f"not applied: {_what(f)}" for f in left]
+    lines = [f"applied: {_what(f)}" for f in applied]
+    lines += [f"not applied (settled by another repair, or no cure): {_what(f)}" for f in left]
     if applied:
         write_recording(repaired, output, replace=force)
         result["output"] = output
