@@ -78,7 +78,7 @@ def plain(path: Path) -> int:
     """The peer: samples it put into lists."""
     data = path.read_bytes()
     at = 5
-    events = {}
+    events: dict[int, tuple[str, int, list[list[float]]]] = {}
     for _ in range(struct.unpack_from("<H", data, 3)[0]):
         identifier = struct.unpack_from("<H", data, at)[0]
         at = data.index(b"\0", at + 2) + 1
