@@ -1,9 +1,256 @@
-"""Check: angles against the quaternion: degrees for radians, inverted pitch."""
+"""Check: angles against the quaternion, and the quaternion against gyro and gravity: unit, sign, order, direction."""
 
-from crazyem.recordings.finding import Finding
-from crazyem.recordings.recording import Recording
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.doctor import axes
+from crazyem.doctor.delays import delay
+from crazyem.doctor.kinematics import (
+    Window,
+    euler_of_quaternion,
+    grid_of,
+    measurements,
+    origin_of,
+    rate_of_attitude,
+    rotate,
+    track,
+    width_for,
+)
+from crazyem.doctor.regress import blocks, choose, slope
+from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.recording import Recording, SignalArray
+
+Array = NDArray[np.float64]
+
+DEGREES = 180.0 / math.pi
+UNITS = {"degrees": DEGREES, "converted": 1.0 / DEGREES}
+ENOUGH = math.radians(0.1)  # rms of an angle, below which nothing is said of it
+ALIKE = 0.7  # correlation that an angle must have with one of the quaternion's to be judged
+NAMES = ("roll", "pitch", "yaw")
+# ways to read four numbers as an attitude: name -> (how far-fetched, columns in the order x y z w, conjugated)
+READINGS: dict[str, tuple[int, tuple[int, ...], bool]] = {
+    "x y z w, body to world": (0, (0, 1, 2, 3), False),
+    "w x y z, body to world": (1, (1, 2, 3, 0), False),
+    "x y z w, world to body": (1, (0, 1, 2, 3), True),
+    "w x y z, world to body": (2, (1, 2, 3, 0), True),
+}
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
-    return []
+    """Findings about every quaternion (against gyro and gravity) and all Euler angles (against quaternions)."""
+    found: list[Finding] = []
+    wrong: set[str] = set()
+    attitudes = measurements(recording, "attitude")
+    for name, array in attitudes.items():
+        finding = _quaternion(name, array, recording)
+        if finding is not None:
+            found.append(finding)
+            wrong.add(name)
+    sound = {name: array for name, array in attitudes.items() if name not in wrong}
+    for name, array in measurements(recording, "euler").items():
+        # of the same origin first: another one may have another heading, and lags
+        ordered = sorted(sound, key=lambda other: origin_of(other) != origin_of(name))
+        for other in ordered:
+            finding, told = _euler(name, array, other, sound[other])
+            if finding is not None:
+                found.append(finding)
+            if told:
+                break
+    return found
+
+
+def reading(array: SignalArray, name: str) -> SignalArray:
+    """The array read in one of the `READINGS`."""
+    _, columns, conjugated = READINGS[name]
+    value = array.value[:, columns]
+    return replace(array, value=value * np.array([-1.0, -1.0, -1.0, 1.0]) if conjugated else value)
+
+
+def _quaternion(name: str, array: SignalArray, recording: Recording) -> Finding | None:
+    """Which reading makes a quaternion turn as the gyro does, and stand upright by the accelerometer?"""
+    turns = _by_rate(array, recording)
+    upright = _by_gravity(array, recording)
+    declared = next(iter(READINGS))
+    chosen = turns[0] if turns else ""
+    evidence: dict[str, float] = {}
+    if turns and turns[0] != declared:
+        evidence |= turns[1]
+        if upright and upright[turns[0]] < 0.9 and upright[declared] > 0.95:
+            return None  # the gyro may be wrong, gravity is not
+    elif not turns and upright and upright[declared] < 0.5:
+        # too little turning: only the order can be told, since gravity does not see the heading
+        chosen = max(upright, key=lambda reading_name: (round(upright[reading_name], 3), -READINGS[reading_name][0]))
+        if upright[chosen] < 0.9:
+            return None
+    else:
+        return None
+    if chosen in ("", declared):
+        return None
+    if upright:
+        evidence |= {"upright_as_declared": upright[declared], "upright": upright[chosen]}
+    text = f"{name} is {chosen}, not {declared}: only so does it agree with the gyro and with gravity."
+    advice = "Correct the order or the direction of the quaternion where it is read."
+    conjugate = chosen == "x y z w, world to body"
+    fix = Fix("scale", (name,), (-1.0, -1.0, -1.0, 1.0)) if conjugate else None
+    return Finding("angles", Grade.UNUSABLE, text, name, (), evidence, advice, fix)
+
+
+def _by_rate(array: SignalArray, recording: Recording) -> tuple[str, dict[str, float]] | None:
+    """The reading whose derivative is the gyro, if that can be told."""
+    for gyro in measurements(recording, "body_rate").values():
+        grid = grid_of(array, gyro)
+        if grid.size == 0:
+            continue
+        window = Window(max(0.24, width_for(array, gyro)))
+        smooth = {key: window.mean(rate_of_attitude(track(reading(array, key), grid))) for key in READINGS}
+        raw = track(gyro, grid)
+        # a conjugate turns about nearly the same axes the other way: one of each order is enough to find the lag
+        lags = [delay(one, window.mean(raw)) for one in list(smooth.values())[:2]]
+        good = [one for one in lags if one is not None and not one.at_edge]
+        if not good:
+            continue
+        late = max(good, key=lambda one: one.explained)
+        measured = window.mean(track(gyro, grid, shift=late.value))
+        valid = measured.valid & np.logical_and.reduce([one.valid for one in smooth.values()])
+        rows = np.flatnonzero(valid)[::3]
+        if rows.size < 100 or float(measured.value[rows].std()) < 0.04:
+            continue
+        candidates = {key: (READINGS[key][0], one.value[rows]) for key, one in smooth.items()}
+        choice = choose(measured.value[rows], candidates, blocks(grid.time[rows]))
+        if choice is None or not choice.name or choice.explained[choice.best] < 0.6:
+            continue
+        declared = next(iter(READINGS))
+        numbers = {
+            "explained": choice.explained[choice.name],
+            "explained_as_declared": choice.explained[declared],
+            "unexplained_ratio": choice.ratio,
+        }
+        return choice.name, numbers
+    return None
+
+
+def _by_gravity(array: SignalArray, recording: Recording) -> dict[str, float] | None:
+    """For each reading the cosine between the mean specific force, turned to the world, and up."""
+    for force in measurements(recording, "specific_force").values():
+        grid = grid_of(array, force)
+        if grid.size == 0:
+            continue
+        felt = track(force, grid)
+        out = {}
+        for key in READINGS:
+            attitude = track(reading(array, key), grid)
+            valid = felt.valid & attitude.valid
+            if valid.sum() < 200:
+                return None
+            world = rotate(attitude.value[valid], felt.value[valid]).mean(axis=0)
+            out[key] = float(world[2] / max(np.linalg.norm(world), 1e-9))
+        return out
+    return None
+
+
+def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -> tuple[Finding | None, bool]:
+    """A finding, if any, and whether anything could be told."""
+    grid = grid_of(array, quaternion)
+    if grid.size == 0:
+        return None, False
+    window = Window(max(0.1, width_for(array, quaternion) / 2))
+    expected = _unwrapped(quaternion)
+    truth = track(expected, grid)
+    straight = _continuous_angles(array)
+    late = delay(window.mean(truth), window.mean(track(straight, grid)), reach=0.15)
+    lag = late.value if late is not None and not late.at_edge and late.explained > 0.5 else 0.0
+    x, y = window.mean(truth), window.mean(track(straight, grid, shift=lag))
+    rows = np.flatnonzero(x.valid & y.valid)[::3]
+    if rows.size < 100:
+        return None, False
+    block = blocks(grid.time[rows])
+    straight_x, straight_y = _unit_variance(x.value[rows]), _unit_variance(y.value[rows])
+    # an angle that hardly moves is noise: it speaks neither for nor against
+    excited = x.value[rows].std(axis=0) >= ENOUGH
+    alike = np.abs(straight_x.T @ straight_y) / rows.size
+    told: NDArray[np.bool_] = np.any(alike > ALIKE, axis=0)
+    if not (excited & told).any():
+        return None, False
+    choice = choose(straight_y * told, _orders(straight_x, told), block)
+    if choice is None or choice.explained[choice.best] < 0.8:
+        return None, False
+    known = [i for i in range(3) if excited[i] and told[i]]
+    parts = {NAMES[i]: slope(x.value[rows, i], y.value[rows, i], block) for i in known}
+    evidence = {
+        "explained": choice.explained[choice.name or choice.best],
+        "explained_as_declared": choice.explained["as declared"],
+        "unexplained_ratio": choice.ratio,
+        "lag_ms": 1e3 * lag,
+    }
+    evidence |= {f"slope_{key}": s.value for key, s in parts.items() if s is not None}
+    head = f"{name} against {other}: "
+    if choice.denied:
+        what = choice.name.removeprefix("as declared ")
+        factor = axes.sign_factor(what, NAMES) if choice.name else None
+        if factor is not None:
+            turned = " and ".join(NAMES[i] for i in range(3) if factor[i] < 0)
+            text = f"{head}the sign of {turned} is inverted."
+            unit = _unit_of([s.value * factor[NAMES.index(k)] for k, s in parts.items() if s is not None])
+            scale = 1.0 / UNITS[unit] if unit else 1.0
+            text = text if not unit else text[:-1] + f", and it is {_unit_said(unit)}."
+            fix = Fix("scale", (name,), tuple(f * scale for f in factor))
+            return Finding("angles", Grade.UNUSABLE, text, name, (), evidence, "Correct its sign.", fix), True
+        said = f"its components are {what}" if choice.name else "it does not agree, and why cannot be told"
+        advice = "Correct the order of its components where it is read."
+        return Finding("angles", Grade.UNUSABLE, f"{head}{said}.", name, (), evidence, advice), True
+    unit = _unit_of([s.value for s in parts.values() if s is not None])
+    if not unit:
+        return None, True
+    text = f"{head}it is {_unit_said(unit)}."
+    fix = Fix("scale", (name,), (1.0 / UNITS[unit],) * 3)
+    return Finding("angles", Grade.UNUSABLE, text, name, (), evidence, "Correct its unit.", fix), True
+
+
+def _unit_variance(value: Array) -> Array:
+    spread = value.std(axis=0)
+    return np.asarray((value - value.mean(axis=0)) / np.where(spread > 1e-12, spread, np.inf), float)
+
+
+def _orders(x: Array, told: NDArray[np.bool_]) -> dict[str, tuple[int, Array]]:
+    """Signs of the angles, and the order yaw, pitch, roll."""
+    out = {}
+    for key, (cost, value) in axes.signed("as declared", x, NAMES).items():
+        if cost <= 2 or [part.lstrip("-") for part in key.split(" ")[-3:]] == ["yaw,", "pitch,", "roll"]:
+            out[key] = (cost, value * told)
+    return out
+
+
+def _unit_of(slopes: list[float]) -> str:
+    """Key of `UNITS` that the slopes point to, "" for radians or where they disagree."""
+    if not slopes or min(slopes) <= 0.0:
+        return ""
+    middle = math.exp(float(np.mean(np.log(slopes))))
+    return next((name for name, factor in UNITS.items() if abs(math.log(middle / factor)) < 0.3), "")
+
+
+def _unit_said(unit: str) -> str:
+    if unit == "degrees":
+        return "in degrees, not radians"
+    return "57.3 times too small: it was in radians, and was converted from degrees once too often"
+
+
+def _unwrapped(quaternion: SignalArray) -> SignalArray:
+    """Roll, pitch, yaw [rad] of a quaternion signal, without jumps."""
+    norm = np.linalg.norm(quaternion.value, axis=1, keepdims=True)
+    angles = np.unwrap(euler_of_quaternion(quaternion.value / np.where(norm > 0, norm, 1.0)), axis=0)
+    return replace(quaternion, value=angles, quantity="euler")
+
+
+def _continuous_angles(array: SignalArray) -> SignalArray:
+    """The array without jumps of a whole turn, whatever its unit: a turn is what the range of yaw suggests."""
+    largest = float(np.abs(array.value).max())
+    if largest <= 1.001 * math.pi / DEGREES:
+        turn = 2.0 * math.pi / DEGREES
+    elif largest <= 1.001 * 2.0 * math.pi:
+        turn = 2.0 * math.pi
+    else:
+        turn = 360.0
+    return replace(array, value=np.unwrap(array.value, axis=0, period=turn))

@@ -1,9 +1,263 @@
-"""Check: specific force and acceleration against the velocity's derivative: unit, frame, scale."""
+"""Check: specific force and acceleration against attitude and motion: unit, gravity, sign, frame, scale, bias."""
 
-from crazyem.recordings.finding import Finding
-from crazyem.recordings.recording import Recording
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from crazyem.doctor import axes
+from crazyem.doctor.attitudes import Pose, poses
+from crazyem.doctor.compare import Look, look
+from crazyem.doctor.kinematics import (
+    GRAVITY,
+    STEP,
+    UP,
+    Grid,
+    Track,
+    Window,
+    difference,
+    grid_of,
+    measurements,
+    rotate,
+    track,
+    width_for,
+)
+from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.recording import Recording, SignalArray
+
+WIDTH = 0.3  # s: an accelerometer in flight is loud
+ENOUGH = 0.25  # m/s^2 rms along an axis, below which frames and signs are not told
+BELIEVED = 0.5  # share of the variance about the mean that a hypothesis must explain
+OFF = 0.05
+UNITS = {"g": 1.0 / GRAVITY, "mg": 1e3 / GRAVITY, "cm/s^2": 1e2, "mm/s^2": 1e3, "g taken twice": GRAVITY}
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
+    """Findings about every specific force and every acceleration."""
+    found: list[Finding] = []
+    attitudes = poses(recording)
+    for name, array in measurements(recording, "specific_force").items():
+        found += _specific_force(name, array, recording, attitudes)
+    for name, array in measurements(recording, "acceleration").items():
+        found += _acceleration(name, array, recording, attitudes)
+    return found
+
+
+def motion(recording: Recording, grid: Grid) -> Track | None:
+    """Acceleration (m, 3) in the world, gravity removed, from the first velocity, else from the first position."""
+    for array in measurements(recording, "velocity").values():
+        return difference(track(array, grid))
+    for array in measurements(recording, "position").values():
+        return difference(difference(track(array, grid)))
+    return None
+
+
+def _moving(recording: Recording) -> SignalArray | None:
+    found = {**measurements(recording, "velocity"), **measurements(recording, "position")}
+    return next(iter(found.values()), None)
+
+
+def _specific_force(name: str, array: SignalArray, recording: Recording, attitudes: list[Pose]) -> list[Finding]:
+    moving = _moving(recording)
+    looks = []
+    for pose in attitudes:
+        if moving is None:
+            break
+        grid = grid_of(array, pose.array, moving)
+        acceleration = motion(recording, grid) if grid.size else None
+        if acceleration is None:
+            continue
+        attitude = pose.track(grid)
+        valid = acceleration.valid & attitude.valid
+        kinematic = acceleration.value
+        force = kinematic + GRAVITY * UP
+        candidates = {
+            "body": (0, Track(rotate(attitude.value, force, inverse=True), valid)),
+            "world": (1, Track(force, valid)),
+            "body, gravity removed": (1, Track(rotate(attitude.value, kinematic, inverse=True), valid)),
+            "turned twice": (2, Track(_twice(attitude.value, force), valid)),
+            "world, gravity removed": (2, Track(kinematic, valid)),
+        }
+        one = look(array, grid, f"{pose.name} and motion", candidates, width=_width(array, pose, moving), least=ENOUGH)
+        if one is not None:
+            looks.append(one)
+    looks.sort(key=lambda one: -one.explained)
+    if looks and looks[0].explained >= BELIEVED:
+        seen = looks[0]
+        if seen.choice.denied:
+            return [_structure(name, seen)]
+        level, error = _level(seen)
+        return _judge_level(name, level, error, seen)
+    return _by_weight(name, array, attitudes)
+
+
+def _twice(attitude: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    return rotate(attitude, rotate(attitude, vector, inverse=True), inverse=True)
+
+
+def _width(array: SignalArray, pose: Pose, moving: SignalArray) -> float:
+    return max(WIDTH, width_for(array, pose.array, moving))
+
+
+def _level(seen: Look) -> tuple[float, float]:
+    """Mean of the measurement along the predicted mean, as a factor of it; and its standard error."""
+    size = float(np.linalg.norm(seen.predicted))
+    return float(seen.mean @ seen.predicted) / size**2, float(np.linalg.norm(seen.mean_error)) / size
+
+
+def _by_weight(name: str, array: SignalArray, attitudes: list[Pose]) -> list[Finding]:
+    """Without motion to compare: over a flight that begins and ends at rest the mean force is the weight."""
+    for pose in attitudes[:1]:
+        grid = grid_of(array, pose.array)
+        window = Window(WIDTH)
+        attitude, force = pose.track(grid), track(array, grid)
+        world = window.mean(Track(rotate(attitude.value, force.value), attitude.valid & force.valid))
+        if world.valid.sum() * STEP >= 5.0:
+            value = world.value[world.valid]
+            return _judge_level(name, float(value[:, 2].mean()) / GRAVITY, 0.05, None)
+    good = np.isfinite(array.value).all(axis=1)
+    norm = np.linalg.norm(array.value[good], axis=1)
+    return _judge_level(name, float(np.median(norm)) / GRAVITY, 0.2, None, signed=False)
+
+
+def _judge_level(name: str, level: float, error: float, seen: Look | None, *, signed: bool = True) -> list[Finding]:
+    """What the level of gravity in a specific force says of its unit, gravity, sign and scale."""
+    evidence = {"gravity_level": level, "gravity_level_error": error, **(seen.evidence() if seen else {})}
+    head = f"The mean of {name} is {level:.4g} times the weight it must carry: "
+    advice = "Correct its unit where it is read."
+    for unit, factor in UNITS.items():
+        if abs(math.log(max(abs(level), 1e-9) / factor)) < math.log(1.3) and (level > 0 or not signed):
+            what = _unit_said(unit) + ", not m/s^2"
+            fix = Fix("scale", (name,), (1.0 / factor,) * 3)
+            return [Finding("forces", Grade.UNUSABLE, f"{head}{what}.", name, (), evidence, advice, fix)]
+    if seen is None and not signed:
+        return []
+    if abs(level) < 0.3:
+        told = seen is not None and seen.whole is not None
+        text = f"{head}gravity was removed from it."
+        if told or abs(level) < 0.03:
+            return [Finding("forces", Grade.UNUSABLE, text, name, (), evidence, "Add gravity again, or read it so.")]
+        return []
+    if level < -0.7:
+        fix = Fix("scale", (name,), (-1.0,) * 3)
+        return [Finding("forces", Grade.UNUSABLE, f"{head}its sign is inverted.", name, (), evidence, advice, fix)]
+    if seen is not None and abs(level - 1.0) >= OFF and abs(level - 1.0) > 4.0 * error:
+        return [_scale(name, level, error, seen, evidence)]
     return []
+
+
+def _unit_said(unit: str) -> str:
+    return "it was converted from g once too often" if unit == "g taken twice" else f"it is in {unit}"
+
+
+def _scale(name: str, level: float, error: float, seen: Look, evidence: Mapping[str, float]) -> Finding:
+    """A level off by some per cent: a scale, or a bias along the vertical; the moving part tells, where it can."""
+    whole = seen.whole
+    interval = f"{level:.3f} ({level - 2 * error:.3f} to {level + 2 * error:.3f})"
+    text = f"The mean of {name} is {interval} times the weight it must carry"
+    bias = (level - 1.0) * float(np.linalg.norm(seen.predicted))
+    advice = "Calibrate it at rest, or divide it by the factor."
+    fix: Fix | None = None
+    numbers = {**evidence, "bias_m_s2": bias, "scale": level, "scale_low": level - 2 * error}
+    numbers["scale_high"] = level + 2 * error
+    is_scale = whole is not None and whole.far_low <= level <= whole.far_high
+    is_bias = whole is not None and whole.far_low <= 1.0 <= whole.far_high
+    if is_scale and not is_bias:
+        text += ", and its changes are as much too large: a scale fault."
+        fix = Fix("scale", (name,), (1.0 / level,) * 3)
+    elif is_bias and not is_scale:
+        text += f", but its changes have the right size: a bias of {bias:.2f} m/s^2 along the vertical."
+    else:
+        text += f": a scale fault, or a bias of {bias:.2f} m/s^2; which of them cannot be told from this flight."
+    return Finding("forces", Grade.DEGRADES, text, name, (), numbers, advice, fix)
+
+
+def _structure(name: str, seen: Look) -> Finding:
+    choice = seen.choice
+    head = f"{name} against {seen.against}: "
+    tail = (
+        f" ({100.0 * seen.evidence()['explained']:.1f} % of its variance explained, "
+        f"as declared {100.0 * choice.explained[seen.declared]:.1f} %)."
+    )
+    advice = "Correct its frame, axes or signs where it is read."
+    fix: Fix | None = None
+    if choice.name == "world":
+        text, fix = f"{head}it is in the world frame, not the body frame{tail}", Fix("world_to_body", (name,))
+        advice = "Rotate it into the body frame by the attitude."
+    elif choice.name == "turned twice":
+        text = f"{head}it was turned from world to body although it was in the body frame already{tail}"
+        advice = "Read it as a body vector, not as a world vector."
+    elif choice.name.endswith("gravity removed"):
+        where = choice.name.partition(",")[0]
+        text = f"{head}it is the acceleration in the {where} frame without gravity, not the specific force{tail}"
+        advice = "Read it as acceleration; add gravity to get the specific force."
+    elif choice.name.startswith("body "):
+        signs = choice.name.removeprefix("body ")
+        text = f"{head}its components are {signs} of the body's{tail}"
+        factor = axes.sign_factor(signs)
+        fix = Fix("scale", (name,), factor) if factor else None
+    else:
+        text = f"{head}it is not what it is declared to be, but which axes or frame it has cannot be told{tail}"
+    return Finding("forces", Grade.UNUSABLE, text, name, (), seen.evidence(), advice, fix)
+
+
+def _acceleration(name: str, array: SignalArray, recording: Recording, attitudes: list[Pose]) -> list[Finding]:
+    moving = _moving(recording)
+    if moving is None:
+        return []
+    grid = grid_of(array, moving, *(pose.array for pose in attitudes[:1]))
+    kinematic = motion(recording, grid) if grid.size else None
+    if kinematic is None:
+        return []
+    candidates: dict[str, tuple[int, Track]] = {"world": (0, kinematic)}
+    for pose in attitudes[:1]:
+        attitude = pose.track(grid)
+        valid = kinematic.valid & attitude.valid
+        candidates["body, gravity removed"] = (1, Track(rotate(attitude.value, kinematic.value, inverse=True), valid))
+        force = kinematic.value + GRAVITY * UP
+        candidates["specific force"] = (1, Track(rotate(attitude.value, force, inverse=True), valid))
+    width = max(WIDTH, width_for(array, moving))
+    seen = look(array, grid, "the derivative of the velocity", candidates, width=width, least=ENOUGH)
+    if seen is None or seen.whole is None or seen.explained < BELIEVED:
+        return []
+    evidence = seen.evidence()
+    head = f"{name} against {seen.against}: "
+    if seen.choice.denied:
+        return [_acceleration_structure(name, head, seen)]
+    unit = axes.known_factor(seen.whole, UNITS)
+    if unit:
+        text = f"{head}it is {seen.whole.value:.4g} times as large: {_unit_said(unit[0])}, not m/s^2."
+        fix = Fix("scale", (name,), (1.0 / unit[1],) * 3)
+        advice = "Correct its unit where it is read."
+        return [Finding("forces", Grade.UNUSABLE, text, name, (), evidence, advice, fix)]
+    level = float(seen.mean[2] - seen.whole.value * seen.predicted[2]) / (GRAVITY * seen.whole.value)
+    if abs(level - 1.0) < 0.3:
+        text = f"{head}gravity is still in it (its mean is {seen.mean[2]:.2f} m/s^2 along z)."
+        numbers = {**evidence, "gravity_level": level}
+        return [Finding("forces", Grade.UNUSABLE, text, name, (), numbers, "Take gravity off its z.")]
+    fault = axes.scale_fault(seen.whole, seen.single, OFF) if seen.covered >= 0.5 else None
+    if fault is None:
+        return []
+    text = f"{head}{fault.text}."
+    numbers = {**evidence, **axes.numbers(seen.single)}
+    fix = Fix("scale", (name,), fault.repair)
+    return [Finding("forces", Grade.DEGRADES, text, name, (), numbers, "Divide it by the factor.", fix)]
+
+
+def _acceleration_structure(name: str, head: str, seen: Look) -> Finding:
+    choice = seen.choice
+    fix: Fix | None = None
+    if choice.name == "specific force":
+        what = "it is the specific force in the body frame, not the acceleration in the world frame"
+    elif choice.name == "body, gravity removed":
+        what = "it is in the body frame, not the world frame"
+    elif choice.name.startswith("world "):
+        signs = choice.name.removeprefix("world ")
+        factor = axes.sign_factor(signs)
+        fix = Fix("scale", (name,), factor) if factor else None
+        what = f"its components are {signs} of the world's"
+    else:
+        what = "it is not what it is declared to be, but which axes or frame it has cannot be told"
+    share, declared = 100.0 * seen.evidence()["explained"], 100.0 * choice.explained[seen.declared]
+    text = f"{head}{what} ({share:.1f} % of its variance explained, as declared {declared:.1f} %)."
+    return Finding("forces", Grade.UNUSABLE, text, name, (), seen.evidence(), "Correct it where it is read.", fix)

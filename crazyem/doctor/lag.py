@@ -1,9 +1,309 @@
-"""Check: lag between streams, and its drift."""
+"""Check: lag between streams, and its drift inside a flight.
 
-from crazyem.recordings.finding import Finding
-from crazyem.recordings.recording import Recording
+Rates and velocities are compared, not angles and positions: what is slow says little of time. Each window of some
+seconds gives a lag by cross-correlation, with a standard error from what it leaves unexplained. What a motor command
+leads an acceleration by is physics and is not looked at.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from crazyem.doctor.attitudes import Pose, poses
+from crazyem.doctor.delays import REACH, delay, spread
+from crazyem.doctor.kinematics import (
+    STEP,
+    Grid,
+    Track,
+    Window,
+    difference,
+    grid_of,
+    measurements,
+    origin_of,
+    quantity_of,
+    rate_of_attitude,
+    track,
+    width_for,
+)
+from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.recording import Recording, SignalArray
+
+Array = NDArray[np.float64]
+
+CERTAIN = 0.995  # one-sided level at which a lag counts as told
+SEEN = 0.003  # s, lag reported from here on
+MATTERS = 0.010  # s, lag that degrades; half of it for its changes, which no shift repairs
+PIECE = 5.0  # s, windows that each give a lag
+AGREES = 0.6  # share of the variance that a window's best lag must explain
+MANY = 40  # windows at most, longer ones then
+FEW = 4  # windows at least
+BRIDGE = 0.1  # s; a cubic across a gap moves nothing in time
+ROUGH = 0.02  # s, standard error above which a window says nothing
+CREDIT = 0.3  # of the windows' standard errors: the least scatter that is believed
+FLOOR = 0.0005  # s, below which no standard error of a window is believed
+UNSTEADY = 2.5  # scatter of the windows over their standard errors, from which on the lag changes
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
-    return []
+    """One finding for each stream (or origin within one) that is late or early against that of the first pose."""
+    reference, base = _reference(recording)
+    if base is None:
+        return []
+    best: dict[_Path, _Lag] = {}
+    for name, array in _comparable(recording):
+        path = _path(name, array)
+        if path == base:
+            continue
+        lag = _lag(name, array, reference)
+        if lag is not None and (path not in best or lag.error < best[path].error):
+            best[path] = lag
+    found = [_judge(recording, base, path, lag) for path, lag in best.items()]
+    return [finding for finding in found if finding is not None]
+
+
+@dataclass(frozen=True)
+class _Changes:
+    """How the lag changes inside a flight [s].
+
+    Attributes:
+        start, end: of a line through the windows, at the ends of the flight.
+        drift, drift_error: end less start.
+        scatter: robust standard deviation of the windows about their middle, in their standard errors.
+        about_line: the same about the line.
+        low, high: 10th and 90th percentile of the windows.
+    """
+
+    start: float
+    end: float
+    drift: float
+    drift_error: float
+    scatter: float
+    about_line: float
+    low: float
+    high: float
+    windows: int
+
+
+@dataclass(frozen=True)
+class _Lag:
+    """Lag of a stream [s], as found from one of its signals over the whole flight, and its changes."""
+
+    signal: str
+    against: str
+    value: float
+    error: float
+    blocks: int
+    explained: float
+    interval: tuple[float, float]
+    changes: _Changes | None
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """What other streams are compared with: the first attitude, and the first position or velocity of its stream."""
+
+    pose: Pose | None
+    moving: tuple[str, SignalArray] | None
+
+
+# the way samples took: their stream, and their origin; a table may hold what came on several ways
+_Path = tuple[str, str]
+
+
+def _path(name: str, array: SignalArray) -> _Path:
+    return array.stream or name, origin_of(name)
+
+
+def _said(path: _Path) -> str:
+    return path[1] or path[0]
+
+
+def _reference(recording: Recording) -> tuple[_Reference, _Path | None]:
+    """The reference, and the way it came (None if there is none)."""
+    pose = next(iter(poses(recording)), None)
+    movers = {**measurements(recording, "position"), **measurements(recording, "velocity")}
+    path = _path(pose.name, pose.array) if pose else None
+    same = [(n, a) for n, a in movers.items() if path in (None, _path(n, a))]
+    moving = next(iter(same), None)
+    if path is None and moving is not None:
+        path = _path(*moving)
+    return _Reference(pose, moving), path
+
+
+def _comparable(recording: Recording) -> list[tuple[str, SignalArray]]:
+    """Signals that tell of time; a velocity (which may be a filter's) only where its origin has no position."""
+    positions = measurements(recording, "position")
+    placed = {origin_of(name) for name in positions}
+    velocities = measurements(recording, "velocity")
+    return [
+        *measurements(recording, "body_rate").items(),
+        *measurements(recording, "attitude").items(),
+        *positions.items(),
+        *((name, array) for name, array in velocities.items() if origin_of(name) not in placed),
+    ]
+
+
+def _lag(name: str, array: SignalArray, reference: _Reference) -> _Lag | None:
+    turning = quantity_of(name, array) in ("body_rate", "attitude")
+    if turning:
+        if reference.pose is None:
+            return None
+        against, other = reference.pose.name, reference.pose.array
+    else:
+        if reference.moving is None:
+            return None
+        against, other = reference.moving
+    grid = grid_of(array, other)
+    if grid.size * STEP < PIECE * FEW / 2:
+        return None
+    window = Window(max(0.3 if turning else 0.2, width_for(array, other)))
+    first = window.mean(_speed(other, against, grid))
+    second = window.mean(_speed(array, name, grid))
+    return _fit(name, against, first, second, grid, window.width)
+
+
+def _speed(array: SignalArray, name: str, grid: Grid) -> Track:
+    quantity = quantity_of(name, array)
+    given = track(array, grid, bridge=BRIDGE)
+    if quantity == "attitude":
+        return rate_of_attitude(given)
+    return difference(given) if quantity == "position" else given
+
+
+def _fit(name: str, against: str, first: Track, second: Track, grid: Grid, width: float) -> _Lag | None:
+    whole = delay(first, second, mixed=False)
+    if whole is None or whole.at_edge or whole.explained < AGREES:
+        return None
+    size = round(max(PIECE, grid.size * STEP / MANY) / STEP)
+    error, count = spread(first, second, whole, size // 2)
+    if count < FEW:
+        return None
+    found = []
+    for first_row in range(0, grid.size - size // 2, size):
+        rows = slice(first_row, first_row + size)
+        one = delay(first.part(rows), second.part(rows), reach=min(REACH, abs(whole.value) + 0.15), mixed=False)
+        if one is None or one.at_edge or one.explained < AGREES:
+            continue
+        rough = _error(second.part(rows), one.explained, width)
+        if rough < ROUGH:
+            found.append((float(grid.time[rows].mean()), one.value, rough))
+    start, end = float(grid.time[0]), float(grid.time[-1])
+    changes = _changes(np.array(found), start, end) if len(found) >= FEW else None
+    return _Lag(name, against, whole.value, max(error, FLOOR), count, whole.explained, (start, end), changes)
+
+
+def _changes(found: Array, start: float, end: float) -> _Changes:
+    """What windows (n, 3) of time, lag, standard error say of how the lag changes."""
+    t, y, e = found.T
+    middle = _weighted_median(y, 1.0 / e)
+    ramp = _ramp(t, y)
+    line = _weighted_median(y - ramp * (t - t.mean()), 1.0 / e)
+    rest = y - line - ramp * (t - t.mean())
+    return _Changes(
+        start=line + ramp * (start - float(t.mean())),
+        end=line + ramp * (end - float(t.mean())),
+        drift=ramp * (end - start),
+        drift_error=1.25
+        * max(_robust(rest), CREDIT * float(np.median(e)))
+        / math.sqrt(t.size)
+        / float(t.std())
+        * (end - start),
+        scatter=_robust((y - middle) / e),
+        about_line=_robust(rest / e),
+        low=float(np.quantile(y, 0.1)),
+        high=float(np.quantile(y, 0.9)),
+        windows=t.size,
+    )
+
+
+def _error(second: Track, explained: float, width: float) -> float:
+    """Standard error of a lag: what is unexplained over how fast the signal changes; one sample a window width."""
+    good = second.valid
+    x = second.value[good]
+    if len(x) < 10:
+        return math.inf
+    change = np.diff(second.value, axis=0)[good[1:] & good[:-1]] / STEP
+    steepness = float((change * change).mean(axis=0).sum())
+    variance = float(x.var(axis=0).sum())
+    independent = max(good.sum() * STEP / width, 1.0)
+    return max(FLOOR, math.sqrt((1.0 - explained) * variance / max(steepness, 1e-12) / independent))
+
+
+def _robust(rest: Array) -> float:
+    """Standard deviation by the median of absolute values."""
+    return 1.4826 * float(np.median(np.abs(rest)))
+
+
+def _ramp(t: Array, y: Array) -> float:
+    """Slope by the median of the slopes of all pairs (Theil and Sen): stray windows do not move it."""
+    i, j = np.triu_indices(t.size, 1)
+    return float(np.median((y[j] - y[i]) / (t[j] - t[i])))
+
+
+def _weighted_median(y: Array, w: Array) -> float:
+    order = np.argsort(y)
+    total = np.cumsum(w[order])
+    return float(np.interp(0.5 * total[-1], total - 0.5 * w[order], y[order]))
+
+
+def _judge(recording: Recording, base: _Path, path: _Path, lag: _Lag) -> Finding | None:
+    wide, sure = (float(stats.t.ppf(level, lag.blocks - 1)) for level in (0.975, CERTAIN))
+    drifts, wanders = _drifts(lag.changes), _wanders(lag.changes)
+    late = abs(lag.value) >= SEEN and abs(lag.value) > sure * lag.error
+    if not (late or drifts or wanders):
+        return None
+    low, high = lag.value - wide * lag.error, lag.value + wide * lag.error
+    evidence = {
+        "lag_ms": 1e3 * lag.value,
+        "lag_low_ms": 1e3 * low,
+        "lag_high_ms": 1e3 * high,
+        "explained": lag.explained,
+    }
+    how = "late" if lag.value > 0 else "early"
+    what = f"The stream {_said(path)}" if _said(path) != lag.signal else lag.signal
+    text = f"{what} is {1e3 * abs(lag.value):.1f} ms {how} against {_said(base)} ({lag.signal} against {lag.against})"
+    fix: Fix | None = None
+    advice = "Use a stretch with one lag, or estimate the lag along; a single shift does not repair it."
+    if lag.changes is not None:
+        evidence |= _numbers(lag.changes)
+    if lag.changes is not None and drifts:
+        text += f", drifting from {1e3 * lag.changes.start:.1f} ms at the start to {1e3 * lag.changes.end:.1f} ms"
+    elif lag.changes is not None and wanders:
+        text += f", and it changes: {1e3 * lag.changes.low:.1f} to {1e3 * lag.changes.high:.1f} ms within the flight"
+    else:
+        names = tuple(n for n, a in recording.signals.items() if _path(n, a) == path)
+        fix = Fix("shift", names, (-lag.value,))
+        text += f"; 95 % interval {1e3 * min(abs(low), abs(high)):.1f} to {1e3 * max(abs(low), abs(high)):.1f} ms"
+        advice = "Shift the stream, or estimate the lag along."
+    grade = Grade.DEGRADES if abs(lag.value) >= MATTERS or drifts or wanders else Grade.HARMLESS
+    return Finding("lag", grade, text + ".", lag.signal, (lag.interval,), evidence, advice, fix)
+
+
+def _drifts(changes: _Changes | None) -> bool:
+    if changes is None or abs(changes.drift) < 0.5 * MATTERS:
+        return False
+    sure = float(stats.t.ppf(CERTAIN, changes.windows - 2))
+    straight = changes.about_line < max(UNSTEADY, 0.7 * changes.scatter)
+    return abs(changes.drift) > sure * changes.drift_error and straight
+
+
+def _wanders(changes: _Changes | None) -> bool:
+    return changes is not None and changes.high - changes.low >= MATTERS and changes.scatter >= UNSTEADY
+
+
+def _numbers(changes: _Changes) -> dict[str, float]:
+    wide = float(stats.t.ppf(0.975, changes.windows - 2))
+    return {
+        "start_ms": 1e3 * changes.start,
+        "end_ms": 1e3 * changes.end,
+        "drift_ms": 1e3 * changes.drift,
+        "drift_low_ms": 1e3 * (changes.drift - wide * changes.drift_error),
+        "drift_high_ms": 1e3 * (changes.drift + wide * changes.drift_error),
+        "window_low_ms": 1e3 * changes.low,
+        "window_high_ms": 1e3 * changes.high,
+        "scatter": changes.scatter,
+        "windows": float(changes.windows),
+    }

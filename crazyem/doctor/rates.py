@@ -1,9 +1,110 @@
-"""Check: body rate against the attitude's derivative: unit, frame, sign, scale."""
+"""Check: body rate against the attitude's derivative: unit, frame, sign, scale, bias."""
 
-from crazyem.recordings.finding import Finding
-from crazyem.recordings.recording import Recording
+import math
+
+import numpy as np
+
+from crazyem.doctor import axes
+from crazyem.doctor.attitudes import Pose, poses
+from crazyem.doctor.compare import Look, agreed_scale, look
+from crazyem.doctor.kinematics import Track, grid_of, measurements, rate_of_attitude, rotate, width_for
+from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.recording import Recording, SignalArray
+
+DEGREES = 180.0 / math.pi
+ENOUGH = 0.04  # rad/s rms of rotation about an axis, below which nothing is said
+BELIEVED = 0.6  # share of the variance a hypothesis must explain
+OFF = 0.05  # scale fault reported from here on
+BIAS = 0.05  # rad/s, reported from here on
+WIDTH = 0.24  # s: a gyro in flight is loud
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
-    return []
+    """Findings about every measurement of the body rate, against every attitude."""
+    found: list[Finding] = []
+    attitudes = poses(recording)
+    for name, array in measurements(recording, "body_rate").items():
+        looks = [one for pose in attitudes if (one := _compare(array, pose)) is not None]
+        if looks:
+            found += _judge(name, looks)
+    return found
+
+
+def _compare(array: SignalArray, pose: Pose) -> Look | None:
+    grid = grid_of(array, pose.array)
+    if grid.size == 0:
+        return None
+    attitude = pose.track(grid)
+    body = rate_of_attitude(attitude)
+    world = rotate(attitude.value, body.value)
+    candidates = {
+        "body": (0, body),
+        "world": (1, Track(world, body.valid)),
+        "turned twice": (1, Track(rotate(attitude.value, body.value, inverse=True), body.valid)),
+        "world, negated": (3, Track(-world, body.valid)),
+    }
+    return look(array, grid, pose.name, candidates, width=max(WIDTH, width_for(array, pose.array)), least=ENOUGH)
+
+
+def _judge(name: str, looks: list[Look]) -> list[Finding]:
+    best = max(looks, key=lambda one: one.explained)
+    whole = best.whole
+    if whole is None or best.explained < BELIEVED:
+        return []
+    if best.choice.denied:
+        return [_structure(name, best)]
+    unit = axes.known_factor(whole, {"deg/s": DEGREES, "converted": 1.0 / DEGREES})
+    if unit:
+        head = f"{name} is {whole.value:.4g} times the derivative of {best.against}: "
+        text = head + (
+            "it is in deg/s, not rad/s."
+            if unit[0] == "deg/s"
+            else "it was in rad/s and was converted from deg/s once too often."
+        )
+        fix = Fix("scale", (name,), (1.0 / unit[1],) * 3)
+        advice = "Multiply it by the factor of the fix, or correct its unit where it is read."
+        return [Finding("rates", Grade.UNUSABLE, text, name, (), best.evidence(), advice, fix)]
+    return [*_scale(name, looks), *_bias(name, best)]
+
+
+def _structure(name: str, seen: Look) -> Finding:
+    choice = seen.choice
+    share, declared = 100.0 * seen.evidence()["explained"], 100.0 * choice.explained["body"]
+    head = f"{name} against the derivative of {seen.against}: "
+    tail = f" ({share:.2f} % of its variance explained, as declared {declared:.2f} %)."
+    fix: Fix | None = None
+    advice = "Correct its frame, axes or signs where it is read."
+    if choice.name == "world":
+        text, fix = f"{head}it is in the world frame, not the body frame{tail}", Fix("world_to_body", (name,))
+        advice = "Rotate it into the body frame by the attitude."
+    elif choice.name == "turned twice":
+        text = f"{head}it was turned from world to body although it was in the body frame already{tail}"
+        advice = "Read it as a body rate, not as a world rate."
+    elif choice.name.startswith("body "):
+        signs = choice.name.removeprefix("body ")
+        text = f"{head}its components are {signs} of the body rate{tail}"
+        factor = axes.sign_factor(signs)
+        fix = Fix("scale", (name,), factor) if factor else None
+    else:
+        text = f"{head}it is not what it is declared to be, but which axes or frame it has cannot be told{tail}"
+    return Finding("rates", Grade.UNUSABLE, text, name, (), seen.evidence(), advice, fix)
+
+
+def _scale(name: str, looks: list[Look]) -> list[Finding]:
+    agreed = agreed_scale(looks, OFF)
+    if agreed is None:
+        return []
+    seen, fault = agreed
+    numbers = {**seen.evidence(), **axes.numbers(seen.single)}
+    text = f"{name} is not the derivative of {seen.against}: {fault.text}."
+    advice = "Find out which of the two is wrong; divide the rate by its factor if it is the rate."
+    return [Finding("rates", Grade.DEGRADES, text, name, (), numbers, advice, Fix("scale", (name,), fault.repair))]
+
+
+def _bias(name: str, seen: Look) -> list[Finding]:
+    if not (np.abs(seen.offset) > np.maximum(BIAS, 5.0 * seen.offset_error)).any():
+        return []
+    evidence = {f"bias_{axis}_rad_s": float(b) for axis, b in zip("xyz", seen.offset, strict=True)}
+    worst = float(np.abs(seen.offset).max())
+    text = f"{name} has a constant bias of up to {worst:.3f} rad/s against the derivative of {seen.against}."
+    return [Finding("rates", Grade.HARMLESS, text, name, (), evidence, "Estimate it along, or take it off.")]

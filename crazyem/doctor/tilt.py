@@ -1,9 +1,180 @@
-"""Check: a tilted pose frame."""
+"""Check: a tilted pose frame: its vertical against gravity as the accelerometer feels it.
 
-from crazyem.recordings.finding import Finding
-from crazyem.recordings.recording import Recording
+In a frame that is tilted by a small rotation vector t, what is left of R f - dv/dt - g e3 is g (t x e3) + R b: the
+first part stays in the world, the second (bias or mounting of the accelerometer) turns with the body. Only turning
+tells them apart.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from crazyem.doctor.attitudes import Pose, poses
+from crazyem.doctor.delays import delay
+from crazyem.doctor.kinematics import (
+    GRAVITY,
+    UP,
+    Grid,
+    Track,
+    Window,
+    difference,
+    grid_of,
+    measurements,
+    origin_of,
+    rate_of_attitude,
+    rotate,
+    track,
+    width_for,
+)
+from crazyem.doctor.regress import CERTAIN, FEW, blocks
+from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.recording import Recording, SignalArray
+
+Array = NDArray[np.float64]
+
+SEEN = math.radians(0.5)  # tilt reported from here on
+MATTERS = math.radians(1.5)  # tilt that degrades
+BODY = math.radians(2.0)  # mounting or bias of the accelerometer, as an angle, reported from here on
+SHARP = math.radians(0.5)  # 95 % half-width that a tilt of its own must be known to
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
-    return []
+    """Findings about every attitude that can be compared with an accelerometer."""
+    forces = measurements(recording, "specific_force")
+    found: list[Finding] = []
+    for pose in poses(recording):
+        for name, array in forces.items():
+            if (finding := _look(recording, pose, name, array)) is not None:
+                found.append(finding)
+            break
+    return found
+
+
+def _look(recording: Recording, pose: Pose, name: str, array: SignalArray) -> Finding | None:
+    moving = _velocity(recording, pose)
+    grid = grid_of(array, pose.array, *([moving] if moving is not None else []))
+    if grid.size == 0:
+        return None
+    rest = _residual(recording, pose, array, moving, grid)
+    if rest is None:
+        return None
+    attitude, world = rest
+    rows = np.flatnonzero(world.valid & attitude.valid)[::5]
+    if rows.size < 100:
+        return None
+    e, q = world.value[rows], attitude.value[rows]
+    norm = float(np.median(np.linalg.norm(e + GRAVITY * UP, axis=1)))
+    if not 0.7 * GRAVITY < norm < 1.3 * GRAVITY:
+        return None  # not a specific force in m/s^2: another check says so
+    block = blocks(grid.time[rows])
+    count = int(block.max()) + 1
+    if count < FEW:
+        return None
+    both, spread = _jackknife(_design(q, both=True), e, block)
+    return _judge(pose.name, name, both, spread, _jackknife(_design(q, both=False), e, block), count)
+
+
+def _velocity(recording: Recording, pose: Pose) -> SignalArray | None:
+    """The velocity of the same origin, else the first; None where there is none."""
+    found = measurements(recording, "velocity")
+    same = [array for name, array in found.items() if origin_of(name) == origin_of(pose.name)]
+    return next(iter([*same, *found.values()]), None)
+
+
+def _residual(
+    recording: Recording, pose: Pose, array: SignalArray, moving: SignalArray | None, grid: Grid
+) -> tuple[Track, Track] | None:
+    """Attitude, and R f - dv/dt - g e3 smoothed, both on the grid."""
+    attitude = pose.track(grid)
+    window = Window(max(0.5, width_for(array, pose.array)))
+    shift = _lag(recording, pose, array, grid)
+    force = track(array, grid, shift=shift)
+    turned = Track(rotate(attitude.value, force.value), attitude.valid & force.valid)
+    felt = window.mean(turned)
+    if moving is None:
+        acceleration = Track(np.zeros_like(felt.value), felt.valid)
+    else:
+        acceleration = window.mean(difference(track(moving, grid)))
+    valid = felt.valid & acceleration.valid
+    return attitude, Track(felt.value - acceleration.value - GRAVITY * UP, valid)
+
+
+def _lag(recording: Recording, pose: Pose, array: SignalArray, grid: Grid) -> float:
+    """By how much the accelerometer is late: as the gyro that was sampled with it."""
+    for gyro in measurements(recording, "body_rate").values():
+        if gyro.stream == array.stream and gyro.time.size == array.time.size:
+            window = Window(0.24)
+            late = delay(window.mean(rate_of_attitude(pose.track(grid))), window.mean(track(gyro, grid)))
+            return 0.0 if late is None or late.at_edge or late.explained < 0.3 else late.value
+    return 0.0
+
+
+def _design(q: Array, *, both: bool) -> Array:
+    """(n, 3, k): columns for tilt x, y (world), and bias x, y, z (body); without `both` only the tilt and bias z."""
+    n = len(q)
+    a = np.zeros((n, 3, 5 if both else 3))
+    a[:, 0, 1], a[:, 1, 0] = GRAVITY, -GRAVITY
+    for k, axis in enumerate((0, 1, 2) if both else (2,)):
+        a[:, :, 2 + k] = rotate(q, np.tile(np.eye(3)[axis], (n, 1)))
+    return a
+
+
+def _jackknife(a: Array, e: Array, block: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Least squares of a x = e over rows, and standard errors by leaving out blocks."""
+    count, k = int(block.max()) + 1, a.shape[2]
+    normal, right = np.zeros((count, k, k)), np.zeros((count, k))
+    for b in range(count):
+        mine = block == b
+        normal[b] = np.einsum("nij,nik->jk", a[mine], a[mine])
+        right[b] = np.einsum("nij,ni->j", a[mine], e[mine])
+    ridge = 1e-9 * np.eye(k) * np.trace(normal.sum(axis=0))
+    whole = np.linalg.solve(normal.sum(axis=0) + ridge, right.sum(axis=0))
+    left = np.array(
+        [np.linalg.solve(normal.sum(axis=0) - normal[b] + ridge, right.sum(axis=0) - right[b]) for b in range(count)]
+    )
+    spread = np.sqrt((count - 1) / count * np.square(left - left.mean(axis=0)).sum(axis=0))
+    return whole, spread
+
+
+def _judge(pose: str, force: str, both: Array, spread: Array, alone: tuple[Array, Array], count: int) -> Finding | None:
+    usual, sure = (float(stats.t.ppf(level, count - 1)) for level in (0.975, CERTAIN))
+    tilt, error = float(np.hypot(*both[:2])), float(np.hypot(*spread[:2]))
+    mount, mount_error = float(np.hypot(*both[2:4])) / GRAVITY, float(np.hypot(*spread[2:4])) / GRAVITY
+    evidence = {
+        "tilt_deg": math.degrees(tilt),
+        "tilt_low_deg": math.degrees(max(tilt - usual * error, 0.0)),
+        "tilt_high_deg": math.degrees(tilt + usual * error),
+        "tilt_x_deg": math.degrees(both[0]),
+        "tilt_y_deg": math.degrees(both[1]),
+        "body_x_m_s2": float(both[2]),
+        "body_y_m_s2": float(both[3]),
+        "body_deg": math.degrees(mount),
+    }
+    said = f"{evidence['tilt_deg']:.2f} deg ({evidence['tilt_low_deg']:.2f} to {evidence['tilt_high_deg']:.2f})"
+    if usual * max(error, mount_error) <= SHARP:
+        if tilt >= SEEN and tilt > sure * error:
+            grade = Grade.DEGRADES if tilt >= MATTERS else Grade.HARMLESS
+            text = f"The frame of {pose} is tilted by {said} against gravity as felt by {force}."
+            advice = "Level the frame: turn positions, velocities and attitudes by the opposite rotation."
+            return Finding("tilt", grade, text, pose, (), evidence, advice)
+        if mount >= BODY and mount > sure * mount_error:
+            text = (
+                f"{force} and {pose} differ by {math.degrees(mount):.1f} deg in the body frame: the accelerometer has "
+                f"a bias ({both[2]:.2f}, {both[3]:.2f} m/s^2 along x, y), or the pose's body frame is not the IMU's."
+            )
+            return Finding("tilt", Grade.HARMLESS, text, force, (), evidence, "Estimate the offset along.")
+        return None
+    level, level_error = alone
+    total, total_error = float(np.hypot(*level[:2])), float(np.hypot(*level_error[:2]))
+    if total < 2.0 * SEEN or total <= sure * total_error:
+        return None
+    numbers = {"together_deg": math.degrees(total), "together_error_deg": math.degrees(total_error)}
+    text = (
+        f"The vertical of {pose} and gravity as felt by {force} differ by {math.degrees(total):.2f} deg: a tilted "
+        "frame, or a bias of the accelerometer; the heading changed too little to tell these apart."
+    )
+    grade = Grade.DEGRADES if total >= 2.0 * MATTERS else Grade.HARMLESS
+    advice = "Record a flight that turns once about the vertical."
+    return Finding("tilt", grade, text, pose, (), numbers, advice)

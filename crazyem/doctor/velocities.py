@@ -1,9 +1,139 @@
-"""Check: velocity against the position's derivative: unit, frame, scale."""
+"""Check: velocity against the position's derivative, and positions of two origins: unit, frame, sign, scale."""
 
-from crazyem.recordings.finding import Finding
-from crazyem.recordings.recording import Recording
+from crazyem.doctor import axes
+from crazyem.doctor.attitudes import Pose, poses
+from crazyem.doctor.compare import Look, agreed_scale, look
+from crazyem.doctor.kinematics import Track, difference, grid_of, measurements, rotate, track, width_for
+from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.recording import Recording, SignalArray
+
+ENOUGH = 0.04  # m/s rms along an axis, below which nothing is said
+FAR = 0.1  # m rms along an axis, the same for positions
+WIDTH = 0.2  # s
+BELIEVED = 0.6
+OFF = 0.05
+# slope of velocity against the position's derivative -> what that means, and which of the two is implausible
+VELOCITY_UNITS = {"mm/s": 1e3, "cm/s": 1e2}
+POSITION_UNITS = {"mm": 1e-3, "cm": 1e-2}
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
-    return []
+    """Findings about every velocity (against every position), and about every position but the first."""
+    positions = measurements(recording, "position")
+    attitudes = poses(recording)
+    found: list[Finding] = []
+    blamed: set[str] = set()
+    for name, array in measurements(recording, "velocity").items():
+        looks = [
+            one
+            for other, reference in positions.items()
+            if (one := _compare(array, other, reference, attitudes)) is not None
+        ]
+        found += _judge(name, looks, blamed)
+    first = next(iter(positions), "")
+    for name, array in positions.items():
+        if name not in (first, *blamed) and first not in blamed:
+            one = _compare_positions(array, first, positions[first])
+            found += _judge_position(name, [one] if one else [])
+    return found
+
+
+def _compare(array: SignalArray, other: str, reference: SignalArray, attitudes: list[Pose]) -> Look | None:
+    grid = grid_of(array, reference, *(pose.array for pose in attitudes[:1]))
+    if grid.size == 0:
+        return None
+    world = difference(track(reference, grid))
+    candidates: dict[str, tuple[int, Track]] = {"world": (0, world)}
+    for pose in attitudes[:1]:
+        attitude = pose.track(grid)
+        turned = rotate(attitude.value, world.value, inverse=True)
+        candidates["body"] = (1, Track(turned, world.valid & attitude.valid))
+    width = max(WIDTH, width_for(array, reference))
+    return look(array, grid, other, candidates, width=width, least=ENOUGH, offset=False)
+
+
+def _compare_positions(array: SignalArray, other: str, reference: SignalArray) -> Look | None:
+    """Positions themselves: the derivative of a stream with late packets is no fair witness of its scale."""
+    grid = grid_of(array, reference)
+    if grid.size == 0:
+        return None
+    candidates = {"world": (0, track(reference, grid))}
+    return look(array, grid, other, candidates, width=max(WIDTH, width_for(array, reference)), least=FAR)
+
+
+def _judge(name: str, looks: list[Look], blamed: set[str]) -> list[Finding]:
+    if not looks:
+        return []
+    best = max(looks, key=lambda one: one.explained)
+    whole = best.whole
+    if whole is None or best.explained < BELIEVED:
+        return []
+    head = f"{name} against the derivative of {best.against}: "
+    evidence = best.evidence()
+    if best.choice.denied:
+        return [_structure("velocities", name, head, best)]
+    unit = axes.known_factor(whole, VELOCITY_UNITS)
+    if unit:
+        text = f"{head}it is {whole.value:.4g} times as large: it is in {unit[0]}, not m/s."
+        fix = Fix("scale", (name,), (1.0 / unit[1],) * 3)
+        return [Finding("velocities", Grade.UNUSABLE, text, name, (), evidence, "Correct its unit.", fix)]
+    unit = axes.known_factor(whole, POSITION_UNITS)
+    if unit:
+        if best.against in blamed:
+            return []
+        blamed.add(best.against)
+        text = f"The derivative of {best.against} is {1 / whole.value:.4g} times {name}: it is in {unit[0]}, not m."
+        fix = Fix("scale", (best.against,), (unit[1],) * 3)
+        return [Finding("velocities", Grade.UNUSABLE, text, best.against, (), evidence, "Correct its unit.", fix)]
+    agreed = agreed_scale(looks, OFF)
+    if agreed is None:
+        return []
+    seen, fault = agreed
+    numbers = {**seen.evidence(), **axes.numbers(seen.single)}
+    text = f"{name} is not the derivative of {seen.against}: {fault.text}."
+    advice = "Find out which of the two is wrong; divide the velocity by its factor if it is the velocity."
+    return [Finding("velocities", Grade.DEGRADES, text, name, (), numbers, advice, Fix("scale", (name,), fault.repair))]
+
+
+def _judge_position(name: str, looks: list[Look]) -> list[Finding]:
+    if not looks or looks[0].whole is None or looks[0].explained < BELIEVED:
+        return []
+    seen, whole = looks[0], looks[0].whole
+    assert whole is not None
+    head = f"{name} against {seen.against}: "
+    if seen.choice.denied:
+        return [_structure("velocities", name, head, seen)]
+    unit = axes.known_factor(whole, {"mm": 1e3, "cm": 1e2, "km": 1e-3})
+    if unit:
+        text = f"{head}it is {whole.value:.4g} times as large: it is in {unit[0]}, not m."
+        fix = Fix("scale", (name,), (1.0 / unit[1],) * 3)
+        return [Finding("velocities", Grade.UNUSABLE, text, name, (), seen.evidence(), "Correct its unit.", fix)]
+    agreed = agreed_scale(looks, OFF)
+    if agreed is None:
+        return []
+    numbers = {**seen.evidence(), **axes.numbers(seen.single)}
+    text = f"{name} and {seen.against} differ in scale: {agreed[1].text}, if {seen.against} is right."
+    advice = "Find out which of the two is calibrated."
+    return [Finding("velocities", Grade.DEGRADES, text, name, (), numbers, advice)]
+
+
+def _structure(check_name: str, name: str, head: str, seen: Look) -> Finding:
+    choice = seen.choice
+    tail = (
+        f" ({100.0 * seen.evidence()['explained']:.2f} % of it explained, "
+        f"as declared {100.0 * choice.explained[seen.declared]:.2f} %)."
+    )
+    fix: Fix | None = None
+    if choice.name == "body":
+        text = f"{head}it is in the body frame, not the world frame{tail}"
+        advice = "Rotate it into the world frame by the attitude."
+    elif choice.name.startswith("world "):
+        signs = choice.name.removeprefix("world ")
+        text = f"{head}its components are {signs} of the world{tail}"
+        factor = axes.sign_factor(signs)
+        fix = Fix("scale", (name,), factor) if factor else None
+        advice = "Correct its axes or signs where it is read."
+    else:
+        text = f"{head}it is not what it is declared to be, but which axes or frame it has cannot be told{tail}"
+        advice = "Correct its frame, axes or signs where it is read."
+    return Finding(check_name, Grade.UNUSABLE, text, name, (), seen.evidence(), advice, fix)

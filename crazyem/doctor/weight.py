@@ -1,9 +1,139 @@
-"""Check: thrust against weight, and a mass the publisher claims."""
+"""Check: the mass that the rotors carry by the known thrust laws, against a mass that the publisher claims.
 
-from crazyem.recordings.finding import Finding
+Thrust over specific force along body z is a mass, but only as good as the thrust law: a law that is 20 % too strong
+and a drone that is 20 % too heavy look the same. So a finding names the ratio, never "the mass".
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from crazyem.doctor.kinematics import GRAVITY, STEP, Grid, Track, grid_of, measurements, track
+from crazyem.doctor.regress import FEW, block_sums, blocks
+from crazyem.physics.rotors import thrust_from_command, thrust_from_speed
+from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording
+from crazyem.vehicle import Vehicle, load_vehicle, preset_names
+
+Array = NDArray[np.float64]
+
+OFF = 0.15  # claimed mass against the nearest law: reported from here on
+LIFTING = 0.6  # of the median thrust while rotors turn: less is a take-off, a landing or the ground
+BRIDGE = 0.15  # s, gaps in thrust and force that a mean may bridge
+PIECE = 25  # rows of a block at least (0.25 s)
+
+
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """What a thrust law says of a flight.
+
+    Attributes:
+        mass: kg, mean thrust over mean specific force along body z.
+        low, high: 95 % interval of the mean; the thrust law itself is not in it.
+        sag: relative change of that mass for each volt of battery [1/V]; NaN where the voltage hardly changes.
+        seconds: of flight used.
+    """
+
+    mass: float
+    low: float
+    high: float
+    sag: float
+    seconds: float
 
 
 def check(recording: Recording) -> list[Finding]:
-    """Findings of this check."""
-    return []
+    """A finding where the publisher claims a mass that no known thrust law carries; nothing without a claim."""
+    claim = claimed_mass(recording)
+    if claim is None:
+        return []
+    carried = {name: found for name in preset_names() if (found := apparent_mass(recording, load_vehicle(name)))}
+    if not carried:
+        return []
+    nearest = min(carried, key=lambda name: abs(math.log(carried[name].mass / claim)))
+    best = carried[nearest]
+    ratio = best.mass / claim
+    if abs(math.log(ratio)) < math.log(1.0 + OFF) or best.low <= claim <= best.high:
+        return []
+    evidence = {"claimed_kg": claim, "ratio": ratio, "ratio_low": best.low / claim, "ratio_high": best.high / claim}
+    for name, one in carried.items():
+        key = name.replace("-", "_")
+        evidence |= {f"mass_{key}_kg": one.mass, f"mass_{key}_low_kg": one.low, f"mass_{key}_high_kg": one.high}
+        evidence |= {f"sag_{key}_per_V": one.sag, "seconds": one.seconds}
+    listed = ", ".join(f"{1e3 * one.mass:.1f} g by {name}" for name, one in carried.items())
+    text = (
+        f"{1e3 * claim:.1f} g are claimed, but the rotors carry {listed} (thrust laws of known drones): at least "
+        f"{ratio:.2f} times the claim. Only the ratio of thrust scale to mass can be observed."
+        if ratio > 1.0
+        else f"{1e3 * claim:.1f} g are claimed, but the rotors carry {listed} (thrust laws of known drones): at most "
+        f"{ratio:.2f} times the claim. Only the ratio of thrust scale to mass can be observed."
+    )
+    advice = "Weigh the drone as it flew, or give the vehicle a thrust law of its own."
+    return [Finding("weight", Grade.DEGRADES, text, "", (), evidence, advice)]
+
+
+def claimed_mass(recording: Recording) -> float | None:
+    """Mass [kg] that the source claims (metadata "claims", "mass_kg"); None if it claims none."""
+    try:
+        mass = float(recording.metadata.get("claims", {}).get("mass_kg", "nan"))
+    except ValueError:
+        return None
+    return mass if 0.0 < mass < math.inf else None
+
+
+def apparent_mass(recording: Recording, vehicle: Vehicle) -> Carried | None:
+    """Mean thrust by a vehicle's law over mean specific force along body z, in flight; None where it cannot be had.
+
+    Without an accelerometer the mean force is taken to be the weight.
+    """
+    made = _thrust(recording, vehicle)
+    if made is None:
+        return None
+    grid, thrust, volts = made
+    force = next(iter(measurements(recording, "specific_force").values()), None)
+    carried = track(force, grid, bridge=BRIDGE) if force is not None else None
+    lift = carried.value[:, 2] if carried is not None else np.full(grid.size, GRAVITY)
+    valid = thrust.valid & (carried.valid if carried is not None else True)
+    total = thrust.value[:, 0]
+    turning = valid & (total > 1e-3)
+    if turning.sum() < FEW * PIECE:
+        return None
+    flying = turning & (total > LIFTING * float(np.median(total[turning]))) & (lift > 0.2 * GRAVITY)
+    rows = np.flatnonzero(flying)
+    if rows.size < FEW * PIECE:
+        return None
+    sums = block_sums(blocks(grid.time[rows]), total[rows], lift[rows], volts.value[rows, 0], np.ones(rows.size))
+    sums = sums[sums[:, 3] >= PIECE]
+    if len(sums) < FEW or not 0.5 * GRAVITY < sums[:, 1].sum() / sums[:, 3].sum() < 2.0 * GRAVITY:
+        return None
+    mass = float(sums[:, 0].sum() / sums[:, 1].sum())
+    each = sums[:, 0] / sums[:, 1]
+    wide = float(stats.t.ppf(0.975, len(sums) - 1)) * float(each.std(ddof=1)) / math.sqrt(len(sums))
+    voltage = sums[:, 2] / sums[:, 3]
+    sag = float(np.polyfit(voltage - voltage.mean(), each / mass, 1)[0]) if np.ptp(voltage) > 0.1 else math.nan
+    return Carried(mass, mass - wide, mass + wide, sag, float(sums[:, 3].sum()) * STEP)
+
+
+def _thrust(recording: Recording, vehicle: Vehicle) -> tuple[Grid, Track, Track] | None:
+    """Total thrust (m, 1) [N] and voltage (m, 1) on a grid: from rotor speeds where the law has them."""
+    speed = next(iter(measurements(recording, "rotor_speed").values()), None)
+    voltage = next(iter(measurements(recording, "voltage").values()), None)
+    if speed is not None and vehicle.rotor_constant is not None:
+        grid = grid_of(speed)
+        rotor = track(speed, grid, bridge=BRIDGE)
+        force = thrust_from_speed(rotor.value, rotor_constant=vehicle.rotor_constant).sum(axis=1)
+        volts = (
+            track(voltage, grid, bridge=2.0) if voltage is not None else Track(np.zeros((grid.size, 1)), rotor.valid)
+        )
+        return grid, Track(force[:, None], rotor.valid), volts
+    command = next(iter(measurements(recording, "motor_command").values()), None)
+    if command is None or voltage is None or not vehicle.thrust_curve:
+        return None
+    grid = grid_of(command, voltage)
+    duty, volts = track(command, grid, bridge=BRIDGE), track(voltage, grid, bridge=2.0)
+    force = thrust_from_command(
+        np.clip(duty.value, 0.0, 1.0), volts.value[:, 0], thrust_curve=vehicle.thrust_curve
+    ).sum(axis=1)
+    return grid, Track(force[:, None], duty.valid & volts.valid), volts

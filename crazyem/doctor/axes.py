@@ -1,0 +1,102 @@
+"""Signed axes as hypotheses, and slopes as units or scale faults: what the comparing checks share."""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.doctor.regress import Slope
+
+Array = NDArray[np.float64]
+
+SLACK = 0.02  # sensors and filters in good order differ by so much
+MANY = 10  # blocks (of 1.5 s or more) that a scale must have been seen over
+_NAMES = "xyz"
+_NEAR = math.log(1.2)  # how far a slope may be from a known factor
+
+
+def signed(label: str, vector: Array, names: Sequence[str] = _NAMES) -> dict[str, tuple[int, Array]]:
+    """All 48 signed orders of the components of (n, 3): name -> (how far-fetched, values); the plain one first.
+
+    A sign costs 1 (all three together: 2), another order 2 more. Names: "body", "body x, -y, z", "body y, x, z".
+    """
+    out: dict[str, tuple[int, Array]] = {}
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            flipped = sum(s < 0 for s in signs)
+            cost = (2 if flipped == 3 else flipped) + (0 if order == (0, 1, 2) else 2)
+            parts = ("-" * (s < 0) + names[i] for s, i in zip(signs, order, strict=True))
+            name = label if cost == 0 else f"{label} " + ", ".join(parts)
+            out[name] = (cost, vector[:, order] * np.array(signs))
+    return out
+
+
+def sign_factor(name: str, names: Sequence[str] = _NAMES) -> tuple[float, ...] | None:
+    """Factors that undo signs named by `signed` ("x, -y, z"), None if the order changed."""
+    parts = name.split(", ")
+    if [part.lstrip("-") for part in parts] != list(names):
+        return None
+    return tuple(-1.0 if part.startswith("-") else 1.0 for part in parts)
+
+
+def known_factor(found: Slope, known: Mapping[str, float]) -> tuple[str, float] | None:
+    """The known factor that a slope is (within 20 %), None if 1 or anything else."""
+    if found.value <= 0.0:
+        return None
+    for name, factor in known.items():
+        if abs(math.log(found.value / factor)) < _NEAR:
+            return name, factor
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleFault:
+    """A scale that is not 1. `text` names factors and intervals; `repair` are the factors to multiply with."""
+
+    text: str
+    repair: tuple[float, ...]
+
+
+def scale_fault(whole: Slope | None, single: Sequence[Slope | None], least: float) -> ScaleFault | None:
+    """A scale fault of all components or of some, if one is at least `least` from 1 for certain, else None.
+
+    Args:
+        whole: slope of all components together.
+        single: of each component.
+        least: deviation from 1 that matters.
+    """
+    off = [s is not None and _off(s, least) for s in single]
+    together = whole is not None and _off(whole, least)
+    # one factor for all, if no component contradicts it
+    if (
+        together
+        and whole is not None
+        and all(s is None or (s.low <= whole.high and s.high >= whole.low) for s in single)
+    ):
+        return ScaleFault(f"its scale is {_said(whole)}", (1.0 / whole.value,) * len(single))
+    if not any(off):
+        return None
+    said = [f"{_NAMES[i]} {_said(s)}" for i, s in enumerate(single) if off[i] and s is not None]
+    repair = tuple(1.0 / s.value if o and s is not None else 1.0 for o, s in zip(off, single, strict=True))
+    return ScaleFault("its scale is " + ", ".join(said), repair)
+
+
+def numbers(single: Sequence[Slope | None]) -> dict[str, float]:
+    """Slopes of the components with their intervals, as evidence."""
+    out: dict[str, float] = {}
+    for axis, s in zip(_NAMES, single, strict=False):
+        if s is not None:
+            out |= {f"slope_{axis}": s.value, f"slope_{axis}_low": s.low, f"slope_{axis}_high": s.high}
+    return out
+
+
+def _off(s: Slope, least: float) -> bool:
+    certain = s.far_low > 1.0 + SLACK or s.far_high < 1.0 - SLACK
+    return abs(s.value - 1.0) >= least and certain and s.explained > 0.8 and s.blocks >= MANY
+
+
+def _said(s: Slope) -> str:
+    return f"{s.value:.3f} ({s.low:.3f} to {s.high:.3f})"

@@ -1,0 +1,174 @@
+"""One measurement against what other streams predict for it, under several hypotheses: what rates, velocities and
+forces have in common."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.doctor import axes
+from crazyem.doctor.delays import delay
+from crazyem.doctor.kinematics import Grid, Track, Window, track
+from crazyem.doctor.regress import Choice, Slope, blocks, choose, slope
+from crazyem.recordings.recording import SignalArray
+
+Array = NDArray[np.float64]
+
+WIDE = 0.5  # s, window for slopes: motion slow enough for the filters of any stream
+STRIDE = 3  # grid steps between rows
+COVERED = 0.5  # share of the time that a scale fault must have been seen over
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """One measurement against one prediction.
+
+    Attributes:
+        against: name of what it was compared with.
+        choice: which hypothesis holds.
+        lag: s by which the measurement is late; already taken out.
+        whole: slope of the measurement against the chosen prediction, all components together.
+        single: of each component.
+        offset: (3,) median of measurement minus slope times prediction.
+        offset_error: (3,) its standard error.
+        covered: share of the common time that the windows of the slope cover.
+        mean: (3,) of the measurement.
+        predicted: (3,) mean of the declared prediction.
+        mean_error: (3,) its standard error, less what the prediction explains.
+    """
+
+    against: str
+    choice: Choice
+    lag: float
+    whole: Slope | None
+    single: tuple[Slope | None, ...]
+    offset: Array
+    offset_error: Array
+    covered: float
+    mean: Array
+    predicted: Array
+    mean_error: Array
+
+    @property
+    def declared(self) -> str:
+        return next(iter(self.choice.explained))
+
+    @property
+    def explained(self) -> float:
+        """By the best hypothesis."""
+        return self.choice.explained[self.choice.best]
+
+    def evidence(self) -> dict[str, float]:
+        """The numbers that every finding of the comparing checks carries."""
+        out = {
+            "explained": self.choice.explained[self.choice.name or self.choice.best],
+            "explained_as_declared": self.choice.explained[self.declared],
+            "unexplained_ratio": self.choice.ratio,
+            "lag_ms": 1e3 * self.lag,
+        }
+        if self.whole is not None:
+            out |= {"slope": self.whole.value, "slope_low": self.whole.low, "slope_high": self.whole.high}
+            out["samples"] = float(self.whole.samples)
+        return out
+
+
+def look(
+    array: SignalArray,
+    grid: Grid,
+    against: str,
+    candidates: Mapping[str, tuple[int, Track]],
+    *,
+    width: float,
+    least: float,
+    offset: bool = True,
+) -> Look | None:
+    """Compare a measurement with predictions; None where there is too little motion or data.
+
+    Args:
+        array: the measurement, three components.
+        grid: of the predictions.
+        against: name of what the predictions were made of.
+        candidates: name -> (how far-fetched, prediction before smoothing); the declared one first.
+        width: s, of the window.
+        least: rms about the mean that the declared prediction must have.
+        offset: the hypotheses are compared about the means.
+    """
+    window = Window(width)
+    raw = track(array, grid)
+    smooth = {name: window.mean(given) for name, (_, given) in candidates.items()}
+    declared = next(iter(smooth.values()))
+    late = delay(declared, window.mean(raw))
+    lag = 0.0 if late is None or late.at_edge or late.explained < 0.3 else late.value
+    if lag:
+        raw = track(array, grid, shift=lag)
+    measured = window.mean(raw)
+    rows = np.flatnonzero(measured.valid & np.logical_and.reduce([s.valid for s in smooth.values()]))[::STRIDE]
+    if rows.size < 100 or float(declared.value[rows].std(axis=0).max()) < least:
+        return None
+    y = measured.value[rows]
+    block = blocks(grid.time[rows])
+    chosen = {name: (cost, smooth[name].value[rows]) for name, (cost, _) in candidates.items()}
+    for name, (cost, value) in axes.signed(next(iter(chosen)), chosen[next(iter(chosen))][1]).items():
+        chosen.setdefault(name, (cost, value))
+    choice = choose(y, chosen, block, offset=offset)
+    if choice is None:
+        return None
+    name = choice.name or choice.best
+    x = chosen[name][1]
+    base = name if name in candidates else next(iter(candidates))
+    wide = Window(max(WIDE, width))
+    far_x, far_y = wide.mean(candidates[base][1]), wide.mean(raw)
+    keep = np.flatnonzero(far_x.valid & far_y.valid)[::STRIDE]
+    if keep.size > 200 and name in candidates:
+        x, y, block = far_x.value[keep], far_y.value[keep], blocks(grid.time[keep])
+    whole = slope(x, y, block)
+    single = tuple(slope(x[:, i], y[:, i], block) for i in range(3))
+    rest = y - (whole.value if whole else 1.0) * x
+    at = declared.value[rows] if len(rows) == len(y) else wide.mean(next(iter(candidates.values()))[1]).value[keep]
+    return Look(
+        against=against,
+        choice=choice,
+        lag=lag,
+        whole=whole,
+        single=single,
+        offset=np.median(rest, axis=0),
+        offset_error=_error(rest, block),
+        covered=len(y) * STRIDE / grid.size,
+        mean=y.mean(axis=0),
+        predicted=at.mean(axis=0),
+        mean_error=_error(y - at * _ratio(y, at), block),
+    )
+
+
+def agreed_scale(looks: Sequence[Look], least: float) -> tuple[Look, axes.ScaleFault] | None:
+    """A scale fault that no comparison contradicts; None if one that could see it sees none.
+
+    What a measurement is compared with may be at fault itself (an onboard attitude follows its own filter), so a fault
+    must show against all; and stretches between lost packets are no fair sample, so most of the time must be covered.
+    """
+    found = []
+    for one in looks:
+        if one.whole is None or one.choice.denied:
+            continue
+        fault = axes.scale_fault(one.whole, one.single, least) if one.covered >= COVERED else None
+        if fault is not None and one.explained >= 0.8:
+            found.append((one, fault))
+        elif one.whole.far_high - one.whole.far_low < 0.3:
+            return None
+    if not found:
+        return None
+    directions = {tuple(np.sign(np.round(np.log(fault.repair), 9))) for _, fault in found}
+    best = min(found, key=lambda pair: pair[0].whole.high - pair[0].whole.low if pair[0].whole else math.inf)
+    return best if len(directions) == 1 else None
+
+
+def _ratio(y: Array, x: Array) -> float:
+    square = float((x * x).sum())
+    return float((x * y).sum()) / square if square > 0 else 1.0
+
+
+def _error(value: Array, block: NDArray[np.int64]) -> Array:
+    means = np.array([value[block == b].mean(axis=0) for b in np.unique(block)])
+    return np.asarray(means.std(axis=0, ddof=1) / math.sqrt(len(means)), float)

@@ -1,0 +1,136 @@
+"""The lag between two tracks of one motion: found to a fraction of a grid step, whatever the units and axes are."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.doctor.kinematics import STEP, Track
+
+Array = NDArray[np.float64]
+
+REACH = 0.3  # s, lags looked for on either side
+ROWS = 4000  # of the grid that a correlation is made of, at most
+NEAR = 6  # grid steps about a lag within which it may move when a block is left out
+LEAST = 45  # and at least
+
+
+@dataclass(frozen=True, slots=True)
+class Delay:
+    """How much later the second track shows what the first one shows.
+
+    Attributes:
+        value: s; positive where the second is late.
+        explained: share of the second's variance that the first, so much later, explains.
+        at_edge: the best lag is at the end of the range: there is no maximum within.
+    """
+
+    value: float
+    explained: float
+    at_edge: bool
+
+
+def delay(first: Track, second: Track, *, reach: float = REACH, mixed: bool = True) -> Delay | None:
+    """Lag of `second` behind `first`, (m, c) each; None if they share too little.
+
+    Args:
+        first, second: smoothed alike, on one grid.
+        reach: s.
+        mixed: explain each component of the second by all of the first (any axes, signs and units); else by the same
+            component only, with a free factor.
+    """
+    most = round(reach / STEP)
+    steps = np.arange(-most, most + 1)
+    curve = np.array([_explained(first, second, int(k), mixed) for k in steps])
+    if not np.isfinite(curve).any():
+        return None
+    top = int(np.nanargmax(curve))
+    edge = top in (0, steps.size - 1) or not np.isfinite(curve[top - 1 : top + 2]).all()
+    if edge:
+        return Delay(float(steps[top]) * STEP, float(curve[top]), True)
+    place = float(steps[top]) - 1.0 + _peak(curve[top - 1 : top + 2])
+    return Delay(place * STEP, float(curve[top]), False)
+
+
+def _explained(first: Track, second: Track, steps: int, mixed: bool) -> float:
+    """Share of the variance of second(t) that first(t - steps) explains; NaN with too little in common."""
+    m = len(first.value)
+    a, b = max(0, -steps), max(0, steps)
+    n = m - abs(steps)
+    stride = max(2, n // ROWS)
+    good = first.valid[a : a + n : stride] & second.valid[b : b + n : stride]
+    count = int(np.count_nonzero(good))
+    if count < LEAST:
+        return math.nan
+    x = first.value[a : a + n : stride][good]
+    y = second.value[b : b + n : stride][good]
+    one = np.full(count, 1.0 / count)
+    mx, my = one @ x, one @ y
+    sxx = x.T @ x / count - np.outer(mx, mx)
+    sxy = x.T @ y / count - np.outer(mx, my)
+    syy = np.einsum("ij,ij->j", y, y) / count - my * my
+    whole = float(syy.sum())
+    if whole <= 0.0 or np.trace(sxx) <= 0.0:
+        return math.nan
+    if mixed:
+        sxx = sxx + np.eye(len(sxx)) * (1e-9 * np.trace(sxx))
+        got = float(np.einsum("ij,ij->", sxy, np.linalg.solve(sxx, sxy)))
+    else:
+        got = float((np.diag(sxy) ** 2 / np.maximum(np.diag(sxx), 1e-300)).sum())
+    return got / whole
+
+
+def spread(first: Track, second: Track, found: Delay, block_rows: int) -> tuple[float, int]:
+    """Standard error [s] of a lag, and of how many blocks: the peak found again with each block left out.
+
+    Args:
+        first, second, found: what `delay` was given and gave.
+        block_rows: grid steps of a block.
+    """
+    middle = round(found.value / STEP)
+    steps = np.arange(middle - NEAR, middle + NEAR + 1)
+    sums = np.array([_block_sums(first, second, int(k), block_rows) for k in steps])
+    used = sums[:, :, 0, 0].min(axis=0) > 0
+    sums = sums[:, used]
+    count = int(used.sum())
+    if count < 3:
+        return math.inf, count
+    total = sums.sum(axis=1)
+    peaks = np.array([_peak(_share(total - sums[:, b])) for b in range(count)]) * STEP
+    return float(np.sqrt((count - 1) / count * np.square(peaks - peaks.mean()).sum())), count
+
+
+def _block_sums(first: Track, second: Track, steps: int, block_rows: int) -> Array:
+    """(blocks, 6, c) sums of 1, x, y, xx, xy, yy of x = first(t - steps), y = second(t), by blocks of t."""
+    m = len(first.value)
+    a, b = max(0, -steps), max(0, steps)
+    n = m - abs(steps)
+    stride = max(2, n // ROWS)
+    at = np.arange(b, b + n, stride)
+    good = first.valid[a : a + n : stride] & second.valid[at]
+    x, y, block = first.value[a : a + n : stride][good], second.value[at][good], (at // block_rows)[good]
+    blocks = -(-m // block_rows)
+    parts = [np.ones_like(x), x, y, x * x, x * y, y * y]
+    return np.array(
+        [[np.bincount(block, weights=p[:, c], minlength=blocks) for c in range(x.shape[1])] for p in parts]
+    ).transpose(2, 0, 1)
+
+
+def _share(sums: Array) -> Array:
+    """Explained share at each lag, from (lags, 6, c) sums."""
+    n = np.maximum(sums[:, 0], 1.0)
+    mx, my = sums[:, 1] / n, sums[:, 2] / n
+    sxx, sxy, syy = sums[:, 3] / n - mx * mx, sums[:, 4] / n - mx * my, sums[:, 5] / n - my * my
+    got = (sxy**2 / np.maximum(sxx, 1e-300)).sum(axis=1)
+    return np.asarray(got / np.maximum(syy.sum(axis=1), 1e-300), float)
+
+
+def _peak(curve: Array) -> float:
+    """Place of the maximum between samples, by a parabola."""
+    top = int(np.argmax(curve))
+    if top in (0, curve.size - 1):
+        return float(top)
+    left, middle, right = curve[top - 1 : top + 2]
+    bend = left - 2.0 * middle + right
+    return top + (0.5 * (left - right) / bend if bend < 0.0 else 0.0)

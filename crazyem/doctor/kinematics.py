@@ -1,0 +1,323 @@
+"""Signals side by side for the checks that use physics: tracks on one time grid, smoothed and differentiated alike.
+
+A relation between two signals, y = dx/dt, is never tested by differentiating x: both sides are multiplied by the same
+smooth window k and integrated, k * y = k' * x. The window is a raised cosine of `width` seconds; what it cannot see
+(vibration, quantisation, the jitter of a 74 Hz stream) does not matter, and white noise is averaged away.
+"""
+
+import weakref
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import convolve1d
+
+from crazyem.recordings.recording import Recording, SignalArray
+from crazyem.signals.sample import SIGNALS
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+STEP = 0.01  # s, of the grid
+LONGEST = 900.0  # s of a recording that are looked at, about its middle
+SHORTEST = 2.0  # s; nothing can be said of less
+WIDTH = 0.16  # s, window for streams of 50 Hz or more
+BRIDGE = 0.045  # s; motion is slow against it
+UP = np.array([0.0, 0.0, 1.0])
+GRAVITY = 9.81  # m/s^2; the true value differs from place to place by 0.3 %
+
+
+def quantity_of(name: str, array: SignalArray) -> str:
+    """The quantity a signal measures: what its reader says, else what its name says, else ""."""
+    if array.quantity:
+        return array.quantity
+    stem = name.split("@", maxsplit=1)[0]
+    return stem if stem in SIGNALS else ""
+
+
+def origin_of(name: str) -> str:
+    """Where a measurement comes from: "" for the recording's first choice, "mocap" for "position@mocap"."""
+    return name.partition("@")[2]
+
+
+def measurements(recording: Recording, quantity: str) -> dict[str, SignalArray]:
+    """All signals that measure a quantity and hold at least 2 s of numbers, made light; the first choice first."""
+    found = {}
+    for name, array in recording.signals.items():
+        if quantity_of(name, array) == quantity and array.value.shape[1] == SIGNALS[quantity][0]:
+            made = light(array, quantity)
+            if made.time.size >= 20 and made.time[-1] - made.time[0] >= SHORTEST:
+                found[name] = made
+    return dict(sorted(found.items(), key=lambda item: (item[0] != quantity, item[0])))
+
+
+# The last signals that were made light, as long as their values live: seven checks ask for the same ones.
+_light: OrderedDict[tuple[int, int, str], tuple[weakref.ref, weakref.ref, SignalArray]] = OrderedDict()
+_KEPT = 32
+
+
+def light(array: SignalArray, quantity: str) -> SignalArray:
+    """The sound samples of a signal, in the order of their stamps, averaged down to 100 Hz where it is faster.
+
+    Of equal stamps the first is kept. Not more than `LONGEST` about the middle of the samples (not of the stamps, so
+    that a stamp that jumped far away does no harm). Angles are picked, not averaged, for the sake of their jumps.
+    """
+    key = (id(array.time), id(array.value), quantity)
+    known = _light.get(key)
+    if known is not None and known[0]() is array.time and known[1]() is array.value:
+        _light.move_to_end(key)
+        return known[2]
+    made = _lightened(array, quantity)
+    _light[key] = (weakref.ref(array.time), weakref.ref(array.value), made)
+    while len(_light) > _KEPT:
+        _light.popitem(last=False)
+    return made
+
+
+def _lightened(array: SignalArray, quantity: str) -> SignalArray:
+    good = _sound(array)
+    time, value = array.time[good], array.value[good]
+    if time.size > 1 and (np.diff(time) <= 0).any():
+        time, kept = np.unique(time, return_index=True)
+        value = value[kept]
+    if time.size and time[-1] - time[0] > LONGEST:
+        near = np.abs(time - float(np.median(time))) <= 0.5 * LONGEST
+        time, value = time[near], value[near]
+    if quantity == "attitude":
+        value = _continuous(value)
+    period = _period(time)
+    many = int(STEP / period + 1e-6) if period > 0 else 1
+    if many > 1:
+        rest = time.size // many * many
+        first, last = time[:rest:many], time[many - 1 : rest : many]
+        # an average across a gap would lie between two times that it belongs to
+        whole = last - first <= 2.0 * many * period
+        if quantity == "euler":
+            time, value = time[many // 2 : rest : many][whole], value[many // 2 : rest : many][whole]
+        else:
+            value = np.asarray(sum(value[k:rest:many] for k in range(many)), float)[whole] / many
+            time = np.asarray(sum(time[k:rest:many] for k in range(many)), float)[whole] / many
+    clean = np.zeros(time.size, bool)
+    rows = np.arange(time.size, dtype=np.int64)
+    none = np.full(time.size, np.nan)
+    return replace(array, time=time, value=value, marked=clean, order=rows, host_time=none, quantity=quantity)
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Times `start + i STEP`, i < size."""
+
+    start: float
+    size: int
+
+    @property
+    def time(self) -> Array:
+        return np.asarray(self.start + STEP * np.arange(self.size), float)
+
+
+def grid_of(*arrays: SignalArray) -> Grid:
+    """A grid over the time that all the (light) arrays share; size 0 where there is none."""
+    if any(array.time.size < 4 for array in arrays):
+        return Grid(0.0, 0)
+    start = max(float(array.time[0]) for array in arrays)
+    end = min(float(array.time[-1]) for array in arrays)
+    return Grid(start, int((end - start) / STEP) + 1) if end - start >= SHORTEST else Grid(0.0, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Values (m, c) on a grid, and where they can be relied on (m,)."""
+
+    value: Array
+    valid: Mask
+
+    def part(self, rows: slice) -> "Track":
+        return Track(self.value[rows], self.valid[rows])
+
+
+def width_for(*arrays: SignalArray) -> float:
+    """Length [s] of the window for streams of these rates: eight samples of the slowest, at least `WIDTH`."""
+    return max([WIDTH, *(8.0 * _period(array.time) for array in arrays)])
+
+
+def track(array: SignalArray, grid: Grid, *, shift: float = 0.0, bridge: float = BRIDGE) -> Track:
+    """A light signal on a grid, by local cubics; not valid across gaps.
+
+    Args:
+        array: of one signal, from `measurements`.
+        grid: from `grid_of`.
+        shift: s by which the stamps of the array are late; they are made earlier by as much.
+        bridge: s, gaps up to here are bridged by a cubic (and always those of 2.6 periods of the stream).
+    """
+    time = array.time - shift
+    if time.size < 4 or grid.size == 0:
+        return Track(np.zeros((grid.size, array.value.shape[1])), np.zeros(grid.size, bool))
+    at = grid.time
+    row = np.clip(np.searchsorted(time, at, side="right") - 1, 0, time.size - 2)
+    out = _cubic(time, array.value, at, row)
+    step = np.diff(time)
+    valid = (at >= time[0]) & (at <= time[-1]) & (step[row] <= max(2.6 * _period(time), bridge))
+    if array.quantity == "attitude":
+        norm = np.sqrt(np.einsum("ij,ij->i", out, out))
+        valid &= norm > 1e-3
+        out /= np.where(norm > 1e-3, norm, 1.0)[:, None]
+    return Track(out, valid)
+
+
+@dataclass(frozen=True)
+class Window:
+    """The raised cosine of `width` seconds and its derivative, as convolution kernels on the grid."""
+
+    width: float
+
+    @property
+    def half(self) -> int:
+        return max(2, round(0.5 * self.width / STEP))
+
+    @cached_property
+    def kernel(self) -> Array:
+        k = 1.0 + np.cos(np.pi * np.arange(-self.half, self.half + 1) / self.half)
+        return np.asarray(k / k.sum(), float)
+
+    @cached_property
+    def slope(self) -> Array:
+        """Gives exactly 1 for a ramp of 1/s."""
+        i = np.arange(-self.half, self.half + 1)
+        k = np.sin(np.pi * i / self.half)
+        return np.asarray(k / (k @ i * STEP), float)
+
+    def mean(self, given: Track) -> Track:
+        """k * x."""
+        return self._apply(given, self.kernel)
+
+    def rate(self, given: Track) -> Track:
+        """k' * x: the derivative of k * x."""
+        return self._apply(given, self.slope)
+
+    def _apply(self, given: Track, kernel: Array) -> Track:
+        if given.valid.size < kernel.size:
+            return Track(given.value, np.zeros(given.valid.size, bool))
+        clean = np.where(given.valid[:, None], given.value, 0.0)
+        # correlation: the kernel is reversed by convolve1d
+        value = convolve1d(clean, kernel[::-1], axis=0, mode="nearest")
+        missing = np.concatenate([[0], np.cumsum(~given.valid)])
+        low = np.arange(given.valid.size) - self.half
+        high = low + 2 * self.half + 1
+        inside = (low >= 0) & (high <= given.valid.size)
+        count = missing[np.clip(high, 0, given.valid.size)] - missing[np.clip(low, 0, given.valid.size)]
+        return Track(value, inside & (count == 0))
+
+
+def rate_of_attitude(attitude: Track) -> Track:
+    """Body rate (m, 3) [rad/s] of a quaternion track: rotation vectors between neighbours, to fourth order."""
+    q = attitude.value
+    rate = np.zeros((len(q), 3))
+    if len(q) >= 5:
+        near = _relative(q[1:-3], q[3:-1]) / (2.0 * STEP)
+        far = _relative(q[:-4], q[4:]) / (4.0 * STEP)
+        rate[2:-2] = (4.0 * near - far) / 3.0
+    return Track(rate, _inner(attitude.valid))
+
+
+def difference(given: Track) -> Track:
+    """Derivative on the grid to fourth order, per second: (m, c)."""
+    x = given.value
+    value = np.zeros_like(x)
+    if len(x) >= 5:
+        value[2:-2] = (8.0 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12.0 * STEP)
+    return Track(value, _inner(given.valid))
+
+
+def _inner(valid: Mask) -> Mask:
+    """Where two neighbours on either side are valid, too."""
+    out = np.zeros(valid.size, bool)
+    if valid.size >= 5:
+        out[2:-2] = valid[:-4] & valid[1:-3] & valid[2:-2] & valid[3:-1] & valid[4:]
+    return out
+
+
+def rotate(attitude: Array, vector: Array, *, inverse: bool = False) -> Array:
+    """R v, body to world (or R^T v with `inverse`): (m, 4) unit quaternions x y z w, (m, 3) vectors."""
+    u = -attitude[:, :3] if inverse else attitude[:, :3]
+    cross = 2.0 * np.cross(u, vector)
+    return np.asarray(vector + attitude[:, 3:] * cross + np.cross(u, cross), float)
+
+
+def quaternion_of_euler(angles: Array) -> Array:
+    """(m, 3) roll, pitch, yaw [rad] (ZYX) to (m, 4) quaternions x y z w."""
+    c, s = np.cos(0.5 * angles), np.sin(0.5 * angles)
+    cr, cp, cy = c.T
+    sr, sp, sy = s.T
+    return np.column_stack(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ]
+    )
+
+
+def euler_of_quaternion(q: Array) -> Array:
+    """(m, 4) unit quaternions x y z w to (m, 3) roll, pitch, yaw [rad] (ZYX)."""
+    x, y, z, w = q.T
+    return np.column_stack(
+        [
+            np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+            np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0)),
+            np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+        ]
+    )
+
+
+def _relative(first: Array, second: Array) -> Array:
+    """Rotation vectors of conj(first) * second, (m, 3)."""
+    ax, ay, az, aw = first.T
+    bx, by, bz, bw = second.T
+    x = aw * bx - ax * bw - ay * bz + az * by
+    y = aw * by + ax * bz - ay * bw - az * bx
+    z = aw * bz - ax * by + ay * bx - az * bw
+    w = aw * bw + ax * bx + ay * by + az * bz
+    sign = np.where(w < 0.0, -1.0, 1.0)
+    vector = np.column_stack([x, y, z]) * sign[:, None]
+    sine = np.sqrt(np.einsum("ij,ij->i", vector, vector))
+    angle = 2.0 * np.arctan2(sine, np.abs(w))
+    return vector * np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0)[:, None]
+
+
+def _continuous(q: Array) -> Array:
+    """Quaternions with signs chosen so that neighbours are near: q and -q are one attitude."""
+    flips = np.where(np.einsum("ij,ij->i", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
+    return q * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+
+
+def _cubic(time: Array, value: Array, at: Array, i: NDArray[np.int64]) -> Array:
+    """Values (m, c) at times (m,) in intervals i, by cubics with slopes of three points; held outside."""
+    step = np.diff(time)
+    secant = np.diff(value, axis=0) / step[:, None]
+    slope = np.empty_like(value)
+    slope[0], slope[-1] = secant[0], secant[-1]
+    before, after = step[:-1, None], step[1:, None]
+    slope[1:-1] = (secant[:-1] * after + secant[1:] * before) / (before + after)
+    h = step[i, None]
+    u = np.clip((at - time[i])[:, None] / h, 0.0, 1.0)
+    v = 1.0 - u
+    ends = v * v * (1 + 2 * u) * value[i] + u * u * (1 + 2 * v) * value[i + 1]
+    return np.asarray(ends + h * u * v * (v * slope[i] - u * slope[i + 1]), float)
+
+
+def _sound(array: SignalArray) -> Mask:
+    """(n,) samples with a time and all components."""
+    sound = np.isfinite(array.time)
+    sound &= ~array.marked
+    for column in range(array.value.shape[1]):  # a reduction over a short axis costs ten times as much
+        sound &= np.isfinite(array.value[:, column])
+    return sound
+
+
+def _period(time: Array) -> float:
+    steps = np.diff(time)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if steps.size else 0.0

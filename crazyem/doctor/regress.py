@@ -1,0 +1,216 @@
+"""Regressions for the checks: slopes with noise on both sides, hypotheses compared block by block, lags.
+
+Neighbouring samples are not independent, so every uncertainty comes from blocks of about 1.5 s: of the slope by
+leaving out one block at a time (jackknife), of the difference between two hypotheses by a paired test over blocks.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Array = NDArray[np.float64]
+
+BLOCK = 1.5  # s
+MANY = 60  # blocks at most; longer ones then
+FEW = 6  # blocks at least, else nothing is said
+CERTAIN = 0.9995  # one-sided level at which a slope counts as told
+CLEAR = 2.0  # what the runner-up leaves unexplained, over what the best leaves
+LIKELIER = 10.0  # log likelihood ratio between best and runner-up
+
+
+@dataclass(frozen=True, slots=True)
+class Slope:
+    """The factor s of y = s x + offset, all components together.
+
+    Attributes:
+        value: geometric mean of the two regressions.
+        direct: y on x; too small by the noise of x.
+        reverse: 1 / (x on y); too large by the noise of y. With independent noises the truth lies between the two.
+        low, high: 95 % interval: the two regressions, each widened by what the jackknife says.
+        far_low, far_high: the same at the level `CERTAIN`.
+        explained: share of the variance that the two sides share (squared correlation).
+        samples: how many (rows times components).
+        blocks: how many.
+    """
+
+    value: float
+    direct: float
+    reverse: float
+    low: float
+    high: float
+    far_low: float
+    far_high: float
+    explained: float
+    samples: int
+    blocks: int
+
+
+def blocks(time: Array) -> NDArray[np.int64]:
+    """Block number (n,) of each row, from its time: 0, 1, .. without holes; at most `MANY` blocks."""
+    if time.size == 0:
+        return np.zeros(0, np.int64)
+    length = max(BLOCK, float(time[-1] - time[0]) / MANY + 1e-9)
+    number = ((time - time[0]) / length).astype(np.int64)
+    return np.asarray(np.unique(number, return_inverse=True)[1], np.int64)
+
+
+def block_sums(block: NDArray[np.int64], *columns: Array) -> Array:
+    """(blocks, len(columns)) sums over each block."""
+    count = int(block.max()) + 1 if block.size else 0
+    return np.column_stack([np.bincount(block, weights=c, minlength=count) for c in columns])
+
+
+def slope(x: Array, y: Array, block: NDArray[np.int64], *, offset: bool = True) -> Slope | None:
+    """Slope of y against x, both (n, c) or (n,); None with too few blocks or no common variance.
+
+    Rows far from the line (five times the median distance and more) are left out, twice over.
+    """
+    x, y = np.atleast_2d(x.T).T, np.atleast_2d(y.T).T
+    keep = np.ones(len(x), bool)
+    for _ in range(3):
+        sums = _moments(x[keep], y[keep], block[keep], offset)
+        if sums is None:
+            return None
+        total = sums.sum(axis=0)
+        factor = _two(total)
+        if factor is None:
+            return None
+        middle = math.copysign(math.sqrt(abs(factor[0] * factor[1])), factor[0])
+        mx = np.median(x[keep], axis=0) if offset else 0.0
+        my = np.median(y[keep], axis=0) if offset else 0.0
+        away = np.linalg.norm((y - my) - middle * (x - mx), axis=1)
+        limit = 5.0 * float(np.median(away[keep])) / 0.6745
+        following = away <= max(limit, 1e-12)
+        if (following == keep).all():
+            break
+        keep = following
+    sums = _moments(x[keep], y[keep], block[keep], offset)
+    if sums is None:
+        return None
+    total = sums.sum(axis=0)
+    both = _two(total)
+    count = len(sums)
+    if both is None or count < FEW:
+        return None
+    parts = [_two(total - one) for one in sums]
+    if any(p is None for p in parts):
+        return None
+    left = np.array(parts)
+    spread = np.sqrt((count - 1) / count * np.square(left - left.mean(axis=0)).sum(axis=0))
+    edges = []
+    for level in (0.975, CERTAIN):
+        wide = float(stats.t.ppf(level, count - 1)) * spread
+        edges.append((min(both[i] - wide[i] for i in (0, 1)), max(both[i] + wide[i] for i in (0, 1))))
+    sxx, sxy, syy = total[:3]
+    return Slope(
+        value=math.copysign(math.sqrt(both[0] * both[1]), both[0]),
+        direct=both[0],
+        reverse=both[1],
+        low=edges[0][0],
+        high=edges[0][1],
+        far_low=edges[1][0],
+        far_high=edges[1][1],
+        explained=float(sxy**2 / (sxx * syy)),
+        samples=int(keep.sum()) * x.shape[1],
+        blocks=count,
+    )
+
+
+def _moments(x: Array, y: Array, block: NDArray[np.int64], offset: bool) -> Array | None:
+    """(blocks, 3) sums of xx, xy, yy, about the mean where there is an offset."""
+    if len(x) < 20:
+        return None
+    if offset:
+        x, y = x - x.mean(axis=0), y - y.mean(axis=0)
+    number = np.asarray(np.unique(block, return_inverse=True)[1], np.int64)
+    return block_sums(number, (x * x).sum(axis=1), (x * y).sum(axis=1), (y * y).sum(axis=1))
+
+
+def _two(total: Array) -> tuple[float, float] | None:
+    """Direct and reverse slope from sums of xx, xy, yy."""
+    sxx, sxy, syy = (float(v) for v in total[:3])
+    if sxx <= 0.0 or syy <= 0.0 or abs(sxy) <= 1e-9 * math.sqrt(sxx * syy):
+        return None
+    return sxy / sxx, syy / sxy
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Which hypothesis a measurement supports.
+
+    Attributes:
+        name: the simplest hypothesis that no other beats for certain; "" if there are several of that simplicity.
+        best: the one that leaves least.
+        explained: share of the variance that each explains.
+        ratio: what the declared hypothesis leaves unexplained, over what the best leaves.
+        margin: what the best of those that were beaten leaves, over what the best leaves.
+        denied: the declared hypothesis is beaten for certain.
+    """
+
+    name: str
+    best: str
+    explained: Mapping[str, float]
+    ratio: float
+    margin: float
+    denied: bool
+
+
+def choose(
+    measured: Array, candidates: Mapping[str, tuple[int, Array]], block: NDArray[np.int64], *, offset: bool = True
+) -> Choice | None:
+    """Which candidate (n, c), times one positive free factor and with free offsets, is the measurement (n, c)?
+
+    Args:
+        measured: (n, c).
+        candidates: name -> (how far-fetched, (n, c) prediction); the one declared has 0 and is first.
+        block: (n,) from `blocks`.
+        offset: free offset of each component.
+
+    "Beaten for certain" means: leaves at least `CLEAR` times as much as the best, not for the sake of a tenth of the
+    blocks, and beyond chance (log likelihood ratio of Gaussian residuals of at least `LIKELIER`, one independent
+    residual a block and component). None with too few blocks.
+    """
+    if len(measured) < 20:
+        return None
+    number = np.asarray(np.unique(block, return_inverse=True)[1], np.int64)
+    y = measured - measured.mean(axis=0) if offset else measured
+    whole = float((y * y).sum())
+    if whole <= 0.0 or number.max() + 1 < FEW:
+        return None
+    left: dict[str, Array] = {}
+    for name, (_, candidate) in candidates.items():
+        x = candidate - candidate.mean(axis=0) if offset else candidate
+        sxx = float((x * x).sum())
+        factor = max(float((x * y).sum()) / sxx, 0.0) if sxx > 0 else 0.0
+        rest = y - factor * x
+        left[name] = block_sums(number, (rest * rest).sum(axis=1))[:, 0]
+    best = min(left, key=lambda name: float(left[name].sum()))
+    least = max(float(left[best].sum()), 1e-12 * whole)
+    components = measured.shape[1]
+    standing = [name for name in left if not better(left[best], left[name], components)]
+    simple = min(candidates[name][0] for name in standing)
+    names = [name for name in standing if candidates[name][0] == simple]
+    declared = next(iter(candidates))
+    beaten = [float(left[name].sum()) for name in left if name not in standing]
+    return Choice(
+        name=names[0] if len(names) == 1 else "",
+        best=best,
+        explained={name: 1.0 - float(rest.sum()) / whole for name, rest in left.items()},
+        ratio=float(left[declared].sum()) / least,
+        margin=min(beaten, default=math.nan) / least,
+        denied=declared not in standing,
+    )
+
+
+def better(first: Array, second: Array, components: int = 1) -> bool:
+    """True if residuals (sums of squares per block) of the first are smaller beyond chance; see `choose`."""
+    gain = np.sort(second - first)
+    tenth = max(1, gain.size // 10)
+    if gain.size < FEW or gain[:-tenth].sum() <= 0.0:
+        return False
+    ratio = float(second.sum()) / max(float(first.sum()), 1e-300)
+    return ratio >= CLEAR and 0.5 * gain.size * components * math.log(ratio) >= LIKELIER
