@@ -133,6 +133,21 @@ class OnlineEstimator:
         """Whether the newest node was in free flight."""
         return self._gate.airborne
 
+    @property
+    def residual(self) -> tuple[float, NDArray, NDArray] | None:
+        """What the newest filtered sample had that the model did not predict; None before the first.
+
+        Returns: its time [s]; (12,) position [m], velocity [m/s], attitude [rad, body] and body rate [rad/s]; (12,)
+        the standard deviations expected of them. Of each component what those before it left unexplained; NaN where
+        nothing was measured.
+        """
+        k = self._fresh - 1
+        if self._em is None or k < 0 or k >= self._tape.size or self._tape.kind[k]:
+            return None
+        variance = self._tape.s[k]
+        sd = np.sqrt(np.where(variance > 0, variance, np.nan))
+        return float(self._tape.time[k]), np.where(variance > 0, self._tape.e[k], np.nan), sd
+
     def feed(self, sample: Sample) -> Estimate | None:
         """Take one sample; returns an estimate when an update was due. Samples of unknown signals are ignored."""
         result = None

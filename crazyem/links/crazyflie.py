@@ -291,6 +291,22 @@ class CrazyflieLink:
         """Why the last parameter access went unanswered; "" while parameters work."""
         return self._parameters.fault if self._parameters is not None else ""
 
+    @property
+    def about(self) -> Mapping[str, Mapping[str, str]]:
+        """What the firmware says of itself, for recordings: sections "firmware" (protocol, revision), "log_types",
+        "parameter_types" and "parameter_values" (as read while connecting)."""
+        crazyflie = self._connected()
+        values = {f"{g}.{n}": str(v) for g, names in crazyflie.param.values.items() for n, v in names.items()}
+        firmware = {name: values[f"firmware.{name}"] for name in ("revision0", "revision1", "modified")
+                    if f"firmware.{name}" in values}  # fmt: skip
+        firmware["protocol"] = str(crazyflie.platform.get_protocol_version())
+        return {
+            "firmware": firmware,
+            "log_types": self.log_variables,
+            "parameter_types": self.parameters,
+            "parameter_values": values,
+        }
+
     def read_parameter(self, name: str, timeout: float = 2.0) -> float:
         """The value in the firmware now, asked for afresh. Raises UsageError or LinkError."""
         return self._parameter_client().read(name, timeout)

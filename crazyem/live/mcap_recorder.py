@@ -10,16 +10,18 @@ from crazyem.vehicle import Vehicle
 
 
 def open_recorder(
-    path: str | None, *, configuration: Mapping[str, Any], vehicle: Vehicle, link: Link
+    path: str | None, *, configuration: Mapping[str, Any], vehicle: Vehicle, link: Link, append: bool = False
 ) -> Recorder | None:
     """A recorder for `path`, None without one.
 
     Args:
         configuration: of the run; values are stored as JSON.
         vehicle: its file's text is stored, so that a replay starts from the same constants.
+        link: connected; its tables and what the firmware says of itself are stored, as far as it knows them.
+        append: continue an existing recording as its next session (after a reconnect) instead of replacing it.
 
     Raises:
-        UsageError: the file cannot be created.
+        UsageError: the file cannot be created. FileFormatError: it cannot be continued.
     """
     if path is None:
         return None
@@ -35,5 +37,7 @@ def open_recorder(
                 "log_variables": " ".join(sorted(link.log_variables)),
                 "parameters": " ".join(sorted(link.parameters)),
             },
+            **getattr(link, "about", {}),
         },
+        append=append,
     )

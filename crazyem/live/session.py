@@ -24,6 +24,7 @@ from crazyem.signals.vocabulary import MOTOR_BLOCK, ROTOR_SPEED_BLOCK, STATE_BLO
 from crazyem.vehicle import Vehicle
 
 RATE = 100.0  # Hz
+LINK_EVERY = 1.0  # s between notes on the link's health
 STATE = STATE_BLOCK + tuple(f"stateEstimateZ.rate{a}" for a in ("Roll", "Pitch", "Yaw"))
 EXTRA = tuple(f"acc.{a}" for a in "xyz") + tuple(f"ctrltargetZ.{a}" for a in "xyz")
 WRENCH = ("thrustSi", "torquex", "torquey", "torquez")
@@ -86,6 +87,7 @@ class Session:
         self.pipeline = Pipeline(estimator, history=self.history, on_estimate=self._estimated)
         self.blocks: tuple[Block, ...] = ()
         self._samples: queue.SimpleQueue[list[Sample] | None] = queue.SimpleQueue()
+        self._link_told = -math.inf
         self._end_wanted = False
         self._stop = threading.Event()
         self._closed = False
@@ -174,6 +176,9 @@ class Session:
     def _estimated(self, estimate: Estimate) -> None:
         if self.recorder is not None:
             self.recorder.estimate(estimate)
+            residual = getattr(self.pipeline.estimator, "residual", None)
+            if residual is not None:
+                self.recorder.residual(*residual)
         if self._on_estimate is not None:
             self._on_estimate(estimate)
 
@@ -204,6 +209,9 @@ class Session:
             return  # a block of somebody else's
         if self.recorder is not None:
             self.recorder.packet(packet)
+            if packet.host_time - self._link_told >= LINK_EVERY:
+                self._link_told = packet.host_time
+                self._tell_link(packet)
         if "supervisor.info" in names:
             info = packet.values[names.index("supervisor.info")]
             self.telemetry.info = int(info) if math.isfinite(info) else None
@@ -219,6 +227,14 @@ class Session:
         for sample in samples:
             self.telemetry.take(sample)
         self._samples.put(samples)
+
+    def _tell_link(self, packet: Packet) -> None:
+        """The link's health, into the recording; latency against the promptest packets, where the link knows them."""
+        assert self.recorder is not None
+        clock = getattr(self.link, "clock", None)
+        fit = clock() if clock is not None else None
+        late = math.nan if fit is None else packet.host_time - fit.to_host(packet.firmware_time_ms)
+        self.recorder.link(self.link.statistics(), late)
 
     def _estimate(self) -> None:
         try:

@@ -146,8 +146,8 @@ def from_summary(path: Path) -> tuple[list[Any], dict[int, int]]:
             size = stream.seek(0, 2)
             stream.seek(max(0, size - tail))
             end = stream.read()
-            footer = parse(mcap_scan.FOOTER, end[HEAD.size :]) if end.endswith(MAGIC) else None
-            start = footer.summary_start if footer else 0
+            footer: Any = parse(mcap_scan.FOOTER, end[HEAD.size :]) if end.endswith(MAGIC) else None
+            start = footer.summary_start if footer is not None else 0
             if not 0 < start < size or size - start > mcap_scan.LARGEST_RECORD:
                 return [], {}
             stream.seek(start)

@@ -144,7 +144,7 @@ class RecordingWriter:
         """An update of the estimator."""
         self._put(self._write_estimate, _now(), estimate)
 
-    def link(self, statistics: LinkStatistics, *, latency: float = math.nan) -> None:
+    def link(self, statistics: LinkStatistics, latency: float = math.nan) -> None:
         """Packets so far, by fate; call it once a second. `latency` in s, where known."""
         self._put(self._write_link, _now(), statistics, latency)
 

@@ -1,0 +1,231 @@
+"""Our MCAP in the hands of others: stock readers without crazyem decode every channel, in order, after any end."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_mcap_signals import flight
+from test_recordings_mcap import BLOCKS, Reference
+from test_recordings_mcap import flight as packets
+
+from crazyem.estimation.result import Estimate, ParameterEstimate
+from crazyem.links.base import LinkStatistics, ParameterWrite
+from crazyem.recordings import open_recording
+from crazyem.recordings.mcap_signals import write_recording
+from crazyem.recordings.recover import recover
+from crazyem.recordings.writer import RecordingWriter
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# A reader that cannot import crazyem: the mcap library and its protobuf decoder only.
+READER = """
+import json, math, sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("crazyem", "firmware_sim"):
+            raise ImportError("blocked: " + name)
+
+sys.meta_path.insert(0, Blocked())
+from google.protobuf import descriptor_pb2, descriptor_pool
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+def plain(message):
+    result = {}
+    for field in message.DESCRIPTOR.fields:
+        value = getattr(message, field.name)
+        if field.message_type is None:
+            result[field.name] = value
+        elif hasattr(value, "add"):
+            result[field.name] = [plain(item) for item in value]
+        else:
+            result[field.name] = plain(value)
+    return result
+
+topics, times, sequences = {}, [], []
+with open(sys.argv[1], "rb") as stream:
+    reader = make_reader(stream, decoder_factories=[DecoderFactory()], validate_crcs=True)
+    for schema, channel, message, decoded in reader.iter_decoded_messages(log_time_order=False):
+        assert schema.encoding == channel.message_encoding == "protobuf"
+        pool = descriptor_pool.DescriptorPool()  # the schema alone must do
+        for file in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
+            pool.Add(file)
+        pool.FindMessageTypeByName(schema.name)
+        times.append(message.log_time)
+        sequences.append(message.sequence)
+        entry = topics.setdefault(channel.topic, {"schema": schema.name, "messages": []})
+        entry["messages"].append(plain(decoded))
+    statistics = reader.get_summary().statistics
+print(json.dumps({"topics": topics, "times": times, "sequences": sequences, "count": statistics.message_count}))
+assert not [name for name in sys.modules if name.startswith("crazyem")]
+"""
+
+
+def read_elsewhere(path, tmp_path):
+    """What the stock reader makes of a file, in a process that cannot import crazyem."""
+    program = tmp_path / "reader.py"
+    program.write_text(READER)
+    done = subprocess.run([sys.executable, "-I", str(program), str(path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout)
+
+
+def record_everything(path, *, append=False):
+    mass = ParameterEstimate(0.034, 1e-4, (0.0338, 0.0342), "kg", True)
+    with RecordingWriter(path, {"run": {"seed": "1"}}, append=append) as writer:
+        writer.blocks(BLOCKS)
+        for packet in packets(200):
+            writer.packet(packet)
+        writer.setpoint(1.25, Reference())
+        writer.parameter_write(ParameterWrite("ctrlLee.mass", 0.034, None, False, 1.7e9 + 1))
+        writer.estimate(Estimate(2.5, {"mass": mass}, samples=800, updates=7, converged=True))
+        writer.residual(2.5, np.arange(12) / 8, np.full(12, 0.5))
+        writer.link(LinkStatistics(100, 2, 1))
+        time.sleep(0.002)
+        writer.link(LinkStatistics(190, 12, 1), latency=0.003)
+        writer.event("landed", "WARNING")
+    assert writer.failure == ""
+
+
+LIVE = {
+    "/log/0": "crazyem.log.Block0",
+    "/log/1": "crazyem.log.Block1",
+    "/log/2": "crazyem.log.Block2",
+    "/pose": "foxglove.PoseInFrame",
+    "/tf": "foxglove.FrameTransform",
+    "/setpoint": "crazyem.Setpoint",
+    "/parameter_write": "crazyem.ParameterWrite",
+    "/estimate": "crazyem.Estimate",
+    "/residual": "crazyem.Residual",
+    "/link": "crazyem.Link",
+    "/events": "foxglove.Log",
+}
+
+
+def test_a_flight_is_decoded_without_crazyem(tmp_path):
+    path = tmp_path / "flight.mcap"
+    record_everything(path)
+    found = read_elsewhere(path, tmp_path)
+    topics = found["topics"]
+    assert {topic: entry["schema"] for topic, entry in topics.items()} == LIVE
+    assert found["times"] == sorted(found["times"])
+    assert found["sequences"] == list(range(1, found["count"] + 1))
+    sent = [p for p in packets(200) if p.block == 1]
+    got = topics["/log/1"]["messages"]
+    names = [v.name.replace(".", "_") for v in BLOCKS[1].variables]
+    assert [tuple(m[n] for n in names) for m in got] == [p.values for p in sent]
+    assert [int(m["firmware_time_ms"]) for m in got] == [p.firmware_time_ms for p in sent]
+    assert topics["/residual"]["messages"][0]["velocity_z"] == 5 / 8
+    assert topics["/residual"]["messages"][0]["body_rate_z_sd"] == 0.5
+    health = topics["/link"]["messages"][1]
+    assert (health["received"], health["lost"], health["latency"]) == (190, 12, 0.003)
+    assert health["loss"] == pytest.approx(0.1)
+    assert health["rate"] > 0
+    assert topics["/events"]["messages"][0]["level"] == 3
+    assert topics["/tf"]["messages"][0]["parent_frame_id"] == "world"
+
+
+def test_two_sessions_are_decoded_without_crazyem(tmp_path):
+    path = tmp_path / "flight.mcap"
+    record_everything(path)
+    record_everything(path, append=True)
+    found = read_elsewhere(path, tmp_path)
+    assert found["times"] == sorted(found["times"])
+    assert found["sequences"] == list(range(1, found["count"] + 1))
+    assert len(found["topics"]["/log/0"]["messages"]) == 400
+
+
+def test_an_imported_recording_is_decoded_without_crazyem(tmp_path):
+    path = tmp_path / "f.mcap"
+    recording = flight()
+    write_recording(recording, path)
+    found = read_elsewhere(path, tmp_path)
+    topics = found["topics"]
+    assert found["times"] == sorted(found["times"])
+    assert found["sequences"] == list(range(1, found["count"] + 1))
+    state = topics["/signals/state"]["messages"]
+    for name, axes in (("position", "xyz"), ("attitude", "xyzw")):
+        values = [[m[f"{name}_{a}"] for a in axes] for m in state]
+        assert values == recording.signals[name].value.tolist()
+    assert [m["time"] for m in state] == recording.signals["position"].time.tolist()
+    assert [m["voltage"] for m in topics["/signals/power"]["messages"]] == recording.signals["voltage"].value[
+        :, 0
+    ].tolist()
+    pose = topics["/pose"]["messages"]
+    assert 70 <= len(pose) <= 76  # 25 a second for three seconds
+    assert pose[0]["pose"]["position"] == dict(zip("xyz", recording.signals["position"].value[0].tolist(), strict=True))
+
+
+def test_a_recovered_recording_is_decoded_without_crazyem(tmp_path):
+    path, target = tmp_path / "flight.mcap", tmp_path / "mended.mcap"
+    record_everything(path)
+    record_everything(path, append=True)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 3 // 4])
+    recover(path, target)
+    found = read_elsewhere(target, tmp_path)
+    assert found["count"] == len(found["sequences"]) > 0
+    assert found["times"] == sorted(found["times"])
+
+
+def test_channel_metadata_holds_the_true_names(tmp_path):
+    from mcap.reader import make_reader
+
+    path = tmp_path / "f.mcap"
+    write_recording(flight(), path)
+    with path.open("rb") as stream:
+        channels = make_reader(stream).get_summary().channels.values()
+    told = {c.topic: json.loads(c.metadata["signals"]) for c in channels if c.topic.startswith("/signals/")}
+    position = next(s for s in told["/signals/state"] if s["name"] == "position")
+    assert position["unit"] == "m"
+    assert position["frame"] == "world"
+    assert position["clock"] == "firmware"
+    assert position["source"] == ["position"]
+    assert position["components"] == ["position_x", "position_y", "position_z"]
+
+
+def test_kill_9_loses_at_most_a_second(tmp_path):
+    """A process records a kilohertz of packets with everything else; the last stamp it printed is the measure."""
+    path = tmp_path / "killed.mcap"
+    program = textwrap.dedent(f"""
+        import sys, time
+        sys.path.insert(0, {str(ROOT)!r})
+        from crazyem.recordings.writer import RecordingWriter
+        from crazyem.signals.packet import Block, Packet, Variable
+        writer = RecordingWriter({str(path)!r})
+        writer.blocks((Block(0, (Variable("pm.vbat", "float"),), 10),))
+        begun = time.monotonic()
+        while True:
+            now = time.monotonic() - begun
+            writer.packet(Packet(0, int(now * 1000), time.time(), (4.0,)))
+            print(now, flush=True)
+            time.sleep(0.001)
+    """)
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    newest = 0.0
+    for line in process.stdout:
+        newest = float(line)
+        if newest > 2.3:
+            break
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    rest = process.stdout.read().split()
+    process.stdout.close()
+    newest = float(rest[-1]) if rest else newest
+    recording = open_recording(path)
+    lost = newest - float(recording.signals["voltage"].time[-1])
+    assert lost <= 1.0
+    assert recording.notices
+    mended = tmp_path / "mended.mcap"
+    report = recover(path, mended)
+    assert report.lost_messages == 0
+    assert open_recording(mended).signals["voltage"].time.size == recording.signals["voltage"].time.size
+    assert os.path.getsize(mended) > 0
