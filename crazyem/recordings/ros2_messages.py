@@ -1,0 +1,266 @@
+"""ROS 2 messages from the bytes in a bag to columns of numbers, with the definitions that the bag itself carries.
+
+Decoding CDR is mcap-ros2-support's. It runs no code from a file, but it believes a definition: an array of a claimed
+length of things that take no bytes would keep it busy for ever, and its pattern for constants takes exponential time on
+some names. So a definition is first reduced to its fields and refused where decoding could take more steps than the
+message has bytes. Formats: design.ros2.org/articles/legacy_interface_definition.html, OMG CDR.
+"""
+
+import contextlib
+import io
+import operator
+import re
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from mcap_ros2._dynamic import generate_dynamic
+from numpy.typing import NDArray
+
+LARGEST_MESSAGE = 1 << 16  # bytes; larger ones are images, maps and point clouds
+_LARGEST_DEFINITION = 1 << 18  # characters
+_FIELDS = 2000  # of a message, with all that is nested in it
+_DEEPEST = 16
+_FIXED = 16  # elements of an array of fixed length that become columns; covariances have 36
+_LONGEST = 64  # elements of a sequence that become columns
+_LINE = re.compile(r"\s*([A-Za-z]\w*(?:/\w+){0,2}(?:<=\d{1,9})?(?:\[(?:<=)?\d{0,9}\])?)\s+([a-z]\w*)\s*(?:[^=\s].*)?$")
+_CONSTANT = re.compile(r"\s*[A-Za-z]\w*(?:<=\d{1,9})?\s+[A-Za-z]\w*\s*=")
+# numbers and their bytes
+_NUMBERS = {"bool": 1, "byte": 1, "char": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4}
+_NUMBERS |= {"float32": 4, "float64": 8, "int64": 8, "uint64": 8}
+_PRIMITIVE = {*_NUMBERS, "string", "wstring"}
+_TIMES = {"builtin_interfaces/Time": ("sec", "nanosec"), "builtin_interfaces/Duration": ("sec", "nanosec")}
+# what the decoder raises on bytes that are no message of the type
+BROKEN: tuple[type[Exception], ...] = (
+    ValueError,
+    IndexError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    NotImplementedError,
+    struct.error,
+    RecursionError,
+    OverflowError,
+    MemoryError,
+)
+
+_Spec = dict[str, list[tuple[str, bool, int, str]]]  # type -> (type, array, fixed length or 0, name) of each field
+
+
+@dataclass(frozen=True, slots=True)
+class MessageType:
+    """How to read messages of one type.
+
+    Attributes:
+        name: "geometry_msgs/PoseStamped".
+        decode: from the bytes of a message to an object with its fields.
+        scalars: dotted names of the numbers.
+        arrays: dotted names and lengths of arrays of numbers; length 0 for sequences.
+        strings: dotted names of the texts.
+        stamped: whether there is a `header.stamp`.
+    """
+
+    name: str
+    decode: Callable[[bytes], Any]
+    scalars: tuple[str, ...]
+    arrays: tuple[tuple[str, int], ...]
+    strings: tuple[str, ...]
+    stamped: bool
+
+
+def message_type(name: str, definition: str) -> MessageType:
+    """From the name and the definition in a bag. Raises ValueError with the reason why it cannot be read."""
+    if len(definition) > _LARGEST_DEFINITION:
+        raise ValueError("its definition is too long")
+    short = _short(name)
+    text, spec = _reduced(short, definition)
+    _check(short, spec)
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):  # it prints what it dislikes
+            decode = generate_dynamic(short, text)[short]
+    except Exception as error:  # the parser has many of its own
+        raise ValueError(f"its definition cannot be parsed ({type(error).__name__})") from error
+    scalars: list[str] = []
+    arrays: list[tuple[str, int]] = []
+    strings: list[str] = []
+    _leaves(short, spec, "", scalars, arrays, strings)
+    stamped = {"header.stamp.sec", "header.stamp.nanosec"} <= set(scalars)
+    own = tuple(s for s in scalars if not (stamped and s.startswith("header.stamp.")))
+    return MessageType(short, decode, own, tuple(arrays), tuple(strings), stamped)
+
+
+def _short(name: str) -> str:
+    """ "geometry_msgs/msg/Pose" and "geometry_msgs/Pose" are one."""
+    parts = name.split("/")
+    if not 2 <= len(parts) <= 3 or not all(re.fullmatch(r"\w{1,100}", p) for p in parts):
+        raise ValueError("its name is none of a ROS 2 message")
+    return f"{parts[0]}/{parts[-1]}"
+
+
+def _reduced(name: str, definition: str) -> tuple[str, _Spec]:
+    """The definition without comments, constants and defaults, and the same as a table."""
+    spec: _Spec = {name: []}
+    lines: list[str] = []
+    current, package = name, name.partition("/")[0]
+    for raw in definition.splitlines():
+        line = raw.partition("#")[0].rstrip()
+        if not line.strip():
+            continue
+        if set(line.strip()) == {"="}:
+            lines.append("=" * 80)
+        elif line.startswith("MSG:"):
+            current = _short(line[4:].strip())
+            package = current.partition("/")[0]
+            spec.setdefault(current, [])
+            lines.append(f"MSG: {current}")
+        elif not _CONSTANT.match(line):
+            match = _LINE.match(line)
+            if match is None:
+                raise ValueError("its definition has a line that is no field")
+            lines.append(f"{match[1]} {match[2]}")
+            spec[current].append((*_type_of(match[1], package), match[2]))
+    return "\n".join(lines), spec
+
+
+def _type_of(text: str, package: str) -> tuple[str, bool, int]:
+    """Type, whether it is an array, and its length if that is fixed."""
+    base, bracket, size = text.partition("[")
+    base = base.partition("<=")[0]
+    if base not in _PRIMITIVE:
+        base = _short(base) if "/" in base else f"{package}/{base}"
+    size = size.rstrip("]")
+    return base, bool(bracket), int(size) if size and not size.startswith("<=") else 0
+
+
+def _check(name: str, spec: _Spec) -> None:
+    """Raise ValueError unless the steps of decoding are few, or at most four for each byte that a message must have."""
+    counted: dict[str, tuple[int, int]] = {}
+
+    def measure(kind: str, depth: int) -> tuple[int, int]:
+        """Steps that reading one takes, elements of sequences not counted, and the bytes without which it fails."""
+        if kind in _TIMES and kind not in spec:
+            return 2, 8
+        if kind in counted:
+            return counted[kind]
+        if kind not in spec:
+            raise ValueError(f"its definition does not hold {kind}")
+        if depth > _DEEPEST:
+            raise ValueError("its definition is nested too deeply")
+        steps, size = 1, 0 if spec[kind] else 1
+        for base, array, length, _ in spec[kind]:
+            one, bytes_of_one = (1, _NUMBERS.get(base, 4)) if base in _PRIMITIVE else measure(base, depth + 1)
+            if array and not length:
+                if base not in _PRIMITIVE and one > 4 * bytes_of_one:
+                    raise ValueError("its definition has a sequence of things of hardly any size")
+                steps, size = steps + one, size + 4
+            elif array and base in _PRIMITIVE:  # read at once, or an element at a time as far as there are bytes
+                steps, size = steps + 1, size + (0 if base in ("uint8", "byte") else length * bytes_of_one)
+            else:
+                steps, size = steps + one * max(length, 1), size + bytes_of_one * max(length, 1)
+            if steps > _FIELDS:
+                raise ValueError(f"its definition has more than {_FIELDS} fields")
+        counted[kind] = (steps, size)
+        return counted[kind]
+
+    measure(name, 0)
+
+
+def _leaves(
+    kind: str,
+    spec: _Spec,
+    prefix: str,
+    scalars: list[str],
+    arrays: list[tuple[str, int]],
+    strings: list[str],
+) -> None:
+    """Dotted names of what a message holds; arrays of messages are left out."""
+    if kind in _TIMES and kind not in spec:
+        scalars += [prefix + part for part in _TIMES[kind]]
+        return
+    for base, array, length, name in spec[kind]:
+        if array:
+            if base in _NUMBERS and length <= _FIXED:
+                arrays.append((prefix + name, length))
+        elif base in _NUMBERS:
+            scalars.append(prefix + name)
+        elif base in _PRIMITIVE:
+            strings.append(prefix + name)
+        else:
+            _leaves(base, spec, f"{prefix}{name}.", scalars, arrays, strings)
+
+
+@dataclass(slots=True, eq=False)
+class Rows:
+    """Decoded messages of a topic.
+
+    Attributes:
+        columns: dotted name -> (n,) numbers; elements of arrays as "values[3]", NaN beyond the end of a short one.
+        stamp: (n,) ns since 1970 of `header.stamp`, 0 where there is none.
+        log: (n,) ns since 1970 at which the recorder got the message.
+        objects: the messages, where asked for.
+        broken: messages that could not be decoded.
+        texts: dotted name -> text in the first message.
+    """
+
+    columns: dict[str, NDArray[np.float64]]
+    stamp: NDArray[np.int64]
+    log: NDArray[np.int64]
+    objects: list[Any]
+    broken: int
+    texts: dict[str, str]
+
+
+def rows_of(kind: MessageType, messages: Sequence[tuple[int, bytes]], *, keep: bool = False) -> Rows:
+    """Decode (log time [ns], bytes) of one topic; `keep` keeps the objects for what is not a plain column."""
+    numbers: list[tuple[Any, ...]] = []
+    lists: list[tuple[Any, ...]] = []
+    stamps: list[int] = []
+    logs: list[int] = []
+    objects: list[Any] = []
+    broken = 0
+    texts: dict[str, str] = {}
+    get_numbers = _getter(kind.scalars)
+    get_lists = _getter(tuple(name for name, _ in kind.arrays))
+    for log, data in messages:
+        try:
+            message = kind.decode(data)
+            row = get_numbers(message)
+            parts = get_lists(message)
+            stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec if kind.stamped else 0
+        except BROKEN:
+            broken += 1
+            continue
+        if not logs:
+            texts = {name: str(operator.attrgetter(name)(message)) for name in kind.strings}
+        numbers.append(row)
+        lists.append(parts)
+        stamps.append(stamp)
+        logs.append(log)
+        if keep:
+            objects.append(message)
+    table = np.array(numbers, np.float64).reshape(len(logs), len(kind.scalars))
+    columns = {name: table[:, i] for i, name in enumerate(kind.scalars)}
+    for i, (name, length) in enumerate(kind.arrays):
+        columns |= _array_columns(name, length, [parts[i] for parts in lists])
+    return Rows(columns, np.array(stamps, np.int64), np.array(logs, np.int64), objects, broken, texts)
+
+
+def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple[Any, ...]]:
+    if not names:
+        return lambda message: ()
+    if len(names) == 1:
+        one = operator.attrgetter(names[0])
+        return lambda message: (one(message),)
+    return operator.attrgetter(*names)
+
+
+def _array_columns(name: str, length: int, lists: list[Any]) -> dict[str, NDArray[np.float64]]:
+    """A column an element; NaN where a sequence has fewer."""
+    longest = length or min(max((len(x) for x in lists), default=0), _LONGEST)
+    table = np.full((len(lists), longest), np.nan)
+    for i, values in enumerate(lists):
+        part = list(values)[:longest]
+        table[i, : len(part)] = part
+    return {f"{name}[{k}]": table[:, k] for k in range(longest)}

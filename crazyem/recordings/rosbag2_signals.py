@@ -1,0 +1,332 @@
+"""From the decoded topics of a bag to a recording: clocks, log blocks with their variables, types with a meaning."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.errors import FileFormatError
+from crazyem.links.clock import STAMP_MODULUS, StampUnwrapper
+from crazyem.recordings.finding import Finding, Grade, note
+from crazyem.recordings.frd_ned import euler_from_quaternions, stacked
+from crazyem.recordings.motor_meaning import decide
+from crazyem.recordings.recording import Recording, SignalArray
+from crazyem.recordings.ros2_messages import MessageType, Rows, rows_of
+from crazyem.recordings.tables import Table, signals_from_tables
+from crazyem.recordings.topics import Mapped, Topic, ranks, seconds, signals_of, text_of
+
+HOST = "ros"  # the clock of the host's ROS nodes
+FIRMWARE = "firmware"
+_LOG = "crazyflie_interfaces/LogDataGeneric"
+_STATUS = "crazyflie_interfaces/Status"
+_FULL_STATE = "crazyflie_interfaces/FullState"
+_TF, _MOCAP = "tf2_msgs/TFMessage", "motion_capture_tracking_interfaces/NamedPoseArray"
+# types by which a namespace is known to be a robot's
+ROBOT_TYPES = {
+    _LOG,
+    _STATUS,
+    _FULL_STATE,
+    "geometry_msgs/PoseStamped",
+    "geometry_msgs/PoseWithCovarianceStamped",
+    "nav_msgs/Odometry",
+    "sensor_msgs/Imu",
+}
+WORLD_TOPICS = {"/tf", "/poses"}  # of all robots
+_FLYING = 16  # supervisor.info
+_NS = 1_000_000_000
+_SAME_EPOCH = 3600 * _NS  # a stamp further from the time of recording is of a simulation or an unset clock
+_XYZ, _XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
+
+
+@dataclass(slots=True)
+class BagTopic:
+    """The messages of a topic: (log time [ns], bytes), and the place of each among all of the bag."""
+
+    name: str
+    kind: MessageType
+    messages: list[tuple[int, bytes]] = field(default_factory=list)
+    places: list[int] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What the user says of a bag: in which file, which robot, the frame of twists, variables by topic."""
+
+    file: str | None = None
+    robot: str | None = None
+    twist: str | None = None
+    variables: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+@dataclass(slots=True, eq=False)
+class _Decoded:
+    """A topic's numbers, its place in the order of the bag, and its times on the axis of the recording."""
+
+    topic: BagTopic
+    rows: Rows
+    order: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    time: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    clock: str = HOST
+
+    @property
+    def stamps(self) -> NDArray[np.int64]:
+        """(n,) ns: the messages' own stamps; when they were recorded, if they have none or are of another epoch."""
+        own = self.rows.stamp
+        believed = (own > 0).all() and abs(float(np.median(own - self.rows.log))) < _SAME_EPOCH
+        return own if believed else self.rows.log
+
+
+def recording_of(
+    path: Path, topics: Sequence[BagTopic], robot: str, told: Told, motor: str | None, findings: tuple[Finding, ...]
+) -> Recording:
+    """The recording of one robot. Raises FileFormatError where there is nothing or the mapping does not fit."""
+    decoded = [d for d in (_decode(topic, robot) for topic in topics) if d is not None]
+    if not decoded:
+        raise FileFormatError(f"{path}: the bag holds not a single sound message of a robot.")
+    for d, order in zip(decoded, ranks([d.rows.log for d in decoded]), strict=True):
+        d.order = order
+    origin, clock_notes, clocks = _place(decoded)
+    logs = [d for d in decoded if d.topic.kind.name == _LOG]
+    tables, log_notes = _tables(logs, told)
+    meaning = decide(tables, given=motor)
+    firmware = signals_from_tables(tables, motor=meaning.meaning) if tables else {}
+    named = {table.name for table in tables}
+    others = [_topic(d) for d in decoded if _label(d) not in named]
+    mapped: list[Mapped] = []
+    twist_notes: list[Finding] = []
+    for d, topic in [(d, t) for d in decoded for t in others if t.name == _label(d)]:
+        mapped += _meaning(d, topic, told, twist_notes)
+    mapped.sort(key=lambda m: _PREFERRED.get(m.origin, 0))
+    have = {*firmware, *(m.quantity for m in mapped if not m.origin)}
+    # a pose from outside is the pose where there is no other
+    mapped = [m if m.quantity in have else replace(m, origin="") for m in mapped]
+    rest, left_out = signals_of(others, mapped)
+    signals = _together(firmware, rest, {_label(d): d.order for d in decoded})
+    broken = [(d.topic.name, d.rows.broken) for d in decoded if d.rows.broken]
+    damaged = [
+        note("integrity", f"{n} messages of {text_of(name)} do not fit their type.", Grade.DEGRADES, messages=float(n))
+        for name, n in broken
+    ]
+    about = {"robot": robot, "topics": " ".join(sorted(text_of(t.name) for t in topics))[:4000], **clocks}
+    return Recording(
+        str(path),
+        "rosbag2",
+        signals,
+        {"rosbag2": about, **meaning.metadata},
+        (*findings, *damaged, *clock_notes, *log_notes, *meaning.findings, *twist_notes, *left_out),
+        (),
+        origin,
+    )
+
+
+_PREFERRED = {"mocap": 1, "tf": 2}
+
+
+def _label(d: _Decoded) -> str:
+    return d.topic.name.strip("/")
+
+
+def _decode(topic: BagTopic, robot: str) -> _Decoded | None:
+    """The numbers of a topic, None if there are none; of topics of all robots those of this one."""
+    keep = topic.kind.name in (_TF, _MOCAP)
+    if not (keep or topic.kind.scalars or topic.kind.arrays):
+        return None
+    rows = rows_of(topic.kind, topic.messages, keep=keep)
+    if keep:
+        rows = _of_robot(rows, topic.kind.name, robot)
+    return _Decoded(topic, rows) if rows.log.size else None
+
+
+def _of_robot(rows: Rows, kind: str, robot: str) -> Rows:
+    """Poses of one robot from messages that hold those of many."""
+    values: list[tuple[float, ...]] = []
+    stamps: list[int] = []
+    logs: list[int] = []
+    for i, message in enumerate(rows.objects):
+        for entry in message.transforms if kind == _TF else message.poses:
+            place, turn = (
+                (entry.transform.translation, entry.transform.rotation)
+                if kind == _TF
+                else (entry.pose.position, entry.pose.orientation)
+            )
+            if (entry.child_frame_id if kind == _TF else entry.name) != robot:
+                continue
+            stamp = entry.header.stamp if kind == _TF else message.header.stamp
+            values.append((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
+            stamps.append(stamp.sec * _NS + stamp.nanosec)
+            logs.append(int(rows.log[i]))
+    table = np.array(values, float).reshape(-1, 7)
+    names = [*(f"position.{c}" for c in _XYZ), *(f"orientation.{c}" for c in _XYZW)]
+    columns = {name: table[:, i] for i, name in enumerate(names)}
+    return Rows(columns, np.array(stamps, np.int64), np.array(logs, np.int64), [], rows.broken, {})
+
+
+def _place(decoded: list[_Decoded]) -> tuple[float, list[Finding], dict[str, str]]:
+    """Put every topic on one axis; returns its origin [s], what to know about it, and the constants behind it."""
+    logs = [d for d in decoded if d.topic.kind.name == _LOG and "timestamp" in d.rows.columns]
+    if not logs:
+        first = min(int(d.stamps.min()) for d in decoded) // _NS
+        for d in decoded:
+            d.time = seconds(d.stamps - first * _NS, 1e9)
+        return float(first), [], {"origin_ns": str(first * _NS)}
+    _unwrap(logs)
+    lead = np.concatenate([d.stamps - np.round(d.time * 1e9).astype(np.int64) for d in logs])
+    offset = int(np.median(lead))
+    others = [d for d in decoded if d not in logs]
+    for d in others:
+        d.time = seconds(d.stamps - offset, 1e9)
+    notes = []
+    if others:
+        spread = float(np.percentile(lead, 95) - np.percentile(lead, 5)) * 1e-9
+        text = (
+            "The time axis is the firmware's, from the log blocks. Other topics have only the host's stamps: they keep "
+            f"their intervals and are shifted by one constant (it varied by {1e3 * spread:.1f} ms in the log blocks)."
+        )
+        notes.append(note("mapping", text, spread_s=spread, offset_s=offset * 1e-9))
+    return 0.0, notes, {"host_minus_firmware_ns": str(offset)}
+
+
+def _unwrap(logs: list[_Decoded]) -> None:
+    """Firmware times [s] of log blocks: a packet's 24 bits of milliseconds made continuous, all blocks on one clock."""
+    stamps = np.concatenate([d.rows.columns["timestamp"] for d in logs]).astype(np.int64)
+    if (stamps < STAMP_MODULUS).all():
+        order = np.argsort(np.concatenate([d.order for d in logs]))
+        unwrapper = StampUnwrapper()
+        for i, stamp in zip(order.tolist(), stamps[order].tolist(), strict=True):
+            stamps[i] = unwrapper.unwrap(stamp)
+    for d, part in zip(logs, np.split(stamps, np.cumsum([d.order.size for d in logs])[:-1]), strict=True):
+        d.time, d.clock = seconds(part, 1e3), FIRMWARE
+
+
+def _tables(logs: list[_Decoded], told: Told) -> tuple[list[Table], list[Finding]]:
+    """Log blocks whose variables the user named, as tables of firmware variables; a finding for each other one."""
+    tables, notes = [], []
+    for d in logs:
+        values = [c for c in d.rows.columns if c.startswith("values[")]
+        names = told.variables.get(d.topic.name)
+        if names is None:
+            text = (
+                f"{text_of(d.topic.name)} is a log block of {len(values)} variables; their names are in "
+                "crazyflies.yaml, not in the bag, so they have no meaning here."
+            )
+            advice = f'Give a mapping file (--map) with [topics."{text_of(d.topic.name)}"] variables = ["..."].'
+            notes.append(Finding("mapping", Grade.DEGRADES, text, evidence={"variables": len(values)}, advice=advice))
+            continue
+        if len(names) != len(values):
+            raise FileFormatError(
+                f'{told.file}: topics."{d.topic.name}".variables has {len(names)} names, but the messages hold '
+                f"{len(values)} values."
+            )
+        columns = {name: d.rows.columns[value] for name, value in zip(names, values, strict=True)}
+        host = seconds(d.rows.log, 1e9)
+        tables.append(Table(_label(d), columns, d.time, d.order, host, clock=FIRMWARE))
+    return tables, notes
+
+
+def _topic(d: _Decoded) -> Topic:
+    used = {"timestamp"} if d.clock == FIRMWARE else set()
+    columns = {name: column for name, column in d.rows.columns.items() if name not in used}
+    return Topic(_label(d), columns, d.time, d.order, seconds(d.rows.log, 1e9), d.clock)
+
+
+def _together(
+    firmware: dict[str, SignalArray], rest: dict[str, SignalArray], order: Mapping[str, NDArray[np.int64]]
+) -> dict[str, SignalArray]:
+    """Signals of log blocks first, the others under another name where they measure the same; one order for all."""
+    signals = dict(firmware)
+    for name, array in rest.items():
+        signals[f"{name}@{array.stream}" if name in signals else name] = array
+    step = len(signals)
+    return {
+        name: replace(array, order=order[array.stream] * step + place)
+        for place, (name, array) in enumerate(signals.items())
+    }
+
+
+def _meaning(d: _Decoded, topic: Topic, told: Told, notes: list[Finding]) -> Iterator[Mapped]:
+    """Signals of the vocabulary in a topic, by the type of its messages."""
+    match d.topic.kind.name:
+        case "geometry_msgs/PoseStamped":
+            yield from _pose(topic, "pose.")
+        case "geometry_msgs/PoseWithCovarianceStamped":
+            yield from _pose(topic, "pose.pose.")
+        case "nav_msgs/Odometry":
+            yield from _odometry(d, topic, told, notes)
+        case "sensor_msgs/Imu":
+            yield from _columns(topic, "body_rate", "angular_velocity.", _XYZ)
+            yield from _columns(topic, "specific_force", "linear_acceleration.", _XYZ)
+            yield from _quaternion(topic, "orientation.")
+        case "sensor_msgs/BatteryState":
+            yield from _columns(topic, "voltage", "", ("voltage",))
+        case "crazyflie_interfaces/Status":
+            yield from _columns(topic, "voltage", "", ("battery_voltage",))
+            info = topic.columns.get("supervisor_info")
+            if info is not None:
+                flag = ((np.asarray(info).astype(np.int64) & _FLYING) != 0).astype(float)[:, None]
+                yield Mapped("flying", topic, flag, ("supervisor_info",))
+        case "crazyflie_interfaces/FullState":
+            yield from _columns(topic, "setpoint_position", "pose.position.", _XYZ)
+            yield from _columns(topic, "setpoint_velocity", "twist.linear.", _XYZ)
+            yield from _columns(topic, "setpoint_acceleration", "acc.", _XYZ)
+            yield from _columns(topic, "setpoint_rate", "twist.angular.", _XYZ)
+            for m in _quaternion(topic, "pose.orientation."):
+                yield replace(m, quantity="setpoint_euler", value=euler_from_quaternions(m.value), frame="")
+        case "crazyflie_interfaces/Position":
+            yield from _columns(topic, "setpoint_position", "", _XYZ)
+        case "tf2_msgs/TFMessage":
+            yield from (replace(m, origin="tf") for m in _pose(topic, ""))
+        case "motion_capture_tracking_interfaces/NamedPoseArray":
+            yield from (replace(m, origin="mocap") for m in _pose(topic, ""))
+
+
+def _columns(topic: Topic, quantity: str, prefix: str, parts: tuple[str, ...]) -> Iterator[Mapped]:
+    names = tuple(prefix + part for part in parts)
+    if set(names) <= topic.columns.keys():
+        yield Mapped(quantity, topic, stacked([topic.columns[n] for n in names]), names)
+
+
+def _quaternion(topic: Topic, prefix: str) -> Iterator[Mapped]:
+    """An attitude, unless no message has one: all zeros, or a covariance that says so (sensor_msgs/Imu)."""
+    for m in _columns(topic, "attitude", prefix, _XYZW):
+        unknown = topic.columns.get("orientation_covariance[0]")
+        absent = np.asarray(~m.value.any(axis=1), bool)
+        if unknown is not None:
+            absent |= np.asarray(unknown == -1, bool)
+        if not absent.all():
+            yield replace(m, value=np.where(absent[:, None], np.nan, m.value), marked=absent)
+
+
+def _pose(topic: Topic, prefix: str) -> Iterator[Mapped]:
+    yield from _columns(topic, "position", prefix + "position.", _XYZ)
+    yield from _quaternion(topic, prefix + "orientation.")
+
+
+def _odometry(d: _Decoded, topic: Topic, told: Told, notes: list[Finding]) -> Iterator[Mapped]:
+    """Pose, velocity in the world, body rate. crazyswarm2's C++ server leaves rates at 0 and the child frame empty."""
+    pose = list(_pose(topic, "pose.pose."))
+    yield from pose
+    attitude = next((m.value for m in pose if m.quantity == "attitude"), None)
+    child = d.rows.texts.get("child_frame_id", "")
+    frame = told.twist or ("body" if child else "world")
+    for m in _columns(topic, "velocity", "twist.twist.linear.", _XYZ):
+        if frame == "body" and attitude is None:
+            continue
+        value = m.value if frame == "world" or attitude is None else rotated(attitude, m.value)
+        why = f'its child frame is "{text_of(child)}"' if child else "it has no child frame"
+        why = "as told" if told.twist else why
+        text = f"The twist of {text_of(d.topic.name)} is read as in the {frame} frame: {why}."
+        advice = 'If that is wrong, say twist = "world" or twist = "body" in a mapping file (--map).'
+        notes.append(Finding("mapping", Grade.HARMLESS, text, "velocity", advice=advice))
+        yield replace(m, value=value)
+    for m in _columns(topic, "body_rate", "twist.twist.angular.", _XYZ):
+        if m.value.any():
+            yield m
+
+
+def rotated(quaternion: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 3) vectors turned by (n, 4) unit quaternions x y z w."""
+    axis, scalar = quaternion[:, :3], quaternion[:, 3:]
+    half = 2.0 * np.cross(axis, vector)
+    return vector + scalar * half + np.cross(axis, half)

@@ -1,0 +1,513 @@
+"""Bags written with mcap-ros2-support: exact values, two clocks, robots, log blocks, definitions that lie, damage."""
+
+import io
+import math
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as PlainWriter
+from mcap_ros2.decoder import DecoderFactory
+from mcap_ros2.writer import Writer
+from scipy.spatial.transform import Rotation
+
+from crazyem.errors import CrazyemError, FileFormatError, UsageError
+from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.recording import Recording
+from crazyem.recordings.registry import open_recording
+from crazyem.recordings.ros2_messages import message_type, rows_of
+from crazyem.recordings.rosbag2_file import read, recognises, recognises_folder
+
+START = 1_700_000_000_000_000_000  # ns since 1970
+LINE = "=" * 80
+HEADER = f"{LINE}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+HEADER += f"{LINE}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+POINT = f"{LINE}\nMSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n"
+VECTOR = f"{LINE}\nMSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
+QUATERNION = f"{LINE}\nMSG: geometry_msgs/Quaternion\nfloat64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n"
+POSE = f"{LINE}\nMSG: geometry_msgs/Pose\nPoint position\nQuaternion orientation\n{POINT}{QUATERNION}"
+TWIST = f"{LINE}\nMSG: geometry_msgs/Twist\nVector3  linear\nVector3  angular\n{VECTOR}"
+DEFINITIONS = {
+    "geometry_msgs/msg/PoseStamped": f"# a pose\nstd_msgs/Header header\ngeometry_msgs/Pose pose\n{HEADER}{POSE}",
+    "nav_msgs/msg/Odometry": "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
+    f"geometry_msgs/TwistWithCovariance twist\n{HEADER}{POSE}{TWIST}"
+    f"{LINE}\nMSG: geometry_msgs/PoseWithCovariance\nPose pose\nfloat64[36] covariance\n"
+    f"{LINE}\nMSG: geometry_msgs/TwistWithCovariance\nTwist twist\nfloat64[36] covariance\n",
+    "sensor_msgs/msg/Imu": "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\n"
+    "float64[9] orientation_covariance # row major\ngeometry_msgs/Vector3 angular_velocity\n"
+    "float64[9] angular_velocity_covariance\ngeometry_msgs/Vector3 linear_acceleration\n"
+    f"float64[9] linear_acceleration_covariance\n{HEADER}{QUATERNION}{VECTOR}",
+    "crazyflie_interfaces/msg/LogDataGeneric": "std_msgs/Header header  # when it was received\n"
+    f"uint32 timestamp # in ms\nfloat32[] values\n{HEADER}",
+    "crazyflie_interfaces/msg/Status": "uint16 SUPERVISOR_INFO_CAN_BE_ARMED = 1\nuint16 SUPERVISOR_INFO_IS_FLYING=16\n"
+    "std_msgs/Header header\nuint16 supervisor_info\nfloat32 battery_voltage\nuint8 pm_state\nuint8 rssi\n"
+    f"uint32 num_rx_broadcast\nuint32 num_tx_broadcast\nuint32 num_rx_unicast\nuint32 num_tx_unicast\n{HEADER}",
+    "crazyflie_interfaces/msg/FullState": "std_msgs/Header header\ngeometry_msgs/Pose pose\ngeometry_msgs/Twist twist\n"
+    f"geometry_msgs/Vector3 acc\n{HEADER}{POSE}{TWIST}",
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"
+    f"{LINE}\nMSG: geometry_msgs/TransformStamped\nstd_msgs/Header header\nstring child_frame_id\nTransform transform\n"
+    f"{LINE}\nMSG: geometry_msgs/Transform\nVector3 translation\nQuaternion rotation\n{HEADER}{VECTOR}{QUATERNION}",
+    "motion_capture_tracking_interfaces/msg/NamedPoseArray": "std_msgs/Header header\nNamedPose[] poses\n"
+    f"{LINE}\nMSG: motion_capture_tracking_interfaces/NamedPose\nstring name\ngeometry_msgs/Pose pose\n{HEADER}{POSE}",
+    "std_msgs/msg/String": "string data\n",
+}
+
+Message = tuple[str, str, int, Any]  # topic, type, log time, message
+
+
+def bag(messages: Iterable[Message], chunk: int = 2000, compression: CompressionType = CompressionType.ZSTD) -> bytes:
+    output = io.BytesIO()
+    writer = Writer(output, chunk_size=chunk, compression=compression)
+    schemas: dict[str, Any] = {}
+    for topic, kind, log, message in messages:
+        if kind not in schemas:
+            schemas[kind] = writer.register_msgdef(kind, DEFINITIONS[kind])
+        writer.write_message(topic, schemas[kind], message, log_time=log, publish_time=log)
+    writer.finish()
+    return output.getvalue()
+
+
+def stamp(ns: int, frame: str = "world") -> dict[str, Any]:
+    return {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": frame}
+
+
+def vector(values: Iterable[float]) -> dict[str, float]:
+    return dict(zip("xyz", map(float, values), strict=True))
+
+
+def quaternion(values: Iterable[float]) -> dict[str, float]:
+    return dict(zip("xyzw", map(float, values), strict=True))
+
+
+def pose(values: Any) -> dict[str, Any]:
+    return {"position": vector(values[:3]), "orientation": quaternion(values[3:7])}
+
+
+def random_poses(n: int, seed: int = 1) -> np.ndarray:
+    turns = Rotation.random(n, random_state=seed).as_quat()
+    return np.column_stack([np.random.default_rng(seed).normal(size=(n, 3)), turns])
+
+
+def pose_message(topic: str, ns: int, values: Any, late: int = 700_000) -> Message:
+    return topic, "geometry_msgs/msg/PoseStamped", ns + late, {"header": stamp(ns), "pose": pose(values)}
+
+
+def odometry(topic: str, ns: int, values: Any, linear: Any, angular: Any = (0, 0, 0), child: str = "") -> Message:
+    message = {
+        "header": stamp(ns),
+        "child_frame_id": child,
+        "pose": {"pose": pose(values), "covariance": [0.0] * 36},
+        "twist": {"twist": {"linear": vector(linear), "angular": vector(angular)}, "covariance": [0.0] * 36},
+    }
+    return topic, "nav_msgs/msg/Odometry", ns, message
+
+
+def log_block(topic: str, ns: int, firmware_ms: int, values: Any, late: int = 0) -> Message:
+    message = {"header": stamp(ns + late), "timestamp": firmware_ms, "values": [float(v) for v in values]}
+    return topic, "crazyflie_interfaces/msg/LogDataGeneric", ns + late, message
+
+
+def status(topic: str, ns: int, info: int, volts: float) -> Message:
+    names = ("pm_state", "rssi", "num_rx_broadcast", "num_tx_broadcast", "num_rx_unicast", "num_tx_unicast")
+    message = {"header": stamp(ns), "supervisor_info": info, "battery_voltage": volts, **dict.fromkeys(names, 0)}
+    return topic, "crazyflie_interfaces/msg/Status", ns, message
+
+
+def save(folder: Path, content: bytes, name: str = "flight.mcap") -> Path:
+    path = folder / name
+    path.write_bytes(content)
+    return path
+
+
+def opened(folder: Path, content: bytes, mapping: str = "", motor: str | None = None) -> Recording:
+    options = ReadOptions(motor=motor)
+    if mapping:
+        file = folder / "map.toml"
+        file.write_text(mapping)
+        options = ReadOptions(mapping=str(file), motor=motor)
+    return read(save(folder, content), options)
+
+
+def test_a_bag_is_recognised_and_opened(tmp_path: Path) -> None:
+    values = random_poses(20)
+    content = bag(pose_message("/cf1/pose", START + i * 10**7, v) for i, v in enumerate(values))
+    assert recognises(content[:65536])
+    assert not recognises(b"\x89MCAP0\r\n")
+    assert not recognises(content.replace(b"\x04\0\0\0ros2", b"\x04\0\0\0none").replace(b"ros2msg", b"protobu"))
+    recording = open_recording(save(tmp_path, content))
+    assert recording.source == "rosbag2"
+    assert recording.metadata["rosbag2"]["robot"] == "cf1"
+    assert not recording.findings
+
+
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE])
+def test_poses_come_back_exactly(tmp_path: Path, compression: CompressionType) -> None:
+    values = random_poses(50)
+    times = START + 123_456_789 + np.arange(50) * 10_000_001
+    messages = [pose_message("/cf1/pose", int(t), v) for t, v in zip(times, values, strict=True)]
+    recording = opened(tmp_path, bag(messages, compression=compression))
+    signals = recording.signals
+    np.testing.assert_array_equal(signals["position"].value, values[:, :3])
+    np.testing.assert_array_equal(signals["attitude"].value, values[:, 3:])
+    assert recording.origin == START // 10**9
+    assert (np.round(signals["position"].time * 1e9).astype(int) + int(recording.origin) * 10**9 == times).all()
+    np.testing.assert_allclose(signals["position"].host_time, (times + 700_000) / 1e9, rtol=0, atol=3e-7)
+    assert signals["position"].clock == "ros"
+    assert signals["position"].stream == "cf1/pose"
+    assert signals["position"].source[0] == "cf1/pose.pose.position.x"
+
+
+def test_twists_in_either_frame(tmp_path: Path) -> None:
+    values = random_poses(30, seed=3)
+    linear = np.random.default_rng(4).normal(size=(30, 3))
+    for child, mapping, body in (
+        ("", "", False),
+        ("cf1", "", True),
+        ("cf1", 'twist = "world"', False),
+        ("", 'twist = "body"', True),
+    ):
+        content = bag(odometry("/cf1/odom", START + i * 10**7, v, linear[i], child=child) for i, v in enumerate(values))
+        recording = opened(tmp_path, content, mapping)
+        expected = Rotation.from_quat(values[:, 3:]).apply(linear) if body else linear
+        np.testing.assert_allclose(recording.signals["velocity"].value, expected, atol=1e-14)
+        assert "body_rate" not in recording.signals  # all zeros: crazyswarm2 leaves them out
+        assert f"in the {'body' if body else 'world'} frame" in recording.findings[0].text
+
+
+def test_status_imu_and_setpoints(tmp_path: Path) -> None:
+    values = random_poses(5, seed=8)
+    messages: list[Message] = []
+    for i, v in enumerate(values):
+        t = START + i * 10**7
+        messages.append(status("/cf2/status", t, 16 if i > 1 else 2, 3.75))
+        imu = {"header": stamp(t), "orientation": quaternion([0] * 4), "orientation_covariance": [-1.0] + [0.0] * 8}
+        imu |= {"angular_velocity": vector(v[:3]), "linear_acceleration": vector(v[1:4])}
+        imu |= {f"{n}_covariance": [0.0] * 9 for n in ("angular_velocity", "linear_acceleration")}
+        messages.append(("/cf2/imu", "sensor_msgs/msg/Imu", t, imu))
+        twist = {"linear": vector(v[2:5]), "angular": vector(v[3:6])}
+        full = {"header": stamp(t), "pose": pose(v), "twist": twist, "acc": vector(v[4:7])}
+        messages.append(("/cf2/cmd_full_state", "crazyflie_interfaces/msg/FullState", t, full))
+        messages.append(("/rosout", "std_msgs/msg/String", t, {"data": "hello"}))
+    signals = opened(tmp_path, bag(messages)).signals
+    assert signals["voltage"].value[:, 0].tolist() == [3.75] * 5
+    assert signals["flying"].value[:, 0].tolist() == [0, 0, 1, 1, 1]
+    np.testing.assert_array_equal(signals["body_rate"].value, values[:, :3])
+    np.testing.assert_array_equal(signals["specific_force"].value, values[:, 1:4])
+    assert "attitude" not in signals  # the IMU says that it has none
+    np.testing.assert_array_equal(signals["setpoint_position"].value, values[:, :3])
+    np.testing.assert_array_equal(signals["setpoint_velocity"].value, values[:, 2:5])
+    np.testing.assert_array_equal(signals["setpoint_acceleration"].value, values[:, 4:7])
+    np.testing.assert_array_equal(signals["setpoint_rate"].value, values[:, 3:6])
+    angles = signals["setpoint_euler"].value
+    rebuilt = Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix()
+    np.testing.assert_allclose(rebuilt, Rotation.from_quat(values[:, 3:]).as_matrix(), atol=1e-12)
+
+
+MOTORS = '[topics."/cf1/motors"]\nvariables = ["motor.m1", "motor.m2", "motor.m3", "motor.m4", "pm.vbat"]\n'
+
+
+def motors(n: int = 20, first: int = 5000, drift: int = 0) -> tuple[list[Message], np.ndarray]:
+    values = np.random.default_rng(6).integers(0, 65536, (n, 5)).astype(float)
+    values[:, 4] = 3.5
+    messages = []
+    for i in range(n):
+        ms = (first + 10 * i) % (1 << 24)
+        messages.append(log_block("/cf1/motors", START + i * (10**7 + drift), ms, values[i], late=2_000_000))
+    return messages, values
+
+
+def test_log_blocks_speak_the_firmwares_vocabulary_on_its_clock(tmp_path: Path) -> None:
+    messages, values = motors()
+    recording = opened(tmp_path, bag(messages), MOTORS, motor="duty")
+    command = recording.signals["motor_command"]
+    np.testing.assert_array_equal(command.value, values[:, :4] / 65535.0)
+    np.testing.assert_array_equal(command.time, 5.0 + np.arange(20) / 100)
+    assert command.clock == "firmware"
+    assert command.stream == "cf1/motors"
+    assert recording.signals["voltage"].value[:, 0].tolist() == [3.5] * 20
+    assert recording.origin == 0.0
+    request = opened(tmp_path, bag(messages), MOTORS, motor="request")
+    assert "motor_request" in request.signals
+    asked = opened(tmp_path, bag(messages), MOTORS)
+    assert asked.signals["motor.m1"].value[:, 0].tolist() == values[:, 0].tolist()
+    assert any(f.check == "motor_meaning" for f in asked.findings)
+
+
+def test_log_blocks_without_names_say_what_is_missing(tmp_path: Path) -> None:
+    messages, values = motors()
+    recording = opened(tmp_path, bag(messages))
+    assert recording.signals["cf1/motors.values[2]"].value[:, 0].tolist() == values[:, 2].tolist()
+    finding = next(f for f in recording.findings if f.check == "mapping")
+    assert '[topics."/cf1/motors"]' in finding.advice
+    assert finding.evidence["variables"] == 5
+
+
+def test_the_firmware_clock_is_unwrapped(tmp_path: Path) -> None:
+    messages, _ = motors(first=(1 << 24) - 100)
+    time = opened(tmp_path, bag(messages), MOTORS).signals["voltage"].time
+    np.testing.assert_allclose(np.diff(time), 0.01, atol=1e-9)
+
+
+def test_host_stamps_are_put_beside_the_firmwares(tmp_path: Path) -> None:
+    messages, _ = motors()
+    poses = random_poses(20)
+    messages += [pose_message("/cf1/pose", START + i * 10**7 + 2_000_000, v) for i, v in enumerate(poses)]
+    recording = opened(tmp_path, bag(messages), MOTORS, motor="duty")
+    position = recording.signals["position"]
+    np.testing.assert_allclose(position.time, recording.signals["motor_command"].time, atol=1e-9)
+    assert (position.clock, recording.signals["motor_command"].clock) == ("ros", "firmware")
+    # the stamps of the file come back
+    offset = int(recording.metadata["rosbag2"]["host_minus_firmware_ns"])
+    stamps = START + np.arange(20) * 10**7 + 2_000_000
+    assert (np.round(position.time * 1e9).astype(int) + offset == stamps).all()
+    orders = np.concatenate([s.order for s in recording.signals.values()])
+    assert np.unique(orders).size == orders.size
+    assert {s.signal for s in recording.samples()} >= {"position", "attitude", "motor_command", "voltage"}
+
+
+def test_a_log_block_and_a_topic_may_measure_the_same(tmp_path: Path) -> None:
+    mapping = '[topics."/cf1/state"]\nvariables = ["stateEstimate.x", "stateEstimate.y", "stateEstimate.z"]\n'
+    messages = [log_block("/cf1/state", START + i * 10**7, 10 * i, [i, 0, 1]) for i in range(5)]
+    messages += [pose_message("/cf1/pose", START + i * 10**7, [9, 9, 9, 0, 0, 0, 1]) for i in range(5)]
+    signals = opened(tmp_path, bag(messages), mapping).signals
+    assert signals["position"].value[:, 0].tolist() == [0, 1, 2, 3, 4]
+    assert signals["position@cf1/pose"].value[:, 0].tolist() == [9] * 5
+
+
+def test_motion_capture_and_tf_of_one_robot(tmp_path: Path) -> None:
+    values = random_poses(6, seed=12)
+    messages: list[Message] = []
+    for i, v in enumerate(values):
+        t = START + i * 10**7
+        named = [{"name": "cf2", "pose": pose(v + 1)}, {"name": "cf1", "pose": pose(v)}]
+        messages.append(
+            ("/poses", "motion_capture_tracking_interfaces/msg/NamedPoseArray", t, {"header": stamp(t), "poses": named})
+        )
+        transform = {"translation": vector(v[:3] + 2), "rotation": quaternion(v[3:])}
+        entry = {"header": stamp(t), "child_frame_id": "cf1", "transform": transform}
+        messages.append(("/tf", "tf2_msgs/msg/TFMessage", t, {"transforms": [entry]}))
+        messages.append(status("/cf1/status", t, 0, 4.0))
+    signals = opened(tmp_path, bag(messages)).signals
+    np.testing.assert_array_equal(signals["position"].value, values[:, :3])  # nothing else gives one
+    np.testing.assert_array_equal(signals["position@tf"].value, values[:, :3] + 2)
+    messages += [pose_message("/cf1/pose", START + i * 10**7, v - 1) for i, v in enumerate(values)]
+    signals = opened(tmp_path, bag(messages)).signals
+    np.testing.assert_array_equal(signals["position"].value, values[:, :3] - 1)
+    np.testing.assert_array_equal(signals["position@mocap"].value, values[:, :3])
+    np.testing.assert_array_equal(signals["position@tf"].value, values[:, :3] + 2)
+
+
+def test_several_robots_need_a_word(tmp_path: Path) -> None:
+    messages = [pose_message(f"/cf{k}/pose", START + i, [k, 0, 0, 0, 0, 0, 1]) for i in range(3) for k in (1, 7)]
+    with pytest.raises(UsageError, match=r"cf1, cf7.*robot = "):
+        opened(tmp_path, bag(messages))
+    recording = opened(tmp_path, bag(messages), 'robot = "cf7"')
+    assert recording.signals["position"].value[:, 0].tolist() == [7, 7, 7]
+    with pytest.raises(UsageError, match="no robot"):
+        opened(tmp_path, bag(messages), 'robot = "cf3"')
+
+
+@pytest.mark.parametrize(
+    ("mapping", "words"),
+    [
+        ("robot = 3", "robot"),
+        ('name = "x"', "name is not"),
+        ('twist = "sideways"', "twist must be"),
+        ('[topics."/cf1/motors"]\nvariables = "motor.m1"', "list of names"),
+        ('[topics."/cf1/motors"]\nvariables = ["motor.m1", "motor.m1"]', "twice"),
+        ('[topics."/cf1/motors"]\nvariables = ["motor.m1"]', "1 names, but the messages hold 5"),
+        ("robot = ", "TOML"),
+    ],
+)
+def test_mappings_that_do_not_fit(tmp_path: Path, mapping: str, words: str) -> None:
+    with pytest.raises(FileFormatError, match=re.escape(words)):
+        opened(tmp_path, bag(motors()[0]), mapping)
+
+
+def test_a_folder_of_split_files_is_one_recording(tmp_path: Path) -> None:
+    values = random_poses(24)
+    messages = [pose_message("/cf1/pose", START + i * 10**7, v) for i, v in enumerate(values)]
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    assert not recognises_folder(folder)
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information:\n  version: 8\n")
+    for k in range(12):
+        save(folder, bag(messages[2 * k : 2 * k + 2]), f"bag_{k}.mcap")
+    assert recognises_folder(folder)
+    recording = open_recording(folder)
+    np.testing.assert_array_equal(recording.signals["position"].value, values[:, :3])
+
+
+def test_bags_in_sqlite_say_how_to_convert(tmp_path: Path) -> None:
+    head = b"SQLite format 3\0" + bytes(100) + b"CREATE TABLE topics CREATE TABLE messages"
+    assert recognises(head)
+    with pytest.raises(FileFormatError, match="ros2 bag convert"):
+        read(save(tmp_path, head, "bag.db3"), ReadOptions())
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    with pytest.raises(FileFormatError, match="ros2 bag convert"):
+        read(tmp_path, ReadOptions())
+    (tmp_path / "bag.db3").unlink()
+    with pytest.raises(FileFormatError, match="no MCAP file"):
+        read(tmp_path, ReadOptions())
+
+
+def test_simulated_time_is_not_mixed_with_real_time(tmp_path: Path) -> None:
+    messages = []
+    for i in range(5):
+        topic, kind, _, message = pose_message("/cf1/pose", i * 10**7, [i, 0, 0, 0, 0, 0, 1])
+        messages.append((topic, kind, START + i * 10**7, message))
+        messages.append(status("/cf1/status", START + i * 10**7, 0, 4.0))
+    signals = opened(tmp_path, bag(messages)).signals
+    np.testing.assert_allclose(signals["position"].time, signals["voltage"].time)
+
+
+def test_truncation_keeps_every_whole_chunk(tmp_path: Path) -> None:
+    values = random_poses(12)
+    content = bag([pose_message("/cf1/pose", START + i * 10**7, v) for i, v in enumerate(values)], chunk=300)
+    most = 0
+    for size in range(0, len(content), 3):
+        try:
+            recording = opened(tmp_path, content[:size])
+        except FileFormatError:
+            assert most == 0
+            continue
+        position = recording.signals["position"].value
+        np.testing.assert_array_equal(position, values[: len(position), :3])
+        assert len(position) >= most
+        assert [f for f in recording.findings if f.check == "integrity"]
+        most = len(position)
+    assert most == 12
+
+
+def test_damage_is_named_by_its_place(tmp_path: Path) -> None:
+    values = random_poses(60)
+    content = bytearray(bag([pose_message("/cf1/pose", START + i, v) for i, v in enumerate(values)], chunk=1000))
+    content[len(content) // 3] ^= 0xFF
+    recording = opened(tmp_path, bytes(content))
+    kept = {tuple(v) for v in recording.signals["position"].value}
+    assert kept < {tuple(v) for v in values[:, :3]}
+    assert len(kept) > 30
+    finding = next(f for f in recording.findings if f.check == "integrity")
+    assert finding.evidence["offset"] <= len(content) // 3 <= finding.evidence["offset"] + finding.evidence["bytes"]
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    place=st.integers(0, 10**6),
+    junk=st.binary(min_size=1, max_size=40),
+    mode=st.sampled_from(["overwrite", "insert", "delete"]),
+    chunk=st.sampled_from([100, 4000]),
+)
+def test_random_damage_never_ends_in_anything_but_our_error(
+    tmp_path_factory: pytest.TempPathFactory, place: int, junk: bytes, mode: str, chunk: int
+) -> None:
+    messages = motors(5)[0]
+    messages += [odometry("/cf1/odom", START + i, [0, 0, 1, 0, 0, 0, 1], [1, 0, 0]) for i in range(5)]
+    content = bag(messages, chunk=chunk, compression=CompressionType.NONE)
+    place = 8 + place % (len(content) - 8)
+    rest = {"overwrite": place + len(junk), "insert": place, "delete": place + len(junk)}[mode]
+    damaged = content[:place] + (b"" if mode == "delete" else junk) + content[rest:]
+    path = save(tmp_path_factory.mktemp("damage"), damaged)
+    recording, said = None, str(path)
+    try:
+        recording = read(path, ReadOptions())
+    except CrazyemError as error:
+        said = str(error)
+    assert recording is None or len(recording) > 0
+    assert str(path) in said
+
+
+LIES = {
+    "itself": "A a",
+    "each other": f"B b\n{LINE}\nMSG: x/B\nA a",
+    "nothing for ever": f"B[] b\n{LINE}\nMSG: x/B\nuint8[1] c",
+    "hardly anything": f"B[] b\n{LINE}\nMSG: x/B\nuint8 d\n" + "\n".join(f"uint8[1] c{i}" for i in range(50)),
+    "long": "B[1000000000] b\n" + f"{LINE}\nMSG: x/B\nuint8 c",
+    "exponential": "B[9] b\n" + "".join(f"{LINE}\nMSG: x/{chr(66 + i)}\n{chr(67 + i)}[9] z\n" for i in range(12)),
+    "unknown": "std_msgs/Strange b",
+    "name": "uint8 " + "A" * 40 + "-=1\nuint8 b",
+    "no field": "uint8",
+    "path": "../../x b",
+}
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_definitions_that_lie_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ValueError, match="definition"):
+        message_type("x/msg/A", LIES[name])
+    output = io.BytesIO()
+    writer = PlainWriter(output)
+    writer.start(profile="ros2", library="")
+    schema = writer.register_schema("x/msg/A", "ros2msg", LIES[name].encode())
+    channel = writer.register_channel("/cf1/a", "cdr", schema)
+    writer.add_message(channel, START, b"\0\1\0\0" + b"\xff" * 1000, START)
+    writer.finish()
+    with pytest.raises(FileFormatError, match="/cf1/a"):
+        opened(tmp_path, output.getvalue())
+
+
+@settings(max_examples=200, deadline=None)
+@given(kind=st.sampled_from(sorted(DEFINITIONS)), data=st.binary(max_size=300))
+def test_any_bytes_as_any_message(tmp_path_factory: pytest.TempPathFactory, kind: str, data: bytes) -> None:
+    output = io.BytesIO()
+    writer = PlainWriter(output)
+    writer.start(profile="ros2", library="")
+    schema = writer.register_schema(kind, "ros2msg", DEFINITIONS[kind].encode())
+    channel = writer.register_channel("/cf1/a", "cdr", schema)
+    for payload in (data, b"\0\1\0\0" + data):
+        writer.add_message(channel, START, payload, START)
+    writer.finish()
+    path = save(tmp_path_factory.mktemp("any"), output.getvalue())
+    recording, said = None, ""
+    try:
+        recording = read(path, ReadOptions())
+    except CrazyemError as error:
+        said = str(error)
+    assert recording is not None or str(path) in said
+
+
+def test_a_claimed_sequence_length_costs_nothing() -> None:
+    name = "crazyflie_interfaces/msg/LogDataGeneric"
+    kind = message_type(name, DEFINITIONS[name])
+    head = b"\0\1\0\0" + bytes(8) + b"\1\0\0\0\0\0\0\0" + bytes(4)
+    rows = rows_of(kind, [(START, head + b"\xff\xff\xff\xff" + bytes(64))])
+    assert (rows.broken, rows.log.size) == (1, 0)
+
+
+def test_a_chunk_that_unpacks_to_more_than_it_says_is_refused(tmp_path: Path) -> None:
+    output = io.BytesIO()
+    writer = PlainWriter(output, chunk_size=1 << 27, compression=CompressionType.ZSTD)
+    writer.start(profile="ros2", library="")
+    schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+    channel = writer.register_channel("/cf1/a", "cdr", schema)
+    for _ in range(5):
+        writer.add_message(channel, START, bytes(20 << 20), START)
+    writer.finish()
+    with pytest.raises(FileFormatError, match="claims"):
+        opened(tmp_path, output.getvalue())
+
+
+def test_values_are_what_the_decoder_of_the_library_gives(tmp_path: Path) -> None:
+    messages = [odometry("/cf1/odom", START + i, random_poses(1, i)[0], [i, 2, 3], [0.1 * i, 1, 1]) for i in range(9)]
+    content = bag(messages)
+    signals = opened(tmp_path, content).signals
+    reader = make_reader(io.BytesIO(content), decoder_factories=[DecoderFactory()])
+    theirs = [message for _, _, _, message in reader.iter_decoded_messages()]
+    picks = {
+        "position": lambda m: m.pose.pose.position,
+        "velocity": lambda m: m.twist.twist.linear,
+        "body_rate": lambda m: m.twist.twist.angular,
+    }
+    for name, pick in picks.items():
+        expected = [[p.x, p.y, p.z] for p in map(pick, theirs)]
+        assert signals[name].value.tolist() == expected
+    assert isinstance(theirs[0], SimpleNamespace)
+    assert math.isfinite(signals["position"].value.sum())
