@@ -1,0 +1,562 @@
+"""The commands on recordings: one file and many, folders and patterns, JSON, errors, interruption, outputs."""
+
+import gzip
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from made_flight import Motion, changed, made_flight
+
+from crazyem.cli import main
+from crazyem.commands import batch, files
+from crazyem.commands.merged import merge_findings, merge_inventories
+from crazyem.commands.output import Report, Result, plain
+from crazyem.doctor.inventory import inventory
+from crazyem.errors import LinkError, UsageError
+from crazyem.recordings import Finding, Grade, Recording, open_recording
+from crazyem.recordings.export import export
+from crazyem.recordings.mcap_signals import write_recording
+
+
+def save(recording: Recording, path: Path) -> Path:
+    export(recording, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sound recording of 8 s; never changed by a test."""
+    return save(made_flight(seconds=8.0), tmp_path_factory.mktemp("flight") / "flight.csv")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, flight: Path) -> Path:
+    """Two recordings, one folder deeper a third, one that is broken, and things that are no recordings."""
+    top = tmp_path / "lab"
+    (top / "day two").mkdir(parents=True)
+    for name in ("b.csv", "a.csv", "day two/a.csv"):
+        link_pair(flight, top / name)
+    (top / "README.txt").write_text("Flights, all of them.\nSee above.\n")
+    (top / "x.csv-metadata.json").write_text("{}")
+    (top / ".hidden.csv").write_bytes(flight.read_bytes())
+    (top / "broken.csv").write_text("time [s],host_time [s],voltage [V]\n0,,x\n")
+    os.mkfifo(top / "pipe")
+    (top / "day two" / "up").symlink_to(top)
+    (top / "nowhere").symlink_to(top / "gone")
+    return top
+
+
+def link_pair(source: Path, target: Path) -> None:
+    target.write_bytes(source.read_bytes())
+    Path(f"{target}-metadata.json").write_bytes(Path(f"{source}-metadata.json").read_bytes())
+
+
+def run(capsys: pytest.CaptureFixture[str], *argv: object) -> tuple[int, str, str]:
+    """Exit code, standard output, standard error."""
+    code = main([str(a) for a in argv])
+    out, err = capsys.readouterr()
+    assert "Traceback" not in err
+    assert "\x1b" not in out + err
+    return code, out, err
+
+
+def fails(capsys: pytest.CaptureFixture[str], *argv: object, code: int) -> str:
+    """Run, expect this exit code and one sentence; return it."""
+    got, _, err = run(capsys, *argv)
+    assert got == code, err
+    lines = [line for line in err.splitlines() if line.startswith("crazyem: ")]
+    assert len(lines) == 1, err
+    assert lines[0].endswith(".")
+    return lines[0]
+
+
+# --- what is found ------------------------------------------------------------------------------------------------
+
+
+def test_folders_patterns_and_links_give_each_recording_once(folder: Path) -> None:
+    found = files.find([str(folder)])
+    names = [str(f.path.relative_to(folder)) for f in found.found]
+    assert names == ["a.csv", "b.csv", "broken.csv", "day two/a.csv"]
+    assert [f.below for f in found.found] == ["", "", "", "day two"]
+    assert found.skipped == 7  # a README, four descriptions, a pipe, a link to nothing
+    again = files.find([str(folder / "b.csv"), str(folder), str(folder / "*.csv"), str(folder / "day two" / "up")])
+    assert [f.path.name for f in again.found] == ["b.csv", "a.csv", "broken.csv", "a.csv"]
+
+
+def test_a_pattern_goes_into_folders_if_it_says_so(folder: Path) -> None:
+    assert len(files.find([str(folder / "**" / "a.csv")]).found) == 2
+    assert len(files.find([str(folder / "[ab].csv")]).found) == 2
+    with pytest.raises(UsageError, match="nothing matches"):
+        files.find([str(folder / "*.mcap")])
+
+
+def test_a_file_whose_name_is_a_pattern_is_that_file(tmp_path: Path, flight: Path) -> None:
+    link_pair(flight, tmp_path / "a[1].csv")
+    link_pair(flight, tmp_path / "a1.csv")
+    assert [f.path.name for f in files.find([str(tmp_path / "a[1].csv")]).found] == ["a[1].csv"]
+
+
+def test_a_folder_without_recordings(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("nothing")
+    assert "no recording in" in fails(capsys, "info", tmp_path, code=2)
+
+
+def test_a_pipe_is_refused_not_waited_for(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
+    assert "neither a file nor a folder" in fails(capsys, "info", folder / "pipe", code=2)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("a.csv.gz", "a"), ("a.csv", "a"), ("a.MCAP", "a"), ("log07", "log07"), (".csv", ".csv"),
+        ("cut_M2_0.5mm_46.5mm__E9_log00", "cut_M2_0.5mm_46.5mm__E9_log00"), ("f.fixed.mcap", "f.fixed"),
+    ],
+)  # fmt: skip
+def test_stem(name: str, expected: str) -> None:
+    assert files.stem(Path(name)) == expected
+
+
+# --- info ---------------------------------------------------------------------------------------------------------
+
+
+def test_info_of_one(capsys: pytest.CaptureFixture[str], flight: Path) -> None:
+    code, out, err = run(capsys, "info", flight)
+    assert (code, err) == (0, "")
+    assert "position" in out
+    assert "what it could identify" in out
+
+
+def test_json_alone_is_all_of_standard_output(capsys: pytest.CaptureFixture[str], flight: Path) -> None:
+    code, out, err = run(capsys, "info", flight, "--json")
+    told = json.loads(out)["files"]
+    assert (code, err) == (0, "")
+    assert [t["file"] for t in told] == [str(flight)]
+    assert told[0]["duration_s"] == pytest.approx(8.0, abs=0.02)
+    signals = {s["name"]: s for s in told[0]["signals"]}
+    assert signals["body_rate"]["unit"] == "rad/s"
+
+
+def test_one_that_fails_does_not_stop_the_others(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
+    summary = folder.parent / "s.json"
+    code, out, err = run(capsys, "info", folder, "--jobs", 1, "--json", summary)
+    assert code == 3
+    assert err.count("crazyem: ") == 1
+    assert "broken.csv" in err
+    assert "3 recordings, 1 could not be read, 7 other files skipped" in out
+    told = json.loads(summary.read_text())
+    assert [bool(f.get("error")) for f in told["files"]] == [False, False, True, False]
+    assert told["files"][2]["exit_code"] == 3
+    assert told["skipped_files"] == 7
+
+
+def test_a_single_unreadable_file_is_one_sentence(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
+    for command in ("info", "doctor"):
+        assert "broken.csv" in fails(capsys, command, folder / "broken.csv", code=3)
+        assert "no such file" in fails(capsys, command, folder / "none.csv", code=2)
+
+
+def test_json_does_not_replace_a_recording(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
+    before = (folder / "a.csv").read_bytes()
+    said = fails(capsys, "info", "--json", folder / "a.csv", folder / "b.csv", code=2)
+    assert "no JSON file" in said
+    assert (folder / "a.csv").read_bytes() == before
+
+
+def test_options_of_reading_reach_the_reader(capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path) -> None:
+    assert "--motor" in fails(capsys, "info", flight, "--motor", "both", code=2)
+    given = []
+    for argv in (["info", "f", "--motor", "request", "--as-published", "--map", "m.toml"], ["replay", "f"]):
+        from crazyem.cli import parser
+
+        given.append(files.read_options(parser().parse_args(argv)))
+    assert (given[0].mapping, given[0].motor, given[0].as_published) == ("m.toml", "request", True)
+    assert (given[1].mapping, given[1].motor, given[1].as_published) == (None, None, False)
+
+
+def test_info_in_parts_says_what_the_whole_says(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = save(made_flight(seconds=150.0, more=["rpm"]), tmp_path / "long.csv")
+    told = []
+    for more in ([], ["--parts"]):
+        code, out, _ = run(capsys, "info", path, "--json", *more)
+        assert code == 0
+        told.append(json.loads(out)["files"][0])
+    whole, parts = told
+    assert parts["duration_s"] == pytest.approx(whole["duration_s"])
+    assert parts["samples"] == whole["samples"]
+    for a, b in zip(whole["signals"], parts["signals"], strict=True):
+        for key in ("name", "samples", "unit", "missing_share", "marked_share"):
+            assert a[key] == b[key]
+        assert a["rate_hz"] == pytest.approx(b["rate_hz"])
+        assert a["longest_gap_s"] == pytest.approx(b["longest_gap_s"])
+    for key in ("speed_max_m_s", "altitude_max_m", "tilt_max_deg", "motor_command_max"):
+        assert parts["envelope"][key] == pytest.approx(whole["envelope"][key], rel=1e-6), key
+
+
+def test_inventories_of_parts_add_up() -> None:
+    recording = made_flight(seconds=20.0)
+    halves = [
+        replace(recording, signals={n: cut(a, half) for n, a in recording.signals.items()}) for half in (False, True)
+    ]
+    whole, merged = inventory(recording), merge_inventories(inventory(h) for h in halves)
+    assert merged.samples == whole.samples
+    for a, b in zip(whole.signals, merged.signals, strict=True):
+        assert (a.name, a.samples, a.start_s, a.end_s, a.rate_hz) == (b.name, b.samples, b.start_s, b.end_s, b.rate_hz)
+        assert a.longest_gap_s == pytest.approx(b.longest_gap_s)
+
+
+def cut(array: Any, later: bool) -> Any:
+    rows = (array.time >= 10.0) == later
+    return replace(array, **{f: getattr(array, f)[rows] for f in ("time", "value", "order", "host_time", "marked")})
+
+
+def test_findings_of_parts_become_one() -> None:
+    early = Finding("gaps", Grade.HARMLESS, "One gap.", "position", ((1.0, 2.0),), {"longest_s": 1.0})
+    late = Finding("gaps", Grade.DEGRADES, "A long gap.", "position", ((70.0, 75.0),), {"longest_s": 5.0})
+    other = Finding("lag", Grade.UNUSABLE, "Lag.", "velocity")
+    merged = merge_findings([(early,), (late, other)])
+    assert [(f.check, f.grade) for f in merged] == [("lag", Grade.UNUSABLE), ("gaps", Grade.DEGRADES)]
+    assert merged[1].intervals == ((1.0, 2.0), (70.0, 75.0))
+    assert dict(merged[1].evidence) == {"longest_s": 5.0, "parts": 2.0}
+
+
+# --- doctor -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def in_degrees(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording whose gyro is in deg/s but says rad/s."""
+    recording = made_flight(Motion(seconds=15.0, size=0.2))  # slow enough to be below what no gyro can show
+    rate = recording.signals["body_rate"].value
+    return save(changed(recording, "body_rate", value=np.degrees(rate)), tmp_path_factory.mktemp("ill") / "gyro.csv")
+
+
+def test_doctor_names_grades_and_advises(capsys: pytest.CaptureFixture[str], in_degrees: Path) -> None:
+    code, out, err = run(capsys, "doctor", in_degrees)
+    assert (code, err) == (0, "")
+    assert "UNUSABLE  rates body_rate" in out
+    assert "evidence: " in out
+    assert "advice: " in out
+    code, out, _ = run(capsys, "doctor", in_degrees, "--strict", "--json")
+    assert code == 5
+    told = json.loads(out)["files"][0]
+    assert told["grade"] == "unusable"
+    assert any(f["check"] == "rates" and f["fix"]["kind"] == "scale" for f in told["findings"] if f["fix"])
+
+
+def test_fix_writes_a_new_file_that_is_cured(
+    capsys: pytest.CaptureFixture[str], in_degrees: Path, tmp_path: Path
+) -> None:
+    before = in_degrees.read_bytes()
+    target = tmp_path / "fixed.mcap"
+    code, out, _ = run(capsys, "doctor", in_degrees, "--fix", "-o", target)
+    assert code == 0
+    assert "applied: rates" in out
+    assert in_degrees.read_bytes() == before
+    repaired = open_recording(target).signals["body_rate"].value
+    assert repaired == pytest.approx(np.radians(open_recording(in_degrees).signals["body_rate"].value), rel=1e-2)
+    code, out, _ = run(capsys, "doctor", target, "--json")
+    assert not any(f["check"] == "rates" for f in json.loads(out)["files"][0]["findings"])
+    assert "exists already" in fails(capsys, "doctor", in_degrees, "--fix", "-o", target, code=2)
+
+
+def test_fix_goes_beside_the_recording_and_never_onto_it(
+    capsys: pytest.CaptureFixture[str], in_degrees: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "gyro.csv"
+    link_pair(in_degrees, path)
+    assert run(capsys, "doctor", path, "--fix")[0] == 0
+    assert (tmp_path / "gyro.fixed.mcap").exists()
+    said = fails(capsys, "doctor", path, "--fix", "--force", "-o", path, code=2)
+    assert "never written in place" in said
+    assert "-o is where --fix writes" in fails(capsys, "doctor", path, "-o", tmp_path / "x.mcap", code=2)
+
+
+def test_what_is_sound_is_not_rewritten(capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path) -> None:
+    target = tmp_path / "new.mcap"
+    code, out, _ = run(capsys, "doctor", flight, "--fix", "-o", target, "--json")
+    fixed = json.loads(out)["files"][0]["fixed"]
+    assert code == 0
+    assert fixed["applied"] == []
+    assert fixed["output"] is None
+    assert not target.exists()
+
+
+def test_copies_among_several_are_told(capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path) -> None:
+    link_pair(flight, tmp_path / "copy.csv")
+    save(made_flight(seconds=8.0, seed=5), tmp_path / "other.csv")
+    code, out, _ = run(capsys, "doctor", flight, tmp_path, "--jobs", 1, "--json")
+    assert code == 0
+    told = json.loads(out)["duplicates"]
+    assert len(told) == 1
+    assert {"flight.csv", "copy.csv"} <= {Path(w).name for w in words(told[0])}
+    assert "other.csv" not in {Path(w).name for w in words(told[0])}
+
+
+def words(value: Any) -> Iterator[str]:
+    """Every string in a JSON value."""
+    if isinstance(value, dict | list):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from words(item)
+    elif isinstance(value, str):
+        yield value
+
+
+# --- import, export -----------------------------------------------------------------------------------------------
+
+
+def test_import_then_export_loses_nothing(capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path) -> None:
+    mcap, table = tmp_path / "f.mcap", tmp_path / "again.csv"
+    assert run(capsys, "import", flight, "-o", mcap)[0] == 0
+    code, out, _ = run(capsys, "export", mcap, "-o", table, "--json")
+    assert code == 0
+    assert json.loads(out)["files"][0]["output"] == [str(table), f"{table}-metadata.json"]
+    a, b = open_recording(flight), open_recording(table)
+    for name, array in a.signals.items():
+        for field in ("time", "value", "host_time", "marked"):
+            assert np.array_equal(getattr(array, field), getattr(b.signals[name], field), equal_nan=field != "marked")
+        assert (array.unit, array.frame, array.clock, array.stream) == (
+            b.signals[name].unit, b.signals[name].frame, b.signals[name].clock, b.signals[name].stream,
+        )  # fmt: skip
+    assert run(capsys, "export", mcap, "-o", tmp_path / "f.parquet")[0] == 0
+    assert pd.read_parquet(tmp_path / "f.parquet").attrs["units"]["voltage"] == "V"
+
+
+def test_several_go_into_a_folder_that_keeps_theirs(
+    capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path
+) -> None:
+    (folder / "broken.csv").unlink()
+    write_recording(made_flight(seconds=2.0), folder / "a.mcap")
+    out = tmp_path / "new" / "tables"
+    code, _, _ = run(capsys, "export", folder, "-o", out, "--format", "parquet", "--jobs", 1)
+    assert code == 0
+    made = sorted(str(p.relative_to(out)) for p in out.rglob("*") if p.is_file())
+    assert made == ["a.csv.parquet", "a.mcap.parquet", "b.parquet", "day two/a.parquet"]
+    said = fails(capsys, "import", folder / "a.csv", folder / "b.csv", "-o", folder / "README.txt", code=2)
+    assert "not a folder" in said
+    said = fails(capsys, "import", folder / "a.csv", folder / "day two" / "a.csv", "-o", tmp_path / "m", code=2)
+    assert "one at a time" in said
+
+
+def test_nothing_is_replaced_unless_asked_and_never_an_input(
+    capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path
+) -> None:
+    path, target = tmp_path / "f.csv", tmp_path / "old.mcap"
+    link_pair(flight, path)
+    target.write_bytes(b"mine")
+    (tmp_path / "link.csv").symlink_to(path)
+    assert "exists already" in fails(capsys, "import", path, "-o", target, code=2)
+    assert target.read_bytes() == b"mine"
+    assert run(capsys, "import", path, "-o", target, "--force")[0] == 0
+    assert open_recording(target).signals
+    for same in (path, tmp_path / "link.csv", tmp_path / "." / "f.csv"):
+        assert "never written in place" in fails(capsys, "export", path, "-o", same, "--force", code=2)
+    assert path.read_bytes() == flight.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("argv", "says"),
+    [
+        (["import", "{f}"], "-o"),
+        (["import", "{f}", "-o", "/proc/x.mcap"], "/proc/x.mcap"),
+        (["import", "{f}", "-o", "no/such/folder/x.mcap"], "cannot write"),
+        (["export", "{f}", "-o", "x.xlsx"], "ends in .csv or .parquet"),
+        (["export", "{f}", "-o", "x.csv", "--format", "parquet"], "--format"),
+        (["info"], "FILE"),
+        (["info", "{f}", "--jobs", "0"], "--jobs"),
+        (["info", "{f}", "--vehicle", "nimbus"], "unknown vehicle"),
+        (["recover", "none.mcap", "-o", "x.mcap"], "none.mcap"),
+        (["recover", "{f}", "-o", "{f}"], "never written in place"),
+        (["layout", "-o", "no/such/folder/x.json"], "cannot write"),
+    ],
+)
+def test_wrong_usage_is_one_sentence(
+    capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    argv: list[str], says: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert says in fails(capsys, *(a.format(f=flight) for a in argv), code=2)
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- recover, layout ----------------------------------------------------------------------------------------------
+
+
+def test_recover_a_cut_recording(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    whole, broken, target = tmp_path / "w.mcap", tmp_path / "b.mcap", tmp_path / "r.mcap"
+    write_recording(made_flight(seconds=60.0), whole)
+    broken.write_bytes(whole.read_bytes()[: whole.stat().st_size * 2 // 3])
+    code, out, _ = run(capsys, "recover", broken, "-o", target, "--json")
+    told = json.loads(out)["files"][0]
+    assert code == 0
+    assert told["messages"] > 0
+    a, b = open_recording(whole).signals["body_rate"], open_recording(target).signals["body_rate"]
+    assert 0 < b.time.size < a.time.size
+    assert np.array_equal(a.value[: b.time.size], b.value)
+    assert "exists already" in fails(capsys, "recover", broken, "-o", target, code=2)
+    (tmp_path / "n.mcap").write_bytes(b"not an MCAP file")
+    assert "n.mcap" in fails(capsys, "recover", tmp_path / "n.mcap", "-o", tmp_path / "m.mcap", code=3)
+
+
+def test_layout_is_json(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    code, out, _ = run(capsys, "layout")
+    assert code == 0
+    assert json.loads(out)["configById"]
+    target = tmp_path / "layout.json"
+    assert run(capsys, "layout", "-o", target)[0] == 0
+    assert json.loads(target.read_text()) == json.loads(out)
+    assert "exists already" in fails(capsys, "layout", "-o", target, code=2)
+
+
+# --- the terminal -------------------------------------------------------------------------------------------------
+
+
+def test_names_cannot_steer_the_terminal(capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path) -> None:
+    assert plain("a\x1b[31m\r\nb") == "a\ufffd[31m\ufffd\nb"
+    link_pair(flight, tmp_path / "a\x1b[31m.csv")
+    assert run(capsys, "info", tmp_path / "a\x1b[31m.csv")[0] == 0  # `run` looks for escapes
+
+
+def test_a_name_that_is_no_text(tmp_path: Path, flight: Path) -> None:
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/fl\xffight.csv"))
+    link_pair(flight, path)
+    target = os.fsencode(tmp_path) + b"/\xfe.mcap"
+    for argv in (["info", path], ["info", path, "--json"], ["doctor", path], ["import", path, "-o", target]):
+        done = crazyem(*argv)
+        assert done.returncode == 0, done.stderr
+        assert b"Traceback" not in done.stderr
+        if "--json" in argv:
+            assert os.fsencode(json.loads(done.stdout)["files"][0]["file"]) == os.fsencode(path)
+    assert open_recording(os.fsdecode(target)).signals
+
+
+def crazyem(*argv: object, **more: Any) -> subprocess.CompletedProcess[bytes]:
+    arguments = [sys.executable, "-m", "crazyem", *(a if isinstance(a, bytes) else str(a) for a in argv)]
+    return subprocess.run(arguments, capture_output=True, timeout=120, check=False, **more)
+
+
+def test_a_reader_that_has_seen_enough(flight: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "crazyem", "info", str(flight)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    said = process.stderr.read()
+    process.stderr.close()
+    assert process.wait(60) == 141
+    assert said == b""
+
+
+@pytest.mark.slow
+def test_interrupted_among_many(tmp_path: Path, flight: Path) -> None:
+    for i in range(200):
+        link_pair(flight, tmp_path / f"{i:03}.csv")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "crazyem", "info", str(tmp_path), "--jobs", "2"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    process.stdout.readline()  # it has begun
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all of its processes
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert b"Traceback" not in err
+    assert err.rstrip().endswith(b"crazyem: interrupted.")
+
+
+# --- many at once -------------------------------------------------------------------------------------------------
+
+
+def square(x: int) -> Result:
+    """A task for other processes."""
+    if x == 3:
+        raise UsageError("three is wrong.")
+    if x == 4:
+        raise RuntimeError("a bug\nin a reader")
+    time.sleep(0.01 * (x % 3))
+    return Result(str(x), {"square": x * x, "process": os.getpid()})
+
+
+def test_errors_stay_with_their_file_and_results_in_order() -> None:
+    results = list(batch.each(square, [(x,) for x in range(8)], names=[str(x) for x in range(8)], what="t", jobs=1))
+    assert [r.file for r in results] == [str(x) for x in range(8)]
+    assert [r.code for r in results] == [0, 0, 0, 2, 1, 0, 0, 0]
+    assert results[3].error == "three is wrong."
+    assert "please report it (RuntimeError: a bug in a reader)" in results[4].error
+    assert results[5].data["square"] == 25
+
+
+@pytest.mark.slow
+def test_processes_give_what_one_process_gives(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
+    told = []
+    for jobs in (1, 2):
+        code, out, _ = run(capsys, "info", folder, "--jobs", jobs, "--json")
+        assert code == 3
+        told.append(json.loads(out))
+    assert told[0] == told[1]
+
+
+def test_processes_are_no_more_than_files() -> None:
+    assert batch.processes(8, 3) == 3
+    assert batch.processes(2, 30) == 2
+    assert batch.processes(None, 1000) >= 1
+    assert batch.processes(None, 1) == 1
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "nonsense://x", "tcp://127.0.0.1:1"])
+def test_no_cluster_there_is_one_sentence(
+    capsys: pytest.CaptureFixture[str], flight: Path, monkeypatch: pytest.MonkeyPatch, address: str
+) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(batch, "CONNECT_SECONDS", 0.5)
+    code = 2 if "nonsense" in address else LinkError.exit_code
+    assert address in fails(capsys, "info", flight, "--cluster", address, code=code)
+
+
+def test_without_dask_it_says_how_to_get_it(
+    capsys: pytest.CaptureFixture[str], flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert "pip install 'crazyem[cluster]'" in fails(capsys, "info", flight, "--cluster", "127.0.0.1:1", code=2)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_gives_what_one_process_gives(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+        code, out, _ = run(capsys, "info", folder, "--cluster", cluster.scheduler_address, "--json")
+    assert code == 3
+    _, alone, _ = run(capsys, "info", folder, "--jobs", 1, "--json")
+    assert json.loads(out) == json.loads(alone)
+
+
+def test_the_report_keeps_the_first_error(capsys: pytest.CaptureFixture[str]) -> None:
+    import argparse
+
+    report = Report(argparse.Namespace(json=None))
+    report.add(Result("a", text="fine"))
+    report.add(Result("b", error="bad", code=5))
+    report.add(Result("c", error="worse.", code=3))
+    assert report.close() == 5
+    out, err = capsys.readouterr()
+    assert out == "fine\n"
+    assert err == "crazyem: bad.\ncrazyem: worse.\n"
+
+
+def test_a_packed_recording_too(capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path) -> None:
+    path = tmp_path / "f.csv.gz"
+    path.write_bytes(gzip.compress(flight.read_bytes()))
+    (tmp_path / "f.csv-metadata.json").write_bytes(Path(f"{flight}-metadata.json").read_bytes())
+    assert run(capsys, "import", path, "-o", tmp_path)[0] == 0
+    assert (tmp_path / "f.mcap").exists()
