@@ -139,7 +139,7 @@ def _lying(
     array = recording.signals.get("specific_force")
     if array is not None:
         time, force = ordered(array)
-        size = np.linalg.norm(force, axis=1)
+        size = np.sqrt(np.einsum("ij,ij->i", force, force))
         rest = (size > 8.0) & (size < 11.6)
         with np.errstate(divide="ignore", invalid="ignore"):
             angle = np.degrees(np.arccos(np.clip(force[:, 2] / size, -1.0, 1.0)))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import Airtime, airtime, inside, listed, longest, runs
+from crazyem.doctor.streams import COMMANDED, Airtime, airtime, inside, listed, longest, runs
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -52,7 +52,8 @@ def check(recording: Recording) -> list[Finding]:
         first = stuck.pop(0)
         alike = [other for other in stuck if _alike(first, other)]
         stuck = [other for other in stuck if other not in alike]
-        found.append(_finding([first, *alike]))
+        company = _company_of(recording, first, alike) if alike else []
+        found.append(_finding(first, [first.name, *(other.name for other in alike), *company]))
     if idle:
         found.append(_idle(idle))
     return found
@@ -71,6 +72,20 @@ class _Stuck:
     @property
     def spans(self) -> list[tuple[float, float]]:
         return [(float(self.array.time[a]), float(self.array.time[b - 1])) for a, b in self.stretches]
+
+
+def _company_of(recording: Recording, first: _Stuck, alike: list[_Stuck]) -> list[str]:
+    """Further signals of a table whose log stood still: nothing else tells that they should have moved."""
+    known = {first.name, *(other.name for other in alike)}
+    found = []
+    for name, array in recording.signals.items():
+        if name in known or not array.quantity or array.quantity in COMMANDED:
+            continue
+        if array.stream != first.array.stream or array.time.size != first.array.time.size:
+            continue
+        if all((array.value[a + 1 : b] == array.value[a]).all() for a, b in first.stretches):
+            found.append(name)
+    return found
 
 
 def _alike(one: _Stuck, other: _Stuck) -> bool:
@@ -228,8 +243,7 @@ def _bent(recording: Recording, start: float, end: float) -> float:
     return float(np.linalg.norm(change)) / max(0.5 * (end - start), 1e-6)
 
 
-def _finding(stuck: list[_Stuck]) -> Finding:
-    first = stuck[0]
+def _finding(first: _Stuck, names: list[str]) -> Finding:
     array = first.array
     rows = np.zeros(array.time.size, bool)
     for start, end in first.stretches:
@@ -238,8 +252,7 @@ def _finding(stuck: list[_Stuck]) -> Finding:
     lasting = max(b - a for a, b in first.spans)
     count = len(first.stretches)
     times = "once" if count == 1 else f"{count} times"
-    names = [s.name for s in stuck]
-    together = len(stuck) > 1
+    together = len(names) > 1
     label = listed(names) if together else f"{first.name} {first.component}".strip()
     return Finding(
         "frozen",

@@ -153,9 +153,11 @@ def _ends(stream: Stream, rhythm: Cadence, begin: float, end: float) -> list[_En
     least = max(1.0, 20.0 * rhythm.period)
     found = []
     for name, array in zip(stream.names, stream.arrays, strict=True):
-        there = np.flatnonzero(np.isfinite(array.value).any(axis=1))
-        if there.size and array.quantity:
-            first, last = float(array.time[there].min()), float(array.time[there].max())
+        if not array.quantity:
+            continue
+        there = np.flatnonzero(np.isfinite(array.value[:, 0]))
+        if there.size:
+            first, last = float(array.time[there[0]]), float(array.time[there[-1]])
             if end - last > least:
                 found.append(_End(True, last, end, (name,)))
             if first - begin > least:

@@ -19,11 +19,14 @@ from crazyem.doctor.streams import (
     places,
     runs,
     same_as_before,
+    sound_rows,
     streams,
 )
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
+# may come from a slower task of the firmware than the rest of their table, and are held meanwhile
+_MAY_BE_SLOW = frozenset({"voltage", "motor_command", "motor_request", "rotor_speed"})
 Rows = NDArray[np.bool_]
 
 LEAST = 0.01  # share of repeated rows worth a word
@@ -57,7 +60,7 @@ def _stream(stream: Stream, flight: Airtime | None) -> list[Finding]:
         if not array.quantity or array.quantity in COMMANDED:
             continue
         flags = same_as_before(array.value) & considered & ~_resting(array)
-        beat = _hold(flags, considered & np.isfinite(array.value).all(axis=1))
+        beat = _hold(flags, considered & sound_rows(array.value)) if array.quantity in _MAY_BE_SLOW else None
         if beat is not None and flags.sum() >= 0.3 * considered.sum() and not _creeps(array):
             found.append(_held_finding(name, float(flags[considered].mean()), 1.0 / stored, beat))
             continue

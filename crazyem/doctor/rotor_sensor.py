@@ -5,6 +5,8 @@ by the fraction where it begins, leaps back where it ends, and lies meanwhile ne
 the other rotors, make one expect. A fraction for the whole flight is told from the expectation alone.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,8 +64,12 @@ def _signal(recording: Recording, name: str, array: SignalArray, rows: NDArray[n
             zero = _stopped(array.time, np.abs(speed[:, rotor]), own, rows)
             if zero.any():
                 found.append(_finding(name, array, rotor, zero, "zero", 0.0, rows))
+            leaps = _leaps(array.time, np.abs(speed[:, rotor]), own, rows)
+            if leaps is None:
+                continue
             for words, fraction in FRACTIONS.items():
-                flags = _leaping(array.time, np.abs(speed[:, rotor]), own, rows, fraction)
+                flags = np.zeros(array.time.size, bool)
+                flags[_between(leaps, fraction)] = True
                 if flags.any():
                     found.append(_finding(name, array, rotor, flags, words, fraction, rows))
     return [*found, *_missing(name, array, rows)]
@@ -121,37 +127,52 @@ def _from_the_others(speed: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDA
     return expected
 
 
-def _leaping(
-    time: NDArray[np.float64],
-    speed: NDArray[np.float64],
-    ratio: NDArray[np.float64],
-    rows: NDArray[np.bool_],
-    fraction: float,
-) -> NDArray[np.bool_]:
-    """(n,) True within stretches at a fraction of the expected speed that begin and end with a leap."""
-    flags = np.zeros(time.size, bool)
-    known = np.flatnonzero(rows & np.isfinite(speed) & (speed > 0) & np.isfinite(ratio))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Leaps:
+    """The known samples of a rotor.
+
+    Attributes:
+        rows: (k,) of them.
+        ratio: (k,) of the speed to what is expected.
+        leap: (k - 1,) speed of a sample to that of the one before; NaN across a gap.
+    """
+
+    rows: NDArray[np.int64]
+    ratio: NDArray[np.float64]
+    leap: NDArray[np.float64]
+
+
+def _leaps(
+    time: NDArray[np.float64], speed: NDArray[np.float64], ratio: NDArray[np.float64], rows: NDArray[np.bool_]
+) -> _Leaps | None:
+    """None if the speed never leaps."""
+    known = np.flatnonzero(rows & (speed > 0) & np.isfinite(ratio))
     if known.size < 3:
-        return flags
-    period = float(np.median(np.diff(time)))
+        return None
     leap = speed[known[1:]] / speed[known[:-1]]
-    close = np.diff(time[known]) < 3.5 * period
-    starts = np.flatnonzero((np.abs(leap / fraction - 1.0) < LEAP) & close)
-    ends = np.flatnonzero((np.abs(leap * fraction - 1.0) < LEAP) & close)
-    near = np.abs(ratio[known] / fraction - 1.0) < NEAR
-    normal = np.abs(ratio[known] - 1.0) < NEAR
+    leap[np.diff(time[known]) > 3.5 * float(np.median(np.diff(time)))] = np.nan
+    return _Leaps(known, ratio[known], leap) if ((leap < 0.6) | (leap > 1.7)).any() else None
+
+
+def _between(leaps: _Leaps, fraction: float) -> NDArray[np.int64]:
+    """Rows of stretches at a fraction of the expected speed that begin and end with a leap."""
+    starts = np.flatnonzero(np.abs(leaps.leap / fraction - 1.0) < LEAP)
+    ends = np.flatnonzero(np.abs(leaps.leap * fraction - 1.0) < LEAP)
+    near = np.abs(leaps.ratio / fraction - 1.0) < NEAR
+    normal = np.abs(leaps.ratio - 1.0) < NEAR
+    last = leaps.rows.size - 1
+    found = [np.empty(0, np.int64)]
     after = 0
     for start in starts[:_MOST_LEAPS]:
         if start < after or not normal[start]:
             continue
-        later = ends[ends > start]
+        place = int(np.searchsorted(ends, start, side="right"))
         # up to the leap back, or to the end of the flight
-        end = int(later[0]) if later.size else known.size - 1
-        within = slice(start + 1, end + 1)
-        if near[within].mean() > 0.8 and (not later.size or normal[min(end + 1, known.size - 1)]):
-            flags[known[start + 1] : known[end] + 1] = True
+        end = int(ends[place]) if place < ends.size else last
+        if near[start + 1 : end + 1].mean() > 0.8 and (place == ends.size or normal[min(end + 1, last)]):
+            found.append(leaps.rows[start + 1 : end + 1])
             after = end + 1
-    return flags & rows & np.isfinite(speed)
+    return np.concatenate(found)
 
 
 def _stopped(

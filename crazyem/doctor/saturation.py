@@ -40,7 +40,7 @@ def _upper(
         top = float(column[rows].max())
         if top >= FULL:
             flags[:, rotor] = (column >= FULL) & rows
-        elif top > 0.5 and _is_ceiling((column == top) & rows, rows):
+        elif top > 0.5 and _is_ceiling(column, top, rows):
             flags[:, rotor] = (column == top) & rows
             ceilings.append(top)
     shares = flags[rows].mean(axis=0)
@@ -75,10 +75,14 @@ def _upper(
     ]
 
 
-def _is_ceiling(at_top: NDArray[np.bool_], rows: NDArray[np.bool_]) -> bool:
-    """True if the greatest value is met too often, and for too long at a time, for a maximum."""
+def _is_ceiling(column: NDArray[np.float64], top: float, rows: NDArray[np.bool_]) -> bool:
+    """True if the greatest value is met too often, and too long at a time, for the maximum of a coarse signal."""
+    at_top = (column == top) & rows
+    count = int(at_top.sum())
     spans = runs(at_top)
-    return bool(at_top.sum() >= max(10, 0.002 * rows.sum())) and bool((spans[:, 1] - spans[:, 0]).max() >= _CEILING_RUN)
+    below = int(((column < top) & (column >= 0.97 * top) & rows).sum())
+    often = count >= max(10, 0.002 * rows.sum()) and count > 0.5 * below
+    return often and bool((spans[:, 1] - spans[:, 0]).max() >= _CEILING_RUN)
 
 
 def _lower(
