@@ -60,3 +60,11 @@ def fill(data, messages, others):
             others[k, 2] = length
             k += 1
         at += 9 + length
+
+
+@compiled
+def gather(data, offsets, rows):
+    """Bytes of messages into rows: as many from each offset as a row is long."""
+    for i in range(offsets.size):
+        for j in range(rows.shape[1]):
+            rows[i, j] = data[offsets[i] + j]

@@ -55,8 +55,15 @@ class FixedMessages:
         return rows
 
     def decode(self, data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """(n,) record array with fields "0", "1", ... of the messages at `offsets`, and which of them are sound."""
-        rows = data[offsets[:, None] + np.arange(self.size)]
+        """(n,) record array with fields "0", "1", ... of the messages at `offsets`, and which of them are sound.
+
+        Every offset must have a whole message behind it.
+        """
+        rows = np.empty((offsets.size, self.size), np.uint8)
+        if offsets.size:
+            from crazyem.recordings.mcap_kernel import gather  # numba takes a second to import
+
+            gather(data, offsets, rows)
         sound = (rows[:, self._tags] == self._blank[self._tags]).all(axis=1)
         return rows.view(self._dtype)[:, 0], sound
 
