@@ -1,6 +1,7 @@
 """From the columns of a wide CSV to signals, by its mapping: units, signs, frames, missing values, lost packets."""
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -16,6 +17,7 @@ from crazyem.signals.sample import SIGNALS
 
 Array = NDArray[np.float64]
 _HARMLESS_SHARE = 0.05  # of rows drawn across lost packets
+_CHUNK = 1 << 16  # rows turned together, to bound memory
 _HALF = math.sqrt(0.5)
 _NED_TO_ENU = (_HALF, _HALF, 0.0, 0.0)  # x y z w: half a turn about the bisector of north and east
 _FLU_TO_FRD = (1.0, 0.0, 0.0, 0.0)  # half a turn about x
@@ -63,7 +65,7 @@ class Rows:
 
 
 def signals_of(layout: Layout, rows: Rows) -> tuple[dict[str, SignalArray], list[Finding]]:
-    """The signals of the kept rows, and what was found of interpolated stretches in them."""
+    """The signals of the kept rows, and what was found of interpolated stretches in them; uses `rows` up."""
     first, last = rows.keep
     time = rows.stamp - rows.origin
     straight = {}
@@ -77,12 +79,17 @@ def signals_of(layout: Layout, rows: Rows) -> tuple[dict[str, SignalArray], list
     kept = _Kept(layout, rows, time, straight)
     step = len(layout.signals) + 1
     signals = {}
+    uses = Counter(c for s in layout.signals.values() for c in s.columns)
     for place, (name, source) in enumerate(layout.signals.items()):
         if source.corners:
             signals[name] = kept.slow(source, place, step)
         else:
             value, marked = kept.values(name, source)
             signals[name] = kept.array(value, marked, place, step, source)
+        uses.subtract(source.columns)
+        for column in source.columns:
+            if not uses[column]:
+                del rows.columns[column]  # they are half of the memory in use
     for column, (name, unit, raw_packet) in layout.raw.items():
         signals[name] = kept.raw(column, unit, raw_packet, step)
     return signals, findings
@@ -200,8 +207,7 @@ class _Kept:
             value = self._framed(value, source)
             if source.frame and source.attitude in self.layout.signals:
                 turn, unknown = self.attitude(source.attitude, self.layout.signals[source.attitude])
-                sign = -1.0 if source.frame == "world" else 1.0
-                value = _rotated(turn * [sign, sign, sign, 1.0], value)
+                value = _rotated(turn, value, inverse=source.frame == "world")
                 marked = marked | unknown
         if source.packet is not None:
             lost = self.straight[source.packet]
@@ -287,10 +293,15 @@ def _product(a: Array, b: Array) -> Array:
     )
 
 
-def _rotated(quaternion: Array, vector: Array) -> Array:
-    """(n, 3) vectors turned by (n, 4) quaternions of any length but 0 (NaN for that), x y z w."""
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        unit = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
-        axis, scalar = unit[:, :3], unit[:, 3:]
-        side = 2.0 * np.cross(axis, vector)
-        return vector + scalar * side + np.cross(axis, side)
+def _rotated(quaternion: Array, vector: Array, *, inverse: bool) -> Array:
+    """(n, 3) vectors turned by (n, 4) quaternions of any length but 0 (NaN for that), x y z w, or turned back."""
+    sign = -1.0 if inverse else 1.0
+    turned = np.empty_like(vector)
+    for start in range(0, len(vector), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            unit = quaternion[part] / np.linalg.norm(quaternion[part], axis=1, keepdims=True)
+            axis, scalar = sign * unit[:, :3], unit[:, 3:]
+            side = 2.0 * np.cross(axis, vector[part])
+            turned[part] = vector[part] + scalar * side + np.cross(axis, side)
+    return turned

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -36,23 +36,29 @@ class _Plan:
     as_published: bool
 
 
-@dataclass(slots=True)
 class _Held:
-    """Rows read and not yet handed out, column by column."""
+    """Rows read and not yet handed out, column by column, in arrays that grow (one copy of the data, not two)."""
 
-    blocks: list[Columns] = field(default_factory=list)
-    rows: int = 0
+    def __init__(self) -> None:
+        self.arrays: Columns = {}
+        self.rows = 0
 
     def add(self, block: Columns) -> None:
-        self.blocks.append(block)
-        self.rows += next(iter(block.values())).size
+        """Append rows."""
+        more = next(iter(block.values())).size
+        for c, values in block.items():
+            array = self.arrays.get(c)
+            if array is None or array.size < self.rows + more:
+                grown = np.empty(max(2 * self.rows, self.rows + more))
+                if array is not None:
+                    grown[: self.rows] = array[: self.rows]
+                self.arrays[c] = array = grown
+            array[self.rows : self.rows + more] = values
+        self.rows += more
 
     def joined(self) -> Columns:
-        """One array a column; the blocks are let go one column after the other."""
-        if len(self.blocks) > 1:
-            whole = {c: np.concatenate([block.pop(c) for block in self.blocks]) for c in tuple(self.blocks[0])}
-            self.blocks = [whole]
-        return self.blocks[0]
+        """One array a column."""
+        return {c: array[: self.rows] for c, array in self.arrays.items()}
 
 
 def read_wide(path: Path, header: Header, mapping: CsvMapping, *, as_published: bool) -> Recording:
@@ -65,12 +71,12 @@ def read_wide(path: Path, header: Header, mapping: CsvMapping, *, as_published: 
     if not held.rows:
         raise FileFormatError(f"{path}: there is a header but not a single sample.")
     columns = held.joined()
-    held.blocks = []
+    held.arrays = {}
     stamp = _stamps(plan, columns, held.rows, 0)
-    first = float(stamp[0])
+    first = float(stamp[0]) + 0.0  # no minus zero
     origin = first if _reversible(stamp, first) else 0.0
     rows = Rows(stamp, origin, _named(plan, columns), (0, stamp.size))
-    columns.clear()
+    del columns, block  # so that columns can go as they turn into signals
     return _recording(plan, rows, damage, last=True)
 
 
@@ -162,7 +168,7 @@ def _origin(plan: _Plan) -> float:
     # with the same lines dropped as in the pass over all columns, or their stamps would count
     for block in read_columns(plan.path, plan.header, plan.needed, (), Damage(), stamp=plan.stamp):
         stamp = block[plan.stamp] / plan.mapping.time[1]
-        first = float(stamp[0]) if math.isnan(first) else first
+        first = float(stamp[0]) + 0.0 if math.isnan(first) else first
         if not _reversible(stamp, first):
             return 0.0
     return 0.0 if math.isnan(first) else first

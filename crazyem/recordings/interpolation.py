@@ -46,13 +46,13 @@ def _centres(
     """(n - 2,) whether each row but the first and last lies on the line through its neighbours, and moves."""
     span = time[2:] - time[:-2]
     share = np.where(span > 0, (time[1:-1] - time[:-2]) / np.where(span > 0, span, 1.0), np.nan)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         change = values[2:] - values[:-2]
         deviation = np.abs(values[1:-1] - values[:-2] - share[:, None] * change)
         on_line = (deviation <= absolute_tolerance + relative_tolerance * np.abs(change)).all(axis=1)
         # A change near the rounding of the file would pass as straight whatever it did.
         moving = (np.abs(change) > 1e3 * absolute_tolerance).any(axis=1)
-    return on_line & moving
+    return np.asarray(on_line & moving)
 
 
 CONTEXT = 32  # rows on either side that decide what a row is; no rule below looks further
@@ -98,7 +98,7 @@ def corners(
     n = time.size
     if n < 4:
         return Corners(np.arange(n), time.copy(), value.copy())
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         share = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
         deviation = np.abs(value[1:-1] - value[:-2] - share * (value[2:] - value[:-2]))
     off = np.zeros(n, bool)
@@ -112,7 +112,8 @@ def corners(
     before = np.sort(np.concatenate(pairs)).astype(np.int64)
     met, where = _meeting(time, value, before)
     measured = np.zeros(n, bool)
-    measured[begin[length == 1]] = True  # a corner on a row
+    # a corner on a row; beside the first or last row it may as well lie between the two, where one line is unknown
+    measured[begin[(length == 1) & (begin > 1) & (begin < n - 2)]] = True
     measured[before[~met]] = measured[before[~met] + 1] = True
     for first, count in zip(begin[length > _LONGEST_GROUP], length[length > _LONGEST_GROUP], strict=True):
         last = first + count
@@ -131,11 +132,11 @@ def _meeting(
     time: NDArray[np.float64], value: NDArray[np.float64], k: NDArray[np.int64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Whether the lines before row k and after row k+1 meet between those rows, and (time, value) where."""
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         left = (value[k] - value[k - 1]) / (time[k] - time[k - 1])
         right = (value[k + 2] - value[k + 1]) / (time[k + 2] - time[k + 1])
         step = time[k + 1] - time[k]
         share = (value[k + 1] - value[k] - right * step) / (left - right) / step
         met = (share > -_SHARE_OUTSIDE) & (share < 1.0 + _SHARE_OUTSIDE) & (step > 0)
-    share = np.clip(np.where(met, share, 0.0), 0.0, 1.0)
-    return met, np.stack([time[k] + share * step, value[k] + left * share * step], axis=1)
+        share = np.clip(np.where(met, share, 0.0), 0.0, 1.0)
+        return met, np.stack([time[k] + share * step, value[k] + left * share * step], axis=1)

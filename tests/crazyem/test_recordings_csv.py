@@ -1,6 +1,9 @@
 """CSV flights: the real recordings, interpolated stretches, and files that are not what they claim to be."""
 
+import contextlib
+import csv
 import gzip
+import io
 import math
 
 import numpy as np
@@ -9,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crazyem.errors import CrazyemError, DataError, FileFormatError
-from crazyem.recordings import open_recording
-from crazyem.recordings.interpolation import interpolated_rows
-from crazyem.recordings.mapping import known_mappings, load_mapping
+from crazyem.recordings import csv_file, open_recording
+from crazyem.recordings.options import ReadOptions
 from crazyem.signals.sample import ESTIMATOR_SIGNALS
 
 NANOBENCH = [
@@ -20,6 +22,11 @@ NANOBENCH = [
     *(f"motor_motor_m{i}" for i in (1, 2, 3, 4)),
     "pwr_pm_vbat",
 ]
+LONG = "host_t,block,fw_ms,name,value\n" + "".join(
+    f"{1.79e9 + 0.01 * k},imu,{10 * k},{name},{k % 7}\n"
+    for k in range(30)
+    for name in ("gyro.x", "gyro.y", "gyro.z", "motor.m1", "motor.m2", "motor.m3", "motor.m4")
+)
 REQUIRED = ("position", "velocity", "attitude", "body_rate", "specific_force", "motor_command", "voltage")
 
 
@@ -142,54 +149,228 @@ def test_garbage_rows_never_raise_anything_else(tmp_path_factory, content, head)
         assert "\n" not in message
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(2, 8))
-def test_exactly_the_straight_runs_are_found(seed, gap):
+@settings(max_examples=200, deadline=None)
+@given(content=st.binary(max_size=300), head=st.integers(0, 2), packed=st.booleans())
+def test_random_bytes_never_raise_anything_else(tmp_path_factory, content, head, packed):
+    path = tmp_path_factory.getbasetemp() / "bytes.csv"
+    header = (b"host_t,block,fw_ms,name,value\n", ",".join(NANOBENCH).encode() + b"\n", b"")[head]
+    raw = header + content
+    path.write_bytes(gzip.compress(raw)[: len(raw)] if packed else raw)
+    with contextlib.suppress(CrazyemError):
+        open_recording(path, ReadOptions(mapping="nanobench"))
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_damage_to_a_sound_file_is_never_a_traceback(tmp_path_factory, data):
+    raw = bytearray((text(rows(40)) if data.draw(st.booleans()) else LONG).encode())
+    for _ in range(data.draw(st.integers(1, 6))):
+        place = data.draw(st.integers(0, len(raw) - 1))
+        new = data.draw(st.sampled_from([b"", b",", b"\n", b'"', b"\r", b"-", b"e", b"\x00", b"\xff", b"9" * 30]))
+        raw[place : place + data.draw(st.integers(0, 3))] = new
+    path = tmp_path_factory.getbasetemp() / "damaged.csv"
+    path.write_bytes(raw)
+    try:
+        recording = open_recording(path)
+    except CrazyemError as error:
+        message = str(error)
+        assert "\n" not in message
+    else:
+        assert all(a.time.size == len(a.value) == a.order.size == a.marked.size for a in recording.signals.values())
+
+
+# --- every way a table can be written --------------------------------------------------------------------------------
+
+MINE = """
+[time]
+column = "t"
+[signals.position]
+columns = ["x", "y", "z"]
+[signals.body_rate]
+columns = ["p", "q", "r"]
+packet = "imu"
+[signals.voltage]
+columns = ["v"]
+corners = true
+[signals.flying]
+columns = ["x"]
+above = 1.0
+hold = 0.5
+"""
+NAMES = ["t", "x", "y", "z", "p", "q", "r", "v", "extra"]
+
+
+def plain(content, delimiter=","):
+    """Columns of a sound CSV by the standard library: what the reader must agree with."""
+    lines = list(csv.DictReader(io.StringIO(content), delimiter=delimiter))
+    return {name: np.array([float(line[name] or "nan") for line in lines]) for name in lines[0]}
+
+
+def mine(folder, content, **options):
+    (folder / "mine.toml").write_text(MINE)
+    path = folder / "flight.csv"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path, ReadOptions(mapping=str(folder / "mine.toml"), **options)
+
+
+def table_text(count, seed=0, delimiter=",", end="\n"):
     rng = np.random.default_rng(seed)
-    time = np.cumsum(rng.uniform(0.009, 0.011, 50))
-    values = rng.normal(size=(50, 3))
-    inner = slice(10, 10 + gap)
-    for c in range(3):
-        values[inner, c] = np.interp(time[inner], time[[9, 10 + gap]], values[[9, 10 + gap], c])
-    found = np.flatnonzero(interpolated_rows(time, np.round(values, 9)))
-    assert found.tolist() == list(range(9, 11 + gap))
+    table = rng.normal(size=(count, len(NAMES)))
+    table[:, 0] = 1e3 + 0.01 * np.arange(count)
+    lines = [delimiter.join(NAMES), *(delimiter.join(map(repr, row)) for row in table.tolist())]
+    return end.join(lines) + end
 
 
-def test_constant_stretches_are_no_evidence():
-    time = 0.01 * np.arange(30)
-    assert not interpolated_rows(time, np.zeros((30, 4))).any()
-    assert not interpolated_rows(time[:2], np.zeros((2, 4))).any()
-    one_moves = np.zeros((30, 2))
-    one_moves[:, 0] = np.linspace(0, 1, 30)
-    assert interpolated_rows(time, one_moves).all()
-
-
-# --- mappings -------------------------------------------------------------------------------------------------------
-
-
-def test_shipped_mappings_load():
-    assert {m.name for m in known_mappings()} >= {"nanobench", "crazyflie_long"}
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (('unit = "g"', 'unit = "stone"'), 'unknown unit "stone"'),
-        (("[signals.position]", "[signals.positon]"), "no such signal"),
-        (('columns = ["px", "py", "pz"]', 'columns = ["px"]'), "position has 3 components, not 1"),
-        (('layout = "wide"', 'layout = "tall"'), "layout must be"),
-        (('column = "t"', ""), "the key column is missing"),
-        (("[time]", "[time"), "not valid TOML"),
-        (('columns = ["px", "py", "pz"]', 'columns = "px"'), "columns must be a list"),
-    ],
+@settings(max_examples=100, deadline=None)
+@given(
+    rows=st.lists(st.lists(st.floats(allow_nan=False), min_size=8, max_size=8), min_size=1, max_size=30),
+    seed=st.integers(0, 9),
+    form=st.sampled_from(["plain", "crlf", "semicolon", "tab", "quoted", "bom", "gzip", "spaces"]),
 )
-def test_a_broken_mapping_names_the_key(change, message):
-    from importlib import resources
+def test_every_double_comes_back_exactly(tmp_path_factory, rows, seed, form):
+    folder = tmp_path_factory.getbasetemp()
+    delimiter = {"semicolon": ";", "tab": "\t"}.get(form, ",")
+    stamps = np.cumsum(np.random.default_rng(seed).uniform(0.001, 0.02, len(rows))).tolist()
+    fields = [[repr(t), *map(repr, row)] for t, row in zip(stamps, rows)]
+    if form == "quoted":
+        fields = [[f'"{f}"' for f in row] for row in fields]
+    if form == "spaces":
+        fields = [[f" {f} " for f in row] for row in fields]
+    end = "\r\n" if form == "crlf" else "\n"
+    content = end.join(delimiter.join(row) for row in [NAMES, *fields]) + end
+    raw = ("\ufeff" if form == "bom" else "").encode() + content.encode()
+    path, options = mine(folder, gzip.compress(raw) if form == "gzip" else raw)
+    recording = open_recording(path, options)
+    assert (recording.origin + recording.signals["position"].time).tolist() == stamps
+    assert recording.signals["position"].value.tolist() == [row[:3] for row in rows]
+    assert recording.signals["extra"].value[:, 0].tolist() == [row[7] for row in rows]
 
-    source = (resources.files("crazyem.recordings") / "mappings" / "nanobench.toml").read_text(encoding="utf-8")
-    assert change[0] in source
-    with pytest.raises(FileFormatError, match=message) as caught:
-        load_mapping(source.replace(*change, 1), "mine.toml")
-    assert "mine.toml" in str(caught.value)
+
+def test_stamps_that_do_not_survive_subtraction_keep_their_origin_at_zero(tmp_path):
+    stamps = [1e9 / 3, 0.1, 0.3]  # a clock that was set
+    content = "t,x,y,z\n" + "".join(f"{t!r},0,0,0\n" for t in stamps)
+    recording = open_recording(*mine(tmp_path, content))
+    assert recording.signals["position"].time.tolist() == stamps
+    assert recording.origin == 0.0
+
+
+def test_decimal_commas_words_duplicates_and_nameless_columns(tmp_path):
+    content = "t;x;y;z;x;mode;;ok\n" + "".join(f"0,{i:02};1,5;2;3;{i};up;;true\n" for i in range(20))
+    recording = open_recording(*mine(tmp_path, content))
+    signals = recording.signals
+    assert signals["position"].value[3].tolist() == [1.5, 2.0, 3.0]
+    assert signals["position"].time[3] == 0.03
+    assert signals["x#2"].value[7, 0] == 7.0
+    assert signals["ok"].value[:, 0].tolist() == [1.0] * 20
+    assert not {"mode", "column 7"} & signals.keys()
+    assert any("x; the first one counts" in n for n in recording.notices)
+    assert any("mode" in n for n in recording.notices)
+
+
+def test_a_few_damaged_lines_cost_themselves_only(tmp_path):
+    lines = table_text(1000).splitlines()
+    expected = plain("\n".join(lines))
+    damaged = {101: "1,2", 340: lines[340].replace(lines[340].split(",")[2], "oops", 1), 700: "," + lines[700][5:]}
+    content = "\n".join(damaged.get(i, line) for i, line in enumerate(lines)) + "\n"
+    recording = open_recording(*mine(tmp_path, content))
+    kept = [i for i in range(1000) if i + 1 not in damaged]
+    assert recording.signals["position"].value[:, 1].tolist() == expected["y"][kept].tolist()
+    (found,) = [f for f in recording.findings if f.check == "integrity"]
+    assert found.grade == "degrades"
+    assert found.evidence == {"lines": 3.0}
+    assert "line 102, 341, 701" in found.text
+    assert "line 102 has 2 fields, the header has 9" in found.text
+
+
+def test_a_word_in_a_column_nobody_needs_is_a_hole_in_it(tmp_path):
+    lines = table_text(300).splitlines()
+    lines[250] = lines[250].rpartition(",")[0] + ",broken"
+    recording = open_recording(*mine(tmp_path, "\n".join(lines) + "\n"))
+    assert np.flatnonzero(np.isnan(recording.signals["extra"].value[:, 0])).tolist() == [249]
+    assert any("1 values in column extra are no numbers" in n for n in recording.notices)
+
+
+def test_a_gzip_file_that_ends_early_gives_what_it_has(tmp_path):
+    packed = gzip.compress(table_text(5000).encode())
+    path, options = mine(tmp_path, packed[: len(packed) * 2 // 3])
+    recording = open_recording(path, options)
+    count = recording.signals["position"].time.size
+    assert 2500 < count < 3500
+    assert np.array_equal(recording.signals["position"].value[:, 0], plain(table_text(5000))["x"][:count])
+    assert any("ends early" in n for n in recording.notices)
+    corrupt = bytearray(packed)
+    corrupt[len(packed) // 2] ^= 0xFF
+    path.write_bytes(corrupt)
+    with pytest.raises(FileFormatError, match=r"gzip|not a number|fields"):
+        open_recording(path, options)
+
+
+def test_a_gzip_bomb_is_refused_and_never_unpacked(tmp_path):
+    header = ",".join(NAMES) + "\n"
+    row = ",".join("0" * 9) + "\n"
+    path, options = mine(tmp_path, gzip.compress((header + row * 8_000_000).encode()))
+    assert path.stat().st_size < 500_000
+    with pytest.raises(FileFormatError, match="unpacks to more than 200 times its size"):
+        open_recording(path, options)
+    path.write_bytes(gzip.compress((header + "1" * 20_000_000).encode()))
+    with pytest.raises(FileFormatError, match="line of more than"):
+        open_recording(path, options)
+
+
+def test_rows_without_stamps_need_a_rate(tmp_path):
+    (tmp_path / "rate.toml").write_text('[time]\nrate_hz = 50\n[signals.voltage]\ncolumns = ["v"]\n')
+    path = put(tmp_path, "v,w\n" + "".join(f"{3.7 + 0.1 * i},0\n" for i in range(10)))
+    recording = open_recording(path, ReadOptions(mapping=str(tmp_path / "rate.toml")))
+    assert recording.signals["voltage"].time == pytest.approx(np.arange(10) / 50)
+    assert any("no stamps" in n for n in recording.notices)
+
+
+# --- parts -----------------------------------------------------------------------------------------------------------
+
+
+def joined(parts):
+    """Signals of several parts, put together."""
+    fields = ("time", "value", "order", "host_time", "marked")
+    return {
+        name: {f: np.concatenate([getattr(p.signals[name], f) for p in parts]) for f in fields}
+        for name in parts[0].signals
+    }
+
+
+def same(parts, whole):
+    assert {p.origin for p in parts} == {whole.origin}
+    for name, arrays in joined(parts).items():
+        for key, array in arrays.items():
+            assert np.array_equal(array, getattr(whole.signals[name], key), equal_nan=array.dtype.kind == "f"), name
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.05, 3.0))
+def test_parts_joined_are_the_whole(tmp_path_factory, seed, seconds):
+    rng = np.random.default_rng(seed)
+    count = 400
+    table = rng.normal(size=(count, len(NAMES)))
+    table[:, 0] = 5.0 + np.cumsum(rng.uniform(0.005, 0.02, count))
+    for start in rng.integers(0, count - 20, 12):  # lost packets, on borders too
+        gap = slice(start, start + int(rng.integers(3, 15)))
+        for c in (4, 5, 6):
+            ends = [gap.start, min(gap.stop, count - 1)]
+            table[gap, c] = np.interp(table[gap, 0], table[ends, 0], table[ends, c])
+    table[:, 7] = np.interp(table[:, 0], np.arange(0, 20, 0.1), 4 + rng.normal(0, 0.01, 200))
+    content = ",".join(NAMES) + "\n" + "".join(",".join(f"{v:.9f}" for v in row) + "\n" for row in table)
+    path, options = mine(tmp_path_factory.getbasetemp(), content)
+    whole = csv_file.read(path, options)
+    parts = list(csv_file.read_parts(path, options, seconds))
+    assert len(parts) >= min(2, int((table[-1, 0] - table[0, 0]) / seconds))
+    same(parts, whole)
+
+
+def test_parts_of_a_real_flight(shared_recordings):
+    path = shared_recordings / "nanobench" / "B3_figure8_medium_rep1.csv.gz"
+    whole = csv_file.read(path, ReadOptions())
+    parts = list(csv_file.read_parts(path, ReadOptions(), 4.0))
+    assert len(parts) == 7
+    same(parts, whole)
 
 
 # --- the real ones --------------------------------------------------------------------------------------------------
