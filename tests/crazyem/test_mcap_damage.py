@@ -1,5 +1,6 @@
 """Damaged MCAP: every complete chunk is read, losses are located by byte, bombs are refused, files are continued."""
 
+import contextlib
 import os
 import struct
 import zlib
@@ -12,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
-from crazyem.recordings import mcap_scan, open_recording
+from crazyem.recordings import ReadOptions, mcap_file, mcap_scan, open_recording
 from crazyem.recordings.mcap_signals import write_recording
 from crazyem.recordings.recover import recover
 from crazyem.recordings.writer import RecordingWriter
@@ -450,3 +451,36 @@ def test_what_cannot_be_continued(small, tmp_path):
         RecordingWriter(tmp_path / "h.mcap", append=True)
     RecordingWriter(tmp_path / "new.mcap", append=True).close()
     assert (tmp_path / "new.mcap").read_bytes().startswith(MAGIC)
+
+
+# --- hostile content behind sound checksums -----------------------------------------------------------------------------
+
+
+PIECES = st.sampled_from([b"\xff\xff\xff\xff", b"9999", b"null", b'"}][']) | st.binary(max_size=2)
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_anything_inside_a_sound_chunk_gives_a_recording_or_one_clear_error(small, tmp_path, data):
+    """Announcements, metadata and messages of any content, packed again with the right CRC."""
+    made = MAGIC
+    for start, end, opcode in top_level(small):
+        content = small[start + 9 : end]
+        if opcode == 6:
+            raw = bytearray(mcap_scan.unpack(mcap_scan.parse_chunk(content)))
+            for _ in range(data.draw(st.integers(0, 3))):
+                at = data.draw(st.integers(0, len(raw) - 1))
+                piece = data.draw(PIECES)
+                raw[at : at + len(piece)] = piece
+            made += chunk_record(zstandard.compress(bytes(raw)), len(raw), zlib.crc32(bytes(raw)))
+        else:
+            made += small[start:end]
+    path = tmp_path / "hostile.mcap"
+    path.write_bytes(made + MAGIC)
+    for use in (
+        lambda: list(open_recording(path).samples()),
+        lambda: list(mcap_file.read_parts(path, ReadOptions(), seconds=0.2)),
+        lambda: recover(path, tmp_path / "mended.mcap", replace=True),
+    ):
+        with contextlib.suppress(CrazyemError):
+            use()
