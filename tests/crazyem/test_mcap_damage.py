@@ -453,7 +453,7 @@ def test_what_cannot_be_continued(small, tmp_path):
     assert (tmp_path / "new.mcap").read_bytes().startswith(MAGIC)
 
 
-# --- hostile content behind sound checksums -----------------------------------------------------------------------------
+# --- hostile content behind sound checksums --------------------------------------------------------------------------
 
 
 PIECES = st.sampled_from([b"\xff\xff\xff\xff", b"9999", b"null", b'"}][']) | st.binary(max_size=2)
