@@ -100,7 +100,7 @@ def _short(name: str) -> str:
 
 
 def _reduced(name: str, definition: str) -> tuple[str, _Spec]:
-    """The definition without comments, constants and defaults, and the same as a table."""
+    """The definition without what nobody reads (comments, constants, defaults, long arrays), and as a table."""
     spec: _Spec = {name: []}
     lines: list[str] = []
     current, package = name, name.partition("/")[0]
@@ -119,8 +119,13 @@ def _reduced(name: str, definition: str) -> tuple[str, _Spec]:
             match = _LINE.match(line)
             if match is None:
                 raise ValueError("its definition has a line that is no field")
-            lines.append(f"{match[1]} {match[2]}")
-            spec[current].append((*_type_of(match[1], package), match[2]))
+            base, array, length = _type_of(match[1], package)
+            spec[current].append((base, array, length, match[2]))
+            if base in _NUMBERS and length > _FIXED:  # nobody wants its elements: one, which aligns, and bytes
+                lines.append(f"{base} zz_first_{match[2]}")
+                lines.append(f"uint8[{(length - 1) * _NUMBERS[base]}] zz_rest_{match[2]}")
+            else:
+                lines.append(f"{match[1]} {match[2]}")
     return "\n".join(lines), spec
 
 

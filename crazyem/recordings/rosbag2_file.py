@@ -173,7 +173,7 @@ class _Bag:
 
     def _topic(self, channel: Any, schema: Any) -> BagTopic | None:
         """The topic of a channel if its messages can be decoded."""
-        name = str(channel.topic)
+        name = "/" + str(channel.topic).strip("/")
         if schema is None or channel.message_encoding != "cdr" or schema.encoding != "ros2msg":
             encoding = f"{channel.message_encoding} with {schema.encoding if schema else 'no'} definitions"
             self.refused[name] = f"its encoding is {text_of(encoding)}"

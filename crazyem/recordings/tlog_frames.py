@@ -22,7 +22,8 @@ _V1, _V2 = 0xFE, 0xFD
 _SIGNED = 1
 _SIGNATURE = 13  # bytes
 _REVERSED = bytes(int(f"{i:08b}"[::-1], 2) for i in range(256))
-_MARK = re.compile(b"[\xfd\xfe]")
+# where a frame may begin: a time of arrival between those years, and the mark of a frame
+_START = re.compile(rb"(?s)(?=\x00[\x03-\x0e].{6}[\xfd\xfe])")
 _TYPE = re.compile(r"(\d*)([a-zA-Z])")
 
 Key = tuple[int, int, int]  # system, component, message
@@ -134,9 +135,9 @@ def _looks_like_frame(data: bytes, at: int) -> bool:
 
 def _resume(data: bytes, damaged: int) -> int:
     """The next place after `damaged` with a sound frame; the end of the log if there is none."""
-    for mark in _MARK.finditer(data, damaged + 9):
-        if _frame(data, mark.start() - 8, None):
-            return mark.start() - 8
+    for start in _START.finditer(data, damaged + 1):
+        if _frame(data, start.start(), None):
+            return start.start()
     return len(data)
 
 

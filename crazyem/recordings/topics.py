@@ -137,24 +137,24 @@ def signals_of(topics: Sequence[Topic], mapped: Sequence[Mapped]) -> tuple[dict[
     Returns: vocabulary first, then every column that is in none of them as "<topic>.<column>".
     """
     mapped = [m for m in mapped if m.topic.time.size]
-    used = {(m.topic.name, column) for m in mapped for column in m.columns}
-    raw, left_out = _within_bounds([(t, c) for t in topics for c in t.columns if (t.name, c) not in used])
+    used = {(id(m.topic), column) for m in mapped for column in m.columns}
+    raw, left_out = _within_bounds([(t, c) for t in topics for c in t.columns if (id(t), c) not in used])
     step = len(mapped) + len(raw)  # room for every signal of a row: orders stay unique and follow the rows
-    unmarked = {t.name: np.zeros(t.time.size, bool) for t in topics}
-    hosts = {t.name: np.full(t.time.size, np.nan) if t.host_time is None else t.host_time for t in topics}
+    unmarked = {id(t): np.zeros(t.time.size, bool) for t in topics}
+    hosts = {id(t): np.full(t.time.size, np.nan) if t.host_time is None else t.host_time for t in topics}
     found: dict[str, SignalArray] = {}
     for place, m in enumerate(mapped):
         name = f"{m.quantity}@{m.origin}" if m.origin else m.quantity
         if name in found:
             name = f"{m.quantity}@{m.topic.name}"
-        if name in found:
-            name = f"{m.quantity}@{m.topic.name}.{m.columns[0]}"
+        while name in found:
+            name += "'"
         found[name] = SignalArray(
             m.topic.time,
             m.value,
             m.topic.order * step + place,
-            hosts[m.topic.name],
-            unmarked[m.topic.name] if m.marked is None else m.marked & ~np.isfinite(m.value).all(axis=1),
+            hosts[id(m.topic)],
+            unmarked[id(m.topic)] if m.marked is None else m.marked & ~np.isfinite(m.value).all(axis=1),
             quantity=m.quantity,
             unit=SIGNALS[m.quantity][1],
             frame=m.frame or SIGNALS[m.quantity][2],
@@ -164,12 +164,15 @@ def signals_of(topics: Sequence[Topic], mapped: Sequence[Mapped]) -> tuple[dict[
         )
     signals = {name: found[name] for name in sorted(found, key=lambda name: list(SIGNALS).index(name.split("@")[0]))}
     for place, (topic, column) in enumerate(raw, start=len(mapped)):
-        signals[f"{topic.name}.{column}"] = SignalArray(
+        name = f"{topic.name}.{column}"
+        while name in signals:  # two topics of one name: in damaged files, or "a_1" beside the second "a"
+            name += "'"
+        signals[name] = SignalArray(
             topic.time,
             floats(topic.columns[column])[:, None],
             topic.order * step + place,
-            hosts[topic.name],
-            unmarked[topic.name],
+            hosts[id(topic)],
+            unmarked[id(topic)],
             unit=topic.units.get(column, ""),
             clock=topic.clock,
             stream=topic.name,

@@ -34,7 +34,7 @@ _FIELDS = 200_000  # of all topics together
 _DEEPEST = 8  # types within types
 _CHAIN = 4  # messages in a row that make a place sound
 _KINDS = b"DAFIMPQLCOSRB"
-_CANDIDATE = re.compile(b"[" + _KINDS + b"]")
+_CANDIDATE = re.compile(b"(?=[\x00-\x1f][" + _KINDS + b"])")  # upper half of a size below 8 KiB, type
 _FORMAT = re.compile(rb"[A-Za-z0-9_\-/]+:(?:\w+(?:\[\d{1,10}\])? \w+;)*(?:\w+(?:\[\d{1,10}\])? \w+)?\Z")
 _FIELD = re.compile(r"(\w+?)(?:\[(\d+)\])? (\w+)")
 _KEY = re.compile(rb"(\w+)(?:\[(\d{1,10})\])? [^\x00-\x1f]+\Z")
@@ -236,8 +236,8 @@ def _key_value(body: bytes) -> bool:
 
 def _resume(data: bytes, damaged: int, limit: int, types: _Types) -> int:
     """The next place after `damaged` where sound messages follow each other up to `limit`; else that."""
-    for match in _CANDIDATE.finditer(data, damaged + 3, limit):
-        start = match.start() - 2
+    for match in _CANDIDATE.finditer(data, damaged + 2, limit):
+        start = match.start() - 1
         position = start
         for _ in range(_CHAIN):
             if position == limit:
