@@ -2,6 +2,7 @@
 
 import argparse
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,11 +68,13 @@ def diagnose(
         source, start, end, found = "", None, None, []
         for part in open_parts(path, options):
             source = part.source
-            stamps = [a.time for a in part.signals.values() if a.time.size]
-            low, high = min(float(t.min()) for t in stamps), max(float(t.max()) for t in stamps)
-            start = low if start is None else min(start, low)
-            end = high if end is None else max(end, high)
-            found.append(examine(part))
+            # a slow stream may have nothing to say in a part; that is no finding
+            signals = {name: array for name, array in part.signals.items() if array.time.size}
+            for array in signals.values():
+                low, high = float(array.time.min()), float(array.time.max())
+                start = low if start is None else min(start, low)
+                end = high if end is None else max(end, high)
+            found.append(examine(replace(part, signals=signals)))
         findings = merge_findings(found)
         duration = (end - start) if start is not None and end is not None else 0.0
         return _result(path, source, duration, findings, {}, [], None)
