@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import Cadence, Stream, cadence, listed, longest, streams
+from crazyem.doctor.streams import QUIET, Cadence, Stream, cadence, listed, longest, streams
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording
 
@@ -27,6 +27,7 @@ _NICE = (1, 2, 4, 5, 8, 10, 12.5, 20, 25, 30, 40, 50, 60, 100, 120, 125, 200, 24
 JUMP = 0.3  # s by which two clocks may part from one packet to the next: a radio link stalls for less
 
 
+@QUIET
 def check(recording: Recording) -> list[Finding]:
     """Findings per stream, and for the drone's clock against the host's."""
     found = []

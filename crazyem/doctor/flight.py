@@ -9,17 +9,19 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import Airtime, Intervals, airtime, inside, longest, ordered, runs
+from crazyem.doctor.streams import QUIET, Airtime, Intervals, airtime, inside, longest, ordered, runs
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording
 
 UPSET = 90.0  # degrees of tilt
 LYING = 60.0  # degrees of tilt at rest
 FAST = 1.5  # m/s into the ground; a controller lands at up to 0.8, a drop from 10 cm ends at 1.4
+IMPOSSIBLE = 50.0  # m/s: a wrong position, not a fall
 APPROACH = 0.05  # s before the ground, over which that speed is taken
 DROPPED = 0.4  # m above ground at which rotors stop
 
 
+@QUIET
 def check(recording: Recording) -> list[Finding]:
     """No flight, a recording that is cut, upsets and crashes."""
     flight = airtime(recording)
@@ -38,9 +40,15 @@ def check(recording: Recording) -> list[Finding]:
 
 
 def _no_flight(flight: Airtime) -> Finding:
-    turned = bool(flight.lifting)
     evidence = {"climbed_m": flight.climbed} if math.isfinite(flight.climbed) else {}
-    text = "The rotors turned, but the drone did not leave the ground." if turned else "The drone never flew."
+    text = "The drone never flew: its rotors never carried it."
+    if flight.lifting:
+        text = "The rotors turned, but the drone did not leave the ground."
+    elif flight.climbed > 0.3:
+        text = (
+            f"The rotors never carried the drone, though its height changes by {flight.climbed:.1f} m: "
+            "carried by hand, or the motor signal is not what it says."
+        )
     return Finding(
         "flight",
         Grade.UNUSABLE,
@@ -173,8 +181,9 @@ def _violence(recording: Recording, end: float) -> dict[str, float]:
         if array is not None:
             rows = (array.time > end - 1.0) & (array.time < end + 1.0)
             size = np.linalg.norm(array.value[rows], axis=1)
-            if np.isfinite(size).any():
-                numbers[key] = float(np.nanmax(size))
+            size = size[np.isfinite(size)]
+            if size.size:
+                numbers[key] = float(size.max())
     return numbers
 
 
@@ -210,7 +219,7 @@ def _impacts(recording: Recording, flight: Airtime) -> list[Finding]:
             if 0.0 < lasting < 3.0 * APPROACH:
                 speed = float(np.linalg.norm(position[i] - position[j])) / lasting
                 down = float(position[j, 2] - position[i, 2]) / lasting
-                if speed > FAST and down > 0.5 * FAST:
+                if FAST < speed < IMPOSSIBLE and down > 0.5 * FAST:
                     hits.append((float(time[i]), speed))
     if not hits:
         return []

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import COMMANDED, Airtime, airtime, inside, listed, longest, runs
+from crazyem.doctor.streams import COMMANDED, QUIET, Airtime, airtime, inside, listed, longest, runs
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -32,6 +32,7 @@ _INERTIAL = frozenset({"body_rate", "specific_force", "acceleration"})
 _MOVED = {"position": 0.03, "velocity": 0.15, "attitude": 0.03, "euler": 0.03}  # m, m/s, rad meanwhile, as others say
 
 
+@QUIET
 def check(recording: Recording) -> list[Finding]:
     """Whole signals and single components that stand still in flight; constant columns, in one finding."""
     flight = airtime(recording)

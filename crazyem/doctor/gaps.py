@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import Cadence, Intervals, Stream, cadence, graded, listed, longest, streams
+from crazyem.doctor.streams import QUIET, Cadence, Intervals, Stream, cadence, graded, listed, longest, streams
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording
 
@@ -16,6 +16,7 @@ SAME_MOMENT = 0.6  # s
 _AROUND = 3  # neighbouring intervals over which a late record may catch up
 
 
+@QUIET
 def check(recording: Recording) -> list[Finding]:
     """Records missing within streams, streams that stop early or start late, and silence of everything."""
     groups = [stream for stream in streams(recording) if stream.time.size > 1]

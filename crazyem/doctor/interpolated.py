@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import COMMANDED, cadence, graded, places, runs
+from crazyem.doctor.streams import COMMANDED, QUIET, cadence, graded, places, runs
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -32,6 +32,7 @@ class Straightness:
     bend: NDArray[np.bool_]
 
 
+@QUIET
 def check(recording: Recording) -> list[Finding]:
     """Runs of interpolated samples and whole signals drawn up from a slower rate, one signal at a time."""
     found = []

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import listed, places, sound_rows
+from crazyem.doctor.streams import QUIET, listed, places, sound_rows
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -58,6 +58,7 @@ LIMITS: dict[str, Limit] = {
 }
 
 
+@QUIET
 def check(recording: Recording) -> list[Finding]:
     """NaN and infinities that are the file's own, impossible values, stamps that are no numbers."""
     found: list[Finding] = []

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from crazyem.doctor.streams import (
     COMMANDED,
+    QUIET,
     Airtime,
     Stream,
     airtime,
@@ -35,6 +36,7 @@ FINE = 0.05  # share of the steps of a fine component that are within four resol
 TOGETHER = 0.9  # share of common repeats from which signals came in one packet
 
 
+@QUIET
 def check(recording: Recording) -> list[Finding]:
     """Repeated rows of each stream, then signals that are held between slower measurements of their own."""
     flight = airtime(recording)
@@ -92,7 +94,10 @@ def _resting(array: SignalArray) -> Rows:
     """Commands at their least or greatest value may stay there."""
     if array.quantity not in ("motor_command", "motor_request"):
         return np.zeros(array.time.size, bool)
-    low, high = np.nanmin(array.value), np.nanmax(array.value)
+    sound = array.value[np.isfinite(array.value)]
+    if sound.size == 0:
+        return np.zeros(array.time.size, bool)
+    low, high = sound.min(), sound.max()
     return ((array.value == low) | (array.value == high)).all(axis=1)
 
 
@@ -124,6 +129,8 @@ def _hold(same: Rows, considered: Rows) -> float | None:
         # a value that happens to stay the same makes a beat of two
         tolerance = max(1.0 if beat > 4 else 0.1, 0.2 * beat)
         single = np.abs(beats - beat) <= tolerance
+        if not single.any():
+            continue
         exact = float(beats[single].mean())
         multiple = np.maximum(np.round(beats / exact), 1.0)
         good = np.abs(beats - multiple * exact) <= tolerance * multiple

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import Intervals, airtime, cadence, inside, listed, longest, ordered, runs
+from crazyem.doctor.streams import QUIET, Intervals, airtime, cadence, inside, listed, longest, ordered, runs
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -31,6 +31,7 @@ ZERO = 0.1  # of what is expected: standing still
 _MOST_LEAPS = 5000
 
 
+@QUIET
 def check(recording: Recording) -> list[Finding]:
     """Findings for each rotor of each rotor_speed signal, within the time in the air."""
     flight = airtime(recording)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import Airtime, Intervals, airtime, inside, longest, ordered, runs
+from crazyem.doctor.streams import QUIET, Airtime, Intervals, airtime, inside, longest, ordered, runs
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording
 
@@ -14,6 +14,7 @@ _CEILING_RUN = 3  # samples at exactly the same greatest value: a cap, not a max
 _WORDS = {"motor_command": "duty", "motor_request": "thrust request"}
 
 
+@QUIET
 def check(recording: Recording) -> list[Finding]:
     """Upper limit, and lower limit while airborne, of commanded duty and of requested thrust, a rotor at a time."""
     flight = airtime(recording)

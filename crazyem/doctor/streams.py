@@ -4,6 +4,7 @@ import math
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,10 @@ class Stream:
     def slow(self) -> bool:
         """True if it varies so slowly that a lost sample does not matter: the voltage alone."""
         return all(array.quantity == "voltage" for array in self.arrays)
+
+
+# Hostile values may overflow anywhere; what comes out then is compared, and compares false.
+QUIET: Any = np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore")
 
 
 def streams(recording: Recording) -> list[Stream]:
@@ -157,8 +162,8 @@ def runs(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 def longest(intervals: Iterable[tuple[float, float]]) -> Intervals:
     """The longest `MOST_INTERVALS`, in order of time."""
-    kept = sorted(intervals, key=lambda span: span[0] - span[1])[:MOST_INTERVALS]
-    return tuple(sorted((float(a), float(b)) for a, b in kept))
+    spans = [(float(min(a, b)), float(max(a, b))) for a, b in intervals if math.isfinite(a) and math.isfinite(b)]
+    return tuple(sorted(sorted(spans, key=lambda span: span[0] - span[1])[:MOST_INTERVALS]))
 
 
 def places(time: NDArray[np.float64], flags: NDArray[np.bool_]) -> Intervals:
@@ -194,6 +199,8 @@ def sound_rows(value: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 def thinned(array: SignalArray) -> SignalArray:
     """Every k-th sample, so that some 200 a second are left: enough to see take-off and landing."""
+    if array.time.size < 2:
+        return array
     period = (float(array.time[-1]) - float(array.time[0])) / max(array.time.size - 1, 1)
     step = int(0.005 / period) if 0.0 < period < 0.0025 else 1
     if step < 2:
@@ -235,6 +242,7 @@ def graded(share: float, *, degrades: float, unusable: float = math.inf) -> Grad
 SHORTEST_FLIGHT = 0.4  # s of lift; less is a hop or a test of the rotors
 LONGEST_FALL = 0.6  # s without lift that a manoeuvre may have
 LIFTED = 0.03  # m above the ground
+_POSSIBLE = {"rotor_speed": 8000.0, "motor_command": 1.5, "motor_request": 1.5}
 _RAW_MOTORS = ("motor.m1", "motor.m2", "motor.m3", "motor.m4")
 _LIFT_SIGNALS = ("motor_command", "motor_request", "rotor_speed", "wrench_command", "mixer_command")
 
@@ -300,6 +308,9 @@ def _from_rotors(
     value: NDArray[np.float64],
     height: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
 ) -> Airtime:
+    possible = np.abs(value).max(axis=1) <= _POSSIBLE.get(name, math.inf)
+    if possible.sum() > 10:  # a wild sample is no flight
+        time, value = time[possible], value[possible]
     thrust = value[:, 0] if name in ("wrench_command", "mixer_command") else value.mean(axis=1)
     thrust = np.maximum(thrust, 0.0)
     if name in ("motor_command", "rotor_speed"):
@@ -308,7 +319,8 @@ def _from_rotors(
     floor = {"motor_command": 0.03, "motor_request": 0.1, "rotor_speed": 200.0**2, "mixer_command": 3000.0}
     lifting: Intervals = ()
     if peak > floor.get(name, 1e-3):
-        level = float(np.median(thrust[thrust > 0.4 * peak]))  # near hover: most of a flight is
+        high = thrust[thrust > 0.4 * peak]
+        level = float(np.median(high)) if high.size else peak  # near hover: most of a flight is
         lifting = _closed(time, thrust > 0.3 * level)
     if height is None:
         return Airtime(lifting, lifting, math.nan, peak, math.nan, float(time[0]), float(time[-1]))

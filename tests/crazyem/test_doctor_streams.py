@@ -19,7 +19,7 @@ from crazyem.doctor.gaps import lost_records
 from crazyem.doctor.streams import airtime, cadence, runs
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.options import ReadOptions
-from crazyem.recordings.recording import Recording
+from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.registry import open_recording
 from crazyem.signals.sample import SIGNALS
 
@@ -123,14 +123,15 @@ def test_nothing_makes_a_check_fail(data):
             "random": rng.random(n) * 3.0,
             "wild": rng.choice([0.0, 1e-9, 1.0, -5.0, 1e9, np.nan, np.inf], n),
         }[steps]
-        array = array_of("voltage", time, np.zeros(n), stream=data.draw(st.sampled_from(["", "a", "b"])))
-        signals[name] = replace(
-            array,
-            value=value,
+        signals[name] = SignalArray(
+            time,
+            value,
+            np.arange(n),
+            time + data.draw(st.sampled_from([np.nan, 0.0, 1.7e9])),
+            rng.random(n) < 0.5,
             quantity=quantity if quantity in SIGNALS else "",
-            marked=rng.random(n) < 0.5,
-            host_time=time + data.draw(st.sampled_from([np.nan, 0.0, 1.7e9])),
             clock=data.draw(st.sampled_from(["firmware", "host"])),
+            stream=data.draw(st.sampled_from(["", "a", "b"])),
         )
     for finding in everything(Recording("x", "made", signals)):
         assert finding.text
