@@ -13,7 +13,7 @@ from crazyem.links.clock import StampUnwrapper
 from crazyem.recordings.csv_text import Damage, Header, split_fields, text_blocks, to_number
 from crazyem.recordings.csv_wide import damage_notes
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.mapping import CsvMapping
+from crazyem.recordings.mapping import CsvMapping, SignalColumns
 from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording, SignalArray
@@ -70,7 +70,7 @@ def read_long(path: Path, header: Header, mapping: CsvMapping, options: ReadOpti
     meaning = decide(tables, given=options.motor, metadata=metadata)
     signals = signals_from_tables(tables, motor=meaning.meaning)
     for name, source in mapping.signals.items():
-        signals = _with_host_signal(signals, name, source.columns, source.scale)
+        signals = _with_host_signal(signals, name, source)
     metadata.update(meaning.metadata)
     if mapping.claims:
         metadata["claims"] = dict(mapping.claims)
@@ -160,16 +160,15 @@ def _table(block: str, names: tuple[str, ...], packets: _Packets) -> Table:
     )
 
 
-def _with_host_signal(
-    signals: dict[str, SignalArray], name: str, variables: tuple[str, ...], scale: tuple[float, ...]
-) -> dict[str, SignalArray]:
+def _with_host_signal(signals: dict[str, SignalArray], name: str, source: SignalColumns) -> dict[str, SignalArray]:
     """The signals, with one that the host logged variable by variable put together (it replaces what it is made of)."""
+    variables = source.columns
     parts = [next((k for k, a in signals.items() if a.source == (v,) and not a.quantity), None) for v in variables]
     arrays = [signals[key] for key in parts if key is not None]
     if len(arrays) != len(variables) or any(a.time is not arrays[0].time for a in arrays):
         return signals
-    value = np.column_stack([a.value[:, 0] * f for a, f in zip(arrays, scale, strict=True)])
-    unit, frame = SIGNALS[name][1:]
-    whole = replace(arrays[0], value=value, quantity=name, unit=unit, frame=frame, source=variables)
+    value = np.column_stack([a.value[:, 0] * f for a, f in zip(arrays, source.scale, strict=True)])
+    unit, frame = SIGNALS[source.quantity][1:]
+    whole = replace(arrays[0], value=value, quantity=source.quantity, unit=unit, frame=frame, source=variables)
     rest = {key: array for key, array in signals.items() if key not in parts and key != name}
     return {name: whole, **rest}

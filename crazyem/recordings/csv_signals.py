@@ -64,6 +64,7 @@ class Rows:
     flown: dict[str, float] = field(default_factory=dict)
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a file may hold any double: the doctor's business
 def signals_of(layout: Layout, rows: Rows) -> tuple[dict[str, SignalArray], list[Finding]]:
     """The signals of the kept rows, and what was found of interpolated stretches in them; uses `rows` up."""
     first, last = rows.keep
@@ -299,9 +300,8 @@ def _rotated(quaternion: Array, vector: Array, *, inverse: bool) -> Array:
     turned = np.empty_like(vector)
     for start in range(0, len(vector), _CHUNK):
         part = slice(start, start + _CHUNK)
-        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            unit = quaternion[part] / np.linalg.norm(quaternion[part], axis=1, keepdims=True)
-            axis, scalar = sign * unit[:, :3], unit[:, 3:]
-            side = 2.0 * np.cross(axis, vector[part])
-            turned[part] = vector[part] + scalar * side + np.cross(axis, side)
+        unit = quaternion[part] / np.linalg.norm(quaternion[part], axis=1, keepdims=True)
+        axis, scalar = sign * unit[:, :3], unit[:, 3:]
+        side = 2.0 * np.cross(axis, vector[part])
+        turned[part] = vector[part] + scalar * side + np.cross(axis, side)
     return turned

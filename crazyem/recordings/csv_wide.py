@@ -148,8 +148,8 @@ def _cut(plan: _Plan, held: _Held, number: int, seconds: float, neighbours: int 
     """Rows that make the next part, None if it is not complete yet."""
     stamp = _stamps(plan, held.joined(), held.rows, number)
     late = stamp >= stamp[0] + seconds
-    cut = min(int(np.argmax(late)) if late.any() else held.rows + 1, _MOST_ROWS)
-    return max(cut, 1) if cut + neighbours <= held.rows else None
+    cut = max(1, min(int(np.argmax(late)) if late.any() else held.rows + 1, _MOST_ROWS))
+    return cut if cut + neighbours <= held.rows else None
 
 
 def _split(columns: Columns, cut: int) -> tuple[Columns, Columns]:
@@ -167,7 +167,7 @@ def _origin(plan: _Plan) -> float:
     first = math.nan
     # with the same lines dropped as in the pass over all columns, or their stamps would count
     for block in read_columns(plan.path, plan.header, plan.needed, (), Damage(), stamp=plan.stamp):
-        stamp = block[plan.stamp] / plan.mapping.time[1]
+        stamp = _stamps(plan, block, 0, 0)
         first = float(stamp[0]) + 0.0 if math.isnan(first) else first
         if not _reversible(stamp, first):
             return 0.0
@@ -182,7 +182,8 @@ def _reversible(stamp: Array, first: float) -> bool:
 def _stamps(plan: _Plan, columns: Columns, rows: int, number: int) -> Array:
     if plan.stamp is None:
         return (number + np.arange(rows)) / plan.mapping.rate
-    return columns[plan.stamp] / plan.mapping.time[1]
+    with np.errstate(over="ignore"):
+        return columns[plan.stamp] / plan.mapping.time[1]
 
 
 def _named(plan: _Plan, columns: Columns) -> dict[str, Array]:

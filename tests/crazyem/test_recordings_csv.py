@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from crazyem.errors import CrazyemError, DataError, FileFormatError
 from crazyem.recordings import csv_file, open_recording
+from crazyem.recordings.mapping import known_mappings
 from crazyem.recordings.options import ReadOptions
 from crazyem.signals.sample import ESTIMATOR_SIGNALS
 
@@ -158,6 +159,29 @@ def test_random_bytes_never_raise_anything_else(tmp_path_factory, content, head,
     path.write_bytes(gzip.compress(raw)[: len(raw)] if packed else raw)
     with contextlib.suppress(CrazyemError):
         open_recording(path, ReadOptions(mapping="nanobench"))
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    preset=st.sampled_from(["nanobench", "nanodrone_raw", "nanodrone_processed"]),
+    values=st.lists(st.floats(), min_size=60, max_size=60),
+    count=st.integers(1, 12),
+    seconds=st.floats(0.0, 1e9),
+)
+def test_any_double_may_stand_in_a_file(tmp_path_factory, preset, values, count, seconds):
+    mapping = next(m for m in known_mappings() if m.name == preset)
+    names = list(dict.fromkeys([*mapping.recognise, *(c for s in mapping.signals.values() for c in s.columns)]))
+    lines = [",".join(names)] + [
+        ",".join(repr(values[(i * k + k) % 60]) for i in range(len(names))) for k in range(count)
+    ]
+    path = tmp_path_factory.getbasetemp() / "doubles.csv"
+    path.write_text("\n".join(lines) + "\n")
+    for options in (ReadOptions(), ReadOptions(as_published=True)):
+        try:
+            whole = csv_file.read(path, options)
+        except CrazyemError:
+            continue
+        same(list(csv_file.read_parts(path, options, seconds)), whole)
 
 
 @settings(max_examples=150, deadline=None)
