@@ -30,6 +30,7 @@ COARSE = 5e-3
 LONGEST_STEP = 0.05  # s; a longer hole between two samples parts two stretches
 MOST_STEPS = 6_000  # more are sampled in blocks, and the information scaled
 BLOCK = 1_000
+MOST_THRUST = 2.0  # of what the vehicle file says of its rotors, above which a sample is no thrust
 ASSUMED_VOLTAGE = 3.7  # V, where none is logged
 DELAY, DELAY_SD = 3.5e-3, 2e-3  # s, prior of the estimator for commands
 SPEED_DELAY_SD = 10e-3  # s, and for measured rotor speeds
@@ -70,7 +71,7 @@ def inputs_of(recording: Recording, vehicle: Vehicle) -> Inputs | str:
     """The wrench the estimator would use, or why there is none."""
     speed = _sound(recording, "rotor_speed")
     if speed is not None and vehicle.rotor_constant is not None:
-        return Inputs(speed[0], wrench_from_speed(speed[1], vehicle), "rotor_speed", False, True)
+        return _sane(Inputs(speed[0], wrench_from_speed(speed[1], vehicle), "rotor_speed", False, True), vehicle)
     command = _sound(recording, "motor_command")
     if command is not None and vehicle.thrust_curve:
         voltage = _sound(recording, "voltage")
@@ -80,7 +81,8 @@ def inputs_of(recording: Recording, vehicle: Vehicle) -> Inputs | str:
             else held(voltage[0], voltage[1][:, 0], command[0])
         )
         wrench = wrench_from_command(command[1], volts, vehicle)
-        return Inputs(command[0], wrench, "motor_command", vehicle.motor_time_constant > 0, voltage is not None)
+        has_lag = vehicle.motor_time_constant > 0
+        return _sane(Inputs(command[0], wrench, "motor_command", has_lag, voltage is not None), vehicle)
     asked = _sound(recording, "wrench_command")
     if asked is not None:
         return Inputs(asked[0], asked[1], "wrench_command", vehicle.motor_time_constant > 0, True)
@@ -91,6 +93,12 @@ def inputs_of(recording: Recording, vehicle: Vehicle) -> Inputs | str:
     return "there are no motor commands, rotor speeds or commanded thrust"
 
 
+def _sane(inputs: Inputs, vehicle: Vehicle) -> Inputs:
+    """Less the samples that claim far more thrust than the rotors have: no rotor did that."""
+    good = (inputs.wrench[:, 0] < MOST_THRUST * 4.0 * vehicle.thrust_max) & (np.diff(inputs.time, prepend=-np.inf) > 0)
+    return inputs if good.all() else replace(inputs, time=inputs.time[good], wrench=inputs.wrench[good])
+
+
 def steps_of(time: Array, value: Array, air: Airborne) -> Steps | None:
     """Stretches of samples (n, c) in the air, thinned to steps of at least 4 ms by averaging; None with too few."""
     inside = air.covers(time)
@@ -98,7 +106,8 @@ def steps_of(time: Array, value: Array, air: Airborne) -> Steps | None:
     if time.size < 4 * ORDER:
         return None
     time, value = thinned(time, value)
-    keep = np.append(True, np.diff(time) > 0.0)
+    # a row that repeats the one before was not measured (a slower stream put onto a faster grid)
+    keep = np.append(True, (np.diff(time) > 0.0) & (value[1:] != value[:-1]).any(axis=1))
     time, value = time[keep], value[keep]
     period = float(np.median(np.diff(time))) if time.size > 1 else math.nan
     cuts = np.flatnonzero(np.diff(time) > max(LONGEST_STEP, 3.5 * period)) + 1
@@ -188,7 +197,7 @@ def rotation_fit_once(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | N
     timed = inputs.lagged
     centre = np.array([*np.log(nominal), math.log(max(vehicle.motor_time_constant, 1e-4)), 0.0, 0.0, 0.0, 0.0])
     centre[4] = DELAY * 1e3 if timed else 0.0
-    prior = np.array([INERTIA_SD] * 3 + [LAG_SD if timed else 1e-9, delay_sd, unit, unit, unit]) ** -2.0
+    prior = np.array([INERTIA_SD] * 3 + [LAG_SD if timed else 0.1, delay_sd, unit, unit, unit]) ** -2.0
     theta = centre.copy()
     response = [_angular_acceleration(t, w, nominal) for t, w in zip(steps.nodes, steps.values)]
     predictor = predictor_of(inputs, steps)

@@ -259,6 +259,8 @@ def _objection(axis: str, relative: float, random: float, bias: float) -> str:
         )
     if random < IDENTIFIABLE:
         return "the battery voltage is not logged, which alone costs 15 %"
+    if relative > 10.0:
+        return f"no excitation: torque about {axis} says nothing of it"
     return f"too little excitation: torque about {axis} determines it only within {196 * relative:.0f} % (95 %)"
 
 
