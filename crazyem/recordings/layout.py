@@ -5,6 +5,7 @@ from typing import Any
 
 from crazyem.recordings.mcap_messages import WORLD
 
+_INERTIA_SHOWN = 6e-5  # kg m^2, top of the axis: intervals of the first second would flatten all that follows
 _COLOURS = ("#4e98e2", "#f5774d", "#6ac27c", "#b678d9")
 
 
@@ -23,6 +24,7 @@ def foxglove_layout(topics: Mapping[str, Sequence[str]] | None = None) -> dict[s
         "Plot!inertia": _plot(
             "inertia [kg m^2], 95 % intervals",
             [path for i, n in enumerate(("Ixx", "Iyy", "Izz")) for path in _interval(n, _COLOURS[i])],
+            most=_INERTIA_SHOWN,
         ),
         "Plot!lag": _plot("motor time constant [s], 95 % interval", _interval("motor_time_constant", _COLOURS[3])),
         "Plot!position_residual": _plot("position residual [m]", _residual("position")),
@@ -125,19 +127,21 @@ def _path(value: str, label: str, number: int = 0, *, colour: str = "", width: f
     }
 
 
-def _plot(title: str, paths: list[dict[str, Any]]) -> dict[str, Any]:
+def _plot(title: str, paths: list[dict[str, Any]], *, most: float | None = None) -> dict[str, Any]:
+    limits = {} if most is None else {"minYValue": 0, "maxYValue": most}
     return {
+        **limits,
         "foxglovePanelTitle": title,
         "title": title,
         "paths": paths,
         "showXAxisLabels": True,
         "showYAxisLabels": True,
         "showLegend": True,
-        "legendDisplay": "floating",
-        "showPlotValuesInLegend": True,
+        "legendDisplay": "left",
+        "showPlotValuesInLegend": False,
         "isSynced": True,
         "xAxisVal": "timestamp",
-        "sidebarDimension": 240,
+        "sidebarDimension": 170,
     }
 
 
@@ -148,7 +152,7 @@ def _scene() -> dict[str, Any]:
         "followMode": "follow-none",
         "cameraState": {
             "perspective": True,
-            "distance": 5,
+            "distance": 3,
             "phi": 60,
             "thetaOffset": 45,
             "targetOffset": [0, 0, 0.5],

@@ -1,0 +1,150 @@
+"""One small valid file of every format, and ways to damage it: what the fuzz tests and the fuzzer start from."""
+
+import gzip
+import io
+import random
+import struct
+from pathlib import Path
+
+import numpy as np
+
+INTERESTING = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 2**63 - 1, 2**64 - 1)
+
+
+def seeds(folder: Path) -> dict[str, bytes]:
+    """Format -> bytes of a small valid file. `folder` is for scratch files."""
+    from test_recordings_cfclient import STATE, as_cfclient, rows_of
+    from test_recordings_tlog import flight as tlog
+    from test_recordings_ulog import flight as ulog
+    from test_recordings_usd import small_log
+
+    return {
+        "usd1": small_log(1)[2],
+        "usd2": small_log(2)[2],
+        "ulog": ulog(rows=6)[0],
+        "tlog": tlog(rows=4)[0],
+        "cfclient": as_cfclient(STATE, rows_of(STATE)).encode(),
+        "nanobench": _nanobench(),
+        "nanobench.gz": gzip.compress(_nanobench(), mtime=0),
+        "long": _long(),
+        "mcap": _ours(folder / "ours.mcap"),
+        "imported": _imported(folder),
+        "exported": _exported(folder),
+        "rosbag2": _rosbag2(folder / "bag.mcap"),
+    }
+
+
+def _nanobench() -> bytes:
+    names = ["t", "px", "py", "pz", "qx", "qy", "qz", "qw", "vx", "vy", "vz"]
+    names += [f"{what}_{axis}" for what in ("imu_acc", "imu_gyro") for axis in "xyz"]
+    names += ["wx_vicon", "wy_vicon", "wz_vicon", *(f"motor_motor_m{i}" for i in range(1, 5)), "pwr_pm_vbat"]
+    rng = np.random.default_rng(4)
+    rows = rng.normal(size=(12, len(names)))
+    rows[:, 0] = 1.7e9 + 0.01 * np.arange(12)
+    lines = [",".join(names), *(",".join(f"{v:.9f}" for v in row) for row in rows)]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _long() -> bytes:
+    lines = ["host_t,block,fw_ms,name,value"]
+    for i in range(8):
+        for name, value in (("stateEstimateZ.x", 5 * i), ("stateEstimateZ.y", -i), ("stateEstimateZ.z", 1000)):
+            lines.append(f"{1.7e9 + 0.01 * i:.6f},pos,{1000 + 10 * i},{name},{value}")
+        lines.append(f"{1.7e9 + 0.01 * i:.6f},ref,,ref.x,{0.1 * i}")
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _ours(path: Path) -> bytes:
+    from crazyem.recordings.writer import RecordingWriter
+    from crazyem.signals.packet import Block, Packet, Variable
+
+    block = Block(3, tuple(Variable(f"stateEstimate.{v}", "float") for v in ("x", "y", "z", "vx", "vy", "vz")), 10)
+    with RecordingWriter(path, {"configuration": {"window": "800"}}) as writer:
+        writer.blocks([block])
+        for i in range(30):
+            writer.packet(Packet(3, 1000 + 10 * i, 1.7e9 + 0.01 * i, (0.1 * i, 1.0, -1.0, 0.0, 2.0, 3.0)))
+        writer.event("the end")
+    return path.read_bytes()
+
+
+def _imported(folder: Path) -> bytes:
+    from crazyem.recordings import open_recording
+    from crazyem.recordings.mcap_signals import write_recording
+
+    source, target = folder / "seed.csv", folder / "imported.mcap"
+    source.write_bytes(_nanobench())
+    target.unlink(missing_ok=True)
+    write_recording(open_recording(source), target)
+    return target.read_bytes()
+
+
+def _exported(folder: Path) -> bytes:
+    from crazyem.cli import main
+
+    source, target = folder / "seed.csv", folder / "exported.csv"
+    source.write_bytes(_nanobench())
+    assert main(["export", str(source), "-o", str(target), "--force"]) == 0
+    return target.read_bytes()
+
+
+def _rosbag2(path: Path) -> bytes:
+    from mcap_ros2.writer import Writer
+
+    text = "float64 x\nfloat64 y\nfloat64 z\n"
+    definition = (
+        "std_msgs/Header header\ngeometry_msgs/Pose pose\n"
+        + "=" * 80
+        + "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+        + "=" * 80
+        + "\nMSG: geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
+        + "=" * 80
+        + "\nMSG: geometry_msgs/Point\n"
+        + text
+        + "=" * 80
+        + "\nMSG: geometry_msgs/Quaternion\n"
+        + text
+        + "float64 w\n"
+    )
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    schema = writer.register_msgdef("geometry_msgs/msg/PoseStamped", definition)
+    for i in range(10):
+        stamp = {"sec": 1_700_000_000, "nanosec": 10_000_000 * i}
+        pose = {"position": {"x": 0.1 * i, "y": 0.0, "z": 1.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+        writer.write_message(
+            topic="/cf1/pose",
+            schema=schema,
+            message={"header": {"stamp": stamp, "frame_id": "world"}, "pose": pose},
+            log_time=10**9 * 1_700_000_000 + 10_000_000 * i,
+            publish_time=10**9 * 1_700_000_000 + 10_000_000 * i,
+        )
+    writer.finish()
+    return stream.getvalue()
+
+
+def damage(data: bytes, rng: random.Random) -> bytes:
+    """A damaged copy: one to six random edits of the kinds that break parsers."""
+    out = bytearray(data)
+    for _ in range(rng.randint(1, 6)):
+        if not out:
+            break
+        at = rng.randrange(len(out))
+        kind = rng.randrange(7)
+        if kind == 0:
+            out[at] ^= 1 << rng.randrange(8)
+        elif kind == 1:
+            out[at] = rng.randrange(256)
+        elif kind == 2:  # a length or a count that lies
+            width = rng.choice((1, 2, 4, 8))
+            value = rng.choice(INTERESTING) % (1 << 8 * width)
+            out[at : at + width] = value.to_bytes(width, rng.choice(("little", "big")))
+        elif kind == 3:
+            del out[at:]
+        elif kind == 4:
+            del out[at : at + rng.randint(1, 40)]
+        elif kind == 5:
+            end = min(len(out), at + rng.randint(1, 200))
+            out[at:at] = out[at:end] * rng.randint(1, 3)
+        else:
+            out[at : at + 8] = struct.pack("<d", rng.choice((float("nan"), float("inf"), -1e308, 1e-320, 2.0**63)))
+    return bytes(out)

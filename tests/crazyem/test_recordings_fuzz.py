@@ -1,0 +1,109 @@
+"""Damaged files of every format: a recording or one clear error, in bounded time and memory, never a traceback.
+
+Seeds and damages are those of reader_seeds.py; benchmarks/fuzz_readers.py runs the same under a coverage-guided fuzzer.
+"""
+
+import random
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from reader_seeds import damage, seeds
+
+from crazyem.errors import CrazyemError
+from crazyem.recordings import open_recording
+
+FORMATS = (  # of reader_seeds.seeds
+    *("usd1", "usd2", "ulog", "tlog", "cfclient", "nanobench", "nanobench.gz", "long"),
+    *("mcap", "imported", "exported", "rosbag2"),
+)
+LONGEST = 10  # s for a file of a few kilobytes, on any machine
+MEMORY = 1 << 30  # bytes beyond what the libraries take
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    made = seeds(tmp_path_factory.mktemp("seeds"))
+    assert sorted(made) == sorted(FORMATS)
+    return made
+
+
+def attempt(path: Path) -> str:
+    """Open a file; the error's text, "" if it could be read. Anything but a CrazyemError goes through."""
+    try:
+        recording = open_recording(path)
+    except CrazyemError as error:
+        return str(error)
+    for finding in recording.findings:
+        assert finding.text
+    return ""
+
+
+def too_long(_signal: int, _frame: object) -> None:
+    raise TimeoutError(f"more than {LONGEST} s")
+
+
+def campaign(data: bytes, folder: Path, *, seed: int, count: int) -> int:
+    """Open `count` damaged copies under an alarm; returns how many could still be read."""
+    rng = random.Random(seed)
+    path = folder / "damaged.bin"
+    signal.signal(signal.SIGALRM, too_long)
+    readable = 0
+    for number in range(count):
+        path.write_bytes(damage(data, rng))
+        signal.setitimer(signal.ITIMER_REAL, LONGEST)
+        try:
+            message = attempt(path)
+        except BaseException as error:
+            raise AssertionError(f"damage number {number} of seed {seed}: {type(error).__name__}: {error}") from error
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+        assert "\n" not in message
+        assert "Traceback" not in message
+        readable += not message
+    return readable
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_seed_itself_is_read(files, name, tmp_path):
+    path = tmp_path / "seed.bin"
+    path.write_bytes(files[name])
+    assert attempt(path) == ""
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_damaged_files(files, name, tmp_path):
+    campaign(files[name], tmp_path, seed=1, count=60)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORMATS)
+def test_many_damaged_files_in_little_memory(name, tmp_path):
+    """In a process of its own, whose address space is capped once the libraries are loaded."""
+    done = subprocess.run(
+        [sys.executable, __file__, name, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parent,
+        timeout=1200,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def main(name: str, folder: Path) -> None:
+    made = seeds(folder)[name]
+    path = folder / "warm.bin"
+    path.write_bytes(made)
+    attempt(path)  # loads what the reader needs, before the limit
+    with open("/proc/self/statm") as statm:
+        used = int(statm.read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
+    print(campaign(made, folder, seed=2, count=1500))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]))
