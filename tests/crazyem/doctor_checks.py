@@ -1,0 +1,37 @@
+"""What the tests of the stream checks share: running one check or all, and planting values into a recording."""
+
+import importlib
+
+from hypothesis import settings
+from made_flight import changed
+
+from crazyem.recordings.finding import Finding
+from crazyem.recordings.recording import Recording
+
+CHECKS = ("numbers", "gaps", "interpolated", "repeated", "clocks", "frozen", "saturation", "rotor_sensor", "flight")
+quick = settings(max_examples=15, deadline=None)
+
+
+def run(check: str, recording: Recording) -> list[Finding]:
+    return importlib.import_module(f"crazyem.doctor.{check}").check(recording)
+
+
+def everything(recording: Recording) -> list[Finding]:
+    return [finding for check in CHECKS for finding in run(check, recording)]
+
+
+def only(check: str, recording: Recording) -> Finding:
+    """The one finding of a check, which no other check repeats as unusable."""
+    findings = run(check, recording)
+    assert len(findings) == 1, [f.text for f in findings]
+    return findings[0]
+
+
+def covers(finding: Finding, start: float, end: float, slack: float = 0.02) -> bool:
+    return any(a - slack <= start and end <= b + slack for a, b in finding.intervals)
+
+
+def with_values(recording: Recording, name: str, rows: slice, value: object) -> Recording:
+    values = recording.signals[name].value.copy()
+    values[rows] = value
+    return changed(recording, name, value=values)
