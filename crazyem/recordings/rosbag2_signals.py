@@ -22,6 +22,7 @@ FIRMWARE = "firmware"
 _LOG = "crazyflie_interfaces/LogDataGeneric"
 _STATUS = "crazyflie_interfaces/Status"
 _FULL_STATE = "crazyflie_interfaces/FullState"
+_ODOMETRY = "nav_msgs/Odometry"
 _TF, _MOCAP = "tf2_msgs/TFMessage", "motion_capture_tracking_interfaces/NamedPoseArray"
 # types by which a namespace is known to be a robot's
 ROBOT_TYPES = {
@@ -98,6 +99,10 @@ def recording_of(
     twist_notes: list[Finding] = []
     for d, topic in [(d, t) for d in decoded for t in others if t.name == _label(d)]:
         mapped += _meaning(d, topic, told, twist_notes)
+    if any(d.rows.texts.get("child_frame_id") for d in decoded if d.topic.kind.name == _ODOMETRY) and any(
+        d.topic.kind.name.startswith("crazyflie_interfaces/") for d in decoded
+    ):
+        twist_notes.append(_PYTHON_SERVER)
     mapped.sort(key=lambda m: _PREFERRED.get(m.origin, 0))
     have = {*firmware, *(m.quantity for m in mapped if not m.origin)}
     # a pose from outside is the pose where there is no other
@@ -122,6 +127,14 @@ def recording_of(
 
 
 _PREFERRED = {"mocap": 1, "tf": 2}
+# crazyflie_server.py: `_log_odom_data_callback` copies gyro.* and stabilizer.pitch as the firmware logs them
+_PYTHON_SERVER = Finding(
+    "mapping",
+    Grade.DEGRADES,
+    "The odometry looks like that of crazyswarm2's Python server, which wrote rates in deg/s and the firmware's "
+    "inverted pitch; it is read as published.",
+    advice="Run crazyem doctor, which tells from the numbers; prefer log blocks.",
+)
 
 
 def _label(d: _Decoded) -> str:

@@ -182,6 +182,14 @@ def test_twists_in_either_frame(tmp_path: Path) -> None:
         assert f"in the {'body' if body else 'world'} frame" in recording.findings[0].text
 
 
+def test_odometry_of_the_python_server_is_not_trusted(tmp_path: Path) -> None:
+    for child in ("", "cf1"):
+        odom = odometry("/cf1/odom", START, [0, 0, 1, 0, 0, 0, 1], [1, 0, 0], [57, 0, 0], child)
+        recording = opened(tmp_path, bag([odom, status("/cf1/status", START, 0, 4.0)]))
+        assert any("deg/s" in f.text for f in recording.findings) == bool(child)
+        assert recording.signals["body_rate"].value.tolist() == [[57, 0, 0]]  # as published
+
+
 def test_status_imu_and_setpoints(tmp_path: Path) -> None:
     values = random_poses(5, seed=8)
     messages: list[Message] = []
