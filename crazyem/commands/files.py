@@ -205,7 +205,7 @@ def targets(found: Iterable[Found], output: str | None, suffix: str, *, force: b
             raise UsageError(f"{target} exists already (--force replaces it).")
     for target in result:
         try:
-            if output is not None and len(found) > 1:
+            if output is not None and (len(found) > 1 or output.endswith(os.sep)):
                 target.parent.mkdir(parents=True, exist_ok=True)
             if not target.parent.is_dir():
                 raise UsageError(f"cannot write {target}: {target.parent} is no folder.")
