@@ -1,0 +1,104 @@
+"""Writes rosbag2 MCAP files for tests, with mcap-ros2-support and hand-written message definitions."""
+
+import io
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from mcap.writer import CompressionType
+from mcap_ros2.writer import Writer
+from scipy.spatial.transform import Rotation
+
+START = 1_700_000_000_000_000_000  # ns since 1970
+LINE = "=" * 80
+HEADER = f"{LINE}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+HEADER += f"{LINE}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+POINT = f"{LINE}\nMSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n"
+VECTOR = f"{LINE}\nMSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
+QUATERNION = f"{LINE}\nMSG: geometry_msgs/Quaternion\nfloat64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n"
+POSE = f"{LINE}\nMSG: geometry_msgs/Pose\nPoint position\nQuaternion orientation\n{POINT}{QUATERNION}"
+TWIST = f"{LINE}\nMSG: geometry_msgs/Twist\nVector3  linear\nVector3  angular\n{VECTOR}"
+DEFINITIONS = {
+    "geometry_msgs/msg/PoseStamped": f"# a pose\nstd_msgs/Header header\ngeometry_msgs/Pose pose\n{HEADER}{POSE}",
+    "nav_msgs/msg/Odometry": "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
+    f"geometry_msgs/TwistWithCovariance twist\n{HEADER}{POSE}{TWIST}"
+    f"{LINE}\nMSG: geometry_msgs/PoseWithCovariance\nPose pose\nfloat64[36] covariance\n"
+    f"{LINE}\nMSG: geometry_msgs/TwistWithCovariance\nTwist twist\nfloat64[36] covariance\n",
+    "sensor_msgs/msg/Imu": "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\n"
+    "float64[9] orientation_covariance # row major\ngeometry_msgs/Vector3 angular_velocity\n"
+    "float64[9] angular_velocity_covariance\ngeometry_msgs/Vector3 linear_acceleration\n"
+    f"float64[9] linear_acceleration_covariance\n{HEADER}{QUATERNION}{VECTOR}",
+    "crazyflie_interfaces/msg/LogDataGeneric": "std_msgs/Header header  # when it was received\n"
+    f"uint32 timestamp # in ms\nfloat32[] values\n{HEADER}",
+    "crazyflie_interfaces/msg/Status": "uint16 SUPERVISOR_INFO_CAN_BE_ARMED = 1\nuint16 SUPERVISOR_INFO_IS_FLYING=16\n"
+    "std_msgs/Header header\nuint16 supervisor_info\nfloat32 battery_voltage\nuint8 pm_state\nuint8 rssi\n"
+    f"uint32 num_rx_broadcast\nuint32 num_tx_broadcast\nuint32 num_rx_unicast\nuint32 num_tx_unicast\n{HEADER}",
+    "crazyflie_interfaces/msg/FullState": "std_msgs/Header header\ngeometry_msgs/Pose pose\ngeometry_msgs/Twist twist\n"
+    f"geometry_msgs/Vector3 acc\n{HEADER}{POSE}{TWIST}",
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"
+    f"{LINE}\nMSG: geometry_msgs/TransformStamped\nstd_msgs/Header header\nstring child_frame_id\nTransform transform\n"
+    f"{LINE}\nMSG: geometry_msgs/Transform\nVector3 translation\nQuaternion rotation\n{HEADER}{VECTOR}{QUATERNION}",
+    "motion_capture_tracking_interfaces/msg/NamedPoseArray": "std_msgs/Header header\nNamedPose[] poses\n"
+    f"{LINE}\nMSG: motion_capture_tracking_interfaces/NamedPose\nstring name\ngeometry_msgs/Pose pose\n{HEADER}{POSE}",
+    "std_msgs/msg/String": "string data\n",
+}
+
+Message = tuple[str, str, int, Any]  # topic, type, log time, message
+
+
+def bag(messages: Iterable[Message], chunk: int = 2000, compression: CompressionType = CompressionType.ZSTD) -> bytes:
+    output = io.BytesIO()
+    writer = Writer(output, chunk_size=chunk, compression=compression)
+    schemas: dict[str, Any] = {}
+    for topic, kind, log, message in messages:
+        if kind not in schemas:
+            schemas[kind] = writer.register_msgdef(kind, DEFINITIONS[kind])
+        writer.write_message(topic, schemas[kind], message, log_time=log, publish_time=log)
+    writer.finish()
+    return output.getvalue()
+
+
+def stamp(ns: int, frame: str = "world") -> dict[str, Any]:
+    return {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": frame}
+
+
+def vector(values: Iterable[float]) -> dict[str, float]:
+    return dict(zip("xyz", map(float, values), strict=True))
+
+
+def quaternion(values: Iterable[float]) -> dict[str, float]:
+    return dict(zip("xyzw", map(float, values), strict=True))
+
+
+def pose(values: Any) -> dict[str, Any]:
+    return {"position": vector(values[:3]), "orientation": quaternion(values[3:7])}
+
+
+def random_poses(n: int, seed: int = 1) -> np.ndarray:
+    turns = Rotation.random(n, random_state=seed).as_quat()
+    return np.column_stack([np.random.default_rng(seed).normal(size=(n, 3)), turns])
+
+
+def pose_message(topic: str, ns: int, values: Any, late: int = 700_000) -> Message:
+    return topic, "geometry_msgs/msg/PoseStamped", ns + late, {"header": stamp(ns), "pose": pose(values)}
+
+
+def odometry(topic: str, ns: int, values: Any, linear: Any, angular: Any = (0, 0, 0), child: str = "") -> Message:
+    message = {
+        "header": stamp(ns),
+        "child_frame_id": child,
+        "pose": {"pose": pose(values), "covariance": [0.0] * 36},
+        "twist": {"twist": {"linear": vector(linear), "angular": vector(angular)}, "covariance": [0.0] * 36},
+    }
+    return topic, "nav_msgs/msg/Odometry", ns, message
+
+
+def log_block(topic: str, ns: int, firmware_ms: int, values: Any, late: int = 0) -> Message:
+    message = {"header": stamp(ns + late), "timestamp": firmware_ms, "values": [float(v) for v in values]}
+    return topic, "crazyflie_interfaces/msg/LogDataGeneric", ns + late, message
+
+
+def status(topic: str, ns: int, info: int, volts: float) -> Message:
+    names = ("pm_state", "rssi", "num_rx_broadcast", "num_tx_broadcast", "num_rx_unicast", "num_tx_unicast")
+    message = {"header": stamp(ns), "supervisor_info": info, "battery_voltage": volts, **dict.fromkeys(names, 0)}
+    return topic, "crazyflie_interfaces/msg/Status", ns, message
