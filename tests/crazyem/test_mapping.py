@@ -365,8 +365,10 @@ def test_nanobench_voltage_has_its_own_samples_back(shared_recordings):
         time = table["t"].to_numpy() - recording.origin
         inside = (time >= voltage.time[0]) & (time <= voltage.time[-1])
         drawn = np.interp(time, voltage.time, voltage.value[:, 0])[inside]
-        # a corner within 4e-9 V of a row is taken to be on it; the file is rounded to 1e-9
-        assert np.abs(drawn - table["pwr_pm_vbat"][inside]).max() < 4e-9 + 0.5e-9
+        # the limit of corners(), see test_interpolation; all but a few rows agree to the rounding of the file
+        error = np.abs(drawn - table["pwr_pm_vbat"][inside])
+        assert error.max() < 1.05e-8
+        assert np.quantile(error, 0.99) < 2e-9
         # never looked at by the reader: the battery is read in steps of 5.2787 mV, and the samples are on them
         steps = voltage.value[:, 0] / 5.27865e-3
         assert np.abs(steps - np.round(steps)).max() < 0.02
