@@ -13,7 +13,7 @@ from crazyem.doctor.regress import Slope
 Array = NDArray[np.float64]
 
 SLACK = 0.02  # sensors and filters in good order differ by so much
-MANY = 10  # blocks (of 1.5 s or more) that a scale must have been seen over
+MANY = 5.0  # blocks (of 1.5 s or more) of motion that a scale must have been seen over
 _NAMES = "xyz"
 _NEAR = math.log(1.2)  # how far a slope may be from a known factor
 

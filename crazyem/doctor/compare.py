@@ -142,11 +142,12 @@ def look(
     )
 
 
-def agreed_scale(looks: Sequence[Look], least: float) -> tuple[Look, axes.ScaleFault] | None:
+def agreed_scale(looks: Sequence[Look], least: float) -> tuple[Look, axes.ScaleFault, int] | None:
     """A scale fault that no comparison contradicts; None if one that could see it sees none.
 
     What a measurement is compared with may be at fault itself (an onboard attitude follows its own filter), so a fault
     must show against all; and stretches between lost packets are no fair sample, so most of the time must be covered.
+    Returns the narrowest comparison, its fault, and the number of comparisons that show it.
     """
     found = []
     for one in looks:
@@ -161,7 +162,7 @@ def agreed_scale(looks: Sequence[Look], least: float) -> tuple[Look, axes.ScaleF
         return None
     directions = {tuple(np.sign(np.round(np.log(fault.repair), 9))) for _, fault in found}
     best = min(found, key=lambda pair: pair[0].whole.high - pair[0].whole.low if pair[0].whole else math.inf)
-    return best if len(directions) == 1 else None
+    return (*best, len(found)) if len(directions) == 1 else None
 
 
 def _ratio(y: Array, x: Array) -> float:

@@ -29,6 +29,8 @@ WIDTH = 0.3  # s: an accelerometer in flight is loud
 ENOUGH = 0.25  # m/s^2 rms along an axis, below which frames and signs are not told
 BELIEVED = 0.5  # share of the variance about the mean that a hypothesis must explain
 OFF = 0.05
+LIKE = 0.04  # how far a velocity may be from its position's derivative to be trusted
+HOVER = 0.03  # m/s rms
 UNITS = {"g": 1.0 / GRAVITY, "mg": 1e3 / GRAVITY, "cm/s^2": 1e2, "mm/s^2": 1e3, "g taken twice": GRAVITY}
 
 
@@ -43,18 +45,36 @@ def check(recording: Recording) -> list[Finding]:
     return found
 
 
-def motion(recording: Recording, grid: Grid) -> Track | None:
-    """Acceleration (m, 3) in the world, gravity removed, from the first velocity, else from the first position."""
-    for array in measurements(recording, "velocity").values():
-        return difference(track(array, grid))
-    for array in measurements(recording, "position").values():
-        return difference(difference(track(array, grid)))
-    return None
-
-
 def _moving(recording: Recording) -> SignalArray | None:
-    found = {**measurements(recording, "velocity"), **measurements(recording, "position")}
-    return next(iter(found.values()), None)
+    """The first velocity that is the derivative of a position; else the first position, else the first velocity."""
+    velocities = measurements(recording, "velocity")
+    positions = measurements(recording, "position")
+    if len(velocities) == 1 and not positions:
+        return next(iter(velocities.values()))
+    for velocity in velocities.values():
+        if any(_derived(velocity, position) for position in positions.values()):
+            return velocity
+    return next(iter([*positions.values(), *velocities.values()]), None)
+
+
+def _derived(velocity: SignalArray, position: SignalArray) -> bool:
+    """True if the slope of a velocity against a position's derivative is 1 within `LIKE`."""
+    grid = grid_of(velocity, position)
+    window = Window(max(WIDTH, width_for(velocity, position)))
+    x, y = window.mean(difference(track(position, grid))), window.mean(track(velocity, grid))
+    rows = np.flatnonzero(x.valid & y.valid)[::3]
+    if rows.size < 100:
+        return False
+    a, b = x.value[rows], y.value[rows]
+    xx, xy, yy = (float((p * q).sum()) for p, q in ((a, a), (a, b), (b, b)))
+    hovers = xx / a.size < HOVER**2 and yy / b.size < HOVER**2
+    return hovers or (xy > 0.0 and abs(math.sqrt(yy / max(xx, 1e-12)) - 1.0) < LIKE and xy**2 > 0.8 * xx * yy)
+
+
+def _acceleration_of(moving: SignalArray, grid: Grid) -> Track:
+    """Acceleration (m, 3) in the world, gravity removed."""
+    first = difference(track(moving, grid))
+    return first if moving.quantity == "velocity" else difference(first)
 
 
 def _specific_force(name: str, array: SignalArray, recording: Recording, attitudes: list[Pose]) -> list[Finding]:
@@ -64,9 +84,9 @@ def _specific_force(name: str, array: SignalArray, recording: Recording, attitud
         if moving is None:
             break
         grid = grid_of(array, pose.array, moving)
-        acceleration = motion(recording, grid) if grid.size else None
-        if acceleration is None:
+        if grid.size == 0:
             continue
+        acceleration = _acceleration_of(moving, grid)
         attitude = pose.track(grid)
         valid = acceleration.valid & attitude.valid
         kinematic = acceleration.value
@@ -181,7 +201,10 @@ def _structure(name: str, seen: Look) -> Finding:
     )
     advice = "Correct its frame, axes or signs where it is read."
     fix: Fix | None = None
-    if choice.name == "world":
+    if choice.name == "world" and abs(_level(seen)[0]) < 0.3 * abs(seen.whole.value if seen.whole else 1.0):
+        text = f"{head}it is the acceleration in the world frame without gravity, not the specific force{tail}"
+        advice = "Read it as acceleration."
+    elif choice.name == "world":
         text, fix = f"{head}it is in the world frame, not the body frame{tail}", Fix("world_to_body", (name,))
         advice = "Rotate it into the body frame by the attitude."
     elif choice.name == "turned twice":
@@ -206,9 +229,9 @@ def _acceleration(name: str, array: SignalArray, recording: Recording, attitudes
     if moving is None:
         return []
     grid = grid_of(array, moving, *(pose.array for pose in attitudes[:1]))
-    kinematic = motion(recording, grid) if grid.size else None
-    if kinematic is None:
+    if grid.size == 0:
         return []
+    kinematic = _acceleration_of(moving, grid)
     candidates: dict[str, tuple[int, Track]] = {"world": (0, kinematic)}
     for pose in attitudes[:1]:
         attitude = pose.track(grid)
@@ -217,7 +240,7 @@ def _acceleration(name: str, array: SignalArray, recording: Recording, attitudes
         force = kinematic.value + GRAVITY * UP
         candidates["specific force"] = (1, Track(rotate(attitude.value, force, inverse=True), valid))
     width = max(WIDTH, width_for(array, moving))
-    seen = look(array, grid, "the derivative of the velocity", candidates, width=width, least=ENOUGH)
+    seen = look(array, grid, f"the derivative of the {moving.quantity}", candidates, width=width, least=ENOUGH)
     if seen is None or seen.whole is None or seen.explained < BELIEVED:
         return []
     evidence = seen.evidence()
@@ -240,8 +263,10 @@ def _acceleration(name: str, array: SignalArray, recording: Recording, attitudes
         return []
     text = f"{head}{fault.text}."
     numbers = {**evidence, **axes.numbers(seen.single)}
-    fix = Fix("scale", (name,), fault.repair)
-    return [Finding("forces", Grade.DEGRADES, text, name, (), numbers, "Divide it by the factor.", fix)]
+    advice = (
+        "Use the derivative of the velocity; a tilt that its filter takes for larger than it is makes such a factor."
+    )
+    return [Finding("forces", Grade.DEGRADES, text, name, (), numbers, advice)]
 
 
 def _acceleration_structure(name: str, head: str, seen: Look) -> Finding:

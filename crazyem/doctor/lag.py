@@ -117,8 +117,9 @@ def _path(name: str, array: SignalArray) -> _Path:
     return array.stream or name, origin_of(name)
 
 
-def _said(path: _Path) -> str:
-    return path[1] or path[0]
+def _said(path: _Path, base: _Path) -> str:
+    """The stream, or the origin where two share a stream."""
+    return path[1] or path[0] if path[0] == base[0] and path != base else path[0]
 
 
 def _reference(recording: Recording) -> tuple[_Reference, _Path | None]:
@@ -263,8 +264,9 @@ def _judge(recording: Recording, base: _Path, path: _Path, lag: _Lag) -> Finding
         "explained": lag.explained,
     }
     how = "late" if lag.value > 0 else "early"
-    what = f"The stream {_said(path)}" if _said(path) != lag.signal else lag.signal
-    text = f"{what} is {1e3 * abs(lag.value):.1f} ms {how} against {_said(base)} ({lag.signal} against {lag.against})"
+    what = lag.signal if path[0] == lag.signal else f"The stream {_said(path, base)}"
+    text = f"{what} is {1e3 * abs(lag.value):.1f} ms {how} against {_said(base, base)}"
+    text += f" ({lag.signal} against {lag.against})"
     fix: Fix | None = None
     advice = "Use a stretch with one lag, or estimate the lag along; a single shift does not repair it."
     if lag.changes is not None:

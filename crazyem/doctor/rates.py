@@ -14,7 +14,8 @@ from crazyem.recordings.recording import Recording, SignalArray
 DEGREES = 180.0 / math.pi
 ENOUGH = 0.04  # rad/s rms of rotation about an axis, below which nothing is said
 BELIEVED = 0.6  # share of the variance a hypothesis must explain
-OFF = 0.05  # scale fault reported from here on
+OFF = 0.05  # scale fault reported from here on, if attitudes of two origins agree
+ALONE = 0.10  # if there is only one: an onboard attitude follows the gyro by a filter of its own
 BIAS = 0.05  # rad/s, reported from here on
 WIDTH = 0.24  # s: a gyro in flight is loud
 
@@ -91,13 +92,16 @@ def _structure(name: str, seen: Look) -> Finding:
 
 
 def _scale(name: str, looks: list[Look]) -> list[Finding]:
-    agreed = agreed_scale(looks, OFF)
+    agreed = agreed_scale(looks, OFF if len(looks) > 1 else ALONE)
     if agreed is None:
         return []
-    seen, fault = agreed
+    seen, fault, witnesses = agreed
     numbers = {**seen.evidence(), **axes.numbers(seen.single)}
     text = f"{name} is not the derivative of {seen.against}: {fault.text}."
-    advice = "Find out which of the two is wrong; divide the rate by its factor if it is the rate."
+    if witnesses < 2:
+        advice = "One of the two is wrong; a third measurement, or the range of the gyro, must say which."
+        return [Finding("rates", Grade.DEGRADES, text, name, (), numbers, advice)]
+    advice = "Attitudes of two origins agree against it: divide the rate by the factor."
     return [Finding("rates", Grade.DEGRADES, text, name, (), numbers, advice, Fix("scale", (name,), fault.repair))]
 
 

@@ -34,7 +34,7 @@ class Slope:
         far_low, far_high: the same at the level `CERTAIN`.
         explained: share of the variance that the two sides share (squared correlation).
         samples: how many (rows times components).
-        blocks: how many.
+        blocks: how many, counted by the share of the motion that each holds.
     """
 
     value: float
@@ -46,7 +46,7 @@ class Slope:
     far_high: float
     explained: float
     samples: int
-    blocks: int
+    blocks: float
 
 
 def blocks(time: Array) -> NDArray[np.int64]:
@@ -67,7 +67,8 @@ def block_sums(block: NDArray[np.int64], *columns: Array) -> Array:
 def slope(x: Array, y: Array, block: NDArray[np.int64], *, offset: bool = True) -> Slope | None:
     """Slope of y against x, both (n, c) or (n,); None with too few blocks or no common variance.
 
-    Rows far from the line (five times the median distance and more) are left out, twice over.
+    Rows far from the line are left out: by five times the median distance, and by as much as they are large (what is
+    off by a factor is no outlier, and a flight that mostly hovers must not lose its manoeuvres).
     """
     x, y = np.atleast_2d(x.T).T, np.atleast_2d(y.T).T
     keep = np.ones(len(x), bool)
@@ -82,9 +83,10 @@ def slope(x: Array, y: Array, block: NDArray[np.int64], *, offset: bool = True) 
         middle = math.copysign(math.sqrt(abs(factor[0] * factor[1])), factor[0])
         mx = np.median(x[keep], axis=0) if offset else 0.0
         my = np.median(y[keep], axis=0) if offset else 0.0
-        away = np.linalg.norm((y - my) - middle * (x - mx), axis=1)
+        line = middle * (x - mx)
+        away = np.linalg.norm((y - my) - line, axis=1)
         limit = 5.0 * float(np.median(away[keep])) / 0.6745
-        following = away <= max(limit, 1e-12)
+        following = away <= np.maximum(limit, np.linalg.norm(line, axis=1) + 1e-12)
         if (following == keep).all():
             break
         keep = following
@@ -116,7 +118,7 @@ def slope(x: Array, y: Array, block: NDArray[np.int64], *, offset: bool = True) 
         far_high=edges[1][1],
         explained=float(sxy**2 / (sxx * syy)),
         samples=int(keep.sum()) * x.shape[1],
-        blocks=count,
+        blocks=float(sxx**2 / max(float(np.square(sums[:, 0]).sum()), 1e-300)),
     )
 
 

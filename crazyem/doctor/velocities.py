@@ -34,7 +34,7 @@ def check(recording: Recording) -> list[Finding]:
     for name, array in positions.items():
         if name not in (first, *blamed) and first not in blamed:
             one = _compare_positions(array, first, positions[first])
-            found += _judge_position(name, [one] if one else [])
+            found += _judge_position(name, [one] if one else [], blamed)
     return found
 
 
@@ -88,14 +88,17 @@ def _judge(name: str, looks: list[Look], blamed: set[str]) -> list[Finding]:
     agreed = agreed_scale(looks, OFF)
     if agreed is None:
         return []
-    seen, fault = agreed
+    seen, fault, witnesses = agreed
     numbers = {**seen.evidence(), **axes.numbers(seen.single)}
     text = f"{name} is not the derivative of {seen.against}: {fault.text}."
-    advice = "Find out which of the two is wrong; divide the velocity by its factor if it is the velocity."
+    if witnesses < 2:
+        advice = "One of the two is wrong, and a third measurement must say which."
+        return [Finding("velocities", Grade.DEGRADES, text, name, (), numbers, advice)]
+    advice = "Positions of two origins agree against it: divide the velocity by the factor."
     return [Finding("velocities", Grade.DEGRADES, text, name, (), numbers, advice, Fix("scale", (name,), fault.repair))]
 
 
-def _judge_position(name: str, looks: list[Look]) -> list[Finding]:
+def _judge_position(name: str, looks: list[Look], blamed: set[str]) -> list[Finding]:
     if not looks or looks[0].whole is None or looks[0].explained < BELIEVED:
         return []
     seen, whole = looks[0], looks[0].whole
@@ -103,7 +106,16 @@ def _judge_position(name: str, looks: list[Look]) -> list[Finding]:
     head = f"{name} against {seen.against}: "
     if seen.choice.denied:
         return [_structure("velocities", name, head, seen)]
-    unit = axes.known_factor(whole, {"mm": 1e3, "cm": 1e2, "km": 1e-3})
+    unit = axes.known_factor(whole, POSITION_UNITS)
+    if unit:
+        blamed.add(seen.against)
+        text = (
+            f"{seen.against} against {name}: it is {1.0 / whole.value:.4g} times as large: it is in {unit[0]}, not m."
+        )
+        fix = Fix("scale", (seen.against,), (unit[1],) * 3)
+        advice = "Correct its unit."
+        return [Finding("velocities", Grade.UNUSABLE, text, seen.against, (), seen.evidence(), advice, fix)]
+    unit = axes.known_factor(whole, {key: 1.0 / factor for key, factor in POSITION_UNITS.items()})
     if unit:
         text = f"{head}it is {whole.value:.4g} times as large: it is in {unit[0]}, not m."
         fix = Fix("scale", (name,), (1.0 / unit[1],) * 3)
