@@ -127,18 +127,48 @@ def _order(verdict: Verdict) -> tuple[int, float]:
     return _RANK.get(str(verdict.verdict), 3), math.inf if sd is None else sd
 
 
+def _without_edges(parts: list[tuple[Finding, ...]]) -> list[tuple[Finding, ...]]:
+    """Parts without what is true of a part only because it is one: no flight in it, rotors at work at its ends."""
+    grounded = [any(f.check == "flight" and f.grade is Grade.UNUSABLE for f in findings) for findings in parts]
+    if len(parts) < 2 or all(grounded):
+        return parts
+    aloft = [f for findings in parts for f in findings if _course(f)]
+    cleaned = [
+        tuple(f for f in findings if not (f.check == "flight" and f.grade is Grade.UNUSABLE) and not _course(f))
+        for findings in parts
+    ]
+    if aloft:
+        seconds = sum(f.evidence["airborne_s"] for f in aloft)
+        text = f"The recording holds {seconds:.1f} s in the air, counted in {len(parts)} parts."
+        spans = tuple(span for f in aloft for span in f.intervals)
+        course = replace(
+            aloft[0], text=f"The recording holds {text}", intervals=spans, evidence={"airborne_s": seconds}
+        )
+        cleaned[-1] = (*cleaned[-1], course)
+    return cleaned
+
+
+def _course(finding: Finding) -> bool:
+    return finding.check == "flight" and finding.grade is Grade.HARMLESS and "airborne_s" in finding.evidence
+
+
+def _key(finding: Finding) -> tuple[str, ...]:
+    # the course of a flight and what went wrong in it are two things
+    return (finding.check, finding.signal, str(finding.grade) if finding.check == "flight" else "")
+
+
 def merge_findings(parts: Iterable[tuple[Finding, ...]]) -> tuple[Finding, ...]:
     """Findings of parts: one for each check and signal, as it was in the worst part, with the stretches of all.
 
     A finding without a stretch is of its whole part; `evidence["parts"]` says in how many parts it was.
     """
-    merged: dict[tuple[str, str], Finding] = {}
-    counts: dict[tuple[str, str], int] = {}
-    for findings in parts:
-        for key in {(f.check, f.signal) for f in findings}:
+    merged: dict[tuple[str, ...], Finding] = {}
+    counts: dict[tuple[str, ...], int] = {}
+    for findings in _without_edges([tuple(findings) for findings in parts]):
+        for key in {_key(f) for f in findings}:
             counts[key] = counts.get(key, 0) + 1
         for finding in findings:
-            key = (finding.check, finding.signal)
+            key = _key(finding)
             known = merged.get(key)
             if known is None:
                 merged[key] = replace(finding, fix=None)

@@ -20,9 +20,9 @@ from crazyem.recordings.recording import Recording, SignalArray
 Array = NDArray[np.float64]
 Signals = dict[str, SignalArray]
 
-# What names rows comes first, while they are still where they were found; then times, since what compares signals needs
-# them; then values; then frames, which need an attitude in order.
-ORDER = ("mark", "unwrap", "sort", "shift", "scale", "world_to_body")
+# Times first, since what compares signals needs them; then units, since a rate in deg/s reads as impossible samples in
+# rad/s and those must not be thrown away; then frames, which need an attitude in order; what is left is marked.
+ORDER = ("unwrap", "sort", "shift", "scale", "world_to_body", "mark")
 _TIMES = ("unwrap", "sort", "shift")
 _ATTITUDE_REACH = 0.1  # s between an attitude and what it rotates
 
@@ -40,7 +40,7 @@ def apply_fixes(recording: Recording, findings: Iterable[Finding]) -> tuple[Reco
 
     Returns: the repaired recording (the same if nothing was applied), and the findings whose repairs are in it.
     """
-    wanted = sorted((f for f in findings if _possible(recording, f.fix)), key=lambda f: ORDER.index(f.fix.kind))  # type: ignore[union-attr]
+    wanted = sorted((f for f in findings if _possible(recording, f.fix)), key=_place)
     applied: list[Finding] = []
     for finding in wanted:
         current = _again(recording, finding)
@@ -55,6 +55,12 @@ def apply_fixes(recording: Recording, findings: Iterable[Finding]) -> tuple[Reco
         done = {id(f) for f in applied}
         recording = replace(recording, findings=tuple(f for f in recording.findings if id(f) not in done))
     return recording, tuple(applied)
+
+
+def _place(finding: Finding) -> int:
+    """When a repair's turn comes: rows that a reader named first, while they are still where it found them."""
+    assert finding.fix is not None
+    return ORDER.index(finding.fix.kind) if _checkable(finding) else -1
 
 
 def repair(recording: Recording, finding: Finding) -> Recording:

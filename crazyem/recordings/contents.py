@@ -6,29 +6,37 @@ from pathlib import Path
 
 from crazyem.errors import FileFormatError, UsageError
 
-LARGEST_UNPACKED = 1 << 30  # bytes: a week of a cfclient CSV, ten hours of a uSD log at 1 kHz; a bomb has no end
+LARGEST_FILE = 4 << 30  # bytes of a plain file: hours of a uSD log at 1 kHz
+LARGEST_UNPACKED = 1 << 30  # bytes of a gzip file, unpacked: a bomb has no end
+_PIECE = 1 << 20
 
 
-def contents(path: Path, *, limit: int = LARGEST_UNPACKED) -> bytes:
+def contents(path: Path, *, limit: int = LARGEST_UNPACKED, plain: int = LARGEST_FILE) -> bytes:
     """All bytes of a file, unpacked.
 
     Args:
         path: plain or gzip, told by content.
         limit: most bytes to unpack a gzip file to.
+        plain: most bytes of one that is not packed.
 
-    Raises: UsageError if it cannot be read, FileFormatError if it cannot be unpacked or is larger than `limit` then.
+    Raises: UsageError if it cannot be read, FileFormatError if it cannot be unpacked or is too large.
     """
     try:
         with path.open("rb") as file:
             packed = file.read(2) == b"\x1f\x8b"
         if not packed:
+            if path.stat().st_size > plain:
+                raise FileFormatError(f"{path} is larger than {plain >> 20} MiB, more than can be read at once.")
             return path.read_bytes()
+        data = bytearray()
         with gzip.open(path, "rb") as file:
-            data = file.read(limit + 1)
+            # in pieces: asking for `limit` bytes at once would set them aside at once
+            while len(data) <= limit and (piece := file.read(_PIECE)):
+                data += piece
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise FileFormatError(f"{path} is not a readable gzip file ({error}).") from error
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
     if len(data) > limit:
         raise FileFormatError(f"{path} unpacks to more than {limit >> 20} MiB; unpack it yourself if it is sound.")
-    return data
+    return bytes(data)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
+from crazyem.recordings.contents import contents
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.frd_ned import (
     ATTITUDE,
@@ -32,7 +33,7 @@ from crazyem.recordings.frd_ned import (
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Event, Recording
 from crazyem.recordings.tlog_frames import MESSAGES, Frames, Frameset, columns_of, scan, units_of
-from crazyem.recordings.topics import Source, Topic, damage, file_bytes, named, seconds, signals_of, text_of
+from crazyem.recordings.topics import Source, Topic, damage, named, seconds, signals_of, text_of
 
 _MILLI_G = 9.80665e-3  # m/s^2, the standard gravity of autopilots
 _RPM = 2.0 * math.pi / 60.0
@@ -70,7 +71,7 @@ def recognises(head: bytes) -> bool:
 
 def read(path: Path, options: ReadOptions) -> Recording:
     """Read a telemetry log. Raises FileFormatError naming the file and what is wrong with it."""
-    data = file_bytes(path)
+    data = contents(path)
     found = scan(data)
     size = len(data)
     del data

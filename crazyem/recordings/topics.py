@@ -1,15 +1,11 @@
 """From topics (named rows of numbers with a time each) to signals: what the readers of ULog, tlog and rosbag2 share."""
 
-import gzip
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import SignalArray
 from crazyem.signals.sample import SIGNALS
@@ -17,7 +13,6 @@ from crazyem.signals.sample import SIGNALS
 # Bounds on columns that nobody mapped: 16 bytes a sample, so some hundred megabytes at most.
 RAW_SIGNALS = 4000
 RAW_SAMPLES = 24_000_000
-LARGEST_FILE = 4 << 30  # bytes, unpacked
 TEXT = 300  # characters of a metadata value that are kept
 
 
@@ -201,23 +196,6 @@ def _within_bounds(raw: list[tuple[Topic, str]]) -> tuple[list[tuple[Topic, str]
         left_out=float(len(raw) - len(kept)),
     )
     return [pair for i, pair in enumerate(raw) if i in kept], [finding]
-
-
-def file_bytes(path: Path, limit: int | None = None) -> bytes:
-    """All bytes of a file, unpacked if it is a gzip file. Raises FileFormatError beyond `limit` bytes, UsageError."""
-    limit = LARGEST_FILE if limit is None else limit
-    try:
-        with path.open("rb") as plain:
-            packed = plain.read(2) == b"\x1f\x8b"
-        with gzip.open(path, "rb") if packed else path.open("rb") as stream:
-            data = stream.read(limit + 1)
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise FileFormatError(f"{path} is not a readable gzip file ({error}).") from error
-    except OSError as error:
-        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
-    if len(data) > limit:
-        raise FileFormatError(f"{path} is larger than {limit >> 20} MiB (unpacked), more than can be read at once.")
-    return bytes(data)
 
 
 def damage(skipped: Sequence[tuple[int, int]], size: int, what: str) -> list[Finding]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pyulog import ULog
 
 from crazyem.errors import FileFormatError
+from crazyem.recordings.contents import contents
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.frd_ned import (
     ATTITUDE,
@@ -30,7 +31,7 @@ from crazyem.recordings.frd_ned import (
 )
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
-from crazyem.recordings.topics import Source, Topic, damage, file_bytes, named, ranks, seconds, signals_of, text_of
+from crazyem.recordings.topics import Source, Topic, damage, named, ranks, seconds, signals_of, text_of
 from crazyem.recordings.ulog_scan import HEADER, MAGIC, Scan, scan, unknown_flags
 
 CLOCK = "autopilot"  # microseconds since boot
@@ -51,7 +52,7 @@ def recognises(head: bytes) -> bool:
 
 def read(path: Path, options: ReadOptions) -> Recording:
     """Read a ULog file. Raises FileFormatError naming the file and what is wrong with it."""
-    data = file_bytes(path)
+    data = contents(path)
     if not recognises(data) or len(data) < HEADER:
         raise FileFormatError(f"{path}: the header of a ULog file has {HEADER} bytes, this one is cut or is none.")
     if unknown_flags(data):

@@ -560,3 +560,23 @@ def test_a_packed_recording_too(capsys: pytest.CaptureFixture[str], flight: Path
     (tmp_path / "f.csv-metadata.json").write_bytes(Path(f"{flight}-metadata.json").read_bytes())
     assert run(capsys, "import", path, "-o", tmp_path)[0] == 0
     assert (tmp_path / "f.mcap").exists()
+
+
+def test_parts_on_the_ground_are_no_verdict_on_the_whole() -> None:
+    grounded = Finding("flight", Grade.UNUSABLE, "The drone never flew: its rotors never carried it.")
+    cut = Finding(
+        "flight",
+        Grade.HARMLESS,
+        "The recording begins with rotors at work; 30.0 s in the air.",
+        intervals=((60.0, 90.0),),
+        evidence={"airborne_s": 30.0},
+    )
+    upset = Finding("flight", Grade.DEGRADES, "The drone is upside down.", intervals=((61.0, 62.0),))
+    merged = merge_findings([(grounded,), (cut, upset), (replace(cut, intervals=((120.0, 150.0),)),)])
+    assert [f.grade for f in merged] == [Grade.DEGRADES, Grade.HARMLESS]
+    assert merged[0].intervals == ((61.0, 62.0),)
+    only = merge_findings([(grounded,), (cut,), (replace(cut, intervals=((120.0, 150.0),)),)])
+    assert [f.evidence["airborne_s"] for f in only] == [60.0]
+    assert only[0].intervals == ((60.0, 90.0), (120.0, 150.0))
+    never = merge_findings([(grounded,), (grounded,)])
+    assert [f.grade for f in never] == [Grade.UNUSABLE]

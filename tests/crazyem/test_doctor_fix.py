@@ -306,3 +306,14 @@ def test_several_faults_at_once() -> None:
         assert np.allclose(result.signals[name].value, array.value, rtol=1e-13), name
     assert len(result.metadata["fixes"]) == 3
     assert [f for f in examine(result) if f.fix is not None] == []
+
+
+def test_a_fast_turn_in_degrees_loses_no_sample() -> None:
+    """In rad/s such a gyro looks impossible now and then; the unit is put right before anything is thrown away."""
+    flight = made_flight(Motion(seconds=20.0, seed=3, size=0.7))
+    rate = flight.signals["body_rate"]
+    faulty = replace(flight, signals={**flight.signals, "body_rate": replace(rate, value=np.degrees(rate.value))})
+    assert any(f.check == "numbers" and f.fix is not None and f.fix.kind == "mark" for f in examine(faulty))
+    repaired, applied = apply_fixes(faulty, examine(faulty))
+    assert any(f.check == "rates" for f in applied)
+    assert np.isfinite(repaired.signals["body_rate"].value).all()

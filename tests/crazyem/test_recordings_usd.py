@@ -370,7 +370,7 @@ def test_gzip_and_a_bomb(put, monkeypatch):
     _, _, data = small_log()
     packed = put(gzip.compress(data), "log.gz")
     assert len(opened(packed)) == len(opened(put(data)))
-    monkeypatch.setattr("crazyem.recordings.contents.contents.__kwdefaults__", {"limit": 100})
+    monkeypatch.setattr("crazyem.recordings.contents.contents.__kwdefaults__", {"limit": 100, "plain": 1 << 30})
     with pytest.raises(FileFormatError, match="more than"):
         opened(packed)
     with pytest.raises(FileFormatError, match="gzip"):
