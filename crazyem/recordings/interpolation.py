@@ -120,6 +120,7 @@ def corners(
         measured[first - (starts and first == 1) : last + (ends and last == n - 1)] = True
     if starts and value[0] == value[1] == value[2]:
         measured[0] = True  # held from before the first row: nothing was drawn there
+    measured |= ~np.isfinite(value)  # what is no number was not drawn by a line: it stays, to be seen
     rows = np.flatnonzero(measured)
     row = np.concatenate([rows, before[met]])
     stamp = np.concatenate([time[rows], where[met, 0]])
