@@ -78,7 +78,7 @@ def main() -> int:
         files = list(arguments.files)
         if not files:
             from crazyem.recordings import open_recording
-            from crazyem.recordings.mcap_signals import write_recording
+            from crazyem.recordings.mcap.signals import write_recording
 
             write_recording(open_recording(SHIPPED), folder / "imported.mcap")
             files = [SHIPPED, folder / "imported.mcap"]

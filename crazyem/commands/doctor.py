@@ -99,7 +99,7 @@ def _repair(
 ) -> tuple[dict[str, Any], list[str]]:
     """Apply what loses nothing and write it; nothing is written where there is nothing to apply."""
     from crazyem.doctor.fix import apply_fixes
-    from crazyem.recordings.mcap_signals import write_recording
+    from crazyem.recordings.mcap.signals import write_recording
 
     wanted = [f for f in findings if f.fix is not None]
     repaired, applied = apply_fixes(recording, findings)

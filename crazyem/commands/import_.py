@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def convert(path: str, output: str, options: ReadOptions, force: bool) -> Result:
     """One file. Raises as `open_recording`; UsageError if the result cannot be written."""
-    from crazyem.recordings.mcap_signals import write_recording
+    from crazyem.recordings.mcap.signals import write_recording
 
     recording = open_recording(path, options)
     write_recording(recording, output, replace=force)

@@ -10,7 +10,7 @@ from crazyem.errors import UsageError
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the layout, or write it to a file."""
-    from crazyem.recordings.layout import foxglove_layout
+    from crazyem.recordings.mcap.layout import foxglove_layout
 
     text = json.dumps(foxglove_layout(), indent=2, allow_nan=False) + "\n"
     target = arguments.output or arguments.json or "-"

@@ -9,7 +9,7 @@ from crazyem.errors import CrazyemError, UsageError
 
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
-    from crazyem.recordings.recover import recover
+    from crazyem.recordings.mcap.recover import recover
 
     report = Report(arguments)
     source, target = arguments.file, arguments.output

@@ -25,7 +25,7 @@ def open_recorder(
     """
     if path is None:
         return None
-    from crazyem.recordings.writer import RecordingWriter
+    from crazyem.recordings.mcap.writer import RecordingWriter
 
     return RecordingWriter(
         path,

@@ -48,14 +48,14 @@ class Reader:
 
 # Most specific first.
 READERS: tuple[Reader, ...] = (
-    Reader("MCAP", "mcap_file"),
-    Reader("rosbag2", "rosbag2_file"),
-    Reader("uSD card log", "usd_file"),
-    Reader("ULog", "ulog_file"),
-    Reader("exported CSV", "exported_csv"),
-    Reader("cfclient CSV", "cfclient_csv"),
-    Reader("CSV", "csv_file"),
-    Reader("MAVLink tlog", "tlog_file"),
+    Reader("MCAP", "mcap.file"),
+    Reader("rosbag2", "ros.rosbag2_file"),
+    Reader("uSD card log", "usd.file"),
+    Reader("ULog", "autopilots.ulog_file"),
+    Reader("exported CSV", "csv.exported"),
+    Reader("cfclient CSV", "csv.cfclient"),
+    Reader("CSV", "csv.file"),
+    Reader("MAVLink tlog", "autopilots.tlog_file"),
 )
 
 

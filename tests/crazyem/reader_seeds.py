@@ -55,7 +55,7 @@ def _long() -> bytes:
 
 
 def _ours(path: Path) -> bytes:
-    from crazyem.recordings.writer import RecordingWriter
+    from crazyem.recordings.mcap.writer import RecordingWriter
     from crazyem.signals.packet import Block, Packet, Variable
 
     block = Block(3, tuple(Variable(f"stateEstimate.{v}", "float") for v in ("x", "y", "z", "vx", "vy", "vz")), 10)
@@ -69,7 +69,7 @@ def _ours(path: Path) -> bytes:
 
 def _imported(folder: Path) -> bytes:
     from crazyem.recordings import open_recording
-    from crazyem.recordings.mcap_signals import write_recording
+    from crazyem.recordings.mcap.signals import write_recording
 
     source, target = folder / "seed.csv", folder / "imported.mcap"
     source.write_bytes(_nanobench())

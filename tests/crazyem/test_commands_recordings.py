@@ -25,7 +25,7 @@ from crazyem.doctor.inventory import inventory
 from crazyem.errors import LinkError, UsageError
 from crazyem.recordings import Finding, Grade, Recording, open_recording
 from crazyem.recordings.export import export
-from crazyem.recordings.mcap_signals import write_recording
+from crazyem.recordings.mcap.signals import write_recording
 
 
 def save(recording: Recording, path: Path) -> Path:

@@ -7,11 +7,11 @@ import pytest
 from test_mcap_signals import flight
 
 from crazyem.live.session import block_plan
-from crazyem.recordings import schemas
-from crazyem.recordings.layout import foxglove_layout, topics_of
-from crazyem.recordings.mcap_messages import EVENTS
-from crazyem.recordings.mcap_signals import write_recording
-from crazyem.recordings.mcap_survey import from_summary
+from crazyem.recordings.mcap import schemas
+from crazyem.recordings.mcap.layout import foxglove_layout, topics_of
+from crazyem.recordings.mcap.messages import EVENTS
+from crazyem.recordings.mcap.signals import write_recording
+from crazyem.recordings.mcap.survey import from_summary
 from crazyem.signals.packet import Block, Variable
 from crazyem.signals.vocabulary import MOTOR_BLOCK, ROTOR_SPEED_BLOCK
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings import open_recording
-from crazyem.recordings.mapping import known_mappings, load_mapping
+from crazyem.recordings.csv.mapping import known_mappings, load_mapping
 from crazyem.recordings.options import ReadOptions
 
 ENU_FROM_NED = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
@@ -266,7 +266,7 @@ def test_shipped_mappings_load():
     ],
 )
 def test_a_broken_mapping_names_the_key(change, message):
-    source = (resources.files("crazyem.recordings") / "mappings" / "nanobench.toml").read_text(encoding="utf-8")
+    source = (resources.files("crazyem.recordings.csv") / "mappings" / "nanobench.toml").read_text(encoding="utf-8")
     assert change[0] in source
     with pytest.raises(FileFormatError, match=message) as caught:
         load_mapping(source.replace(*change, 1), "mine.toml")

@@ -13,10 +13,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
-from crazyem.recordings import ReadOptions, mcap_file, mcap_scan, open_recording
-from crazyem.recordings.mcap_signals import write_recording
-from crazyem.recordings.recover import recover
-from crazyem.recordings.writer import RecordingWriter
+from crazyem.recordings import ReadOptions, open_recording
+from crazyem.recordings.mcap import file as mcap_file
+from crazyem.recordings.mcap import scan as mcap_scan
+from crazyem.recordings.mcap.recover import recover
+from crazyem.recordings.mcap.signals import write_recording
+from crazyem.recordings.mcap.writer import RecordingWriter
 from crazyem.signals.packet import Block, Packet, Variable
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -412,7 +414,7 @@ def test_nothing_is_lost_if_the_second_session_dies_at_any_moment(tmp_path):
     path, cut = tmp_path / "f.mcap", tmp_path / "cut.mcap"
     record(path)
     before = path.read_bytes()
-    from crazyem.recordings.append import reopen
+    from crazyem.recordings.mcap.append import reopen
 
     reopen(path).stream.close()
     assert path.read_bytes() == before  # opening alone changes nothing

@@ -18,9 +18,9 @@ from test_recordings_mcap import flight as packets
 from crazyem.estimation.result import Estimate, ParameterEstimate
 from crazyem.links.base import LinkStatistics, ParameterWrite
 from crazyem.recordings import open_recording
-from crazyem.recordings.mcap_signals import write_recording
-from crazyem.recordings.recover import recover
-from crazyem.recordings.writer import RecordingWriter
+from crazyem.recordings.mcap.recover import recover
+from crazyem.recordings.mcap.signals import write_recording
+from crazyem.recordings.mcap.writer import RecordingWriter
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -197,7 +197,7 @@ def test_kill_9_loses_at_most_a_second(tmp_path):
     program = textwrap.dedent(f"""
         import sys, time
         sys.path.insert(0, {str(ROOT)!r})
-        from crazyem.recordings.writer import RecordingWriter
+        from crazyem.recordings.mcap.writer import RecordingWriter
         from crazyem.signals.packet import Block, Packet, Variable
         writer = RecordingWriter({str(path)!r})
         writer.blocks((Block(0, (Variable("pm.vbat", "float"),), 10),))

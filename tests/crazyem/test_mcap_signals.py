@@ -19,11 +19,11 @@ from crazyem.recordings import (
     ReadOptions,
     Recording,
     SignalArray,
-    mcap_file,
     open_recording,
 )
-from crazyem.recordings.mcap_signals import write_recording
-from crazyem.recordings.stream_codec import unique_name
+from crazyem.recordings.mcap import file as mcap_file
+from crazyem.recordings.mcap.signals import write_recording
+from crazyem.recordings.mcap.stream_codec import unique_name
 from crazyem.signals.sample import SIGNALS
 
 TEXT = ("quantity", "unit", "frame", "clock", "stream", "source")

@@ -13,7 +13,7 @@ from crazyem.recordings.finding import Grade
 from crazyem.recordings.motor_meaning import MOTORS, decide
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.tables import Table
-from crazyem.recordings.usd_file import read
+from crazyem.recordings.usd.file import read
 
 SENT = [f"pwm.m{i}_pwm" for i in (1, 2, 3, 4)]
 COMMANDS = [f"controller.cmd_{name}" for name in ("thrust", "roll", "pitch", "yaw")]
@@ -67,7 +67,7 @@ FLAT = np.full((4, 200), 40_000.5)  # tells nothing: not even whole numbers
 
 def columns_of(shared_recordings, name):
     """A uSD log's columns through the reader's own table."""
-    import crazyem.recordings.usd_file as module
+    import crazyem.recordings.usd.file as module
 
     seen = []
     with pytest.MonkeyPatch.context() as patch:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from crazyem.errors import CrazyemError, FileFormatError
 from crazyem.recordings import motor_meaning
-from crazyem.recordings.cfclient_csv import read, recognises, recognises_folder
+from crazyem.recordings.csv.cfclient import read, recognises, recognises_folder
 from crazyem.recordings.finding import Grade
 from crazyem.recordings.options import ReadOptions
 

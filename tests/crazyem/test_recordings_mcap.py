@@ -17,8 +17,8 @@ from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.estimation.result import Estimate, ParameterEstimate
 from crazyem.links.base import ParameterWrite
 from crazyem.recordings import open_recording
-from crazyem.recordings.schemas import BlockCodec
-from crazyem.recordings.writer import RecordingWriter
+from crazyem.recordings.mcap.schemas import BlockCodec
+from crazyem.recordings.mcap.writer import RecordingWriter
 from crazyem.signals.packet import Block, Packet, Variable
 from crazyem.signals.vocabulary import decoders
 
@@ -281,7 +281,7 @@ def test_a_killed_process_leaves_its_flight_readable(tmp_path):
     program = f"""
 import sys, time
 sys.path.insert(0, {os.getcwd()!r})
-from crazyem.recordings.writer import RecordingWriter
+from crazyem.recordings.mcap.writer import RecordingWriter
 from crazyem.signals.packet import Block, Packet, Variable
 writer = RecordingWriter({str(path)!r})
 writer.blocks((Block(0, (Variable("pm.vbat", "float"),), 10),))

@@ -36,8 +36,8 @@ from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording
-from crazyem.recordings.ros2_messages import message_type, rows_of
-from crazyem.recordings.rosbag2_file import read, recognises, recognises_folder
+from crazyem.recordings.ros.ros2_messages import message_type, rows_of
+from crazyem.recordings.ros.rosbag2_file import read, recognises, recognises_folder
 
 
 def save(folder: Path, content: bytes, name: str = "flight.mcap") -> Path:

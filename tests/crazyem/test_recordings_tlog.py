@@ -16,11 +16,11 @@ from pymavlink.generator.mavcrc import x25crc
 from scipy.spatial.transform import Rotation
 
 from crazyem.errors import CrazyemError, FileFormatError
+from crazyem.recordings.autopilots.tlog_file import read, recognises
+from crazyem.recordings.autopilots.tlog_frames import checksum
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording
-from crazyem.recordings.tlog_file import read, recognises
-from crazyem.recordings.tlog_frames import checksum
 
 START = 1_700_000_000_000_000  # us since 1970
 BOOT = START - 100_000_000  # when the autopilot booted

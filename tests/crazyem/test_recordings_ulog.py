@@ -14,11 +14,11 @@ from pyulog import ULog
 from scipy.spatial.transform import Rotation
 
 from crazyem.errors import CrazyemError, FileFormatError
+from crazyem.recordings.autopilots.ulog_file import read, recognises
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording
 from crazyem.recordings.topics import RAW_SIGNALS
-from crazyem.recordings.ulog_file import read, recognises
 
 CODES = {"float": "f", "double": "d", "uint64_t": "Q", "uint8_t": "B", "bool": "?", "int32_t": "i", "uint32_t": "I"}
 FLIP = np.diag([1.0, -1.0, -1.0])

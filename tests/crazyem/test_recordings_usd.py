@@ -14,7 +14,7 @@ from crazyem.recordings import motor_meaning
 from crazyem.recordings.finding import Grade
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.tables import Table
-from crazyem.recordings.usd_file import read, recognises
+from crazyem.recordings.usd.file import read, recognises
 
 FIXED = 0xFFFF
 
@@ -90,7 +90,7 @@ def tables_of(monkeypatch):
         seen.append(list(tables))
         return genuine(tables, **options)
 
-    monkeypatch.setattr("crazyem.recordings.usd_file.motor_meaning.decide", spy)
+    monkeypatch.setattr("crazyem.recordings.usd.file.motor_meaning.decide", spy)
     return seen
 
 
@@ -299,8 +299,8 @@ def test_stamps_of_version_1_go_on_where_they_wrap(put, monkeypatch):
 
 
 def test_long_runs_cross_the_window_of_a_comparison(put, monkeypatch):
-    monkeypatch.setattr("crazyem.recordings.usd_records._WINDOW", 64)
-    monkeypatch.setattr("crazyem.recordings.usd_records._GATHERED", 1024)
+    monkeypatch.setattr("crazyem.recordings.usd.records._WINDOW", 64)
+    monkeypatch.setattr("crazyem.recordings.usd.records._GATHERED", 1024)
     events = [(FIXED, "fixedFrequency", [("a.b", "H")]), (2, "other", [("x", "B")])]
     lengths = [1, 15, 16, 17, 63, 64, 65, 80, 128, 129, 300]
     kinds = [k % 2 for k, n in enumerate(lengths) for _ in range(n)]

@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from crazyem.recordings.csv_long import read_long
-from crazyem.recordings.csv_text import read_header, split_header
-from crazyem.recordings.csv_wide import read_wide, read_wide_parts
-from crazyem.recordings.mapping import mapping_for
+from crazyem.recordings.csv.long import read_long
+from crazyem.recordings.csv.mapping import mapping_for
+from crazyem.recordings.csv.text import read_header, split_header
+from crazyem.recordings.csv.wide import read_wide, read_wide_parts
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
 from crazyem.links.clock import STAMP_MODULUS, StampUnwrapper
+from crazyem.recordings.autopilots.frd_ned import euler_from_quaternions, stacked
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.frd_ned import euler_from_quaternions, stacked
 from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.recording import Recording, SignalArray
-from crazyem.recordings.ros2_messages import MessageType, Rows, rows_of
+from crazyem.recordings.ros.ros2_messages import MessageType, Rows, rows_of
 from crazyem.recordings.tables import Table, signals_from_tables
 from crazyem.recordings.topics import Mapped, Topic, ranks, seconds, signals_of, text_of
 

@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.recordings import mcap_scan
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.mcap_scan import HEAD, MAGIC, MESSAGE_HEAD, Loss, Problem
+from crazyem.recordings.mcap import scan as mcap_scan
+from crazyem.recordings.mcap.scan import HEAD, MAGIC, MESSAGE_HEAD, Loss, Problem
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
-from crazyem.recordings.ros2_messages import LARGEST_MESSAGE, MessageType, message_type
-from crazyem.recordings.rosbag2_signals import ROBOT_TYPES, WORLD_TOPICS, BagTopic, Told, recording_of
+from crazyem.recordings.ros.ros2_messages import LARGEST_MESSAGE, MessageType, message_type
+from crazyem.recordings.ros.rosbag2_signals import ROBOT_TYPES, WORLD_TOPICS, BagTopic, Told, recording_of
 from crazyem.recordings.topics import text_of
 
 _PROFILE = b"ros2"
@@ -237,7 +237,7 @@ def _inner(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _parsed(opcode: int, data: bytes) -> Any:
-    from crazyem.recordings.mcap_survey import parse
+    from crazyem.recordings.mcap.survey import parse
 
     return parse(opcode, data)
 

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.recordings import mcap_scan
-from crazyem.recordings.mcap_messages import PROFILE
-from crazyem.recordings.mcap_output import Output
-from crazyem.recordings.mcap_scan import HEAD, MAGIC, Loss, Problem, Scan
-from crazyem.recordings.mcap_survey import Part, from_summary, index_of, parse, parts, profile_of
+from crazyem.recordings.mcap import scan as mcap_scan
+from crazyem.recordings.mcap.messages import PROFILE
+from crazyem.recordings.mcap.output import Output
+from crazyem.recordings.mcap.scan import HEAD, MAGIC, Loss, Problem, Scan
+from crazyem.recordings.mcap.survey import Part, from_summary, index_of, parse, parts, profile_of
 
 
 @dataclass

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.recordings.mcap_scan import HEAD, MAGIC, MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX
+from crazyem.recordings.mcap.scan import HEAD, MAGIC, MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX
 
 CHUNK_BYTES = 256 * 1024
 ANNOUNCE_EVERY = 20  # chunks

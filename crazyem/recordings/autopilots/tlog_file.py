@@ -15,9 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
-from crazyem.recordings.contents import contents
-from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.frd_ned import (
+from crazyem.recordings.autopilots.frd_ned import (
     ATTITUDE,
     BODY,
     MOTORS,
@@ -30,9 +28,11 @@ from crazyem.recordings.frd_ned import (
     stacked,
     vectors,
 )
+from crazyem.recordings.autopilots.tlog_frames import MESSAGES, Frames, Frameset, columns_of, scan, units_of
+from crazyem.recordings.contents import contents
+from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Event, Recording
-from crazyem.recordings.tlog_frames import MESSAGES, Frames, Frameset, columns_of, scan, units_of
 from crazyem.recordings.topics import Source, Topic, damage, named, seconds, signals_of, text_of
 
 _MILLI_G = 9.80665e-3  # m/s^2, the standard gravity of autopilots

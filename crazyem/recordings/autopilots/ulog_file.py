@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 from pyulog import ULog
 
 from crazyem.errors import FileFormatError
-from crazyem.recordings.contents import contents
-from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.frd_ned import (
+from crazyem.recordings.autopilots.frd_ned import (
     ATTITUDE,
     BODY,
     MOTORS,
@@ -29,10 +27,12 @@ from crazyem.recordings.frd_ned import (
     stacked,
     vectors,
 )
+from crazyem.recordings.autopilots.ulog_scan import HEADER, MAGIC, Scan, scan, unknown_flags
+from crazyem.recordings.contents import contents
+from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.topics import Source, Topic, damage, named, ranks, seconds, signals_of, text_of
-from crazyem.recordings.ulog_scan import HEADER, MAGIC, Scan, scan, unknown_flags
 
 CLOCK = "autopilot"  # microseconds since boot
 _RPM = 2.0 * math.pi / 60.0

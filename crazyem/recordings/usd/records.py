@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.recordings.usd_format import EventType
+from crazyem.recordings.usd.format import EventType
 
 _STREAK = 16  # records of one kind in a row before a run is guessed
 _WINDOW = 1 << 16  # records compared at once, at most: bounds the memory of a comparison

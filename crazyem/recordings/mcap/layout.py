@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from crazyem.recordings.mcap_messages import WORLD
+from crazyem.recordings.mcap.messages import WORLD
 
 _INERTIA_SHOWN = 6e-5  # kg m^2, top of the axis: intervals of the first second would flatten all that follows
 _COLOURS = ("#4e98e2", "#f5774d", "#6ac27c", "#b678d9")

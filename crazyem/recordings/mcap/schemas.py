@@ -16,7 +16,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from crazyem.signals.packet import Block, Packet, Variable
 
 if TYPE_CHECKING:
-    from crazyem.recordings.stream_codec import FixedMessages
+    from crazyem.recordings.mcap.stream_codec import FixedMessages
 
 _F = descriptor_pb2.FieldDescriptorProto
 _TYPES = {
@@ -211,7 +211,7 @@ class BlockCodec:
 
     def table(self) -> "FixedMessages":
         """The same messages as arrays: fields firmware_time_ms, host_time, then the variables."""
-        from crazyem.recordings.stream_codec import FixedMessages
+        from crazyem.recordings.mcap.stream_codec import FixedMessages
 
         return FixedMessages(["<i8", "<f8", *("<f8" for _ in self.block.variables)])
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from crazyem.errors import FileFormatError
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.mcap_content import Content, join
-from crazyem.recordings.mcap_findings import OWN_METADATA, finding_of, findings_from_json
-from crazyem.recordings.mcap_messages import PROFILE
-from crazyem.recordings.mcap_scan import MAGIC, Loss, Problem
-from crazyem.recordings.mcap_survey import Part, from_summary, parts, profile_of
+from crazyem.recordings.mcap.content import Content, join
+from crazyem.recordings.mcap.findings import OWN_METADATA, finding_of, findings_from_json
+from crazyem.recordings.mcap.messages import PROFILE
+from crazyem.recordings.mcap.scan import MAGIC, Loss, Problem
+from crazyem.recordings.mcap.survey import Part, from_summary, parts, profile_of
 from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording, SignalArray

@@ -253,7 +253,7 @@ def _unpack_lz4(chunk: PackedChunk) -> bytes:
 
 def scan(data: bytes) -> Scan:
     """The records in the bytes of a chunk. Raises ValueError where they make no sense."""
-    from crazyem.recordings.mcap_kernel import count, fill  # numba takes a second to import
+    from crazyem.recordings.mcap.kernel import count, fill  # numba takes a second to import
 
     array = np.frombuffer(data, np.uint8)
     counts = np.zeros(2, np.int64)

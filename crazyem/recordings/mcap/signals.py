@@ -1,6 +1,6 @@
 """Writing any recording as MCAP of ours: one channel a stream, its signals exact, in the order of processing.
 
-What `mcap_file.read` makes of it is the same recording: times, values, host times and marks bit for bit, units, frames,
+What `mcap.file.read` makes of it is the same recording: times, values, host times and marks bit for bit, units, frames,
 clocks and sources, events, findings and metadata. docs/formats/mcap.md has the channels.
 """
 
@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import UsageError
-from crazyem.recordings import schemas
 from crazyem.recordings.finding import Finding, Grade
-from crazyem.recordings.mcap_findings import OWN_METADATA, findings_to_json
-from crazyem.recordings.mcap_messages import (
+from crazyem.recordings.mcap import schemas
+from crazyem.recordings.mcap.findings import OWN_METADATA, findings_to_json
+from crazyem.recordings.mcap.messages import (
     EVENTS,
     FINDINGS,
     OTHER_EVENTS,
@@ -30,10 +30,10 @@ from crazyem.recordings.mcap_messages import (
     pose_messages,
     versions,
 )
-from crazyem.recordings.mcap_output import Output
-from crazyem.recordings.mcap_scan import MESSAGE, MESSAGE_HEAD
+from crazyem.recordings.mcap.output import Output
+from crazyem.recordings.mcap.scan import MESSAGE, MESSAGE_HEAD
+from crazyem.recordings.mcap.stream_codec import MOST_FIELDS, MOST_SIGNALS, Column, StreamLayout, unique_name
 from crazyem.recordings.recording import Event, Recording, SignalArray
-from crazyem.recordings.stream_codec import MOST_FIELDS, MOST_SIGNALS, Column, StreamLayout, unique_name
 
 _EPOCH = (9.0e8, 4.2e9)  # s: stamps between 1998 and 2103 are taken for times since 1970
 _LEVELS = {Grade.HARMLESS: 2, Grade.DEGRADES: 3, Grade.UNUSABLE: 4}  # of foxglove.Log

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
-from crazyem.recordings.csv_signals import Layout, Rows, signals_of
-from crazyem.recordings.csv_text import Columns, Damage, Header, read_columns
+from crazyem.recordings.csv.interpolation import CONTEXT
+from crazyem.recordings.csv.mapping import CsvMapping, SignalColumns
+from crazyem.recordings.csv.signals import Layout, Rows, signals_of
+from crazyem.recordings.csv.text import Columns, Damage, Header, read_columns
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.interpolation import CONTEXT
-from crazyem.recordings.mapping import CsvMapping, SignalColumns
 from crazyem.recordings.recording import Recording
 from crazyem.signals.sample import SIGNALS
 

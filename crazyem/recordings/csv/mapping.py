@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.recordings.mapping_units import is_electrical, time_divisor, unit_factor
+from crazyem.recordings.csv.mapping_units import is_electrical, time_divisor, unit_factor
 from crazyem.signals.sample import SIGNALS, components
 
 BODY_AXES, WORLD_AXES = ("FLU", "FRD"), ("ENU", "NED")
@@ -154,7 +154,7 @@ def load_mapping(text: str, where: str) -> CsvMapping:
 @functools.cache
 def known_mappings() -> tuple[CsvMapping, ...]:
     """The mappings that ship with crazyem, the most demanding first."""
-    folder = resources.files("crazyem.recordings") / "mappings"
+    folder = resources.files("crazyem.recordings.csv") / "mappings"
     files = sorted((f for f in folder.iterdir() if f.name.endswith(".toml")), key=lambda f: f.name)
     loaded = (load_mapping(f.read_text(encoding="utf-8"), f.name) for f in files)
     return tuple(sorted(loaded, key=lambda m: -len(m.recognise)))

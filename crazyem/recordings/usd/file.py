@@ -13,8 +13,8 @@ from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Event, Recording
 from crazyem.recordings.tables import Table, signals_from_tables
-from crazyem.recordings.usd_format import LETTERS, STAMPS, EventType, Header, parse_header, plausible
-from crazyem.recordings.usd_records import Records, gather, locate
+from crazyem.recordings.usd.format import LETTERS, STAMPS, EventType, Header, parse_header, plausible
+from crazyem.recordings.usd.records import Records, gather, locate
 
 _CRC_BYTES = 4
 _DAMAGE_ADVICE = "Copy the file from the card again; what stands before the place named was read."

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.recordings import schemas
+from crazyem.recordings.mcap import schemas
 
 MOST_SIGNALS = 60  # in one message, a bit each in `marked`
 MOST_FIELDS = 4096  # in one message; guards against metadata that claim anything
@@ -61,7 +61,7 @@ class FixedMessages:
         """
         rows = np.empty((offsets.size, self.size), np.uint8)
         if offsets.size:
-            from crazyem.recordings.mcap_kernel import gather  # numba takes a second to import
+            from crazyem.recordings.mcap.kernel import gather  # numba takes a second to import
 
             gather(data, offsets, rows)
         sound = (rows[:, self._tags] == self._blank[self._tags]).all(axis=1)

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.recordings.autopilots.frd_ned import quaternions_from_euler
+from crazyem.recordings.csv.interpolation import corners, interpolated_rows
+from crazyem.recordings.csv.mapping import SignalColumns
 from crazyem.recordings.finding import Finding, Grade, intervals_of
-from crazyem.recordings.frd_ned import quaternions_from_euler
-from crazyem.recordings.interpolation import corners, interpolated_rows
-from crazyem.recordings.mapping import SignalColumns
 from crazyem.recordings.recording import SignalArray
 from crazyem.signals.sample import SIGNALS
 

@@ -12,10 +12,10 @@ from typing import Any
 from mcap.records import MetadataIndex, Schema
 
 from crazyem.errors import FileFormatError
-from crazyem.recordings.mcap_messages import PROFILE
-from crazyem.recordings.mcap_output import Book, index_record, note_chunk
-from crazyem.recordings.mcap_scan import DATA_END, HEAD, MAGIC, MESSAGE_INDEX, METADATA, Loss, Problem
-from crazyem.recordings.mcap_survey import Part, index_of, parse, parts, profile_of
+from crazyem.recordings.mcap.messages import PROFILE
+from crazyem.recordings.mcap.output import Book, index_record, note_chunk
+from crazyem.recordings.mcap.scan import DATA_END, HEAD, MAGIC, MESSAGE_INDEX, METADATA, Loss, Problem
+from crazyem.recordings.mcap.survey import Part, index_of, parse, parts, profile_of
 
 
 @dataclass

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.recordings import mcap_scan, schemas
-from crazyem.recordings.mcap_messages import EVENTS, OTHER_EVENTS, fields_of
-from crazyem.recordings.mcap_survey import Part, parse
+from crazyem.recordings.mcap import scan as mcap_scan
+from crazyem.recordings.mcap import schemas
+from crazyem.recordings.mcap.messages import EVENTS, OTHER_EVENTS, fields_of
+from crazyem.recordings.mcap.stream_codec import MOST_FIELDS, MOST_SIGNALS, FixedMessages, StreamLayout
+from crazyem.recordings.mcap.survey import Part, parse
 from crazyem.recordings.recording import Event, SignalArray
-from crazyem.recordings.stream_codec import MOST_FIELDS, MOST_SIGNALS, FixedMessages, StreamLayout
 from crazyem.recordings.tables import Table
 from crazyem.signals.packet import Block
 

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from crazyem.errors import UsageError
 from crazyem.links.base import LinkStatistics, ParameterWrite
-from crazyem.recordings import schemas
-from crazyem.recordings.mcap_messages import EVENTS, POSE_EVERY, PROFILE, pose_messages, timestamp, versions
-from crazyem.recordings.mcap_output import Output
+from crazyem.recordings.mcap import schemas
+from crazyem.recordings.mcap.messages import EVENTS, POSE_EVERY, PROFILE, pose_messages, timestamp, versions
+from crazyem.recordings.mcap.output import Output
 from crazyem.signals.packet import Block, Packet
 from crazyem.signals.sample import Sample
 from crazyem.signals.vocabulary import BlockDecoder, decoders
@@ -93,7 +93,7 @@ class RecordingWriter:
         self._thread.start()
 
     def _reopen(self, path: Path) -> None:
-        from crazyem.recordings.append import reopen
+        from crazyem.recordings.mcap.append import reopen
 
         before = reopen(path)
         self._file = before.stream

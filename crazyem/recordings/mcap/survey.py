@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.recordings import mcap_scan
-from crazyem.recordings.mcap_scan import HEAD, MAGIC, MESSAGE_HEAD, Loss, PackedChunk, Problem, Record, Scan
+from crazyem.recordings.mcap import scan as mcap_scan
+from crazyem.recordings.mcap.scan import HEAD, MAGIC, MESSAGE_HEAD, Loss, PackedChunk, Problem, Record, Scan
 
 RATIO = 100  # a file that unpacks to more than this many times its size (and 64 MiB) is a bomb; flights have 2 to 5
 _BATCH = 256 * 1024  # bytes of records outside chunks that are looked at together

@@ -1,0 +1,1 @@
+"""Logs of PX4 and MAVLink autopilots."""

@@ -1,0 +1,1 @@
+"""CSV files: any through a mapping, cfclient's, and our own exports."""
