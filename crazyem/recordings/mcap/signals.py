@@ -232,7 +232,8 @@ class _Clock:
 
     def of(self, time: NDArray[np.float64], host_time: NDArray[np.float64]) -> NDArray[np.float64]:
         """ns, NaN where not known."""
-        return (host_time if self.host_known else time + self.shift) * 1e9
+        with np.errstate(over="ignore"):  # an absurd stamp becomes infinite here, and is clipped where it is written
+            return (host_time if self.host_known else time + self.shift) * 1e9
 
 
 class _Extra:
@@ -350,7 +351,7 @@ def _poses(output: Output, recording: Recording, ranks: Mapping[str, NDArray[np.
         return []
     if position.value.shape[1] != 3 or attitude.value.shape[1] != 4:
         return []
-    whole = np.isfinite(attitude.value.sum(axis=1))
+    whole = np.isfinite(attitude.value).all(axis=1)
     turns = np.argsort(ranks["attitude"])
     turns = turns[whole[turns]]
     log_times = clock.of(position.time, position.host_time)
