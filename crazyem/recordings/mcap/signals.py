@@ -232,7 +232,7 @@ class _Clock:
 
     def of(self, time: NDArray[np.float64], host_time: NDArray[np.float64]) -> NDArray[np.float64]:
         """ns, NaN where not known."""
-        with np.errstate(over="ignore", invalid="ignore"):  # an absurd stamp becomes infinite here, and is clipped where it is written
+        with np.errstate(over="ignore", invalid="ignore"):  # absurd stamps become infinite; writing clips them
             return (host_time if self.host_known else time + self.shift) * 1e9
 
 
