@@ -12,6 +12,7 @@ from crazyem.doctor.identifiability import Verdict, identifiability
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
 
+_MOST_ENTRIES = 12  # of a section of metadata that are shown as text
 _LONGEST_TEXT = 120  # characters of a metadata value that are shown
 
 
@@ -223,7 +224,12 @@ def _listed(values: dict[str, Any]) -> dict[str, Any]:
 
 def _metadata_lines(metadata: Mapping[str, Mapping[str, str]]) -> list[str]:
     return [
-        f"  {section}: " + ", ".join(f"{key} {value}" for key, value in values.items())
+        f"  {section}: "
+        + (
+            ", ".join(f"{key} {value}" for key, value in values.items())
+            if len(values) <= _MOST_ENTRIES
+            else f"{len(values)} entries (--json shows them)"
+        )
         for section, values in metadata.items()
     ]
 
