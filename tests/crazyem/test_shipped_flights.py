@@ -35,8 +35,8 @@ def test_the_lossy_flight_lost_what_the_link_counted():
     for name, lost in by_stamps.items():
         # a late record beside a lost one may hide it: the doctor counts what certainly is missing
         assert 0.97 * lost <= found[name] <= lost, name
-    # the link also counts what it lost after the last packet that was recorded
-    assert 0 <= counted - sum(by_stamps.values()) <= 8
+    # a stamp that jitters at either end of a block makes room for one record more or less
+    assert abs(counted - sum(by_stamps.values())) <= len(by_stamps)
     assert 0.07 < counted / (counted + int(recording.metadata["statistics"]["received"])) < 0.13
 
 
