@@ -243,7 +243,7 @@ def _unpack_zstd(chunk: PackedChunk) -> bytes:
 
 
 def _unpack_lz4(chunk: PackedChunk) -> bytes:
-    import lz4.frame  # type: ignore[import-untyped]
+    import lz4.frame
 
     try:
         return bytes(lz4.frame.LZ4FrameDecompressor().decompress(bytes(chunk.packed), max_length=chunk.size + 1))

@@ -351,7 +351,7 @@ def _poses(output: Output, recording: Recording, ranks: Mapping[str, NDArray[np.
         return []
     if position.value.shape[1] != 3 or attitude.value.shape[1] != 4:
         return []
-    whole = np.isfinite(attitude.value).all(axis=1)
+    whole = np.asarray(np.isfinite(attitude.value).all(axis=1))
     turns = np.argsort(ranks["attitude"])
     turns = turns[whole[turns]]
     log_times = clock.of(position.time, position.host_time)
