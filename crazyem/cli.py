@@ -73,6 +73,7 @@ def parser() -> argparse.ArgumentParser:
     fly.add_argument("--duration", type=seconds, default=20.0, metavar="S", help="of the trajectory (default: 20)")
     fly.add_argument("--no-push", action="store_true", help="estimate only, write no parameters")
     fly.add_argument("--record", metavar="FILE.mcap", help="record everything")
+    fly.add_argument("--append", action="store_true", help="to an existing recording, as its next session")
     fly.add_argument("--scenario", metavar="FILE", help="the simulator's truth (only the simulator reads it)")
     fly.add_argument("--seed", type=_integer(0, 2**31 - 1), help="of the simulator's noise (default: 0)")
     fly.add_argument(
@@ -87,6 +88,7 @@ def parser() -> argparse.ArgumentParser:
     watch.add_argument("uri", metavar="URI")
     watch.add_argument("--duration", type=_number(0.1, 1e6, " seconds"), metavar="S", help="s until it ends by itself")
     watch.add_argument("--record", metavar="FILE.mcap", help="record everything")
+    watch.add_argument("--append", action="store_true", help="to an existing recording, as its next session")
     _on_recordings(commands)
     return top
 

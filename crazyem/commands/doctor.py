@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     report = Report(arguments)
     if arguments.output is not None and not arguments.fix:
         raise UsageError("-o is where --fix writes; without --fix nothing is written.")
-    files = find(arguments.files)
+    files = find(arguments.files, mapping=arguments.map)
     options = read_options(arguments)
     outputs: list[Path | None] = [None] * len(files.found)
     if arguments.fix:

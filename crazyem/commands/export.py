@@ -16,7 +16,7 @@ from crazyem.recordings.parts import can_be_parted, is_large, open_parts
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     report = Report(arguments)
-    files = find(arguments.files)
+    files = find(arguments.files, mapping=arguments.map)
     suffix = f".{arguments.format or 'csv'}"
     outputs = targets(files.found, arguments.output, suffix, force=arguments.force)
     for output in outputs:

@@ -11,9 +11,11 @@ from typing import Any
 from crazyem.commands.output import complain
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings import ReadOptions
+from crazyem.recordings.csv.file import has_mapping
 from crazyem.recordings.registry import READERS, reader_of
 
-# What the reader of any CSV takes in a folder: text with commas is everywhere. A file named by the user is always read.
+# What the reader of any CSV takes in a folder: text with commas is everywhere, so name and columns must fit (with
+# --map the name alone). A file named by the user is always read.
 _ANY_CSV, _CSV_NAMES = "CSV", (".csv", ".csv.gz", ".tsv", ".tsv.gz")
 _SUFFIXES = (".gz", ".csv", ".tsv", ".txt", ".mcap", ".ulg", ".tlog", ".bin", ".db3")
 
@@ -39,15 +41,19 @@ class Files:
     skipped: int = 0
 
 
-def find(arguments: Iterable[str]) -> Files:
+def find(arguments: Iterable[str], *, mapping: str | None = None) -> Files:
     """Recordings named by files, folders (searched through) and patterns; each once.
 
     In folders and patterns, files that no reader knows are counted, not read; so are hidden ones not even counted.
     A folder that is a recording itself (rosbag2, a cfclient session) counts as one.
 
+    Args:
+        arguments: of the command line.
+        mapping: --map; with it every CSV file in a folder counts, whatever its columns.
+
     Raises: UsageError if nothing is left.
     """
-    search = _Search()
+    search = _Search(mapped=mapping is not None)
     names = list(arguments)
     for name in names:
         search.argument(name)
@@ -58,7 +64,8 @@ def find(arguments: Iterable[str]) -> Files:
 
 
 class _Search:
-    def __init__(self) -> None:
+    def __init__(self, *, mapped: bool) -> None:
+        self.mapped = mapped
         self.found: list[Found] = []
         self.skipped = 0
         self._seen: set[str] = set()
@@ -87,7 +94,7 @@ class _Search:
     def _matched(self, path: Path) -> None:
         if path.is_dir():
             self._folder(path)
-        elif path.is_file() and _is_recording(path):
+        elif path.is_file() and _is_recording(path, mapped=self.mapped):
             self._take(path, "")
         else:
             self.skipped += 1
@@ -119,7 +126,7 @@ class _Search:
                         self._take(path, _below(folder, top))
                     else:
                         inner.append(path)
-                elif _is(entry, stat.S_ISREG) and _is_recording(path):
+                elif _is(entry, stat.S_ISREG) and _is_recording(path, mapped=self.mapped):
                     self._take(path, _below(folder, top))
                 else:
                     self.skipped += 1
@@ -145,7 +152,7 @@ def _is(entry: os.DirEntry[str], kind: Any) -> bool:
         return False
 
 
-def _is_recording(path: Path) -> bool:
+def _is_recording(path: Path, *, mapped: bool) -> bool:
     try:
         reader = reader_of(path)
     except FileFormatError:
@@ -153,7 +160,14 @@ def _is_recording(path: Path) -> bool:
         return path.name.lower().endswith(".csv.gz")
     except UsageError:
         return True  # cannot be opened: reading it says why
-    return reader.name != _ANY_CSV or path.name.lower().endswith(_CSV_NAMES)
+    if reader.name != _ANY_CSV:
+        return True
+    if not path.name.lower().endswith(_CSV_NAMES):
+        return False
+    try:
+        return mapped or has_mapping(path)
+    except (FileFormatError, UsageError):
+        return True  # damaged: reading it says how
 
 
 def _is_recording_folder(path: Path) -> bool:

@@ -112,7 +112,9 @@ def _fly(arguments: argparse.Namespace, *, plan: FlightPlan, vehicle: Any, uri: 
             "push": plan.push,
             "seed": arguments.seed or 0 if not arguments.uri else None,
         }
-        recorder = open_recorder(arguments.record, configuration=configuration, vehicle=vehicle, link=link)
+        recorder = open_recorder(
+            arguments.record, configuration=configuration, vehicle=vehicle, link=link, append=arguments.append
+        )
         if recorder is not None:
             stack.callback(recorder.close)
         session = Session(

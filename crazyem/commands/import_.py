@@ -13,7 +13,7 @@ from crazyem.recordings import ReadOptions, Recording, open_recording
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     report = Report(arguments)
-    files = find(arguments.files)
+    files = find(arguments.files, mapping=arguments.map)
     outputs = targets(files.found, arguments.output, ".mcap", force=arguments.force)
     options = read_options(arguments)
     tasks = [(str(f.path), str(o), options, arguments.force) for f, o in zip(files.found, outputs, strict=True)]

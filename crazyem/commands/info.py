@@ -17,7 +17,7 @@ def run(arguments: argparse.Namespace) -> int:
     report = Report(arguments)
     if arguments.vehicle:
         load_vehicle(arguments.vehicle)  # a mistake in it is one error, not one for each file
-    files = find(arguments.files)
+    files = find(arguments.files, mapping=arguments.map)
     options = read_options(arguments)
     tasks = [
         (str(f.path), options, arguments.vehicle, arguments.parts, processes(arguments.jobs, len(files.found)))

@@ -42,7 +42,9 @@ def run(arguments: argparse.Namespace) -> int:
         configuration = {
             "command": "watch", "uri": arguments.uri, "window": arguments.window, "every": arguments.every,
         }  # fmt: skip
-        recorder = open_recorder(arguments.record, configuration=configuration, vehicle=vehicle, link=link)
+        recorder = open_recorder(
+            arguments.record, configuration=configuration, vehicle=vehicle, link=link, append=arguments.append
+        )
         if recorder is not None:
             stack.callback(recorder.close)
         session = Session(link, vehicle=vehicle, estimator=new_estimator(vehicle, arguments), recorder=recorder)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from crazyem.recordings.csv.long import read_long
-from crazyem.recordings.csv.mapping import mapping_for
+from crazyem.recordings.csv.mapping import known_mappings, mapping_for
 from crazyem.recordings.csv.text import read_header, split_header
 from crazyem.recordings.csv.wide import read_wide, read_wide_parts
 from crazyem.recordings.options import ReadOptions
@@ -18,6 +18,12 @@ def recognises(head: bytes) -> bool:
     except UnicodeDecodeError:
         return False
     return len(names) > 1 and all(name.isprintable() for name in names)
+
+
+def has_mapping(path: Path) -> bool:
+    """Whether a shipped mapping knows the columns of this file. Raises FileFormatError if it has no readable header."""
+    columns = set(read_header(path).names)
+    return any(set(mapping.recognise) <= columns for mapping in known_mappings())
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
