@@ -144,25 +144,33 @@ def envelope(recording: Recording, air: Airborne) -> Envelope:
         found["speed_max_m_s"], found["speed_rms_m_s"] = float(norm.max()), float(np.sqrt(np.mean(norm**2)))
         found["vertical_speed_min_m_s"] = float(velocity[:, 2].min())
         found["vertical_speed_max_m_s"] = float(velocity[:, 2].max())
+        del velocity, norm  # of a long flight, one signal at a time
+    del speed
     for name, upright in (("attitude", _upright_of_quaternion), ("euler", _upright_of_euler)):
         value = inside_of(recording, name, air)
         if value is not None:
             found["tilt_from"] = name
             found["tilt_max_deg"] = float(np.degrees(np.arccos(np.clip(upright(value).min(), -1.0, 1.0))))
             break
+    value = None
     rate = inside_of(recording, "body_rate", air)
     if rate is not None:
         found["body_rate_max_rad_s"] = tuple(float(r) for r in np.abs(rate).max(axis=0))
+    del rate
     position = inside_of(recording, "position", air)
     if position is not None:
         found["altitude_min_m"], found["altitude_max_m"] = float(position[:, 2].min()), float(position[:, 2].max())
+    del position
     acceleration = inside_of(recording, "acceleration", air)
     if acceleration is not None:
         found["acceleration_max_m_s2"] = float(np.linalg.norm(acceleration, axis=1).max())
+    del acceleration
     force = inside_of(recording, "specific_force", air)
     if force is not None:
         norm = np.linalg.norm(force, axis=1)
         found["specific_force_min_m_s2"], found["specific_force_max_m_s2"] = float(norm.min()), float(norm.max())
+        del norm
+    del force
     voltage = inside_of(recording, "voltage", air)
     if voltage is not None:
         found["voltage_start_V"], found["voltage_end_V"] = float(voltage[0, 0]), float(voltage[-1, 0])

@@ -9,7 +9,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 Array = NDArray[np.float64]
 
@@ -106,7 +105,10 @@ def autoregression(parts: list[Array]) -> Array:
 
 def filtered(weights: Array, part: Array) -> Array:
     """A stretch (k,) or (k, p) through the whitening filter, without its first rows."""
-    return np.asarray(lfilter(weights, [1.0], part, axis=0))[ORDER:]
+    # what scipy.signal.lfilter does, to the bit; importing that takes a second
+    if part.ndim == 1:
+        return np.convolve(weights, part)[ORDER : part.size]
+    return np.column_stack([np.convolve(weights, column)[ORDER : column.size] for column in part.T])
 
 
 def _inflation(terms: Array, covariance: Array) -> Array:

@@ -2,11 +2,10 @@
 
 import csv
 import gzip
-import io
 import json
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -22,9 +21,11 @@ from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.signals.sample import SIGNALS, components
 
-_BLOCK = 4 << 20  # bytes of text parsed at a time
+_BLOCK = 2 << 20  # bytes of text parsed at a time
 _LONGEST_LINE = 4 << 20
 _LARGEST_DESCRIPTION = 256 << 20
+_GROWTH = 1.25  # of arrays that are full
+_MOST_AHEAD = 8.0
 _UNPACKED = 64 << 20, 50  # a gzip file may grow to the first, or by the second, whichever is more
 
 Floats = NDArray[np.float64]
@@ -44,34 +45,127 @@ def read(path: Path, options: ReadOptions) -> Recording:
     Raises: FileFormatError naming line or column.
     """
     table = _Table(path)
-    blocks = list(table.blocks())
-    return table.recording(blocks, 0)
+    held = _Held(table.description.entries)
+    for batch, first, ahead in table.batches():
+        held.add(batch, first, ahead, path)
+    return table.recording(held)
 
 
 def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Iterator[Recording]:
     """Consecutive stretches of at least `seconds` of an exported recording; events come with the first."""
     table = _Table(path)
-    held: list[_Block] = []
-    rows = 0
-    for block in table.blocks():
-        held.append(block)
-        if not float(block.time[-1]) - float(held[0].time[0]) < seconds:
-            yield table.recording(held, rows)
-            rows += sum(b.time.size for b in held)
-            held = []
-    if held or not rows:
-        yield table.recording(held, rows)
+    held = _Held(table.description.entries)
+    for batch, first, _ in table.batches():
+        held.add(batch, first, 1.0, path)
+        if not float(held.time.rows[-1]) - float(held.time.rows[0]) < seconds:
+            yield table.recording(held)
+            held = _Held(table.description.entries, held.first + held.time.size)
+    if held.time.size or not held.first:
+        yield table.recording(held)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Block:
-    """Some rows: (r,) stamps and host times; for each signal the rows with a sample of it, (k, c) values, marks."""
+class _Growing:
+    """(n,) or (n, width) values that rows are appended to."""
 
-    time: Floats
-    host_time: Floats
-    row: list[NDArray[np.int64]]
-    value: list[Floats]
-    marked: list[NDArray[np.bool_]]
+    def __init__(self, kind: type, width: int | None = None) -> None:
+        self._array: NDArray[Any] = np.empty(0 if width is None else (0, width), kind)
+        self.size = 0
+
+    def more(self, count: int, ahead: float) -> NDArray[Any]:
+        """Room for `count` rows after the last, to be filled; there may be `ahead` times as many in the end."""
+        size = self.size + count
+        if size > len(self._array):
+            # what is never filled takes up no memory; but what the first lines promise is not all believed
+            capacity = int(size * max(_GROWTH, min(1.05 * ahead, _MOST_AHEAD)))
+            larger = np.empty((capacity, *self._array.shape[1:]), self._array.dtype)
+            larger[: self.size] = self._array[: self.size]
+            self._array = larger
+        room = self._array[self.size : size]
+        self.size = size
+        return room
+
+    @property
+    def rows(self) -> NDArray[Any]:
+        """The rows so far."""
+        return self._array[: self.size]
+
+
+class _Held:
+    """Rows of the table that become one recording: stamps of all rows, and of each signal the rows that have it.
+
+    Filled a batch at a time, straight from the text into the arrays of the signals: a flight is held once.
+    """
+
+    def __init__(self, entries: tuple[SignalEntry, ...], first: int = 0) -> None:
+        self.entries = entries
+        self.first = first  # number of its first row in the file
+        self.time, self.host_time = _Growing(float), _Growing(float)
+        self.value = [_Growing(float, len(entry.parts)) for entry in entries]
+        self.order = [_Growing(np.int64) for _ in entries]
+        self.marked = [_Growing(bool) for _ in entries]
+
+    def add(self, batch: Any, line: int, ahead: float, path: Path) -> None:
+        """Append a RecordBatch whose first row is `line` of the file. Raises FileFormatError naming the row."""
+        count, before = batch.num_rows, self.first + self.time.size
+        time = batch.column(0).to_numpy(zero_copy_only=False)
+        if batch.column(0).null_count:
+            raise FileFormatError(f"{path}: row {line + int(np.argmax(np.isnan(time)))} has no time.")
+        self.time.more(count, ahead)[:] = time
+        self.host_time.more(count, ahead)[:] = batch.column(1).to_numpy(zero_copy_only=False)
+        column = 2
+        for place, entry in enumerate(self.entries):
+            parts = [batch.column(column + i) for i in range(len(entry.parts))]
+            column += len(parts)
+            row = _rows_with(parts, count)
+            value = self.value[place].more(row.size, ahead)
+            for i, part in enumerate(parts):
+                value[:, i] = part.to_numpy(zero_copy_only=False)[row]
+            self.order[place].more(row.size, ahead)[:] = (row + before) * len(self.entries) + place
+            marked = self.marked[place].more(row.size, ahead)
+            if entry.marked:
+                marked[:] = batch.column(column).to_numpy(zero_copy_only=False)[row] == 1.0
+                column += 1
+            else:
+                marked[:] = False
+
+    def signals(self) -> dict[str, SignalArray]:
+        """The signals; those of one stream share their stamps."""
+        signals: dict[str, SignalArray] = {}
+        shared: list[tuple[NDArray[np.int64], int, Floats, Floats]] = []
+        for place, entry in enumerate(self.entries):
+            order = self.order[place].rows
+            # the same rows: orders that differ by the places of the signals alone
+            known = next((k for k in shared if k[0].size == order.size and (order - k[0] == place - k[1]).all()), None)
+            if known is None:
+                known = (order, place, self._of(self.time, order), self._of(self.host_time, order))
+                shared.append(known)
+            signals[entry.name] = SignalArray(
+                known[2],
+                self.value[place].rows,
+                order,
+                known[3],
+                self.marked[place].rows,
+                quantity=entry.quantity,
+                unit=entry.unit,
+                frame=entry.frame,
+                clock=entry.clock,
+                stream=entry.stream,
+                source=entry.source,
+            )
+        return signals
+
+    def _of(self, stamps: _Growing, order: NDArray[np.int64]) -> Floats:
+        """Stamps of the rows that a signal has."""
+        if order.size == stamps.size:
+            return stamps.rows
+        return stamps.rows[order // len(self.entries) - self.first]
+
+
+def _rows_with(parts: list[Any], count: int) -> NDArray[np.int64]:
+    """Rows in which at least one of some columns has a value."""
+    if any(not part.null_count for part in parts):
+        return np.arange(count)
+    return np.flatnonzero(np.logical_or.reduce([p.is_valid().to_numpy(zero_copy_only=False) for p in parts]))
 
 
 class _Table:
@@ -121,94 +215,49 @@ class _Table:
     def _note(self, text: str, grade: Grade = Grade.HARMLESS) -> None:
         self.findings.append(note("integrity", text, grade))
 
-    def blocks(self) -> Iterator[_Block]:
-        """The rows of the file, in bounded memory. Raises FileFormatError naming line or column."""
+    def batches(self) -> Iterator[tuple[Any, int, float]]:
+        """The rows of the file, in bounded memory: (RecordBatch, line of its first row, how much longer the file is).
+
+        Raises FileFormatError naming line or column.
+        """
         import pyarrow as pa
         from pyarrow import csv as pa_csv
 
         names = [str(i) for i in range(len(self.titles))]
+        reading = pa_csv.ReadOptions(column_names=names, block_size=2 * _LONGEST_LINE, use_threads=False)
+        converting = pa_csv.ConvertOptions(column_types=dict.fromkeys(names, pa.float64()), null_values=[""])
+        first = 2
         with _open(self.path) as raw:
-            file = _WholeLines(raw, self.path)
-            try:
-                reader = pa_csv.open_csv(
-                    pa.PythonFile(file, mode="r"),
-                    read_options=pa_csv.ReadOptions(
-                        column_names=names, skip_rows=1, block_size=_BLOCK, use_threads=False
-                    ),
-                    convert_options=pa_csv.ConvertOptions(
-                        column_types={name: pa.float64() for name in names}, null_values=[""]
-                    ),
-                )
-                first = 2
-                for batch in reader:
-                    if batch.num_rows:
-                        yield self._block(batch, first)
-                        first += batch.num_rows
-            except pa.ArrowException as error:
-                if "Empty CSV file" not in str(error):
+            text = _Text(raw, self.path)
+            text.skip_line()
+            # a piece at a time, not as one stream: the threads that read ahead would keep what they had of each piece
+            for piece in text.pieces():
+                try:
+                    table = pa_csv.read_csv(pa.py_buffer(piece), reading, convert_options=converting)
+                except pa.ArrowException as error:
+                    if "Empty CSV file" in str(error):
+                        continue
                     raise FileFormatError(f"{self.path}: a line cannot be read ({_sentence(error)}).") from None
-        if file.damage:
-            self._note(file.damage, Grade.DEGRADES)
+                for batch in table.to_batches():
+                    yield batch, first, text.ahead
+                    first += batch.num_rows
+                    del batch
+                del table
+        if text.damage:
+            self._note(text.damage, Grade.DEGRADES)
 
-    def _block(self, batch: Any, first: int) -> _Block:
-        time = batch.column(0).to_numpy(zero_copy_only=False)
-        if batch.column(0).null_count:
-            raise FileFormatError(f"{self.path}: row {first + int(np.argmax(np.isnan(time)))} has no time.")
-        host = batch.column(1).to_numpy(zero_copy_only=False)
-        rows, values, marks = [], [], []
-        place = 2
-        for entry in self.description.entries:
-            count = len(entry.parts)
-            parts = [batch.column(i) for i in range(place, place + count)]
-            row = np.flatnonzero(np.logical_or.reduce([p.is_valid().to_numpy(zero_copy_only=False) for p in parts]))
-            rows.append(row)
-            values.append(np.column_stack([p.to_numpy(zero_copy_only=False)[row] for p in parts]))
-            place += count
-            marked = np.zeros(row.size, bool)
-            if entry.marked:
-                marked = batch.column(place).to_numpy(zero_copy_only=False)[row] == 1.0
-                place += 1
-            marks.append(marked)
-        return _Block(time, host, rows, values, marks)
-
-    def recording(self, blocks: list[_Block], first: int) -> Recording:
-        """The recording that some consecutive blocks make; `first` is the number of their first row."""
-        if not blocks:
+    def recording(self, held: _Held) -> Recording:
+        """The recording that some consecutive rows make."""
+        if not held.time.size:
             raise FileFormatError(f"{self.path}: there is a header but not a single sample.")
-        starts = np.cumsum([0, *(b.time.size for b in blocks)])
-        time = np.concatenate([b.time for b in blocks])
-        host = np.concatenate([b.host_time for b in blocks])
-        entries = self.description.entries
-        signals = {}
-        shared: dict[tuple[int, int, int], tuple[NDArray[np.int64], Floats, Floats]] = {}
-        for place, entry in enumerate(entries):
-            row = np.concatenate([b.row[place] + s for b, s in zip(blocks, starts[:-1], strict=True)])
-            # signals of one stream have the same rows: one array of stamps for all of them
-            key = (row.size, *((int(row[0]), int(row[-1])) if row.size else (0, 0)))
-            known = shared.get(key)
-            if known is None or not np.array_equal(known[0], row):
-                known = shared[key] = (row, time[row], host[row])
-            signals[entry.name] = SignalArray(
-                known[1],
-                np.concatenate([b.value[place] for b in blocks]),
-                (row + first) * len(entries) + place,
-                known[2],
-                np.concatenate([b.marked[place] for b in blocks]),
-                quantity=entry.quantity,
-                unit=entry.unit,
-                frame=entry.frame,
-                clock=entry.clock,
-                stream=entry.stream,
-                source=entry.source,
-            )
         known_of = self.description
         return Recording(
             str(self.path),
             known_of.source,
-            signals,
+            held.signals(),
             known_of.metadata or {},
             (*known_of.findings, *self.findings),
-            known_of.events if first == 0 else (),
+            known_of.events if held.first == 0 else (),
             known_of.origin,
         )
 
@@ -261,47 +310,47 @@ def _open(path: Path) -> IO[bytes]:
         raise FileFormatError(f"{path} cannot be read ({error.strerror or error}).") from None
 
 
-class _WholeLines(io.RawIOBase):
-    """A file as the parser reads it: up to its last newline, and as far as a damaged gzip file can be unpacked."""
+class _Text:
+    """The text of a file in pieces of whole lines: up to its last newline, or as far as a damaged gzip file goes."""
 
     def __init__(self, file: IO[bytes], path: Path) -> None:
         self.file, self.path = file, path
         self.damage = ""
-        self._ready = b""
+        self._size, self._taken = max(1, path.stat().st_size), 0
         self._tail = b""
-        self._ended = False
         packed = isinstance(file, gzip.GzipFile)
-        self._left = max(_UNPACKED[0], _UNPACKED[1] * path.stat().st_size) if packed else None
+        self._left = max(_UNPACKED[0], _UNPACKED[1] * self._size) if packed else None
 
-    def readable(self) -> bool:
-        return True
+    @property
+    def ahead(self) -> float:
+        """Size of the file over what was read of it, packed or not."""
+        return self._size / max(1, self._taken)
 
-    def read(self, size: int = -1) -> bytes:
-        """At most `size` bytes; b"" at the end."""
-        while not self._ready and not self._ended:
-            self._fill()
-        size = len(self._ready) if size < 0 else size
-        result, self._ready = self._ready[:size], self._ready[size:]
-        return result
+    def skip_line(self) -> None:
+        """Leave out the first line."""
+        self.file.readline(_LONGEST_LINE)
 
-    def _fill(self) -> None:
-        more = self._more()
-        if self._left is not None:
-            self._left -= len(more)
-            if self._left < 0:
-                raise FileFormatError(f"{self.path} unpacks to far more than a recording of its size would; not read.")
-        if not more:
-            self._ended = True
-            if self._tail and not self.damage:
-                self.damage = "The last line has no end; it was cut and is left out."
-            return
-        head, newline, tail = more.rpartition(b"\n")
-        if newline:
-            self._ready, self._tail = self._tail + head + newline, tail
-        else:
-            self._tail += tail
-        if len(self._tail) > _LONGEST_LINE:
-            raise FileFormatError(f"{self.path}: a line is longer than {_LONGEST_LINE >> 20} MiB.")
+    def pieces(self) -> Iterator[bytes]:
+        """The rest, a few MiB at a time."""
+        while more := self._more():
+            if self._left is not None:
+                self._left -= len(more)
+                if self._left < 0:
+                    raise FileFormatError(
+                        f"{self.path} unpacks to far more than a recording of its size would; not read."
+                    )
+            file = self.file.fileobj if isinstance(self.file, gzip.GzipFile) else self.file
+            self._taken = file.tell()
+            end = more.rfind(b"\n") + 1
+            if end:
+                yield self._tail + more[:end]
+                self._tail = more[end:]
+            else:
+                self._tail += more
+            if len(self._tail) > _LONGEST_LINE:
+                raise FileFormatError(f"{self.path}: a line is longer than {_LONGEST_LINE >> 20} MiB.")
+        if self._tail and not self.damage:
+            self.damage = "The last line has no end; it was cut and is left out."
 
     def _more(self) -> bytes:
         try:
