@@ -1,7 +1,7 @@
 """A recording as one table: which column holds which component of which signal, and which row which samples."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -153,7 +153,7 @@ def describe(parts: Iterable[Recording]) -> Description:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """The rows of a table: runs of samples, in processing order, with one stamp and one host time.
+    """Consecutive rows of a table: runs of samples, in processing order, with one stamp and one host time.
 
     Attributes:
         time: (r,) s.
@@ -168,24 +168,64 @@ class Rows:
     sample: dict[str, NDArray[np.int64]]
 
 
-def rows_of(recording: Recording, names: Iterable[str]) -> Rows:
-    """Samples of the named signals as rows.
+def rows_of(recording: Recording, names: Iterable[str], *, samples: int = 1 << 16) -> Iterator[Rows]:
+    """The named signals as rows, some at a time: what is held besides the recording does not grow with it.
 
     Samples that follow one another in processing order share a row if their stamps and host times are the same, bit
     for bit, and the columns of the later one are further right. So the order of the samples is the order of reading
     the table row by row, from left to right.
+
+    Args:
+        recording: any.
+        names: in the order of the columns; those that it does not have are left out.
+        samples: most that are taken of a signal at once.
     """
     arrays = {name: recording.signals[name] for name in names if name in recording.signals}
-    if not arrays:
-        empty = np.empty(0)
-        return Rows(empty, empty, {}, {})
-    order = np.concatenate([a.order for a in arrays.values()])
-    place = np.concatenate([np.full(a.order.size, i, np.int32) for i, a in enumerate(arrays.values())])
-    sample = np.concatenate([np.arange(a.order.size) for a in arrays.values()])
-    time = np.concatenate([np.asarray(a.time, float) for a in arrays.values()])
-    host = np.concatenate([np.asarray(a.host_time, float) for a in arrays.values()])
+    places = {name: _by_order(array.order) for name, array in arrays.items()}
+    orders = {name: a.order if places[name] is None else a.order[places[name]] for name, a in arrays.items()}
+    at, most = dict.fromkeys(arrays, 0), samples
+    while any(at[name] < order.size for name, order in orders.items()):
+        ends = _ends(orders, at, most)
+        taken = {name: _slice(places[name], at[name], ends[name]) for name in arrays}
+        rows = _rows(arrays, taken)
+        if any(ends[name] < order.size for name, order in orders.items()):
+            if rows.time.size < 2:  # the first row may go on
+                most *= 2
+                continue
+            rows = _without_last(rows)  # as this one may
+            ends = {name: at[name] + rows.row[name].size for name in arrays}
+        yield rows
+        at, most = ends, samples
+
+
+def _by_order(order: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """(n,) numbers of samples in processing order, None if they are in it."""
+    return None if (order[1:] >= order[:-1]).all() else np.argsort(order, kind="stable")
+
+
+def _slice(place: NDArray[np.int64] | None, begin: int, end: int) -> NDArray[np.int64]:
+    return np.arange(begin, end) if place is None else place[begin:end]
+
+
+def _ends(orders: dict[str, NDArray[np.int64]], at: dict[str, int], most: int) -> dict[str, int]:
+    """Up to where to take the samples of each signal: `most` of one of them, fewer of the others; at least one."""
+    full = [order[at[name] + most] for name, order in orders.items() if at[name] + most < order.size]
+    if not full:
+        return {name: order.size for name, order in orders.items()}
+    # samples of one order stay together, however many there are
+    first = min(int(order[at[name]]) for name, order in orders.items() if at[name] < order.size)
+    limit = max(int(min(full)), first + 1)
+    return {name: int(np.searchsorted(order, limit)) for name, order in orders.items()}
+
+
+def _rows(arrays: dict[str, SignalArray], taken: dict[str, NDArray[np.int64]]) -> Rows:
+    """Rows of some samples of each signal."""
+    order = np.concatenate([a.order[taken[name]] for name, a in arrays.items()])
+    place = np.concatenate([np.full(t.size, i, np.int32) for i, t in enumerate(taken.values())])
+    sample = np.concatenate(list(taken.values()))
+    time = np.concatenate([np.asarray(a.time, float)[taken[name]] for name, a in arrays.items()])
+    host = np.concatenate([np.asarray(a.host_time, float)[taken[name]] for name, a in arrays.items()])
     by_order = np.argsort(order, kind="stable")
-    del order
     place, sample, time, host = place[by_order], sample[by_order], time[by_order], host[by_order]
     host[np.isnan(host)] = np.nan  # one bit pattern, so that unknown equals unknown
     starts = np.ones(time.size, bool)
@@ -201,6 +241,17 @@ def rows_of(recording: Recording, names: Iterable[str]) -> Rows:
         host[starts],
         {name: row[w] for name, w in zip(arrays, where, strict=True)},
         {name: sample[w] for name, w in zip(arrays, where, strict=True)},
+    )
+
+
+def _without_last(rows: Rows) -> Rows:
+    count = rows.time.size - 1
+    kept = {name: int(np.searchsorted(row, count)) for name, row in rows.row.items()}
+    return Rows(
+        rows.time[:count],
+        rows.host_time[:count],
+        {name: row[: kept[name]] for name, row in rows.row.items()},
+        {name: sample[: kept[name]] for name, sample in rows.sample.items()},
     )
 
 

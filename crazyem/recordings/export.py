@@ -98,13 +98,13 @@ def _blocks(description: Description, parts: Iterable[Recording], schema: Any) -
     names = [entry.name for entry in description.entries]
     columns = description.columns
     for recording in parts:
-        rows = rows_of(recording, names)
-        for first in range(0, rows.time.size, _ROWS):
-            last = min(first + _ROWS, rows.time.size)
-            host = rows.host_time[first:last]
-            arrays = [pa.array(rows.time[first:last]), pa.array(host, mask=np.isnan(host))]
-            arrays += [_filled(recording, rows, column, first, last) for column in columns]
-            yield pa.record_batch(arrays, schema=schema)
+        for rows in rows_of(recording, names):
+            for first in range(0, rows.time.size, _ROWS):
+                last = min(first + _ROWS, rows.time.size)
+                host = rows.host_time[first:last]
+                arrays = [pa.array(rows.time[first:last]), pa.array(host, mask=np.isnan(host))]
+                arrays += [_filled(recording, rows, column, first, last) for column in columns]
+                yield pa.record_batch(arrays, schema=schema)
 
 
 def _filled(recording: Recording, rows: Rows, column: Column, first: int, last: int) -> Any:
