@@ -44,7 +44,8 @@ def test_help_is_quick_and_imports_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
-    assert all(word in done.stdout for word in ("fly", "replay", "watch", "info", "doctor", "import", "export", "recover", "layout"))
+    words = ("fly", "replay", "watch", "info", "doctor", "import", "export", "recover", "layout")
+    assert all(word in done.stdout for word in words)
 
 
 def test_options_named_in_the_interface_exist():
