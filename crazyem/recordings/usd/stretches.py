@@ -1,0 +1,219 @@
+"""A uSD card log a stretch at a time: a first look at all of the file, then its records; memory does not grow."""
+
+import gzip
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.errors import FileFormatError, UsageError
+from crazyem.recordings.contents import LARGEST_UNPACKED
+from crazyem.recordings.finding import Finding
+from crazyem.recordings.motor_meaning import MOTORS
+from crazyem.recordings.tables import Table
+from crazyem.recordings.usd.content import CRC_BYTES, Checksum, Clock, integrity, table
+from crazyem.recordings.usd.format import EventType, Header, parse_header
+from crazyem.recordings.usd.records import Records, gather, locate
+
+_PIECE = 1 << 22  # bytes read at a time
+_LONGEST_HEADER = 1 << 27  # bytes; what the limits of usd/format.py add up to is less
+_MOST_BYTES = 1 << 26  # of records in a stretch, however slowly its clock runs
+_SAMPLED = 1 << 19  # rows from which is decided what motor.m1..4 is
+
+Packed = list[NDArray[np.void]]  # records of each kind
+
+
+class Survey:
+    """What a look at a whole file tells, without keeping its records.
+
+    Attributes:
+        header: of the file.
+        size: of the file, unpacked [bytes].
+        checksum: of the file.
+        stop, unknown: where its last whole record ends and what follows there, as in `Records`.
+        counts: records of each kind.
+
+    Raises: FileFormatError if the header makes no sense or it cannot be unpacked; UsageError if it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.header = _header(path)
+        self.counts = [0] * len(self.header.events)
+        self.unknown: int | None = None
+        self.stop = self.header.size
+        samples = {k: _Sample() for k, e in enumerate(self.header.events) if set(MOTORS) <= set(e.variables)}
+        tail = b""
+        self.size, computed = 0, 0
+        for piece in _pieces(path):
+            self.size += len(piece)
+            tail += piece
+            computed = zlib.crc32(memoryview(tail)[:-CRC_BYTES], computed)
+            tail = tail[-CRC_BYTES:]
+        room = self.size >= self.header.size + CRC_BYTES
+        self.checksum = Checksum(int.from_bytes(tail, "little"), computed) if room else Checksum(None, None)
+        for begin, data, records in _walk(self):
+            self.stop, self.unknown = begin + records.stop, records.unknown
+            order = [np.flatnonzero(records.kind == kind) for kind in range(len(self.counts))]
+            for k, sample in samples.items():
+                sample.add(gather(data, self.header.events[k], records.start[order[k]]))
+            self.counts = [n + rows.size for n, rows in zip(self.counts, order, strict=True)]
+        self._samples = {k: sample.rows(self.header.events[k]) for k, sample in samples.items()}
+
+    def integrity(self, *, last: float) -> tuple[str, list[Finding]]:
+        """As `content.integrity`."""
+        return integrity(size=self.size, stop=self.stop, unknown=self.unknown, checksum=self.checksum, last=last)
+
+    def tables(self) -> list[Table]:
+        """Tables as the whole file has them, with some rows of those that hold motor.m1..4 and none of the others."""
+        result = []
+        for k, (event, count) in enumerate(zip(self.header.events, self.counts, strict=True)):
+            if count and event.variables:
+                rows = self._samples.get(k, np.empty(0, event.layout))
+                result.append(table(event, rows, np.zeros(rows.size), np.arange(rows.size)))
+        return result
+
+
+class _Sample:
+    """Every so many-th of the records that are added: all while they are few."""
+
+    def __init__(self) -> None:
+        self.step, self.count, self.held = 1, 0, 0
+        self.kept: list[NDArray[np.void]] = []
+
+    def add(self, records: NDArray[np.void]) -> None:
+        self.kept.append(records[-self.count % self.step :: self.step].copy())
+        self.count += records.size
+        self.held += self.kept[-1].size
+        while self.held > _SAMPLED:
+            self.kept = [np.concatenate(self.kept)[::2].copy()]
+            self.held = self.kept[0].size
+            self.step *= 2
+
+    def rows(self, event: EventType) -> NDArray[np.void]:
+        return np.concatenate([np.empty(0, event.layout), *self.kept])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretch:
+    """Consecutive records.
+
+    Attributes:
+        first: number of the first one in the file.
+        time: (n,) s.
+        order: rows of each kind among them.
+        packed: records of each kind.
+        ends: True if no others follow.
+    """
+
+    first: int
+    time: NDArray[np.float64]
+    order: Sequence[NDArray[np.intp]]
+    packed: Packed
+    ends: bool
+
+
+def stretches(survey: Survey, seconds: float) -> Iterator[Stretch]:
+    """The records of a file in stretches of at least `seconds`, or of 64 MiB if they come sooner."""
+    header = survey.header
+    total, first, begin, held_bytes = sum(survey.counts), 0, 0.0, 0
+    clock = Clock(header)
+    held: list[tuple[NDArray[np.float64], NDArray[np.uint16], Packed]] = []
+    rows = 0
+    for _, data, records in _walk(survey):
+        order = [np.flatnonzero(records.kind == kind) for kind in range(len(header.events))]
+        packed = [gather(data, e, records.start[r]) for e, r in zip(header.events, order, strict=True)]
+        time = clock.seconds(order, [p["stamp"] for p in packed])
+        at = 0
+        while at < time.size:
+            begin = begin if held else float(time[at])
+            late = np.flatnonzero(time[at:] - begin >= seconds)
+            end = at + int(late[0]) + 1 if late.size else time.size
+            held.append(_cut(time, records.kind, order, packed, at, end))
+            rows += end - at
+            held_bytes += int(records.start[end - 1] - records.start[at])
+            at = end
+            ends = first + rows == total
+            if late.size or held_bytes >= _MOST_BYTES or ends:
+                yield _joined(header, held, first, ends)
+                first, rows, held, held_bytes = first + rows, 0, [], 0
+    if held:  # the file has become shorter meanwhile
+        yield _joined(header, held, first, True)
+
+
+def _cut(
+    time: NDArray[np.float64],
+    kind: NDArray[np.uint16],
+    order: Sequence[NDArray[np.intp]],
+    packed: Packed,
+    at: int,
+    end: int,
+) -> tuple[NDArray[np.float64], NDArray[np.uint16], Packed]:
+    """Records `at` to `end` of a piece, copied: the piece need not stay."""
+    places = [np.searchsorted(rows, (at, end)) for rows in order]
+    return time[at:end], kind[at:end], [p[a:b].copy() for p, (a, b) in zip(packed, places, strict=True)]
+
+
+def _joined(
+    header: Header, held: list[tuple[NDArray[np.float64], NDArray[np.uint16], Packed]], first: int, ends: bool
+) -> Stretch:
+    kind = np.concatenate([k for _, k, _ in held])
+    packed = []
+    for number, event in enumerate(header.events):
+        # as bytes: records are not taken apart to be joined
+        parts = [p[number].view(np.uint8) for _, _, p in held if p[number].size]
+        packed.append((np.concatenate(parts) if parts else np.empty(0, np.uint8)).view(event.layout))
+    order = [np.flatnonzero(kind == number) for number in range(len(header.events))]
+    return Stretch(first, np.concatenate([t for t, _, _ in held]), order, packed, ends)
+
+
+def _walk(survey: Survey) -> Iterator[tuple[int, bytes, Records]]:
+    """A piece at a time: (where it begins in the file, its bytes, the whole records in it)."""
+    header = survey.header
+    end = survey.size - (CRC_BYTES if survey.checksum.right else 0)
+    data, begin = b"", 0  # a piece of the file, and where it begins
+    skip = header.size
+    for piece in _pieces(survey.path):
+        data += piece
+        if len(data) <= skip:
+            continue
+        records = locate(data, header.events, skip, min(len(data), end - begin))
+        yield begin, data, records
+        if records.unknown is not None:
+            return
+        data, begin, skip = data[records.stop :], begin + records.stop, 0
+
+
+def _header(path: Path) -> Header:
+    data = b""
+    for piece in _pieces(path):
+        data += piece
+        try:
+            return parse_header(data, path)
+        except FileFormatError:
+            if len(data) > _LONGEST_HEADER:
+                raise
+    return parse_header(data, path)
+
+
+def _pieces(path: Path) -> Iterator[bytes]:
+    """The bytes of a file, unpacked. Raises as `contents`."""
+    size = 0
+    try:
+        with path.open("rb") as plain:
+            packed = plain.read(2) == b"\x1f\x8b"
+        with cast(IO[bytes], gzip.open(path, "rb")) if packed else path.open("rb") as file:
+            while piece := file.read(_PIECE):
+                size += len(piece)
+                if packed and size > LARGEST_UNPACKED:
+                    most = LARGEST_UNPACKED >> 20
+                    raise FileFormatError(f"{path} unpacks to more than {most} MiB; unpack it yourself if it is sound.")
+                yield piece
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise FileFormatError(f"{path} is not a readable gzip file ({error}).") from error
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
