@@ -135,7 +135,7 @@ def stretches(survey: Survey, seconds: float) -> Iterator[Stretch]:
             end = at + int(late[0]) + 1 if late.size else time.size
             held.append(_cut(time, records.kind, order, packed, at, end))
             rows += end - at
-            held_bytes += int(records.start[end - 1] - records.start[at])
+            held_bytes += sum(p.nbytes for p in held[-1][2])
             at = end
             ends = first + rows == total
             if late.size or held_bytes >= _MOST_BYTES or ends:
