@@ -1,14 +1,14 @@
 """How long does a ten-minute flight at 1 kHz take to read and check, and how much memory, in every format of ours?
 
-    python benchmarks/recordings.py [--minutes 10] [--rounds 3] [--only commands,peers,folder,large] [--json FILE]
+    python benchmarks/recordings.py [--minutes 10] [--rounds 3] [--only commands,peers,folder] [--json FILE]
 
-The flight is made here: 20 variables (position, velocity, quaternion, gyro, accelerometer, four motors), seeded, with
-take-off and landing. It is written as a uSD card log; from that `crazyem import` makes an MCAP file and `crazyem export`
-a CSV; the same numbers go into a plain CSV that is read through a mapping.
+The flight is made here: 20 variables (position, velocity, quaternion, gyro, accelerometer, four motors), seeded,
+with take-off and landing. It is written as a uSD card log; from that `crazyem import` makes an MCAP file and `crazyem
+export` a CSV; the same numbers go into a plain CSV that is read through a mapping.
 
 `commands`: `crazyem info` and `crazyem doctor` on each, as processes of their own: wall time, processor time and peak
 memory of the whole process, against the limits of 10 s and 500 MB. `peers`: reading alone, against what one would take
-otherwise. `folder`: benchmarks/usd_folder.py. `large`: not part of the default; see recordings_large.py. Linux.
+otherwise. `folder`: benchmarks/usd_folder.py. Files larger than memory: recordings_large.py. Linux.
 """
 
 import argparse
@@ -101,7 +101,8 @@ def _path(t: Any, seconds: float, phases: Any) -> tuple[Any, Any, Any]:
         ramp = ramp**3 * (10.0 - 15.0 * ramp + 6.0 * ramp**2)
         frequencies = np.array([0.11, 0.23, 0.37, 0.53])
         waves = [np.sin(2.0 * np.pi * frequencies * t[:, None] + phase).sum(axis=1) for phase in phases]
-        return ramp[:, None] * (np.column_stack([0.25 * waves[0], 0.25 * waves[1], 0.1 * waves[2]]) + [0, 0, 1.0])
+        place = np.column_stack([0.25 * waves[0], 0.25 * waves[1], 1.0 + 0.1 * waves[2]])
+        return ramp[:, None] * place
 
     h = 2e-3
     before, here, after = at(t - h), at(t), at(t + h)
