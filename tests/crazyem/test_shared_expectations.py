@@ -1,0 +1,145 @@
+"""What `info` and `doctor` say of every shared recording, held against a second look at the raw files without crazyem.
+
+`expectations/<set>.json` holds, for each recording, reviewed facts and findings. A fact is a number that the plain code
+in `second_look.py` derives from the file; a finding names the facts that its numbers must agree with, how they were had
+(`how`), or why it was not verified. `not_found` are defects that the second look shows and the doctor does not name.
+The test fails if either look moves away from what was reviewed.
+"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from second_look import Facts, second_look
+
+from crazyem.cli import main
+
+HERE = Path(__file__).with_name("expectations")
+SETS = {
+    name: json.loads((HERE / f"{name}.json").read_text(encoding="utf-8"))
+    for name in ("crazypad", "sysid", "nanobench", "nanodrone", "real_firmware")
+}
+FILES = sorted(f"{name}/{file}" for name, content in SETS.items() for file in content["recordings"])
+QUICK = (
+    "crazypad/motor__cut_propeller_M3_1mm_46mm__E8_log01",
+    "crazypad/controller__normal_flight__E9_log00",
+    "nanobench/B2_circle_fast_rep3.csv.gz",
+    "nanodrone/raw/square_run1.csv.gz",
+    "nanodrone/processed/random_run1.csv.gz",
+    "real_firmware/lee_34g_mass_pushed_midflight.csv.gz",
+)
+
+
+def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict:
+    """The JSON that a command prints about one recording."""
+    assert main([*arguments, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)["files"][0]
+
+
+def compare(findings: list[dict], expected: list[dict], facts: Facts) -> Iterator[str]:
+    """What differs between findings and those expected: none missing, none too many, the numbers as the facts are."""
+    left = list(findings)
+    for wanted in expected:
+        match = [
+            one
+            for one in left
+            if all(one[key] == wanted[key] for key in ("check", "grade", "signal")) and wanted["says"] in one["text"]
+        ]
+        what = f"{wanted['check']} ({wanted['grade']}) of {wanted['signal'] or 'the recording'}, {wanted['says']!r}"
+        if not match:
+            yield f"not found: {what}"
+            continue
+        left.remove(match[0])
+        for key, (fact, tolerance) in wanted.get("evidence", {}).items():
+            if match[0]["evidence"][key] != pytest.approx(facts[fact], abs=tolerance):
+                yield f"{what}: {key} is {match[0]['evidence'][key]:.6g}, {fact} is {facts[fact]:.6g} +- {tolerance:g}"
+        if "more_than_one" in wanted and not facts[wanted["more_than_one"]] > 1.0:
+            yield f"{what}: {wanted['more_than_one']} is {facts[wanted['more_than_one']]:.6g}"
+    for one in left:
+        yield f"not expected: {one['check']} ({one['grade']}) of {one['signal'] or 'the recording'}: {one['text']}"
+
+
+def expected_of(name: str) -> dict:
+    folder, file = name.split("/", 1)
+    return SETS[folder]["recordings"][file]
+
+
+def differences(root: Path, name: str, capsys: pytest.CaptureFixture[str]) -> Iterator[str]:
+    """All that differs between the file, what was reviewed, and what the commands say."""
+    expected, path = expected_of(name), root / name
+    facts = second_look(path)
+    for key, value in expected["facts"].items():
+        if facts[key] != pytest.approx(value, rel=1e-4, abs=1e-9):
+            yield f"second look: {key} is {facts[key]:.6g}, was {value:.6g}"
+    told = said(capsys, "info", str(path))
+    main_signal = next(one for one in told["signals"] if one["name"] in ("position", "body_rate"))
+    told = told | told["envelope"] | main_signal
+    for key, (fact, tolerance) in expected["info"].items():
+        if told[key] != pytest.approx(facts[fact], abs=tolerance):
+            yield f"info: {key} is {told[key]:.6g}, {fact} is {facts[fact]:.6g} +- {tolerance:g}"
+    diagnosis = said(capsys, "doctor", str(path))
+    if diagnosis["grade"] != expected["grade"]:
+        yield f"doctor: {diagnosis['grade']}, not {expected['grade']}"
+    yield from compare(diagnosis["findings"], expected["findings"], facts)
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_reviewed(shared_recordings, capsys, name):
+    assert list(differences(shared_recordings, name, capsys)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in FILES if name not in QUICK])
+def test_every_other_recording_as_reviewed(shared_recordings, capsys, name):
+    assert list(differences(shared_recordings, name, capsys)) == []
+
+
+def test_every_shared_recording_was_reviewed(shared_recordings):
+    files = {str(p.relative_to(shared_recordings)) for p in shared_recordings.rglob("*") if p.is_file()}
+    assert {name for name in files if not name.endswith(".truth.csv.gz")} == set(FILES)
+    assert len(FILES) == 67
+
+
+# Claims of the nanobench publisher that are wrong in every flight: how a finding of each begins.
+CLAIMS = {
+    "degrees": ("angles", "euler", "it was in radians"),
+    "pitch": ("angles", "euler@onboard", "the sign of pitch is inverted"),
+    "world rate": ("rates", "body_rate@vicon", "in the body frame already"),
+    "m/s^2": ("forces", "acceleration@onboard", "it is in g, not m/s^2"),
+    "27 g": ("weight", "", "27.0 g are claimed"),
+    "measured at 100 Hz": ("interpolated", "body_rate", "lie on straight lines"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in FILES if name.startswith("nanobench/")])
+def test_what_the_publisher_says_is_found_wrong(shared_recordings, capsys, name):
+    """With the corrections off every wrong claim is found; with them on, none of those that they correct."""
+    path, expected = shared_recordings / name, expected_of(name)
+    found = said(capsys, "doctor", str(path), "--as-published")["findings"]
+    for claim, (check, signal, words) in CLAIMS.items():
+        seen = [f for f in found if f["check"] == check and f["signal"] == signal and words in f["text"]]
+        assert len(seen) == 1 or claim in expected.get("cannot_tell", {}), claim
+    assert any(f["check"] == "lag" for f in found) or "lag" in expected["cannot_tell"]
+    wrong = [
+        f for f in found if f["check"] in ("angles", "rates") or (f["check"], f["grade"]) == ("forces", "unusable")
+    ]
+    assert list(compare(wrong, expected["as_published"], second_look(path))) == []
+    corrected = said(capsys, "doctor", str(path))["findings"]
+    assert not [f for f in corrected if f["check"] in ("angles", "rates") or f["grade"] == "unusable"]
+
+
+@pytest.mark.slow
+def test_processed_runs_are_known_as_pieces_of_the_raw_ones(shared_recordings, capsys):
+    """All twelve and no other; where each begins is found here as the shift at which the two x agree best."""
+    assert main(["doctor", str(shared_recordings / "nanodrone"), "--jobs", "1", "--json"]) == 0
+    duplicates = json.loads(capsys.readouterr().out)["duplicates"]
+    assert sorted(Path(d["first"]).name for d in duplicates) == sorted({Path(n).name for n in FILES if "/raw/" in n})
+    for one in duplicates:
+        raw, cut = (pd.read_csv(one[key])["x"].to_numpy() for key in ("first", "second"))
+        misses = [np.abs(raw[k : k + cut.size] - cut).mean() for k in range(raw.size - cut.size + 1)]
+        assert Path(one["first"]).name == Path(one["second"]).name
+        assert -one["offset_s"] == pytest.approx(0.01 * int(np.argmin(misses)), abs=0.05)
