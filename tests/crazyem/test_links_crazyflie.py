@@ -2,6 +2,7 @@
 
 import contextlib
 import struct
+import threading
 import time
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from crazyem.errors import LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.links.base import LinkLost, Packet
+from crazyem.links.connecting import new_crazyflie
 from crazyem.links.crazyflie import CrazyflieLink
 
 NAMES = ("stateEstimateZ.x", "stateEstimateZ.y", "stateEstimateZ.z", "pm.vbat")
@@ -193,6 +195,24 @@ def test_closing_hands_back_only_if_it_commanded(fake_peer):
     with connected(fake_peer):
         pass
     assert not [r for r in fake_peer.requests if r[0] >> 4 in (3, 7)]  # an observer sends no setpoint
+
+
+def test_a_sender_that_meets_the_end_of_the_link_does_not_wait_for_the_ping_thread():
+    """The ping thread of cflib waits for the send lock; a sender that finds the link dead holds it."""
+    crazyflie = new_crazyflie("udp://127.0.0.1:1")
+    crazyflie.connected.call("")  # starts the ping thread
+    try:
+        with crazyflie._send_lock:
+            time.sleep(0.3)  # longer than between two pings: the thread waits for the lock now
+            ender = threading.Thread(target=crazyflie.disconnected.call, args=("",), daemon=True)
+            ender.start()
+            ender.join(10)
+            assert not ender.is_alive()
+        thread = crazyflie.link_statistics.latency._ping_thread_instance
+        thread.join(10)
+        assert not thread.is_alive()
+    finally:
+        crazyflie.link_statistics.latency._stop_event.set()
 
 
 def test_setpoint_outside_the_wire_format(fake_peer):
