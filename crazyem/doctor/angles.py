@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from crazyem.doctor import axes
 from crazyem.doctor.delays import delay
 from crazyem.doctor.kinematics import (
+    Track,
     Window,
     euler_of_quaternion,
     grid_of,
@@ -28,7 +29,8 @@ Array = NDArray[np.float64]
 DEGREES = 180.0 / math.pi
 UNITS = {"degrees": DEGREES, "converted": 1.0 / DEGREES}
 ENOUGH = math.radians(0.1)  # rms of an angle, below which nothing is said of it
-ALIKE = 0.7  # correlation that an angle must have with one of the quaternion's to be judged
+ALIKE = 0.8  # correlation that an angle must have with one of the quaternion's to be judged
+HIGHEST = (math.radians(80.0), math.radians(65.0))  # roll and pitch up to which Euler angles are judged
 NAMES = ("roll", "pitch", "yaw")
 # ways to read four numbers as an attitude: name -> (how far-fetched, columns in the order x y z w, conjugated)
 READINGS: dict[str, tuple[int, tuple[int, ...], bool]] = {
@@ -163,7 +165,7 @@ def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -
     late = delay(window.mean(truth), window.mean(track(straight, grid)), reach=0.15)
     lag = late.value if late is not None and not late.at_edge and late.explained > 0.5 else 0.0
     x, y = window.mean(truth), window.mean(track(straight, grid, shift=lag))
-    rows = np.flatnonzero(x.valid & y.valid)[::3]
+    rows = np.flatnonzero(_upright(track(quaternion, grid), x.valid & y.valid))[::3]
     if rows.size < 100:
         return None, False
     block = blocks(grid.time[rows])
@@ -174,9 +176,15 @@ def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -
     told: NDArray[np.bool_] = np.any(alike > ALIKE, axis=0)
     if not (excited & told).any():
         return None, False
-    choice = choose(straight_y * told, _orders(straight_x, told), block)
+    ways = _orders(straight_x, told)
+    choice = choose(straight_y * told, ways, block)
     if choice is None or choice.explained[choice.best] < 0.8:
         return None, False
+    if choice.denied and choice.name:
+        # each angle must bear it out by itself: noise has a sign, too
+        match = (ways[choice.name][1] * straight_y).mean(axis=0)
+        if not (match[told] > ALIKE).all():
+            return None, False
     known = [i for i in range(3) if excited[i] and told[i]]
     parts = {NAMES[i]: slope(x.value[rows, i], y.value[rows, i], block) for i in known}
     evidence = {
@@ -207,6 +215,18 @@ def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -
     text = f"{head}it is {_unit_said(unit)}."
     fix = Fix("scale", (name,), (1.0 / UNITS[unit],) * 3)
     return Finding("angles", Grade.UNUSABLE, text, name, (), evidence, "Correct its unit.", fix), True
+
+
+def _upright(attitude: Track, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The longest stretch in which roll and pitch are far from where Euler angles jump."""
+    angles = np.abs(euler_of_quaternion(attitude.value))
+    far = (angles[:, 0] < HIGHEST[0]) & (angles[:, 1] < HIGHEST[1]) | ~attitude.valid
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]]).astype(np.int8)))
+    out = np.zeros(valid.size, bool)
+    if edges.size:
+        longest = int(np.argmax(edges[1::2] - edges[::2]))
+        out[edges[2 * longest] : edges[2 * longest + 1]] = True
+    return out & valid
 
 
 def _unit_variance(value: Array) -> Array:

@@ -125,7 +125,8 @@ def look(
         x, y, block = far_x.value[keep], far_y.value[keep], blocks(grid.time[keep])
     whole = slope(x, y, block)
     single = tuple(slope(x[:, i], y[:, i], block) for i in range(3))
-    rest = y - (whole.value if whole else 1.0) * x
+    factor = 1.0 if whole is None or whole.far_low <= 1.0 <= whole.far_high else whole.value
+    rest = y - factor * x
     at = declared.value[rows] if len(rows) == len(y) else wide.mean(next(iter(candidates.values()))[1]).value[keep]
     return Look(
         against=against,

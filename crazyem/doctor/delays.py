@@ -11,6 +11,7 @@ from crazyem.doctor.kinematics import STEP, Track
 Array = NDArray[np.float64]
 
 REACH = 0.3  # s, lags looked for on either side
+COARSE = 3  # grid steps between lags tried at first
 ROWS = 4000  # of the grid that a correlation is made of, at most
 NEAR = 6  # grid steps about a lag within which it may move when a block is left out
 LEAST = 45  # and at least
@@ -42,9 +43,15 @@ def delay(first: Track, second: Track, *, reach: float = REACH, mixed: bool = Tr
     """
     most = round(reach / STEP)
     steps = np.arange(-most, most + 1)
-    curve = np.array([_explained(first, second, int(k), mixed) for k in steps])
+    curve = np.full(steps.size, np.nan)
+    # what was smoothed has no peak narrower than the window: every third lag finds it, its neighbours refine it
+    for k in range(0, steps.size, COARSE):
+        curve[k] = _explained(first, second, int(steps[k]), mixed)
     if not np.isfinite(curve).any():
         return None
+    near = int(np.nanargmax(curve))
+    for k in range(max(near - COARSE, 0), min(near + COARSE + 1, steps.size)):
+        curve[k] = _explained(first, second, int(steps[k]), mixed)
     top = int(np.nanargmax(curve))
     edge = top in (0, steps.size - 1) or not np.isfinite(curve[top - 1 : top + 2]).all()
     if edge:
@@ -98,6 +105,8 @@ def spread(first: Track, second: Track, found: Delay, block_rows: int) -> tuple[
         return math.inf, count
     total = sums.sum(axis=1)
     peaks = np.array([_peak(_share(total - sums[:, b])) for b in range(count)]) * STEP
+    if peaks.min() <= 0.0 or peaks.max() >= 2 * NEAR * STEP:
+        return math.inf, count
     return float(np.sqrt((count - 1) / count * np.square(peaks - peaks.mean()).sum())), count
 
 
@@ -122,8 +131,11 @@ def _share(sums: Array) -> Array:
     n = np.maximum(sums[:, 0], 1.0)
     mx, my = sums[:, 1] / n, sums[:, 2] / n
     sxx, sxy, syy = sums[:, 3] / n - mx * mx, sums[:, 4] / n - mx * my, sums[:, 5] / n - my * my
-    got = (sxy**2 / np.maximum(sxx, 1e-300)).sum(axis=1)
-    return np.asarray(got / np.maximum(syy.sum(axis=1), 1e-300), float)
+    # what is left of sums that cancel is nothing
+    still = (sxx <= 1e-12 * (sums[:, 3] / n)) | (syy <= 1e-12 * (sums[:, 5] / n))
+    got = np.where(still, 0.0, sxy**2 / np.where(still, 1.0, sxx)).sum(axis=1)
+    whole = np.where(still, 0.0, syy).sum(axis=1)
+    return np.asarray(np.where(whole > 0.0, got / np.where(whole > 0.0, whole, 1.0), 0.0), float)
 
 
 def _peak(curve: Array) -> float:

@@ -24,6 +24,9 @@ STEP = 0.01  # s, of the grid
 LONGEST = 900.0  # s of a recording that are looked at, about its middle
 SHORTEST = 2.0  # s; nothing can be said of less
 WIDTH = 0.16  # s, window for streams of 50 Hz or more
+SLOWEST = 0.25  # s between samples, above which a stream tells nothing of motion
+IMPOSSIBLE = 1e9  # of any quantity in any unit; other checks report it
+MOST = 1000  # samples averaged into one: 100 kHz
 BRIDGE = 0.045  # s; motion is slow against it
 UP = np.array([0.0, 0.0, 1.0])
 GRAVITY = 9.81  # m/s^2; the true value differs from place to place by 0.3 %
@@ -43,12 +46,13 @@ def origin_of(name: str) -> str:
 
 
 def measurements(recording: Recording, quantity: str) -> dict[str, SignalArray]:
-    """All signals that measure a quantity and hold at least 2 s of numbers, made light; the first choice first."""
+    """All signals that measure a quantity for 2 s and four times a second, made light; the first choice first."""
     found = {}
     for name, array in recording.signals.items():
         if quantity_of(name, array) == quantity and array.value.shape[1] == SIGNALS[quantity][0]:
             made = light(array, quantity)
-            if made.time.size >= 20 and made.time[-1] - made.time[0] >= SHORTEST:
+            slow = quantity != "voltage" and _period(made.time) > SLOWEST
+            if made.time.size >= 20 and made.time[-1] - made.time[0] >= SHORTEST and not slow:
                 found[name] = made
     return dict(sorted(found.items(), key=lambda item: (item[0] != quantity, item[0])))
 
@@ -88,7 +92,7 @@ def _lightened(array: SignalArray, quantity: str) -> SignalArray:
     if quantity == "attitude":
         value = _continuous(value)
     period = _period(time)
-    many = int(STEP / period + 1e-6) if period > 0 else 1
+    many = int(min(STEP / period + 1e-6, MOST)) if period > 0 else 1
     if many > 1:
         rest = time.size // many * many
         first, last = time[:rest:many], time[many - 1 : rest : many]
@@ -309,11 +313,11 @@ def _cubic(time: Array, value: Array, at: Array, i: NDArray[np.int64]) -> Array:
 
 
 def _sound(array: SignalArray) -> Mask:
-    """(n,) samples with a time and all components."""
+    """(n,) samples with a time and all components, none of them absurd."""
     sound = np.isfinite(array.time)
     sound &= ~array.marked
     for column in range(array.value.shape[1]):  # a reduction over a short axis costs ten times as much
-        sound &= np.isfinite(array.value[:, column])
+        sound &= np.abs(array.value[:, column]) < IMPOSSIBLE  # not for NaN either
     return sound
 
 

@@ -180,7 +180,8 @@ def _fit(name: str, against: str, first: Track, second: Track, grid: Grid, width
         return None
     size = round(max(PIECE, grid.size * STEP / MANY) / STEP)
     error, count = spread(first, second, whole, size // 2)
-    if count < FEW:
+    error = max(error, _error(first, second, whole.value, whole.explained, width))
+    if count < FEW or not error < math.inf:
         return None
     found = []
     for first_row in range(0, grid.size - size // 2, size):
@@ -188,12 +189,12 @@ def _fit(name: str, against: str, first: Track, second: Track, grid: Grid, width
         one = delay(first.part(rows), second.part(rows), reach=min(REACH, abs(whole.value) + 0.15), mixed=False)
         if one is None or one.at_edge or one.explained < AGREES:
             continue
-        rough = _error(second.part(rows), one.explained, width)
+        rough = _error(first.part(rows), second.part(rows), one.value, one.explained, width)
         if rough < ROUGH:
             found.append((float(grid.time[rows].mean()), one.value, rough))
     start, end = float(grid.time[0]), float(grid.time[-1])
     changes = _changes(np.array(found), start, end) if len(found) >= FEW else None
-    return _Lag(name, against, whole.value, max(error, FLOOR), count, whole.explained, (start, end), changes)
+    return _Lag(name, against, whole.value, error, count, whole.explained, (start, end), changes)
 
 
 def _changes(found: Array, start: float, end: float) -> _Changes:
@@ -220,17 +221,27 @@ def _changes(found: Array, start: float, end: float) -> _Changes:
     )
 
 
-def _error(second: Track, explained: float, width: float) -> float:
-    """Standard error of a lag: what is unexplained over how fast the signal changes; one sample a window width."""
-    good = second.valid
-    x = second.value[good]
-    if len(x) < 10:
+def _error(first: Track, second: Track, lag: float, explained: float, width: float) -> float:
+    """Standard error of a lag: what is unexplained, over how fast what is common changes; one sample a window width.
+
+    The mean square frequency of the common part is the covariance of the derivatives over that of the signals, to
+    which noise of either adds nothing.
+    """
+    steps = round(lag / STEP)
+    n = len(first.value) - abs(steps)
+    x, y = first.value[max(0, -steps) :][:n], second.value[max(0, steps) :][:n]
+    good = first.valid[max(0, -steps) :][:n] & second.valid[max(0, steps) :][:n]
+    both = good[1:] & good[:-1]
+    if both.sum() < 10:
         return math.inf
-    change = np.diff(second.value, axis=0)[good[1:] & good[:-1]] / STEP
-    steepness = float((change * change).mean(axis=0).sum())
-    variance = float(x.var(axis=0).sum())
+    dx, dy = np.diff(x, axis=0)[both] / STEP, np.diff(y, axis=0)[both] / STEP
+    x, y = x[good] - x[good].mean(axis=0), y[good] - y[good].mean(axis=0)
+    common = float((x * y).mean(axis=0) @ (x * y).mean(axis=0))
+    moving = float((dx * dy).mean(axis=0) @ (x * y).mean(axis=0))
+    if common <= 0.0 or moving <= 0.0:
+        return math.inf
     independent = max(good.sum() * STEP / width, 1.0)
-    return max(FLOOR, math.sqrt((1.0 - explained) * variance / max(steepness, 1e-12) / independent))
+    return max(FLOOR, math.sqrt(max(1.0 - explained, 0.0) / explained * common / moving / independent))
 
 
 def _robust(rest: Array) -> float:
@@ -253,7 +264,7 @@ def _weighted_median(y: Array, w: Array) -> float:
 def _judge(recording: Recording, base: _Path, path: _Path, lag: _Lag) -> Finding | None:
     wide, sure = (float(stats.t.ppf(level, lag.blocks - 1)) for level in (0.975, CERTAIN))
     drifts, wanders = _drifts(lag.changes), _wanders(lag.changes)
-    late = abs(lag.value) >= SEEN and abs(lag.value) > sure * lag.error
+    late = abs(lag.value) >= SEEN and abs(lag.value) > sure * lag.error and lag.error < 0.5 * ROUGH
     if not (late or drifts or wanders):
         return None
     low, high = lag.value - wide * lag.error, lag.value + wide * lag.error

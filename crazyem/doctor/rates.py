@@ -106,7 +106,9 @@ def _scale(name: str, looks: list[Look]) -> list[Finding]:
 
 
 def _bias(name: str, seen: Look) -> list[Finding]:
-    if not (np.abs(seen.offset) > np.maximum(BIAS, 5.0 * seen.offset_error)).any():
+    # in a steady turn a scale that is not known well looks like a bias
+    unknown = np.abs(seen.predicted) * (seen.whole.far_high - seen.whole.far_low if seen.whole else 1.0)
+    if not (np.abs(seen.offset) > np.maximum(BIAS, 5.0 * seen.offset_error) + unknown).any():
         return []
     evidence = {f"bias_{axis}_rad_s": float(b) for axis, b in zip("xyz", seen.offset, strict=True)}
     worst = float(np.abs(seen.offset).max())

@@ -37,6 +37,7 @@ Array = NDArray[np.float64]
 SEEN = math.radians(0.5)  # tilt reported from here on
 MATTERS = math.radians(1.5)  # tilt that degrades
 BODY = math.radians(2.0)  # mounting or bias of the accelerometer, as an angle, reported from here on
+APART = 2e-3  # smallest eigenvalue of the normalised normal matrix: half the variance of the heading in rad^2
 SHARP = math.radians(0.5)  # 95 % half-width that a tilt of its own must be known to
 
 
@@ -72,7 +73,10 @@ def _look(recording: Recording, pose: Pose, name: str, array: SignalArray) -> Fi
     count = int(block.max()) + 1
     if count < FEW:
         return None
-    both, spread = _jackknife(_design(q, both=True), e, block)
+    design = _design(q, both=True)
+    both, spread = _jackknife(design, e, block)
+    if not _separable(design):
+        spread = np.full_like(spread, np.inf)
     return _judge(pose.name, name, both, spread, _jackknife(_design(q, both=False), e, block), count)
 
 
@@ -119,6 +123,13 @@ def _design(q: Array, *, both: bool) -> Array:
     for k, axis in enumerate((0, 1, 2) if both else (2,)):
         a[:, :, 2 + k] = rotate(q, np.tile(np.eye(3)[axis], (n, 1)))
     return a
+
+
+def _separable(a: Array) -> bool:
+    """True if the heading changes enough for tilt and bias to have columns of their own."""
+    flat = a.reshape(-1, a.shape[2])
+    flat = flat / np.linalg.norm(flat, axis=0)
+    return float(np.linalg.eigvalsh(flat.T @ flat)[0]) > APART
 
 
 def _jackknife(a: Array, e: Array, block: NDArray[np.int64]) -> tuple[Array, Array]:

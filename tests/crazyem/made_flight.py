@@ -244,7 +244,7 @@ def array_of(quantity: str, time: ArrayLike, value: ArrayLike, *, stream: str = 
     """A signal of the vocabulary from (n,) times [s] and (n, c) values; `place` keeps orders of signals apart."""
     time = np.asarray(time, float)
     value = np.asarray(value, float)
-    value = value.reshape(time.size, -1)
+    value = value.reshape(time.size, SIGNALS[quantity][0])
     _, unit, frame = SIGNALS[quantity]
     return SignalArray(
         time,
