@@ -44,8 +44,8 @@ def new_crazyflie(uri: str) -> Any:
         cflib.crtp.CLASSES.clear()
         cflib.crtp.init_drivers(enable_serial_driver=uri.startswith("serial"))
     crazyflie = Crazyflie(ro_cache=None, rw_cache=None)
-    # cflib 0.1.34 joins its ping thread from whoever meets the link's end. If that is a sender, it holds the lock that the
-    # ping thread waits for, and neither ever comes back; a ping thread that is only told to stop ends by itself.
+    # cflib 0.1.34 joins its ping thread in whoever meets the link's end. If that is a sender, it holds the lock that
+    # the ping thread waits for, and neither ever comes back; a ping thread that is only told to stop ends by itself.
     latency = crazyflie.link_statistics.latency
     latency.stop = latency._stop_event.set
     return crazyflie
