@@ -274,9 +274,11 @@ def _judge(recording: Recording, base: _Path, path: _Path, lag: _Lag) -> Finding
         "lag_high_ms": 1e3 * high,
         "explained": lag.explained,
     }
-    how = "late" if lag.value > 0 else "early"
+    # of a lag that drifts the middle of the line says more than the peak of the whole, which the lively parts decide
+    said = 0.5 * (lag.changes.start + lag.changes.end) if lag.changes is not None and drifts else lag.value
+    how = "late" if said > 0 else "early"
     what = lag.signal if path[0] == lag.signal else f"The stream {_said(path, base)}"
-    text = f"{what} is {1e3 * abs(lag.value):.1f} ms {how} against {_said(base, base)}"
+    text = f"{what} is {1e3 * abs(said):.1f} ms {how} against {_said(base, base)}"
     text += f" ({lag.signal} against {lag.against})"
     fix: Fix | None = None
     advice = "Use a stretch with one lag, or estimate the lag along; a single shift does not repair it."
