@@ -17,7 +17,8 @@ from crazyem.recordings.recording import SignalArray
 Array = NDArray[np.float64]
 
 WIDE = 0.5  # s, window for slopes: motion slow enough for the filters of any stream
-STRIDE = 3  # grid steps between rows
+STRIDE = 3  # grid steps between rows, more in recordings of more than a few minutes
+ROWS = 6000  # at most
 COVERED = 0.5  # share of the time that a scale fault must have been seen over
 
 
@@ -96,6 +97,7 @@ def look(
         offset: the hypotheses are compared about the means.
     """
     window = Window(width)
+    stride = max(STRIDE, grid.size // ROWS)
     raw = track(array, grid)
     smooth = {name: window.mean(given) for name, (_, given) in candidates.items()}
     declared = next(iter(smooth.values()))
@@ -104,7 +106,7 @@ def look(
     if lag:
         raw = track(array, grid, shift=lag)
     measured = window.mean(raw)
-    rows = np.flatnonzero(measured.valid & np.logical_and.reduce([s.valid for s in smooth.values()]))[::STRIDE]
+    rows = np.flatnonzero(measured.valid & np.logical_and.reduce([s.valid for s in smooth.values()]))[::stride]
     if rows.size < 100 or float(declared.value[rows].std(axis=0).max()) < least:
         return None
     y = measured.value[rows]
@@ -120,7 +122,7 @@ def look(
     base = name if name in candidates else next(iter(candidates))
     wide = Window(max(WIDE, width))
     far_x, far_y = wide.mean(candidates[base][1]), wide.mean(raw)
-    keep = np.flatnonzero(far_x.valid & far_y.valid)[::STRIDE]
+    keep = np.flatnonzero(far_x.valid & far_y.valid)[::stride]
     if keep.size > 200 and name in candidates:
         x, y, block = far_x.value[keep], far_y.value[keep], blocks(grid.time[keep])
     whole = slope(x, y, block)
@@ -136,7 +138,7 @@ def look(
         single=single,
         offset=np.median(rest, axis=0),
         offset_error=_error(rest, block),
-        covered=len(y) * STRIDE / grid.size,
+        covered=len(y) * stride / grid.size,
         mean=y.mean(axis=0),
         predicted=at.mean(axis=0),
         mean_error=_error(y - at * _ratio(y, at), block),
