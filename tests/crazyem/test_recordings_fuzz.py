@@ -74,6 +74,18 @@ def test_the_seed_itself_is_read(files, name, tmp_path):
     assert attempt(path) == ""
 
 
+@pytest.mark.parametrize("name", ["mcap", "imported"])
+@pytest.mark.parametrize("start", [1, 8, 20, 28, 36])
+def test_a_summary_said_to_begin_in_the_footer(files, name, start, tmp_path):
+    """Found by the fuzzer: the last bytes of an MCAP say where its summary begins, here at or behind themselves."""
+    data = bytearray(files[name])
+    footer = len(data) - 37  # opcode, length, summary start, summary offset start, checksum, magic
+    data[footer + 9 : footer + 17] = (len(data) - start).to_bytes(8, "little")
+    path = tmp_path / "footer.mcap"
+    path.write_bytes(bytes(data))
+    assert attempt(path) == ""
+
+
 @pytest.mark.parametrize("name", FORMATS)
 def test_damaged_files(files, name, tmp_path):
     campaign(files[name], tmp_path, seed=1, count=60)

@@ -148,7 +148,7 @@ def from_summary(path: Path) -> tuple[list[Any], dict[int, int]]:
             end = stream.read()
             footer: Any = parse(mcap_scan.FOOTER, end[HEAD.size :]) if end.endswith(MAGIC) else None
             start = footer.summary_start if footer is not None else 0
-            if not 0 < start < size or size - start > mcap_scan.LARGEST_RECORD:
+            if not 0 < start <= size - tail or size - start > mcap_scan.LARGEST_RECORD:
                 return [], {}
             stream.seek(start)
             data = stream.read(size - start - tail)
