@@ -1,6 +1,6 @@
 """Recordings larger than memory: `info`, `doctor` and `export` in parts, where reading the whole is not possible.
 
-    python benchmarks/recordings_large.py [--megabytes 1000] [--limit 1500] [--only usd,mcap,csv,exported] [--json FILE]
+    python benchmarks/recordings_large.py [--megabytes 1000] [--limit 1200] [--only usd,mcap,csv,exported] [--json FILE]
 
 The flight of benchmarks/recordings.py, long enough for a file of so many megabytes in each format. Every command runs
 in a process whose address space is limited (RLIMIT_AS; libraries take a good part of it, most never touched). Without
@@ -77,7 +77,7 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--megabytes", type=float, default=1000.0)
-    parser.add_argument("--limit", type=float, default=1500.0, help="of the address space [MB]")
+    parser.add_argument("--limit", type=float, default=1200.0, help="of the address space [MB]")
     parser.add_argument("--only", default="usd,mcap,csv,exported")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
