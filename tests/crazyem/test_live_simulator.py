@@ -55,7 +55,7 @@ def wait_for(process, word, seconds=90.0):
 
 def test_a_flight_learns_its_mass_pushes_it_and_replays_bit_for_bit(tmp_path, payload, capsys):
     out, log = tmp_path / "f.json", tmp_path / "f.mcap"
-    code = main(["fly", "--trajectory", "hover", "--duration", "9", "--scenario", payload, "--speed", "4",
+    code = main(["fly", "--trajectory", "hover", "--duration", "11", "--scenario", payload, "--speed", "2",
                  "--record", str(log), "--json", str(out)])  # fmt: skip
     assert code == 0
     summary = json.loads(out.read_text())
