@@ -141,9 +141,7 @@ def _without_edges(parts: list[tuple[Finding, ...]]) -> list[tuple[Finding, ...]
         seconds = sum(f.evidence["airborne_s"] for f in aloft)
         text = f"The recording holds {seconds:.1f} s in the air, counted in {len(parts)} parts."
         spans = tuple(span for f in aloft for span in f.intervals)
-        course = replace(
-            aloft[0], text=f"The recording holds {text}", intervals=spans, evidence={"airborne_s": seconds}
-        )
+        course = replace(aloft[0], text=text, intervals=spans, evidence={"airborne_s": seconds})
         cleaned[-1] = (*cleaned[-1], course)
     return cleaned
 
