@@ -4,7 +4,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: fly test slow lint bench cfclient-test clean setup
+.PHONY: fly test slow lint bench concealed paper paper-docs cfclient-test clean setup
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -30,6 +30,18 @@ lint: $(READY)
 
 bench: $(READY)  ## speed against named peers (those installed: pip install -e '.[bench]')
 	$(BIN)/python benchmarks/speed.py
+
+concealed: $(READY)  ## physics hidden in the simulator, and whether diagnose finds it; goes on where it was stopped
+	$(BIN)/python -m benchmarks.concealed draw --cases 320 --seed 2026 --out out/concealed
+	$(BIN)/python -m benchmarks.concealed fly --out out/concealed
+	$(BIN)/python -m benchmarks.concealed diagnose --out out/concealed
+	$(BIN)/python -m benchmarks.concealed score --out out/concealed --write-docs
+
+paper: $(READY)  ## Zhao's paper again: its tables and figures, by its method and by ours; goes on where it was stopped
+	$(BIN)/crazyem paper --out paper
+
+paper-docs: paper  ## the numbers of that run into docs/paper.md, README.md and the drift test
+	$(BIN)/python -m crazyem.paper.docs paper/results.json --small tests/crazyem/expectations/paper_small.json
 
 cfclient-test: $(READY)  ## the graphical client against the simulator, in an environment of its own
 	$(PYTHON) -m venv .venv-cfclient

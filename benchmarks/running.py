@@ -100,14 +100,13 @@ def measure_accuracy(*, seeds: Sequence[int], window: int, seconds: float, passe
     for seed in seeds:
         flight = simulate(seed=seed, seconds=seconds)
         estimator = OnlineEstimator(flight.vehicle, window=window)
-        since = updates = 0
-        settled_before: Any = None
+        since = updates = full = 0
         for sample in flight.samples():
             if estimator.feed(sample) is None:
                 continue
             updates += 1
-            since = since + 1 if estimator._settled is settled_before else 0
-            settled_before = estimator._settled
+            since = since + 1 if estimator.full_updates == full else 0
+            full = estimator.full_updates
             em = estimator._em
             assert em is not None
             if updates % REFRESH != REFRESH - 1 or em.tape.size < window:

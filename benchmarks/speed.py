@@ -77,12 +77,11 @@ def window_of(em: WindowEM, first: int, last: int) -> Window:
 
 
 def scored_pass(em: WindowEM, first: int, last: int) -> Parameters:
-    """The same with the Fisher information of all parameters and the score of the noise scales."""
+    """The same with the Fisher information of all parameters and a step of the noise scales."""
     em.refill_inputs(first, last)
     em.forward(first, last, restart=True)
-    em.information(first, last)
     em.backward(first, last)
-    em._noise_score(first, last)
+    em.information(first, last)
     return em.maximise(first, last)
 
 

@@ -71,7 +71,7 @@ def parser() -> argparse.ArgumentParser:
     )
     seconds = _number(1, 3600, " seconds")
     fly.add_argument("--duration", type=seconds, default=20.0, metavar="S", help="of the trajectory (default: 20)")
-    fly.add_argument("--no-push", action="store_true", help="estimate only, write no parameters")
+    _pushing(fly, "write to a drone that is not simulated (default: dry run)")
     fly.add_argument("--record", metavar="FILE.mcap", help="record everything")
     fly.add_argument("--append", action="store_true", help="to an existing recording, as its next session")
     fly.add_argument("--scenario", metavar="FILE", help="the simulator's truth (only the simulator reads it)")
@@ -79,18 +79,101 @@ def parser() -> argparse.ArgumentParser:
     fly.add_argument(
         "--speed", type=_number(0.05, 100), metavar="X", help="of the simulator, times real time (default: 1)"
     )
+    _logging(fly, reconnect=8.0)
+    _many(fly)
 
     replay = common("replay", "run the estimator over a recording", recorded=True)
     replay.add_argument("file", metavar="FILE", help="a recording of any known format")
     _reading(replay)
 
-    watch = common("watch", "estimate without commanding")
-    watch.add_argument("uri", metavar="URI")
+    watch = common("watch", "estimate without commanding; of MAVLink drones, write hover thrust if asked")
+    watch.add_argument("uri", nargs="?", metavar="URI")
     watch.add_argument("--duration", type=_number(0.1, 1e6, " seconds"), metavar="S", help="s until it ends by itself")
+    _pushing(watch, "write hover thrust to a MAVLink drone (default: dry run)")
     watch.add_argument("--record", metavar="FILE.mcap", help="record everything")
     watch.add_argument("--append", action="store_true", help="to an existing recording, as its next session")
+    _logging(watch, reconnect=30.0)
+    _many(watch)
+    _links(commands)
+    _policy(commands)
     _on_recordings(commands)
+    _paper(commands)
     return top
+
+
+def _pushing(p: argparse.ArgumentParser, push: str) -> None:
+    """Whether the guard may write."""
+    pushing = p.add_mutually_exclusive_group()
+    pushing.add_argument("--push", action="store_true", help=push)
+    pushing.add_argument("--confirm", action="store_true", help="write, but ask before the first time")
+    pushing.add_argument("--dry-run", action="store_true", help="decide and tell what would be written, write nothing")
+    pushing.add_argument("--no-push", action="store_true", help="estimate only, write no parameters")
+    p.add_argument("--policy", metavar="FILE.toml", help="of the guard on writes (default: see crazyem policy)")
+
+
+def _logging(p: argparse.ArgumentParser, *, reconnect: float) -> None:
+    """What a session asks of its link."""
+    hertz, seconds = _number(1, 1000, " Hz"), _number(0, 3600, " seconds")
+    p.add_argument("--rate", type=hertz, default=100.0, metavar="HZ", help="of the log, to 1000 (default: 100)")
+    p.add_argument(
+        "--reconnect", type=seconds, default=reconnect, metavar="S",
+        help=f"how long a lost link is tried again; 0: never (default: {reconnect:g})",
+    )  # fmt: skip
+
+
+def _many(p: argparse.ArgumentParser) -> None:
+    """Several drones, and how they are shown."""
+    p.add_argument("--uri", action="append", default=[], dest="uris", metavar="URI", help="one more drone (repeatable)")
+    p.add_argument("--swarm", metavar="FILE.toml", help="drones with uri, vehicle, trajectory and offset each")
+    shown = p.add_mutually_exclusive_group()
+    shown.add_argument("--live", action="store_true", help="a live view, also where output goes to a file")
+    shown.add_argument("--no-live", action="store_true", help="plain lines (default where there is no terminal)")
+    p.add_argument(
+        "--foxglove", nargs="?", type=_integer(1, 65535), const=8765, metavar="PORT",
+        help="stream to Foxglove on this host while it runs (default port: 8765)",
+    )  # fmt: skip
+
+
+def _links(commands: Any) -> None:
+    """What there is to fly and watch."""
+    text = "what a drone could be reached through here: radio, USB, UDP, serial; and what is missing"
+    p = commands.add_parser("links", help=text, description=text)
+    p.add_argument("--host", default="127.0.0.1", metavar="HOST", help="asked for drones on UDP (default: this one)")
+    p.add_argument(
+        "--ports", nargs="+", type=_integer(1, 65535), metavar="PORT", help="of UDP (default: 19850 to 19859)"
+    )
+    p.add_argument("--no-air", action="store_true", help="do not search the air for drones, which takes some seconds")
+    p.add_argument("--json", nargs="?", const="-", metavar="FILE", help="for programs; without FILE on standard output")
+
+
+def _policy(commands: Any) -> None:
+    """The rules of the guard."""
+    text = "the rules of the guard on writes to a drone: the shipped ones, or a file's, checked"
+    p = commands.add_parser("policy", help=text, description=text)
+    p.add_argument("file", nargs="?", metavar="FILE.toml", help="a policy file (default: the shipped policy)")
+    p.add_argument("--json", nargs="?", const="-", metavar="FILE", help="for programs; without FILE on standard output")
+
+
+def _paper(commands: Any) -> None:
+    """Zhao's paper, made again."""
+    text = "the paper's simulations again: its method, ours and the information limit, as tables and figures"
+    p = commands.add_parser("paper", help=text, description=text)
+    p.add_argument("--experiment", choices=("all", "table1", "offline", "online"), default="all")
+    p.add_argument("--sensor", choices=("A", "B", "C", "all"), default="all")
+    p.add_argument("--method", choices=("published", "crazyem", "both"), default="both")
+    p.add_argument("--seeds", type=_integer(1, 10_000), default=20, metavar="N", help="flights of each (default: 20)")
+    p.add_argument("--jobs", type=_integer(1, 1024), metavar="N", help="processes (default: one a core)")
+    p.add_argument("--cluster", metavar="ADDRESS", help="work on a Dask cluster: address of its scheduler")
+    p.add_argument(
+        "--out", default="paper", metavar="DIR", help="output, and where a stopped run goes on (default: paper)"
+    )
+    p.add_argument(
+        "--reading", choices=("p5", "literal"), default="p5", help="of what the paper leaves unsaid (default: p5)"
+    )
+    p.add_argument(
+        "--set", action="append", metavar="NAME=VALUE", help="change a setting of the simulation (repeatable)"
+    )
+    p.add_argument("--settings", action="store_true", help="list the settings with their reasons, and run nothing")
 
 
 def _reading(p: argparse.ArgumentParser) -> None:
@@ -104,6 +187,43 @@ def _reading(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--as-published", action="store_true", help="believe a preset's publisher instead of correcting known mistakes"
     )
+
+
+def _diagnose(commands: Any) -> None:
+    """Where simulation and flight part."""
+    text = "where a vehicle's model and its flights part, which physics was left out, and the model with it"
+    p = commands.add_parser("diagnose", help=text, description=text)
+    p.add_argument("files", nargs="+", metavar="RECORDING", help="flights of one drone")
+    p.add_argument("--vehicle", metavar="NAME|FILE", help="the nominal model (default: the one that was flown)")
+    p.add_argument("--against", metavar="SIMULATED", help="a simulated recording of the same mission, to look at first")
+    p.add_argument(
+        "--held-out", nargs="+", action="extend", default=[], metavar="RECORDING", help="flights only to judge by"
+    )
+    p.add_argument(
+        "--withhold", action="append", default=[], metavar="SIGNAL", help="a signal to leave unused, e.g. pm.vbat"
+    )
+    p.add_argument("--candidates", metavar="A,B,...", help="effects to look for (default: the whole catalogue)")
+    p.add_argument("--report", metavar="OUT.html", help="one self-contained page")
+    p.add_argument("--json", metavar="OUT.json", help="the diagnosis for programs; - for standard output")
+    p.add_argument("--write-vehicle", metavar="FITTED.toml", help="the vehicle with what was found")
+    _reading(p)
+
+
+def _predict(commands: Any) -> None:
+    """Open loop, for anyone's own metric."""
+    text = "where a vehicle goes by its model: open-loop predictions from every recorded state, by recorded inputs"
+    p = commands.add_parser("predict", help=text, description=text)
+    p.add_argument("file", metavar="RECORDING", help="a recording of any known format")
+    p.add_argument("--vehicle", metavar="NAME|FILE", help="preset or vehicle file (default: the one that was flown)")
+    p.add_argument("--horizon", type=_integer(1, 1_000_000), required=True, metavar="N", help="steps from each start")
+    step = _number(1e-4, 10, " seconds")
+    p.add_argument("--step", type=step, metavar="S", help="s between predicted states (default: the recorded samples)")
+    p.add_argument(
+        "--every", type=_integer(1, 1_000_000), default=1, metavar="K", help="samples from start to start (default: 1)"
+    )
+    p.add_argument("-o", "--output", required=True, metavar="OUT.npz", help="array `prediction`, and which starts")
+    p.add_argument("--force", action="store_true", help="replace what is there (never a recording that is read)")
+    _reading(p)
 
 
 def _on_recordings(commands: Any) -> None:
@@ -149,8 +269,12 @@ def _on_recordings(commands: Any) -> None:
     recover.add_argument("file", metavar="BROKEN.mcap", help="of any program; it is only read")
     writes(recover, "OUT.mcap", "the new file")
 
+    _diagnose(commands)
+    _predict(commands)
     layout = command("layout", "a Foxglove and Lichtblick layout for recordings of ours", many=False)
     writes(layout, "FILE.json", "file (default: standard output)", required=False)
+    layout.add_argument("--swarm", metavar="FILE.toml", help="for the drones of this file, as --foxglove streams them")
+    layout.add_argument("--drones", nargs="+", metavar="NAME", help="the same for drones by name")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -14,19 +14,41 @@ from numba import njit
 FASTMATH = {"contract", "reassoc", "nsz"}  # lets dot products use vector registers; NaN keeps its meaning
 
 _ROOT = Path(__file__).parent
-_KERNELS = tuple(_ROOT / folder for folder in ("physics", "estimation"))  # kernels here call each other across files
-_STAMP = tuple(
-    (path.name, path.stat().st_mtime_ns, path.stat().st_size)
-    for folder in _KERNELS
-    for path in sorted(folder.rglob("*.py"))
-)
+# Folders with kernels, and the folders whose kernels those call: an edit in any of these calls for compiling again.
+_CALLS = {
+    "physics": ("physics",),
+    "estimation": ("physics", "estimation"),
+    "control": ("control",),
+    "paper": ("control", "paper"),
+    "diagnosis": ("physics", "estimation", "diagnosis"),
+}
+
+
+def _has_kernels(path: Path) -> bool:
+    """Whether an edit there can change a kernel: it defines some, or the indices that they read."""
+    return path.name == "layout.py" or "@compiled" in path.read_text(encoding="utf-8")
+
+
+def _stamp(folders: tuple[str, ...]) -> tuple[tuple[str, int, int], ...]:
+    kernels = (p for folder in folders for p in sorted((_ROOT / folder).rglob("*.py")) if _has_kernels(p))
+    # this file says how to compile
+    return tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in (Path(__file__), *kernels))
+
+
+_STAMPS = {folder: _stamp(called) for folder, called in _CALLS.items()}
 
 
 def compiled(function: Callable[..., Any]) -> Any:
-    """Compile `function` (explicit loops over arrays): cached on disk, without the interpreter lock."""
-    dispatcher: Any = njit(cache=True, nogil=True, fastmath=FASTMATH)(function)
-    if not any(folder in Path(function.__code__.co_filename).parents for folder in _KERNELS):
+    """Compile `function` (explicit loops over arrays): cached on disk, without the interpreter lock.
+
+    A division by zero gives inf or NaN, as in numpy, and callers check what comes out; raising instead would put a
+    branch at every division and cost a third of an update.
+    """
+    dispatcher: Any = njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")(function)
+    path = Path(function.__code__.co_filename)
+    folder = path.relative_to(_ROOT).parts[0] if path.is_relative_to(_ROOT) else ""
+    if folder not in _STAMPS:
         return dispatcher  # a kernel elsewhere uses its own file only, whose time numba checks itself
     with contextlib.suppress(AttributeError):  # private to numba; without it caching works, only less watchful
-        dispatcher._cache._cache_file._source_stamp = _STAMP
+        dispatcher._cache._cache_file._source_stamp = _STAMPS[folder]
     return dispatcher

@@ -36,6 +36,16 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--speed", type=_positive, default=1.0, help="firmware seconds per second (default %(default)s)"
     )
+    parser.add_argument(
+        "--swarm", metavar="N|FILE.toml", help="many drones in one process: so many on ports --port and up, or a file's"
+    )
+    parser.add_argument(
+        "--mavlink",
+        action="append",
+        metavar="udpout:HOST:PORT|udpin:HOST:PORT|serial",
+        help="speak MAVLink as a PX4 would, instead of CRTP: to a ground station, to whoever calls, or at a "
+        "pseudo-terminal whose name is printed (repeatable: all hear the same, all may command)",
+    )
     parser.add_argument("--truth", type=Path, help="write the true motion to this CSV file, 100 rows per second")
     return parser
 
@@ -44,7 +54,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the simulator until SIGINT or SIGTERM; 0 then, 2 after a mistake of the user, told in one sentence."""
     arguments = _parser().parse_args(argv)
     try:
-        _run(arguments)
+        if arguments.mavlink is not None:
+            from firmware_sim.mavlink.run import run as run_mavlink
+
+            run_mavlink(arguments)
+        elif arguments.swarm is not None:
+            _run_swarm(arguments)
+        else:
+            _run(arguments)
     except FirmwareSimError as error:
         print(f"firmware_sim: {error}", file=sys.stderr)
         return 2
@@ -82,6 +99,29 @@ def _run(arguments: argparse.Namespace) -> None:
         host, port = sock.getsockname()
         print(f"firmware_sim: udp://{host}:{port} platform {scenario.platform} seed {arguments.seed}", flush=True)
         server.run()
+
+
+def _run_swarm(arguments: argparse.Namespace) -> None:
+    from firmware_sim import swarm
+
+    if arguments.seed < 0:
+        raise FirmwareSimError(f"--seed must not be negative, it is {arguments.seed}")
+    if arguments.truth:
+        raise FirmwareSimError("--truth is for one drone: leave it out with --swarm")
+    options = {"port": arguments.port, "seed": arguments.seed, "scenario": arguments.scenario}
+    text = arguments.swarm
+    digits = text.isascii() and text.isdigit() and len(text) < 10
+    drones = swarm.of_number(int(text), **options) if digits else swarm.of_file(Path(text), **options)
+    with contextlib.ExitStack() as stack:
+        running = swarm.open_swarm(drones, stack, host=arguments.host, speed=arguments.speed)
+
+        def stop(_signal: int, _frame: object) -> None:
+            running.stopping = True
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, stop)
+        print(f"firmware_sim: {len(drones)} drones are ready", flush=True)
+        running.run()
 
 
 if __name__ == "__main__":

@@ -13,7 +13,10 @@ from firmware_sim.controllers import layout as mem
 from firmware_sim.controllers import lqg_design, parameters, variables
 from firmware_sim.controllers import variables as lv
 from firmware_sim.controllers.tick import tick_step
+from firmware_sim.controllers.tick_with_effects import tick_step_with_effects
 from firmware_sim.plant import layout as at
+from firmware_sim.plant.effects.drive import present_wrench
+from firmware_sim.plant.effects.motion import origin
 from firmware_sim.plant.noise import NoiseSource
 from firmware_sim.plant.rotors import wrench
 from firmware_sim.plant.sensors import ACC_CUTOFF, settle
@@ -38,6 +41,11 @@ class Flight:
         self.armed = scenario.platform != "cf21bl"
         self._noise = NoiseSource(seed)
         self._truth = scenario.truth()
+        self._payload = scenario.payload_changes()
+        self._effects = bool(
+            self._truth[at.EFFECT_ROTORS] + self._truth[at.EFFECT_BODY] + self._truth[at.EFFECT_SENSING]
+        )
+        self._tick_step = tick_step_with_effects if self._effects else tick_step  # compiled when first called
         self._board = scenario.board()
         self.state = scenario.start_state()
         self._sensor = np.zeros(at.SENSOR_SIZE)
@@ -53,17 +61,19 @@ class Flight:
         self.param = {name: (self._param, i) for name, i in parameters.INDEX.items()}
         self._controller = float(DEFAULT_CONTROLLER)
         self._design_lqg()
-        self._start_up()
+        self._start_up(scenario)
         for name, value in scenario.parameters.items():
             if name in self.param:
                 self._param[self.param[name][1]] = value
                 self.parameter_written(name)
         self._compile()
 
-    def _start_up(self) -> None:
+    def _start_up(self, scenario: Scenario) -> None:
         """Sensors settled and calibrated, estimate at its place: as after a boot on level ground."""
         biases = self._noise.boot(3)
         self._sensor[at.BIAS : at.BIAS + 3] = biases * self._truth[at.GYRO_BIAS : at.GYRO_BIAS + 3]
+        if "gyro_bias" in scenario.effects:
+            self._sensor[at.BIAS : at.BIAS + 3] += [scenario.effects["gyro_bias"][axis] for axis in "xyz"]
         for i in range(3):
             settle(self._sensor, at.ACCEL_FILTER + 2 * i, self.state[at.ACC + i], ACC_CUTOFF)
         self._sensor[at.VBAT] = self._sensor[at.VBAT_FILTERED] = self.state[at.VOLTS]
@@ -116,9 +126,11 @@ class Flight:
 
     def step(self) -> None:
         """One millisecond."""
+        while self._payload is not None and self._payload.due(self.tick, self.state):
+            self._payload.apply(self._truth, self.state)
         row = self._noise.prepare(self.tick)
         flags = int(self.motors_allowed) | int(self.armed) << 1
-        tick_step(*self._arrays(), self._noise.rows[row], self.tick, flags)
+        self._tick_step(*self._arrays(), self._noise.rows[row], self.tick, flags)
         self.tick += 1
 
     def _arrays(self) -> tuple[np.ndarray, ...]:
@@ -140,16 +152,27 @@ class Flight:
 
     def _compile(self) -> None:
         """Compile (or load) the tick on copies, so that the first millisecond takes no longer than the others."""
-        tick_step(*(array.copy() for array in self._arrays()), np.zeros(at.NOISE_WIDTH), 0, 0)
+        self._tick_step(*(array.copy() for array in self._arrays()), np.zeros(at.NOISE_WIDTH), 0, 0)
         self.truth_row()
 
     def truth_row(self) -> list[float]:
-        """What is true now, as truth_header names it: s, m, m/s, -, rad/s, N, N m, PWM 0..65535, V."""
+        """What is true now, as truth_header names it: s, m, m/s, -, rad/s, N, N m, PWM 0..65535, V.
+
+        Position and velocity of the geometric origin; force and torque (about the centre of mass) of the rotors.
+        """
         u: Any = np.empty(4)
-        wrench(self._truth, self.state, at.ROTOR, u)
+        p: Any = self.state[at.POS : at.POS + 3].copy()
+        v: Any = self.state[at.VEL : at.VEL + 3].copy()
+        if self._effects:
+            present_wrench(self._truth, self.state, u)
+            origin(self._truth, self.state, p, v)
+        else:
+            wrench(self._truth, self.state, at.ROTOR, u)
         return [
             self.tick * 1e-3,
-            *self.state[: at.ROTOR].tolist(),
+            *p.tolist(),
+            *v.tolist(),
+            *self.state[at.QUAT : at.ROTOR].tolist(),
             *u.tolist(),
             *self.state[at.PWM : at.PWM + 4].tolist(),
             float(self.state[at.VOLTS]),

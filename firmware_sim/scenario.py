@@ -4,7 +4,6 @@ Every key is listed in docs/firmware_sim.md with its default; a wrong one raises
 """
 
 import math
-import tomllib
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,13 @@ import numpy as np
 from firmware_sim.errors import ScenarioError
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.battery import open_circuit
+from firmware_sim.plant.effects.body import Body, loaded_body, replaced
+from firmware_sim.plant.effects.catalogue import Values, parse_effects
+from firmware_sim.plant.effects.constants import fill_effects, rotation
 from firmware_sim.plant.ground import GRAVITY
+from firmware_sim.plant.payload_events import PayloadChanges, PayloadEvent, PointMass, carried, parse_events
 from firmware_sim.plant.platforms import PLATFORMS, SQRT_HALF
+from firmware_sim.vehicle_file import read_toml, vehicle_tables
 
 
 def key(default: Any, low: float, high: float, sizes: tuple[int, ...] = (0,)) -> Any:
@@ -29,7 +33,7 @@ class Vehicle:
 
     mass: float = key(None, 1e-3, 5.0)
     inertia: tuple[float, ...] = key(None, -1.0, 1.0, (3, 6))  # Ixx, Iyy, Izz [, Ixy, Ixz, Iyz]
-    arm: float = key(None, 5e-3, 1.0)  # rotor offset along body x and along body y
+    arm: float | tuple[float, ...] = key(None, 5e-3, 1.0, (0, 2))  # rotor offset along body x and y (or both)
     thrust_curve: tuple[float, ...] = key(None, -100.0, 100.0, (1, 2, 3, 4, 5, 6))
     torque_per_thrust: float = key(None, 0.0, 1.0)
     thrust_max: float = key(None, 1e-3, 100.0)  # per rotor
@@ -112,6 +116,7 @@ _SECTIONS: dict[str, type] = {
     "ground": Ground,
     "link": Link,
 }
+_TABLES = (*_SECTIONS, "parameters", "effects", "hidden", "payload")
 
 
 @dataclass(frozen=True)
@@ -128,26 +133,40 @@ class Scenario:
     ground: Ground = field(default_factory=Ground)
     link: Link = field(default_factory=Link)
     parameters: dict[str, float] = field(default_factory=dict)
+    effects: dict[str, Values] = field(default_factory=dict)
+    hidden: dict[str, Values] = field(default_factory=dict)
+    payload: tuple[PayloadEvent, ...] = ()
+
+    def body(self, events: int = 0) -> Body:
+        """The body that flies after the first `events` payload events: the vehicle's, with what changes its mass."""
+        mass = _or(self.vehicle.mass, PLATFORMS[self.platform].mass)
+        return loaded_body(mass, self.inertia(), self.effects, carried(self._load(), self.payload[:events]))
+
+    def _load(self) -> list[PointMass]:
+        """What is carried from the start."""
+        p = self.effects.get("payload", {"mass": 0.0})
+        return [(p["mass"], (p["x"], p["y"], p["z"]))] if p["mass"] > 0.0 else []
 
     def inertia(self) -> np.ndarray:
-        """Inertia matrix (3, 3), kg m^2, body axes."""
+        """Inertia matrix (3, 3) of the bare vehicle, kg m^2, body axes."""
         values = self.vehicle.inertia or PLATFORMS[self.platform].inertia
         xx, yy, zz, xy, xz, yz = (*values, 0.0, 0.0, 0.0)[:6]
         return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
-    def truth(self) -> np.ndarray:
-        """The plant's constants as the compiled code reads them (plant/layout.py)."""
+    def truth(self, events: int = 0) -> np.ndarray:
+        """The plant's constants as the compiled code reads them (plant/layout.py), after the first `events` events."""
         c, v, platform = np.zeros(at.TRUTH_SIZE), self.vehicle, PLATFORMS[self.platform]
-        J = self.inertia()
-        c[at.MASS] = _or(v.mass, platform.mass)
+        body = self.body(events)
+        J = body.inertia
+        c[at.MASS] = body.mass
         c[at.INERTIA : at.INERTIA + 9] = J.ravel()
         c[at.INERTIA_INV : at.INERTIA_INV + 9] = np.linalg.inv(J).ravel()
-        c[at.ARM] = _or(v.arm, SQRT_HALF * platform.arm_length)
+        c[at.ARM], c[at.ARM_Y] = np.broadcast_to(_or(v.arm, SQRT_HALF * platform.arm_length), 2)
         curve = _or(v.thrust_curve, platform.curve)
         c[at.CURVE : at.CURVE + len(curve)] = curve
         c[at.TORQUE_PER_THRUST] = _or(v.torque_per_thrust, platform.torque_per_thrust)
         c[at.THRUST_MAX] = _or(v.thrust_max, platform.rotor_thrust_limit)
-        c[at.MOTOR_TAU] = v.motor_time_constant
+        c[at.MOTOR_TAU] = _or(self.effects.get("motor_lag", {}).get("time_constant"), v.motor_time_constant)
         c[at.ROTOR_CONSTANT] = _or(v.rotor_constant, platform.rotor_constant)
         c[at.NOISE_THRUST] = self.noise.thrust
         c[at.NOISE_TORQUE : at.NOISE_TORQUE + 3] = self.noise.torque
@@ -158,7 +177,12 @@ class Scenario:
         c[at.VBAT_NOISE] = self.battery.noise
         c[at.FLOOR] = self.ground.height
         c[at.FRICTION] = self.ground.friction
-        c[at.CONTACT_FREQUENCY : at.CONTACT_FREQUENCY + 3] = _contact(c[at.MASS], c[at.ARM], J)
+        fill_effects(c, self.effects, self.hidden, _or(v.mass, platform.mass), body.center_of_mass)
+        if self.payload:  # the centre of mass may move, and the time since take-off is kept with effects only
+            c[[at.EFFECT_ROTORS, at.EFFECT_BODY, at.EFFECT_SENSING]] = 1.0
+        arm = max(c[at.ARM], c[at.ARM_Y])
+        c[at.FEET_REACH] = 1.5 * arm
+        c[at.CONTACT_FREQUENCY : at.CONTACT_FREQUENCY + 3] = _contact(c[at.STANDING_MASS], arm, J)
         c[at.GYRO_NOISE] = self.sensors.gyro_noise
         c[at.GYRO_BIAS : at.GYRO_BIAS + 3] = self.sensors.gyro_bias
         c[at.GYRO_WALK] = self.sensors.gyro_bias_walk
@@ -168,6 +192,12 @@ class Scenario:
         c[at.FIX_POSITION] = self.estimator.position_noise
         c[at.FIX_ATTITUDE] = self.estimator.attitude_noise
         return c
+
+    def payload_changes(self) -> PayloadChanges | None:
+        """What happens to the body in flight; None where nothing does."""
+        if not self.payload:
+            return None
+        return PayloadChanges(self.payload, [self.truth(n + 1) for n in range(len(self.payload))])
 
     def board(self) -> np.ndarray:
         """The constants compiled into the platform's firmware, whatever is true."""
@@ -191,6 +221,13 @@ class Scenario:
         if standing:
             x[at.POS + 2] = self.ground.height
             x[at.ACC + 2] = GRAVITY
+        yaw, (cx, cy, cz) = self.start.yaw, self.body().center_of_mass
+        x[at.POS] += math.cos(yaw) * cx - math.sin(yaw) * cy
+        x[at.POS + 1] += math.sin(yaw) * cx + math.cos(yaw) * cy
+        x[at.POS + 2] += cz
+        x[at.LOAD + 2] = -1.0
+        if "accelerometer_misalignment" in self.effects:
+            x[at.ACC : at.ACC + 3] = rotation(self.effects["accelerometer_misalignment"]).T @ x[at.ACC : at.ACC + 3]
         return x
 
 
@@ -212,44 +249,66 @@ def load_scenario(path: Path | None) -> Scenario:
     """Read a scenario file; None gives the default. Raises ScenarioError with one sentence naming file and key."""
     if path is None:
         return Scenario()
-    try:
-        with open(path, "rb") as file:
-            table = tomllib.load(file)
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{path}: not a TOML file ({error})") from error
-    return parse_scenario(table, str(path))
+    return parse_scenario(read_toml(path), str(path), folder=path.parent)
 
 
-def parse_scenario(table: dict[str, Any], source: str) -> Scenario:
-    """Check a scenario's table and build it; source names the file in messages. Raises ScenarioError."""
+def parse_scenario(table: dict[str, Any], source: str, folder: Path | None = None) -> Scenario:
+    """Check a scenario's table and build it; source names the file in messages. Raises ScenarioError.
+
+    folder: what a relative vehicle_file starts from (without it, the working directory).
+    """
     platform = table.get("platform", "cf2")
     if not isinstance(platform, str) or platform not in PLATFORMS:
         raise ScenarioError(f"{source}: platform must be one of {', '.join(PLATFORMS)}, not {platform!r}")
     scenario = Scenario(platform=platform)
+    if "vehicle_file" in table:
+        scenario = _of_vehicle_file(scenario, table["vehicle_file"], source, folder or Path())
     for name, value in table.items():
-        if name == "platform":
+        if name in ("platform", "vehicle_file"):
             continue
-        if name not in _SECTIONS and name != "parameters":
-            raise ScenarioError(
-                f"{source}: {name} is not part of a scenario (known: {', '.join(_SECTIONS)}, parameters)"
-            )
+        if name not in _TABLES:
+            raise ScenarioError(f"{source}: {name} is not part of a scenario (known: {', '.join(_TABLES)})")
         if not isinstance(value, dict):
             raise ScenarioError(f"{source}: {name} must be a section [{name}]")
         if name == "parameters":
             scenario = replace(scenario, parameters=_parameters(value, source))
+        elif name in ("effects", "hidden"):
+            checked: Any = getattr(scenario, name) | parse_effects(value, source, name)
+            scenario = replace(scenario, **{name: checked})
+        elif name == "payload":
+            continue  # below: it depends on the effects, wherever they stand
         else:
-            scenario = replace(scenario, **{name: _section(_SECTIONS[name], name, value, source)})
+            scenario = replace(
+                scenario, **{name: replace(getattr(scenario, name), **_section(name, value, f"{source}: {name}."))}
+            )
     _check_body(scenario, source)
+    if "payload" in table:
+        events = parse_events(table["payload"], source, loaded=bool(scenario._load()))
+        scenario = replace(scenario, payload=events)
     return scenario
 
 
-def _section(kind: type, name: str, table: dict[str, Any], source: str) -> Any:
-    known = {f.name: f for f in fields(kind)}
-    values = {}
+def _of_vehicle_file(scenario: Scenario, value: Any, source: str, folder: Path) -> Scenario:
+    """The scenario with a vehicle file's constants and effects, which the scenario's own keys then override."""
+    if not isinstance(value, str):
+        raise ScenarioError(f"{source}: vehicle_file must be the path of a vehicle file, not {value!r}")
+    path = folder / value
+    vehicle, effects = vehicle_tables(path)
+    scenario = replace(
+        scenario,
+        vehicle=Vehicle(**_section("vehicle", vehicle, f"{path}: ")),
+        effects=parse_effects(effects, str(path), "effects"),
+    )
+    _check_body(scenario, str(path))
+    return scenario
+
+
+def _section(name: str, table: dict[str, Any], prefix: str) -> dict[str, Any]:
+    """The checked values that a table gives to a section; `prefix` goes before a key's name in messages."""
+    known = {f.name: f for f in fields(_SECTIONS[name])}
+    values: dict[str, Any] = {}
     for entry, value in table.items():
-        where = f"{source}: {name}.{entry}"
+        where = f"{prefix}{entry}"
         if entry not in known:
             raise ScenarioError(f"{where} is not a key of a scenario (known: {', '.join(known)})")
         rule = known[entry].metadata
@@ -259,7 +318,7 @@ def _section(kind: type, name: str, table: dict[str, Any], source: str) -> Any:
             values[entry] = value
         else:
             values[entry] = _numbers(value, where, rule["low"], rule["high"], rule["sizes"])
-    return kind(**values)
+    return values
 
 
 def _numbers(value: Any, where: str, low: float, high: float, sizes: tuple[int, ...]) -> float | tuple[float, ...]:
@@ -292,8 +351,17 @@ def _parameters(table: dict[str, Any], source: str) -> dict[str, float]:
 def _check_body(scenario: Scenario, source: str) -> None:
     """An inertia matrix no body can have is an error of the file."""
     if scenario.vehicle.inertia is not None:
-        principal = np.linalg.eigvalsh(scenario.inertia())
-        if principal[0] < 1e-9:
-            raise ScenarioError(f"{source}: vehicle.inertia is not positive definite")
-        if principal[2] > (principal[0] + principal[1]) * 1.000001:
-            raise ScenarioError(f"{source}: vehicle.inertia breaks the triangle inequality, no body has it")
+        _check_inertia(scenario.inertia(), f"{source}: vehicle.inertia")
+    changed = [name for name in ("inertia", "inertia_products") if name in scenario.effects]
+    if changed:
+        _check_inertia(replaced(scenario.inertia(), scenario.effects), f"{source}: effects.{changed[-1]}")
+    if scenario.platform != "cf21bl" and "rotor_sensor" in scenario.effects:
+        raise ScenarioError(f"{source}: effects.rotor_sensor needs platform cf21bl, {scenario.platform} has no sensors")
+
+
+def _check_inertia(J: np.ndarray, where: str) -> None:
+    principal = np.linalg.eigvalsh(J)
+    if principal[0] < 1e-9:
+        raise ScenarioError(f"{where} is not positive definite")
+    if principal[2] > (principal[0] + principal[1]) * 1.000001:
+        raise ScenarioError(f"{where} breaks the triangle inequality, no body has it")

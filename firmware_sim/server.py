@@ -8,6 +8,7 @@ import selectors
 import socket
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import TextIO
 
 from firmware_sim import wire
@@ -78,28 +79,52 @@ class Server:
         self._pending: deque[bytes] = deque()  # replies the socket had no room for
         self._truth = TruthWriter(truth, firmware) if truth else None
         self.stopping = False
+        self.stood_still = 0  # how often the host was so late that the drone's time stood still instead
+        self._zero, self._epoch = 0, 0.0
 
     def run(self) -> None:
         """Serve until `stopping` is set (a signal handler does)."""
         with selectors.DefaultSelector() as selector:
             selector.register(self._sock, selectors.EVENT_READ)
-            most = min(_MAX_BEHIND_HOST * self._speed, _MAX_BEHIND_FIRMWARE) + _CHUNK
-            zero, epoch = self.firmware.flight.tick, time.monotonic()  # this tick belongs to this time
+            self.begin()
             while not self.stopping:
-                target = zero + (time.monotonic() - epoch) * 1000.0 * self._speed
-                behind = int(target) - self.firmware.flight.tick
-                if behind > most:
-                    zero, epoch, behind = self.firmware.flight.tick, time.monotonic(), 0
-                if behind > 0:
-                    self._advance(min(behind, _CHUNK))
-                self._receive_all()
-                self._transmit()
-                if behind > _CHUNK:
+                due = self.turn(self.firmware.next_event)
+                if due <= 0.0:
                     continue
-                due = epoch + (self.firmware.next_event() - zero) / (1000.0 * self._speed)
-                wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if self._pending else 0)
-                selector.modify(self._sock, wanted)
+                selector.modify(self._sock, self.wanted)
                 selector.select(max(due - time.monotonic(), 0.0))
+
+    def begin(self) -> None:
+        """Time goes on from here."""
+        self._zero, self._epoch = self.firmware.flight.tick, time.monotonic()  # this tick belongs to this time
+
+    def turn(self, next_event: Callable[[], int]) -> float:
+        """Let pass what is due, at most a chunk of it; receive and send.
+
+        Args:
+            next_event: the tick [ms] at which to come again.
+
+        Returns: host time (monotonic, s) of the next turn, 0 if there is more to do at once.
+        """
+        flight = self.firmware.flight
+        most = min(_MAX_BEHIND_HOST * self._speed, _MAX_BEHIND_FIRMWARE) + _CHUNK
+        behind = int(self._zero + (time.monotonic() - self._epoch) * 1000.0 * self._speed) - flight.tick
+        if behind > most:
+            self.begin()
+            behind = 0
+            self.stood_still += 1
+        if behind > 0:
+            self._advance(min(behind, _CHUNK))
+        self._receive_all()
+        self._transmit()
+        if behind > _CHUNK:
+            return 0.0
+        return self._epoch + (next_event() - self._zero) / (1000.0 * self._speed)
+
+    @property
+    def wanted(self) -> int:
+        """What of the socket is to be waited for (`selectors`)."""
+        return selectors.EVENT_READ | (selectors.EVENT_WRITE if self._pending else 0)
 
     def _advance(self, milliseconds: int) -> None:
         if self._truth is None:

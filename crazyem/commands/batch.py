@@ -22,6 +22,7 @@ def each(
     what: str,
     jobs: int | None = None,
     cluster: str | None = None,
+    unit: str = "files",
 ) -> Iterator[Result]:
     """Results of `function(*task)`, in the order of the tasks, as they become known; progress on standard error.
 
@@ -32,11 +33,12 @@ def each(
         what: the command, for progress.
         jobs: processes; None: one a core, but none for a single task.
         cluster: address of a Dask scheduler, whose workers see the same files under the same names.
+        unit: what the tasks are, for progress.
 
     Raises: UsageError (no `distributed`, wrong address), LinkError (nothing answers there).
     """
     calls = [(function, task, name) for task, name in zip(tasks, names, strict=True)]
-    with Progress(what, len(calls)) as progress, contextlib.ExitStack() as stack:
+    with Progress(what, len(calls), unit) as progress, contextlib.ExitStack() as stack:
         for result in _results(calls, jobs, cluster, stack):
             progress.clear()
             yield result

@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +17,41 @@ from crazyem.vehicle import Vehicle
 
 def say(line: str) -> None:
     """Progress goes to standard error, so that `--json -` leaves standard output to the summary."""
-    print(line, file=sys.stderr, flush=True)
+    print(f"{line}\n", end="", file=sys.stderr, flush=True)  # in one piece, whoever else prints
 
 
 class LiveLine:
-    """Prints a line each second about a session."""
+    """Prints a line each second about a session, and remembers what it was told for the live view.
 
-    def __init__(self, session: Any) -> None:
+    Attributes:
+        quiet: whether something else shows it now.
+    """
+
+    def __init__(self, session: Any, *, prefix: str = "", quiet: Callable[[], bool] = lambda: False) -> None:
         self.session = session
+        self.prefix, self.quiet = prefix, quiet
+        self.phase, self.seconds = "connected", 0.0
+        self._told = 0
 
     def __call__(self, phase: str, seconds: float) -> None:
+        self.phase, self.seconds = phase, seconds
         history: History = self.session.history
         lost = self.session.link.statistics().lost
         history.losses.append((self.session.clock.newest, lost))
-        say(live_line(phase, seconds, self.session.estimate, lost=lost, pushes=len(history.pushes)))
+        if not self.quiet():
+            say(self.prefix + live_line(phase, seconds, self.session.estimate, lost=lost, pushes=len(history.pushes)))
+            self._told = tell_steps(history, self._told, prefix=self.prefix)
+
+
+def tell_steps(history: History, told: int, *, prefix: str = "") -> int:
+    """A line for each step of mass that was decided since `told` of them were; returns how many are told now."""
+    for step in history.steps[told:]:
+        if step.real is None:
+            break
+        told += 1
+        if step.real:
+            say(f"{prefix}{step}")
+    return told
 
 
 def plot_path(arguments: argparse.Namespace, *others: str | None) -> str:
@@ -106,11 +127,24 @@ def raise_after(error: BaseException | None) -> None:
         raise error
 
 
-def new_estimator(vehicle: Vehicle, arguments: argparse.Namespace) -> Any:
-    """The estimator with the window of the command line."""
-    from crazyem.estimation.online import OnlineEstimator
+def new_estimator(vehicle: Vehicle, arguments: argparse.Namespace, *, attitude_period: float = 0.0) -> Any:
+    """The estimator with the window of the command line; it begins its window anew when the mass steps.
 
-    return OnlineEstimator(vehicle, window=arguments.window, every=arguments.every)
+    `attitude_period` [s] as in `OnlineEstimator`.
+    """
+    from crazyem.estimation.online import OnlineEstimator
+    from crazyem.estimation.steps import StepAwareEstimator
+
+    return StepAwareEstimator(
+        OnlineEstimator(vehicle, window=arguments.window, every=arguments.every, attitude_period=attitude_period)
+    )
+
+
+def attitude_period(uri: str) -> float:
+    """For `new_estimator`, of what comes from this link [s]."""
+    from crazyem.signals.mavlink import ATTITUDE_PERIOD
+
+    return ATTITUDE_PERIOD if uri.startswith("mavlink:") else 0.0
 
 
 def compile_kernels(vehicle: Vehicle) -> None:

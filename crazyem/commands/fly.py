@@ -2,10 +2,13 @@
 
 import argparse
 import contextlib
+import select
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
+from urllib.parse import urlsplit
 
 from crazyem.commands.common import (
     LiveLine,
@@ -17,6 +20,7 @@ from crazyem.commands.common import (
     report,
     say,
 )
+from crazyem.commands.view import Everyone, Shown, Streams, landing, live_view, wants_view
 from crazyem.control.trajectories import Trajectory, Vector, excite, figure8, hover
 from crazyem.control.waypoints import read_waypoints, waypoints
 from crazyem.errors import CrazyemError, UsageError
@@ -24,10 +28,12 @@ from crazyem.links import open_link
 from crazyem.live.controllers import controller_named
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
 from crazyem.live.mcap_recorder import open_recorder
+from crazyem.live.oversight import Rules
+from crazyem.live.policy import load_policy
 from crazyem.live.session import Session
 from crazyem.live.simulator import Simulator
 from crazyem.live.summary import check_writable
-from crazyem.vehicle import load_vehicle
+from crazyem.physics import folding
 
 HEIGHT = 1.0  # m
 SIMPLE = {"hover": hover, "figure8": figure8, "excite": excite}
@@ -52,9 +58,9 @@ def trajectory_maker(words: list[str], duration: float) -> Callable[[Vector, flo
 
 
 @contextlib.contextmanager
-def interrupts() -> Iterator[Interrupts]:
+def interrupts(counter: Interrupts | None = None) -> Iterator[Interrupts]:
     """Ctrl-C counts instead of raising, so that it can never hit between two commands to a flying drone."""
-    counter = Interrupts()
+    counter = counter or Interrupts()
     if threading.current_thread() is not threading.main_thread():
         yield counter
         return
@@ -66,20 +72,80 @@ def interrupts() -> Iterator[Interrupts]:
             signal.signal(s, handler)
 
 
+def simulated(uri: str) -> bool:
+    """Whether a URI is a simulator's: UDP on this host, or none at all, which starts one. All else may be a drone."""
+    if not uri:
+        return True
+    try:
+        parts = urlsplit(uri)
+        return parts.scheme == "udp" and parts.hostname == "127.0.0.1"
+    except ValueError:
+        return False
+
+
+def write_rules(arguments: argparse.Namespace, uri: str | None = None, *, name: str = "this drone") -> Rules:
+    """Policy and mode of the guard: simulators are written to, drones only after --push or --confirm.
+
+    Args:
+        uri: of the drone; None takes that of the command line.
+        name: of the drone, for sentences.
+
+    Raises:
+        UsageError, FileFormatError: the policy cannot be used.
+    """
+    policy = load_policy(arguments.policy)
+    meant = arguments.push or arguments.confirm or simulated(arguments.uri or "" if uri is None else uri)
+    dry_run = arguments.dry_run or not meant
+    if dry_run and not arguments.dry_run and not arguments.no_push:
+        say(f"dry run: nothing is written to {name} until --push (or --confirm) is given")
+    return Rules(policy, dry_run=dry_run, ask=asker(name) if arguments.confirm and not dry_run else None)
+
+
+_ASKING = threading.Lock()  # one question at a time, whoever asks
+
+
+def asker(name: str) -> Callable[[str, threading.Event], bool]:
+    """Asks on the terminal about a drone of that name."""
+
+    def ask(question: str, ended: threading.Event) -> bool:
+        with _ASKING:
+            return ask_terminal(question if name == "this drone" else f"{name}: {question}", ended)
+
+    return ask
+
+
+def ask_terminal(question: str, ended: threading.Event) -> bool:
+    """Yes or no from standard input; no where there is none, or once `ended` is set."""
+    say(f"{question}\n  push it, and what follows under the policy? [y/N]")
+    while not ended.is_set():
+        # Never blocked in a read: the flight may end before anyone answers.
+        if select.select([sys.stdin], [], [], 0.2)[0]:
+            return sys.stdin.readline().strip().lower() in ("y", "yes")
+    return False
+
+
 def run(arguments: argparse.Namespace) -> int:
     """The command; returns the exit code, raises CrazyemError for errors of the user's."""
-    vehicle = load_vehicle(arguments.vehicle)
+    if arguments.uris or arguments.swarm:
+        from crazyem.commands.swarm import fly as fly_many
+
+        return fly_many(arguments)
+    if (arguments.uri or "").startswith("mavlink:"):
+        raise UsageError("a MAVLink drone is flown by its own ground station: use crazyem watch, with --push to write.")
+    vehicle, left_out = folding.fold(folding.load(arguments.vehicle))
     controller = controller_named(arguments.controller)
     plan = FlightPlan(
         trajectory=trajectory_maker(arguments.trajectory, arguments.duration),
         controller=controller,
         height=HEIGHT,
         push=not arguments.no_push,
+        rules=write_rules(arguments),
     )
     plot = plot_path(arguments, arguments.record, arguments.json)
     for path in (arguments.json, arguments.record, plot):
         check_writable(path)
     new_estimator(vehicle, arguments)  # a wrong window is refused here
+    view = wants_view(arguments)
     if arguments.uri and (arguments.scenario or arguments.speed is not None or arguments.seed is not None):
         raise UsageError("--scenario, --seed and --speed belong to the built-in simulator: leave out the URI.")
     compile_kernels(vehicle)
@@ -89,14 +155,25 @@ def run(arguments: argparse.Namespace) -> int:
             simulator = Simulator(scenario=arguments.scenario, seed=arguments.seed or 0, speed=arguments.speed or 1.0)
             uri = stack.enter_context(simulator).uri
             say(f"simulated firmware at {uri}")
-        return _fly(arguments, plan=plan, vehicle=vehicle, uri=uri, plot=plot)
+        return _fly(arguments, plan=plan, vehicle=vehicle, left_out=left_out, uri=uri, plot=plot, view=view)
 
 
-def _fly(arguments: argparse.Namespace, *, plan: FlightPlan, vehicle: Any, uri: str, plot: str) -> int:
+def _fly(
+    arguments: argparse.Namespace,
+    *,
+    plan: FlightPlan,
+    vehicle: Any,
+    left_out: list[str],
+    uri: str,
+    plot: str,
+    view: bool,
+) -> int:
     error: BaseException | None = None
     with contextlib.ExitStack() as stack:
         # Outermost, so that even a Ctrl-C while connecting or closing ends in order.
-        stop = stack.enter_context(interrupts())
+        one = Interrupts()
+        stack.enter_context(interrupts(Everyone([one])))
+        streams = stack.enter_context(Streams(arguments.foxglove))
         link = open_link(uri)
         stack.callback(link.close)
         link.connect()
@@ -107,14 +184,17 @@ def _fly(arguments: argparse.Namespace, *, plan: FlightPlan, vehicle: Any, uri: 
             "controller": plan.controller.name,
             "trajectory": " ".join(arguments.trajectory),
             "duration": arguments.duration,
+            "rate": arguments.rate,
             "window": arguments.window,
             "every": arguments.every,
             "push": plan.push,
+            "guard": plan.rules.mode if plan.push and plan.rules is not None else "no push",
             "seed": arguments.seed or 0 if not arguments.uri else None,
         }
         recorder = open_recorder(
             arguments.record, configuration=configuration, vehicle=vehicle, link=link, append=arguments.append
         )
+        recorder = streams.beside(recorder)
         if recorder is not None:
             stack.callback(recorder.close)
         session = Session(
@@ -123,11 +203,17 @@ def _fly(arguments: argparse.Namespace, *, plan: FlightPlan, vehicle: Any, uri: 
             estimator=new_estimator(vehicle, arguments),
             recorder=recorder,
             wrench=plan.controller.wrench,
+            rate=arguments.rate,
+            reconnect_within=arguments.reconnect,
         )
         stack.callback(session.close)
+        session.history.notice(folding.notice(left_out))
+        line = LiveLine(session)
+        shown = [Shown(session, line, name=vehicle.name, land=landing(one))]
         try:
             session.start()
-            Flight(session, plan, interrupts=stop, progress=LiveLine(session)).fly()
+            with live_view(view, lambda: shown) as line.quiet:
+                Flight(session, plan, interrupts=one, progress=line).fly()
         except (FlightInterruptedError, MotorsCutError) as e:
             error = e
             session.history.notice("the flight was ended by the user.")

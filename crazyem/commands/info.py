@@ -7,16 +7,16 @@ from crazyem.commands.batch import each, processes
 from crazyem.commands.files import find, read_options
 from crazyem.commands.merged import merge_inventories
 from crazyem.commands.output import Report, Result
+from crazyem.physics import folding
 from crazyem.recordings import ReadOptions, open_recording
 from crazyem.recordings.parts import can_be_parted, is_large, open_parts
-from crazyem.vehicle import load_vehicle
 
 
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     report = Report(arguments)
     if arguments.vehicle:
-        load_vehicle(arguments.vehicle)  # a mistake in it is one error, not one for each file
+        folding.load(arguments.vehicle)  # a mistake in it is one error, not one for each file
     files = find(arguments.files, mapping=arguments.map)
     options = read_options(arguments)
     tasks = [
@@ -39,7 +39,7 @@ def inspect(path: str, options: ReadOptions, vehicle: str | None, parts: bool, j
     """One file. Raises as `open_recording`."""
     from crazyem.doctor.inventory import inventory
 
-    drone = load_vehicle(vehicle) if vehicle else None
+    drone = folding.load(vehicle) if vehicle else None
     large = parts or is_large(Path(path), jobs=jobs)
     if large and can_be_parted(Path(path)):
         found = merge_inventories(inventory(part, drone) for part in open_parts(path, options))

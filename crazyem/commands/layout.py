@@ -1,18 +1,20 @@
-"""`crazyem layout`: a layout for Foxglove and Lichtblick that shows recordings of ours."""
+"""`crazyem layout`: a layout for Foxglove and Lichtblick that shows recordings of ours, or a swarm streamed live."""
 
 import argparse
 import json
+import re
 from pathlib import Path
+from typing import Any
 
 from crazyem.commands.output import check_json
 from crazyem.errors import UsageError
 
+NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
+
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the layout, or write it to a file."""
-    from crazyem.recordings.mcap.layout import foxglove_layout
-
-    text = json.dumps(foxglove_layout(), indent=2, allow_nan=False) + "\n"
+    text = json.dumps(_layout(arguments), indent=2, allow_nan=False) + "\n"
     target = arguments.output or arguments.json or "-"
     if target == "-":
         print(text, end="", flush=True)
@@ -25,3 +27,23 @@ def run(arguments: argparse.Namespace) -> int:
     except OSError as error:
         raise UsageError(f"cannot write {target}: {error.strerror}.") from None
     return 0
+
+
+def _layout(arguments: argparse.Namespace) -> dict[str, Any]:
+    """For the drones that are named, of a swarm file or as words, else for one drone without a name."""
+    from crazyem.recordings.mcap.layout import foxglove_layout, swarm_layout
+
+    names = list(getattr(arguments, "drones", None) or ())
+    swarm = getattr(arguments, "swarm", None)
+    if swarm and names:
+        raise UsageError("--swarm names the drones: leave out --drones.")
+    if swarm:
+        from crazyem.live.swarm import read_swarm
+
+        names = [m.name for m in read_swarm(swarm, vehicle="cf2", trajectory=("hover",))]
+    for name in names:
+        if not NAME.fullmatch(name):
+            raise UsageError(f"the name of a drone is 1 to 40 letters, digits, - or _, not {name!r}.")
+    if len(set(names)) < len(names):
+        raise UsageError("every drone needs a name of its own.")
+    return swarm_layout(names) if names else foxglove_layout()

@@ -111,8 +111,8 @@ def check_json(path: str | None) -> None:
 class Progress:
     """How far a long command is: one line that overwrites itself on a terminal, else a line now and then."""
 
-    def __init__(self, what: str, total: int) -> None:
-        self.what, self.total, self.done = what, total, 0
+    def __init__(self, what: str, total: int, unit: str = "files") -> None:
+        self.what, self.total, self.done, self.unit = what, total, 0, unit
         self._terminal = sys.stderr is not None and sys.stderr.isatty()
         self._due = time.monotonic() + _FIRST
         self._shown = False
@@ -127,7 +127,7 @@ class Progress:
         """One more is done."""
         self.done += 1
         if self.total > 1:
-            self.show(f"{self.what}: {self.done} of {self.total} files")
+            self.show(f"{self.what}: {self.done} of {self.total} {self.unit}")
 
     def show(self, text: str) -> None:
         """The state in words, if it is time to say it."""

@@ -3,15 +3,18 @@
 import argparse
 import time
 
-from crazyem.commands.common import new_estimator, plot_path, report, say
+from crazyem.commands.common import new_estimator, plot_path, report, say, tell_steps
 from crazyem.commands.files import read_options
 from crazyem.errors import DataError
 from crazyem.live.history import History, Push
 from crazyem.live.pipeline import Pipeline
 from crazyem.live.summary import check_writable, live_line
+from crazyem.physics import folding
 from crazyem.recordings import Recording, open_recording
-from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
+from crazyem.signals.mavlink import ATTITUDE_PERIOD
+from crazyem.vehicle import Vehicle
 
+MAVLINK_ATTITUDES = {"ATTITUDE", "ATTITUDE_QUATERNION"}
 SCALE_NOTICE = (
     "mass and thrust scale are one parameter in this data: the value is as right as the thrust law of the vehicle "
     "file (a thrust law x % too strong reads as a mass x % too high), and the interval does not include that."
@@ -21,9 +24,9 @@ SCALE_NOTICE = (
 def vehicle_of(recording: Recording, given: str | None) -> Vehicle:
     """--vehicle, else the vehicle the recording was flown with, else cf2."""
     if given:
-        return load_vehicle(given)
+        return folding.load(given)
     stored = recording.metadata.get("vehicle", {}).get("toml")
-    return parse_vehicle(stored, where=f"vehicle in {recording.path}") if stored else load_vehicle("cf2")
+    return folding.parse(stored, where=f"vehicle in {recording.path}") if stored else folding.load("cf2")
 
 
 def required_signals(recording: Recording, vehicle: Vehicle) -> list[str]:
@@ -47,10 +50,18 @@ def required_signals(recording: Recording, vehicle: Vehicle) -> list[str]:
     return ["position", "attitude", *inputs, *(n for n in ("velocity", "body_rate") if n in names)]
 
 
+def attitude_period_of(recording: Recording) -> float:
+    """As the live estimator had it: longer than nothing for what an autopilot sent over MAVLink [s]."""
+    attitude = recording.signals.get("attitude")
+    names = attitude.source if attitude is not None else ()
+    theirs = "mavlink" in recording.metadata or any(n.split(".")[0] in MAVLINK_ATTITUDES for n in names)
+    return ATTITUDE_PERIOD if theirs else 0.0
+
+
 def replay(recording: Recording, pipeline: Pipeline, *, progress: bool = True) -> None:
     """Run every sample of a recording through the pipeline."""
     shown = time.monotonic()
-    first = None
+    first, told = None, 0
     for sample in recording.samples():
         first = sample.time if first is None else first
         pipeline.sample(sample)
@@ -58,6 +69,7 @@ def replay(recording: Recording, pipeline: Pipeline, *, progress: bool = True) -
             shown = time.monotonic()
             newest = pipeline.history.estimates[-1] if pipeline.history.estimates else None
             say(live_line("replay", sample.time - first, newest, lost=0, pushes=0))
+            told = tell_steps(pipeline.history, told)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -66,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     for path in (arguments.json, plot):
         check_writable(path)
     recording = open_recording(arguments.file, read_options(arguments))
-    vehicle = vehicle_of(recording, arguments.vehicle)
+    vehicle, left_out = folding.fold(vehicle_of(recording, arguments.vehicle))
     configured = recording.metadata.get("configuration", {})
     for name, default in (("window", "800"), ("every", "4")):
         if getattr(arguments, name) is None:
@@ -74,7 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
     recording.check(required_signals(recording, vehicle))
     history = History()
     take_events(recording, history)
-    pipeline = Pipeline(new_estimator(vehicle, arguments), history=history)
+    estimator = new_estimator(vehicle, arguments, attitude_period=attitude_period_of(recording))
+    pipeline = Pipeline(estimator, history=history)
     pipeline.estimate_until = history.marks.get("estimate_end", pipeline.estimate_until)
     replay(recording, pipeline)
     if not any(e.samples for e in history.estimates):
@@ -90,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
         received=received,
         lost=lost,
         extra={"source": recording.source, "duration_s": recording.duration},
-        notices=(SCALE_NOTICE, *recording.notices),
+        notices=(SCALE_NOTICE, *filter(None, [folding.notice(left_out)]), *recording.notices),
     )
     return 0
 

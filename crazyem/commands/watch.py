@@ -1,4 +1,8 @@
-"""`crazyem watch URI`: estimates of a drone somebody else flies; commands nothing, writes no parameter."""
+"""`crazyem watch URI`: estimates of a drone somebody else flies; commands nothing, and writes nothing unless asked.
+
+Only MAVLink drones can be written to here, their hover thrust, under the guard and with --push or --confirm. Without
+these the guard of such a drone runs dry: it tells what it would write.
+"""
 
 import argparse
 import contextlib
@@ -7,6 +11,7 @@ import time
 
 from crazyem.commands.common import (
     LiveLine,
+    attitude_period,
     close_recorder,
     compile_kernels,
     new_estimator,
@@ -15,18 +20,31 @@ from crazyem.commands.common import (
     report,
     say,
 )
-from crazyem.commands.fly import interrupts
-from crazyem.errors import CrazyemError
+from crazyem.commands.fly import ask_terminal, interrupts
+from crazyem.commands.view import Shown, Streams, live_view, wants_view
+from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
+from crazyem.live.hover import hover_afterwards
 from crazyem.live.mcap_recorder import open_recorder
+from crazyem.live.oversight import Rules
+from crazyem.live.policy import load_policy
 from crazyem.live.session import Session
 from crazyem.live.summary import check_writable
-from crazyem.vehicle import load_vehicle
+from crazyem.live.telemetry import FLYING
+from crazyem.physics import folding
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Until Ctrl-C, --duration, or the drone is gone; then the summary."""
-    vehicle = load_vehicle(arguments.vehicle)
+    if arguments.uris or arguments.swarm:
+        from crazyem.commands.swarm import watch as watch_many
+
+        return watch_many(arguments)
+    if not arguments.uri:
+        raise UsageError("watch needs a URI, such as radio://0/80/2M or udp://127.0.0.1:19850 (see crazyem links).")
+    view = wants_view(arguments)
+    rules = write_rules(arguments)
+    vehicle, left_out = folding.fold(folding.load(arguments.vehicle))
     plot = plot_path(arguments, arguments.record, arguments.json)
     for path in (arguments.json, arguments.record, plot):
         check_writable(path)
@@ -35,27 +53,48 @@ def run(arguments: argparse.Namespace) -> int:
     error: BaseException | None = None
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(interrupts())
+        streams = stack.enter_context(Streams(arguments.foxglove))
         link = open_link(arguments.uri)
         stack.callback(link.close)
         link.connect()
         say(f"watching {arguments.uri} (Ctrl-C ends)")
         configuration = {
             "command": "watch", "uri": arguments.uri, "window": arguments.window, "every": arguments.every,
+            "rate": arguments.rate,
         }  # fmt: skip
         recorder = open_recorder(
             arguments.record, configuration=configuration, vehicle=vehicle, link=link, append=arguments.append
         )
+        recorder = streams.beside(recorder)
         if recorder is not None:
             stack.callback(recorder.close)
-        session = Session(link, vehicle=vehicle, estimator=new_estimator(vehicle, arguments), recorder=recorder)
+        session = Session(
+            link,
+            vehicle=vehicle,
+            estimator=new_estimator(vehicle, arguments, attitude_period=attitude_period(arguments.uri)),
+            recorder=recorder,
+            rate=arguments.rate,
+            reconnect_within=arguments.reconnect,
+        )
+        session.history.notice(folding.notice(left_out))
         stack.callback(session.close)
         try:
             session.start()
-            _watch(session, stop, arguments.duration)
+            if rules is not None:
+                say(f"guard: {rules.mode}. {session.push_to_controller(rules)}")
+                session.pipeline.push_from = -math.inf
+            line = LiveLine(session)
+            shown = [Shown(session, line, name=vehicle.name)]
+            with live_view(view, lambda: shown) as line.quiet:
+                follow(session, stop, arguments.duration, line)
         except CrazyemError as e:
             error = e
             session.history.notice(str(e))
+        session.end_pushing(_outcome(session, error))
         session.close()
+        if session.oversight is not None and session.pusher is not None:
+            known, before = session.pusher.known, session.oversight.originals
+            session.history.notice(hover_afterwards(session.oversight.guard.controller, now=known, before=before))
         statistics = link.statistics()
         if recorder is not None:
             close_recorder(recorder, statistics, session.history)
@@ -77,8 +116,38 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _watch(session: Session, stop: object, duration: float | None) -> None:
-    line = LiveLine(session)
+def write_rules(arguments: argparse.Namespace) -> Rules | None:
+    """Policy and mode of the guard, None where nothing is to be written or said about it.
+
+    Raises:
+        UsageError: asked to write to a drone that only `crazyem fly` writes to; no such policy. FileFormatError.
+    """
+    mavlink = arguments.uri.startswith("mavlink:")
+    writes = arguments.push or arguments.confirm
+    if not mavlink and (writes or arguments.dry_run or arguments.policy):
+        raise UsageError("watch writes to MAVLink drones only: use crazyem fly, or crazyem.attach in a script.")
+    if not mavlink or arguments.no_push:
+        return None
+    open_link(arguments.uri)  # a wrong address is refused here, before anything is compiled
+    ask = ask_terminal if arguments.confirm else None
+    return Rules(load_policy(arguments.policy), dry_run=not writes, ask=ask)
+
+
+def _outcome(session: Session, error: BaseException | None) -> str:
+    """How it ended, for the policy: what was written is put back only on the ground."""
+    if session.lost is not None or isinstance(error, LinkError):
+        return "link_lost"
+    if error is not None:
+        return "failed"
+    return "interrupted" if session.telemetry.has(FLYING) else "landed"
+
+
+def follow(session: Session, stop: object, duration: float | None, line: LiveLine) -> None:
+    """Until Ctrl-C, or `duration` [s] of the drone's clock; a line a second.
+
+    Raises:
+        CrazyemError: what went wrong in the session.
+    """
     begun, shown = math.nan, time.monotonic()
     while not getattr(stop, "count", 0):
         session.raise_if_failed()

@@ -12,6 +12,7 @@ from crazyem.doctor import axes
 from crazyem.doctor.delays import delay
 from crazyem.doctor.kinematics import Grid, Track, Window, track
 from crazyem.doctor.regress import Choice, Slope, blocks, choose, slope
+from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import SignalArray
 
 Array = NDArray[np.float64]
@@ -166,6 +167,52 @@ def agreed_scale(looks: Sequence[Look], least: float) -> tuple[Look, axes.ScaleF
     directions = {tuple(np.sign(np.round(np.log(fault.repair), 9))) for _, fault in found}
     best = min(found, key=lambda pair: pair[0].whole.high - pair[0].whole.low if pair[0].whole else math.inf)
     return (*best, len(found)) if len(directions) == 1 else None
+
+
+def misread(check: str, name: str, seen: Look, *, noun: str, head: str, tail: str) -> Finding:
+    """The finding that a vector is in another frame or has other axes than declared.
+
+    Args:
+        check: whose finding. name: signal. noun: what the vector is ("body rate").
+        head, tail: what the text begins and ends with.
+    """
+    choice = seen.choice.name
+    fix: Fix | None = None
+    advice = "Correct its frame, axes or signs where it is read."
+    if choice == "world":
+        text, fix = "it is in the world frame, not the body frame", Fix("world_to_body", (name,))
+        advice = "Rotate it into the body frame by the attitude."
+    elif choice == "turned twice":
+        text = "it was turned from world to body although it was in the body frame already"
+        advice = f"Read it as a {noun}, not as one of the world."
+    elif choice.startswith("body "):
+        signs = choice.removeprefix("body ")
+        text = f"its components are {signs} of the {noun}"
+        factor = axes.sign_factor(signs)
+        fix = Fix("scale", (name,), factor) if factor else None
+    else:
+        text = "it is not what it is declared to be, but which axes or frame it has cannot be told"
+    return Finding(check, Grade.UNUSABLE, f"{head}{text}{tail}", name, (), seen.evidence(), advice, fix)
+
+
+def wrong_scale(
+    check: str, name: str, looks: Sequence[Look], least: float, *, alone: str, agreed: str
+) -> list[Finding]:
+    """The finding that a signal is not the derivative of what it is compared with, by a factor; none if it is.
+
+    Args:
+        check: whose finding. name: signal. looks, least: as for `agreed_scale`.
+        alone, agreed: advice where one comparison shows it, and where several do.
+    """
+    found = agreed_scale(looks, least)
+    if found is None:
+        return []
+    seen, fault, witnesses = found
+    numbers = {**seen.evidence(), **axes.numbers(seen.single)}
+    text = f"{name} is not the derivative of {seen.against}: {fault.text}."
+    if witnesses < 2:
+        return [Finding(check, Grade.DEGRADES, text, name, (), numbers, alone)]
+    return [Finding(check, Grade.DEGRADES, text, name, (), numbers, agreed, Fix("scale", (name,), fault.repair))]
 
 
 def _ratio(y: Array, x: Array) -> float:

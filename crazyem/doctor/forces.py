@@ -7,7 +7,7 @@ import numpy as np
 
 from crazyem.doctor import axes
 from crazyem.doctor.attitudes import Pose, poses
-from crazyem.doctor.compare import Look, look
+from crazyem.doctor.compare import Look, look, misread
 from crazyem.doctor.kinematics import (
     GRAVITY,
     STEP,
@@ -199,29 +199,17 @@ def _structure(name: str, seen: Look) -> Finding:
         f" ({100.0 * seen.evidence()['explained']:.1f} % of its variance explained, "
         f"as declared {100.0 * choice.explained[seen.declared]:.1f} %)."
     )
-    advice = "Correct its frame, axes or signs where it is read."
-    fix: Fix | None = None
+    text = ""
     if choice.name == "world" and abs(_level(seen)[0]) < 0.3 * abs(seen.whole.value if seen.whole else 1.0):
         text = f"{head}it is the acceleration in the world frame without gravity, not the specific force{tail}"
         advice = "Read it as acceleration."
-    elif choice.name == "world":
-        text, fix = f"{head}it is in the world frame, not the body frame{tail}", Fix("world_to_body", (name,))
-        advice = "Rotate it into the body frame by the attitude."
-    elif choice.name == "turned twice":
-        text = f"{head}it was turned from world to body although it was in the body frame already{tail}"
-        advice = "Read it as a body vector, not as a world vector."
     elif choice.name.endswith("gravity removed"):
         where = choice.name.partition(",")[0]
         text = f"{head}it is the acceleration in the {where} frame without gravity, not the specific force{tail}"
         advice = "Read it as acceleration; add gravity to get the specific force."
-    elif choice.name.startswith("body "):
-        signs = choice.name.removeprefix("body ")
-        text = f"{head}its components are {signs} of the body's{tail}"
-        factor = axes.sign_factor(signs)
-        fix = Fix("scale", (name,), factor) if factor else None
-    else:
-        text = f"{head}it is not what it is declared to be, but which axes or frame it has cannot be told{tail}"
-    return Finding("forces", Grade.UNUSABLE, text, name, (), seen.evidence(), advice, fix)
+    if text:
+        return Finding("forces", Grade.UNUSABLE, text, name, (), seen.evidence(), advice)
+    return misread("forces", name, seen, noun="specific force", head=head, tail=tail)
 
 
 def _acceleration(name: str, array: SignalArray, recording: Recording, attitudes: list[Pose]) -> list[Finding]:

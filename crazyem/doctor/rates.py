@@ -6,7 +6,7 @@ import numpy as np
 
 from crazyem.doctor import axes
 from crazyem.doctor.attitudes import Pose, poses
-from crazyem.doctor.compare import Look, agreed_scale, look
+from crazyem.doctor.compare import Look, look, misread, wrong_scale
 from crazyem.doctor.kinematics import Track, grid_of, measurements, rate_of_attitude, rotate, width_for
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
@@ -73,36 +73,15 @@ def _structure(name: str, seen: Look) -> Finding:
     share, declared = 100.0 * seen.evidence()["explained"], 100.0 * choice.explained["body"]
     head = f"{name} against the derivative of {seen.against}: "
     tail = f" ({share:.2f} % of its variance explained, as declared {declared:.2f} %)."
-    fix: Fix | None = None
-    advice = "Correct its frame, axes or signs where it is read."
-    if choice.name == "world":
-        text, fix = f"{head}it is in the world frame, not the body frame{tail}", Fix("world_to_body", (name,))
-        advice = "Rotate it into the body frame by the attitude."
-    elif choice.name == "turned twice":
-        text = f"{head}it was turned from world to body although it was in the body frame already{tail}"
-        advice = "Read it as a body rate, not as a world rate."
-    elif choice.name.startswith("body "):
-        signs = choice.name.removeprefix("body ")
-        text = f"{head}its components are {signs} of the body rate{tail}"
-        factor = axes.sign_factor(signs)
-        fix = Fix("scale", (name,), factor) if factor else None
-    else:
-        text = f"{head}it is not what it is declared to be, but which axes or frame it has cannot be told{tail}"
-    return Finding("rates", Grade.UNUSABLE, text, name, (), seen.evidence(), advice, fix)
+    return misread("rates", name, seen, noun="body rate", head=head, tail=tail)
 
 
 def _scale(name: str, looks: list[Look]) -> list[Finding]:
-    agreed = agreed_scale(looks, OFF if len(looks) > 1 else ALONE)
-    if agreed is None:
-        return []
-    seen, fault, witnesses = agreed
-    numbers = {**seen.evidence(), **axes.numbers(seen.single)}
-    text = f"{name} is not the derivative of {seen.against}: {fault.text}."
-    if witnesses < 2:
-        advice = "One of the two is wrong; a third measurement, or the range of the gyro, must say which."
-        return [Finding("rates", Grade.DEGRADES, text, name, (), numbers, advice)]
-    advice = "Attitudes of two origins agree against it: divide the rate by the factor."
-    return [Finding("rates", Grade.DEGRADES, text, name, (), numbers, advice, Fix("scale", (name,), fault.repair))]
+    return wrong_scale(
+        "rates", name, looks, OFF if len(looks) > 1 else ALONE,
+        alone="One of the two is wrong; a third measurement, or the range of the gyro, must say which.",
+        agreed="Attitudes of two origins agree against it: divide the rate by the factor.",
+    )  # fmt: skip
 
 
 def _bias(name: str, seen: Look) -> list[Finding]:

@@ -2,7 +2,7 @@
 
 from crazyem.doctor import axes
 from crazyem.doctor.attitudes import Pose, poses
-from crazyem.doctor.compare import Look, agreed_scale, look
+from crazyem.doctor.compare import Look, agreed_scale, look, wrong_scale
 from crazyem.doctor.kinematics import Track, difference, grid_of, measurements, rotate, track, width_for
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
@@ -85,17 +85,11 @@ def _judge(name: str, looks: list[Look], blamed: set[str]) -> list[Finding]:
         text = f"The derivative of {best.against} is {1 / whole.value:.4g} times {name}: it is in {unit[0]}, not m."
         fix = Fix("scale", (best.against,), (unit[1],) * 3)
         return [Finding("velocities", Grade.UNUSABLE, text, best.against, (), evidence, "Correct its unit.", fix)]
-    agreed = agreed_scale(looks, OFF)
-    if agreed is None:
-        return []
-    seen, fault, witnesses = agreed
-    numbers = {**seen.evidence(), **axes.numbers(seen.single)}
-    text = f"{name} is not the derivative of {seen.against}: {fault.text}."
-    if witnesses < 2:
-        advice = "One of the two is wrong, and a third measurement must say which."
-        return [Finding("velocities", Grade.DEGRADES, text, name, (), numbers, advice)]
-    advice = "Positions of two origins agree against it: divide the velocity by the factor."
-    return [Finding("velocities", Grade.DEGRADES, text, name, (), numbers, advice, Fix("scale", (name,), fault.repair))]
+    return wrong_scale(
+        "velocities", name, looks, OFF,
+        alone="One of the two is wrong, and a third measurement must say which.",
+        agreed="Positions of two origins agree against it: divide the velocity by the factor.",
+    )  # fmt: skip
 
 
 def _judge_position(name: str, looks: list[Look], blamed: set[str]) -> list[Finding]:

@@ -6,7 +6,9 @@ parameters of its time (they are physical quantities: accelerations, rates), whi
 sense of Neal and Hinton. Where EM crawls, a Fisher-scoring step on the likelihood of the innovations takes
 over."""
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,8 @@ class Information:
         inflation: (9,) factor by which correlation widened each standard deviation.
         bias: (9,) by which the parameters may be off because commands are known only at their stamps, in the same
             coordinates; counted as one more standard deviation in the covariance.
+        noise_sd: (11,) standard deviations of the logarithms of the noise scales, zero where known.
+        noise_step: (11,) scoring step of these logarithms.
     """
 
     matrix: NDArray
@@ -42,6 +46,18 @@ class Information:
     decrement: float
     inflation: NDArray
     bias: NDArray
+    noise_sd: NDArray
+    noise_step: NDArray
+
+    @cached_property
+    def sd(self) -> NDArray:
+        """(9,) standard deviations by the covariance."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def noise_length(self) -> float:
+        """The longest step that a noise scale should still take, in standard deviations."""
+        return float(np.max(np.abs(self.noise_step) / np.where(self.noise_sd > 0, self.noise_sd, np.inf)))
 
 
 class WindowEM:
@@ -62,9 +78,9 @@ class WindowEM:
         t, p = self.tape, self.parameters
         inertia = p.inertia
         return kernels.forward(
-            first, last, restart, t.time, t.kind, t.y, t.thrust, t.torque, p.theta[0], inertia, p.inverse,
-            p.noise.q, p.noise.r, START_VARIANCE, t.xp, t.pp, t.xf, t.pf, t.gain, t.s, t.e, t.blocks, t.middle,
-            t.loglik,
+            first, last, restart, t.time, t.kind, t.y, t.force, t.thrust, t.torque, p.theta[0], inertia, p.inverse,
+            p.noise.q, p.noise.r, p.noise.measurement[4] ** 2, self.setup.lead, START_VARIANCE, t.xp, t.pp, t.xf, t.pf,
+            t.gain, t.s, t.e, t.blocks, t.middle, t.loglik,
         )  # fmt: skip
 
     def backward(self, first: int, last: int) -> None:
@@ -72,10 +88,10 @@ class WindowEM:
         t, p = self.tape, self.parameters
         inertia = p.inertia
         kernels.backward(
-            first, last, t.time, t.kind, t.usable, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
+            first, last, t.time, t.kind, t.usable, t.force, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
             t.thrust_delay, t.torque_delay, p.theta[4], p.theta[5], p.theta[6:9], p.theta[0], inertia,
-            p.inverse, p.noise.q, p.noise.r, t.xf, t.pf, t.gain, t.s, t.e, t.blocks,
-            t.middle, t.stats, t.moments,
+            p.inverse, p.noise.q, p.noise.r, p.noise.measurement[4] ** 2, self.setup.lead, t.xf, t.pf, t.gain, t.s,
+            t.e, t.blocks, t.middle, t.stats, t.moments,
         )  # fmt: skip
 
     def refill_inputs(self, first: int, last: int) -> None:
@@ -97,6 +113,7 @@ class WindowEM:
                 self.setup.free,
                 prior.centre,
                 prior.precision,
+                self.setup.known_squares,
                 iterations,
                 self._squares,
             )
@@ -111,48 +128,64 @@ class WindowEM:
         n = sums[kernels.COUNT]
         if n < 3:
             return self.parameters.noise
-        squares = np.empty(10)
+        squares = np.empty(11)
         squares[:2] = sums[kernels.IMPULSE : kernels.IMPULSE + 2] / n
         squares[2:6] = self._squares / theta[:4] ** 2 / n
-        seen = np.maximum(sums[kernels.MEASURED : kernels.MEASURED + 4], 1e-9)
-        squares[6:] = sums[kernels.RESIDUAL : kernels.RESIDUAL + 4] / seen
+        seen = np.maximum(sums[kernels.MEASURED : kernels.MEASURED + 5], 1e-9)
+        squares[6:] = sums[kernels.RESIDUAL : kernels.RESIDUAL + 5] / seen
         # curvature of the log-likelihood in log s is 2 n; the prior adds its own
         weight = 1.0 / (1.0 + 2 * np.concatenate([np.full(6, n), seen]) * prior.noise_sd**2)
-        with np.errstate(divide="ignore"):
-            logs = 0.5 * np.log(np.maximum(squares, 1e-300)) * (1 - weight) + prior.noise.logs * weight
+        logs = 0.5 * np.log(np.maximum(squares, 1e-300)) * (1 - weight) + prior.noise.logs * weight
         logs = np.where(weight > 0.5, prior.noise.logs, logs)
-        return self._bounded(logs)
+        return self.setup.noise_at(theta, np.maximum(logs, prior.floor))
 
-    def _bounded(self, logs: NDArray) -> Noise:
-        prior = self.setup.prior
-        floor = np.log(np.concatenate([prior.impulse_floor, prior.measurement_floor]))
-        return Noise.from_logs(np.maximum(logs, floor))
+    def noise_terms(self, first: int, last: int) -> NDArray:
+        """What each row adds to the score of the logarithms of the noise scales (n, 11); the window must be smoothed.
 
-    def _noise_score(self, first: int, last: int) -> tuple[NDArray, float]:
-        """Scoring step (10,) of the logarithms of the noise scales, and its largest length in standard deviations.
-
-        The score comes from the smoother (Fisher's identity: the expected complete-data score); the information is the
-        larger of its diagonal part and the long-run variance of the score's terms, so that steps never overshoot far.
+        Fisher's identity: the score of the likelihood is the expected score of the complete data.
         """
-        noise, prior = self.parameters.noise, self.setup.prior
-        rows = self.tape.stats[first + 1 : last]
-        if len(rows) == 0:
-            return np.zeros(10), 0.0
+        noise, rows = self.parameters.noise, self.tape.stats[first:last]
         counts = rows[:, kernels.COUNT : kernels.COUNT + 1]
-        terms = np.concatenate(
+        return np.concatenate(
             [
-                rows[:, kernels.IMPULSE : kernels.IMPULSE + 6] / noise.q - counts,
-                rows[:, kernels.RESIDUAL : kernels.RESIDUAL + 4] / np.square(noise.measurement)
-                - rows[:, kernels.MEASURED : kernels.MEASURED + 4],
+                (rows[:, kernels.IMPULSE : kernels.IMPULSE + 6] + rows[:, kernels.BRIDGE : kernels.BRIDGE + 6])
+                / noise.q
+                - counts,
+                rows[:, kernels.RESIDUAL : kernels.RESIDUAL + 5] / np.square(noise.measurement)
+                - rows[:, kernels.MEASURED : kernels.MEASURED + 5],
             ],
             axis=1,
         )
-        diagonal = 2 * rows[:, kernels.IMPULSE_SEEN :].sum(0)
-        information = np.maximum(diagonal, long_run(terms - terms.mean(0))) + prior.noise_sd**-2
-        score = terms.sum(0) + (prior.noise.logs - noise.logs) / prior.noise_sd**2
-        step = np.clip(score / information, -1.5, 1.5)
-        bounded = self._bounded(noise.logs + step).logs - noise.logs
-        return bounded, float(np.max(np.abs(bounded) * np.sqrt(information)))
+
+    def noise_information(self, first: int, last: int) -> NDArray:
+        """Expected information (11, 11) of the logarithms of the noise scales; the window must have been filtered."""
+        t, p = self.tape, self.parameters
+        return kernels.noise_information(
+            first, last, t.time, t.kind, t.usable, t.force, t.torque, p.inertia, p.inverse, p.noise.q, p.noise.r,
+            p.noise.measurement[4] ** 2, self.setup.lead, t.xf, t.gain, t.s, t.blocks, t.middle,
+        )  # fmt: skip
+
+    def _noise_step(self, first: int, last: int, of_noise: NDArray | None) -> tuple[NDArray, NDArray]:
+        """Scoring step (11,) of the logarithms of the noise scales, and their standard deviations (11,).
+
+        Unless `of_noise` (11, 11) is given, the information is the larger of what each step says for itself and the
+        long-run variance of the score's terms: cheap, and steps never overshoot far.
+        """
+        noise, setup = self.parameters.noise, self.setup
+        prior = setup.prior
+        terms = self.noise_terms(first, last)
+        if of_noise is None:
+            own = 2 * self.tape.stats[first:last, kernels.IMPULSE_SEEN : kernels.SIZE].sum(0)
+            information = np.maximum(own, long_run(terms - terms.mean(0))) + prior.noise_sd**-2
+            variance = 1.0 / information
+            score = terms.sum(0) + (prior.noise.logs - noise.logs) / prior.noise_sd**2
+            step = score * variance
+        else:
+            covariance = np.linalg.inv(of_noise + np.eye(11) / prior.noise_sd**2)
+            variance = np.diag(covariance)
+            step = covariance @ (terms.sum(0) + (prior.noise.logs - noise.logs) / prior.noise_sd**2)
+        step = np.maximum(noise.logs + np.clip(step, -1.5, 1.5), prior.floor) - noise.logs
+        return np.where(setup.known_scales, 0.0, step), np.where(setup.known_scales, 0.0, np.sqrt(variance))
 
     # passes -------------------------------------------------------------------------------------------------
 
@@ -172,18 +205,31 @@ class WindowEM:
         tape.stats[begin] = kept
         self.parameters = self.maximise(first, last, iterations=3)
 
-    def information(self, first: int, last: int) -> Information:
-        """Score and information at the present parameters; the window must have been filtered with them."""
+    def sensitivities(self, first: int, last: int) -> NDArray:
+        """Information (9, 9) of theta by the means of the innovations, score rows onto the tape; window filtered."""
         t, p, setup = self.tape, self.parameters, self.setup
         inertia = p.inertia
-        matrix = kernels.sensitivities(
-            first, last, t.time, t.kind, t.usable, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
-            t.thrust_delay, t.torque_delay, p.theta, self.setup.unit, inertia, p.inverse, t.xf, t.gain,
-            t.s, t.e, t.blocks, t.middle, t.score,
+        return kernels.sensitivities(
+            first, last, t.time, t.kind, t.usable, t.force, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
+            t.thrust_delay, t.torque_delay, p.theta, setup.unit, inertia, p.inverse, p.noise.q,
+            p.noise.measurement[4] ** 2, setup.lead, t.xf, t.gain, t.s, t.e, t.blocks, t.middle, t.score,
         )  # fmt: skip
+
+    def information(self, first: int, last: int, *, of_noise: NDArray | None = None) -> Information:
+        """Score and information at the present parameters; the window must have been filtered and smoothed with them.
+
+        `of_noise` (11, 11) is the information about the noise scales (`noise_information`), guessed unless given.
+        """
+        t, p, setup = self.tape, self.parameters, self.setup
+        matrix = self.sensitivities(first, last)
+        noise_step, noise_sd = self._noise_step(first, last, of_noise)
         free = np.flatnonzero(setup.free)
         precision = setup.prior.precision
-        score = t.score[first:last, free].sum(0) - (precision * offset(p.theta, setup.prior.centre, setup.unit))[free]
+        score = t.score[first:last].sum(0)
+        if setup.carried.any():  # known scales move with mass and inertia: what they say of them
+            matrix += self._carried_information(first, last, of_noise)
+            score += setup.carried.T @ self.noise_terms(first, last).sum(0)
+        score = (score - precision * offset(p.theta, setup.prior.centre, setup.unit))[free]
         posterior = matrix[np.ix_(free, free)] + np.diag(precision[free])
         covariance = np.linalg.inv(posterior)
         step = np.zeros(9)
@@ -198,7 +244,17 @@ class WindowEM:
             # added as squares: the sizes are known well, but not so well that parts could be trusted to cancel
             bias[free] = np.sqrt(covariance**2 @ self.command_noise_score(first, last)[free] ** 2)
         full += np.diag(bias**2)
-        return Information(matrix, full, step, decrement, factors, bias)
+        return Information(matrix, full, step, decrement, factors, bias, noise_sd, noise_step)
+
+    def _carried_information(self, first: int, last: int, of_noise: NDArray | None) -> NDArray:
+        """What the size of known process noise says of theta (9, 9), less what the unknown scales take of it."""
+        setup = self.setup
+        if of_noise is None:
+            of_noise = np.diag(2 * self.tape.stats[first:last, kernels.IMPULSE_SEEN : kernels.SIZE].sum(0))
+        unknown = np.flatnonzero(~setup.known_scales)
+        among = of_noise[np.ix_(unknown, unknown)] + np.eye(len(unknown)) / setup.prior.noise_sd**2
+        cross = of_noise[unknown] @ setup.carried
+        return setup.carried.T @ of_noise @ setup.carried - cross.T @ np.linalg.solve(among, cross)
 
     def command_noise_score(self, first: int, last: int) -> NDArray:
         """(9,) what noise in the samples of the commands adds to the score (aliasing.py).
@@ -229,27 +285,29 @@ class WindowEM:
             score[5] -= weight * m_delay * unit[5]
         return score
 
-    def converge(self, first: int, last: int, *, passes: int) -> Information:
-        """Full passes until the score test is passed, at most `passes`: EM while far, scoring when near.
+    def converge(self, first: int, last: int, *, passes: int, tolerance: float = TOLERANCE) -> Information:
+        """Full passes until no step would be longer than `tolerance` standard deviations, at most `passes`.
+
+        EM while far, scoring when near.
 
         The tape is left filtered and smoothed with the parameters that the returned information belongs to.
         """
-        damping, before = np.ones(10), np.zeros(10)  # a noise scale whose steps swing back takes shorter ones
+        damping, before = np.ones(11), np.zeros(11)  # a noise scale whose steps swing back takes shorter ones
         for count in range(passes):
             self.refill_inputs(first, last)
             self.forward(first, last, restart=True)
-            info = self.information(first, last)
             self.backward(first, last)
-            noise_step, noise_length = self._noise_score(first, last)
+            info = self.information(first, last)
+            noise_step = info.noise_step
             damping = np.where(noise_step * before < 0, 0.5 * damping, np.minimum(1.3 * damping, 1.0))
             before = noise_step
-            if (info.decrement < TOLERANCE and noise_length < TOLERANCE) or count == passes - 1:
+            if max(info.decrement, info.noise_length) < tolerance or count == passes - 1:
                 break
             after = self.maximise(first, last)
             em_step = np.max(np.abs(offset(after.theta, self.parameters.theta, self.setup.unit)[:4]))
             if info.decrement < 10.0 and em_step < 0.1:
                 theta = displaced(self.parameters.theta, np.clip(info.step, -0.2, 0.2), self.setup.unit)
-                noise = Noise.from_logs(self.parameters.noise.logs + damping * noise_step)
+                noise = self.setup.noise_at(theta, self.parameters.noise.logs + damping * noise_step)
                 self.parameters = Parameters(theta, noise, after.inertia_products)
             else:
                 self.parameters = after
@@ -258,9 +316,10 @@ class WindowEM:
 
 def offset(theta: NDArray, origin: NDArray, unit: NDArray) -> NDArray:
     """How far theta is from origin: logarithms of the ratios, linear parameters in their units. (9,) -> (9,)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        far = np.where((theta > 0) & (origin > 0), np.log(theta / origin), 0.0)
-    far[kernels.DELAY :] = ((theta - origin) / unit)[kernels.DELAY :]
+    far: NDArray = (theta - origin) / unit
+    for i in range(kernels.DELAY):
+        a, b = float(theta[i]), float(origin[i])
+        far[i] = math.log(a / b) if a > 0 and b > 0 else 0.0
     return far
 
 

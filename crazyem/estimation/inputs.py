@@ -7,6 +7,7 @@ from crazyem.estimation.tape import Tape
 from crazyem.physics.lag import CAUSAL, fit_predictor, hold_predictor, lagged_means
 
 MAX_GAP = 0.1  # s without an input beyond which a step cannot be trusted
+_RECENT = 8  # inputs looked at one by one, newest first, before the rest is searched
 SETTLE = 5.0  # time constants after which a lag has forgotten where it started
 
 
@@ -22,11 +23,7 @@ class InputHistory:
         self._at = 0  # command at or before the time of the lag's state
         self.predictor = hold_predictor()
         self.gap_end = -np.inf  # when the last long gap between inputs ended
-
-    @property
-    def newest(self) -> float:
-        """Stamp of the newest input [s], -inf if none."""
-        return self.times[self.size - 1] if self.size else -np.inf
+        self.newest = -np.inf  # stamp of the newest input [s], -inf if none
 
     def append(self, time: float, wrench: NDArray, *, needed_from: float) -> bool:
         """Add an input; False if its stamp is not newer than the newest. Inputs before `needed_from` may be dropped."""
@@ -42,6 +39,7 @@ class InputHistory:
             self._make_room(needed_from)
         self.times[self.size] = time
         self.wrenches[self.size] = wrench
+        self.newest = time
         self.size += 1
         return True
 
@@ -57,8 +55,17 @@ class InputHistory:
             self.times = np.concatenate([self.times, np.zeros_like(self.times)])
             self.wrenches = np.concatenate([self.wrenches, np.zeros_like(self.wrenches)])
 
+    def at(self, time: float) -> int:
+        """Index of the last input at or before `time` [s], 0 if all are later; quick where `time` is a recent one."""
+        for back in range(1, min(self.size, _RECENT) + 1):
+            if self.times[self.size - back] <= time:
+                return self.size - back
+        return max(0, int(np.searchsorted(self.times[: self.size], time, "right")) - 1)
+
     def covers(self, begin: float, end: float) -> bool:
         """Whether no stretch of [begin, end] is more than MAX_GAP away from inputs on both sides."""
+        if self.gap_end <= begin <= end <= self.newest and self.times[0] <= begin:
+            return True  # the last gap there was had ended by then
         times = self.times[: self.size]
         first = int(np.searchsorted(times, begin, "right")) - 1
         last = int(np.searchsorted(times, end, "left"))

@@ -1,11 +1,13 @@
 """What is estimated and what is assumed: parameter vector, noise scales, priors; all frozen."""
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.errors import UsageError
 from crazyem.vehicle import GRAVITY, Vehicle
 
 NAMES = (
@@ -19,7 +21,13 @@ NAMES = (
     "torque_offset_y",
     "torque_offset_z",
 )
-GROUPS = ("position", "velocity", "attitude", "body_rate")
+GROUPS = ("position", "velocity", "attitude", "body_rate", "specific_force")
+
+
+# How velocities of a step become positions (physics/rigid_body.py). A flying body follows the midpoint rule; simulators
+# that step explicitly (as eq. 56 does) or semi-implicitly are followed exactly by theirs.
+INTEGRATION = {"midpoint": 0.5, "euler": 0.0, "semi-implicit": 1.0}
+TINY_IMPULSE = 1e-7  # m/s^2 sqrt(s), rad/s^2 sqrt(s): stands for no process noise at all
 
 
 @dataclass(frozen=True)
@@ -28,7 +36,8 @@ class Noise:
 
     Attributes:
         impulse: (6,) intensities of specific force x y z [m/s^2 sqrt(s)] and angular acceleration [rad/s^2 sqrt(s)].
-        measurement: (4,) standard deviations of position [m], velocity [m/s], attitude [rad], body rate [rad/s].
+        measurement: (5,) standard deviations of position [m], velocity [m/s], attitude [rad], body rate [rad/s],
+            specific force [m/s^2] (an accelerometer, where one is used).
     """
 
     impulse: NDArray
@@ -36,7 +45,7 @@ class Noise:
 
     @cached_property
     def logs(self) -> NDArray:
-        """Logarithms of all ten scales: impulses, then measurements."""
+        """Logarithms of all eleven scales: impulses, then measurements."""
         return np.log(np.concatenate([self.impulse, self.measurement]))
 
     @classmethod
@@ -52,7 +61,7 @@ class Noise:
     @cached_property
     def r(self) -> NDArray:
         """Measurement variances (12,), for the kernels."""
-        return np.repeat(np.square(self.measurement), 3)
+        return np.repeat(np.square(self.measurement[:4]), 3)
 
 
 @dataclass(frozen=True)
@@ -64,7 +73,7 @@ class Prior:
         sd: (9,) of the logarithms; of the linear parameters in their units.
         noise: scales that the prior is centred on.
         noise_sd: of the logarithms of the noise scales.
-        impulse_floor, measurement_floor: smallest scales admitted (6,), (4,): far below what a real sensor resolves.
+        impulse_floor, measurement_floor: smallest scales admitted (6,), (5,): far below what a real sensor resolves.
     """
 
     centre: NDArray
@@ -72,12 +81,17 @@ class Prior:
     noise: Noise
     noise_sd: float = 1.5
     impulse_floor: NDArray = field(default_factory=lambda: np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3]))
-    measurement_floor: NDArray = field(default_factory=lambda: np.array([5e-5, 1e-4, 1e-4, 1e-4]))
+    measurement_floor: NDArray = field(default_factory=lambda: np.array([5e-5, 1e-4, 1e-4, 1e-4, 1e-4]))
 
-    @property
+    @cached_property
     def precision(self) -> NDArray:
         """(9,) of the logarithms, and of the linear parameters in their units."""
         return 1.0 / np.square(self.sd)
+
+    @cached_property
+    def floor(self) -> NDArray:
+        """Logarithms of the smallest scales admitted (11,)."""
+        return np.log(np.concatenate([self.impulse_floor, self.measurement_floor]))
 
 
 @dataclass(frozen=True)
@@ -105,20 +119,117 @@ class Parameters:
 
 
 @dataclass(frozen=True)
+class KnownNoise:
+    """Noise that is known and not estimated; None is estimated.
+
+    Process noise is given in newtons and newton metres. In the estimator's units of acceleration it is divided by the
+    mass or an inertia, so these then act on the data through the size of the noise, too (errata of eq. 104 to 106).
+
+    Attributes:
+        force: intensity of the noise in thrust [N sqrt(s)].
+        torque: about each axis, or one number for all [N m sqrt(s)].
+        lateral_force: along body x and y [N sqrt(s)]; may be 0.
+        position, velocity, attitude, body_rate, specific_force: standard deviations of the measurements [m], [m/s],
+            [rad], [rad/s], [m/s^2].
+
+    Raises:
+        UsageError: one is not a positive number.
+    """
+
+    force: float | None = None
+    torque: float | tuple[float, float, float] | None = None
+    lateral_force: float | None = None
+    position: float | None = None
+    velocity: float | None = None
+    attitude: float | None = None
+    body_rate: float | None = None
+    specific_force: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (("torque", v) for v in self._torques):
+            _check_known(name, value)
+        for name in ("force", "lateral_force", *GROUPS):
+            _check_known(name, getattr(self, name), zero=name == "lateral_force")
+
+    @property
+    def _torques(self) -> tuple[float | None, ...]:
+        return self.torque if isinstance(self.torque, tuple) else (self.torque,) * 3
+
+    @cached_property
+    def mask(self) -> NDArray:
+        """(11,) bool: which of the scales of `Noise` are known."""
+        return np.isfinite(self.logs(np.ones(len(NAMES))))
+
+    def logs(self, theta: NDArray) -> NDArray:
+        """Logarithms (11,) of the scales of `Noise` with the parameters theta (9,); NaN where not known."""
+        body = np.array([theta[0], theta[0], theta[0], theta[1], theta[2], theta[3]])
+        process = (self.lateral_force, self.lateral_force, self.force, *self._torques)
+        sensors = tuple(getattr(self, name) for name in GROUPS)
+        values = np.array([math.nan if v is None else v for v in (*process, *sensors)], float)
+        values[:6] = np.maximum(values[:6] / body, TINY_IMPULSE)
+        return np.log(values)
+
+
+def _check_known(name: str, value: float | None, *, zero: bool = False) -> None:
+    if value is not None and not (0 < value < math.inf or (zero and value == 0)):
+        raise UsageError(f"the known noise of {name.replace('_', ' ')} must be a positive number, not {value}")
+
+
+@dataclass(frozen=True)
 class Setup:
-    """Start, prior and what is free: all that the estimator is told before the first sample."""
+    """Start, prior and what is free: all that the estimator is told before the first sample.
+
+    Attributes:
+        start: where the estimation begins.
+        prior: on parameters and noise scales.
+        free: (9,) bool, which parameters are estimated.
+        unit: (9,) of the linear parameters; 1 for those taken by their logarithms.
+        lead: rule of integration (physics/rigid_body.py): 0.5 midpoint, 0 explicit Euler, 1 semi-implicit Euler.
+        known: noise that is not estimated.
+    """
 
     start: Parameters
     prior: Prior
-    free: NDArray  # (9,) bool
-    unit: NDArray  # (9,) of the linear parameters; 1 for those taken by their logarithms
+    free: NDArray
+    unit: NDArray
+    lead: float = 0.5
+    known: KnownNoise | None = None
+
+    def noise_at(self, theta: NDArray, logs: NDArray) -> Noise:
+        """Noise from logarithms of the scales (11,), the known ones replaced by what they are with theta (9,)."""
+        if self.known is None:
+            return Noise.from_logs(logs)
+        known = self.known.logs(theta)
+        return Noise.from_logs(np.where(np.isnan(known), logs, known))
+
+    @cached_property
+    def known_scales(self) -> NDArray:
+        """(11,) bool: scales that are not estimated."""
+        return np.zeros(11, bool) if self.known is None else self.known.mask
+
+    @cached_property
+    def known_squares(self) -> NDArray:
+        """(5,) squared intensities of thrust, torque, lateral force where known, else 0 (`mstep.maximise`)."""
+        if self.known is None:
+            return np.zeros(5)
+        process = self.known.logs(np.ones(len(NAMES)))[[2, 3, 4, 5, 0]]
+        return np.nan_to_num(np.exp(2 * process), nan=0.0) * (process > np.log(2 * TINY_IMPULSE))
+
+    @cached_property
+    def carried(self) -> NDArray:
+        """(11, 9) derivatives of the logarithms of the known scales by theta's: heavier is quieter."""
+        slopes = np.zeros((11, len(NAMES)))
+        acts = self.known_squares[[4, 4, 0, 1, 2, 3]] > 0
+        for scale, parameter in enumerate((0, 0, 0, 1, 2, 3)):
+            slopes[scale, parameter] = -1.0 if acts[scale] else 0.0
+        return slopes
 
 
 # Where the noise scales start: process noise large, so that the first samples decide and not the start.
 START_IMPULSE = np.array([0.5, 0.5, 5.0, 20.0, 20.0, 20.0])
 # Measurement noise starts large too: from below, the likelihood is flat in it and says nothing.
-START_MEASUREMENT = np.array([2e-2, 1e-1, 3e-2, 1e-1])
-TYPICAL_MEASUREMENT = np.array([1e-3, 1e-2, 3e-3, 3e-3])
+START_MEASUREMENT = np.array([2e-2, 1e-1, 3e-2, 1e-1, 0.5])
+TYPICAL_MEASUREMENT = np.array([1e-3, 1e-2, 3e-3, 3e-3, 0.1])
 
 # Delay between an input's stamp and its effect on the logged rates [s]: centre and standard deviation of the prior.
 # Commands of a Crazyflie: held for 2 ms at 500 Hz (1 ms in the mean), and rates low-passed at 80 Hz (2.8 ms).
@@ -133,7 +244,13 @@ TRIM = 0.05
 
 
 def setup_for(
-    vehicle: Vehicle, *, mass: float | None = None, inertia: tuple[float, float, float] | None = None, lag: bool = True
+    vehicle: Vehicle,
+    *,
+    mass: float | None = None,
+    inertia: tuple[float, float, float] | None = None,
+    lag: bool = True,
+    integration: str = "midpoint",
+    known_noise: KnownNoise | None = None,
 ) -> Setup:
     """Start and prior for a vehicle.
 
@@ -142,7 +259,14 @@ def setup_for(
         mass: [kg] start of a cold start, e.g. 0.001 (paper, eq. 116); the prior on mass is then flat in effect.
         inertia: [kg m^2] start of a cold start.
         lag: whether inputs are commands, with the rotor lag still to come (False: rotor speeds or true wrenches).
+        integration: midpoint, euler or semi-implicit: how what is flown turns velocities into positions.
+        known_noise: noise that is not estimated.
+
+    Raises:
+        UsageError: there is no such integration.
     """
+    if integration not in INTEGRATION:
+        raise UsageError(f"unknown integration '{integration}' (known: {', '.join(INTEGRATION)})")
     delay, delay_sd = DELAY_OF_COMMANDS if lag else DELAY_OF_SPEEDS
     centre = np.array([vehicle.mass, *vehicle.inertia, vehicle.motor_time_constant, delay, 0.0, 0.0, 0.0])
     cold = mass is not None or inertia is not None
@@ -169,4 +293,6 @@ def setup_for(
     free = np.array([True, True, True, True, has_lag, timed, timed, timed, timed])
     offset = max(TRIM * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
     unit = np.array([1.0, 1.0, 1.0, 1.0, 1.0, DELAY_UNIT, offset, offset, offset])
-    return Setup(Parameters(start, noise, vehicle.inertia_products), prior, free, unit)
+    bare = Setup(Parameters(start, noise, vehicle.inertia_products), prior, free, unit)
+    setup = replace(bare, lead=INTEGRATION[integration], known=known_noise)
+    return replace(setup, start=replace(setup.start, noise=setup.noise_at(start, noise.logs)))

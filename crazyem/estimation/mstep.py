@@ -6,6 +6,9 @@ form),
     Q = N log m - N/2 log S_F + N sum_i log I_i - N/2 sum_i log S_i + log prior,
     S_F = sum E[(m a - F)^2] dt,   S_i = sum E[(I_i alpha_i + (I_k - I_j) w_j w_k - M_i)^2] dt,
 
+or, where the intensity s of a noise is known in newtons or newton metres, - S / (2 s^2) in place of the - N/2 log S of
+its axis: then the size of the residuals, too, says what mass and inertia are.
+
 M with its offset, F and M being linear in tau and in the delay around the values they were made with. Every S
 is a quadratic form c' A c in a vector c that is linear in the parameters, with A the sums of kernels.py, so
 Newton's method in the logarithms of the parameters costs microseconds; logarithms also rule out sign flips."""
@@ -13,7 +16,7 @@ Newton's method in the logarithms of the parameters costs microseconds; logarith
 import numpy as np
 
 from crazyem.compiled import compiled
-from crazyem.estimation.kernels import AXIS, AXIS_SIZE, COUNT, DELAY, LAG, MASS, OFFSET, PARAMETERS
+from crazyem.estimation.kernels import AXIS, AXIS_SIZE, COUNT, DELAY, IMPULSE, LAG, MASS, OFFSET, PARAMETERS
 
 MAX_STEP = 1.0  # largest change of a logarithm, or of a linear parameter in its unit, in one Newton step
 
@@ -29,8 +32,12 @@ def _unpack(sums, base, n, out):
 
 
 @compiled
-def objective(theta, unit, sums, free, centre, precision, gradient, hessian, squares):
-    """-Q at theta (9,), its gradient and Hessian (logarithms, units); squares (4,) receives S_F, S_x, S_y, S_z."""
+def objective(theta, unit, sums, free, centre, precision, known, gradient, hessian, squares):
+    """-Q at theta (9,), its gradient and Hessian (logarithms, units); squares (4,) receives S_F, S_x, S_y, S_z.
+
+    `known` (5,) holds the squared intensities of thrust [N^2 s], torque [(N m)^2 s] and lateral force [N^2 s] that are
+    known, 0 for the others.
+    """
     count = sums[COUNT]
     a = np.zeros((6, 6))
     c = np.zeros(6)
@@ -80,13 +87,17 @@ def objective(theta, unit, sums, free, centre, precision, gradient, hessian, squ
             s += c[p] * ac[p]
         s = max(s, 1e-150)  # squared below
         squares[term] = s
-        value += 0.5 * count * np.log(s)
+        # the profiled term count/2 log s and the known one s / (2 variance) differ in slope and curvature only
+        profiled = known[term] == 0.0
+        weight = count / s if profiled else 1.0 / known[term]
+        bend = 1.0 / s if profiled else 0.0
+        value += 0.5 * (count * np.log(s) if profiled else s * weight)
         for u in range(PARAMETERS):
             grad[u] = 0.0
             for p in range(n):
                 grad[u] += dc[p, u] * ac[p]
             grad[u] *= 2.0 * scale[u]
-            gradient[u] += 0.5 * count * grad[u] / s
+            gradient[u] += 0.5 * weight * grad[u]
         for p in range(n):
             for v in range(PARAMETERS):
                 adc[p, v] = 0.0
@@ -94,12 +105,17 @@ def objective(theta, unit, sums, free, centre, precision, gradient, hessian, squ
                     adc[p, v] += a[p, q] * dc[q, v]
         for u in range(PARAMETERS):
             if u <= LAG:
-                hessian[u, u] += 0.5 * count * grad[u] / s
+                hessian[u, u] += 0.5 * weight * grad[u]
             for v in range(PARAMETERS):
                 h = 0.0
                 for p in range(n):
                     h += dc[p, u] * adc[p, v]
-                hessian[u, v] += 0.5 * count * (2.0 * h * scale[u] * scale[v] / s - grad[u] * grad[v] / (s * s))
+                hessian[u, v] += 0.5 * weight * (2.0 * h * scale[u] * scale[v] - grad[u] * grad[v] * bend)
+    if known[4] > 0.0:  # lateral accelerations are noise alone: along with the known noise they weigh the drone
+        s = theta[0] ** 2 * (sums[IMPULSE] + sums[IMPULSE + 1]) / known[4]
+        value += 0.5 * s - 2.0 * count * np.log(theta[0])
+        gradient[0] += s - 2.0 * count
+        hessian[0, 0] += 2.0 * s
     for u in range(PARAMETERS):
         if free[u]:
             d = np.log(theta[u] / centre[u]) if u <= LAG else (theta[u] - centre[u]) / unit[u]
@@ -116,7 +132,7 @@ def objective(theta, unit, sums, free, centre, precision, gradient, hessian, squ
 
 
 @compiled
-def maximise(theta, unit, sums, free, centre, precision, iterations, squares):
+def maximise(theta, unit, sums, free, centre, precision, known, iterations, squares):
     """Newton's method with Levenberg damping from theta (9,: kernels.py), in place.
 
     Args:
@@ -125,6 +141,7 @@ def maximise(theta, unit, sums, free, centre, precision, iterations, squares):
         sums: statistics summed over the window.
         free: (9,) which parameters may move.
         centre, precision: (9,) prior: centre, and 1/sd^2 of the logarithm, or of the linear parameter in its unit.
+        known: (5,) squares of the intensities of thrust, torque and lateral force that are known, 0 where profiled.
         iterations: at most so many Newton steps.
         squares: (4,) receives the residual sums S_F, S_x, S_y, S_z at the result.
     """
@@ -133,7 +150,9 @@ def maximise(theta, unit, sums, free, centre, precision, iterations, squares):
     trial = np.empty(PARAMETERS)
     g2 = np.empty(PARAMETERS)
     h2 = np.empty((PARAMETERS, PARAMETERS))
-    value = objective(theta, unit, sums, free, centre, precision, gradient, hessian, squares)
+    value = objective(theta, unit, sums, free, centre, precision, known, gradient, hessian, squares)
+    if not (np.isfinite(value) and np.isfinite(gradient).all() and np.isfinite(hessian).all()):
+        return  # the states diverged: there is nothing to step by
     damping = 0.0
     for _ in range(iterations):
         size = 0.0
@@ -150,7 +169,7 @@ def maximise(theta, unit, sums, free, centre, precision, iterations, squares):
                 down += step[u] * gradient[u]
                 size = max(size, abs(step[u]))
                 trial[u] = theta[u] * np.exp(step[u]) if u <= LAG else theta[u] + unit[u] * step[u]
-            new = objective(trial, unit, sums, free, centre, precision, g2, h2, squares)
+            new = objective(trial, unit, sums, free, centre, precision, known, g2, h2, squares)
             if down < 0.0 and new <= value + 1e-9:
                 for u in range(PARAMETERS):
                     theta[u] = trial[u]
@@ -164,4 +183,4 @@ def maximise(theta, unit, sums, free, centre, precision, iterations, squares):
             break
         if size < 1e-7:
             break
-    objective(theta, unit, sums, free, centre, precision, gradient, hessian, squares)
+    objective(theta, unit, sums, free, centre, precision, known, gradient, hessian, squares)

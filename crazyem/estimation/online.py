@@ -8,6 +8,7 @@ incremental pass by default, full passes while the parameters still move, and ev
 import math
 import time as clock
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,10 @@ from crazyem.errors import DataError, UsageError
 from crazyem.estimation.contact import ContactGate
 from crazyem.estimation.em import Information, WindowEM, offset
 from crazyem.estimation.inputs import MAX_GAP, SETTLE, InputHistory
-from crazyem.estimation.model import Parameters, Setup, setup_for
+from crazyem.estimation.marginal import Marginal, Refreshed
+from crazyem.estimation.model import INTEGRATION, KnownNoise, Parameters, Setup, setup_for
 from crazyem.estimation.result import Estimate
+from crazyem.estimation.settling import PASSED, Settled, settle
 from crazyem.estimation.tape import Tape
 from crazyem.estimation.verdict import estimate_of, nothing_known
 from crazyem.physics.lag import CAUSAL, HOLD, LINEAR
@@ -30,12 +33,19 @@ PATIENCE = 0.06  # s a node waits for inputs before the last one is held
 LOOKBACK = 20  # samples smoothed again in an incremental pass
 REFRESH = 12  # updates between two full passes with information
 YOUNG = 200  # samples below which every update is a full pass
-MOVED = 0.02  # change of a parameter's logarithm that calls for full passes
+NEWBORN = 24  # samples below which it takes as many passes as it needs: a cold start flies with what comes out
+CLOSE = 0.1  # standard deviations from the maximum at which full passes end
+# Standard deviations that a noise scale may be off where estimates count as converged: two of them are some 5 % of an
+# interval, and full passes end when the parameters have arrived.
+PASSED_NOISE = 2.0
+# Change of a parameter's logarithm that calls for full passes: a share of its standard deviation, between two limits.
+MOVED_SD, MOVED, MOVED_FAR = 0.5, 0.02, 0.1
 
 # No drone is faster, further or stronger (SI): a sample beyond is an error of transmission, used as missing.
 SANE = {
     "position": 1e4, "velocity": 1e2, "attitude": 2.0, "body_rate": 2e2,
     "motor_command": 1.5, "rotor_speed": 1e5, "wrench_command": 1e3,
+    "specific_force": 1e3,
 }  # fmt: skip
 
 _COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
@@ -57,14 +67,15 @@ class Counters:
 @dataclass
 class _Node:
     time: float
-    y: NDArray = field(default_factory=lambda: np.full(13, np.nan))
+    y: NDArray = field(default_factory=lambda: np.full(16, np.nan))  # 13 of the tape, specific force
 
 
 def _sane(signal: str, value: tuple[float, ...]) -> bool:
     """Whether every component is a number that can be true (a NaN is not, nor a quaternion far from unit length)."""
     limit = SANE[signal]
-    if not all(abs(v) < limit for v in value):
-        return False
+    for v in value:  # plain loops and Python floats in what runs for every sample: numpy costs more than it saves there
+        if not -limit < v < limit:
+            return False
     return signal != "attitude" or 0.5 < math.hypot(*value) < 2.0
 
 
@@ -77,10 +88,19 @@ class OnlineEstimator:
         every: samples between updates.
         input_signal: motor_command, rotor_speed or wrench_command; None takes the first of these the vehicle can use.
         mass, inertia: start values of a cold start [kg], [kg m^2].
+        integration: midpoint, euler or semi-implicit: the rule by which what is flown moves. A body obeys the first, a
+            simulator whichever it was written with.
+        accelerometer: whether to use specific_force, the mean over the step that ends at its stamp. Off by default: a
+            real one measures the vibration of its frame.
+        known_noise: noise that is known and not estimated.
+        attitude_period: s between attitudes that are used where body rates are there as well; 0 uses all. An onboard
+            filter integrates its gyro: its attitude errs as its rates do, and for longer than a sample lasts.
 
     Attributes:
         airborne: verdict of the contact gate on the newest node.
         update_seconds: wall-clock cost of each update [s].
+        full_updates: how many updates made full passes.
+        settled: how the maximum was reached in the last `finish`.
         counters: what came in.
     """
 
@@ -93,6 +113,10 @@ class OnlineEstimator:
         input_signal: str | None = None,
         mass: float | None = None,
         inertia: tuple[float, float, float] | None = None,
+        integration: str = "midpoint",
+        accelerometer: bool = False,
+        known_noise: KnownNoise | None = None,
+        attitude_period: float = 0.0,
     ) -> None:
         if window < 20:
             raise UsageError(f"a window of {window} samples is too short to estimate from (at least 20)")
@@ -100,11 +124,18 @@ class OnlineEstimator:
             raise UsageError(f"an update every {every} samples is not possible (at least 1)")
         if input_signal is not None and input_signal not in _INPUTS:
             raise UsageError(f"unknown input signal '{input_signal}' (known: {', '.join(_INPUTS)})")
+        if integration not in INTEGRATION:
+            raise UsageError(f"unknown integration '{integration}' (known: {', '.join(INTEGRATION)})")
         self.vehicle = vehicle
         self.window = window
         self.every = every
         self._input = input_signal
-        self._cold = (mass, inertia)
+        self._make_setup = partial(
+            setup_for, vehicle, mass=mass, inertia=inertia, integration=integration, known_noise=known_noise
+        )
+        self._measured = {**_COLUMNS, "specific_force": slice(13, 16)} if accelerometer else _COLUMNS
+        self._attitude_period = attitude_period
+        self._attitude_time = self._rate_time = -math.inf  # of the newest attitude that is used, of the newest rates
         self._setup: Setup | None = None
         self._em: WindowEM | None = None
         self._tape = Tape(3 * window + 64)
@@ -120,11 +151,15 @@ class OnlineEstimator:
         self._since = 0
         self._updates = 0
         self._information: Information | None = None
-        self._settled: Parameters | None = None  # parameters of the last full pass
+        self._reference: Parameters | None = None  # parameters of the last full pass
+        self._refreshed = Refreshed()
+        self._marginal: Marginal | None = None
         self._converged = False
         self._last_time = math.nan
+        self.settled: Settled | None = None
         self.counters = Counters()
         self.update_seconds: list[float] = []
+        self.full_updates = 0
 
     # what comes in -------------------------------------------------------------------------------------------
 
@@ -132,6 +167,11 @@ class OnlineEstimator:
     def airborne(self) -> bool:
         """Whether the newest node was in free flight."""
         return self._gate.airborne
+
+    @property
+    def trace(self) -> list[NDArray]:
+        """Parameters (9,) at every point on the way to the maximum in the last `finish`; empty before."""
+        return [] if self.settled is None else [stop.theta for stop in self.settled.path]
 
     @property
     def residual(self) -> tuple[float, NDArray, NDArray] | None:
@@ -176,8 +216,9 @@ class OnlineEstimator:
             if self._fresh < self._tape.size:
                 self._em.incremental(first, self._fresh, self._tape.size, lookback=LOOKBACK)
                 self._fresh = self._tape.size
-            self._information = self._em.converge(first, self._tape.size, passes=60)
-            self._judge()
+            self.settled = settle(self._em, first, self._tape.size)
+            self._information, self._marginal = self.settled.information, self.settled.marginal
+            self._converged = self.settled.converged
             self._updates += 1
         return self._estimate()
 
@@ -191,7 +232,7 @@ class OnlineEstimator:
         if "flying" in group and math.isfinite(group["flying"][0]):
             self._flying = group["flying"][0] > 0.5
         self._take_input(group, time)
-        if any(name in group for name in _COLUMNS):
+        if any(name in group for name in self._measured):
             self._take_measurement(group, time)
         return self._admit(flush=False)
 
@@ -223,8 +264,7 @@ class OnlineEstimator:
         else:
             wrench = value
         if self._setup is None:
-            mass, inertia = self._cold
-            self._setup = setup_for(self.vehicle, mass=mass, inertia=inertia, lag=self._input != "rotor_speed")
+            self._setup = self._make_setup(lag=self._input != "rotor_speed")
             if not self._setup.free[4]:
                 self._inputs.mode = LINEAR if self._input == "rotor_speed" else HOLD
             self._em = WindowEM(self._setup, self._tape, self._inputs)
@@ -237,21 +277,21 @@ class OnlineEstimator:
         if time <= newest + 1e-9:
             self.counters.late += 1
             return
-        node = self._pending[-1] if self._pending and time - self._pending[-1].time < SAME_NODE else _Node(time)
-        new = node.y.copy()
-        for name, columns in _COLUMNS.items():
+        joins = bool(self._pending) and time - self._pending[-1].time < SAME_NODE
+        node = self._pending[-1] if joins else _Node(time)
+        known = joins  # a node that waits knows something already
+        for name, columns in self._measured.items():
             if name in group:
                 value = group[name]
                 if _sane(name, value):
-                    new[columns] = value
+                    node.y[columns] = value
+                    known = True
                     continue
                 self.counters.missing += 1
                 if name != "attitude":  # half an attitude is none
-                    new[columns] = [v if abs(v) < SANE[name] else math.nan for v in value]
-        if np.all(np.isnan(new)):
-            return
-        node.y = new
-        if not self._pending or node is not self._pending[-1]:
+                    node.y[columns] = part = [v if abs(v) < SANE[name] else math.nan for v in value]
+                    known = known or not all(math.isnan(v) for v in part)
+        if known and not joins:
             self._pending.append(node)
 
     # nodes onto the tape ------------------------------------------------------------------------------------
@@ -278,11 +318,11 @@ class OnlineEstimator:
         self._last_time = node.time
         self.counters.nodes += 1
         inputs, tape = self._inputs, self._tape
-        tau, delay = self._em.parameters.theta[4:6]
+        tau, delay = self._em.parameters.theta[4:6].tolist()
         if node.time < inputs.times[0]:
             return None
-        at = max(0, int(np.searchsorted(inputs.times[: inputs.size], node.time, "right")) - 1)
-        airborne = self._gate.update(height=float(node.y[2]), thrust=float(inputs.wrenches[at, 0]), flying=self._flying)
+        thrust = float(inputs.wrenches[inputs.at(node.time), 0])
+        airborne = self._gate.update(height=float(node.y[2]), thrust=thrust, flying=self._flying)
         if not airborne:
             self.counters.grounded += 1
             if not self._starts:
@@ -295,7 +335,14 @@ class OnlineEstimator:
         if starts:
             self.counters.breaks += 1
         self._starts = False
-        dropped = tape.append(node.time, node.y, starts=starts, keep=self.window + LOOKBACK + 2 * self.every + 8)
+        self._thin_attitude(node, starts=starts)
+        if tape.size == tape.capacity and self._fresh < tape.size:
+            # updates are rarer than the tape is long: what was not filtered yet must be before it falls off
+            self._em.incremental(max(0, tape.size - self.window), self._fresh, tape.size, lookback=LOOKBACK)
+            self._fresh = tape.size
+        keep = self.window + LOOKBACK + 2 * min(self.every, self.window) + 8
+        dropped = tape.append(node.time, node.y[:13], starts=starts, keep=keep)
+        tape.force[tape.size - 1] = node.y[13:]
         self._fresh -= dropped
         if node.time - inputs.gap_end < SETTLE * max(tau, 0.02) and self._setup is not None and self._setup.free[4]:
             tape.usable[tape.size - 1] = False
@@ -308,6 +355,16 @@ class OnlineEstimator:
         self.update_seconds.append(clock.perf_counter() - begin)
         return self._estimate()
 
+    def _thin_attitude(self, node: _Node, *, starts: bool) -> None:
+        """Take away an attitude that comes too soon after the last one, as long as rates tell how it went on."""
+        if not math.isnan(node.y[10]):
+            self._rate_time = node.time
+        soon = node.time - self._attitude_time < self._attitude_period - SAME_NODE
+        if soon and not starts and node.time - self._rate_time < self._attitude_period:
+            node.y[6:10] = math.nan
+        elif not math.isnan(node.y[6]):
+            self._attitude_time = node.time
+
     # updates ------------------------------------------------------------------------------------------------
 
     def _update(self) -> None:
@@ -318,19 +375,22 @@ class OnlineEstimator:
         first = max(0, last - self.window)
         em.incremental(first, self._fresh, last, lookback=LOOKBACK)
         self._fresh = last
-        moved = math.inf
-        if self._settled is not None:
-            change = offset(em.parameters.theta, self._settled.theta, em.setup.unit)
-            moved = float(np.max(np.abs(change[:5])))
         young = last - first < min(YOUNG, self.window)
-        if young or moved > MOVED or self._updates % REFRESH == 0:
-            self._information = em.converge(first, last, passes=4 if young else 2)
-            self._settled = em.parameters
-            self._judge()
+        if young or self._moved(em) or self._updates % REFRESH == 0:
+            passes = 12 if last - first < NEWBORN else 4 if young else 2
+            self.full_updates += 1
+            self._information = em.converge(first, last, passes=passes, tolerance=CLOSE)
+            self._reference = em.parameters
+            self._converged = self._information.decrement < PASSED and self._information.noise_length < PASSED_NOISE
+            self._marginal = self._refreshed.refresh(em, first, last, self._information)
 
-    def _judge(self) -> None:
-        assert self._information is not None
-        self._converged = self._information.decrement < 0.2
+    def _moved(self, em: WindowEM) -> bool:
+        """Whether a parameter has moved since the last full passes by more than older rows' expectations can bear."""
+        if self._reference is None or self._information is None:
+            return True
+        change = np.abs(offset(em.parameters.theta, self._reference.theta, em.setup.unit))[:5]
+        limit = np.minimum(np.maximum(MOVED_SD * self._information.sd[:5], MOVED), MOVED_FAR)
+        return bool((change > limit).any())
 
     # what goes out ------------------------------------------------------------------------------------------
 
@@ -345,4 +405,5 @@ class OnlineEstimator:
             samples=int(min(self._tape.size, self.window)),
             updates=self._updates,
             converged=self._converged,
+            marginal=self._marginal,
         )

@@ -1,8 +1,9 @@
 """The estimator's inner loops in plain numpy and textbook form: the slow twin that tests hold the kernels against.
 
 Extended Kalman filter with dense matrices and joint measurement updates; Rauch-Tung-Striebel smoother with the
-covariance of the state at both ends of a step (lag-one); expectations taken from those. Nothing here is shared with
-kernels.py but the model itself (crazyem.physics.rigid_body) and the layout of its statistics.
+covariance of the state at both ends of a step (lag-one); expectations taken from those. With an
+accelerometer the state is augmented by the impulse of the step, of which the measurement is a component. Nothing here
+is shared with the kernels but the model itself (crazyem.physics.rigid_body).
 """
 
 from typing import NamedTuple
@@ -48,11 +49,12 @@ def state_of(row: NDArray) -> State:
 
 def extended_kalman_filter(
     time: NDArray, y: NDArray, thrust: NDArray, torque: NDArray, *, prior: State, prior_cov: NDArray,
-    mass: float, inertia: NDArray, q: NDArray, r: NDArray,
+    mass: float, inertia: NDArray, q: NDArray, r: NDArray, lead: float = 0.5,
 ) -> Filtered:  # fmt: skip
     """Filter over all samples; y (n, 13) with NaN where missing; thrust (n,), torque (n, 3) means of the steps.
 
-    q (6,) impulse variances per second in units of acceleration, r (12,) measurement variances.
+    q (6,) impulse variances per second in units of acceleration, r (12,) measurement variances; `lead` as in
+    crazyem.physics.rigid_body.
     """
     n = len(time)
     predicted: list[State] = []
@@ -65,9 +67,9 @@ def extended_kalman_filter(
             x, cov = prior, prior_cov
         else:
             dt = time[k] - time[k - 1]
-            phi, g = step_jacobians(filtered[-1], thrust[k], torque[k], dt=dt, mass=mass, inertia=inertia)
-            x = step(filtered[-1], thrust[k], torque[k], dt=dt, mass=mass, inertia=inertia)
-            cov = phi @ pf[k - 1] @ phi.T + g @ np.diag(q * dt) @ g.T + bridge_covariance(g, q, dt=dt)
+            phi, g = step_jacobians(filtered[-1], thrust[k], torque[k], dt=dt, mass=mass, inertia=inertia, lead=lead)
+            x = step(filtered[-1], thrust[k], torque[k], dt=dt, mass=mass, inertia=inertia, lead=lead)
+            cov = phi @ pf[k - 1] @ phi.T + g @ np.diag(q * dt) @ g.T + bridge_covariance(g, q, dt=dt, lead=lead)
             transitions[k], noises[k] = phi, g
         predicted.append(x)
         pp[k] = cov
@@ -117,3 +119,80 @@ def expected_accelerations(
         rate = smoothed.states[k - 1].body_rate
         acceleration[k] = angular_acceleration(rate, torque[k], inertia=inertia) + smoothed.impulse[k, 3:] / dt
     return force, acceleration
+
+
+class Augmented(NamedTuple):
+    """Filter and smoother of state and impulse together: errors (12,) of the state, impulse (6,) of the step.
+
+    Row k is the sample k and the step that ends there. `cov` and `impulse` of the smoother are marginals of one joint
+    covariance (18, 18); the impulse's variance is in (m/s)^2 and (rad/s)^2.
+    """
+
+    filtered: list[State]
+    filtered_cov: NDArray  # (n, 12, 12)
+    log_likelihood: float
+    smoothed: list[State]
+    smoothed_cov: NDArray  # (n, 12, 12)
+    impulse: NDArray  # (n, 6)
+    impulse_cov: NDArray  # (n, 6, 6)
+
+
+def augmented_smoother(
+    time: NDArray, y: NDArray, force: NDArray, thrust: NDArray, torque: NDArray, *, prior: State, prior_cov: NDArray,
+    mass: float, inertia: NDArray, q: NDArray, r: NDArray, r_force: float, lead: float = 0.5,
+) -> Augmented:  # fmt: skip
+    """Extended Kalman filter and Rauch-Tung-Striebel smoother with an accelerometer's readings among the measurements.
+
+    force (n, 3) mean body-frame specific force over the step that ends at each sample [m/s^2], NaN where missing;
+    r_force its variance; the rest as in `extended_kalman_filter`. The step is linearised at the impulse that the
+    accelerometer alone suggests, and all that was measured at a sample is one joint update.
+    """
+    n = len(time)
+    transition, predicted_cov = np.zeros((n, 18, 18)), np.zeros((n, 18, 18))
+    cov, mean = np.zeros((n, 18, 18)), np.zeros((n, 18))  # mean: of the error around (points, impulses)
+    points: list[State] = []
+    filtered: list[State] = []
+    impulses, filtered_impulse = np.zeros((n, 6)), np.zeros((n, 6))
+    log_likelihood = 0.0
+    for k in range(n):
+        measures = np.eye(18)[:12]
+        noise = np.append(r, np.full(3, r_force))
+        if k == 0:
+            points.append(prior)
+            predicted_cov[0, :12, :12] = prior_cov
+            measured = np.append(difference(state_of(y[0]), prior), np.full(3, np.nan))
+        else:
+            dt = time[k] - time[k - 1]
+            model = np.array([0.0, 0.0, thrust[k] / mass])
+            impulses[k, :3] = np.nan_to_num(force[k] - model) * q[:3] / (q[:3] / dt + r_force)
+            arguments = (filtered[-1], thrust[k], torque[k])
+            points.append(step(*arguments, dt=dt, mass=mass, inertia=inertia, impulse=impulses[k], lead=lead))
+            phi, g = step_jacobians(*arguments, dt=dt, mass=mass, inertia=inertia, impulse=impulses[k], lead=lead)
+            transition[k, :12, :12] = phi
+            both = np.vstack([g, np.eye(6)])
+            predicted_cov[k] = transition[k] @ cov[k - 1] @ transition[k].T + both @ np.diag(q * dt) @ both.T
+            predicted_cov[k, :12, :12] += bridge_covariance(g, q, dt=dt, lead=lead)
+            mean[k] = -both @ impulses[k]
+            measured = np.append(difference(state_of(y[k]), points[k]), force[k] - model - impulses[k, :3] / dt)
+            measures = np.vstack([measures, np.eye(18)[12:15] / dt])
+        seen = np.flatnonzero(~np.isnan(measured))
+        innovation = measured[seen] - measures[seen] @ mean[k]
+        s = measures[seen] @ predicted_cov[k] @ measures[seen].T + np.diag(noise[seen])
+        gain = np.linalg.solve(s, measures[seen] @ predicted_cov[k]).T
+        cov[k] = (np.eye(18) - gain @ measures[seen]) @ predicted_cov[k]
+        error = mean[k] + gain @ innovation
+        filtered.append(points[k].plus(error[:12]))
+        filtered_impulse[k] = impulses[k] + error[12:]
+        log_likelihood -= 0.5 * (innovation @ np.linalg.solve(s, innovation) + np.linalg.slogdet(2 * np.pi * s)[1])
+    smoothed, smoothed_impulse, smoothed_cov = list(filtered), filtered_impulse.copy(), cov.copy()
+    for k in range(n - 2, -1, -1):
+        ahead = np.append(difference(smoothed[k + 1], points[k + 1]), smoothed_impulse[k + 1] - impulses[k + 1])
+        gain = np.linalg.solve(predicted_cov[k + 1], transition[k + 1] @ cov[k]).T
+        error = gain @ (ahead - mean[k + 1])
+        smoothed[k] = filtered[k].plus(error[:12])
+        smoothed_impulse[k] = filtered_impulse[k] + error[12:]
+        smoothed_cov[k] = cov[k] + gain @ (smoothed_cov[k + 1] - predicted_cov[k + 1]) @ gain.T
+    return Augmented(
+        filtered, cov[:, :12, :12], log_likelihood, smoothed, smoothed_cov[:, :12, :12], smoothed_impulse,
+        smoothed_cov[:, 12:, 12:],
+    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What the estimator says: values with standard deviations, intervals, and whether the data support them at all."""
+"""What the estimator says: values with standard deviations, intervals, whether the data support them; steps of mass."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -82,3 +82,40 @@ class Estimate:
                 + f"{p.unit}{note}"
             )
         return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A change of mass.
+
+    Attributes:
+        time: s, when it began. found: s, when it was noticed.
+        before: kg. after: kg, None until decided. real: whether it was one, None until decided.
+        jumped: it was none because the logged thrust jumped by itself: commands or voltage are not what they were.
+    """
+
+    time: float
+    found: float
+    before: float
+    after: float | None = None
+    real: bool | None = None
+    jumped: bool = False
+
+    def __str__(self) -> str:
+        if self.jumped:
+            return f"the logged thrust jumped at {self.time:.2f} s, and the drone did not: commands or voltage lie"
+        if self.real and self.after is not None:
+            return f"mass changed at {self.time:.2f} s: {self.before:.4g} -> {self.after:.4g} kg"
+        what = "a gust" if self.real is False else "perhaps a change of mass"
+        return f"{what} at {self.time:.2f} s, noticed at {self.found:.2f} s"
+
+    def to_json(self) -> dict[str, float | bool | None]:
+        """The form of the summary; times on the drone's clock."""
+        return {
+            "time": self.time,
+            "found": self.found,
+            "before_kg": self.before,
+            "after_kg": self.after,
+            "real": self.real,
+            "jumped": self.jumped,
+        }

@@ -10,21 +10,20 @@ MAX_LAG = 100
 
 @compiled
 def long_run(terms):
-    """Variance of the column sums of terms (n, p), Bartlett kernel (Newey and West 1987). Returns (p,)."""
+    """Variance of the column sums of terms (n, p), Bartlett kernel (Newey and West 1987). Returns (p,).
+
+    The weights 1 - lag/length of the kernel are those of a running sum of that length, of which this is the mean
+    square: a few additions a term, however many lags.
+    """
     n, p = terms.shape
+    length = (min(n // 8, MAX_LAG) if n >= MIN_ROWS else 0) + 1
     out = np.zeros(p)
-    column = np.empty(n)
-    lags = min(n // 8, MAX_LAG) if n >= MIN_ROWS else 0
-    for c in range(p):
-        for k in range(n):
-            column[k] = terms[k, c]
-        total = 0.0
-        for k in range(n):
-            total += column[k] * column[k]
-        for lag in range(1, lags + 1):
-            acc = 0.0
-            for k in range(lag, n):
-                acc += column[k] * column[k - lag]
-            total += 2.0 * (1.0 - lag / (lags + 1.0)) * acc
-        out[c] = total
-    return out
+    running = np.zeros(p)
+    for k in range(n + length - 1):
+        for c in range(p):
+            if k < n:
+                running[c] += terms[k, c]
+            if k >= length:
+                running[c] -= terms[k - length, c]
+            out[c] += running[c] * running[c]
+    return out / length

@@ -14,6 +14,7 @@ class Tape:
     _ROWS = (
         ("time", (), float),
         ("y", (13,), float),
+        ("force", (3,), float),  # mean specific force over the step, body [m/s^2]; NaN where not measured
         ("kind", (), np.int8),
         ("usable", (), np.bool_),
         ("mean", (4,), float),  # mean of lagged F and M over the step
@@ -49,6 +50,7 @@ class Tape:
     # for the type checker
     time: np.ndarray
     y: np.ndarray
+    force: np.ndarray
     kind: np.ndarray
     usable: np.ndarray
     mean: np.ndarray
@@ -86,6 +88,7 @@ class Tape:
         k = self.size
         self.time[k] = time
         self.y[k] = y
+        self.force[k] = np.nan
         self.kind[k] = BREAK if starts or k == 0 else 0
         self.usable[k] = self.kind[k] == 0
         self.mean[k] = 0.0

@@ -6,6 +6,7 @@ import numpy as np
 
 from crazyem.estimation.em import Information, displaced, offset
 from crazyem.estimation.kernels import DELAY, LAG
+from crazyem.estimation.marginal import Marginal
 from crazyem.estimation.model import GROUPS, NAMES, Parameters, Setup
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
 from crazyem.vehicle import Vehicle
@@ -13,6 +14,8 @@ from crazyem.vehicle import Vehicle
 IDENTIFIABLE = 0.15  # largest standard deviation of a logarithm that counts as identified
 IMPLAUSIBLE = 3.0  # prior standard deviations beyond which an inertia is not believed
 FEWEST = 20  # samples in flight before anything counts as identified
+_INERTIA = (np.arange(len(NAMES)) > 0) & (np.arange(len(NAMES)) < LAG)
+_LOGARITHMIC = np.arange(len(NAMES)) < DELAY
 
 
 def estimate_of(
@@ -24,6 +27,7 @@ def estimate_of(
     samples: int,
     updates: int,
     converged: bool,
+    marginal: Marginal | None = None,
 ) -> Estimate:
     """The estimate, every parameter with its standard deviation, 95 % interval and verdict.
 
@@ -35,37 +39,38 @@ def estimate_of(
         samples: in the window.
         updates: so far.
         converged: whether the score test was passed.
+        marginal: with noise scales integrated out that the data leave open.
     """
-    theta, prior, unit = parameters.theta, setup.prior, setup.unit
-    sd = np.sqrt(np.maximum(np.diag(information.covariance), 0.0))
+    prior, unit = setup.prior, setup.unit
+    if marginal is None:
+        theta, sd = parameters.theta, information.sd
+        below, above = -1.96 * sd, 1.96 * sd
+    else:
+        theta, sd = displaced(parameters.theta, marginal.shift, unit), marginal.sd
+        below, above = marginal.low - marginal.shift, marginal.high - marginal.shift
     # An inertia that the prior all but excludes says that the model does not hold here, not that the drone is odd.
     deviation = np.abs(offset(theta, prior.centre, unit))
     implausible = deviation > IMPLAUSIBLE * prior.sd
-    sd[1:4] = np.where(implausible, np.maximum(sd, deviation), sd)[1:4]
-    low, high = (displaced(theta, z * sd, unit) for z in (-1.96, 1.96))
-    absolute = sd * np.where(np.arange(len(sd)) < DELAY, theta, unit)
+    distrusted = implausible & _INERTIA
+    if distrusted.any():
+        sd = np.where(distrusted, np.maximum(sd, deviation), sd)
+        below, above = np.where(distrusted, -1.96 * sd, below), np.where(distrusted, 1.96 * sd, above)
+    low, high = displaced(theta, below, unit), displaced(theta, above, unit)
+    absolute = sd * np.where(_LOGARITHMIC, theta, unit)
     if not setup.free[LAG]:  # the inputs contain the lag, so the data say nothing of it
         absolute[LAG], low[LAG], high[LAG] = math.inf, 0.0, math.inf
     said = {}
-    for i, name in enumerate(NAMES):
-        reason = _objection(
-            i, float(sd[i]), setup, information, samples=samples, converged=converged, implausible=bool(implausible[i])
-        )
-        said[name] = ParameterEstimate(
-            value=float(theta[i]),
-            sd=float(absolute[i]),
-            ci95=(float(low[i]), float(high[i])),
-            unit=PARAMETER_UNITS[name],
-            identifiable=not reason,
-            reason=reason,
-        )
+    columns = (v.tolist() for v in (theta, sd, absolute, low, high, implausible))
+    for i, (name, value, spread, of_value, least, most, odd) in enumerate(zip(NAMES, *columns, strict=True)):
+        reason = _objection(i, spread, setup, information, samples=samples, converged=converged, implausible=odd)
+        said[name] = ParameterEstimate(value, of_value, (least, most), PARAMETER_UNITS[name], not reason, reason)
     noise = parameters.noise
     intensities = noise.impulse * np.concatenate([np.full(3, theta[0]), theta[1:4]])
     names = ("force_x", "force_y", "thrust", "torque_x", "torque_y", "torque_z")
     return Estimate(
         time=time,
         parameters=said,
-        noise={**dict(zip(names, intensities.tolist())), **dict(zip(GROUPS, noise.measurement.tolist()))},
+        noise={**dict(zip(names, intensities.tolist())), **dict(zip(GROUPS[:4], noise.measurement.tolist()))},
         samples=samples,
         updates=updates,
         converged=converged,

@@ -12,9 +12,16 @@ __all__ = ["open_link"]
 
 def open_link(uri: str) -> Link:
     """The link for a URI, not yet connected. Raises UsageError if the URI names no link we know."""
+    if uri.startswith("mavlink:"):
+        from crazyem.links.mavlink.link import MavlinkLink
+
+        return MavlinkLink(uri)
     scheme, separator, _ = uri.partition("://")
     if not separator:
-        raise UsageError(f'"{uri}" is not a link URI; it should look like udp://127.0.0.1:19850 or radio://0/80/2M.')
+        raise UsageError(
+            f'"{uri}" is not a link URI; it should look like udp://127.0.0.1:19850, radio://0/80/2M or '
+            "mavlink:udpin:0.0.0.0:14550."
+        )
     if scheme not in CRAZYFLIE_SCHEMES:
         known = ", ".join(f"{s}://" for s in CRAZYFLIE_SCHEMES)
         raise UsageError(f'"{uri}": no link for {scheme}://; known are {known}.')

@@ -1,5 +1,6 @@
 """The narrow interface every link to a drone offers: what it logs, what it takes, and an honest account of losses."""
 
+import math
 import queue
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -7,7 +8,7 @@ from typing import Protocol
 
 from crazyem.signals.packet import Block, Packet, Variable
 
-__all__ = ["Block", "Link", "LinkLost", "LinkStatistics", "Packet", "ParameterWrite", "Variable"]
+__all__ = ["Block", "Link", "LinkLost", "LinkStatistics", "Outage", "Packet", "ParameterWrite", "Variable"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +32,43 @@ class ParameterWrite:
 
 @dataclass(frozen=True, slots=True)
 class LinkStatistics:
-    """Packets by fate. `lost` is inferred from the firmware stamps against the block's period."""
+    """Packets by fate, delays and clocks. `lost` is inferred from the firmware stamps against the block's period.
+
+    Attributes:
+        per_block: block -> received, lost, late.
+        delays: block -> median and 99th percentile of the newest packets' delay over the least-delayed ones, s.
+        round_trip: median of the newest echoes, s; NaN where unknown.
+        clock_offset, clock_rate: host time [s since the epoch] = offset + rate * firmware time [s]; NaN where unknown.
+        outages: how often the link was lost and came back.
+    """
 
     received: int = 0
     lost: int = 0
     late: int = 0
     per_block: Mapping[int, tuple[int, int, int]] = field(default_factory=dict)
+    delays: Mapping[int, tuple[float, float]] = field(default_factory=dict)
+    round_trip: float = math.nan
+    clock_offset: float = math.nan
+    clock_rate: float = math.nan
+    outages: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Outage:
+    """A time without a link that is over.
+
+    Attributes:
+        reason: why the link counted as lost, one sentence.
+        seconds: from the last log packet before to the first after, host clock.
+        before_ms, after_ms: their stamps on the drone's clock, unwrapped, ms.
+        created: log blocks that had to be created anew.
+    """
+
+    reason: str
+    seconds: float
+    before_ms: float
+    after_ms: float
+    created: int
 
 
 class Link(Protocol):
@@ -48,7 +80,7 @@ class Link(Protocol):
     uri: str
     packets: "queue.SimpleQueue[Packet | LinkLost]"
 
-    def connect(self, timeout: float = 15.0) -> None: ...  # raises LinkError
+    def connect(self, timeout: float = 30.0) -> None: ...  # raises LinkError
     def close(self) -> None: ...
     @property
     def log_variables(self) -> Mapping[str, str]: ...  # name -> C type

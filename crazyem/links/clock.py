@@ -1,11 +1,15 @@
 """Firmware stamps and host clock: unwrapping 24 bits, counting what never arrived, relating the two clocks."""
 
 import math
+import statistics
 from collections import deque
 from dataclasses import dataclass
+from itertools import pairwise
 
 STAMP_MODULUS = 1 << 24  # ms; the firmware sends the low 24 bits of its millisecond counter: wraps at 16777.216 s
 _HALF = STAMP_MODULUS // 2
+_STALL = 0.4  # s of host time by which all packets come later than before, after a clock stood still
+_STALL_SEEN = 5  # bins (seconds of firmware time) in which not one packet was as early as before
 
 
 class StampUnwrapper:
@@ -20,13 +24,15 @@ class StampUnwrapper:
 
     def unwrap(self, stamp: int) -> int:
         """Unwrapped time [ms] of a stamp [ms]; the first stamp is returned as it is."""
-        if self._newest is None:
-            self._newest = int(stamp)
-            return self._newest
-        step = (int(stamp) - self._newest + _HALF) % STAMP_MODULUS - _HALF
-        time = self._newest + step
-        self._newest = max(self._newest, time)
+        time = self.peek(stamp)
+        self._newest = time if self._newest is None else max(self._newest, time)
         return time
+
+    def peek(self, stamp: int) -> int:
+        """As `unwrap`, without taking note of the stamp."""
+        if self._newest is None:
+            return int(stamp)
+        return self._newest + (int(stamp) - self._newest + _HALF) % STAMP_MODULUS - _HALF
 
 
 class LossCounter:
@@ -119,10 +125,30 @@ class ClockRelation:
             while len(self._bins) > self._seconds:
                 self._bins.pop(next(iter(self._bins)))
 
+    def _forget_before_stall(self) -> None:
+        """A simulator that was denied the processor stood still: what was before that says nothing of now.
+
+        Seen as a step up by more than any delay worth the name, from which not one packet in seconds comes back.
+        """
+        points = list(self._bins.values())
+        if len(points) < 2 * _STALL_SEEN:
+            return
+        slopes = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(points) if b[0] > a[0]]
+        rate = statistics.median(slopes) if slopes else 1.0
+        level = [y - rate * x for x, y in points]
+        lowest = math.inf  # of what follows
+        for i in range(len(points) - 2, -1, -1):
+            lowest = min(lowest, level[i + 1])
+            if len(points) - 1 - i >= _STALL_SEEN and lowest - level[i] > _STALL:
+                for key in list(self._bins)[: i + 1]:
+                    del self._bins[key]
+                return
+
     def fit(self) -> ClockFit | None:
         """The relation so far, or None before the first packet. The rate is 1 until three seconds have been seen."""
         if self._origin is None:
             return None
+        self._forget_before_stall()
         points = list(self._bins.values())
         n = len(points)
         mean_x = sum(p[0] for p in points) / n

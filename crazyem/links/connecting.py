@@ -1,4 +1,8 @@
-"""Opening and closing a cflib link within bounded time: cflib waits for ever for any reply that is lost."""
+"""Opening and closing a cflib link within bounded time: cflib waits for ever for any reply that is lost.
+
+Three nets, one below the other: a request without an answer is sent again (`courier.py`); a connection that stands
+still nevertheless is given up and begun anew, a little later each time; and all of it ends at the caller's timeout.
+"""
 
 import contextlib
 import logging
@@ -7,8 +11,11 @@ import time
 from typing import Any
 
 from crazyem.errors import LinkError
+from crazyem.links.courier import Courier
 
 SILENCE_LIMIT = 3.0  # s without a new answer before a connection attempt is given up
+ATTEMPTS = 3  # at a drone that does answer, but not everything
+_BACKOFF = 0.2  # s before the second attempt, twice that before the third
 _LOG_DATA = (5, 2)
 _CONSOLE_PORT = 0
 _LINK_PORT = 15
@@ -104,28 +111,86 @@ class _Progress:
         self.wake.set()
 
 
-def open_link(crazyflie: Any, uri: str, timeout: float) -> None:
-    """Connect and wait until the tables and every parameter value are there.
+def connect(uri: str, timeout: float) -> Any:
+    """A connected cflib Crazyflie, tables and every parameter value read; `timeout` [s] is for all attempts together.
 
-    Raises: LinkError with one sentence that tells "nothing answers" from "a reply was lost". The link is closed then.
+    Raises: LinkError with one sentence that tells "nothing answers" from "a reply was lost". Nothing stays open.
     """
-    progress = _Progress(crazyflie)
     deadline = time.monotonic() + timeout
+    pause = _BACKOFF
+    told: LinkError | None = None  # what was missing at a drone that did answer
+    for attempt in range(ATTEMPTS):
+        crazyflie = new_crazyflie(uri)
+        progress = _Progress(crazyflie)
+        try:
+            _open(crazyflie, progress, uri, deadline, timeout)
+            return crazyflie
+        except LinkError as error:
+            # A later silence says less than what an earlier attempt missed.
+            told = error if progress.answers or told is None else told
+            # Where nobody ever answers, or time is up, there is nothing to try again.
+            answered = progress.answers or told is not error
+            if not answered or attempt == ATTEMPTS - 1 or time.monotonic() + pause >= deadline:
+                raise told from None
+        finally:
+            progress.detach()
+        time.sleep(pause)
+        pause *= 2
+    raise AssertionError
+
+
+def _open(crazyflie: Any, progress: _Progress, uri: str, deadline: float, timeout: float) -> None:
+    """One attempt."""
     try:
-        crazyflie.open_link(uri)
-        while not progress.wake.wait(0.05):
-            _shorten_naps(crazyflie)
+        _begin(crazyflie, uri)
+        while not progress.wake.wait(0.01):
+            shorten_naps(crazyflie)
             now = time.monotonic()
             if now > deadline or now - progress.last_answer > min(SILENCE_LIMIT, timeout):
                 raise LinkError(_why(progress, uri, timeout, late=now > deadline))
+            _repeat_if_overdue(crazyflie)
         if not progress.done:
             raise LinkError(_why_failed(progress, uri))
-        _shorten_naps(crazyflie)
+        shorten_naps(crazyflie)
     except BaseException:
         shut(crazyflie)
         raise
-    finally:
-        progress.detach()
+
+
+def _begin(crazyflie: Any, uri: str) -> None:
+    """What `Crazyflie.open_link` does (cflib 0.1.34), with a courier around its driver from the first packet on."""
+    from cflib.crazyflie import State
+
+    crazyflie.connection_requested.call(uri)
+    crazyflie.state = State.INITIALIZED
+    crazyflie.link_uri = uri
+    try:
+        crazyflie.link = new_driver(crazyflie, uri)
+        if crazyflie.link is None:
+            crazyflie.connection_failed.call(uri, f"no driver found or malformed URI: {uri}")
+            return
+        if not crazyflie.incoming.is_alive():
+            crazyflie.incoming.start()
+        crazyflie.packet_received.add_callback(crazyflie._check_for_initial_packet_cb)
+        crazyflie._start_connection_setup()
+    except Exception as error:  # a driver may raise anything: no dongle, no permission, no such host
+        crazyflie.connection_failed.call(uri, str(error) or type(error).__name__)
+
+
+def new_driver(crazyflie: Any, uri: str) -> Any:
+    """A driver for the URI in a courier, None if there is none; raises whatever the driver raises."""
+    import cflib.crtp
+
+    statistics = crazyflie.link_statistics.radio_link_statistics_callback
+    driver = cflib.crtp.get_link_driver(uri, statistics, crazyflie._link_error_cb)
+    return Courier(driver) if driver else None
+
+
+def _repeat_if_overdue(crazyflie: Any) -> None:
+    link = crazyflie.link
+    packet = link.overdue() if isinstance(link, Courier) else None
+    if packet is not None:
+        crazyflie.send_packet(packet)
 
 
 def _why(progress: _Progress, uri: str, timeout: float, *, late: bool) -> str:
@@ -170,9 +235,9 @@ def shut(crazyflie: Any, *, hand_back: bool = False, cut_motors: bool = False) -
                 crazyflie.commander.send_setpoint(0, 0, 0, 0)
             if hand_back:
                 crazyflie.commander.send_notify_setpoint_stop()
-            _shorten_naps(crazyflie)
+            shorten_naps(crazyflie)
             crazyflie.link_statistics.latency.ping()  # its echo ends the receiver's present nap
-    link = _take_link(crazyflie)  # sending may have failed and closed it
+    link = take_link(crazyflie)  # sending may have failed and closed it
     if link is not None:
         _wake(crazyflie, link)
         with contextlib.suppress(Exception):
@@ -181,7 +246,7 @@ def shut(crazyflie: Any, *, hand_back: bool = False, cut_motors: bool = False) -
         crazyflie.close_link()
 
 
-def _take_link(crazyflie: Any) -> Any:
+def take_link(crazyflie: Any) -> Any:
     """Take the driver out of the object, not in the middle of a send: a sender would die holding cflib's lock."""
     lock: Any = getattr(crazyflie, "_send_lock", None)
     held = lock is not None and lock.acquire(timeout=0.5)
@@ -193,7 +258,7 @@ def _take_link(crazyflie: Any) -> Any:
     return link
 
 
-def _shorten_naps(crazyflie: Any) -> None:
+def shorten_naps(crazyflie: Any) -> None:
     """Let cflib's udp receiver look every 0.1 s, not every second, whether it should stop: closing waits for it."""
     with contextlib.suppress(Exception):
         if crazyflie.link.socket.gettimeout() is not None:

@@ -3,25 +3,28 @@
 import contextlib
 import math
 import queue
+import statistics
 import struct
 import threading
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from crazyem.errors import LinkError, UsageError
-from crazyem.links import connecting
-from crazyem.links.base import LinkLost, LinkStatistics, ParameterWrite
-from crazyem.links.clock import ClockFit, ClockRelation, LossCounter, StampUnwrapper
-from crazyem.links.packing import pack, period_of
+from crazyem.links import connecting, high_level
+from crazyem.links.base import LinkLost, LinkStatistics, Outage, ParameterWrite
+from crazyem.links.blocks import LogBlocks
+from crazyem.links.clock import ClockFit
 from crazyem.links.parameters import ParameterClient
+from crazyem.links.reconnecting import AnotherDroneError, Reviver
 from crazyem.signals.packet import Block, Packet
 
 SILENT_AFTER = 2.0  # s without log data, while blocks run, after which the drone counts as lost
-LATE_AFTER = 0.1  # s behind the least-delayed packets after which a packet counts as late
-_START_ATTEMPT = 0.5  # s to wait for a block's first packet beyond its period, before asking again
-_START_ATTEMPTS = 4
+_ECHO = (15, 0)
+_ECHO_STAMP = struct.Struct("<Bd")  # of cflib's pings: a mark, and host time [s]
+_ECHOES = 50  # newest, for the median of the round trip
 
 
 class CrazyflieLink:
@@ -39,17 +42,17 @@ class CrazyflieLink:
         self._owned = True
         self._commanded = False
         self._parameters: ParameterClient | None = None
-        self._running: dict[int, tuple[Block, Any, Callable[..., None]]] = {}
-        self._counters: dict[int, LossCounter] = {}
-        self._unwrapper = StampUnwrapper()
-        self._clock = ClockRelation()
-        self._edge: ClockFit | None = None
+        self._blocks = LogBlocks(uri, self.packets)
+        self._reviver: Reviver | None = None
         self._lock = threading.Lock()
         self._lost = ""
+        self._hopeless = False
+        self._returning = False
         self._stop = threading.Event()
         self._watcher: threading.Thread | None = None
         self._last_packet = time.monotonic()
-        self._last_log = self._last_packet
+        self._last_echo: float | None = None
+        self._round_trips: deque[float] = deque(maxlen=_ECHOES)
 
     @classmethod
     def from_crazyflie(cls, crazyflie: Any) -> "CrazyflieLink":
@@ -66,15 +69,16 @@ class CrazyflieLink:
 
     # --- connection ---------------------------------------------------------------------------------------------
 
-    def connect(self, timeout: float = 15.0) -> None:
+    def connect(self, timeout: float = 30.0) -> None:
         """Connect and read all tables and parameter values.
 
-        Raises: LinkError: nothing answers, or a reply was lost on the way (cflib itself would wait for ever).
+        Requests whose answer is lost are repeated, and a connection that stands still is begun anew.
+
+        Raises: LinkError: nothing answers, or not everything within `timeout` [s].
         """
         if self._cf is not None:
             return
-        crazyflie = connecting.new_crazyflie(self.uri)
-        connecting.open_link(crazyflie, self.uri, timeout)
+        crazyflie = connecting.connect(self.uri, timeout)
         if crazyflie.platform.get_protocol_version() < 4:
             connecting.shut(crazyflie)
             raise LinkError(f"The firmware at {self.uri} is too old: it does not speak CRTP protocol 4 or newer.")
@@ -84,10 +88,14 @@ class CrazyflieLink:
         connecting.quiet_cflib()
         self._cf = crazyflie
         self._parameters = ParameterClient(crazyflie, self.uri)
+        self._blocks.attach(crazyflie)
+        self._reviver = Reviver(crazyflie, self.uri) if self._owned else None
+        self._lost, self._hopeless = "", False
+        self._last_echo = None
         crazyflie.connection_lost.add_callback(self._on_connection_lost)
         crazyflie.disconnected.add_callback(self._on_disconnected)
         crazyflie.packet_received.add_callback(self._on_any_packet)
-        self._last_packet = self._last_log = time.monotonic()
+        self._last_packet = time.monotonic()
         self._stop.clear()
         self._watcher = threading.Thread(target=self._watch, name="crazyem-link-watch", daemon=True)
         self._watcher.start()
@@ -102,7 +110,7 @@ class CrazyflieLink:
         if crazyflie is None:
             return
         self._stop.set()
-        self._remove_blocks(crazyflie)
+        self._blocks.remove(answered=not self._lost)
         if self._parameters is not None:
             self._parameters.close()
             self._parameters = None
@@ -131,8 +139,8 @@ class CrazyflieLink:
     @property
     def log_variables(self) -> Mapping[str, str]:
         """Name -> C type of everything the firmware can log."""
-        table = self._connected().log.toc.toc
-        return {f"{group}.{name}": item.ctype for group, items in table.items() for name, item in items.items()}
+        self._connected()
+        return self._blocks.available()
 
     def subscribe(
         self, variables: Sequence[str], rate_hz: float, groups: Sequence[Sequence[str]] | None = None
@@ -141,107 +149,33 @@ class CrazyflieLink:
 
         Args:
             variables: names, in any order.
-            rate_hz: of every one of them, 0.4 to 100 Hz (rounded to periods of 10 ms).
+            rate_hz: of every one of them: 0.4 to 100 Hz, rounded to periods of 10 ms; up to 1000 Hz, rounded to 1 ms,
+                with firmware that starts blocks by the millisecond.
             groups: names that must be sampled together; None = the parts of each signal.
 
-        Raises: UsageError (unknown variable, does not fit), LinkError (a block does not start).
+        Raises: UsageError (unknown variable, does not fit, too fast for this firmware), LinkError (does not start).
         """
-        from cflib.crazyflie.log import LogConfig
-
-        crazyflie = self._connected()
-        in_use = [b for b in crazyflie.log.log_blocks if b.added or b.pending or b.started]
-        blocks = pack(
-            variables,
-            self.log_variables,
-            period_of(rate_hz),
-            groups=groups,
-            first_identifier=max(self._counters, default=-1) + 1,
-            blocks_in_use=len(in_use),
-            variables_in_use=sum(len(b.variables) for b in in_use),
-        )
-        for block in blocks:
-            config = LogConfig(f"crazyem {block.identifier}", block.period_ms)
-            for variable in block.variables:
-                config.add_variable(variable.name)
-            try:
-                crazyflie.log.add_config(config)
-            except (KeyError, AttributeError) as error:
-                raise UsageError(f"The drone does not take log block {block.identifier}: {error}.") from error
-            receive = self._receiver(block)
-            config.data_received_cb.add_callback(receive)
-            self._counters[block.identifier] = LossCounter(block.period_ms)
-            self._last_log = time.monotonic()
-            self._running[block.identifier] = (block, config, receive)
-            self._start(block, config)
-        return blocks
-
-    def _start(self, block: Block, config: Any) -> None:
-        """Start a block and see its first packet; ask again if a reply was lost (the firmware tolerates repeats)."""
-        for _ in range(_START_ATTEMPTS):
-            try:
-                config.start()
-            except (AttributeError, KeyError) as error:
-                raise UsageError(f"The drone does not take log block {block.identifier}: {error}.") from error
-            deadline = time.monotonic() + _START_ATTEMPT + block.period_ms / 1000.0
-            while time.monotonic() < deadline:
-                if self._lost:
-                    raise LinkError(self._lost)
-                if self._counters[block.identifier].received:
-                    return
-                if config.err_no:
-                    raise LinkError(f"The drone refused log block {block.identifier} (error {config.err_no}).")
-                time.sleep(0.002)
-        raise LinkError(f"Log block {block.identifier} of {self.uri} does not start: no data came.")
-
-    def _receiver(self, block: Block) -> Callable[[int, Mapping[str, float], Any], None]:
-        names = tuple(v.name for v in block.variables)
-        identifier = block.identifier
-
-        def receive(stamp: int, data: Mapping[str, float], _config: Any) -> None:
-            host_time = time.time()
-            self._last_log = time.monotonic()
-            with self._lock:
-                firmware_time = self._unwrapper.unwrap(stamp)
-                self._clock.add(firmware_time, host_time)
-                edge = self._edge
-                late = edge is not None and host_time - edge.to_host(firmware_time) > LATE_AFTER
-                self._counters[identifier].count(firmware_time, late=late)
-            self.packets.put(Packet(identifier, firmware_time, host_time, tuple(data[name] for name in names)))
-
-        return receive
-
-    def _remove_blocks(self, crazyflie: Any) -> None:
-        for _, config, receive in self._running.values():
-            with contextlib.suppress(ValueError):
-                config.data_received_cb.remove_callback(receive)
-            if crazyflie.link is not None and not self._lost:
-                with contextlib.suppress(Exception):
-                    config.stop()
-                    config.delete()
-        deadline = time.monotonic() + 0.3
-        while not self._lost and time.monotonic() < deadline and any(c.added for _, c, _ in self._running.values()):
-            time.sleep(0.005)
-        for _, config, _ in self._running.values():
-            with contextlib.suppress(ValueError):
-                crazyflie.log.log_blocks.remove(config)
-        self._running.clear()
+        self._connected()
+        return self._blocks.subscribe(variables, rate_hz, groups, lambda: self._lost)
 
     def statistics(self) -> LinkStatistics:
-        """Packets received, lost (inferred from stamps) and late, in total and per block."""
-        with self._lock:
-            fates = {i: (c.received, c.lost, c.late) for i, c in self._counters.items()}
-        totals = [sum(f[k] for f in fates.values()) for k in range(3)]
-        return LinkStatistics(totals[0], totals[1], totals[2], fates)
+        """Packets received, lost (inferred from stamps) and late, delays, clocks: in total and per block."""
+        trips = list(self._round_trips)
+        return self._blocks.statistics(statistics.median(trips) if trips else math.nan)
 
     def clock(self) -> ClockFit | None:
         """How the host clock runs against the firmware's, None before the first packet."""
-        with self._lock:
-            return self._clock.fit()
+        return self._blocks.clock()
 
     # --- the end of a link --------------------------------------------------------------------------------------
 
-    def _on_any_packet(self, _packet: Any) -> None:
+    def _on_any_packet(self, packet: Any) -> None:
         self._last_packet = time.monotonic()
+        if (packet.port, packet.channel) == _ECHO and len(packet.data) == _ECHO_STAMP.size:
+            self._last_echo = self._last_packet
+            took = time.time() - _ECHO_STAMP.unpack(bytes(packet.data))[1]
+            if 0.0 <= took < 10.0:  # another's echo, a harmed one, or a host clock that was set
+                self._round_trips.append(took)
 
     def _on_connection_lost(self, _uri: str, _message: str) -> None:
         self._report_lost(f"The drone at {self.uri} was lost (the link reports an error).")
@@ -258,19 +192,58 @@ class CrazyflieLink:
         self.packets.put(LinkLost(reason, time.time()))
 
     def _watch(self) -> None:
-        """A peer that falls silent raises nothing in cflib: compare the time of the last packet with the clock."""
+        """A peer that falls silent raises nothing in cflib: compare the times of the last packets with the clock."""
         while not self._stop.wait(0.2):
-            with self._lock:
-                self._edge = self._clock.fit()
-                periods = [block.period_ms / 1000.0 for block, _, _ in list(self._running.values())]
+            self._blocks.refresh()
+            periods = self._blocks.periods
             if not periods or self._lost:
                 continue
             limit = max(SILENT_AFTER, 5.0 * min(periods))
             now = time.monotonic()
-            if now - self._last_log > limit:
+            if now - self._blocks.last_packet > limit:
                 silent = now - self._last_packet > limit
                 what = "nothing has come" if silent else "it still answers but sends no log data (has it restarted?)"
                 self._report_lost(f"The drone at {self.uri} was lost: {what} for {limit:g} s.")
+            elif self._owned and self._last_echo is not None and now - self._last_echo > limit:
+                what = "it sends, but has answered nothing"  # setpoints do not arrive either
+                self._report_lost(f"The drone at {self.uri} was lost: {what} for {limit:g} s.")
+
+    @property
+    def can_reconnect(self) -> bool:
+        """Whether `reconnect` may bring a lost link back: it is ours, and nothing speaks against it."""
+        return self._reviver is not None and not self._hopeless
+
+    def reconnect(self, timeout: float = 5.0, abort: threading.Event | None = None) -> Outage:
+        """After a `LinkLost`: bring the same drone's link back, blocks and all; packets then go on under their numbers.
+
+        Setpoints are sent meanwhile whenever there is something to send them through: a link may be lost one way only.
+
+        Args:
+            timeout: s.
+            abort: set it to give up earlier.
+
+        Raises: LinkError: not in time, or there is no going on (restarted, another firmware, not a link of ours).
+        """
+        if not self._lost or self._cf is None:
+            raise LinkError(f"The link to {self.uri} is not lost.")
+        if self._reviver is None or self._hopeless:
+            raise LinkError(self._lost)
+        before, since, reason = self._blocks.newest_ms, self._blocks.last_packet, self._lost
+        self._returning = True
+        self._blocks.hold()
+        try:
+            created = self._reviver.revive(self._blocks, timeout, abort or threading.Event())
+        except AnotherDroneError:
+            self._hopeless = True
+            raise
+        finally:
+            self._returning = False
+        self._last_echo = None  # to be heard again first
+        now = time.monotonic()
+        after = self._blocks.release()
+        with self._lock:
+            self._lost = ""
+        return Outage(reason, now - since, before, after, created)
 
     def _connected(self) -> Any:
         if self._cf is None:
@@ -330,7 +303,9 @@ class CrazyflieLink:
     # --- flying -------------------------------------------------------------------------------------------------
 
     def _command(self) -> Any:
-        crazyflie = self._connected()
+        crazyflie = self._cf if self._returning and self._cf is not None else self._connected()
+        if crazyflie.link is None:
+            raise LinkError(self._lost or f"The link to {self.uri} is closed.")
         self._commanded = True
         return crazyflie
 
@@ -348,6 +323,11 @@ class CrazyflieLink:
     def land(self, height: float, duration: float) -> None:
         """High-level landing to `height` [m, world] in `duration` [s]."""
         self._command().high_level_commander.land(height, duration)
+
+    def land_and_confirm(self, height: float, duration: float, *, timeout: float) -> bool:
+        """As `land`, sent until the drone says that it has the command; False if it did not within `timeout` [s]."""
+        command = high_level.land_command(height, duration)
+        return high_level.confirmed(self._command(), command, timeout=timeout, repeat_after=0.04)
 
     def go_to(self, x: float, y: float, z: float, yaw: float, duration: float, relative: bool = False) -> None:
         """High-level move to x, y, z [m, world] and yaw [rad] in `duration` [s]."""

@@ -11,15 +11,21 @@ MAX_BLOCKS = 16
 MAX_VARIABLES = 128
 PERIOD_UNIT_MS = 10  # START_BLOCK counts in 10 ms, in one byte
 MAX_PERIOD_MS = 2540
+FASTEST = 1000.0  # Hz; the firmware's timers count milliseconds
 
 
 def period_of(rate_hz: float) -> int:
-    """Log period [ms] for a rate [Hz]: a multiple of 10 ms, at most 2540. Raises UsageError outside 0.394..100 Hz."""
+    """Log period [ms] for a rate [Hz].
+
+    Up to 100 Hz a multiple of 10 ms, at most 2540, which every firmware can. Beyond, whole milliseconds, for which the
+    firmware needs the start by milliseconds (protocol 4 knows only tens). Raises UsageError outside 0.394..1000 Hz.
+    """
     if not rate_hz > 0:
-        raise UsageError(f"A log rate of {rate_hz:g} Hz makes no sense; choose 0.4 to 100 Hz.")
-    period = round(1000.0 / rate_hz / PERIOD_UNIT_MS) * PERIOD_UNIT_MS
-    if period < PERIOD_UNIT_MS or period > MAX_PERIOD_MS:
-        raise UsageError(f"The firmware logs at 0.4 to 100 Hz, not {rate_hz:g} Hz.")
+        raise UsageError(f"A log rate of {rate_hz:g} Hz makes no sense; choose 0.4 to 100 Hz, or up to {FASTEST:g} Hz.")
+    unit = PERIOD_UNIT_MS if rate_hz <= 1000.0 / PERIOD_UNIT_MS else 1
+    period = round(1000.0 / rate_hz / unit) * unit
+    if period < 1 or period > MAX_PERIOD_MS or rate_hz > FASTEST:
+        raise UsageError(f"The firmware logs at 0.4 to {FASTEST:g} Hz, not {rate_hz:g} Hz.")
     return period
 
 

@@ -8,8 +8,11 @@ from typing import Any
 
 from crazyem.errors import DataError
 from crazyem.estimation.result import Estimate
+from crazyem.live.oversight import Rules
+from crazyem.live.policy import Policy, load_policy
 from crazyem.live.session import Session
-from crazyem.vehicle import Vehicle, load_vehicle
+from crazyem.physics import folding
+from crazyem.vehicle import Vehicle
 
 
 class Attachment:
@@ -61,7 +64,14 @@ class Attachment:
 
 
 def attach(
-    cf: Any, vehicle: str | Vehicle = "cf2", *, push: bool = False, window: int = 800, every: int = 4
+    cf: Any,
+    vehicle: str | Vehicle = "cf2",
+    *,
+    push: bool = False,
+    policy: str | Policy | None = None,
+    dry_run: bool = False,
+    window: int = 800,
+    every: int = 4,
 ) -> Attachment:
     """Estimate mass and inertia of a drone that a script already talks to.
 
@@ -73,23 +83,30 @@ def attach(
         cf: an open, connected cflib Crazyflie (`scf.cf` of a SyncCrazyflie).
         vehicle: preset name, path of a vehicle file, or a Vehicle.
         push: let the guard write mass and inertia to the controller that runs, if it takes them.
+        policy: of the guard: a file's path or a Policy; None is the shipped one. What was pushed stays in the drone
+            when the attachment ends: the flight is the script's.
+        dry_run: with `push`, decide and tell (`session.history.guard`), but write nothing.
         window, every: newest samples used, samples per update.
 
     Raises:
-        UsageError: unknown vehicle, not connected, or a log variable is missing. LinkError: no answer.
+        UsageError: unknown vehicle, no such policy, not connected, or a log variable is missing. LinkError: no answer.
     """
     from crazyem.estimation.online import OnlineEstimator
+    from crazyem.estimation.steps import StepAwareEstimator
     from crazyem.links.crazyflie import CrazyflieLink
     from crazyem.live.warm_up import warm_up
 
-    model = vehicle if isinstance(vehicle, Vehicle) else load_vehicle(vehicle)
+    rules = Rules(policy if isinstance(policy, Policy) else load_policy(policy), dry_run=dry_run)
+    model, left_out = folding.fold(vehicle if isinstance(vehicle, Vehicle) else folding.load(vehicle))
     warm_up(model)
     link = CrazyflieLink.from_crazyflie(cf)
-    session = Session(link, vehicle=model, estimator=OnlineEstimator(model, window=window, every=every))
+    estimator = StepAwareEstimator(OnlineEstimator(model, window=window, every=every))
+    session = Session(link, vehicle=model, estimator=estimator)
+    session.history.notice(folding.notice(left_out))
     try:
         session.start()
         if push:
-            session.push_to_controller()
+            session.push_to_controller(rules)
             session.pipeline.push_from = -math.inf
     except BaseException:
         session.close()

@@ -1,6 +1,7 @@
 """What each firmware controller believes about the drone, and the parameter writes that tell it better."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from crazyem.errors import UsageError
@@ -30,6 +31,11 @@ class Controller:
     attitude_gains: tuple[tuple[str, str], ...] = ()
     wrench: str = ""
     note: str = ""
+    mass_scale: float = 1.0  # kg a unit of the mass parameter, where that is not a mass (see crazyem.live.hover)
+
+    def scale(self, parameter: str) -> float:
+        """SI units of the estimate in a unit of a parameter."""
+        return self.mass_scale if parameter == self.mass else 1.0
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -100,7 +106,7 @@ def writes_for(
     now = {**beliefs, **changed}
     writes: list[tuple[str, float]] = []
     if "mass" in changed and controller.mass:
-        writes.append((controller.mass, changed["mass"]))
+        writes.append((controller.mass, changed["mass"] / controller.mass_scale))
     for name, parameter in zip(("Ixx", "Iyy", "Izz"), controller.inertia):
         if name in changed:
             writes.append((parameter, changed[name]))
@@ -120,3 +126,33 @@ def writes_for(
         pair = [(damping, originals[damping] * scale), (stiffness, originals[stiffness] * scale)]
         writes.extend(pair if scale >= before else pair[::-1])
     return tuple(writes)
+
+
+EQUAL = 1e-6  # relative difference of values that is none: sixteen steps of the firmware's floats
+
+
+def writes_back(
+    controller: Controller,
+    target: Mapping[str, float],
+    *,
+    now: Mapping[str, float],
+    uncertain: Collection[str] = (),
+) -> tuple[tuple[str, float], ...]:
+    """Parameter writes that lead from the values `now` to those of `target`, safe at every step like `writes_for`.
+
+    Args:
+        target: firmware parameter -> value; what is not in it is left as it is.
+        now: what the drone holds, as far as known; NaN where not.
+        uncertain: written even if `now` is equal, because that value was never confirmed.
+    """
+
+    def differs(name: str) -> bool:
+        value = now.get(name, math.nan)
+        return name in target and (name in uncertain or not math.isclose(value, target[name], rel_tol=EQUAL))
+
+    names = [n for n in ((controller.mass,) if controller.mass else ()) + controller.inertia if differs(n)]
+    for stiffness, damping in controller.attitude_gains:
+        rising = now.get(stiffness, math.nan) <= target.get(stiffness, math.nan)
+        pair = (damping, stiffness) if rising else (stiffness, damping)
+        names += [n for n in pair if differs(n)]
+    return tuple((n, target[n]) for n in names)

@@ -10,11 +10,14 @@ from crazyem.control.trajectories import Trajectory, Vector, after_hover
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links.base import Link
 from crazyem.live.controllers import Controller
+from crazyem.live.oversight import Rules
 from crazyem.live.session import Session
 from crazyem.live.stream import SetpointStream
 from crazyem.live.telemetry import ARMED, CAN_FLY, FLYING, Telemetry
 
 BASELINE = 3.0  # s of hover before anything is pushed: shows what the drone does with what it believes now
+CONFIRMED_WITHIN = 0.25  # s; without setpoints the drone levels out after 0.5 s
+HAND_OVERS, HAND_OVER_EVERY = 3, 0.04  # times that the drone is handed back to land, s between them
 SILENCE = 3.0  # s of host time without a packet after which the drone counts as lost
 
 
@@ -45,6 +48,7 @@ class FlightPlan:
         controller: of the firmware.
         height: of the hover above the take-off point, m.
         push: whether estimates go to the controller.
+        rules: how they do (policy, dry run, confirmation); None: the shipped policy.
         baseline: s of hover before pushes and before the trajectory.
     """
 
@@ -52,6 +56,7 @@ class FlightPlan:
     controller: Controller
     height: float = 1.0
     push: bool = True
+    rules: Rules | None = None
     baseline: float = BASELINE
 
 
@@ -127,12 +132,23 @@ class Flight:
             self._take_off()
             self._trajectory()
             self._land()
+            self.session.end_pushing("landed")
         except MotorsCutError:
             self._cut()
+            self.session.end_pushing("interrupted")
             raise
-        except BaseException:
-            self._bring_down()
+        except BaseException as error:
+            try:
+                self._bring_down()
+            finally:
+                # Only now, on the ground or with the motors off, may parameters jump.
+                self.session.end_pushing(self._outcome(error))
             raise
+
+    def _outcome(self, error: BaseException) -> str:
+        if self.session.lost is not None or isinstance(error, LinkError):
+            return "link_lost"
+        return "interrupted" if isinstance(error, FlightInterruptedError | KeyboardInterrupt) else "failed"
 
     # phases
 
@@ -145,7 +161,7 @@ class Flight:
             raise UsageError(f"the drone cannot fly: {telemetry.grounded_reason()}.")
         select_controller(self.link, self.plan.controller)
         if self.plan.push:
-            note = self.session.push_to_controller()
+            note = self.session.push_to_controller(self.plan.rules)
             if note and self.session.recorder is not None:
                 self.session.recorder.event(note)
         if not telemetry.has(ARMED):
@@ -174,7 +190,9 @@ class Flight:
     def _trajectory(self) -> None:
         path = after_hover(self.path, seconds=self.plan.baseline)
         record = self.session.recorder.setpoint if self.session.recorder is not None else None
-        self._stream = stream = SetpointStream(self.link, path, self.session.clock, on_setpoint=record)
+        self._stream = stream = SetpointStream(
+            self.link, path, self.session.clock, on_setpoint=record, returning=lambda: self.session.returning
+        )
         self._enter("hovering")
         stream.start()
         self._mark("trajectory_start", self.session.clock.newest)
@@ -189,16 +207,17 @@ class Flight:
     def _land(self) -> None:
         """Hand back to the high-level commander, land, and make sure that it has."""
         self._enter("landing")
+        # What is sent into an outage is lost, and a second Ctrl-C still cuts.
+        self._wait(lambda: not self.session.returning, math.inf)
         self.session.pipeline.push_until = -math.inf
         self.session.end_estimates()
         if self._stream is not None:
             self._stream.stop()
             self._stream = None
-        self.link.release_setpoints()
         height = self.telemetry.height - self._ground
         duration = 1.0 + 1.5 * max(height if math.isfinite(height) else 1.0, 0.3)
         for _ in range(2):
-            self.link.land(self._ground, duration)
+            self._hand_over(duration)
             self._sleep(duration)
             try:
                 self._wait(self._landed, 5.0, "did not land")
@@ -212,6 +231,24 @@ class Flight:
         self._may_fly = False
         self._enter("landed")
 
+    def _hand_over(self, duration: float) -> None:
+        """The drone to the high-level commander, with a plan to land.
+
+        The plan comes first: a release that arrives without one stops the motors, and nothing says what arrived. So
+        both are sent three times; a plan that begins anew does no harm, and 2 s without a release would drop the drone.
+        A link that can ask whether the plan arrived does so first.
+        """
+        confirm = getattr(self.link, "land_and_confirm", None)
+        if confirm is not None and confirm(self._ground, duration, timeout=CONFIRMED_WITHIN):
+            for _ in range(HAND_OVERS):
+                self.link.release_setpoints()
+                self._sleep(HAND_OVER_EVERY)
+            return
+        for _ in range(HAND_OVERS):
+            self.link.land(self._ground, duration)
+            self._sleep(HAND_OVER_EVERY)
+            self.link.release_setpoints()
+
     def _landed(self) -> bool:
         return not self.telemetry.has(FLYING) and not self.telemetry.height > self._ground + 0.15
 
@@ -224,7 +261,8 @@ class Flight:
         if not self._may_fly:
             return
         notice = self.session.history.notice
-        if self.session.lost is None:
+        fell = self.session.outages and self.telemetry.grounded_reason()
+        if self.session.lost is None and not fell:
             flew = self.telemetry.has(FLYING) or self.telemetry.height > self._ground + 0.1
             for _ in range(2):  # a Ctrl-C that arrives while landing is the second one: cut
                 try:
@@ -288,12 +326,14 @@ class Flight:
             raise FlightInterruptedError
         newest = self.session.clock.newest
         newest = newest if math.isfinite(newest) else -1.0
-        if newest != self._moved[0]:
+        if newest != self._moved[0] or self.session.returning:
             self._moved = (newest, now)
         elif now - self._moved[1] > SILENCE and self.session.lost is None:
             raise LinkError(self._silent())
         if self.session.lost is not None or (self.session.failure is not None and self.phase != "landing"):
             self.session.raise_if_failed()
+        if self.session.outages and self._may_fly and self.telemetry.grounded_reason():
+            raise CrazyemError(f"the drone fell while the link was gone: {self.telemetry.grounded_reason()}.")
         if self._stream is not None and self._stream.failure is not None:
             raise LinkError(f"setpoints could not be sent: {self._stream.failure}.")
         if now - self._report >= 1.0:

@@ -4,10 +4,15 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from crazyem.estimation.result import Estimate
+from crazyem.estimation.result import Estimate, Step
 from crazyem.live.controllers import Controller, writes_for
 
 INERTIA = ("Ixx", "Iyy", "Izz")
+# After a change of mass its new value has to agree for this share of the agreement time, and may follow the last write
+# after this share of the interval: what is known is that the old value is wrong.
+STEP_SHARE = 0.4
+LARGEST_STEP = 0.25  # relative change of mass that one write may follow at once
+STEP_RECENT = 5.0  # s for which that holds, or until the new mass is written
 
 
 @dataclass(frozen=True)
@@ -15,23 +20,30 @@ class Limits:
     """What the guard asks of an estimate before it reaches a controller.
 
     Attributes:
+        parameters: which of mass, Ixx, Iyy, Izz may be written at all.
         mass_bounds, inertia_bounds: allowed range as multiples of the vehicle's nominal value.
+        mass_absolute, inertia_absolute: allowed range in kg and kg m^2, whatever the vehicle file says.
         mass_half_width, inertia_half_width: largest 95 % half width, relative to the value.
         mass_agreement, inertia_agreement: largest spread (max - min over value) within `agreement_time`.
         agreement_time: s over which estimates have to agree, all of them acceptable.
-        slew: largest relative change in one write.
+        slew: largest relative change in one write; a step of mass adds itself, up to `LARGEST_STEP`.
+        unjudged: largest relative change from what was last judged good.
         interval: s between writes.
         mass_deadband, inertia_deadband: relative changes smaller than this are not worth a write.
     """
 
+    parameters: tuple[str, ...] = ("mass", *INERTIA)
     mass_bounds: tuple[float, float] = (0.5, 2.0)
     inertia_bounds: tuple[float, float] = (0.33, 3.0)
+    mass_absolute: tuple[float, float] = (0.010, 0.250)
+    inertia_absolute: tuple[float, float] = (1e-6, 1e-3)
     mass_half_width: float = 0.03
     inertia_half_width: float = 0.10
     mass_agreement: float = 0.02
     inertia_agreement: float = 0.08
     agreement_time: float = 0.5
     slew: float = 0.15
+    unjudged: float = 0.35
     interval: float = 0.5
     mass_deadband: float = 0.002
     inertia_deadband: float = 0.03
@@ -44,6 +56,12 @@ class Limits:
         """Allowed multiples of nominal for a parameter."""
         return self.mass_bounds if name == "mass" else self.inertia_bounds
 
+    def allowed(self, name: str, nominal: float) -> tuple[float, float]:
+        """Allowed range [SI] of a parameter whose nominal value is `nominal`: both kinds of bounds hold."""
+        low, high = (b * nominal for b in self.bounds(name))
+        least, most = self.mass_absolute if name == "mass" else self.inertia_absolute
+        return max(low, least), min(high, most)
+
 
 @dataclass(frozen=True)
 class Decision:
@@ -52,16 +70,23 @@ class Decision:
     Attributes:
         time: s on the drone's clock of the estimate it rests on.
         writes: firmware parameters and values, in the order to be written.
-        reason: per estimated parameter, why it is not written; empty where it is.
+        reason: per estimated parameter, why it is not written; empty where it is. Of a revert: why.
+        kind: "push"; "revert" to the last good values in flight; "restore" after it. Only pushes end with the guard.
     """
 
     time: float
     writes: tuple[tuple[str, float], ...] = ()
     reason: Mapping[str, str] | str = ""
+    kind: str = "push"
 
     def __str__(self) -> str:
         if self.writes:
             return ", ".join(f"{n} = {v:.6g}" for n, v in self.writes)
+        return self.why
+
+    @property
+    def why(self) -> str:
+        """The reasons in one line."""
         if isinstance(self.reason, str):
             return self.reason
         return "; ".join(f"{n}: {r}" for n, r in self.reason.items() if r)
@@ -93,17 +118,41 @@ class Guard:
         self.beliefs = self._beliefs()
         self._history: deque[tuple[float, dict[str, float], dict[str, str]]] = deque()
         self._last_write = float("-inf")
+        self._before: tuple[dict[str, float], float] | None = None
+        self._step: Step | None = None
+        self.capped = True  # whether changes wait for a verdict; not where nobody judges
+        self._trusted = dict(self.beliefs)  # what the controller believed when it was last judged
 
     def _beliefs(self) -> dict[str, float]:
         parameters = ((self.controller.mass,) if self.controller.mass else ()) + self.controller.inertia
         names = (("mass",) if self.controller.mass else ()) + (INERTIA if self.controller.inertia else ())
-        return {n: self.originals[p] for n, p in zip(names, parameters)}
+        return {n: self.originals[p] * self.controller.scale(p) for n, p in zip(names, parameters)}
+
+    def withdraw(self) -> None:
+        """The newest decision was not carried out: the controller still believes what it did before."""
+        if self._before is not None:
+            self.beliefs, self._last_write = dict(self._before[0]), self._before[1]
+            self._before = None
+
+    def trust(self) -> None:
+        """What the controller believes now was judged good."""
+        self._trusted = dict(self.beliefs)
 
     def stop(self, reason: str) -> None:
         """Never write again in this flight (a write was not confirmed: what the drone believes is not known)."""
         self.stopped = self.stopped or reason
 
-    def consider(self, estimate: Estimate, time: float, *, airborne: bool, enabled: bool = True) -> Decision:
+    def stepped(self, step: Step) -> None:
+        """A change of mass was noticed, or it is known by now what it was: what was estimated before is of no use."""
+        if step.jumped:
+            self.stop(f"{step}; nothing more is pushed.")
+        self._step = step if step.real is not False else None
+        if step.real is not True:
+            self._history.clear()
+
+    def consider(
+        self, estimate: Estimate, time: float, *, airborne: bool, enabled: bool = True, objection: str = ""
+    ) -> Decision:
         """What to write after this estimate.
 
         Args:
@@ -111,6 +160,7 @@ class Guard:
             time: s on the drone's clock.
             airborne: False on the ground or in contact; history is forgotten then.
             enabled: False while the flight is not in a phase where writes are wanted; history is kept.
+            objection: why nothing may be written now whatever the estimate (battery, supervisor); history is kept.
         """
         if self.stopped:
             return Decision(time, reason=self.stopped)
@@ -120,26 +170,44 @@ class Guard:
         self._remember(estimate, time)
         if not enabled:
             return Decision(time, reason="not in a phase of the flight where parameters are pushed")
-        if time - self._last_write < self.limits.interval:
+        if objection:
+            return Decision(time, reason=objection)
+        recent = self._recent_step(time)
+        if time - self._last_write < self.limits.interval * (STEP_SHARE if recent is not None else 1.0):
             return Decision(time, reason="too soon after the last write")
 
         reasons: dict[str, str] = {}
         changed: dict[str, float] = {}
         for name in self.beliefs:
             reasons[name] = self._objection(name, time)
+            if self._step is not None and self._step.real is None:
+                reasons[name] = "the mass may have changed just now"
+            if name not in self.limits.parameters:
+                reasons[name] = "not to be pushed by this policy"
             if not reasons[name]:
-                changed[name] = self._slewed(name, estimate[name].value)
+                value = self._slewed(name, estimate[name].value, recent)
+                if self.beliefs[name] > 0 and abs(value / self.beliefs[name] - 1) < self.limits.of(name, "deadband"):
+                    reasons[name] = "a change as large as this waits until the last one was judged"
+                    continue
+                low, high = self.limits.allowed(name, self.nominal[name])
+                if low <= value <= high:
+                    changed[name] = value
+                else:  # one step from what it believes now still leads outside
+                    reasons[name] = f"the controller believes {self.beliefs[name]:.4g}, too far outside to lead it back"
         if self.controller.attitude_gains and ("Ixx" in changed) != ("Iyy" in changed):
             # Roll and pitch gains share one scale; one axis alone would skew it.
             lone, other = ("Ixx", "Iyy") if "Ixx" in changed else ("Iyy", "Ixx")
-            if reasons[other] != "unchanged":
+            if reasons[other] != "unchanged" or other not in self.limits.parameters:
                 del changed[lone]
                 reasons[lone] = f"waits for {other}"
         if not changed:
             return Decision(time, reason=reasons)
         writes = writes_for(self.controller, changed, beliefs=self.beliefs, originals=self.originals)
+        self._before = (dict(self.beliefs), self._last_write)
         self.beliefs.update(changed)
         self._last_write = time
+        if "mass" in changed:
+            self._step = None
         return Decision(time, writes=writes, reason=reasons)
 
     def _remember(self, estimate: Estimate, time: float) -> None:
@@ -157,7 +225,7 @@ class Guard:
             return p.reason or "not identifiable"
         if not (low <= p.value <= high) or not p.value > 0:  # also catches NaN
             return "no valid value"
-        lo, hi = (b * self.nominal[name] for b in self.limits.bounds(name))
+        lo, hi = self.limits.allowed(name, self.nominal[name])
         if not lo <= p.value <= hi:
             return f"{p.value:.4g} {p.unit} is outside [{lo:.4g}, {hi:.4g}]"
         half = max(high - p.value, p.value - low) / p.value
@@ -165,15 +233,25 @@ class Guard:
             return f"uncertain: +-{100 * half:.1f} %"
         return ""
 
+    def _recent_step(self, time: float) -> Step | None:
+        """The change of mass that the controller does not know yet."""
+        step = self._step
+        return step if step is not None and step.real and time - step.found < STEP_RECENT else None
+
     def _objection(self, name: str, time: float) -> str:
-        newest = self._history[-1]
+        newest, needed = self._history[-1], self.limits.agreement_time
+        if name == "mass" and self._recent_step(time) is not None:
+            needed *= STEP_SHARE
         if newest[2][name]:
             return newest[2][name]
-        if time - self._history[0][0] < self.limits.agreement_time:
+        if time - self._history[0][0] < needed:
             return "too early to tell"
-        if any(faults[name] for _, _, faults in self._history):
+        # one older than the span is looked at, so that the span is really covered
+        first = max((k for k, (t, _, _) in enumerate(self._history) if t <= time - needed), default=0)
+        span = list(self._history)[first:]
+        if any(faults[name] for _, _, faults in span):
             return "only just acceptable"
-        values = [v[name] for _, v, _ in self._history]
+        values = [v[name] for _, v, _ in span]
         if (max(values) - min(values)) / newest[1][name] > self.limits.of(name, "agreement"):
             return "estimates still move"
         change = abs(newest[1][name] / self.beliefs[name] - 1) if self.beliefs[name] > 0 else float("inf")
@@ -181,8 +259,14 @@ class Guard:
             return "unchanged"
         return ""
 
-    def _slewed(self, name: str, value: float) -> float:
+    def _slewed(self, name: str, value: float, step: Step | None) -> float:
         now, slew = self.beliefs[name], self.limits.slew
+        if name == "mass" and step is not None and step.after is not None:
+            slew += min(abs(step.after / step.before - 1), LARGEST_STEP)
         if not now > 0:
             return value  # the controller believed nonsense; the bounds around nominal still hold
-        return min(max(value, now * (1 - slew)), now * (1 + slew))
+        low, high = now * (1 - slew), now * (1 + slew)
+        trusted = self._trusted[name]
+        if self.capped and trusted > 0:
+            low, high = max(low, trusted * (1 - self.limits.unjudged)), min(high, trusted * (1 + self.limits.unjudged))
+        return min(max(value, low), high)

@@ -1,52 +1,85 @@
 """What a session remembers for its summary and plot: the track, the estimates, the pushes and the phases."""
 
 import math
+from array import array
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from crazyem.estimation.result import Estimate
+from crazyem.estimation.result import Estimate, Step
 from crazyem.signals.sample import Sample
 
 NAMES = ("mass", "Ixx", "Iyy", "Izz", "motor_time_constant")
+KEPT = 6000  # estimates; four minutes at 25 a second. The recording has them all
+ROWS = 60_000  # of a track; ten minutes at 100 Hz
 SETTLE = 4.0  # s after the first push before a tracking error counts as "after": the height loop takes 2 to 3 s
 
 
 @dataclass(frozen=True)
 class Push:
-    """One parameter write: time on the drone's clock [s], what was written and whether its echo came back equal."""
+    """One parameter write: time on the drone's clock [s], what was written and whether its echo came back equal.
+
+    `purpose` is "push", or why it was taken back: "revert" in flight, "restore" after it, "undo" of half a set.
+    """
 
     time: float
     parameter: str
     value: float
     verified: bool
+    purpose: str = "push"
 
     def to_json(self) -> dict[str, Any]:
-        """The form of the summary."""
-        return {"time": self.time, "parameter": self.parameter, "value": self.value, "verified": self.verified}
+        """The form of the summary; the purpose only where it is not the usual one."""
+        usual = {"time": self.time, "parameter": self.parameter, "value": self.value, "verified": self.verified}
+        return usual if self.purpose == "push" else {**usual, "purpose": self.purpose}
+
+
+class Track:
+    """Rows of time [s] and xyz [m], evenly thinned so that memory is bounded: once full, every second one goes."""
+
+    def __init__(self, rows: int = ROWS) -> None:
+        self._values, self._most = array("d"), 4 * rows
+        self._every, self._seen = 1, 0
+
+    def add(self, time: float, position: tuple[float, ...]) -> None:
+        """A row, unless it is one that would be thinned out."""
+        if self._seen % self._every == 0:
+            self._values.extend((time, *position))
+            if len(self._values) == self._most:
+                self._values = array("d", np.array(self._values).reshape(-1, 4)[::2].ravel())
+                self._every *= 2
+        self._seen += 1
+
+    def array(self) -> np.ndarray:
+        """(n, 4) time [s], xyz [m]; a copy."""
+        return np.array(self._values).reshape(-1, 4)
 
 
 @dataclass
 class History:
-    """Grows while a session runs.
+    """What a session keeps; its memory is bounded but for the pushes, of which there are two a second at most.
 
     Attributes:
-        track: rows of time [s], position xyz [m].
-        setpoints: rows of time [s], active setpoint xyz [m].
-        estimates: every estimate, in order.
+        track: position in the world.
+        setpoints: active setpoint, likewise.
+        estimates: in order; of old ones, where they are more than `KEPT`, every second (again and again).
         pushes: every parameter write by the guard.
         marks: phase -> time on the drone's clock [s]: trajectory_start, trajectory_end, push_enabled.
         notices: sentences for the user.
+        steps: changes of mass that were noticed, the newest perhaps undecided.
+        guard: what the guard was told and did, empty where there was none (`Oversight.account`).
     """
 
-    track: list[tuple[float, ...]] = field(default_factory=list)
-    setpoints: list[tuple[float, ...]] = field(default_factory=list)
+    track: Track = field(default_factory=Track)
+    setpoints: Track = field(default_factory=Track)
     estimates: list[Estimate] = field(default_factory=list)
     pushes: list[Push] = field(default_factory=list)
     marks: dict[str, float] = field(default_factory=dict)
     notices: list[str] = field(default_factory=list)
     losses: list[tuple[float, int]] = field(default_factory=list)
+    steps: tuple[Step, ...] = ()
+    guard: dict[str, Any] = field(default_factory=dict)
 
     def notice(self, sentence: str) -> None:
         """Keep a sentence once."""
@@ -56,19 +89,26 @@ class History:
     def take(self, sample: Sample) -> None:
         """Keep a sample if it is of the track."""
         if sample.signal == "setpoint_position":
-            self.setpoints.append((sample.time, *sample.value))
+            self.setpoints.add(sample.time, sample.value)
         elif sample.signal == "position":
-            self.track.append((sample.time, *sample.value))
+            self.track.add(sample.time, sample.value)
+
+    def keep(self, estimate: Estimate) -> None:
+        """Add an estimate. Whoever reads the list meanwhile keeps the one it has: a thinned list is another one."""
+        self.estimates.append(estimate)
+        if len(self.estimates) > KEPT:
+            half = KEPT // 2
+            self.estimates = self.estimates[:half:2] + self.estimates[half:]
 
     def track_array(self) -> np.ndarray:
         """Time, position and setpoint, shape (n, 7); the setpoint is interpolated onto the positions' times.
 
         The two travel in packets of different instants; NaN where no setpoint is known.
         """
-        track = np.array(self.track, dtype=float).reshape(-1, 4)
+        track = self.track.array()
         out = np.full((len(track), 7), np.nan)
         out[:, :4] = track
-        wanted = np.array(self.setpoints, dtype=float).reshape(-1, 4)
+        wanted = self.setpoints.array()
         if len(wanted):
             for k in (1, 2, 3):
                 out[:, 3 + k] = np.interp(track[:, 0], wanted[:, 0], wanted[:, k], left=np.nan)
@@ -85,7 +125,7 @@ class History:
     def before_and_after(self) -> tuple[dict[str, float | None], dict[str, float | None]]:
         """Tracking rms [m] and mean height error [m], each before the first push and after it has settled."""
         t, error = self._error()
-        verified = [p.time for p in self.pushes if p.verified]
+        verified = [p.time for p in self.pushes if p.verified and p.purpose == "push"]
         first = min(verified, default=math.inf)
         rms: dict[str, float | None] = {}
         height: dict[str, float | None] = {}

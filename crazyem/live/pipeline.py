@@ -6,16 +6,16 @@ same order give the same estimates, live or replayed.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
-from crazyem.estimation.result import Estimate
-from crazyem.live.guard import Decision, Guard
+from crazyem.estimation.result import Estimate, Step
+from crazyem.live.guard import Decision
 from crazyem.live.history import History
 from crazyem.signals.sample import Sample
 
 
 class Estimator(Protocol):
-    """What the pipeline needs of an estimator (crazyem.estimation.online.OnlineEstimator)."""
+    """What the pipeline needs of an estimator: an OnlineEstimator, or one around it that finds steps of mass."""
 
     @property
     def airborne(self) -> bool: ...
@@ -24,6 +24,22 @@ class Estimator(Protocol):
 
     def feed(self, sample: Sample) -> Estimate | None: ...
     def finish(self) -> Estimate: ...
+
+
+class Gate(Protocol):
+    """What decides over writes (crazyem.live.guard.Guard, or crazyem.live.oversight.Oversight around it)."""
+
+    def consider(self, estimate: Estimate, time: float, *, airborne: bool, enabled: bool = True) -> Decision: ...
+
+
+def steps_of(estimator: Any) -> Sequence[Step]:
+    """The steps that an estimator, or the one inside it, has found; none where it does not look for any."""
+    while estimator is not None:
+        found = getattr(estimator, "steps", None)
+        if found is not None:
+            return tuple(found)
+        estimator = getattr(estimator, "inner", None)
+    return ()
 
 
 class Pipeline:
@@ -35,6 +51,7 @@ class Pipeline:
         guard: None where nothing is to be pushed.
         push: takes a decision with writes; must not block.
         on_estimate: called with every estimate (live line, recording).
+        on_step: called with every step of mass when it is noticed, and again when it is decided what it was.
     """
 
     def __init__(
@@ -42,17 +59,20 @@ class Pipeline:
         estimator: Estimator,
         *,
         history: History,
-        guard: Guard | None = None,
+        guard: Gate | None = None,
         push: Callable[[Decision], None] | None = None,
         on_estimate: Callable[[Estimate], None] | None = None,
+        on_step: Callable[[Step], None] | None = None,
     ) -> None:
         self.estimator = estimator
         self.history = history
         self.guard = guard
         self.push = push
         self.on_estimate = on_estimate
+        self.on_step = on_step
         self.push_from = math.inf  # s on the drone's clock; estimates of this time and later may be pushed
         self.push_until = math.inf
+        self.paused = False  # by a person: nothing new is pushed meanwhile
         self.estimate_until = math.inf  # s; later samples (the landing) belong to the track, not to the estimate
         self.decision: Decision | None = None
         self.samples = 0
@@ -64,13 +84,14 @@ class Pipeline:
         estimate = self.estimator.feed(sample) if sample.time <= self.estimate_until else None
         if estimate is None:
             return None
-        self.history.estimates.append(estimate)
+        self.history.keep(estimate)
+        self._take_steps(estimate.time)
         if self.guard is not None:
             self.decision = self.guard.consider(
                 estimate,
                 estimate.time,
                 airborne=self.estimator.airborne,
-                enabled=self.push_from <= estimate.time <= self.push_until,
+                enabled=not self.paused and self.push_from <= estimate.time <= self.push_until,
             )
             if self.decision.writes and self.push is not None:
                 self.push(self.decision)
@@ -78,10 +99,26 @@ class Pipeline:
             self.on_estimate(estimate)
         return estimate
 
+    def _take_steps(self, time: float) -> None:
+        """Tell of what is new about steps of mass before anything is decided on the estimate."""
+        steps, known = steps_of(self.estimator), self.history.steps
+        if not steps or (len(steps) == len(known) and steps[-1] is known[-1]):
+            return
+        self.history.steps = tuple(steps)
+        for step in steps[max(len(known) - 1, 0) :]:
+            if step in known:
+                continue
+            stepped = getattr(self.guard, "stepped", None)
+            if stepped is not None:
+                stepped(step, time)
+            if self.on_step is not None:
+                self.on_step(step)
+
     def finish(self) -> Estimate:
         """The final estimate of the newest window, converged."""
         estimate = self.estimator.finish()
-        self.history.estimates.append(estimate)
+        self.history.keep(estimate)
+        self._take_steps(estimate.time)
         if self.on_estimate is not None:
             self.on_estimate(estimate)
         return estimate

@@ -10,12 +10,16 @@ import threading
 from collections.abc import Callable, Sequence
 
 from crazyem.errors import CrazyemError, DataError, LinkError, UsageError
-from crazyem.estimation.result import Estimate
-from crazyem.links.base import Block, Link, LinkLost, Packet
+from crazyem.estimation.result import Estimate, Step
+from crazyem.links.base import Block, Link, LinkLost, LinkStatistics, Outage, Packet
 from crazyem.live.clock import FirmwareClock
-from crazyem.live.guard import Guard, Limits
+from crazyem.live.crew import Crew, Mailbox
+from crazyem.live.guard import Guard
 from crazyem.live.history import History
+from crazyem.live.hover import hover_rules, hover_target
+from crazyem.live.oversight import Oversight, Rules
 from crazyem.live.pipeline import Estimator, Pipeline
+from crazyem.live.policy import load_policy
 from crazyem.live.push import Pusher, push_target, read_originals
 from crazyem.live.recorder import Recorder
 from crazyem.live.telemetry import Telemetry
@@ -25,6 +29,9 @@ from crazyem.vehicle import Vehicle
 
 RATE = 100.0  # Hz
 LINK_EVERY = 1.0  # s between notes on the link's health
+# A drone under low-level setpoints levels out after 0.5 s without them and cuts its motors after 2 s; one that hovers
+# by itself goes on. So a link is worth waiting for, but not for long.
+RECONNECT_WITHIN = 8.0  # s
 STATE = STATE_BLOCK + tuple(f"stateEstimateZ.rate{a}" for a in ("Roll", "Pitch", "Yaw"))
 EXTRA = tuple(f"acc.{a}" for a in "xyz") + tuple(f"ctrltargetZ.{a}" for a in "xyz")
 WRENCH = ("thrustSi", "torquex", "torquey", "torquez")
@@ -51,6 +58,25 @@ def block_plan(available: Sequence[str], *, wrench: str = "ctrlLee") -> list[tup
     return [STATE, motors, *(extra for extra in optional if extra)]
 
 
+def link_account(statistics: LinkStatistics, outages: Sequence[Outage]) -> dict[str, str]:
+    """What became of the packets, for a recording: clocks, round trip, and each block's fates and delays."""
+    account = {
+        "clock.offset_s": repr(statistics.clock_offset),
+        "clock.rate": repr(statistics.clock_rate),
+        "clock.drift_ppm": f"{1e6 * (statistics.clock_rate - 1.0):.3f}",
+        "round_trip_s": f"{statistics.round_trip:.6f}",
+        "outages": str(len(outages)),
+    }
+    for number, outage in enumerate(outages):
+        account[f"outage.{number}"] = f"{outage.before_ms:.0f} ms to {outage.after_ms:.0f} ms: {outage.reason}"
+    for block, (received, lost, late) in statistics.per_block.items():
+        account[f"block.{block}.packets"] = f"{received} received, {lost} lost, {late} late"
+        if block in statistics.delays:
+            median, p99 = statistics.delays[block]
+            account[f"block.{block}.delay_s"] = f"{median:.6f} median, {p99:.6f} 99th percentile"
+    return account
+
+
 class Session:
     """Estimates from an open link until closed.
 
@@ -61,6 +87,10 @@ class Session:
         recorder: or None.
         wrench: log group of the controller whose commanded thrust and torque are recorded.
         on_estimate: called in the estimator's thread with every estimate.
+        rate: of the log, Hz; beyond 100 the firmware must start blocks by the millisecond.
+        reconnect_within: s for which a lost link is tried again, 0 = never. The window is kept: the estimator sees the
+            gap in the stamps and begins a new stretch after it.
+        crew: whose threads estimate, where one process has many sessions; None: a thread of the session's own.
     """
 
     def __init__(
@@ -72,6 +102,9 @@ class Session:
         recorder: Recorder | None = None,
         wrench: str = "ctrlLee",
         on_estimate: Callable[[Estimate], None] | None = None,
+        rate: float = RATE,
+        reconnect_within: float = RECONNECT_WITHIN,
+        crew: Crew | None = None,
     ) -> None:
         self.link = link
         self.vehicle = vehicle
@@ -80,13 +113,21 @@ class Session:
         self.clock = FirmwareClock()
         self.telemetry = Telemetry()
         self.lost: LinkLost | None = None
+        self.outages: list[Outage] = []
+        self.rate = rate
+        self.reconnect_within = reconnect_within
+        self._linked = threading.Event()
+        self._linked.set()
         self.failure: CrazyemError | None = None
         self.pusher: Pusher | None = None
+        self.oversight: Oversight | None = None
         self._wrench = wrench
         self._on_estimate = on_estimate
         self.pipeline = Pipeline(estimator, history=self.history, on_estimate=self._estimated)
+        self.pipeline.on_step = self._stepped
         self.blocks: tuple[Block, ...] = ()
         self._samples: queue.SimpleQueue[list[Sample] | None] = queue.SimpleQueue()
+        self._mailbox: Mailbox | None = crew.mailbox(self._feed, self._estimating_failed) if crew is not None else None
         self._link_told = -math.inf
         self._end_wanted = False
         self._stop = threading.Event()
@@ -100,38 +141,85 @@ class Session:
 
     def start(self) -> None:
         """Subscribe and let packets flow."""
-        plan = block_plan(tuple(self.link.log_variables), wrench=self._wrench)
         blocks: list[Block] = []
-        # Threads first: packets of the first block must not pile up behind the set-up of the last.
-        for variables in plan:
-            blocks.extend(self.link.subscribe(variables, RATE))
+        start_streams = getattr(self.link, "start_streams", None)
+        if start_streams is not None:  # a drone that sends messages, not variables
+            self._keep_frames()
+            blocks.extend(start_streams(self.rate))
+        else:
+            # Threads first: packets of the first block must not pile up behind the set-up of the last.
+            for variables in block_plan(tuple(self.link.log_variables), wrench=self._wrench):
+                blocks.extend(self.link.subscribe(variables, self.rate))
         self.blocks = tuple(blocks)
         if self.recorder is not None:
             self.recorder.blocks(self.blocks)
         self._decoders = decoders(self.blocks)
         self._names = {b.identifier: tuple(v.name for v in b.variables) for b in self.blocks}
-        for target, name in ((self._receive, "crazyem-receive"), (self._estimate, "crazyem-estimate")):
+        mine = ((self._receive, "crazyem-receive"), (self._estimate, "crazyem-estimate"))
+        for target, name in mine if self._mailbox is None else mine[:1]:
             thread = threading.Thread(target=target, name=name, daemon=True)
             thread.start()
             self._threads.append(thread)
 
-    def push_to_controller(self, limits: Limits | None = None) -> str:
-        """Let the guard push to the controller that runs now; returns a sentence if there is anything to say."""
-        controller, note = push_target(self.link)
+    def _keep_frames(self) -> None:
+        """The drone's messages as they came, into the recording."""
+        keep = getattr(self.recorder, "frame", None)
+        if keep is not None:
+            self.link.on_frame = keep  # type: ignore[attr-defined]
+
+    def push_to_controller(self, rules: Rules | None = None) -> str:
+        """Let the guard push to the controller that runs now; returns a sentence if there is anything to say.
+
+        Args:
+            rules: policy, dry run, confirmation; the shipped policy without.
+        """
+        rules = rules or Rules(load_policy())
+        if getattr(self.link, "hover_parameter", None) is not None:
+            controller, note = hover_target(self.link, self.vehicle)
+            rules = hover_rules(rules, self.link, controller)
+        else:
+            controller, note = push_target(self.link)
         self.history.notice(note)
         if controller is None:
             return note
         nominal = dict(zip(("mass", "Ixx", "Iyy", "Izz"), (self.vehicle.mass, *self.vehicle.inertia)))
         originals = read_originals(self.link, controller)
-        guard = Guard(controller, nominal=nominal, originals=originals, limits=limits)
+        guard = Guard(controller, nominal=nominal, originals=originals, limits=rules.policy.limits)
         on_write = None
         if self.recorder is not None:
             on_write = self.recorder.parameter_write
             self.recorder.metadata("parameters_at_connect", {k: repr(v) for k, v in originals.items()})
-        self.pusher = Pusher(self.link, guard, history=self.history, on_write=on_write)
-        self.pipeline.push = self.pusher.submit
-        self.pipeline.guard = guard
+            self.recorder.metadata("guard", {"mode": rules.mode, "policy": rules.policy.to_toml()})
+        oversight = Oversight(
+            guard,
+            rules,
+            originals=originals,
+            history=self.history,
+            telemetry=self.telemetry,
+            now=lambda: self.clock.newest,
+            residual=lambda: getattr(self.pipeline.estimator, "residual", None),
+            enabled=lambda time: self.pipeline.push_from <= time <= self.pipeline.push_until,
+            tell=self._tell,
+        )
+        if not rules.dry_run:
+            self.pusher = oversight.pusher = Pusher(
+                self.link,
+                guard,
+                history=self.history,
+                on_write=on_write,
+                wait_for_link=self.wait_for_link,
+                outages=lambda: len(self.outages) + self.returning,
+                known=originals,
+                on_done=oversight.done,
+            )
+            self.pipeline.push = self.pusher.submit
+        self.pipeline.guard = self.oversight = oversight
         return note
+
+    def end_pushing(self, outcome: str) -> None:
+        """The flight is over, `landed`, `interrupted`, `failed` or `link_lost`: keep or restore, as the policy says."""
+        if self.oversight is not None:
+            self.oversight.end(outcome)
 
     def end_estimates(self) -> None:
         """Keep what comes from now on out of the estimate: a landing excites little and ends near the ground.
@@ -159,7 +247,11 @@ class Session:
         reason = self.lost.reason.rstrip(".") if self.lost else "no packets arrive"
         if self.link.uri not in reason:
             reason = f"the drone at {self.link.uri} was lost: {reason}"
-        tail = f"; the recording {self.recorder.path} is intact up to there" if self.recorder is not None else ""
+        tail = (
+            f"; the recording {self.recorder.path} is intact up to there"
+            if self.recorder is not None and self.recorder.path
+            else ""
+        )
         return f"{reason[:1].lower()}{reason[1:]}{tail}."
 
     def close(self) -> None:
@@ -170,8 +262,15 @@ class Session:
         self._stop.set()
         for thread in self._threads:
             thread.join(timeout=30.0)
+        if self._mailbox is not None:
+            self._mailbox.wait(30.0)
         if self.pusher is not None:
             self.pusher.close()
+        if self.oversight is not None:
+            self.oversight.close()
+        if self.recorder is not None and self._threads:
+            account: dict[str, str] = dict(getattr(self.link, "account", dict)())
+            self.recorder.metadata("link", {**link_account(self.link.statistics(), self.outages), **account})
 
     def _estimated(self, estimate: Estimate) -> None:
         if self.recorder is not None:
@@ -182,6 +281,9 @@ class Session:
         if self._on_estimate is not None:
             self._on_estimate(estimate)
 
+    def _stepped(self, step: Step) -> None:
+        self._tell(str(step))
+
     def _receive(self) -> None:
         try:
             while not self._stop.is_set():
@@ -190,7 +292,8 @@ class Session:
                 except queue.Empty:
                     continue
                 if isinstance(item, LinkLost):
-                    self.lost = item
+                    if self._come_back(item):
+                        continue
                     break
                 self._packet(item)
         except CrazyemError as error:
@@ -199,6 +302,45 @@ class Session:
             self.failure = CrazyemError(f"receiving failed: {error!r}")
         finally:
             self._samples.put(None)
+
+    @property
+    def returning(self) -> bool:
+        """Whether the link is lost and being brought back."""
+        return not self._linked.is_set()
+
+    def wait_for_link(self) -> bool:
+        """Until the link is there, or lost for good; whether it is there. At once where nothing is amiss."""
+        self._linked.wait(self.reconnect_within + 5.0)
+        return self._linked.is_set() and self.lost is None
+
+    def _come_back(self, lost: LinkLost) -> bool:
+        """Bring the link back, in the receiving thread: there is nothing else to receive. False: lost for good."""
+        reconnect = getattr(self.link, "reconnect", None)
+        if reconnect is None or not getattr(self.link, "can_reconnect", True) or self.reconnect_within <= 0.0:
+            self.lost = lost
+            return False
+        self._linked.clear()
+        self._tell(f"the link was lost, trying again: {lost.reason}")
+        try:
+            outage: Outage = reconnect(self.reconnect_within, self._stop)
+        except LinkError as error:
+            self.lost = LinkLost(f"{lost.reason.rstrip('.')}; {str(error)[:1].lower()}{str(error)[1:]}", lost.host_time)
+            return False
+        else:
+            self.outages.append(outage)
+        finally:
+            self._linked.set()
+        sentence = (
+            f"the link was gone for {outage.seconds:.1f} s (no data from {outage.before_ms / 1000:.3f} to "
+            f"{outage.after_ms / 1000:.3f} s of the drone's clock) and came back."
+        )
+        self.history.notice(sentence)
+        self._tell(sentence)
+        return True
+
+    def _tell(self, sentence: str) -> None:
+        if self.recorder is not None:
+            self.recorder.event(sentence)
 
     def _packet(self, packet: Packet) -> None:
         if self._end_wanted and self.pipeline.estimate_until == math.inf and math.isfinite(self.clock.newest):
@@ -226,7 +368,9 @@ class Session:
         samples = self._decoders[packet.block].decode(packet)
         for sample in samples:
             self.telemetry.take(sample)
-        self._samples.put(samples)
+        if self.oversight is not None:
+            self.oversight.take(samples)
+        (self._samples if self._mailbox is None else self._mailbox).put(samples)
 
     def _tell_link(self, packet: Packet) -> None:
         """The link's health, into the recording; latency against the promptest packets, where the link knows them."""
@@ -239,9 +383,14 @@ class Session:
     def _estimate(self) -> None:
         try:
             while (samples := self._samples.get()) is not None:
-                for sample in samples:
-                    self.pipeline.sample(sample)
-        except CrazyemError as error:
-            self.failure = self.failure or error
+                self._feed(samples)
         except Exception as error:
-            self.failure = self.failure or CrazyemError(f"estimating failed: {error!r}")
+            self._estimating_failed(error)
+
+    def _feed(self, samples: list[Sample]) -> None:
+        for sample in samples:
+            self.pipeline.sample(sample)
+
+    def _estimating_failed(self, error: Exception) -> None:
+        known = error if isinstance(error, CrazyemError) else CrazyemError(f"estimating failed: {error!r}")
+        self.failure = self.failure or known

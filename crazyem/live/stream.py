@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 
 from crazyem.control.trajectories import Reference, Trajectory
+from crazyem.errors import LinkError
 from crazyem.links.base import Link
 from crazyem.live.clock import FirmwareClock
 
@@ -12,6 +13,8 @@ from crazyem.live.clock import FirmwareClock
 # place between two log samples and the logged motor commands would be off by a constant part of every step: measured,
 # 6 % of the yaw torque, which goes straight into Izz. Seven milliseconds visit every place within 70 ms.
 PERIOD = 0.007  # s of firmware time
+LEAP = 0.5  # s of the trajectory from one setpoint to the next after an outage that are too many
+NOTICED_WITHIN = 0.3  # s from the loss of a link until the session knows of it
 SHORTEST = 0.0005  # s of host time; below this a fast simulator gets setpoints further apart
 
 
@@ -20,6 +23,7 @@ class SetpointStream:
 
     Args:
         on_setpoint: called with (firmware time [s], reference) after each setpoint (recording).
+        returning: whether a lost link is being brought back; a setpoint that cannot be sent meanwhile is left out.
     """
 
     def __init__(
@@ -29,11 +33,16 @@ class SetpointStream:
         clock: FirmwareClock,
         *,
         on_setpoint: Callable[[float, Reference], None] | None = None,
+        returning: Callable[[], bool] | None = None,
     ) -> None:
         self.link = link
         self.trajectory = trajectory
         self.clock = clock
         self.on_setpoint = on_setpoint
+        self.returning = returning or (lambda: False)
+        self.left_out = 0
+        self._reached = 0.0
+        self._after_outage = False
         self.sent = 0
         self.failure: Exception | None = None
         self.began = float("nan")
@@ -61,12 +70,38 @@ class SetpointStream:
         try:
             while not self._stop.is_set():
                 firmware = self.clock.now()
-                r = self.trajectory.at(firmware - self.began)
-                self.link.send_full_state(r.position, r.velocity, r.acceleration, r.quaternion, (0.0, 0.0, r.yaw_rate))
-                self.sent += 1
-                if self.on_setpoint is not None:
-                    self.on_setpoint(firmware, r)
+                r = self.trajectory.at(self._progress(firmware))
+                if self._send(r):
+                    self.sent += 1
+                    if self.on_setpoint is not None:
+                        self.on_setpoint(firmware, r)
                 due = max(due + max(PERIOD / max(self.clock.rate, 1e-3), SHORTEST), time.monotonic() - 0.05)
                 self._stop.wait(max(due - time.monotonic(), 0.0))
         except Exception as error:
             self.failure = error
+
+    def _progress(self, firmware: float) -> float:
+        """The trajectory's time [s]; after an outage it goes on where it stood: a leap shakes the drone."""
+        progress = firmware - self.began
+        if self.returning():
+            self._after_outage = True
+        elif self._after_outage and progress - self._reached > LEAP:
+            self.began += progress - self._reached
+            self._after_outage, progress = False, self._reached
+        self._reached = progress
+        return progress
+
+    def _send(self, r: Reference) -> bool:
+        """Whether it left; raises LinkError if it did not and nobody is bringing the link back."""
+        try:
+            self.link.send_full_state(r.position, r.velocity, r.acceleration, r.quaternion, (0.0, 0.0, r.yaw_rate))
+        except LinkError as error:
+            # The link reports its loss through the queue of packets: give whoever reads it a moment to act on it.
+            until = time.monotonic() + NOTICED_WITHIN
+            while not self.returning():
+                if time.monotonic() > until or self._stop.is_set():
+                    raise error
+                time.sleep(0.005)
+            self.left_out += 1
+            return False
+        return True

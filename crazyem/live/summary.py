@@ -43,6 +43,8 @@ def build_summary(
         "vehicle": vehicle,
         "estimates": estimate.to_json(),
         "pushes": [p.to_json() for p in history.pushes],
+        "guard": history.guard or None,
+        "steps": [step.to_json() for step in history.steps],
         "updates": estimate.updates,
         "update_ms": {
             "median": float(np.median(ms)) if ms.size else None,
@@ -112,10 +114,16 @@ def check_writable(path: str | None) -> None:
 def text_summary(summary: Mapping[str, Any], estimate: Estimate) -> str:
     """A few lines for the terminal."""
     lines = [str(estimate)]
+    lines += [
+        f"mass changed at {s['time']:.2f} s: {s['before_kg']:.4g} -> {s['after_kg']:.4g} kg"
+        for s in summary.get("steps", ())
+        if s["real"]
+    ]
     pushes = summary["pushes"]
     if pushes:
         unverified = sum(not p["verified"] for p in pushes)
         lines.append(f"pushes: {len(pushes)} parameter writes, {unverified} not confirmed")
+    lines += guard_lines(summary.get("guard"))
     received, lost = summary["samples"]["received"], summary["samples"]["lost"]
     ms = summary["update_ms"]
     cost = f", {ms['median']:.2f} ms each (99 %: {ms['p99']:.2f} ms)" if ms["median"] is not None else ""
@@ -130,6 +138,24 @@ def text_summary(summary: Mapping[str, Any], estimate: Estimate) -> str:
             lines.append(f"{label}: {before:{sign}.3f} m{then}")
     lines += [f"note: {n}" for n in summary["notices"]]
     return "\n".join(lines)
+
+
+def guard_lines(guard: Mapping[str, Any] | None) -> list[str]:
+    """What the guard did beyond writing: a dry run's writes, what it took back, why it held back to the end."""
+    if not guard:
+        return []
+    decisions = guard["decisions"]
+    lines = []
+    if guard["mode"] == "dry run":
+        values = {name: value for d in decisions if d["action"] == "would write" for name, value in d["writes"]}
+        would = ", ".join(f"{name} = {value:.6g}" for name, value in values.items())
+        lines.append(f"dry run: nothing was written{'; would have ended with ' + would if would else ''}")
+    reverts = [d for d in decisions if d["action"] == "revert"]
+    lines += [f"taken back at {d['time']:.1f} s: {d['reason']}" for d in reverts]
+    held = [d for d in decisions if d["action"] == "hold"]
+    if held and not any(d["action"] in ("write", "would write") for d in decisions):
+        lines.append(f"nothing was pushed: {held[-1]['reason']}")
+    return lines
 
 
 def live_line(phase: str, seconds: float, estimate: Estimate | None, *, lost: int, pushes: int) -> str:

@@ -4,11 +4,20 @@ State: position p [m, world], velocity v [m/s, world], attitude q (x, y, z, w; b
 Errors are 12-vectors (dp, dv, dtheta, dw) with q_true = q * exp(dtheta): the attitude error is in the body frame.
 
 One step of length dt with mean thrust F and mean torque M over the step, and random impulses u of specific force and
-angular acceleration (body frame), by the midpoint rule, second order in dt:
+angular acceleration (body frame), with h = lead dt:
 
-    a  = R(q exp(w dt/2)) (e3 F/m + u_v/dt) - g e3          v' = v + dt a
+    a  = R(q exp(h w)) (e3 F/m + u_v/dt) - g e3             v' = v + dt a
     al = I^-1 (M - w x I w) + u_w/dt                        w' = w + dt al
-    p' = p + dt (v + v')/2                                  q' = q exp(dt (w + w')/2)
+    p' = p + dt v + h dt a                                  q' = q exp(dt w + h dt al)
+
+`lead` says by which fraction of a step the velocities that move position and attitude, and the attitude that turns the
+force, are ahead of the step's start. Flights in continuous time take 1/2, the midpoint rule, second order in dt. The
+others are for data of simulators that step so: 0 is explicit Euler (Zhao eq. 56), 1 is semi-implicit Euler. For those
+the discrete motion is the truth, and there is nothing within a step (`bridge_covariance`).
+
+Explicit Euler adds to roll, pitch and yaw dt times their derivatives (Zhao eq. 47), as the simulators do that step so:
+q' is not q exp(dt w) but differs from it by dt^2, which precise noise levels notice. Where pitch is within 3 degrees of
+a right angle, and those derivatives have no bounds, it is q exp(dt w) after all.
 
 Noise enters through force and torque only (Zhao eq. 55), so its covariance has rank 6, not 12; in units of
 acceleration it does not depend on mass and inertia.
@@ -19,8 +28,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.physics.rotations import quaternion_from_rotation_vector, quaternion_product, rotation_matrix, skew
+from crazyem.physics.rotations import (
+    quaternion_from_euler,
+    quaternion_from_rotation_vector,
+    quaternion_product,
+    rotation_matrix,
+    skew,
+)
 from crazyem.vehicle import GRAVITY
+
+UPRIGHT = 0.05  # cosine of pitch below which Euler angles are not stepped
 
 
 class State(NamedTuple):
@@ -56,6 +73,7 @@ def step(
     mass: float,
     inertia: NDArray,
     impulse: NDArray | None = None,
+    lead: float = 0.5,
 ) -> State:
     """One step of the rigid body.
 
@@ -67,18 +85,49 @@ def step(
         mass: [kg].
         inertia: (3, 3) [kg m^2], body FLU.
         impulse: (6,) random specific impulse [m/s] and angular-velocity impulse [rad/s], body FLU; none if absent.
+        lead: rule of integration, 0.5 midpoint, 0 explicit, 1 semi-implicit Euler.
     """
+    h = lead * dt
     p, v, q, w = state
     impulse = np.zeros(6) if impulse is None else impulse
-    middle = rotation_matrix(quaternion_product(q, quaternion_from_rotation_vector(0.5 * dt * w)))
+    middle = rotation_matrix(quaternion_product(q, quaternion_from_rotation_vector(h * w)))
     specific = np.array([0.0, 0.0, thrust / mass]) + impulse[:3] / dt
     v_next = v + dt * (middle @ specific - np.array([0.0, 0.0, GRAVITY]))
     w_next = w + dt * angular_acceleration(w, torque, inertia=inertia) + impulse[3:]
-    q_next = quaternion_product(q, quaternion_from_rotation_vector(0.5 * dt * (w + w_next)))
-    return State(p + 0.5 * dt * (v + v_next), v_next, q_next / np.linalg.norm(q_next), w_next)
+    q_next = quaternion_product(q, quaternion_from_rotation_vector((dt - h) * w + h * w_next))
+    if lead == 0.0 and np.cos((angles := euler_angles(q))[1]) > UPRIGHT:
+        q_next = quaternion_from_euler(*(angles + dt * angle_rates(angles) @ w))
+    return State(p + (dt - h) * v + h * v_next, v_next, q_next / np.linalg.norm(q_next), w_next)
 
 
-def bridge_covariance(noise: NDArray, q: NDArray, *, dt: float) -> NDArray:
+def euler_angles(q: NDArray) -> NDArray:
+    """Roll, pitch, yaw (3,) rad with R(q) = Rz(yaw) Ry(pitch) Rx(roll), pitch within a right angle."""
+    r = rotation_matrix(q)
+    roll, yaw = np.arctan2(r[2, 1], r[2, 2]), np.arctan2(r[1, 0], r[0, 0])
+    return np.array([roll, np.arcsin(np.clip(-r[2, 0], -1.0, 1.0)), yaw])
+
+
+def angle_rates(angles: NDArray) -> NDArray:
+    """Matrix (3, 3) from body rates to the derivatives of roll, pitch, yaw (3,) rad: Zhao eq. 47."""
+    sr, cr, cp, tp = np.sin(angles[0]), np.cos(angles[0]), np.cos(angles[1]), np.tan(angles[1])
+    return np.array([[1.0, sr * tp, cr * tp], [0.0, cr, -sr], [0.0, sr / cp, cr / cp]])
+
+
+def _explicit_turn_jacobians(q: NDArray, w: NDArray, dt: float) -> tuple[NDArray, NDArray]:
+    """Derivatives (3, 3) of the attitude error after an explicit step by the one before and by the body rate."""
+    angles = euler_angles(q)
+    rates = angle_rates(angles)
+    after = angles + dt * rates @ w
+    sr, cr, sp, cp = np.sin(angles[0]), np.cos(angles[0]), np.sin(angles[1]), np.cos(angles[1])
+    along, across = sr * w[1] + cr * w[2], cr * w[1] - sr * w[2]  # derivatives of yaw, times cp, and of pitch
+    bent = np.eye(3)
+    bent[:, 0] += dt * np.array([across * sp / cp, -along, across / cp])
+    bent[:, 1] += dt * np.array([along / cp**2, 0.0, along * sp / cp**2])
+    back = np.linalg.inv(angle_rates(after))
+    return back @ bent @ rates, dt * back @ rates
+
+
+def bridge_covariance(noise: NDArray, q: NDArray, *, dt: float, lead: float = 0.5) -> NDArray:
     """Covariance (12, 12) that white noise adds within a step beyond its impulse.
 
     The integral of a Brownian motion given both its ends is uncertain by dt^3/12 times its intensity: position and
@@ -89,7 +138,10 @@ def bridge_covariance(noise: NDArray, q: NDArray, *, dt: float) -> NDArray:
         noise: (12, 6) from `step_jacobians`.
         q: (6,) impulse variances per second.
         dt: length of the step [s].
+        lead: rule of integration; zero but for the midpoint rule, as nothing happens within a step of the others.
     """
+    if lead != 0.5:
+        return np.zeros((12, 12))
     within = np.zeros((12, 6))
     within[0:3, 0:3] = noise[3:6, 0:3]
     within[6:9, 3:6] = noise[6:9, 3:6] / (0.5 * dt)
@@ -103,23 +155,32 @@ def right_jacobian(phi: NDArray) -> NDArray:
 
 
 def step_jacobians(
-    state: State, thrust: float, torque: NDArray, *, dt: float, mass: float, inertia: NDArray
+    state: State,
+    thrust: float,
+    torque: NDArray,
+    *,
+    dt: float,
+    mass: float,
+    inertia: NDArray,
+    impulse: NDArray | None = None,
+    lead: float = 0.5,
 ) -> tuple[NDArray, NDArray]:
     """Derivatives of `step`'s error-state: with respect to the error (12, 12) and to the impulse (12, 6).
 
-    Exact but for terms of third order in the turn of half a step.
+    Arguments as of `step`; taken at `impulse`. Exact but for terms of third order in the turn of a step.
     """
+    h = lead * dt
+    impulse = np.zeros(6) if impulse is None else impulse
     _, _, q, w = state
-    half_turn = rotation_matrix(quaternion_from_rotation_vector(0.5 * dt * w))
+    part_turn = rotation_matrix(quaternion_from_rotation_vector(h * w))
     start = rotation_matrix(q)
-    middle = start @ half_turn
-    acceleration = thrust / mass
-    e3 = np.array([0.0, 0.0, 1.0])
-    v_theta = -dt * acceleration * start @ skew(half_turn @ e3)
-    v_rate = -0.5 * dt * dt * acceleration * middle @ skew(e3)
+    middle = start @ part_turn
+    specific = np.array([0.0, 0.0, thrust / mass]) + impulse[:3] / dt
+    v_theta = -dt * start @ skew(part_turn @ specific)
+    v_rate = -h * dt * middle @ skew(specific)
     w_rate = np.eye(3) + dt * np.linalg.solve(inertia, skew(inertia @ w) - skew(w) @ inertia)
-    w_next = w + dt * angular_acceleration(w, torque, inertia=inertia)
-    phi = 0.5 * dt * (w + w_next)
+    w_next = w + dt * angular_acceleration(w, torque, inertia=inertia) + impulse[3:]
+    phi = (dt - h) * w + h * w_next
     turn = rotation_matrix(quaternion_from_rotation_vector(phi))
     jr = right_jacobian(phi)
 
@@ -127,15 +188,18 @@ def step_jacobians(
     transition[0:3, 3:6] = dt * np.eye(3)
     transition[3:6, 6:9] = v_theta
     transition[3:6, 9:12] = v_rate
-    transition[0:3, 6:9] = 0.5 * dt * v_theta
-    transition[0:3, 9:12] = 0.5 * dt * v_rate
+    transition[0:3, 6:9] = h * v_theta
+    transition[0:3, 9:12] = h * v_rate
     transition[6:9, 6:9] = turn.T
-    transition[6:9, 9:12] = 0.5 * dt * jr @ (np.eye(3) + w_rate)
+    transition[6:9, 9:12] = jr @ ((dt - h) * np.eye(3) + h * w_rate)
     transition[9:12, 9:12] = w_rate
 
+    if lead == 0.0 and np.cos(euler_angles(q)[1]) > UPRIGHT:
+        transition[6:9, 6:9], transition[6:9, 9:12] = _explicit_turn_jacobians(q, w, dt)
+
     noise = np.zeros((12, 6))
-    noise[0:3, 0:3] = 0.5 * dt * middle
+    noise[0:3, 0:3] = h * middle
     noise[3:6, 0:3] = middle
-    noise[6:9, 3:6] = 0.5 * dt * jr
+    noise[6:9, 3:6] = h * jr
     noise[9:12, 3:6] = np.eye(3)
     return transition, noise

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.signals.mavlink import MAPPINGS
 from crazyem.signals.packet import Block, Packet
 from crazyem.signals.sample import ESTIMATOR_SIGNALS, SIGNALS, Sample
 
@@ -196,9 +197,36 @@ class Source:
     convert: Conversion
 
 
+def _half_turn(factor: float) -> Conversion:
+    """FRD to FLU, NED to NWU (see crazyem.signals.mavlink)."""
+    signs = np.array([1.0, -1.0, -1.0])
+
+    def many(columns: Columns) -> NDArray[np.float64]:
+        return _stacked(columns) * signs * factor
+
+    return Conversion(lambda v: (float(v[0]) * factor, float(v[1]) * -1.0 * factor, float(v[2]) * -1.0 * factor), many)
+
+
+_turned_quaternion = Conversion(
+    lambda v: (float(v[1]), float(v[2]) * -1.0, float(v[3]) * -1.0, float(v[0])),
+    lambda columns: _stacked(columns)[:, [1, 2, 3, 0]] * np.array([1.0, -1.0, -1.0, 1.0]),
+)
+_turned_angles = _row_by_row(lambda v: quaternion_from_euler(v[0], v[1] * -1.0, v[2] * -1.0), 4)
+
+
+def _conversion(kind: str, factor: float) -> Conversion:
+    fixed = {"quaternion": _turned_quaternion, "angles": _turned_angles}
+    return fixed.get(kind) or (_half_turn if kind == "vector" else _scaled)(factor)
+
+
 def _names(pattern: str, parts: str) -> tuple[str, ...]:
     return tuple(pattern.replace("*", part) for part in parts.split())
 
+
+MAVLINK_SOURCES: tuple[Source, ...] = tuple(
+    Source(m.signal, m.variables, _conversion(m.kind, m.factor)) for m in MAPPINGS
+)
+_MAVLINK_OUTPUTS = tuple(s for s in MAVLINK_SOURCES if s.signal == "motor_command")
 
 # Best first within a signal: a float log beats its quantised twin, a real duty beats nothing.
 SOURCES: tuple[Source, ...] = (
@@ -232,15 +260,18 @@ SOURCES: tuple[Source, ...] = (
     Source("acceleration", _names("stateEstimateZ.*", "ax ay az"), _compressed_acceleration),
     Source("mixer_command", _names("controller.cmd_*", "thrust roll pitch yaw"), _as_is),
     Source("setpoint_acceleration", _names("ctrltarget.*", "ax ay az"), _as_is),
+    *MAVLINK_SOURCES,
 )
 # Which of these motor.m1..4 is depends on the firmware (crazyem/recordings/motor_meaning.py); pwm.* is always real.
 DUTY_SOURCES: tuple[Source, ...] = (
     Source("motor_command", _names("pwm.*_pwm", "m1 m2 m3 m4"), _divided(65535.0)),
     Source("motor_command", _names("motor.*", "m1 m2 m3 m4"), _divided(65535.0)),
+    *_MAVLINK_OUTPUTS,
 )
 REQUEST_SOURCES: tuple[Source, ...] = (
     Source("motor_command", _names("pwm.*_pwm", "m1 m2 m3 m4"), _divided(65535.0)),
     Source("motor_request", _names("motor.*", "m1 m2 m3 m4"), _divided(65535.0)),
+    *_MAVLINK_OUTPUTS,
 )
 
 # Blocks that each fit one packet of 26 bytes; what the estimator asks for when the user names nothing.

@@ -19,8 +19,7 @@ _STOP_WATCHDOG = 1000  # ms between notifications once the first has come
 _FREE_FALL = 0.1  # g
 _TILTED, _TILTED_TIME = 0.5, 1000  # acc.z below this [g] for that long [ms] is a tumble
 _UPSIDE_DOWN, _UPSIDE_DOWN_TIME = -0.2, 100
-# ms in this range of rpm. The firmware's limit is 3500; the thrust curve extrapolated down to idle gives some more.
-_SPUN_UP_TIME, _SPUN_UP_LOW, _SPUN_UP_HIGH = 200, 1000, 4000
+_SPUN_UP_TIME, _SPUN_UP_LOW, _SPUN_UP_HIGH = 200, 1000, 3500  # ms in this range of rpm
 
 
 class State(IntEnum):

@@ -43,6 +43,14 @@ def position_error(setpoint, estimate, axis, yaw):
 
 
 @kernel
+def any_absolute(setpoint):
+    """Does the setpoint give a place along any axis?"""
+    return (
+        setpoint[sp.MODE_X] == sp.ABSOLUTE or setpoint[sp.MODE_Y] == sp.ABSOLUTE or setpoint[sp.MODE_Z] == sp.ABSOLUTE
+    )
+
+
+@kernel
 def align(force, yaw, D):
     """D (3x3): rotation whose z axis is along `force` and whose x axis points towards yaw [rad].
 

@@ -17,13 +17,11 @@ from firmware_sim.plant.quaternion import compress, matrix, roll_pitch_yaw
 
 @kernel
 def log_estimate(sensor, estimate, P, log):
-    """stateEstimate.*, stateEstimateZ.*, gyro.*, acc.*, kalman.*, stabilizer attitude."""
+    """stateEstimate.*, stateEstimateZ.*, kalman.*, stabilizer attitude."""
     R = np.empty((3, 3))
     matrix(estimate, at.E_QUAT, R)
     q = at.E_QUAT
     for i in range(3):
-        log[lv.GYRO + i] = math.degrees(sensor[at.GYRO + i])
-        log[lv.ACC + i] = sensor[at.ACCEL + i] / GRAVITY
         log[lv.EST + i] = estimate[at.E_POS + i]
         log[lv.EST + 3 + i] = estimate[at.E_VEL + i]
         acc, body = 0.0, 0.0
@@ -49,6 +47,14 @@ def log_estimate(sensor, estimate, P, log):
         log[lv.KALMAN + 9 + i] = P[i, i]
     for i in range(4):
         log[lv.KALMAN + 18 + i] = estimate[q + i]
+
+
+@kernel
+def log_inertial(sensor, log):
+    """gyro.*, acc.*: never late with the estimate."""
+    for i in range(3):
+        log[lv.GYRO + i] = math.degrees(sensor[at.GYRO + i])
+        log[lv.ACC + i] = sensor[at.ACCEL + i] / GRAVITY
 
 
 @kernel
@@ -95,9 +101,18 @@ def log_control(memory, param, log, union_float, union_short):
         log[lv.PID_CTR_YAW] = memory[mem.LEGACY + 3]
 
 
+# Idling rotors are slower than the thrust curve, drawn on below the firmware's least thrust, makes them. Busetto's data
+# (arXiv 2512.14450): 11 stretches at rest, duty 0.1526, 3.4 to 4.1 V, 0.47 to 0.64 of the least thrust by the curve.
+IDLE_SPEED = 0.90  # of the curve's; sd 0.006
+IDLE_UP_TO = 0.64  # of the least thrust
+
+
 @kernel
-def log_rotor_speed(truth, state, log):
-    """motor.m*_rpm, mechanical, of speed controllers that report it: thrust = constant * (rad/s)^2."""
+def log_rotor_speed(truth, board, state, log):
+    """motor.m*_rpm, mechanical, of speed controllers that report it: thrust = constant * (rad/s)^2, less at idle."""
     for i in range(4):
-        speed = math.sqrt(max(state[at.ROTOR + i], 0.0) / truth[at.ROTOR_CONSTANT])
-        log[lv.RPM + i] = min(math.trunc(speed * 30.0 / math.pi), 65534.0)
+        thrust = max(state[at.ROTOR + i], 0.0)
+        share = min(max(thrust / board[at.B_THRUST_MIN], IDLE_UP_TO), 1.0)
+        idle = IDLE_SPEED + (1.0 - IDLE_SPEED) * (share - IDLE_UP_TO) / (1.0 - IDLE_UP_TO)
+        speed = idle * math.sqrt(thrust / truth[at.ROTOR_CONSTANT])
+        log[lv.RPM + i] = min(math.trunc(truth[at.RPM_SCALE + i] * speed * 30.0 / math.pi), 65534.0)

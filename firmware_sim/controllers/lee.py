@@ -2,8 +2,9 @@
 
 F_d = a_d + g e3 + Kd e_v + Kp e_p + Ki int e_p;  thrust = mass F_d . R e3
 M = -KR e_R - Kw (w - w_r) - KI int e_R + w x J w, with w_r from the setpoint's jerk and yaw rate.
-Two differences: an axis under velocity control has no position error (the firmware pulls it towards 0), and without
-a position to hold the attitude setpoint is followed.
+It knows places only: with one axis under position control all three are, so a hover setpoint (velocities along x and
+y, which leave the places there 0) pulls towards the origin; without any the thrust is the setpoint's, 0 unless manual.
+One difference: without a place to hold, the attitude setpoint is followed (the firmware keeps an old one).
 """
 
 import math
@@ -17,10 +18,10 @@ from firmware_sim.controllers import variables as lv
 from firmware_sim.controllers.attitude import (
     align,
     angles,
+    any_absolute,
     desired_rate,
     desired_yaw,
     from_angles,
-    position_error,
     rotation_error,
 )
 from firmware_sim.kernel import kernel
@@ -49,13 +50,12 @@ def lee_step(setpoint, estimate, sensor, param, memory, log):
     force, eR, w, wr = np.zeros(3), np.empty(3), np.empty(3), np.zeros(3)
     matrix(estimate, at.E_QUAT, R)
     yaw = desired_yaw(setpoint, estimate, DT)
-    if setpoint[sp.MODE_X] + setpoint[sp.MODE_Y] + setpoint[sp.MODE_Z] > 0.0:
+    if any_absolute(setpoint):
         for i in range(3):
-            e_pos, e_vel = position_error(setpoint, estimate, i, yaw)
             limit = abs(param[pm.LEE_KP_LIMIT])
-            e_pos = min(max(e_pos, -limit), limit)
+            e_pos = min(max(setpoint[sp.X + i] - estimate[at.E_POS + i], -limit), limit)
             limit = abs(param[pm.LEE_KD_LIMIT])
-            e_vel = min(max(e_vel, -limit), limit)
+            e_vel = min(max(setpoint[sp.VX + i] - estimate[at.E_VEL + i], -limit), limit)
             limit = abs(param[pm.LEE_KPI_LIMIT])
             memory[mem.LEE_I_POS + i] = min(max(memory[mem.LEE_I_POS + i] + DT * e_pos, -limit), limit)
             force[i] = (

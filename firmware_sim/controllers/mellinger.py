@@ -3,6 +3,8 @@
 F_des = mass (a_d + g e3) + kp e_p + kd e_v + ki int e_p;  thrust = massThrust F_des . R e3
 M = -kR vee(D'R - R'D) + kw e_w + ki_m int + kd_omega d(e_w)/dt, pitch inverted for the mixer. The mixer's scale is
 65535 = THRUST_MAX a motor, so ctrlMel.mass is only a mass if massThrust fits the platform.
+It knows places and, without thrust of its own, attitudes; whatever else is asked for (velocities, levelling out after
+a timeout) is a hover at the setpoint's height: level, with the present yaw, without feedforward.
 """
 
 import math
@@ -13,11 +15,12 @@ from firmware_sim.commander import setpoint as sp
 from firmware_sim.controllers import layout as mem
 from firmware_sim.controllers import parameters as pm
 from firmware_sim.controllers import variables as lv
-from firmware_sim.controllers.attitude import align, desired_yaw, from_angles, position_error, rotation_error
+from firmware_sim.controllers.attitude import align, desired_yaw, from_angles, rotation_error
+from firmware_sim.controllers.power_distribution import to_int
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.ground import GRAVITY
-from firmware_sim.plant.quaternion import matrix
+from firmware_sim.plant.quaternion import matrix, roll_pitch_yaw
 
 DT = 0.002  # s
 LIMIT = 32000.0  # PWM units of roll, pitch and yaw
@@ -46,20 +49,28 @@ def mellinger_step(setpoint, estimate, sensor, param, memory, log):
     matrix(estimate, at.E_QUAT, R)
     yaw = desired_yaw(setpoint, estimate, DT)
     thrust = setpoint[sp.THRUST]
-    manual = setpoint[sp.MODE_Z] == sp.DISABLE
-    if manual:
+    place = setpoint[sp.MODE_X] == sp.ABSOLUTE
+    tilt = setpoint[sp.MODE_ROLL] == sp.ABSOLUTE and setpoint[sp.MODE_PITCH] == sp.ABSOLUTE
+    mass = param[pm.MEL_MASS]
+    for i in range(3):
+        g = pm.MEL_Z if i == 2 else pm.MEL_XY  # kp, kd, ki, range
+        e_pos = setpoint[sp.X + i] - estimate[at.E_POS + i]
+        e_vel = setpoint[sp.VX + i] - estimate[at.E_VEL + i]
+        held = clamp(memory[mem.MEL_I_POS + i] + DT * e_pos, param[g + 3])
+        memory[mem.MEL_I_POS + i] = held
+        if place or i == 2:
+            force[i] = param[g] * e_pos + param[g + 1] * e_vel + param[g + 2] * held
+        if place:
+            force[i] += mass * setpoint[sp.AX + i]
+    force[2] += mass * GRAVITY
+    if not place and tilt and setpoint[sp.MODE_Z] == sp.DISABLE:
         from_angles(math.radians(setpoint[sp.ROLL]), -math.radians(setpoint[sp.PITCH]), yaw, D)
     else:
-        mass = param[pm.MEL_MASS]
-        for i in range(3):
-            g = pm.MEL_Z if i == 2 else pm.MEL_XY  # kp, kd, ki, range
-            e_pos, e_vel = position_error(setpoint, estimate, i, yaw)
-            held = clamp(memory[mem.MEL_I_POS + i] + DT * e_pos, param[g + 3])
-            memory[mem.MEL_I_POS + i] = held
-            force[i] = mass * setpoint[sp.AX + i] + param[g] * e_pos + param[g + 1] * e_vel + param[g + 2] * held
-        force[2] += mass * GRAVITY
-        thrust = param[pm.MEL_MASS_THRUST] * (force[0] * R[0, 2] + force[1] * R[1, 2] + force[2] * R[2, 2])
+        if not place:
+            _, _, yaw = roll_pitch_yaw(estimate, at.E_QUAT)
         align(force, yaw, D)
+    if setpoint[sp.MODE_Z] != sp.DISABLE:
+        thrust = param[pm.MEL_MASS_THRUST] * (force[0] * R[0, 2] + force[1] * R[1, 2] + force[2] * R[2, 2])
     rotation_error(D, R, eR)
     for i in range(3):
         kR, kw, ki = param[pm.MEL_KR + i // 2], param[pm.MEL_KW + i // 2], param[pm.MEL_KI_M + i // 2]
@@ -74,9 +85,9 @@ def mellinger_step(setpoint, estimate, sensor, param, memory, log):
         log[lv.MEL + 8 + i] = D[i, 2]
     out = mem.LEGACY
     memory[out] = thrust
-    memory[out + 1] = clamp(M[0], LIMIT)
-    memory[out + 2] = clamp(-M[1], LIMIT)
-    memory[out + 3] = clamp(-M[2], LIMIT)
+    memory[out + 1] = to_int(clamp(M[0], LIMIT))  # control_t has 16-bit integers
+    memory[out + 2] = to_int(clamp(-M[1], LIMIT))
+    memory[out + 3] = to_int(clamp(-M[2], LIMIT))
     if not thrust > 0.0:
         for i in range(4):
             memory[out + i] = 0.0

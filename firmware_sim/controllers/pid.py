@@ -56,7 +56,14 @@ def regulate(k, desired, measured, dt, limit, circular, cutoff, param, memory, l
 
 @kernel
 def reset(estimate, memory):
-    """Forget integrals; derivatives start from what is measured now; hold the present heading."""
+    """Forget integrals and hold the present heading."""
+    forget(estimate, memory)
+    memory[mem.PID_ATTITUDE + 2] = angles(estimate)[2]
+
+
+@kernel
+def forget(estimate, memory):
+    """Forget integrals; derivatives start from what is measured now. The heading to hold stays."""
     roll, pitch, yaw = angles(estimate)
     measured = (roll, pitch, yaw, 0.0, 0.0, 0.0)
     for k in range(12):
@@ -64,7 +71,7 @@ def reset(estimate, memory):
         memory[m] = memory[m + 1] = memory[m + 2] = memory[m + 3] = 0.0
         if k < 6:
             memory[m + 1] = measured[k]
-    memory[mem.PID_ATTITUDE], memory[mem.PID_ATTITUDE + 1], memory[mem.PID_ATTITUDE + 2] = roll, pitch, yaw
+    memory[mem.PID_ATTITUDE], memory[mem.PID_ATTITUDE + 1] = roll, pitch
 
 
 @kernel
@@ -83,7 +90,7 @@ def pid_step(setpoint, estimate, sensor, param, memory, log, tick):
         changed = changed or memory[mem.PID_MODES + i] != setpoint[i]
         memory[mem.PID_MODES + i] = setpoint[i]
     if changed:
-        reset(estimate, memory)
+        forget(estimate, memory)
     a = mem.PID_ATTITUDE
     roll, pitch, yaw = angles(estimate)
     if setpoint[sp.MODE_YAW] == sp.VELOCITY:

@@ -87,9 +87,7 @@ def motors_step(board, state, sensor, param, memory, log, allowed, armed):
             pwm = min(max(param[pm.POWER_SET + (1 if manual > 1 else 1 + i)], 0.0), FULL)
             if manual == 3:
                 pwm = min(max(compensate(board, sensor[at.VBAT_FILTERED], pwm), 0.0), FULL)
-        if not allowed:
-            pwm = idle if armed and requires_arming else 0.0
-        if param[pm.STOP] > 0.0 or (requires_arming and not armed):
+        if not allowed or param[pm.STOP] > 0.0 or (requires_arming and not armed):
             pwm = 0.0
         state[at.PWM + i] = pwm
         log[lv.MOTOR + i] = pwm

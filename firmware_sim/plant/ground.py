@@ -16,18 +16,18 @@ GRAVITY = 9.81
 def contact(truth, p, v, R, w, force, torque):
     """Add the floor's force [N, world] and torque [N m, body]; returns the number of feet that touch.
 
-    p, v: position m and velocity m/s (world) as arrays; R body to world; w body rate rad/s.
+    p, v: position m and velocity m/s (world) as arrays, of the geometric origin, which the torque is about; R body to
+    world; w body rate rad/s.
     """
-    reach = truth[at.ARM] * 1.5
-    if p[2] > truth[at.FLOOR] + reach:
+    if p[2] > truth[at.FLOOR] + truth[at.FEET_REACH]:
         return 0
-    m4 = 0.25 * truth[at.MASS]
+    m4 = 0.25 * truth[at.STANDING_MASS]
     wc = truth[at.CONTACT_FREQUENCY]
     sag = GRAVITY / (wc * wc)
     touching = 0
     for leg in range(4):
         bx = truth[at.ARM] if leg < 2 else -truth[at.ARM]
-        by = truth[at.ARM] if leg % 2 == 0 else -truth[at.ARM]
+        by = truth[at.ARM_Y] if leg % 2 == 0 else -truth[at.ARM_Y]
         rx, ry, rz = R[0, 0] * bx + R[0, 1] * by, R[1, 0] * bx + R[1, 1] * by, R[2, 0] * bx + R[2, 1] * by
         depth = truth[at.FLOOR] + sag - (p[2] + rz)
         if depth <= 0.0:

@@ -13,6 +13,8 @@ import numpy as np
 from firmware_sim.controllers import parameters as pm
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
+from firmware_sim.plant.effects.motion import origin
+from firmware_sim.plant.effects.sensing import seen_pose
 from firmware_sim.plant.ground import GRAVITY
 from firmware_sim.plant.quaternion import matrix, turn
 
@@ -24,20 +26,19 @@ def estimate_step(truth, state, sensor, estimate, P, param, noise, tick):
     """One millisecond: integrate the sensors, every 10th the covariance, and take the fixes that are due."""
     if estimate[at.E_RESET] > 0.0 or not healthy(estimate, P):
         estimate[at.E_RESET] = 0.0
-        restart(state, estimate, P)
+        restart(truth, state, estimate, P)
     integrate(sensor, estimate, 1e-3)
     if tick % PREDICT_EVERY == 0:
         predict(estimate, P, param, 1e-3 * PREDICT_EVERY)
     kind = truth[at.FIX_KIND]
     if kind > 0.0 and tick % int(truth[at.FIX_PERIOD]) == 0:
+        p, q = np.empty(3), np.empty(4)
+        seen_pose(truth, state, sensor, tick, p, q)
         sd = param[pm.EXT_POS_SD]
         for i in range(3):
-            fix = state[at.POS + i] + truth[at.FIX_POSITION] * noise[at.N_FIX_POSITION + i]
+            fix = p[i] + truth[at.FIX_POSITION] * noise[at.N_FIX_POSITION + i]
             scalar_update(estimate, P, i, fix - estimate[at.E_POS + i], sd * sd)
         if kind > 1.0:
-            q = np.empty(4)
-            for i in range(4):
-                q[i] = state[at.QUAT + i]
             s = truth[at.FIX_ATTITUDE]
             a = at.N_FIX_ATTITUDE
             turn(q, 0, s * noise[a], s * noise[a + 1], s * noise[a + 2])
@@ -64,10 +65,14 @@ def healthy(estimate, P):
 
 
 @kernel
-def restart(state, estimate, P):
+def restart(truth, state, estimate, P):
     """Start at the true position and attitude (the drone is placed and levelled by hand) with a small covariance."""
+    if truth[at.EFFECT_SENSING] > 0.0:
+        origin(truth, state, estimate[at.E_POS : at.E_POS + 3], estimate[at.E_VEL : at.E_VEL + 3])
+    else:
+        for i in range(3):
+            estimate[at.E_POS + i] = state[at.POS + i]
     for i in range(3):
-        estimate[at.E_POS + i] = state[at.POS + i]
         estimate[at.E_VEL + i] = 0.0
     for i in range(4):
         estimate[at.E_QUAT + i] = state[at.QUAT + i]

@@ -2,6 +2,7 @@
 
 dp = v dt;  m dv = (R e3 F + f_ext - m g e3) dt + R e3 s_F dW_0;  dq = q w/2 dt;
 J dw = (M + m_ext - w x J w) dt + s_M dW   (Zhao, eq. 54-55 with the full inertia matrix and R e3 = third column of R).
+A body with effects takes effects/step.py's way; the equations are written out in both, because a call costs time here.
 """
 
 import math
@@ -52,7 +53,10 @@ def derivative(truth, x, u, force, torque, dx, R, f, t):
 
 @kernel
 def body_step(truth, state, u, force, torque, noise, dt):
-    """Advance position, velocity, attitude and body rate by dt and set the specific force; noise only off the floor."""
+    """Advance position, velocity, attitude and body rate by dt and set the specific force; noise only off the floor.
+
+    For a body without effects; effects/step.py has the others.
+    """
     x = state[0:13]
     R = np.empty((3, 3))
     f, t, w, before = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -109,7 +113,7 @@ def rests(truth, state, u, force, torque):
     """True if the drone stands still on all four feet and nothing acts that could move it: it is then left alone."""
     if state[at.FEET] < 4:
         return False
-    weight = truth[at.MASS] * GRAVITY
+    weight = truth[at.STANDING_MASS] * GRAVITY
     if u[0] + abs(force[0]) + abs(force[1]) + abs(force[2]) > 0.3 * weight:
         return False
     limit = 0.1 * weight * truth[at.ARM]

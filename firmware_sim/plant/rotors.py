@@ -42,10 +42,10 @@ def lag(truth, state, dt, mean):
 
 @kernel
 def wrench(truth, f, o, out):
-    """out = [F N, Mx, My, Mz N m] of the four thrusts f[o:o+4]."""
-    d, k = truth[at.ARM], truth[at.TORQUE_PER_THRUST]
+    """out = [F N, Mx, My, Mz N m] of the four thrusts f[o:o+4], about the geometric origin."""
+    dx, dy, k = truth[at.ARM], truth[at.ARM_Y], truth[at.TORQUE_PER_THRUST]
     f1, f2, f3, f4 = f[o], f[o + 1], f[o + 2], f[o + 3]
     out[0] = f1 + f2 + f3 + f4
-    out[1] = d * (-f1 - f2 + f3 + f4)
-    out[2] = d * (-f1 + f2 + f3 - f4)
+    out[1] = dy * (-f1 - f2 + f3 + f4)
+    out[2] = dx * (-f1 + f2 + f3 - f4)
     out[3] = k * (-f1 + f2 - f3 + f4)

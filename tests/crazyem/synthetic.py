@@ -67,10 +67,10 @@ class Flight:
 
 
 @njit(cache=True)
-def _turned(q, phi):
+def turned(q, phi):
     """q * exp(phi), normalised."""
     angle = np.sqrt(phi[0] ** 2 + phi[1] ** 2 + phi[2] ** 2)
-    s = 0.5 if angle < 1e-9 else np.sin(angle / 2) / angle
+    s = 0.5 if angle < 1e-12 else np.sin(angle / 2) / angle
     x, y, z, w = s * phi[0], s * phi[1], s * phi[2], np.cos(angle / 2)
     out = np.empty(4)
     out[0] = q[3] * x + q[0] * w + q[1] * z - q[2] * y
@@ -81,7 +81,7 @@ def _turned(q, phi):
 
 
 @njit(cache=True)
-def _matrix(q):
+def matrix(q):
     x, y, z, w = q
     return np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -107,10 +107,10 @@ def _fly(n, dt, control_every, mass, inertia, lag, scale, sensor, dither, heave,
         x[k, 0:3], x[k, 3:6], x[k, 6:10], x[k, 10:13] = p, v, q, w
         y[k, 0:3] = p + sensor[0] * errors[k, 0:3]
         y[k, 3:6] = v + sensor[1] * errors[k, 3:6]
-        y[k, 6:10] = _turned(q, sensor[2] * errors[k, 6:9])
+        y[k, 6:10] = turned(q, sensor[2] * errors[k, 6:9])
         y[k, 10:13] = w + sensor[3] * errors[k, 9:12]
         if k % control_every == 0:
-            seen, rate = _matrix(y[k, 6:10]), y[k, 10:13]
+            seen, rate = matrix(y[k, 6:10]), y[k, 10:13]
             wanted = up - 7.0 * p - 4.0 * v
             axis = wanted / np.sqrt(np.sum(wanted**2))
             wrong = seen.T @ np.cross(seen[:, 2].copy(), axis)
@@ -127,11 +127,11 @@ def _fly(n, dt, control_every, mass, inertia, lag, scale, sensor, dither, heave,
         actings[k] = acting
         force = acting[0] + scale[0] * noise[k, 0] / np.sqrt(dt)
         torque = acting[1:] + scale[1] * noise[k, 1:] / np.sqrt(dt)
-        a = _matrix(q)[:, 2] * force / mass - up
+        a = matrix(q)[:, 2] * force / mass - up
         alpha = inverse @ (torque - np.cross(w, inertia @ w))
         p = p + dt * v + 0.5 * dt * dt * a
         v = v + dt * a
-        q = _turned(q, dt * (w + 0.5 * dt * alpha))
+        q = turned(q, dt * (w + 0.5 * dt * alpha))
         w = w + dt * alpha
     return x, y, commands, actings
 

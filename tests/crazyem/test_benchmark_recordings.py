@@ -99,6 +99,7 @@ def test_files_larger_than_memory_run_small(benches: dict[str, ModuleType]) -> N
     assert [r["code"] for r in rows] == [0] * 6
 
 
+@pytest.mark.slow
 def test_the_fuzzer_runs_or_says_what_is_missing(tmp_path: Path) -> None:
     script = str(FOLDER / "fuzz_readers.py")
     if importlib.util.find_spec("atheris") is None:

@@ -94,6 +94,7 @@ def test_uri_after_the_trajectory_is_still_the_uri(capsys, free_port):
     assert "Nothing answers" in fails(capsys, "fly", "--trajectory", "hover", f"udp://127.0.0.1:{free_port}", code=4)
 
 
+@pytest.mark.slow
 def test_reply_lost_while_connecting(capsys, fake_peer):
     fake_peer.lose = lambda request: request[:2] == b"\x5c\x02" and request[2] == 1
     assert "reply was lost" in fails(capsys, "watch", fake_peer.uri, code=4)

@@ -2,11 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crazyem.estimation.contact import CLEARANCE, CONTACT, OFF_FRACTION, ContactGate
+from crazyem.estimation.contact import CLEARANCE, CONFIRM, CONTACT, OFF_FRACTION, ContactGate
 
 MAX = 0.48  # N, four rotors of 0.12 N
 HOVER = 0.28
@@ -22,14 +23,29 @@ def run(*samples, thrust_max=MAX):
 def test_a_flight_from_the_ground_and_back():
     heights = [0.0, 0.0, 0.01, 0.05, 0.09, 0.5, 1.0, 0.5, 0.09, 0.06, 0.04, 0.0, 0.0]
     thrusts = [0.0, 0.2, 0.3, *[HOVER] * 8, 0.2, 0.0]
-    expected = [False, False, False, False, True, True, True, True, True, True, False, False, False]
+    expected = [False, False, False, False, False, True, True, True, True, True, False, False, False]
     assert run(*zip(heights, thrusts)) == expected
 
 
 def test_height_counts_from_where_it_rested():
-    assert run((0.75, 0.0), (0.78, HOVER), (0.84, HOVER), (0.79, HOVER)) == [False, False, True, False]
+    assert run((0.75, 0.0), (0.78, HOVER), (0.92, HOVER), (0.79, HOVER)) == [False, False, True, False]
     # a second rest on something higher
-    assert run((0.0, 0.0), (0.5, HOVER), (0.4, 0.0), (0.42, HOVER), (0.5, HOVER)) == [False, True, False, False, True]
+    assert run((0.0, 0.0), (0.5, HOVER), (0.4, 0.0), (0.42, HOVER), (0.57, HOVER)) == [False, True, False, False, True]
+
+
+def test_a_slow_take_off_is_believed_when_it_is_seen_again_and_again():
+    low = [(CLEARANCE + 0.001, HOVER)]
+    assert run((0.0, 0.0), *low * (CONFIRM + 1)) == [False] * CONFIRM + [True, True]
+    # one reading below starts the count anew, one that is missing does not
+    interrupted = [*low * (CONFIRM - 1), (0.07, HOVER), *low * (CONFIRM - 1), (nan, HOVER), *low]
+    assert run((0.0, 0.0), *interrupted) == [False] * (1 + len(interrupted) - 1) + [True]
+    # what was counted before a touch-down does not count after it
+    down = [(0.5, HOVER), (0.0, HOVER), *low * CONFIRM]
+    assert run((0.0, 0.0), *low * CONFIRM, *down)[CONFIRM + 1 :] == [True, False, *[False] * (CONFIRM - 1), True]
+
+
+def test_far_above_is_flight_at_once():
+    assert run((0.0, 0.0), (2 * CLEARANCE, HOVER)) == [False, True]
 
 
 def test_a_recording_that_begins_in_flight():
@@ -85,6 +101,37 @@ def test_the_reason_is_always_there_when_it_does_not_fly():
 def test_no_ground_sample_is_ever_let_through(samples):
     """Whatever the rotors do and whatever is measured: below the contact height after a rest nothing is flight."""
     assert not any(run((0.0, 0.0), *((h + 0.0, f) for h, f in samples)))
+
+
+@settings(max_examples=200)
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.014))
+def test_a_noisy_height_lets_no_sample_on_the_floor_through(seed, noise):
+    """The paper's take-off: one reading at rest, then a second on the floor under rising thrust."""
+    heights = noise * np.random.default_rng(seed).normal(size=200)
+    assert not any(run(*((h, 0.01 * k) for k, h in enumerate(heights)), thrust_max=math.inf))
+
+
+@settings(max_examples=200)
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.014), st.floats(0.2, 3.0))
+def test_a_noisy_height_hides_no_flight_for_long(seed, noise, climb):
+    """Climbing at 0.2 m/s and more, the drone is known to fly before it is a quarter of a metre up, and remains so."""
+    rng = np.random.default_rng(seed)
+    heights = np.concatenate([[0.0], climb * 0.005 * np.arange(400)])
+    verdicts = run(*((h + noise * rng.normal(), float(k > 0)) for k, h in enumerate(heights)), thrust_max=math.inf)
+    flies = heights > 0.25
+    assert all(v for v, f in zip(verdicts, flies) if f)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_touch_downs_are_taken_out_again(seed):
+    """Up, down to the floor with the rotors turning, and up again, with noise: no sample on the floor is ever used."""
+    rng = np.random.default_rng(seed)
+    up = np.linspace(0.0, 0.5, 60)
+    heights = np.concatenate([[0.0], up, up[::-1], np.zeros(40), up])
+    verdicts = run(*((h + 0.01 * rng.normal(), float(k > 0)) for k, h in enumerate(heights)), thrust_max=math.inf)
+    assert not any(verdicts[121:161])
+    assert verdicts[60]
+    assert verdicts[-1]
 
 
 @given(st.lists(st.tuples(st.floats(-1, 3) | st.just(nan), st.floats(0, 1), st.none() | st.booleans()), max_size=50))

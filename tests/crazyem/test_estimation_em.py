@@ -41,7 +41,7 @@ def at_truth(em: WindowEM) -> None:
     theta = em.parameters.theta.copy()
     theta[:5] = TRUE
     impulse = np.array([1e-4, 1e-4, TRUTH.force_noise / TRUTH.mass, *(TRUTH.torque_noise / np.array(TRUTH.inertia))])
-    em.parameters = replace(em.parameters, theta=theta, noise=Noise(impulse, np.array(TRUTH.sensor)))
+    em.parameters = replace(em.parameters, theta=theta, noise=Noise(impulse, np.array([*TRUTH.sensor, 0.1])))
 
 
 def log_posterior(em: WindowEM, n: int, parameters) -> float:

@@ -17,6 +17,7 @@ THETA = np.array([MASS, 2.0e-5, 2.1e-5, 3.6e-5, 0.06, 0.003, *OFFSET])
 UNIT = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1e-3, 1e-5, 1e-5, 1e-5])  # of the linear parameters: s, N m
 Q = np.array([0.02, 0.03, 0.05, 0.3, 0.25, 0.15]) ** 2
 R = np.repeat(np.array([1e-3, 1e-2, 3e-3, 2e-3]) ** 2, 3)
+R_FORCE = 0.3**2  # (m/s^2)^2
 P0 = np.repeat([1e-4, 1e-3, 1e-3, 1e-2], 3)
 
 
@@ -44,36 +45,36 @@ def filled_tape(seed: int, n: int = 40, *, missing: float = 0.3, dither: float =
     return tape
 
 
-def forward(tape, first=0, last=None, *, restart=True, mass=MASS, inertia=INERTIA, q=Q, r=R):
+def forward(tape, first=0, last=None, *, restart=True, mass=MASS, inertia=INERTIA, q=Q, r=R, lead=0.5):
     t, last = tape, tape.size if last is None else last
     return kernels.forward(
-        first, last, restart, t.time, t.kind, t.y, t.thrust, t.torque, mass, inertia, np.linalg.inv(inertia), q, r,
-        START_VARIANCE, t.xp, t.pp, t.xf, t.pf, t.gain, t.s, t.e, t.blocks, t.middle, t.loglik,
+        first, last, restart, t.time, t.kind, t.y, t.force, t.thrust, t.torque, mass, inertia, np.linalg.inv(inertia),
+        q, r, R_FORCE, lead, START_VARIANCE, t.xp, t.pp, t.xf, t.pf, t.gain, t.s, t.e, t.blocks, t.middle, t.loglik,
     )  # fmt: skip
 
 
-def backward(tape, first=0, last=None, *, mass=MASS, inertia=INERTIA, q=Q, r=R, tau=THETA[4], delay=THETA[5]):
+def backward(tape, first=0, last=None, *, mass=MASS, inertia=INERTIA, q=Q, r=R, tau=THETA[4], delay=THETA[5], lead=0.5):
     t, last = tape, tape.size if last is None else last
     kernels.backward(
-        first, last, t.time, t.kind, t.usable, t.thrust, t.torque, t.thrust_tau, t.torque_tau, t.thrust_delay,
-        t.torque_delay, tau, delay, OFFSET, mass, inertia, np.linalg.inv(inertia), q, r, t.xf, t.pf, t.gain, t.s, t.e,
-        t.blocks, t.middle, t.stats, t.moments,
+        first, last, t.time, t.kind, t.usable, t.force, t.thrust, t.torque, t.thrust_tau, t.torque_tau, t.thrust_delay,
+        t.torque_delay, tau, delay, OFFSET, mass, inertia, np.linalg.inv(inertia), q, r, R_FORCE, lead, t.xf, t.pf,
+        t.gain, t.s, t.e, t.blocks, t.middle, t.stats, t.moments,
     )  # fmt: skip
 
 
-def sensitivities(tape, theta=THETA, inertia=INERTIA):
+def sensitivities(tape, theta=THETA, inertia=INERTIA, *, lead=0.5):
     t = tape
     return kernels.sensitivities(
-        0, t.size, t.time, t.kind, t.usable, t.thrust, t.torque, t.thrust_tau, t.torque_tau, t.thrust_delay,
-        t.torque_delay, theta, UNIT, inertia, np.linalg.inv(inertia), t.xf, t.gain, t.s, t.e, t.blocks, t.middle,
-        t.score,
+        0, t.size, t.time, t.kind, t.usable, t.force, t.thrust, t.torque, t.thrust_tau, t.torque_tau, t.thrust_delay,
+        t.torque_delay, theta, UNIT, inertia, np.linalg.inv(inertia), Q, R_FORCE, lead, t.xf, t.gain, t.s, t.e,
+        t.blocks, t.middle, t.score,
     )  # fmt: skip
 
 
-def twin(tape) -> tuple[reference.Filtered, reference.Smoothed]:
+def twin(tape, *, lead=0.5) -> tuple[reference.Filtered, reference.Smoothed]:
     filtered = reference.extended_kalman_filter(
         tape.time, tape.y, tape.thrust, tape.torque, prior=reference.state_of(tape.xp[0]), prior_cov=tape.pp[0],
-        mass=MASS, inertia=INERTIA, q=Q, r=R,
+        mass=MASS, inertia=INERTIA, q=Q, r=R, lead=lead,
     )  # fmt: skip
     return filtered, reference.rauch_tung_striebel(tape.time, filtered, q=Q)
 
@@ -255,7 +256,7 @@ def displaced(name: int, step: float) -> np.ndarray:
     return theta
 
 
-def moved(seed: int, name: int, step: float) -> tuple[float, np.ndarray]:
+def moved(seed: int, name: int, step: float, *, lead: float = 0.5) -> tuple[float, np.ndarray]:
     """Log-likelihood and innovations of a filter run with one parameter moved."""
     tape = filled_tape(seed, missing=0.2)
     theta = displaced(name, step)
@@ -263,7 +264,7 @@ def moved(seed: int, name: int, step: float) -> tuple[float, np.ndarray]:
     tape.thrust += tau * tape.thrust_tau + delay * tape.thrust_delay
     tape.torque += tau * tape.torque_tau + delay * tape.torque_delay + np.array(offset)
     inertia = INERTIA + np.diag(theta[1:4] - THETA[1:4])
-    value = forward(tape, mass=theta[0], inertia=inertia)
+    value = forward(tape, mass=theta[0], inertia=inertia, lead=lead)
     return value, tape.e.copy()
 
 

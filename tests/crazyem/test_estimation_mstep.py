@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
+from scipy.stats import norm
 
 from crazyem.estimation import kernels
 from crazyem.estimation.mstep import maximise, objective
@@ -61,31 +62,36 @@ def moved(theta, origin=TRUTH):
     return np.concatenate([np.log(theta[:5] / origin[:5]), ((theta - origin) / UNIT)[5:]])
 
 
-def evaluate(theta, sums, *, free=ALL, centre=TRUTH, precision=None):
+NOTHING = np.zeros(5)
+
+
+def evaluate(theta, sums, *, free=ALL, centre=TRUTH, precision=None, known=NOTHING):
     gradient, hessian, squares = np.zeros(N), np.zeros((N, N)), np.zeros(4)
     precision = np.full(N, 0.5) if precision is None else precision
-    value = objective(theta, UNIT, sums, free, centre, precision, gradient, hessian, squares)
+    value = objective(theta, UNIT, sums, free, centre, precision, known, gradient, hessian, squares)
     return value, gradient, hessian, squares
 
 
-def solve(theta, sums, *, free=ALL, centre=TRUTH, precision=None, iterations=60):
+def solve(theta, sums, *, free=ALL, centre=TRUTH, precision=None, iterations=60, known=NOTHING):
     theta, squares = theta.copy(), np.zeros(4)
     precision = np.full(N, 1e-9) if precision is None else precision
-    maximise(theta, UNIT, sums, free, centre, precision, iterations, squares)
+    maximise(theta, UNIT, sums, free, centre, precision, known, iterations, squares)
     return theta, squares
 
 
-@given(seeds, st.lists(st.floats(-0.8, 0.8), min_size=N, max_size=N))
+@given(seeds, st.lists(st.floats(-0.8, 0.8), min_size=N, max_size=N), st.booleans())
 @settings(max_examples=25, deadline=None)
-def test_gradient_and_hessian_are_those_of_finite_differences(seed, where):
+def test_gradient_and_hessian_are_those_of_finite_differences(seed, where, known):
     sums = statistics(seed)[0]
+    sums[kernels.IMPULSE : kernels.IMPULSE + 2] = 0.3, 0.5
+    known = np.array([1e-4, 1e-9, 0.0, 2e-9, 1e-3]) if known else NOTHING
     theta = displaced(TRUTH, np.array(where))
-    _, gradient, hessian, _ = evaluate(theta, sums)
+    _, gradient, hessian, _ = evaluate(theta, sums, known=known)
     h = 1e-5
     scale = np.sqrt(np.abs(np.diag(hessian))) + 1.0
     for u in range(N):
         d = np.eye(N)[u] * h
-        (high, g_high, *_), (low, g_low, *_) = (evaluate(displaced(theta, s * d), sums) for s in (1, -1))
+        (high, g_high, *_), (low, g_low, *_) = (evaluate(displaced(theta, s * d), sums, known=known) for s in (1, -1))
         assert gradient[u] == pytest.approx((high - low) / (2 * h), rel=1e-4, abs=1e-4 * scale[u])
         numeric = (g_high - g_low) / (2 * h)
         np.testing.assert_allclose(hessian[u] / scale[u] / scale, numeric / scale[u] / scale, atol=1e-5)
@@ -106,6 +112,23 @@ def test_objective_is_the_expected_log_likelihood_written_out():
         return -n * np.log(mass) + n / 2 * np.log(squares)
 
     assert ours == pytest.approx(written_out(0.04) - written_out(0.03), rel=1e-9)
+
+
+def test_objective_with_known_noise_is_the_expected_log_likelihood_written_out():
+    """Every step adds log N(F - m a; 0, s^2 / dt) + log m, and a lateral acceleration likewise, all in newtons."""
+    sums, acceleration, thrust = statistics(1, lag=False)
+    sums[kernels.IMPULSE : kernels.IMPULSE + 2] = 0.3, 0.5
+    n, s, lateral = sums[kernels.COUNT], 2e-3, 5e-4
+    heavy, light = TRUTH.copy(), TRUTH.copy()
+    heavy[0], light[0] = 0.04, 0.03
+    known = np.array([s**2, 0.0, 0.0, 0.0, lateral**2])
+    values = [evaluate(theta, sums, precision=np.zeros(N), known=known)[0] for theta in (heavy, light)]
+
+    def written_out(mass):
+        along = norm.logpdf(mass * acceleration - thrust, scale=s / 0.1) + np.log(mass)  # a step is 0.01 s
+        return -along.sum() - 2 * n * np.log(mass) + 0.5 * mass**2 * 0.8 / lateral**2
+
+    assert values[0] - values[1] == pytest.approx(written_out(0.04) - written_out(0.03), rel=1e-9)
 
 
 @given(seeds)
@@ -191,3 +214,13 @@ def test_recovers_the_truth_within_its_curvature():
     rms = np.sqrt(np.mean(np.square(errors), 0))
     assert np.all(rms < 1.6)
     assert np.all(rms > 0.4)
+
+
+def test_statistics_of_states_that_diverged_move_nothing() -> None:
+    """Without any attitude a filter may diverge; its infinite sums must not become a singular matrix."""
+    for bad in (np.nan, np.inf):
+        theta = TRUTH.copy()
+        sums = np.full(kernels.SIZE, bad)
+        sums[kernels.COUNT] = 400.0
+        maximise(theta, UNIT, sums, ALL, TRUTH, np.ones(N), np.zeros(5), 30, np.zeros(4))
+        np.testing.assert_array_equal(theta, TRUTH)

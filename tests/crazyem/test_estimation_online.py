@@ -254,6 +254,17 @@ def test_a_long_flight_through_a_small_window(flight):
     within(estimates[-1], "mass", TRUTH.mass)
 
 
+def test_updates_rarer_than_the_tape_is_long(flight):
+    """Rows fall off the tape before an update is due; nothing is written beyond its end, and the last window counts."""
+    rare, often = (OnlineEstimator(LAGGED, window=60, every=every) for every in (20_000, 5))
+    longer = synthetic.fly(TRUTH, seed=3, duration=10.0)
+    assert feed(rare, synthetic.samples(longer)) == []
+    feed(often, synthetic.samples(longer))
+    one, other = rare.finish(), often.finish()
+    assert one.samples == 60
+    assert one["mass"].value == pytest.approx(other["mass"].value, abs=0.5 * other["mass"].sd)
+
+
 @pytest.mark.parametrize(("arguments", "word"), [
     ({"window": 3}, "window"), ({"every": 0}, "every 0"), ({"input_signal": "throttle"}, "throttle"),
 ])  # fmt: skip

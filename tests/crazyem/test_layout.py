@@ -1,14 +1,19 @@
 """The viewer's layout: every path in it is in the messages we write, every panel is placed, once."""
 
+import argparse
 import json
 import re
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from test_mcap_signals import flight
 
+from crazyem.commands import layout as command
+from crazyem.errors import UsageError
 from crazyem.live.session import block_plan
 from crazyem.recordings.mcap import schemas
-from crazyem.recordings.mcap.layout import foxglove_layout, topics_of
+from crazyem.recordings.mcap.layout import foxglove_layout, swarm_layout, topics_of
 from crazyem.recordings.mcap.messages import EVENTS
 from crazyem.recordings.mcap.signals import write_recording
 from crazyem.recordings.mcap.survey import from_summary
@@ -112,3 +117,59 @@ def test_topics_of_log_blocks():
     ]
     assert topics_of(announced) == {"/log/3": ["firmware_time_ms", "host_time", "pm_vbatMV"]}
     assert "/log/3.pm_vbatMV" in paths(foxglove_layout(topics_of(announced)))
+
+
+NAMES = st.lists(st.from_regex(r"[A-Za-z0-9_-]{1,12}", fullmatch=True), min_size=1, max_size=6, unique=True)
+
+
+@settings(max_examples=20, deadline=None)
+@given(NAMES)
+def test_every_drone_of_a_swarm_has_every_panel_of_a_single_one(names):
+    layout = json.loads(json.dumps(swarm_layout(names), allow_nan=False))
+    panels, tabs = layout["configById"], layout["configById"]["Tab!drones"]["tabs"]
+    assert [tab["title"] for tab in tabs] == ["All", *names]
+    alone = foxglove_layout()["configById"]
+    for tab, name in zip(tabs[1:], names, strict=True):
+        shown = placed(tab["layout"])
+        assert len(shown) == sum(not key.startswith(("3D", "Tab")) for key in alone)
+        own = [p["value"] for key in shown for p in panels[key].get("paths", ())]
+        assert sorted(own) == sorted(f"/{name}{path}" for path in paths({"configById": alone}))
+        others = {panels[key].get(field) for key in shown for field in ("topicPath", "topicToRender")} - {None}
+        assert others == {f"/{name}/estimate", f"/{name}/events"}
+        assert f"/{name}/pose" in panels["3D!pose"]["topics"]
+        assert f"frame:{name}" in panels["3D!pose"]["transforms"]
+
+
+def test_panels_of_a_swarm_are_placed_once_and_no_tab_is_inside_another():
+    layout = swarm_layout(["alpha", "beta-2"])
+    shown = placed(layout["layout"])
+    for tab in layout["configById"]["Tab!drones"]["tabs"]:
+        inside = placed(tab["layout"])
+        assert not [name for name in inside if name.startswith("Tab!")]
+        shown += inside
+    assert sorted(shown) == sorted(layout["configById"])
+    for path in paths(layout):
+        drone, _, rest = path[1:].partition("/")
+        assert drone in {"alpha", "beta-2"}
+        match = PATH.fullmatch(f"/{rest}")
+        if not match["topic"].startswith("/log/"):
+            assert resolve(descriptor_of(match["topic"]), match["fields"]).type in (1, 3, 5), path
+
+
+def test_the_command_takes_names_from_words_or_a_swarm_file(tmp_path, capsys):
+    def told(**given):
+        words = {"output": None, "json": None, "force": False, "drones": None, "swarm": None, **given}
+        assert command.run(argparse.Namespace(**words)) == 0
+        return json.loads(capsys.readouterr().out)
+
+    swarm = tmp_path / "swarm.toml"
+    swarm.write_text('[[drone]]\nname = "left"\nuri = "udp://127.0.0.1:1"\n[[drone]]\nuri = "udp://127.0.0.1:2"\n')
+    assert told(swarm=str(swarm)) == swarm_layout(["left", "drone1"])
+    assert told(drones=["a", "b"]) == swarm_layout(["a", "b"])
+    assert told() == foxglove_layout()
+    for words in ({"drones": ["a", "a"]}, {"drones": ["a/b"]}, {"drones": ["a"], "swarm": str(swarm)}):
+        with pytest.raises(UsageError):
+            told(**words)
+    for names in ([], ["a", "a"]):
+        with pytest.raises(ValueError, match="of their own"):
+            swarm_layout(names)

@@ -72,6 +72,36 @@ def test_clock_relation_finds_offset_and_rate(rate):
     assert fit.packets == 6000
 
 
+@pytest.mark.parametrize("rate", [1.0, 0.125])
+def test_a_clock_that_stood_still_does_not_bend_the_relation(rate):
+    """A simulator denied the processor for two seconds, twice: afterwards packets are as punctual as before."""
+    rng = np.random.default_rng(4)
+    relation = ClockRelation()
+    firmware = 10 * np.arange(4000)
+    stalls = 2.0 * (firmware > 3000) + 2.0 * (firmware > 22_000)
+    host = 1.7e9 + rate * firmware / 1000.0 + stalls + rng.exponential(0.003, firmware.size)
+    for f, h in zip(firmware, host, strict=True):
+        relation.add(int(f), float(h))
+        if f % 200 == 0:
+            relation.fit()
+    fit = relation.fit()
+    assert fit.rate == pytest.approx(rate, abs=2e-4)
+    assert fit.to_host(39_000) == pytest.approx(1.7e9 + rate * 39.0 + 4.0, abs=0.01)
+    assert fit.delay < 0.05
+
+
+def test_a_delay_that_passes_is_no_stall():
+    relation = ClockRelation()
+    for n in range(3000):
+        late = 0.6 if 1000 <= n < 1300 else 0.0  # three seconds of a link that is behind
+        relation.add(10 * n, 1.7e9 + n / 100.0 + late)
+        if n % 20 == 0:
+            relation.fit()
+    fit = relation.fit()
+    assert fit.rate == pytest.approx(1.0, abs=0.02)
+    assert fit.to_host(5_000) == pytest.approx(1.7e9 + 5.0, abs=0.2)
+
+
 def test_real_blocks_lose_what_their_stamps_say(shared_recordings):
     """The real firmware's stamps: 22 s at 100 Hz; the file itself shows which slots are empty."""
     import csv

@@ -136,7 +136,8 @@ LOSSES = [
 
 @pytest.mark.parametrize(("prefix", "message"), LOSSES)
 def test_a_reply_lost_while_connecting_is_an_error_not_a_hang(fake_peer, monkeypatch, prefix, message):
-    monkeypatch.setattr("crazyem.links.connecting.SILENCE_LIMIT", 0.4)
+    # Long enough that a busy host's pause is not taken for the drone's silence.
+    monkeypatch.setattr("crazyem.links.connecting.SILENCE_LIMIT", 0.8)
     fake_peer.lose = lambda request: bytes([request[0] | 0x0C]) + request[1 : len(prefix)] == prefix
     link = CrazyflieLink(fake_peer.uri)
     with pytest.raises(LinkError, match=message) as caught:

@@ -78,12 +78,27 @@ def test_limits_have_one_sentence_each():
         pack(["gyro.X"], TYPES, 10)
 
 
-@pytest.mark.parametrize(("rate", "period"), [(100, 10), (50, 20), (99.0, 10), (30, 30), (1, 1000), (0.4, 2500)])
+@pytest.mark.parametrize(
+    ("rate", "period"),
+    [
+        (100, 10),
+        (50, 20),
+        (99.0, 10),
+        (30, 30),
+        (1, 1000),
+        (0.4, 2500),
+        (101, 10),
+        (200, 5),
+        (333, 3),
+        (500, 2),
+        (1000, 1),
+    ],
+)
 def test_periods(rate, period):
     assert period_of(rate) == period
 
 
-@pytest.mark.parametrize("rate", [0, -1, 500, 0.1, float("nan")])
+@pytest.mark.parametrize("rate", [0, -1, 1001, 5000, 0.1, float("nan"), float("inf")])
 def test_rates_the_firmware_cannot_log(rate):
     with pytest.raises(UsageError, match="Hz"):
         period_of(rate)

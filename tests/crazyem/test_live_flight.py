@@ -72,7 +72,7 @@ def test_a_whole_flight_pushes_and_lands():
     link = fake.FakeLink()
     run = Run(link, plan(hover))
     run()
-    assert order(link) == ["release", "take_off", "setpoint", "release", "land", "stop"]
+    assert order(link) == ["release", "take_off", "setpoint", *3 * ["land", "release"], "stop"]
     assert landed(link)
     assert link.values["stabilizer.controller"] == 5
     assert link.values["ctrlLee.mass"] == pytest.approx(0.036, rel=0.005)
@@ -112,7 +112,9 @@ def test_an_unconfirmed_write_ends_pushing_but_not_the_flight():
     run = Run(link, plan(hover, duration=8.0))
     run()
     pushes = run.session.history.pushes
-    assert [p.verified for p in pushes] == [True, True, False]
+    assert [p.verified for p in pushes] == [True, True, False, False]
+    assert pushes[3].purpose == "undo"  # of the half-written set: tried, and reported
+    assert pushes[3].parameter == pushes[0].parameter == "ctrlLee.mass"
     assert any("not confirmed" in n for n in run.session.history.notices)
     assert landed(link)
 
@@ -138,7 +140,7 @@ def test_first_interrupt_lands():
     link = fake.FakeLink()
     with pytest.raises(FlightInterruptedError):
         Run(link, plan(duration=60.0), interrupt_at=(8000,))()
-    assert order(link)[-3:] == ["release", "land", "stop"]
+    assert order(link)[-3:] == ["land", "release", "stop"]
     assert landed(link)
 
 

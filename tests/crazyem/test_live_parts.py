@@ -4,6 +4,7 @@ import json
 import math
 import random
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
 from crazyem.live.clock import FirmwareClock
 from crazyem.live.guard import Decision
-from crazyem.live.history import SETTLE, History, Push
+from crazyem.live.history import KEPT, SETTLE, History, Push, Track
 from crazyem.live.pipeline import Pipeline
 from crazyem.live.plot import write_plot
 from crazyem.live.push import Pusher
@@ -123,6 +124,17 @@ def test_plot_is_written_even_with_next_to_nothing(tmp_path):
         write_plot(tmp_path / "no" / "p.png", history, load_vehicle("cf2"), title="t")
 
 
+def test_a_long_flight_keeps_the_newest_estimates_and_fewer_of_the_old_ones():
+    history, count = History(), 5 * KEPT
+    for k in range(count):
+        history.keep(replace(estimate(), time=float(k)))
+    times = [e.time for e in history.estimates]
+    assert len(times) <= KEPT
+    assert times == sorted(times)
+    assert times[0] == 0.0
+    assert times[-KEPT // 2 :] == list(range(count - KEPT // 2, count))
+
+
 def test_pipeline_needs_nothing_but_samples():
     class Echo:
         airborne = True
@@ -195,3 +207,15 @@ def test_a_fault_while_pushing_is_named_and_ends_the_pushing():
     pusher.close()
     assert [p.verified for p in history.pushes] == [False]  # the second write was never tried
     assert "a fault nobody foresaw" in guard.stopped
+
+
+@pytest.mark.parametrize("count", [0, 7, 8, 9, 40, 1000])
+def test_a_track_is_thinned_evenly_and_never_grows_beyond_its_rows(count):
+    track = Track(rows=8)
+    for k in range(count):
+        track.add(0.01 * k, (k, 2 * k, 3 * k))
+        assert len(track.array()) < 8
+    times = track.array()[:, 0]
+    every = next((2**j for j in range(20) if count <= 8 * 2**j - 2**j), 1)  # the least that leaves fewer than 8 rows
+    assert times == pytest.approx(0.01 * np.arange(0, count, every))
+    np.testing.assert_array_equal(track.array()[:, 2], 2 * track.array()[:, 1])

@@ -90,6 +90,7 @@ def test_bad_scenario_is_one_sentence_naming_the_key(tmp_path, capsys):
     assert "mas" in said
 
 
+@pytest.mark.slow
 def test_drone_lost_in_flight_leaves_a_readable_recording(tmp_path, simulator):
     drone = simulator("--speed", "3")
     process = start("fly", drone.uri, "--duration", "30", "--record", "lost.mcap", "--json", "lost.json", cwd=tmp_path)
@@ -104,6 +105,7 @@ def test_drone_lost_in_flight_leaves_a_readable_recording(tmp_path, simulator):
     assert any("lost" in n for n in json.loads((tmp_path / "lost.json").read_text())["notices"])
 
 
+@pytest.mark.slow
 def test_interrupt_lands_and_still_reports(tmp_path, simulator):
     drone = simulator("--speed", "4", "--truth", str(tmp_path / "truth.csv"))
     process = start("fly", drone.uri, "--duration", "60", "--json", "cut.json", cwd=tmp_path)

@@ -1,30 +1,47 @@
-"""The graphical client, without a screen, accepts the simulator (in an environment of its own: CFCLIENT_PYTHON)."""
+"""The graphical client, without a screen, accepts the simulator (in an environment of its own: CFCLIENT_PYTHON).
 
+Directly, and behind the relay with what unmodified cflib can bear: log data lost, doubled, out of order. A single lost
+reply would hang it (crtp.md 7), whoever the drone is.
+"""
+
+import contextlib
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 CHECK = Path(__file__).parents[2] / "benchmarks" / "cfclient_check.py"
+FAULTS = ["--drop", "0.05", "--burst", "2", "--duplicate", "0.02", "--reorder", "0.02", "--kinds", "log.data"]
+
+
+@contextlib.contextmanager
+def running(*module: str) -> Iterator[str]:
+    """A simulator or relay as a process: its URI."""
+    with subprocess.Popen([sys.executable, "-m", *module], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            yield process.stdout.readline().split()[1]
+        finally:
+            process.terminate()
 
 
 @pytest.mark.slow
-def test_cfclient_reaches_fully_connected_without_an_exception():
+@pytest.mark.parametrize("behind_the_relay", [False, True])
+def test_cfclient_reaches_fully_connected_without_an_exception(behind_the_relay: bool) -> None:
     python = os.environ.get("CFCLIENT_PYTHON")
     if not python:
         pytest.skip("CFCLIENT_PYTHON does not name the interpreter of an environment with cfclient")
     if subprocess.run([python, "-c", "import cfclient, PyQt6.QtWidgets"], capture_output=True, check=False).returncode:
         pytest.skip(f"{python} cannot import cfclient")
-    command = [sys.executable, "-m", "firmware_sim", "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as simulator:
-        try:
-            uri = simulator.stdout.readline().split()[1]
-            result = subprocess.run(
-                [python, str(CHECK), uri, "--seconds", "3"], capture_output=True, text=True, timeout=180, check=False
-            )
-        finally:
-            simulator.terminate()
+    with contextlib.ExitStack() as stack:
+        uri = stack.enter_context(running("firmware_sim", "--port", "0"))
+        if behind_the_relay:
+            uri = stack.enter_context(running("firmware_sim.relay", uri, *FAULTS))
+        result = subprocess.run(
+            [python, str(CHECK), uri, "--seconds", "3"], capture_output=True, text=True, timeout=180, check=False
+        )
     assert result.returncode == 0, result.stdout + result.stderr
     assert "fully connected" in result.stdout

@@ -1,6 +1,7 @@
 """Unmodified cflib against the simulator process: scan, connect, log, parameters, memory, flights, a second client."""
 
 import contextlib
+import json
 import os
 import queue
 import subprocess
@@ -246,3 +247,66 @@ def test_a_brushless_drone_needs_arming(tmp_path):
         fly(cf)
         cf.high_level_commander.takeoff(0.5, 1.5)
         wait_until(lambda: height(cf) == pytest.approx(0.5, abs=0.05))
+
+
+# What unmodified cflib can bear: late packets of every kind, log data that is lost, doubled or out of order. A single
+# lost reply hangs it for ever (crtp.md 7), which is why crazyem puts a courier between (tests/crazyem/test_links_*).
+LIGHT_FAULTS = """
+seed = 7
+[[fault]]
+what = "delay"
+ms = 1.0
+jitter_ms = 2.0
+[[fault]]
+what = "drop"
+rate = 0.05
+burst = 2.0
+kinds = ["log.data"]
+[[fault]]
+what = "duplicate"
+rate = 0.02
+kinds = ["log.data"]
+[[fault]]
+what = "reorder"
+rate = 0.02
+kinds = ["log.data"]
+"""
+
+
+@contextlib.contextmanager
+def relay(target, schedule):
+    """The fault relay in front of a simulator: its URI."""
+    command = [sys.executable, "-m", "firmware_sim.relay", target, "--schedule", str(schedule), "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process.stdout.readline().split()[1], process
+        finally:
+            process.terminate()
+
+
+@pytest.mark.slow
+def test_unmodified_cflib_connects_logs_writes_and_flies_behind_the_relay(tmp_path):
+    schedule = tmp_path / "light.toml"
+    schedule.write_text(LIGHT_FAULTS)
+    with simulator("--speed", str(SPEED)) as drone, relay(drone, schedule) as (uri, process):
+        with connected(uri) as cf:
+            blocks = {
+                "state": [f"stateEstimateZ.{n}" for n in ("x", "y", "z", "vx", "vy", "vz", "quat")],
+                "motors": [*(f"motor.m{n}" for n in range(1, 5)), "pm.vbatMV", "supervisor.info"],
+            }
+            data = collect(cf, blocks, 200)
+            stamps = [stamp for stamp, _ in data["state"]]
+            assert len(set(stamps)) < len(stamps)  # some came twice
+            assert max(stamps) - min(stamps) > 2000  # and some never
+            for n in range(20):
+                cf.param.set_value("supervisor.landedTimeout", str(3000 + n))
+            wait_until(lambda: cf.param.get_value("supervisor.landedTimeout") == "3019")
+            fly(cf)
+            cf.high_level_commander.takeoff(0.6, 1.5)
+            wait_until(lambda: height(cf) == pytest.approx(0.6, abs=0.05))
+            cf.high_level_commander.land(0.0, 1.5)
+            wait_until(lambda: not cf.supervisor.is_flying)
+        process.terminate()
+        account = json.loads(process.communicate(timeout=TIMEOUT)[0])
+    assert account["harmed"]["down"]["log.data"] > 20
+    assert account["harmed"]["down"].keys() >= {"param.toc", "param.write"}  # delayed

@@ -1,5 +1,9 @@
 """Power distribution: undone by the host's formulas it must give back what the controller asked for."""
 
+import csv
+import gzip
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -7,10 +11,13 @@ from hypothesis import strategies as st
 
 from firmware_sim.controllers import layout as mem
 from firmware_sim.controllers import parameters, variables
+from firmware_sim.controllers.externalise import log_rotor_speed
 from firmware_sim.controllers.power_distribution import motor_volts, motors_step
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.platforms import PLATFORMS
 from firmware_sim.scenario import Scenario
+
+NANODRONE = Path(__file__).resolve().parents[3] / "shared" / "recordings" / "nanodrone" / "raw"
 
 
 class Board:
@@ -115,7 +122,8 @@ def test_idle_thrust_only_where_arming_is_required() -> None:
     brushed, brushless = Board("cf2"), Board("cf21bl")
     brushed.param[parameters.IDLE_THRUST] = 9000
     assert brushed.run(allowed=False).tolist() == [0] * 4
-    assert brushless.run(allowed=False, armed=True).tolist() == [7000] * 4
+    assert brushless.run().tolist() == [7000] * 4
+    assert brushless.run(allowed=False, armed=True).tolist() == [0] * 4  # stopped is stopped
     assert brushless.run(allowed=True, armed=False).tolist() == [0] * 4
     brushless.param[parameters.IDLE_THRUST] = 3000
     assert brushless.run().tolist() == [3000] * 4
@@ -134,3 +142,38 @@ def test_motor_power_set_overrides_the_controller() -> None:
 
 def test_what_is_not_a_number_stops_the_motors() -> None:
     assert Board().ask(float("nan"), (0, 0, 0)).tolist() == [0, 0, 0, 0]
+
+
+@pytest.mark.skipif(not NANODRONE.is_dir(), reason="the shared recordings are not beside this checkout")
+def test_rotors_at_rest_turn_as_fast_as_those_of_real_brushless_drones() -> None:
+    """Idle stretches (duty 10000/65535 on all four) of the raw runs: median speed against ours at that voltage."""
+    board, ratios = Board("cf21bl"), []
+    for path in sorted(NANODRONE.glob("*.csv.gz")):
+        with gzip.open(path, "rt") as file:
+            rows = list(csv.DictReader(file))
+        idle = [all(abs(float(r[f"m{i}_thrust"] or "nan") - 10000 / 65535) < 2e-4 for i in range(1, 5)) for r in rows]
+        edges = np.flatnonzero(np.diff([0, *idle, 0]))
+        for a, b in zip(edges[::2], edges[1::2], strict=True):
+            if b - a < 60:
+                continue
+            part = rows[a + 40 : b]  # spun down
+            real = np.array([float(r[f"m{i}_erpm"] or 65535) / 6 for r in part for i in range(1, 5)])
+            volts = np.median([float(r["Vbat"]) for r in part if r["Vbat"]]) * 10000 / 65535
+            truth = np.zeros(at.TRUTH_SIZE)
+            truth[at.ROTOR_CONSTANT], truth[at.RPM_SCALE : at.RPM_SCALE + 4] = board.constants.rotor_constant, 1.0
+            board.state[at.ROTOR : at.ROTOR + 4] = np.polynomial.polynomial.polyval(volts, board.constants.curve)
+            log_rotor_speed(truth, board.board, board.state, board.log)
+            ratios.append(np.median(real[real < 10000]) / board.log[variables.RPM])
+    assert len(ratios) == 11
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.01)
+    assert np.std(ratios) < 0.01
+
+
+def test_reported_speeds_are_the_thrust_law_in_flight() -> None:
+    board = Board("cf21bl")
+    truth = np.zeros(at.TRUTH_SIZE)
+    truth[at.ROTOR_CONSTANT], truth[at.RPM_SCALE : at.RPM_SCALE + 4] = 3.72e-8, 1.0
+    for thrust in (board.constants.thrust_min, 0.1, 0.2):
+        board.state[at.ROTOR : at.ROTOR + 4] = thrust
+        log_rotor_speed(truth, board.board, board.state, board.log)
+        assert board.log[variables.RPM] == int(np.sqrt(thrust / 3.72e-8) * 30 / np.pi)

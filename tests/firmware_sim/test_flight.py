@@ -108,8 +108,10 @@ def test_follows_yaw_and_velocity(controller: int) -> None:
     s[sp.VX], s[sp.VY], s[sp.VELOCITY_BODY], s[sp.RATE_YAW] = 0.0, 0.2, 1.0, 0.0
     for _ in range(2000):
         flight.step()
-    if controller == 2:  # as in the firmware, Mellinger under velocity control only brakes towards the velocity
-        assert flight.state[at.VEL + 1] > 0.1
+    if controller == 2:  # as in the firmware, Mellinger takes no velocities: it stays level
+        assert abs(flight.state[at.VEL + 1]) < 0.1
+    elif controller == 5:  # and Lee adds them to its pull towards the place
+        assert flight.state[at.POS + 1] == pytest.approx(4.0 * 0.2 / 7.0, abs=0.01)  # Kpos_D v = Kpos_P y
     else:
         assert flight.state[at.VEL : at.VEL + 2] == pytest.approx([0.0, 0.2], abs=0.08)
     before = read(flight, "stabilizer.yaw")

@@ -1,4 +1,4 @@
-"""Compiled inner loops of the estimator: extended Kalman filter, smoother, statistics, innovation sensitivities.
+"""Compiled inner loops of the estimator: Kalman filter, smoother, statistics, sensitivities, noise information.
 
 All matrices are 12 x 12 or smaller, so everything is explicit loops over contiguous rows. Every measured
 quantity is one component of the error state (position, velocity, attitude error, body rate), so measurements
@@ -16,6 +16,7 @@ from crazyem.estimation.kernels.filter import forward
 from crazyem.estimation.kernels.layout import (
     AXIS,
     AXIS_SIZE,
+    BRIDGE,
     COUNT,
     DELAY,
     IMPULSE,
@@ -29,12 +30,14 @@ from crazyem.estimation.kernels.layout import (
     RESIDUAL_SEEN,
     SIZE,
 )
+from crazyem.estimation.kernels.noise import noise_information
 from crazyem.estimation.kernels.sensitivity import sensitivities
 from crazyem.estimation.kernels.smoother import backward, total
 
 __all__ = [
     "AXIS",
     "AXIS_SIZE",
+    "BRIDGE",
     "COUNT",
     "DELAY",
     "IMPULSE",
@@ -49,6 +52,7 @@ __all__ = [
     "SIZE",
     "backward",
     "forward",
+    "noise_information",
     "sensitivities",
     "total",
 ]

@@ -3,6 +3,7 @@
 import numpy as np
 
 from crazyem.compiled import compiled
+from crazyem.physics.rigid_body import UPRIGHT
 
 
 @compiled
@@ -86,10 +87,97 @@ def rate_jacobian(w, inertia, inverse, dt, out):
 
 
 @compiled
-def apply(blocks, dt, x, out):
-    """out = Phi x for x (12, n); blocks are dv/dtheta, dv/dw, dtheta/dtheta, dtheta/dw, dw/dw of the transition."""
+def right_jacobian(phi, out):
+    """d log(exp(phi)^-1 exp(phi + d)) / dd to second order in phi, as in physics/rigid_body.py."""
+    x0, x1, x2 = phi[0], phi[1], phi[2]
+    n2 = x0 * x0 + x1 * x1 + x2 * x2
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = phi[i] * phi[j] / 6.0
+        out[i, i] += 1.0 - n2 / 6.0
+    out[0, 1] += 0.5 * x2
+    out[0, 2] -= 0.5 * x1
+    out[1, 0] -= 0.5 * x2
+    out[1, 2] += 0.5 * x0
+    out[2, 0] += 0.5 * x1
+    out[2, 1] -= 0.5 * x0
+
+
+@compiled
+def explicit_turn(q, start, w, dt, out, by_attitude, by_rate):
+    """Attitude `out` when dt times their derivatives are added to roll, pitch and yaw, with its Jacobian blocks.
+
+    start (3, 3) is the rotation matrix of q. Returns False, and does nothing, near a pitch of a right angle. No angle
+    is needed: out = Rz(dyaw) Rq Rx(-roll) Ry(dpitch) Rx(roll) Rx(droll), the turns about y and x taken in the body.
+    """
+    sp = -start[2, 0]
+    cp = np.sqrt(start[2, 1] ** 2 + start[2, 2] ** 2)
+    if cp <= UPRIGHT:
+        return False
+    sr, cr = start[2, 1] / cp, start[2, 2] / cp
+    along, across = sr * w[1] + cr * w[2], cr * w[1] - sr * w[2]
+    turn = np.empty(3)
+    part = np.empty(4)
+    turn[0], turn[1], turn[2] = 0.0, 0.0, along / cp
+    half_turn(turn, dt, part)
+    product(part, q, out)
+    turn[0], turn[1], turn[2] = 0.0, across * cr, -across * sr
+    half_turn(turn, dt, part)
+    product(out, part, out)
+    turn[0], turn[1], turn[2] = w[0] + sp / cp * along, 0.0, 0.0
+    half_turn(turn, dt, part)
+    product(out, part, out)
+    # sines and cosines of roll and pitch afterwards
+    sp1 = -2 * (out[0] * out[2] - out[1] * out[3])
+    r21, r22 = 2 * (out[1] * out[2] + out[0] * out[3]), 1 - 2 * (out[0] * out[0] + out[1] * out[1])
+    cp1 = np.sqrt(r21 * r21 + r22 * r22)
+    sr1, cr1 = r21 / cp1, r22 / cp1
+    for j in range(3):
+        # derivatives of the angles by body error j, of the angles afterwards by it, and of the error afterwards
+        roll = 1.0 if j == 0 else (sr if j == 1 else cr) * sp / cp
+        pitch = 0.0 if j == 0 else (cr if j == 1 else -sr)
+        yaw = 0.0 if j == 0 else (sr if j == 1 else cr) / cp
+        by_rate[0, j] = dt * (roll - sp1 * yaw)
+        by_rate[1, j] = dt * (cr1 * pitch + sr1 * cp1 * yaw)
+        by_rate[2, j] = dt * (cr1 * cp1 * yaw - sr1 * pitch)
+        roll1 = roll + dt * (across * sp / cp * roll + along / (cp * cp) * pitch)
+        pitch1 = pitch - dt * along * roll
+        yaw1 = yaw + dt * (across / cp * roll + along * sp / (cp * cp) * pitch)
+        by_attitude[0, j] = roll1 - sp1 * yaw1
+        by_attitude[1, j] = cr1 * pitch1 + sr1 * cp1 * yaw1
+        by_attitude[2, j] = cr1 * cp1 * yaw1 - sr1 * pitch1
+    return True
+
+
+@compiled
+def specific_force(model, measured, q, dt, r_force, mean, left):
+    """Specific force of a step, given what an accelerometer says of its mean; returns the log-likelihood of that.
+
+    The measurement is model + u/dt + noise with u ~ N(0, q dt) independent of all that the filter knows, so each axis
+    is conditioned on its own. model (3,), measured (3,; NaN: not measured) and mean (3,) in m/s^2; left (3,) receives
+    the intensity of the impulse that is still unknown, q and left in (m/s)^2/s.
+    """
+    loglik = 0.0
+    for i in range(3):
+        mean[i] = model[i]
+        left[i] = q[i]
+        if not np.isnan(measured[i]):
+            var = q[i] / dt + r_force
+            err = measured[i] - model[i]
+            mean[i] += q[i] / dt * err / var
+            left[i] = q[i] * r_force / var
+            loglik -= 0.5 * (np.log(2 * np.pi * var) + err * err / var)
+    return loglik
+
+
+@compiled
+def apply(blocks, dt, h, x, out):
+    """out = Phi x for x (12, n); blocks are dv/dtheta, dv/dw, dtheta/dtheta, dtheta/dw, dw/dw of the transition.
+
+    h = lead dt: p' = p + (dt - h) v + h v'.
+    """
     n = x.shape[1]
-    h = 0.5 * dt
+    rest = dt - h
     for i in range(3):
         a0, a1, a2 = blocks[0, i, 0], blocks[0, i, 1], blocks[0, i, 2]
         b0, b1, b2 = blocks[1, i, 0], blocks[1, i, 1], blocks[1, i, 2]
@@ -100,17 +188,16 @@ def apply(blocks, dt, x, out):
             t0, t1, t2 = x[6, j], x[7, j], x[8, j]
             w0, w1, w2 = x[9, j], x[10, j], x[11, j]
             v = x[3 + i, j] + a0 * t0 + a1 * t1 + a2 * t2 + b0 * w0 + b1 * w1 + b2 * w2
-            out[i, j] = x[i, j] + h * (x[3 + i, j] + v)
+            out[i, j] = x[i, j] + rest * x[3 + i, j] + h * v
             out[3 + i, j] = v
             out[6 + i, j] = c0 * t0 + c1 * t1 + c2 * t2 + d0 * w0 + d1 * w1 + d2 * w2
             out[9 + i, j] = e0 * w0 + e1 * w1 + e2 * w2
 
 
 @compiled
-def apply_transposed(blocks, dt, x, out):
+def apply_transposed(blocks, dt, h, x, out):
     """out = Phi' x for x (12, n)."""
     n = x.shape[1]
-    h = 0.5 * dt
     for i in range(3):
         a0, a1, a2 = blocks[0, 0, i], blocks[0, 1, i], blocks[0, 2, i]
         b0, b1, b2 = blocks[1, 0, i], blocks[1, 1, i], blocks[1, 2, i]

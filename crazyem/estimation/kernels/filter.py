@@ -6,23 +6,27 @@ from crazyem.compiled import compiled
 from crazyem.estimation.kernels.algebra import (
     angular_acceleration,
     apply,
+    explicit_turn,
     half_turn,
     log,
     matrix,
     product,
     rate_jacobian,
+    right_jacobian,
+    specific_force,
 )
 from crazyem.vehicle import GRAVITY
 
 
 @compiled
-def forward(first, last, restart, time, kind, y, thrust, torque, mass, inertia, inverse, q, r, p0,
-            xp, pp, xf, pf, gain, s, e, blocks, middle, loglik):  # fmt: skip
+def forward(first, last, restart, time, kind, y, force, thrust, torque, mass, inertia, inverse, q, r, r_force, lead,
+            p0, xp, pp, xf, pf, gain, s, e, blocks, middle, loglik):  # fmt: skip
     """Extended Kalman filter over samples first..last-1, written into the tape arrays; returns the log-likelihood.
 
     A sample k is predicted from k - 1 with thrust[k], torque[k] (means over the step that ends at k), except where
     kind[k] == 1 (a break: the state starts anew at the measurement with variances p0) and at k == first with restart
-    (the prior xp[first], pp[first] stands as it is). Missing measurements are NaN in y.
+    (the prior xp[first], pp[first] stands as it is). Missing measurements are NaN in y and force. `lead` is the
+    rule of integration (physics/rigid_body.py).
     """
     cov = np.empty((12, 12))
     tmp = np.empty((12, 12))
@@ -31,6 +35,9 @@ def forward(first, last, restart, time, kind, y, thrust, torque, mass, inertia, 
     turn = np.empty((3, 3))
     start = np.empty((3, 3))
     alpha = np.empty(3)
+    model = np.zeros(3)
+    f = np.empty(3)
+    left = np.empty(3)
     phi = np.empty(3)
     correction = np.empty(12)
     innov = np.empty(12)
@@ -38,6 +45,7 @@ def forward(first, last, restart, time, kind, y, thrust, torque, mass, inertia, 
     total = 0.0
     for k in range(first, last):
         x = xp[k]
+        ll = 0.0
         if kind[k] == 1:
             for i in range(13):
                 x[i] = y[k, i] if not np.isnan(y[k, i]) else (xf[k - 1, i] if k > 0 else 0.0)
@@ -57,8 +65,10 @@ def forward(first, last, restart, time, kind, y, thrust, torque, mass, inertia, 
                     cov[i, j] = pp[k, i, j]
         else:
             dt = time[k] - time[k - 1]
-            h = 0.5 * dt
-            bridge = dt * dt / 12.0  # what white noise does to position and attitude between its values at both ends
+            h = lead * dt
+            rest = dt - h
+            # what white noise does to position and attitude between its values at both ends of a step
+            bridge = dt * dt / 12.0 if lead == 0.5 else 0.0
             w = xf[k - 1, 10:13]
             b = blocks[k]
             # mean
@@ -68,59 +78,55 @@ def forward(first, last, restart, time, kind, y, thrust, torque, mass, inertia, 
             for i in range(3):
                 for j in range(3):
                     middle[k, i, j] = start[i, 0] * turn[0, j] + start[i, 1] * turn[1, j] + start[i, 2] * turn[2, j]
-            acc = thrust[k] / mass
+            model[2] = thrust[k] / mass
+            ll = specific_force(model, force[k], q, dt, r_force, f, left)
             angular_acceleration(w, torque[k], inertia, inverse, alpha)
             for i in range(3):
-                a = middle[k, i, 2] * acc
+                a = middle[k, i, 0] * f[0] + middle[k, i, 1] * f[1] + middle[k, i, 2] * f[2]
                 if i == 2:
                     a -= GRAVITY
                 v = xf[k - 1, 3 + i]
                 x[3 + i] = v + dt * a
-                x[i] = xf[k - 1, i] + h * (v + x[3 + i])
+                x[i] = xf[k - 1, i] + rest * v + h * x[3 + i]
                 x[10 + i] = w[i] + dt * alpha[i]
-                phi[i] = h * (w[i] + x[10 + i])
+                phi[i] = rest * w[i] + h * x[10 + i]
             half_turn(phi, 1.0, quat)
             product(xf[k - 1, 6:10], quat, x[6:10])
             # Jacobian blocks
-            u0, u1, u2 = turn[0, 2], turn[1, 2], turn[2, 2]
-            f = -dt * acc
+            f0, f1, f2 = -dt * f[0], -dt * f[1], -dt * f[2]
+            u0 = turn[0, 0] * f0 + turn[0, 1] * f1 + turn[0, 2] * f2
+            u1 = turn[1, 0] * f0 + turn[1, 1] * f1 + turn[1, 2] * f2
+            u2 = turn[2, 0] * f0 + turn[2, 1] * f1 + turn[2, 2] * f2
             for i in range(3):
-                b[0, i, 0] = f * (start[i, 1] * u2 - start[i, 2] * u1)
-                b[0, i, 1] = f * (start[i, 2] * u0 - start[i, 0] * u2)
-                b[0, i, 2] = f * (start[i, 0] * u1 - start[i, 1] * u0)
-                b[1, i, 0] = f * h * middle[k, i, 1]
-                b[1, i, 1] = -f * h * middle[k, i, 0]
-                b[1, i, 2] = 0.0
+                b[0, i, 0] = start[i, 1] * u2 - start[i, 2] * u1
+                b[0, i, 1] = start[i, 2] * u0 - start[i, 0] * u2
+                b[0, i, 2] = start[i, 0] * u1 - start[i, 1] * u0
+                b[1, i, 0] = h * (middle[k, i, 1] * f2 - middle[k, i, 2] * f1)
+                b[1, i, 1] = h * (middle[k, i, 2] * f0 - middle[k, i, 0] * f2)
+                b[1, i, 2] = h * (middle[k, i, 0] * f1 - middle[k, i, 1] * f0)
             rate_jacobian(w, inertia, inverse, dt, b[4])
             matrix(quat, turn)
-            x0, x1, x2 = phi[0], phi[1], phi[2]
-            n2 = x0 * x0 + x1 * x1 + x2 * x2
+            right_jacobian(phi, jr)
             for i in range(3):
                 for j in range(3):
                     b[2, i, j] = turn[j, i]
-                    jr[i, j] = phi[i] * phi[j] / 6.0
-                jr[i, i] += 1.0 - n2 / 6.0
-            jr[0, 1] += 0.5 * x2
-            jr[0, 2] -= 0.5 * x1
-            jr[1, 0] -= 0.5 * x2
-            jr[1, 2] += 0.5 * x0
-            jr[2, 0] += 0.5 * x1
-            jr[2, 1] -= 0.5 * x0
-            for i in range(3):
-                for j in range(3):
-                    b[3, i, j] = h * (jr[i, j] + jr[i, 0] * b[4, 0, j] + jr[i, 1] * b[4, 1, j] + jr[i, 2] * b[4, 2, j])
+                    b[3, i, j] = rest * jr[i, j] + h * (
+                        jr[i, 0] * b[4, 0, j] + jr[i, 1] * b[4, 1, j] + jr[i, 2] * b[4, 2, j]
+                    )
+            if lead == 0.0:
+                explicit_turn(xf[k - 1, 6:10], start, w, dt, x[6:10], b[2], b[3])
             # covariance: Phi P Phi' + G Q G'
-            apply(b, dt, pf[k - 1], tmp)
+            apply(b, dt, h, pf[k - 1], tmp)
             for i in range(12):
                 for j in range(12):
                     tra[i, j] = tmp[j, i]
-            apply(b, dt, tra, cov)
+            apply(b, dt, h, tra, cov)
             for i in range(3):
                 for j in range(3):
                     v = dt * (
-                        middle[k, i, 0] * middle[k, j, 0] * q[0]
-                        + middle[k, i, 1] * middle[k, j, 1] * q[1]
-                        + middle[k, i, 2] * middle[k, j, 2] * q[2]
+                        middle[k, i, 0] * middle[k, j, 0] * left[0]
+                        + middle[k, i, 1] * middle[k, j, 1] * left[1]
+                        + middle[k, i, 2] * middle[k, j, 2] * left[2]
                     )
                     cov[3 + i, 3 + j] += v
                     cov[i, 3 + j] += h * v
@@ -135,6 +141,11 @@ def forward(first, last, restart, time, kind, y, thrust, torque, mass, inertia, 
                     cov[6 + i, 9 + j] += v
                     cov[9 + j, 6 + i] += v
                 cov[9 + i, 9 + i] += dt * q[3 + i]
+            for c in range(3):
+                if left[c] != q[c]:  # the accelerometer's mean over the step says nothing of what is within
+                    for i in range(3):
+                        for j in range(3):
+                            cov[i, j] += bridge * dt * middle[k, i, c] * middle[k, j, c] * (q[c] - left[c])
         for i in range(12):
             for j in range(12):
                 pp[k, i, j] = cov[i, j]
@@ -150,7 +161,6 @@ def forward(first, last, restart, time, kind, y, thrust, torque, mass, inertia, 
             innov[9 + i] = y[k, 10 + i] - x[10 + i]
         for i in range(12):
             correction[i] = 0.0
-        ll = 0.0
         for i in range(12):
             if np.isnan(innov[i]):
                 s[k, i] = 0.0
@@ -166,10 +176,10 @@ def forward(first, last, restart, time, kind, y, thrust, torque, mass, inertia, 
                 g[j] = cov[i, j] * inv
             for j in range(12):
                 correction[j] += g[j] * err
-                f = g[j] * var
+                c = g[j] * var
                 row = cov[j]
                 for m in range(12):
-                    row[m] -= f * g[m]
+                    row[m] -= c * g[m]
             ll -= 0.5 * (np.log(2 * np.pi * var) + err * err * inv)
         if kind[k] == 1:
             ll = 0.0

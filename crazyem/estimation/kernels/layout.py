@@ -9,11 +9,12 @@ AXIS = 10  # 3 x 21: upper triangle of z z', z = (alpha_i, gyroscopic product, M
 AXIS_SIZE = 21
 COUNT = 73  # 1: steps
 IMPULSE = 74  # 6: squared impulses over dt, by body axis: specific force, angular acceleration
-RESIDUAL = 80  # 4: squared measurement residuals of position, velocity, attitude, body rate
-MEASURED = 84  # 4: how many scalars went into each
-IMPULSE_SEEN = 88  # 6: squared share of each impulse's variance that the data resolve
-RESIDUAL_SEEN = 94  # 4: the same for the measurement noise
-SIZE = 98
+RESIDUAL = 80  # 5: squared measurement residuals of position, velocity, attitude, body rate, specific force
+MEASURED = 85  # 5: how many scalars went into each
+BRIDGE = 90  # 6: squared noise within the step over dt^3 / 12, less its intensity; 0 but for the midpoint rule
+IMPULSE_SEEN = 96  # 6: squared share of each impulse's variance that the data resolve
+RESIDUAL_SEEN = 102  # 5: the same for the measurement noise
+SIZE = 107
 
 # Parameters: mass, Ixx, Iyy, Izz, time constant (by their logarithms); delay, torque offset x y z (linear, in units).
 PARAMETERS = 9

@@ -4,12 +4,13 @@ import numpy as np
 
 from crazyem.compiled import compiled
 from crazyem.estimation.kernels.algebra import angular_acceleration, apply
-from crazyem.estimation.kernels.layout import OFFSET, PARAMETERS
+from crazyem.estimation.kernels.layout import DELAY, LAG, OFFSET, PARAMETERS
 
 
 @compiled
-def sensitivities(first, last, time, kind, usable, thrust, torque, thrust_tau, torque_tau, thrust_delay,
-                  torque_delay, theta, unit, inertia, inverse, xf, gain, s, e, blocks, middle, score):  # fmt: skip
+def sensitivities(first, last, time, kind, usable, force, thrust, torque, thrust_tau, torque_tau, thrust_delay,
+                  torque_delay, theta, unit, inertia, inverse, q, r_force, lead, xf, gain, s, e, blocks, middle,
+                  score):  # fmt: skip
     """Derivatives of the innovations with respect to the nine parameters (logarithms, units).
 
     With the noise intensities in units of acceleration as free nuisance parameters the gains do not depend on these
@@ -22,6 +23,8 @@ def sensitivities(first, last, time, kind, usable, thrust, torque, thrust_tau, t
     d2 = np.zeros((12, PARAMETERS))
     info = np.zeros((PARAMETERS, PARAMETERS))
     alpha = np.empty(3)
+    model = np.empty(3)
+    column = (0, LAG, DELAY)
     for k in range(first, last):
         for a in range(PARAMETERS):
             score[k, a] = 0.0
@@ -31,23 +34,34 @@ def sensitivities(first, last, time, kind, usable, thrust, torque, thrust_tau, t
                     d[i, a] = 0.0
             continue
         dt = time[k] - time[k - 1]
-        h = 0.5 * dt
+        h = lead * dt
         w = xf[k - 1, 10:13]
-        apply(blocks[k], dt, d, d2)
+        apply(blocks[k], dt, h, d, d2)
         for i in range(12):
             for a in range(PARAMETERS):
                 d[i, a] = d2[i, a]
         if usable[k]:
             angular_acceleration(w, torque[k], inertia, inverse, alpha)
+            # derivatives of F/m; of what an accelerometer measured, the model moves only the rest
+            model[0] = -thrust[k] / theta[0]
+            model[1] = theta[4] * thrust_tau[k] / theta[0]
+            model[2] = unit[5] * thrust_delay[k] / theta[0]
+            rest = 1.0
+            if not np.isnan(force[k, 2]):
+                var = q[2] / dt + r_force
+                rest = r_force / var
+                err = force[k, 2] - thrust[k] / theta[0]
+                for a in range(3):
+                    score[k, column[a]] += model[a] * err / var
+                    for b in range(3):
+                        info[column[a], column[b]] += model[a] * model[b] / var
             for i in range(3):
-                v = -dt * middle[k, i, 2] * thrust[k] / theta[0]
-                d[3 + i, 0] += v
-                d[i, 0] += h * v
+                v = rest * dt * middle[k, i, 2]
+                for a in range(3):
+                    d[3 + i, column[a]] += v * model[a]
+                    d[i, column[a]] += h * v * model[a]
                 for a in range(4, 6):
                     f = theta[4] if a == 4 else unit[a]
-                    t = f * dt * middle[k, i, 2] * (thrust_tau[k] if a == 4 else thrust_delay[k]) / theta[0]
-                    d[3 + i, a] += t
-                    d[i, a] += h * t
                     t = 0.0
                     for j in range(3):
                         t += inverse[i, j] * (torque_tau[k, j] if a == 4 else torque_delay[k, j])

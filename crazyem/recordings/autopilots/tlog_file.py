@@ -5,7 +5,6 @@ time since boot. The latter is the time axis. What becomes which signal is the t
 explains it. Sources: mavlink.io/en/messages/common.html, ArduPilot's GCS_MAVLINK (units of RAW_IMU).
 """
 
-import math
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -34,9 +33,8 @@ from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Event, Recording
 from crazyem.recordings.topics import Source, Topic, damage, named, seconds, signals_of, text_of
+from crazyem.signals.mavlink import RPM, mapping
 
-_MILLI_G = 9.80665e-3  # m/s^2, the standard gravity of autopilots
-_RPM = 2.0 * math.pi / 60.0
 _EPOCH = 10**15  # us; a `time_usec` beyond is since 1970, below since boot
 _ARMED = 128
 _ARDUPILOT = 3
@@ -273,12 +271,17 @@ def _masked(bits: int, *, local: bool = False) -> Callable[[Topic], NDArray[np.b
     return invalid
 
 
+def _shared(signal: str, message: str) -> Source:
+    """What a live link reads from a message, read from a log the same way."""
+    row = mapping(signal, message)
+    turned = {"vector": vectors, "quaternion": quaternions, "angles": _quaternions_of_angles}[row.kind]
+    frame = {"position": WORLD, "velocity": WORLD, "attitude": ATTITUDE}.get(signal, BODY)
+    return Source(signal, message, row.fields, _scaled(row.factor, turned), frame=frame)
+
+
 _XYZ = named("*", "x y z")
 _V = named("v*", "x y z")
 _ANGLES = named("*", "roll pitch yaw")
-_SPEEDS = named("*speed", "roll pitch yaw")
-_ACC = named("*acc", "x y z")
-_GYRO = named("*gyro", "x y z")
 _Q = named("q[*]", "0 1 2 3")
 _RPMS = named("rpm[*]", "0 1 2 3")
 _VOLTAGES = named("voltages[*]", "0 1 2 3 4 5 6 7 8 9") + named("voltages_ext[*]", "0 1 2 3")
@@ -286,18 +289,18 @@ _TARGET = "POSITION_TARGET_LOCAL_NED"
 _BODY_RATES = named("body_*_rate", "roll pitch yaw")
 
 _SIGNALS: tuple[Source, ...] = (
-    Source("position", "LOCAL_POSITION_NED", _XYZ, vectors, frame=WORLD),
-    Source("velocity", "LOCAL_POSITION_NED", _V, vectors, frame=WORLD),
-    Source("attitude", "ATTITUDE_QUATERNION", named("q*", "1 2 3 4"), quaternions, frame=ATTITUDE),
-    Source("attitude", "ATTITUDE", _ANGLES, _quaternions_of_angles, frame=ATTITUDE),
-    Source("body_rate", "HIGHRES_IMU", _GYRO, vectors, frame=BODY),
-    Source("body_rate", "SCALED_IMU", _GYRO, _scaled(1e-3, vectors), frame=BODY),
-    Source("body_rate", "ATTITUDE_QUATERNION", _SPEEDS, vectors, frame=BODY),
-    Source("body_rate", "ATTITUDE", _SPEEDS, vectors, frame=BODY),
-    Source("specific_force", "HIGHRES_IMU", _ACC, vectors, frame=BODY),
-    Source("specific_force", "SCALED_IMU", _ACC, _scaled(_MILLI_G, vectors), frame=BODY),
-    Source("rotor_speed", "ESC_STATUS", _RPMS, _scaled(_RPM), frame=MOTORS),
-    Source("rotor_speed", "ESC_TELEMETRY_1_TO_4", _RPMS, _scaled(_RPM), frame=MOTORS),
+    _shared("position", "LOCAL_POSITION_NED"),
+    _shared("velocity", "LOCAL_POSITION_NED"),
+    _shared("attitude", "ATTITUDE_QUATERNION"),
+    _shared("attitude", "ATTITUDE"),
+    _shared("body_rate", "HIGHRES_IMU"),
+    _shared("body_rate", "SCALED_IMU"),
+    _shared("body_rate", "ATTITUDE_QUATERNION"),
+    _shared("body_rate", "ATTITUDE"),
+    _shared("specific_force", "HIGHRES_IMU"),
+    _shared("specific_force", "SCALED_IMU"),
+    Source("rotor_speed", "ESC_STATUS", _RPMS, _scaled(RPM), frame=MOTORS),
+    Source("rotor_speed", "ESC_TELEMETRY_1_TO_4", _RPMS, _scaled(RPM), frame=MOTORS),
     Source("voltage", "BATTERY_STATUS", _VOLTAGES, _cells, _equal("voltages[0]", 65535)),
     Source("voltage", "SYS_STATUS", ("voltage_battery",), _scaled(1e-3), _equal("voltage_battery", 65535)),
     Source("setpoint_position", _TARGET, _XYZ, vectors, _masked(0x007, local=True), frame=WORLD),
@@ -320,10 +323,7 @@ _SIGNALS: tuple[Source, ...] = (
     Source("position", "VISION_POSITION_ESTIMATE", _XYZ, vectors, frame=WORLD, origin="vision"),
 )
 # raw counts by the definition, milli-g and mrad/s from ArduPilot
-_RAW_IMU: tuple[Source, ...] = (
-    Source("body_rate", "RAW_IMU", _GYRO, _scaled(1e-3, vectors), frame=BODY),
-    Source("specific_force", "RAW_IMU", _ACC, _scaled(_MILLI_G, vectors), frame=BODY),
-)
+_RAW_IMU: tuple[Source, ...] = (_shared("body_rate", "RAW_IMU"), _shared("specific_force", "RAW_IMU"))
 
 
 @dataclass(frozen=True, slots=True)

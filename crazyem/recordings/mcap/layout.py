@@ -1,4 +1,7 @@
-"""A layout for Foxglove and Lichtblick that shows a flight: pose, parameters, residuals, link, motors, voltage."""
+"""Layouts for Foxglove and Lichtblick that show a flight: pose, parameters, residuals, link, motors, voltage.
+
+One for a drone and its recording, one for several drones streamed live: /NAME before their topics (live/foxglove.py).
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,6 +10,7 @@ from crazyem.recordings.mcap.messages import WORLD
 
 _INERTIA_SHOWN = 6e-5  # kg m^2, top of the axis: intervals of the first second would flatten all that follows
 _COLOURS = ("#4e98e2", "#f5774d", "#6ac27c", "#b678d9")
+_MORE_COLOURS = (*_COLOURS, "#e2c84e", "#4ed0d0", "#e27fb4", "#9a9a9a")  # one a drone, then again from the first
 
 
 def foxglove_layout(topics: Mapping[str, Sequence[str]] | None = None) -> dict[str, Any]:
@@ -65,6 +69,67 @@ def foxglove_layout(topics: Mapping[str, Sequence[str]] | None = None) -> dict[s
             "splitPercentage": 45,
         },
     }
+
+
+def swarm_layout(names: Sequence[str]) -> dict[str, Any]:
+    """The layout of several drones that are streamed live: all in one scene and one tab, and a tab for each.
+
+    Tabs do not go into tabs, so a drone's tab shows its panels side by side.
+
+    Args:
+        names: of the drones, as in their topics (/NAME/estimate). Raises ValueError: there are none, or one twice.
+    """
+    if not names or len(set(names)) < len(names):
+        raise ValueError("a layout needs drones with a name of their own each")
+    colour = {name: _MORE_COLOURS[i % len(_MORE_COLOURS)] for i, name in enumerate(names)}
+
+    def together(title: str, path: str) -> dict[str, Any]:
+        return _plot(title, [_path(f"/{n}{path}", n, colour=colour[n]) for n in names])
+
+    scene = _scene()
+    scene["transforms"] = {"frame:world": {"visible": True}} | {f"frame:{n}": {"visible": True} for n in names}
+    scene["topics"] = {f"/{n}/pose": {"visible": True, "type": "axis", "axisScale": 0.2} for n in names}
+    panels: dict[str, Any] = {
+        "3D!pose": scene,
+        "Plot!mass": together("mass [kg]", '/estimate.parameters[:]{name=="mass"}.value'),
+        "Plot!lost": together("link: packets lost", "/link.lost"),
+        "Plot!voltage": together("battery voltage", "/log/1.pm_vbatMV"),
+    }
+    tabs = [("All", _columns(_columns("Plot!mass", "Plot!lost"), "Plot!voltage"))]
+    single = foxglove_layout()["configById"]
+    for name in names:
+        own = {k: f"{k}_{name}" for k in single if k.split("!")[0] not in ("3D", "Tab")}
+        panels |= {own[k]: _of_drone(single[k], name) for k in own}
+        left = _columns(_columns(own["Plot!mass"], own["Plot!inertia"]), _columns(own["Plot!lag"], own["RosOut!log"]))
+        middle = _columns(
+            _columns(own["Plot!position_residual"], own["Plot!attitude_residual"]), own["Plot!rate_residual"]
+        )
+        right = _columns(
+            _columns(own["Plot!link"], own["Plot!latency"]), _columns(own["Plot!motors"], own["Plot!voltage"])
+        )
+        tabs.append((name, _rows(_rows(left, middle), _rows(right, own["RawMessages!estimate"]))))
+    panels["Tab!drones"] = {"activeTabIdx": 0, "tabs": [{"title": title, "layout": layout} for title, layout in tabs]}
+    return {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": {**_rows("3D!pose", "Tab!drones"), "splitPercentage": 30},
+    }
+
+
+def _of_drone(panel: dict[str, Any], name: str) -> dict[str, Any]:
+    """A panel of the layout for one drone with the name before its topics."""
+    moved = dict(panel)
+    if "paths" in panel:
+        moved["paths"] = [{**p, "value": f"/{name}{p['value']}"} for p in panel["paths"]]
+    for key in ("topicPath", "topicToRender"):
+        if key in panel:
+            moved[key] = f"/{name}{panel[key]}"
+    for key in ("title", "foxglovePanelTitle"):
+        if key in panel:
+            moved[key] = f"{name}: {panel[key]}"
+    return moved
 
 
 def topics_of(announced: Sequence[Any]) -> dict[str, list[str]]:
@@ -176,3 +241,8 @@ def _scene() -> dict[str, Any]:
 def _columns(first: Any, second: Any) -> dict[str, Any]:
     """One above the other."""
     return {"direction": "column", "first": first, "second": second}
+
+
+def _rows(first: Any, second: Any) -> dict[str, Any]:
+    """One beside the other."""
+    return {"direction": "row", "first": first, "second": second}

@@ -19,6 +19,7 @@ EVENTS: dict[str, tuple[str, str]] = {
 }
 OTHER_EVENTS = ("/other_events", "crazyem.Event")
 FINDINGS = "/findings"
+FRAMES = "/mavlink"  # frames as they came, message encoding "mavlink"; for other programs, never read back
 
 
 def pose_messages(

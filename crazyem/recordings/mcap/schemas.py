@@ -73,6 +73,10 @@ _MESSAGES: dict[str, tuple[tuple[str, str], ...]] = {
         ("rate", "double"),
         ("loss", "double"),
         ("latency", "double"),
+        ("round_trip", "double"),
+        ("clock_offset", "double"),
+        ("clock_rate", "double"),
+        ("outages", "int64"),
     ),
     # what the newest sample had that the model did not predict, and the standard deviation it was expected to have
     "crazyem.Residual": (

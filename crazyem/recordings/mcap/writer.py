@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from crazyem.errors import UsageError
 from crazyem.links.base import LinkStatistics, ParameterWrite
 from crazyem.recordings.mcap import schemas
-from crazyem.recordings.mcap.messages import EVENTS, POSE_EVERY, PROFILE, pose_messages, timestamp, versions
+from crazyem.recordings.mcap.messages import EVENTS, FRAMES, POSE_EVERY, PROFILE, pose_messages, timestamp, versions
 from crazyem.recordings.mcap.output import Output
 from crazyem.signals.packet import Block, Packet
 from crazyem.signals.sample import Sample
@@ -52,6 +52,7 @@ class RecordingWriter:
             channels are announced anew, sequence numbers and log times go on, sections of metadata are named
             "session 2: configuration". Nothing in the file changes before the new session's first bytes are written,
             and what these replace is only the summary at its end, which is written again.
+        output: takes the messages instead of a file: an object with the methods of `Output` and `close`.
 
     Attributes:
         path: the file, as text.
@@ -63,7 +64,12 @@ class RecordingWriter:
     """
 
     def __init__(
-        self, path: str | Path, metadata: Mapping[str, Mapping[str, str]] | None = None, *, append: bool = False
+        self,
+        path: str | Path,
+        metadata: Mapping[str, Mapping[str, str]] | None = None,
+        *,
+        append: bool = False,
+        output: Any = None,
     ) -> None:
         self.path = str(path)
         self.failure = ""
@@ -80,11 +86,15 @@ class RecordingWriter:
         self._link_before: tuple[float, int, int] | None = None
         self._closed = False
         self._lock = threading.Lock()
+        self._file: Any = None
+        self._output: Any = None
         try:
-            if append and Path(path).exists() and Path(path).stat().st_size:
+            if output is not None:
+                self._file = self._output = output
+            elif append and Path(path).exists() and Path(path).stat().st_size:
                 self._reopen(Path(path))
             else:
-                self._file: Any = open(path, "wb")  # noqa: SIM115 - closed by `close`
+                self._file = open(path, "wb")  # noqa: SIM115 - closed by `close`
                 self._output = Output(self._file)
             self._begin(metadata or {})
         except OSError as error:
@@ -131,6 +141,10 @@ class RecordingWriter:
     def packet(self, packet: Packet) -> None:
         """A log packet as it came."""
         self._put(self._write_packet, packet)
+
+    def frame(self, host_time: float, data: bytes) -> None:
+        """A MAVLink frame as it came, `host_time` in s since the epoch: what a tlog would hold."""
+        self._put(self._write_frame, host_time, data)
 
     def setpoint(self, time: float, reference: Setpoint) -> None:
         """A setpoint sent, `time` in s on the firmware clock."""
@@ -250,6 +264,11 @@ class RecordingWriter:
         if decoder is not None and packet.firmware_time_ms / 1000.0 - self._pose_time >= POSE_EVERY:
             self._write_pose(decoder.decode(packet))
 
+    def _write_frame(self, host_time: float, data: bytes) -> None:
+        if FRAMES not in self._channels:
+            self._channels[FRAMES] = self._output.channel(FRAMES, "mavlink", 0)  # 0: there is no schema
+        self._message(self._channels[FRAMES], host_time, data)
+
     def _write_pose(self, samples: list[Sample]) -> None:
         """foxglove.PoseInFrame and FrameTransform, for the 3D panels of viewers."""
         position = None
@@ -315,6 +334,10 @@ class RecordingWriter:
             "lost": statistics.lost,
             "late": statistics.late,
             "latency": latency,
+            "round_trip": statistics.round_trip,
+            "clock_offset": statistics.clock_offset,
+            "clock_rate": statistics.clock_rate,
+            "outages": statistics.outages,
         }
         before, fields["rate"], fields["loss"] = self._link_before, math.nan, math.nan
         if before is not None and host_time > before[0]:

@@ -1,15 +1,8 @@
-"""Physical effects beyond the plain rigid body, one file an effect.
+"""Physical effects beyond the plain rigid body, one file an effect or a small family of them.
 
-None is built yet. An effect will be a kernel `add(state, truth, noise, force, torque)` that adds to the external force
-[N, world] and torque [N m, body]; `external` calls each of them by name, because compiled code takes no functions.
+catalogue.py names them and checks a scenario's tables, constants.py turns them into the numbers of layout.py, body.py
+loads the body. At run time drive.py takes the place of the plain rotors, step.py that of the plain body,
+sensing.py is what positioning, inertial sensors and log see. A drone whose effects are all neutral flies without them:
+flight.py chooses between controllers/tick.py and tick_with_effects.py.
+docs/firmware_sim_effects.md has all definitions and signs.
 """
-
-from firmware_sim.kernel import kernel
-
-
-@kernel
-def external(state, truth, noise, force, torque):
-    """Set force [N, world] and torque [N m, body] to the sum of all effects."""
-    for i in range(3):
-        force[i] = 0.0
-        torque[i] = 0.0

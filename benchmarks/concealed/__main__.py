@@ -1,0 +1,54 @@
+"""python -m benchmarks.concealed draw|fly|diagnose|score --cases N --seed S --out DIR"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from .paths import Study
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.concealed", description=__doc__)
+    parser.add_argument("step", choices=("draw", "fly", "diagnose", "score"))
+    parser.add_argument("--cases", type=int, default=320, help="to draw (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=2026, help="of the draw (default %(default)s)")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the study")
+    parser.add_argument(
+        "--speed", type=float, default=10.0, help="of the flights at most, times real time (default %(default)s)"
+    )
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after that; run again to go on")
+    parser.add_argument(
+        "--part", type=int, nargs=2, default=(0, 1), metavar=("K", "N"), help="fly, diagnose: share K of N"
+    )
+    parser.add_argument("--command", nargs="+", help="diagnose: instead of `crazyem diagnose`")
+    parser.add_argument("--write-docs", action="store_true", help="score: docs/concealed.md and docs/concealed.json")
+    parser.add_argument("--no-ideal", action="store_true", help="score: without what takes half a minute a case")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one step of a study."""
+    arguments = _parser().parse_args(argv)
+    study, part = Study(arguments.out.resolve()), (arguments.part[0], arguments.part[1])
+    if arguments.step == "draw":
+        from .draw import write_cases
+
+        print(f"{write_cases(study, cases=arguments.cases, seed=arguments.seed)} cases written to {study.folder}")
+    elif arguments.step == "fly":
+        from .fly import fly_all
+
+        fly_all(study, speed=arguments.speed, minutes=arguments.minutes, part=part)
+    elif arguments.step == "diagnose":
+        from .diagnose import diagnose_all
+
+        diagnose_all(study, command=arguments.command, minutes=arguments.minutes, part=part)
+    else:
+        from .report import report
+
+        print(report(study, write_docs=arguments.write_docs, ideal=not arguments.no_ideal))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,80 @@
+"""Runs the diagnosis on every flown case, as a process that sees two recordings and the name of the nominal vehicle.
+
+It works in an empty folder with links to the recordings; nothing that it is given leads to the truth.
+"""
+
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from .paths import Study, read, write
+
+DIAGNOSE = (sys.executable, "-m", "crazyem", "diagnose")
+TIME_LIMIT = 900.0  # s; an answer later than that counts as none
+
+
+def diagnose_one(study: Study, case: str, vehicle: str, command: Sequence[str]) -> dict[str, Any]:
+    """The answer file of a case: case, seconds, code, said (last line on standard error), result (the JSON or None)."""
+    with tempfile.TemporaryDirectory() as folder:
+        link = os.link if _same_disk(study, folder) else os.symlink
+        for flight in ("recording", "held_out"):
+            link(study.recording(case, flight), Path(folder) / f"{flight}.mcap")
+        words = [
+            *command, "recording.mcap", "--vehicle", vehicle, "--held-out", "held_out.mcap", "--json", "answer.json",
+            "--write-vehicle", "fitted.toml",
+        ]  # fmt: skip
+        begun = time.monotonic()
+        try:
+            done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=TIME_LIMIT, check=False)
+            code, said = done.returncode, done.stderr.strip().splitlines()[-1:]
+        except subprocess.TimeoutExpired:
+            code, said = -1, [f"no answer after {TIME_LIMIT:g} s"]
+        seconds = time.monotonic() - begun
+        fitted = Path(folder) / "fitted.toml"
+        if fitted.is_file():
+            study.fitted(case).parent.mkdir(parents=True, exist_ok=True)
+            study.fitted(case).write_bytes(fitted.read_bytes())
+        try:
+            result = json.loads((Path(folder) / "answer.json").read_text())
+        except (OSError, ValueError):
+            result = None
+    return {"case": case, "seconds": round(seconds, 2), "code": code, "said": "".join(said), "result": result}
+
+
+def _same_disk(study: Study, folder: str) -> bool:
+    """Whether the recordings can be linked to so that not even a link shows where they are."""
+    return os.stat(study.folder).st_dev == os.stat(folder).st_dev
+
+
+def flown(study: Study) -> list[str]:
+    """Cases of which both recordings exist."""
+    return [c for c in study.cases() if all(study.recording(c, f).is_file() for f in ("recording", "held_out"))]
+
+
+def diagnose_all(
+    study: Study,
+    *,
+    command: Sequence[str] | None = None,
+    minutes: float = math.inf,
+    part: tuple[int, int] = (0, 1),
+) -> int:
+    """Diagnose what has no answer yet; returns how many. Answers are kept: delete OUT/answers to ask again."""
+    begun, asked = time.monotonic(), 0
+    for case in flown(study):
+        if int(case) % part[1] != part[0] or study.answer(case).is_file():
+            continue
+        if time.monotonic() - begun > 60.0 * minutes:
+            break
+        answer = diagnose_one(study, case, read(study.truth(case))["platform"], command or DIAGNOSE)
+        write(study.answer(case), answer)
+        asked += 1
+        named = [e["name"] for e in (answer["result"] or {}).get("effects", [])]
+        print(f"{case}: {', '.join(named) or 'nothing'} ({answer['seconds']:.1f} s) {answer['said']}", flush=True)
+    return asked

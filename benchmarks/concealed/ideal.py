@@ -1,0 +1,90 @@
+"""What the best possible observer would say: log-likelihood ratio of the truth, and the true model's prediction error.
+
+Both go through the tool's own likelihood and predictor, because the ideal observer is that with the true parameters. As
+long as one of them is missing, the figures that need it are left out and the page says so.
+"""
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from crazyem.recordings.registry import open_recording
+from crazyem.vehicle import Vehicle
+
+HORIZON = 50  # steps of the recording's 100 Hz: 0.5 s
+EVERY = 10  # samples between starts
+
+
+def ideal_nats(recording: Path, vehicle: Vehicle, effects: Mapping[str, Mapping[str, Any]]) -> float | None:
+    """Log-likelihood of the recording under the true effects less that under the nominal vehicle; None: not available.
+
+    Either model gets the noise scales and the small delay of stamps that fit it best, as an observer must who does not
+    know them; the truth begins with the noise that the nominal vehicle ended with.
+    """
+    try:
+        from crazyem.diagnosis.always import nuisances, with_nuisances
+        from crazyem.diagnosis.candidates import Candidate
+        from crazyem.diagnosis.fit import Data, nominal, refine
+        from crazyem.diagnosis.flight import flight_of
+        from crazyem.diagnosis.model import Point
+        from crazyem.diagnosis.noise import first_guess
+    except ImportError:
+        return None
+    data = Data([flight_of(open_recording(str(recording)), vehicle)])
+    bare = nominal(data, Point(vehicle, {}, first_guess()))
+
+    def loglik(point: Point) -> float:
+        # What is always free is so near neutral; of a true effect the value is known, and there is no such prior.
+        free = nuisances(data, point, [Candidate(name, (), ()) for name in point.effects])
+        return float(refine(data, with_nuisances(point, free), (), nuisances=free, rounds=2, noise=False).loglik)
+
+    without = loglik(bare)
+    true = replace(bare, effects={name: dict(table) for name, table in effects.items()})
+    data.settle(true)
+    true = data.fit_noise(true, iterations=5)
+    return loglik(true) - without
+
+
+def held_out_error(recording: Path, vehicle_file: str) -> dict[str, float] | None:
+    """RMS error of `crazyem predict` after 0.5 s, between lift-off and landing: position m, velocity m/s, attitude rad,
+    body_rate rad/s; None while the command does not exist or refuses."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "prediction.npz"
+        words = ["predict", str(recording), "--vehicle", vehicle_file, "--horizon", str(HORIZON), "--every", str(EVERY)]
+        done = subprocess.run(
+            [sys.executable, "-m", "crazyem", *words, "-o", str(out)], capture_output=True, text=True, check=False
+        )
+        if done.returncode or not out.is_file():
+            return None
+        with np.load(out) as file:
+            prediction, start, step = file["prediction"], file["start_time"], float(file["step"])
+    return errors_of(recording, np.asarray(prediction)[:, -1], np.asarray(start) + HORIZON * step)
+
+
+def errors_of(recording: Path, predicted: np.ndarray, time: np.ndarray) -> dict[str, float]:
+    """RMS of predicted states (n, 13) against what was recorded nearest to each time (n,), in the air only."""
+    signals = open_recording(str(recording)).signals
+    columns = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
+    heights = signals["position"]
+    up = np.interp(time, heights.time, np.asarray(heights.value)[:, 2])
+    flying = (up > 0.15) & np.all(np.isfinite(predicted), axis=1)
+    out = {}
+    for name, where in columns.items():
+        signal = signals[name]
+        nearest = np.clip(np.searchsorted(signal.time, time), 1, len(signal.time) - 1)
+        nearest -= (time - signal.time[nearest - 1]) < (signal.time[nearest] - time)
+        true, guess = np.asarray(signal.value)[nearest], predicted[:, where]
+        if name == "attitude":
+            aligned = np.clip(np.abs(np.sum(true * guess, axis=1)), 0.0, 1.0)
+            distance = 2.0 * np.arccos(aligned)
+        else:
+            distance = np.linalg.norm(true - guess, axis=1)
+        use = flying & (np.abs(signal.time[nearest] - time) < 0.006)
+        out[name] = float(np.sqrt(np.mean(distance[use] ** 2))) if use.any() else float("nan")
+    return out

@@ -1,0 +1,46 @@
+"""The files of a study, and nothing else: what is told to whom is decided by which of these folders it is given."""
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Study:
+    """OUT/cases is what the diagnosing process is told of; OUT/truth is what it is not."""
+
+    folder: Path
+
+    def truth(self, case: str) -> Path:
+        return self.folder / "truth" / f"{case}.json"
+
+    def scenario(self, case: str) -> Path:
+        return self.folder / "truth" / f"{case}.toml"
+
+    def recording(self, case: str, flight: str) -> Path:
+        """flight: "recording" or "held_out"."""
+        return self.folder / "cases" / case / f"{flight}.mcap"
+
+    def answer(self, case: str) -> Path:
+        return self.folder / "answers" / f"{case}.json"
+
+    def fitted(self, case: str) -> Path:
+        return self.folder / "answers" / f"{case}.toml"
+
+    def cases(self) -> list[str]:
+        return sorted(p.stem for p in (self.folder / "truth").glob("[0-9]*.json"))
+
+
+def read(path: Path) -> Any:
+    """A JSON file, None where there is none."""
+    return json.loads(path.read_text()) if path.is_file() else None
+
+
+def write(path: Path, document: Any) -> None:
+    """A JSON file, whole or not at all, so that an interrupted study can go on."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(document, indent=1) + "\n")
+    os.replace(part, path)

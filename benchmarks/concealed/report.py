@@ -1,0 +1,139 @@
+"""Collects a study from its files, scores it, writes the table that is published."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from crazyem.vehicle import load_vehicle
+
+from .ideal import held_out_error, ideal_nats
+from .paths import Study, read, write
+from .score import Outcome, figures
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+MARKS = ("<!-- concealed: table -->", "<!-- /concealed -->")
+
+
+def outcomes(study: Study, *, ideal: bool = True) -> list[Outcome]:
+    """Every flown case that was asked about. What needs the truth on top is computed once and kept in OUT/ideal;
+    `ideal` False takes only what is there."""
+    out = []
+    for case in study.cases():
+        answer, truth = read(study.answer(case)), read(study.truth(case))
+        if answer is None:
+            continue
+        known = _ideal(study, case, truth) if ideal else read(study.folder / "ideal" / f"{case}.json") or {}
+        out.append(Outcome(truth, answer["result"], answer["seconds"], known.get("nats"), known.get("held_out", {})))
+    return out
+
+
+def _ideal(study: Study, case: str, truth: dict[str, Any]) -> dict[str, Any]:
+    """Nats of the truth on the flight; held-out errors of nominal, fitted and true model."""
+    file = study.folder / "ideal" / f"{case}.json"
+    known: dict[str, Any] = read(file) or {"held_out": {}}
+    vehicle = load_vehicle(truth["platform"])
+    if known.get("nats") is None and truth["kind"] in ("single", "pair"):
+        known["nats"] = ideal_nats(study.recording(case, "recording"), vehicle, truth["effects"])
+    folder = study.folder / "vehicles"
+    models = {"nominal": folder / f"{truth['platform']}.toml", "fitted": study.fitted(case)}
+    if truth["effects"] and not truth["hidden"]:
+        models["true"] = study.truth(case).with_name(f"{case}_vehicle.toml")
+        models["true"].write_text(_with_effects(vehicle.to_toml(), truth["effects"]))
+    for name, model in models.items():
+        if known["held_out"].get(name) is None and model.is_file():
+            known["held_out"][name] = held_out_error(study.recording(case, "held_out"), str(model))
+    write(file, known)
+    return known
+
+
+def _with_effects(vehicle: str, effects: dict[str, dict[str, Any]]) -> str:
+    """A vehicle file with the effects of the truth."""
+    tables = [
+        f"\n[effects.{n}]\n" + "".join(f"{k} = {json.dumps(v)}\n" for k, v in t.items()) for n, t in effects.items()
+    ]
+    return vehicle + "".join(tables)
+
+
+def percent(share: dict[str, Any]) -> str:
+    """A share with the number of cases behind it."""
+    return "not measured" if share["share"] is None else f"{100 * share['share']:.1f} % of {share['n']}"
+
+
+def _number(value: float | None, text: str) -> str:
+    return "not measured" if value is None else text.format(value)
+
+
+def table(f: dict[str, Any]) -> str:
+    """The figures as Markdown."""
+    cases, p, s, o = f["cases"], f["parameters"], f["single"], f["outside"]
+    calibration = f["confidence"]["expected_calibration_error"]
+    rows = [
+        ("nothing hidden: false alarms", percent(f["nothing"]["false_alarms"]), "at most 3 %"),
+        ("single, strong: named first (a declared group counts half)", percent(s["named_first_strong"]), "95 %"),
+        ("single, all detectable: named first (a declared group counts half)", percent(s["named_first_all"]), "85 %"),
+        ("the same, groups not looked at", percent(s["first_whatever_groups"]), ""),
+        ("right rotor, where one was named", percent(s["right_rotor"]), ""),
+        ("95 % intervals that hold the truth", percent(p["interval_coverage"]), "90 to 98 %"),
+        ("median error of a parameter, of the effect's size", _number(p["error"]["median"], "{:.1%}"), "under 10 %"),
+        ("pairs: both and only both", percent(f["pairs"]["both_and_only_both"]), "75 %"),
+        ("pairs, up to declared groups", percent(f["pairs"]["up_to_declared_groups"]), ""),
+        ("outside: unexplained, right axis and regime", percent(o["unexplained_right_axis_and_regime"]), "80 %"),
+        ("outside: wrong confident name", percent(o["wrong_confident_name"]), "under 5 %"),
+        ("held-out 0.5 s error within 10 % of the true model's",
+         percent(f["held_out"]["within_10_percent_of_true_model"]), "all"),
+        ("median of that ratio", _number(f["held_out"]["median_ratio"], "{:.3f}"), ""),
+        ("confidence: expected calibration error", _number(calibration, "{:.3f}"), ""),
+        ("seconds for a case: median", _number(f["seconds"]["median"], "{:.1f}"), "under 60"),
+    ]  # fmt: skip
+    lines = [
+        f"{sum(cases.values())} cases: {cases['nothing']} with nothing hidden, {cases['single']} single effects "
+        f"({s['detectable']['n']} detectable), {cases['pair']} pairs, {cases['outside']} outside the catalogue; "
+        f"{f['no_answer']} without an answer; {f.get('not_flown', 0)} more could not be flown. The ideal observer is "
+        f"known in {f['ideal_observer_known']}; where it is not, a case counts as detectable.",
+        "",
+        "| figure | measured | aim |",
+        "|---|---|---|",
+        *(f"| {name} | {value} | {aim} |" for name, value, aim in rows),
+        "",
+        "| effect | named first | median error |",
+        "|---|---|---|",
+    ]
+    for name, share in f["by_effect"].items():
+        error = p["error_by_effect"].get(name, {}).get("median")
+        lines.append(f"| {name} | {percent(share)} | {_number(error, '{:.1%}')} |")
+    lines += ["", "| confidence said | names | right |", "|---|---|---|"]
+    lines += [f"| {b['said']:.2f} | {b['n']} | {b['right']:.2f} |" for b in f["confidence"]["bins"]]
+    lines += [
+        "",
+        "| case | what went wrong | true (strength) | said (confidence) | groups | nats |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in f["failures"]:
+        true = ", ".join(f"{n} ({u:.2f})" for n, u in row["strength"].items()) or "nothing"
+        said = ", ".join(_said(e) for e in row["said"]) or "nothing"
+        groups = "; ".join(" = ".join(g) for g in row["indistinguishable"])
+        nats = "" if row["nats"] is None else f"{row['nats']:.0f}"
+        lines.append(f"| {row['case']} | {row['why']} | {true} | {said} | {groups} | {nats} |")
+    return "\n".join(lines)
+
+
+def _said(effect: dict[str, Any]) -> str:
+    confidence = effect["confidence"]
+    return f"{effect['name']} ({confidence:.2f})" if isinstance(confidence, float) else str(effect["name"])
+
+
+def report(study: Study, *, write_docs: bool = False, ideal: bool = True) -> str:
+    """Score a study: figures into OUT/score.json, and the table; `write_docs` publishes both."""
+    found = figures(outcomes(study, ideal=ideal))
+    truths = [read(study.truth(c)) for c in study.cases()]
+    found["not_flown"] = sum(any(not q["flown"] for q in t.get("quality", {}).values()) for t in truths)
+    found["study_seed"] = truths[0].get("study_seed") if truths else None
+    write(study.folder / "score.json", found)
+    text = table(found)
+    if write_docs:
+        write(DOCS / "concealed.json", found)
+        page = (DOCS / "concealed.md").read_text()
+        before, _, rest = page.partition(MARKS[0])
+        _, _, after = rest.partition(MARKS[1])
+        (DOCS / "concealed.md").write_text(f"{before}{MARKS[0]}\n\n{text}\n\n{MARKS[1]}{after}")
+    return text

@@ -1,0 +1,84 @@
+"""`crazyem diagnose RECORDING...`: where simulation and recording part, which physics was left out, and the fit."""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from crazyem.commands.files import read_options
+from crazyem.commands.output import put
+from crazyem.commands.replay import vehicle_of
+from crazyem.errors import UsageError
+from crazyem.live.summary import check_writable
+from crazyem.recordings import open_recording
+from crazyem.recordings.recording import Recording
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    from crazyem.diagnosis.compare import compare
+    from crazyem.diagnosis.diagnose import diagnose
+    from crazyem.diagnosis.document import document_of, saved_vehicle, text_of
+    from crazyem.diagnosis.report import write_report
+
+    for path in (arguments.json, arguments.report, arguments.write_vehicle):
+        check_writable(path)
+    begin = time.monotonic()
+
+    def say(text: str) -> None:
+        print(f"diagnose: {time.monotonic() - begin:5.1f} s  {text}", file=sys.stderr, flush=True)
+
+    options = read_options(arguments)
+    recordings = [open_recording(p, options) for p in arguments.files]
+    held_out = [open_recording(p, options) for p in arguments.held_out]
+    vehicle = vehicle_of(recordings[0], arguments.vehicle)
+    wanted = [n.strip() for n in (arguments.candidates or "").split(",") if n.strip()]
+    found = diagnose(recordings, vehicle, held_out=held_out, wanted=wanted, withhold=arguments.withhold, say=say)
+    say("open-loop errors before and after")
+    document, pictures = document_of(found, recordings, held_out, withhold=arguments.withhold)
+    document["notices"] = _notices(recordings)
+    document["seconds"] = time.monotonic() - begin
+    if arguments.against:
+        document["against"] = compare(recordings[0], open_recording(arguments.against, options))
+    if arguments.write_vehicle:
+        name = Path(arguments.write_vehicle).stem
+        _replace(arguments.write_vehicle, saved_vehicle(found, name).to_toml())
+    if arguments.report:
+        write_report(arguments.report, document, pictures)
+    if arguments.json == "-":
+        put(json.dumps(document, indent=1))
+        return 0
+    if arguments.json:
+        _replace(arguments.json, json.dumps(document, indent=1) + "\n")
+    text = text_of(document)
+    if "against" in document:
+        text += "\n" + "\n".join(_against(document["against"]))
+    put(text)
+    return 0
+
+
+def _notices(recordings: Sequence[Recording]) -> list[str]:
+    return [n for r in recordings for n in r.notices]
+
+
+def _against(compared: Any) -> list[str]:
+    lines = [f"  against {compared['simulated']}: {compared['seconds']:.1f} s of the same mission"]
+    for name, entry in compared["signals"].items():
+        size = f"{entry['rms']:.4g} {entry['unit']}, largest {entry['largest']:.4g}"
+        lines.append(f"    {name:16s} rms difference {size}")
+    return lines
+
+
+def _replace(path: str, text: str) -> None:
+    """All or nothing. Raises UsageError if it cannot be written."""
+    beside = Path(f"{path}.part")
+    try:
+        beside.write_text(text, encoding="utf-8")
+        os.replace(beside, path)
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise UsageError(f"cannot write {path}: {error.strerror or error}.") from None

@@ -1,0 +1,421 @@
+"""`crazyem fly` and `crazyem watch` with several drones: one process, an estimator, a recording and a result each.
+
+A drone that cannot be reached, refuses or is lost is told about and leaves the others alone. Only where two drones
+would come too close does none of them fly.
+"""
+
+import argparse
+import concurrent.futures
+import contextlib
+import functools
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from crazyem.commands.common import (
+    LiveLine,
+    attitude_period,
+    close_recorder,
+    compile_kernels,
+    new_estimator,
+    say,
+)
+from crazyem.commands.output import put
+from crazyem.commands.view import Everyone, Shown, Streams, landing, live_view, wants_view
+from crazyem.errors import CrazyemError, LinkError, UsageError
+from crazyem.links import open_link
+from crazyem.live.controllers import controller_named
+from crazyem.live.crew import Crew, Paced
+from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
+from crazyem.live.mcap_recorder import open_recorder
+from crazyem.live.session import Session
+from crazyem.live.summary import build_summary, check_writable, write_json
+from crazyem.live.swarm import Course, Member, check_distances, displaced, members_of, read_swarm, settle_interpreter
+from crazyem.physics import folding
+
+AT_ONCE, CLOSING = 3, 8  # connections being made and closed; more only steal each other's time
+POSITION_WITHIN = 10.0  # s
+SUFFIXES = (".csv.gz", ".csv", ".mcap", ".json", ".png")
+
+
+@dataclass
+class Drone:
+    """One drone of a running command.
+
+    Attributes:
+        error: what ended it early, None if all is well. outcome: in a few words.
+    """
+
+    member: Member
+    vehicle: Any
+    left_out: list[str]
+    log: str | None = None
+    plot: str | None = None
+    plan: FlightPlan | None = None
+    link: Any = None
+    session: Session | None = None
+    estimator: Paced | None = None
+    recorder: Any = None
+    line: LiveLine | None = None
+    shown: Shown | None = None
+    interrupts: Interrupts = field(default_factory=Interrupts)
+    error: BaseException | None = None
+    outcome: str = ""
+    row: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return self.member.name
+
+    def failed(self, error: BaseException) -> None:
+        """It goes no further; the first error is the one that counts."""
+        self.error = self.error or error
+        stopped = isinstance(error, FlightInterruptedError | MotorsCutError)
+        self.outcome = "landed on request" if isinstance(error, FlightInterruptedError) else "motors cut"
+        sentence = "the flight was ended by the user." if stopped else str(error)
+        if not stopped:
+            self.outcome = sentence
+            say(f"{self.name}: {sentence}")
+        if self.session is not None:
+            self.session.history.notice(sentence)
+        if self.shown is not None:
+            self.shown.ended = self.outcome
+
+
+def path_for(base: str | None, name: str, suffix: str = "") -> str | None:
+    """`flights.mcap` -> `flights.NAME.mcap`."""
+    if base is None:
+        return None
+    path = Path(base)
+    ending = next((s for s in SUFFIXES if path.name.endswith(s) and path.name != s), path.suffix)
+    stem = path.name.removesuffix(ending)
+    return str(path.with_name(f"{stem}.{name}{suffix or ending}"))
+
+
+def members(arguments: argparse.Namespace, trajectory: Sequence[str] = ("hover",)) -> list[Member]:
+    """The drones of the command line or of a swarm file.
+
+    Raises:
+        UsageError, FileFormatError: they cannot be used.
+    """
+    uris = [*([arguments.uri] if arguments.uri else []), *arguments.uris]
+    if arguments.swarm and uris:
+        raise UsageError("give the drones in a swarm file or on the command line, not both.")
+    if arguments.swarm:
+        return read_swarm(arguments.swarm, vehicle=arguments.vehicle, trajectory=trajectory)
+    return members_of(uris, vehicle=arguments.vehicle, trajectory=trajectory)
+
+
+def fly(arguments: argparse.Namespace) -> int:
+    """Fly all drones; returns the exit code, that of the first error."""
+    from crazyem.commands.fly import HEIGHT, trajectory_maker, write_rules
+
+    if arguments.scenario or arguments.speed is not None or arguments.seed is not None:
+        raise UsageError("--scenario, --seed and --speed belong to one drone in the built-in simulator.")
+    drones = _drones(arguments, members(arguments, arguments.trajectory))
+    controller = controller_named(arguments.controller)
+    for drone in drones:
+        m = drone.member
+        if m.uri.startswith("mavlink:"):
+            raise UsageError(f"{m.name}: a MAVLink drone is flown by its own ground station: use crazyem watch.")
+        make = displaced(trajectory_maker(list(m.trajectory), arguments.duration), m.offset)
+        rules = write_rules(arguments, m.uri, name=m.name)
+        drone.plan = FlightPlan(make, controller, height=HEIGHT, push=not arguments.no_push, rules=rules)
+    return _run(arguments, drones, wrench="", work=_fly, before=_keep_apart)
+
+
+def watch(arguments: argparse.Namespace) -> int:
+    """Watch all drones; returns the exit code, that of the first error."""
+    if arguments.push or arguments.confirm:
+        raise UsageError("several drones at once are watched only: nothing is written to them.")
+    drones = _drones(arguments, members(arguments))
+    return _run(arguments, drones, wrench="ctrlLee", work=functools.partial(_watch, duration=arguments.duration))
+
+
+def _drones(arguments: argparse.Namespace, chosen: Sequence[Member]) -> list[Drone]:
+    """Everything that can be found wrong before a drone is asked."""
+    drones = []
+    for m in chosen:
+        vehicle, left_out = folding.fold(folding.load(m.vehicle))
+        log, plot = path_for(arguments.record, m.name), path_for(arguments.plot, m.name)
+        for path in (log, plot):
+            check_writable(path)
+        drones.append(Drone(m, vehicle, left_out, log, plot))
+    check_writable(arguments.json)
+    new_estimator(drones[0].vehicle, arguments)  # a wrong window is refused here
+    return drones
+
+
+def _run(
+    arguments: argparse.Namespace,
+    drones: list[Drone],
+    *,
+    wrench: str,
+    work: Callable[[Drone], None],
+    before: Callable[[Sequence[Drone]], None] = lambda drones: None,
+) -> int:
+    view = wants_view(arguments)
+    compile_kernels(drones[0].vehicle)
+    settle_interpreter()
+    with contextlib.ExitStack() as stack:
+        everyone = Everyone([d.interrupts for d in drones])
+        from crazyem.commands.fly import interrupts
+
+        stack.enter_context(interrupts(everyone))
+        streams = stack.enter_context(Streams(arguments.foxglove))
+        crew = Crew()
+        stack.callback(crew.close)
+        try:
+            _connect(arguments, drones, wrench=wrench, streams=streams, crew=crew, everyone=everyone)
+            before([d for d in drones if d.error is None])
+            with live_view(view, lambda: [d.shown for d in drones if d.shown is not None]) as showing:
+                _together(drones, work, quiet=showing)
+        finally:
+            with concurrent.futures.ThreadPoolExecutor(CLOSING, thread_name_prefix="crazyem-close") as pool:
+                list(pool.map(_close, drones))
+        return _report(arguments, drones)
+
+
+def _connect(
+    arguments: argparse.Namespace,
+    drones: Sequence[Drone],
+    *,
+    wrench: str,
+    streams: Streams,
+    crew: Crew,
+    everyone: Interrupts,
+) -> None:
+    """Links, recordings and sessions; a drone that cannot be reached is left behind."""
+
+    def connect(number: int) -> None:
+        drone = drones[number]
+        if everyone.count:
+            drone.failed(FlightInterruptedError())
+            return
+        try:
+            drone.link = open_link(drone.member.uri)
+            drone.link.connect()
+            _begin(arguments, drone, number, len(drones), wrench=wrench, streams=streams, crew=crew)
+            say(f"{drone.name}: connected to {drone.member.uri}")
+        except CrazyemError as error:
+            drone.failed(error)
+        except Exception as error:  # a fault of ours with one drone must not bring down the others
+            drone.failed(CrazyemError(f"connecting failed: {error!r}."))
+
+    with concurrent.futures.ThreadPoolExecutor(AT_ONCE, thread_name_prefix="crazyem-connect") as pool:
+        list(pool.map(connect, range(len(drones))))
+
+
+def _begin(
+    arguments: argparse.Namespace, drone: Drone, number: int, of: int, *, wrench: str, streams: Streams, crew: Crew
+) -> None:
+    m, plan = drone.member, drone.plan
+    configuration = {
+        "command": arguments.command, "uri": m.uri, "drone": m.name, "of": of, "rate": arguments.rate,
+        "window": arguments.window, "every": arguments.every,
+    }  # fmt: skip
+    if plan is not None:
+        configuration |= {
+            "controller": plan.controller.name, "trajectory": " ".join(m.trajectory), "offset": list(m.offset),
+            "duration": arguments.duration, "push": plan.push,
+            "guard": plan.rules.mode if plan.push and plan.rules is not None else "no push",
+        }  # fmt: skip
+    recorder = open_recorder(
+        drone.log, configuration=configuration, vehicle=drone.vehicle, link=drone.link, append=arguments.append
+    )
+    drone.recorder = streams.beside(recorder, m.name)
+    drone.estimator = estimator = Paced(
+        new_estimator(drone.vehicle, arguments, attitude_period=attitude_period(m.uri)),
+        number=number,
+        of=of,
+        late=arguments.every / arguments.rate,
+    )
+    session = Session(
+        drone.link,
+        vehicle=drone.vehicle,
+        estimator=estimator,
+        recorder=drone.recorder,
+        wrench=wrench,
+        rate=arguments.rate,
+        reconnect_within=arguments.reconnect,
+        crew=crew,
+    )
+    estimator.newest = lambda: session.clock.newest
+    drone.session = session
+    session.history.notice(folding.notice(drone.left_out))
+    drone.line = LiveLine(session, prefix=f"{m.name:<8} ")
+    land = landing(drone.interrupts) if plan is not None else None
+    drone.shown = Shown(session, drone.line, name=m.name, land=land)
+    session.start()
+
+
+def _keep_apart(drones: Sequence[Drone]) -> None:
+    """Positions first, then what each will fly from there.
+
+    Raises:
+        UsageError: two would come too close.
+    """
+    until = time.monotonic() + POSITION_WITHIN
+    courses = {}
+    for drone in drones:
+        assert drone.session is not None
+        assert drone.plan is not None
+        telemetry = drone.session.telemetry
+        while telemetry.position is None and time.monotonic() < until:
+            time.sleep(0.02)
+        if telemetry.position is None:
+            drone.failed(LinkError("the drone sends no position."))
+            continue
+        x, y, z = telemetry.position
+        dx, dy, dz = drone.member.offset
+        start = (x, y, z + drone.plan.height)
+        path = drone.plan.trajectory(start, telemetry.yaw)
+        courses[drone.name] = Course((x, y, z), (x + dx, y + dy, start[2] + dz), path)
+    check_distances(courses)
+
+
+def _fly(drone: Drone) -> None:
+    assert drone.session is not None
+    assert drone.plan is not None
+    Flight(drone.session, drone.plan, interrupts=drone.interrupts, progress=drone.line).fly()
+
+
+def _watch(drone: Drone, *, duration: float | None) -> None:
+    from crazyem.commands.watch import follow
+
+    assert drone.session is not None
+    assert drone.line is not None
+    follow(drone.session, drone.interrupts, duration, drone.line)
+
+
+def _together(drones: Sequence[Drone], work: Callable[[Drone], None], *, quiet: Callable[[], bool]) -> None:
+    """Each in a thread of its own; returns when all have ended."""
+
+    def one(drone: Drone) -> None:
+        assert drone.line is not None
+        assert drone.shown is not None
+        drone.line.quiet = quiet
+        try:
+            work(drone)
+            drone.outcome = drone.shown.ended = "landed" if drone.plan is not None else "watched"
+        except (CrazyemError, FlightInterruptedError, MotorsCutError) as error:
+            drone.failed(error)
+        except Exception as error:
+            drone.failed(CrazyemError(f"flying failed: {error!r}."))
+
+    threads = [
+        threading.Thread(target=one, args=(d,), name=f"crazyem-drone-{d.name}") for d in drones if d.error is None
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        while thread.is_alive():
+            thread.join(timeout=0.1)  # short, so that Ctrl-C is heard
+
+
+def _close(drone: Drone) -> None:
+    """Session, recording, link; whatever fails with one drone."""
+    try:
+        if drone.session is not None:
+            drone.session.close()
+            if drone.recorder is not None:
+                if drone.estimator is not None:
+                    drone.recorder.metadata("estimator", {"updates_left_out": str(drone.estimator.skipped)})
+                close_recorder(drone.recorder, drone.link.statistics(), drone.session.history)
+    except CrazyemError as error:
+        drone.failed(error)
+    finally:
+        if drone.link is not None:
+            drone.link.close()
+
+
+def _report(arguments: argparse.Namespace, drones: Sequence[Drone]) -> int:
+    for drone in drones:
+        try:
+            drone.row = _summary(drone)
+        except CrazyemError as error:
+            if drone.error is None:
+                drone.failed(error)
+            notices = list(drone.session.history.notices) if drone.session is not None else []
+            drone.row = {"log": drone.log, "vehicle": drone.vehicle.name, "notices": notices}
+    errors = [d.error for d in drones if d.error is not None]
+    stopped = any(isinstance(e, FlightInterruptedError | MotorsCutError) for e in errors)
+    real = [e for e in errors if not isinstance(e, FlightInterruptedError | MotorsCutError)]
+    code = int(getattr(real[0], "exit_code", 1)) if real else 130 if stopped else 0
+    rows = [{"name": d.name, "uri": d.member.uri, "outcome": d.outcome, **d.row, **_error(d)} for d in drones]
+    text = table(rows)
+    if arguments.json == "-":
+        say(text)
+    else:
+        put(text)
+    if arguments.json:
+        write_json({"command": arguments.command, "drones": rows}, arguments.json)
+    return code
+
+
+def _error(drone: Drone) -> dict[str, Any]:
+    if drone.error is None or isinstance(drone.error, FlightInterruptedError | MotorsCutError):
+        return {}
+    return {"error": str(drone.error), "exit_code": getattr(drone.error, "exit_code", 1)}
+
+
+def _summary(drone: Drone) -> dict[str, Any]:
+    """As of a single flight, and what the crew left out.
+
+    Raises:
+        DataError: nothing was flown that could be estimated from.
+    """
+    if drone.session is None or drone.estimator is None:
+        raise drone.error or CrazyemError("it was not connected.")
+    pipeline, history, statistics = drone.session.pipeline, drone.session.history, drone.link.statistics()
+    if drone.estimator.skipped:
+        history.notice(
+            f"{drone.estimator.skipped} updates were left out because this computer could not keep up; every sample "
+            "was used."
+        )
+    estimate = pipeline.finish()
+    extra = {
+        "late": statistics.late, "plot": drone.plot, "updates_left_out": drone.estimator.skipped,
+        "trajectory": " ".join(drone.member.trajectory) if drone.plan is not None else None,
+        "offset": list(drone.member.offset) if drone.plan is not None else None,
+    }  # fmt: skip
+    summary = build_summary(
+        log=drone.log, vehicle=drone.vehicle.name, estimate=estimate, history=history,
+        update_seconds=drone.estimator.update_seconds, received=statistics.received, lost=statistics.lost, extra=extra,
+    )  # fmt: skip
+    if drone.plot is not None:
+        from crazyem.live.plot import write_plot
+
+        write_plot(drone.plot, history, drone.vehicle, title=f"{drone.name}, vehicle {drone.vehicle.name}")
+    return summary
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """A line per drone for people; what is not identifiable has a question mark."""
+    head = (
+        f"{'drone':<12} {'mass g':>15} {'Ixx':>13} {'Iyy':>13} {'Izz e-6 kg m2':>15} {'writes':>6} {'lost':>5}  outcome"
+    )
+    lines = [head]
+    for row in rows:
+        values = []
+        for name, width, scale in (("mass", 15, 1e3), ("Ixx", 13, 1e6), ("Iyy", 13, 1e6), ("Izz", 15, 1e6)):
+            p = row.get("estimates", {}).get(name)
+            values.append(f"{_value(p, scale):>{width}}")
+        lost = row.get("samples", {}).get("lost", "-")
+        lines.append(
+            f"{row['name']:<12.12} {' '.join(values)} {len(row.get('pushes', ())):>6} {lost:>5}  {row['outcome']}"
+        )
+    lines += [f"{row['name']}: note: {n}" for row in rows for n in row.get("notices", ()) if n != row.get("error")]
+    return "\n".join(lines)
+
+
+def _value(p: dict[str, Any] | None, scale: float) -> str:
+    if p is None:
+        return "-"
+    half = (p["ci95"][1] - p["ci95"][0]) / 2 * scale
+    width = f"{half:.2f}" if math.isfinite(half) and half < 99 else ">99"
+    return f"{p['value'] * scale:.2f}+-{width}{'' if p['identifiable'] else '?'}"

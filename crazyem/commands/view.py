@@ -1,0 +1,130 @@
+"""What a running command shows: a live view in a terminal, plain lines elsewhere, and a stream for Foxglove."""
+
+import argparse
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from crazyem.commands.common import LiveLine, say
+from crazyem.errors import UsageError
+from crazyem.live.flight import Interrupts
+from crazyem.live.recorder import Recorder
+
+
+def wants_view(arguments: argparse.Namespace) -> bool:
+    """Whether a live view is to be drawn: asked for, or by default where people look at it.
+
+    It is drawn on standard error, so that a summary may go to a file. --confirm asks its question on plain lines.
+
+    Raises:
+        UsageError: --live without a terminal, or with --confirm.
+    """
+    if arguments.no_live:
+        return False
+    drawable = _terminal(sys.stderr) and os.environ.get("TERM") != "dumb"  # a terminal that cannot move its cursor
+    if arguments.live:
+        if not drawable:
+            raise UsageError("--live needs a terminal: leave it out, and plain lines are printed.")
+        if getattr(arguments, "confirm", False):
+            raise UsageError("--confirm asks its question on plain lines: leave out --live.")
+        return True
+    return drawable and _terminal(sys.stdout) and not getattr(arguments, "confirm", False)
+
+
+def _terminal(stream: Any) -> bool:
+    try:
+        return bool(stream is not None and stream.isatty())
+    except (OSError, ValueError):
+        return False
+
+
+class Everyone(Interrupts):
+    """Ctrl-C for all drones: a first one lands them, a second one cuts. A drone that lands already does not land twice.
+
+    Args:
+        ones: the interrupts of each.
+    """
+
+    def __init__(self, ones: Sequence[Interrupts]) -> None:
+        super().__init__()
+        self.ones = list(ones)
+
+    def __call__(self, *_: object) -> None:
+        self.count += 1
+        for one in self.ones:
+            one.count = max(one.count, self.count)
+
+
+def landing(one: Interrupts) -> Callable[[], None]:
+    """What the key for landing does; never a cut, however often it is pressed."""
+
+    def land() -> None:
+        one.count = max(one.count, 1)
+
+    return land
+
+
+class Shown:
+    """A running drone as the view needs it."""
+
+    def __init__(self, session: Any, line: LiveLine, *, name: str, land: Callable[[], None] | None = None) -> None:
+        from crazyem.live.controls import SessionControls
+        from crazyem.live.views import Observer
+
+        self.line = line
+        self.ended = ""
+        self.observer = Observer(session, name=name, phase=lambda: (line.phase, line.seconds), ended=lambda: self.ended)
+        self.controls = SessionControls(session, name=name, land=land)
+
+
+@contextlib.contextmanager
+def live_view(wanted: bool, drones: Callable[[], Sequence[Shown]]) -> Iterator[Callable[[], bool]]:
+    """The dashboard while the block runs; yields whether it is showing now (q ends it, plain lines take over).
+
+    Args:
+        drones: those that run now; called in the dashboard's thread.
+    """
+    if not wanted:
+        yield lambda: False
+        return
+    from crazyem.live.dashboard import Dashboard, terminal_console
+
+    dashboard = Dashboard(
+        lambda: [d.observer.snapshot() for d in drones()],
+        lambda: [d.controls for d in drones()],
+        console=terminal_console(sys.stderr),
+    )
+    with dashboard:
+        yield lambda: dashboard.showing
+    if dashboard.failure:
+        say(dashboard.failure)
+
+
+class Streams:
+    """Recorders with a stream for Foxglove beside them, if one was asked for; a context manager."""
+
+    def __init__(self, port: int | None) -> None:
+        self._port = port
+        self._server: Any = None
+
+    def __enter__(self) -> "Streams":
+        if self._port is not None:
+            from crazyem.live.foxglove import FoxgloveServer
+
+            self._server = FoxgloveServer(self._port)
+            say(f"live for Foxglove at {self._server.url} (layout: crazyem layout)")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._server is not None:
+            self._server.close()
+
+    def beside(self, recorder: Recorder | None, name: str = "") -> Any:
+        """The recorder, with a stream of the same beside it; `name` goes before topics where drones are many."""
+        if self._server is None:
+            return recorder
+        from crazyem.live.foxglove import Both
+
+        return Both(recorder, self._server.recorder(name))

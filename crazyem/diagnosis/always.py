@@ -1,0 +1,199 @@
+"""What a vehicle file never says exactly, and is therefore always free, with priors; fits that leave it free."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.fit import Data, Fitted, refine, remembering
+from crazyem.diagnosis.flight import Flight
+from crazyem.diagnosis.gram import Solution, used
+from crazyem.diagnosis.model import Point
+from crazyem.physics.rotors import wrench
+from crazyem.vehicle import Vehicle
+
+# What is never exactly as a vehicle file says, and is therefore always free, within these standard deviations: the
+# delay between a stamp and its effect, what sampling the commands at 100 Hz does to inertia and lag, and what an
+# onboard filter does to velocities. An effect is more.
+DELAY_SD = {False: 2e-3, True: 5e-3}  # s, by whether rotor speeds are measured
+INERTIA_SD = np.array([0.02, 0.02, 0.04])  # relative
+LAG_SD = 2e-3  # s
+CENTRE_SD = (2e-5, 2e-5, 7e-4)  # m; a height of -0.4 to -0.8 mm is what velocities of onboard filters look like
+VELOCITY_SD = 2e-3  # relative: no onboard filter is better
+# From one day to the next, of a drone whose file has a trim: batteries are put in again, propellers and feet bent.
+# Healthy and damaged flights of two drones on several days scatter like this (docs/diagnosis_real.md).
+TRIM_SD = (5e-4, 5e-4, 1.6e-4)  # m: torque per thrust
+THRUST_SD = 0.02  # relative
+FLAPPING_SD, DRAG_SD = 3e-4, 0.02  # N m s/m, N s/m: real rotors have both, bare rigid bodies of files neither
+LEANING_SD = (0.02, 0.02, 2e-3)  # rad: an attitude made from the acceleration is tilted as the accelerometer is
+TRIM = "trim"
+EDGE, SLOW = 0.5, 1.0  # s left out at either end; Hz below which torques say nothing of sampling
+ANGLES = ("roll", "pitch", "yaw")
+# Commands of a loop at 500 Hz that answer to vibration, logged at 100 Hz, are nearly white: most of what is logged acts
+# for 2 ms only, and what acts was not logged. That is an error in the input, under which every fit makes the drone look
+# heavy and damped. Share of the power of roll and pitch torques above half of the Nyquist frequency (white: a half):
+COARSE = 0.2  # simulated flights have up to 0.12
+COARSE_INERTIA_SD, COARSE_DAMPING_SD = 1.0, 3e-4  # relative; N m s
+COARSE_REASON = "the recorded commands are mostly faster than their sampling: what acted in between is not known"
+TRIM_REASON = "a shifted centre of mass is a trim, and that changes from day to day"
+FAST = ("inertia", "inertia_products", "torque_scale", "rate_damping", "rotor_inertia", "motor_lag", "input_delay",
+        "measurement_delay", "gyro_bias", "thrust_curve")  # fmt: skip
+CALM, GUSTIER = 1.0, 2.0  # m/s; times what the file has. Hovering in a room looks like 0 to 0.6 m/s
+Nuisances = list[tuple[Candidate, tuple[float, ...]]]  # with the precision of each free parameter
+
+
+def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisances:
+    """What is always free, with the precisions of its priors about neutral."""
+    measured = data.flights[0].inputs.measured
+    found: Nuisances = [(Candidate("input_delay", (), ("delay",)), (DELAY_SD[measured] ** -2,))]
+    if "body_rate" in data.signals or "attitude" in data.signals:
+        coarse = coarsely_sampled(data, point)
+        share = COARSE_INERTIA_SD if coarse else INERTIA_SD
+        moments = tuple((share * np.array(point.vehicle.inertia)) ** -2.0)
+        found.append((Candidate("inertia", (), ("xx", "yy", "zz")), moments))
+        if coarse:
+            found.append((Candidate("rate_damping", (), ("x", "y", "z")), (COARSE_DAMPING_SD**-2,) * 3))
+        if "velocity" in data.signals:
+            found.append((Candidate("center_of_mass", (), ("x", "y", "z")), tuple(sd**-2 for sd in CENTRE_SD)))
+        if not measured and point.vehicle.motor_time_constant > 0:
+            found.append((Candidate("motor_lag", (), ("time_constant",)), (LAG_SD**-2,)))
+    if "velocity" in data.signals and "position" in data.signals:
+        found.append((Candidate("velocity_scale", (), ("x", "y", "z")), (VELOCITY_SD**-2,) * 3))
+    if TRIM in point.vehicle.effects:
+        found.append((Candidate(TRIM, (), ("x", "y", "z")), tuple(sd**-2 for sd in TRIM_SD)))
+        found.append((Candidate("thrust_scale", (), ("scale",)), (THRUST_SD**-2,)))
+        found.append((Candidate("velocity_moment", (), ("roll_per_vy", "pitch_per_vx")), (FLAPPING_SD**-2,) * 2))
+        found.append((Candidate("linear_drag", (), ("x", "y", "z")), (DRAG_SD**-2,) * 3))
+    if "attitude" not in data.signals and any(np.isfinite(f.y[:, 6]).any() for f in data.flights):
+        found.append((Candidate("attitude_misalignment", (), ANGLES), tuple(sd**-2 for sd in LEANING_SD)))
+    taken = {c.effect for c in accepted}
+    return [(c, p) for c, p in found if c.effect not in taken]
+
+
+def coarsely_sampled(data: Data, point: Point) -> bool:
+    """Whether the commands of most flights are faster than their sampling (see `COARSE`); with a trim in the file."""
+    if TRIM not in point.vehicle.effects:
+        return False
+    shares = [fast_share(f, point.vehicle) for f in data.flights if not f.inputs.measured]
+    return bool(shares) and float(np.median(shares)) > COARSE
+
+
+def fast_share(flight: Flight, vehicle: Vehicle) -> float:
+    """Share of the power of the commanded roll and pitch torques above half of the Nyquist frequency, the larger."""
+    time = flight.inputs.time
+    inside = (time > flight.time[0] + EDGE) & (time < flight.time[-1] - EDGE)
+    if inside.sum() < 100:
+        return 0.0
+    period = float(np.median(np.diff(time[inside])))
+    torque = wrench(flight.inputs.thrust[inside], arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust)[:, 1:3]
+    grid = np.arange(time[inside][0], time[inside][-1], period)
+    even = np.stack([np.interp(grid, time[inside], c) for c in torque.T])
+    window = np.hanning(grid.size)
+    power = np.abs(np.fft.rfft((even - even.mean(axis=1, keepdims=True)) * window)) ** 2
+    frequency = np.fft.rfftfreq(grid.size, period)
+    fast, all_of_it = power[:, frequency > 0.25 / period].sum(1), power[:, frequency > SLOW].sum(1)
+    return float(np.divide(fast, all_of_it, out=np.zeros(2), where=all_of_it > 0).max())
+
+
+def abstained(
+    data: Data, point: Point, candidates: Sequence[Candidate], left_out: dict[str, str]
+) -> tuple[list[Candidate], dict[str, str]]:
+    """The candidates without those that coarsely sampled commands cannot speak of, and the reasons with theirs."""
+    gone = {}
+    if TRIM in point.vehicle.effects:
+        gone = {c.effect: TRIM_REASON for c in candidates if c.effect == "center_of_mass"}
+    if coarsely_sampled(data, point):
+        gone |= {c.effect: COARSE_REASON for c in candidates if c.effect in FAST}
+    return [c for c in candidates if c.effect not in gone], {**left_out, **gone}
+
+
+def steadied(data: Data, point: Point) -> Point:
+    """The point with the noise of a drone whose trim is unknown: what is steady must not pass for noise.
+
+    A weak rotor is a steady torque many times that of a day's trim. Before it is found, noise scales would grow until
+    it is noise, and then nothing asks for it any more. For a vehicle file with a trim only.
+    """
+    if TRIM not in point.vehicle.effects:
+        return point
+    free = [Candidate(TRIM, (), ("x", "y", "z")), Candidate("thrust_scale", (), ("scale",))]
+    rest = [(c, p) for c, p in nuisances(data, point, free)]
+    start = with_nuisances(point, [*rest, *((c, ()) for c in free)])
+    found = start
+    for _ in range(2):  # the first time the noise still holds what is steady
+        found = refine(data, found, free, nuisances=rest, rounds=4).point
+        white = replace(found.noise, disturbance=np.concatenate([found.noise.disturbance[:3], np.zeros(3)]))
+        found = remembering(data, data.fit_noise(replace(found, noise=white)))
+    return replace(point, noise=found.noise)
+
+
+def solved(fitted: Fitted) -> tuple[Solution, float]:
+    """The free parameters at the maximum with their covariance, and how many degrees of freedom they take.
+
+    With a trim in the file some 20 things are always free, more than a flight of 16 s has blocks; most of them are what
+    their priors say, and take none.
+    """
+    real = TRIM in fitted.point.vehicle.effects
+    gram, precision = fitted.gram, fitted.precision
+    solution = gram.solve(range(gram.size), precision=precision, effective=real)
+    information = gram.total(range(gram.size))[1]
+    return solution, used(information, information + np.diag(precision)) if real else gram.size
+
+
+def by_gain(point: Point, gain: float, count: int, blocks: int, p_value: float) -> float:
+    """The p-value of `count` parameters; with a trim in the file by `gain`, nats over their own dispersion.
+
+    Some 20 things are free then, more than a short flight has blocks, so the scatter of the blocks' scores says nothing
+    of what is left of a column once they are taken out.
+    """
+    if TRIM not in point.vehicle.effects:
+        return p_value
+    return float(stats.f.sf(2.0 * max(gain, 0.0) / count, count, max(blocks - 1, 1)))
+
+
+def usual_gusts(vehicle: Vehicle) -> float:
+    """Standard deviation of the air's speed [m/s] below which it is the weather, and no finding."""
+    filed = float(vehicle.effects.get("gusts", {}).get("standard_deviation", 0.0))
+    return max(GUSTIER * filed, CALM if TRIM in vehicle.effects else 0.0)
+
+
+def without(point: Point, effect: str) -> Point:
+    """The point with an effect as the vehicle file has it, which is nothing for most."""
+    rest = {n: v for n, v in point.effects.items() if n != effect}
+    if effect in point.vehicle.effects:
+        rest[effect] = dict(point.vehicle.effects[effect])
+    return replace(point, effects=rest)
+
+
+def unsure(data: Data, point: Point) -> dict[tuple[str, str], float]:
+    """(effect, parameter) -> standard deviation within which it is never known, whatever a fit says."""
+    return {
+        (c.effect, name): precision**-0.5
+        for c, precisions in nuisances(data, point, ())
+        for name, precision in zip(c.free, precisions, strict=True)
+    }
+
+
+def with_nuisances(point: Point, free: Nuisances) -> Point:
+    """The point with all of them present, so that derivatives are taken at it."""
+    for c, _ in free:
+        if c.effect not in point.effects:
+            point = point.with_effects({c.effect: c.neutral(point)})
+    return point
+
+
+def on_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate]) -> Fitted:
+    """The model on flights kept apart: effects as they are, what is always free belongs to each flight."""
+    free = nuisances(held_out, point, accepted)
+    bare = point.with_effects({c.effect: c.neutral(point) for c, _ in free})
+    return refine(held_out, bare, (), nuisances=free, rounds=2, noise=False)
+
+
+def refine_base(
+    data: Data, point: Point, accepted: Sequence[Candidate], *, rounds: int = 5, noise: bool = True
+) -> Fitted:
+    """`refine` with what is always free; with a trim, noise scales stay as they are (see `steadied`)."""
+    noise = noise and TRIM not in point.vehicle.effects
+    free = nuisances(data, point, accepted)
+    return refine(data, with_nuisances(point, free), accepted, nuisances=free, rounds=rounds, noise=noise)

@@ -1,0 +1,311 @@
+"""From recordings and a vehicle to a diagnosis: nominal model, where it fails, which effects, the fit, what remains."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from crazyem.diagnosis import accelerometer
+from crazyem.diagnosis.always import abstained, solved, steadied, unsure, usual_gusts
+from crazyem.diagnosis.candidates import Candidate, candidates_for
+from crazyem.diagnosis.fit import Data
+from crazyem.diagnosis.fit import nominal as nominal_of
+from crazyem.diagnosis.flight import flight_of
+from crazyem.diagnosis.gusts import find_gusts
+from crazyem.diagnosis.locate import Located, locate
+from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.place import depends_on_place
+from crazyem.diagnosis.select import ADMITTED, SURE, Selection, Trial, exchanged, margin, select
+from crazyem.diagnosis.unexplained import Unexplained, unexplained
+from crazyem.diagnosis.witness import false_speed, late_measurements
+from crazyem.recordings.recording import Recording
+from crazyem.vehicle import Vehicle
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Value:
+    """An estimated parameter: value and sd in `unit`, ci95 (low, high)."""
+
+    value: float
+    unit: str
+    sd: float
+    ci95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Named:
+    """An effect that was found.
+
+    Attributes:
+        name: in the catalogue; `label` with its choices.
+        parameters: those fitted; `chosen`: those searched.
+        held_out_nats: log-likelihood it brings on flight that it was not fitted to.
+        p_value: of its score test, the number of candidates allowed for.
+        confidence: probability that this effect is there and not a look-alike.
+    """
+
+    name: str
+    label: str
+    parameters: dict[str, Value]
+    chosen: dict[str, object]
+    held_out_nats: float
+    p_value: float
+    confidence: float
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """All that was found; `document.py` turns it into JSON."""
+
+    vehicle: Vehicle
+    fitted_vehicle: Vehicle
+    recordings: tuple[str, ...]
+    held_out: tuple[str, ...]
+    mismatch: bool
+    before: Located
+    after: Located
+    effects: tuple[Named, ...]
+    indistinguishable: tuple[tuple[str, ...], ...]
+    would_separate: tuple[str, ...]
+    unexplained: Unexplained
+    selection: Selection
+    left_out: dict[str, str]
+    explained: float
+
+
+def diagnose(
+    recordings: Sequence[Recording],
+    vehicle: Vehicle,
+    *,
+    held_out: Sequence[Recording] = (),
+    wanted: Sequence[str] = (),
+    withhold: Sequence[str] = (),
+    say: Say = lambda text: None,
+) -> Diagnosis:
+    """Which physics is missing from a vehicle's model, by its recordings.
+
+    Raises:
+        DataError: a recording cannot be used (no flight, no inputs, too short).
+        UsageError: an unknown effect among those wanted.
+    """
+    flights = [flight_of(r, vehicle, withhold=withhold) for r in recordings]
+    kept_apart = [flight_of(r, vehicle, withhold=withhold) for r in held_out]
+    data, apart = Data(flights), Data(kept_apart) if kept_apart else None
+    say(f"nominal model of {vehicle.name}: {sum(f.duration for f in flights):.0f} s of flight")
+    bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, first_guess())
+    nominal = nominal_of(data, bare)
+    if apart:
+        apart.settle(nominal)
+        apart.leave_out_wild(nominal)
+        apart.settle(nominal)
+    candidates, left_out = candidates_for(
+        nominal, data.signals, measured_speeds=flights[0].inputs.measured, wanted=wanted
+    )
+    candidates, left_out = abstained(data, nominal, candidates, left_out)
+    nominal = steadied(data, nominal)
+    selection = select(data, nominal, candidates, held_out=apart, say=say)
+    selection, told = _asked(data, selection, recordings)
+    say("where the nominal model fails")
+    data.settle(selection.nominal)
+    before = locate(data, selection.nominal)
+    after = before
+    if selection.accepted:
+        say("what remains")
+        data.settle(selection.final)
+        after = locate(data, selection.final)
+    place = depends_on_place(data, apart, selection.final)
+    remains = unexplained(data, selection, after, apart)
+    if place is not None:
+        remains = remains.beside(place.finding)
+    effects, groups, separate = _named(data, selection, remains, told)
+    beside = _beside(data, apart, selection.final, remains, wanted, left_out, place is not None, say)
+    if any(e.name == "gusts" for e in beside):
+        remains = remains.without_force()
+    effects = (*effects, *beside)
+    fitted_vehicle = _with_effects(vehicle, selection, beside)
+    mismatch = bool(effects) or remains.found
+    return Diagnosis(
+        vehicle, fitted_vehicle, tuple(r.path for r in recordings), tuple(r.path for r in held_out), mismatch,
+        before, after, effects, groups, separate, remains, selection, left_out, remains.explained,
+    )  # fmt: skip
+
+
+def _asked(data: Data, selection: Selection, recordings: Sequence[Recording]) -> tuple[Selection, frozenset[str]]:
+    """The selection after the witnesses were heard, and the names of effects that they told from their look-alikes."""
+    told: set[str] = set()
+    punctual = replace(selection.nominal, effects={n: dict(v) for n, v in selection.nominal.vehicle.effects.items()})
+    for candidate in selection.accepted:
+        chosen, values = dict(candidate.fixed), candidate.values(selection.final)
+        if candidate.effect == "input_delay":
+            nats = late_measurements(data, punctual, values["delay"])
+            if nats is not None and abs(nats) > TELLING:
+                told |= {MEASURED_LATE if nats > 0 else "input_delay", "input_delay"}
+            continue
+        if candidate.effect in WEAK_OR_MISREAD and chosen.get("onset_time") is None:
+            fault, rotor = candidate.effect == "rotor_fault", chosen["rotor"]
+            reading = values["scale"] ** -0.5 if fault else values["scale"]
+            nats = false_speed(recordings, rotor, reading, selection.nominal.vehicle.motor_time_constant)
+            fixed: tuple[tuple[str, Any], ...] = (("rotor", rotor),)
+            other, start = Candidate("rotor_sensor", fixed, ("scale",)), reading
+            if not fault:
+                nats = None if nats is None else -nats
+                other, start = Candidate("rotor_fault", fixed, ("scale",)), reading**-2
+        else:
+            continue
+        if nats is not None and abs(nats) > TELLING:
+            told |= {candidate.effect, other.effect}
+            if nats > 0:
+                selection = exchanged(data, selection, candidate, other, [start])
+    return selection, frozenset(told)
+
+
+def _beside(
+    data: Data,
+    apart: Data | None,
+    point: Point,
+    remains: Unexplained,
+    wanted: Sequence[str],
+    left_out: dict[str, str],
+    by_place: bool,
+    say: Say,
+) -> list[Named]:
+    """What is no column of the regression: gusts, unless a force depends on place, and a tilted accelerometer."""
+    found = []
+    if (not wanted or "gusts" in wanted) and "gusts" not in left_out and not by_place:
+        say("gusts")
+        gusts = find_gusts(data, point)
+        known = gusts is not None and gusts.speed < usual_gusts(point.vehicle)
+        if gusts is not None and not known and gusts.moving_air and remains.force_nats < FIXED * gusts.gain:
+            memory_sd = gusts.memory * gusts.memory_sd
+            low, high = np.exp(np.log(gusts.memory) + np.array([-1.96, 1.96]) * gusts.memory_sd)
+            values = {
+                "standard_deviation": Value(gusts.speed, "m/s", gusts.speed_sd, _around(gusts.speed, gusts.speed_sd)),
+                "correlation_time": Value(gusts.memory, "s", memory_sd, (float(low), float(high))),
+            }
+            held = gusts.gain
+            if apart is not None:
+                there = find_gusts(apart, point)
+                held = there.gain if there else 0.0
+            if held > 0:
+                found.append(Named("gusts", "gusts", values, {}, held, float(np.exp(-min(held, 700.0))),
+                                   _trust(remains.without_force()) * _share(min(gusts.gain, held), [])))  # fmt: skip
+    if not wanted or accelerometer.EFFECT in wanted:
+        tilted = accelerometer.tilt(data, point)
+        if tilted is not None:
+            solution, gram = tilted
+            sd = np.sqrt(np.diag(solution.covariance)[:3])
+            angles = solution.theta[:3]
+            wald = float(stats.f.sf(np.sum((angles / sd)[:2] ** 2) / 2, 2, max(len(gram.score) - 7, 3)))
+            held = accelerometer.held_out_gain(apart or data, point, angles)
+            sure = max(solution.p_value, wald) < SURE and held > ADMITTED
+            if sure and np.abs(angles).max() > accelerometer.LEAST:
+                values = {n: Value(float(a), "rad", float(e), _around(float(a), float(e)))
+                          for n, a, e in zip(accelerometer.ANGLES, angles, sd, strict=True)}  # fmt: skip
+                found.append(Named(accelerometer.EFFECT, accelerometer.EFFECT, values, {}, held, wald,
+                                   _share(min(solution.gain / max(1.0, solution.dispersion), held), [])))  # fmt: skip
+    return found
+
+
+def _around(value: float, sd: float) -> tuple[float, float]:
+    return value - 1.96 * sd, value + 1.96 * sd
+
+
+def _with_effects(vehicle: Vehicle, selection: Selection, beside: Sequence[Named]) -> Vehicle:
+    """The vehicle with what was found; delays within what is normal are left out."""
+    kept = {n: dict(v) for n, v in vehicle.effects.items()}
+    accepted = {c.effect for c in selection.accepted}
+    for name, values in selection.final.effects.items():
+        if name in accepted:
+            kept[name] = {k: v for k, v in values.items() if v is not None}
+    for named in beside:
+        kept[named.name] = {n: v.value for n, v in named.parameters.items()}
+    return replace(vehicle, effects=kept)
+
+
+def _named(
+    data: Data, selection: Selection, remains: Unexplained, told: frozenset[str]
+) -> tuple[tuple[Named, ...], tuple[tuple[str, ...], ...], tuple[str, ...]]:
+    fitted = selection.fitted
+    if not selection.accepted:
+        return (), (), ()
+    solution, used = solved(fitted)
+    sd = np.sqrt(np.maximum(np.diag(solution.covariance), 0.0))
+    freedom = max(len(fitted.gram.score) - used, 3)
+    width = float(stats.t.ppf(0.975, freedom))
+    named, groups, separate = [], [], []
+    at, never = 0, unsure(data, selection.nominal)
+    for candidate, step in zip(fitted.candidates, (s for s in selection.steps if s.taken), strict=True):
+        # late inputs and late measurements are one model, so it is fitted as the first, whatever it is called
+        late = candidate.effect == "input_delay" and MEASURED_LATE in told
+        values = candidate.values(selection.final)
+        parameters = {}
+        for name in candidate.free:
+            p = candidate.parameter(name)
+            error = float(np.hypot(sd[at], never.get((candidate.effect, name), 0.0)))
+            low, high = values[name] - width * error, values[name] + width * error
+            parameters[name] = Value(values[name], p.unit, error, (max(low, p.low), min(high, p.high)))
+            at += 1
+        taken = step.taken
+        assert taken is not None
+        rivals = [t for t in step.trials if t.p_value < SURE and t.candidate.effect != candidate.effect]
+        if candidate.effect in told:
+            rivals = [t for t in rivals if t.candidate.effect not in told]
+        alike = [t for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}]
+        confidence = _trust(remains) * _share(taken.evidence, []) * _preferred(taken, rivals)
+        p_value = min(1.0, taken.p_value * max(1, selection.tried))
+        name, label, chosen = candidate.effect, candidate.label, dict(candidate.fixed)
+        if late:
+            name, label, chosen = MEASURED_LATE, MEASURED_LATE, {"streams": ("state", "gyro")}
+        named.append(Named(name, label, parameters, chosen, taken.held_out, p_value, confidence))
+        equal = () if candidate.effect in told else SAME.get(candidate.effect, ())
+        if alike or equal:
+            group = tuple(dict.fromkeys([candidate.effect, *(t.candidate.effect for t in alike), *equal]))
+            groups.append(group)
+            from crazyem.physics.effects.catalogue import CATALOGUE
+
+            separate += [CATALOGUE[n].separates for n in group if CATALOGUE[n].separates]
+    order = sorted(range(len(named)), key=lambda i: -_evidence(selection, i))
+    return tuple(named[i] for i in order), tuple(groups), tuple(dict.fromkeys(separate))
+
+
+def _evidence(selection: Selection, i: int) -> float:
+    taken = [s.taken for s in selection.steps if s.taken][i]
+    assert taken is not None
+    return taken.evidence
+
+
+FIXED = 0.3  # share of the gain of gusts that a force which depends on place or motion may have beside it
+CALIBRATED = 0.9  # of the names that nothing speaks against this share was right (docs/diagnosis.md)
+DOUBTFUL = 0.4  # confidence at most where structure is left
+TELLING = 3.0  # nats by which a witness tells two effects apart
+MEASURED_LATE = "measurement_delay"
+WEAK_OR_MISREAD = ("rotor_fault", "rotor_sensor")
+# Exactly the same to every signal: inputs that act late, and measurements that are all late together.
+SAME = {"input_delay": ("measurement_delay",)}
+TEMPER = 0.5  # evidence counts half: models are approximate, and candidates were chosen by it
+
+
+def _trust(remains: Unexplained) -> float:
+    """What a name is worth beside structure that it does not explain: the right model leaves none."""
+    return min(remains.explained, DOUBTFUL) if remains.found else remains.explained
+
+
+def _preferred(taken: Trial, rivals: Sequence[Trial]) -> float:
+    """Probability that none of the rivals is the better explanation, by the scatter of the likelihoods' differences."""
+    chance = 1.0
+    for rival in rivals:
+        if rival.fitted is not None and rival.blocks.size == taken.blocks.size:
+            nats, sd = margin(taken, rival)
+            chance *= float(stats.norm.cdf(nats / sd))
+    return chance
+
+
+def _share(best: float, others: Sequence[float]) -> float:
+    """Probability of the best against its rivals and against nothing (evidence 0)."""
+    weights = np.exp(np.clip(TEMPER * (np.array([*others, 0.0]) - best), -700, 0))
+    return CALIBRATED / float(1.0 + weights.sum())

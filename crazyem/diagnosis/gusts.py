@@ -1,0 +1,82 @@
+"""gusts: air that moves at random with memory, told by the likelihood of a disturbing force with memory.
+
+It has no deterministic term, so it is no column of the regression. The filter carries a disturbing specific force
+(Ornstein-Uhlenbeck, body axes) as states; its stationary spread is fitted with the other noise scales for several
+correlation times, and the likelihood as a parabola in their logarithm gives the best one with its error.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.fit import Data
+from crazyem.diagnosis.model import Point
+
+MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)  # s
+GAINED = 40.0  # nats
+SMALLEST = 0.08  # m/s^2: less is what onboard filters leave
+ALIKE = 3.0  # largest ratio between the axes' spreads for moving air; a force on one axis alone is none
+PUSH = 0.007  # N s/m: of moving air on a drone whose drag is not known (docs/effects.md)
+
+
+@dataclass(frozen=True)
+class Gusts:
+    """A disturbing force with memory.
+
+    Attributes:
+        gain: nats beyond white noise.
+        spread: (3,) standard deviation of specific force, body [m/s^2].
+        memory: s, with `memory_sd` of its logarithm.
+        moving_air: whether all axes are disturbed alike.
+        speed: m/s, standard deviation of the air's velocity, with `speed_sd`.
+    """
+
+    gain: float
+    spread: NDArray
+    memory: float
+    memory_sd: float
+    moving_air: bool
+    speed: float
+    speed_sd: float
+
+
+def find_gusts(data: Data, point: Point) -> Gusts | None:
+    """Whether a disturbing force with memory is there; None if the likelihood gains nothing by it."""
+    white = data.loglik(point, passes=2)
+
+    def fitted(memory: float) -> tuple[float, Point]:
+        torques = point.noise.disturbance[3:], np.broadcast_to(np.asarray(point.noise.memory, float), (6,))[3:]
+        noise = replace(point.noise, disturbance=np.concatenate([np.full(3, 0.1), torques[0]]),
+                        memory=np.concatenate([np.full(3, memory), torques[1]]))  # fmt: skip
+        found = data.fit_noise(replace(point, noise=noise), iterations=5)
+        return data.loglik(found, passes=2), found
+
+    first = fitted(1.0)
+    if first[0] - white < 0.5 * GAINED or first[1].noise.disturbance[:3].max() < 0.7 * SMALLEST:
+        return None
+    tried = {1.0: first, **{m: fitted(m) for m in MEMORIES if m != 1.0}}
+    best = max(tried, key=lambda m: tried[m][0])
+    gain = tried[best][0] - white
+    spread = tried[best][1].noise.disturbance[:3]
+    if gain < GAINED or spread.max() < SMALLEST:
+        return None
+    logs = np.log(np.array(sorted(tried)))
+    heights = np.array([tried[m][0] for m in sorted(tried)])
+    near = np.argsort(np.abs(logs - np.log(best)))[:3]
+    curve = np.polyfit(logs[near], heights[near], 2)
+    memory = float(np.exp(np.clip(-curve[1] / (2 * curve[0]), logs[0], logs[-1]))) if curve[0] < 0 else best
+    seconds = sum(f.duration for f in data.flights)
+    independent = max(3.0 * seconds / (2.0 * memory), 2.0)
+    memory_sd = max(1.0 / np.sqrt(max(-2 * curve[0], 1e-9)), np.sqrt(2.0 / independent))
+    size = float(np.sqrt(np.mean(spread**2)))
+    push = drag_of(point) or PUSH
+    speed = size * point.vehicle.mass / push
+    alike = bool(spread.max() < ALIKE * spread.min())
+    return Gusts(gain, spread, memory, float(memory_sd), alike, speed, speed / float(np.sqrt(2 * independent)))
+
+
+def drag_of(point: Point) -> float:
+    """Mean linear drag [N s/m] if the model has one."""
+    drag = point.effects.get("linear_drag")
+    return float(np.mean([drag[a] for a in "xyz"])) if drag else 0.0

@@ -1,0 +1,305 @@
+"""The innovations of a flight under given accelerations, and what they say about any number of parameters at once.
+
+An extended Kalman filter on position, velocity, attitude, body rate and, where wanted, two disturbances with memory
+(specific force and angular acceleration, body axes, Ornstein-Uhlenbeck). Specific force and angular acceleration of
+each step are inputs, computed beforehand by `physics.motion` at the filter's own states: the kernel knows no parameter.
+It carries along the derivative of the state with respect to every column (a change of the accelerations, or of what
+the sensors show): the recursion of the innovations' sensitivities, with which the score and the information of all
+columns are sums over the innovations. Commands answer to what the drone did before, but an innovation does not know
+them in advance, so the closed loop brings no bias (Ljung, System Identification, ch. 7 and 13).
+"""
+
+import numpy as np
+
+from crazyem.compiled import compiled
+from crazyem.estimation.kernels.algebra import half_turn, log, matrix, product, right_jacobian
+from crazyem.vehicle import GRAVITY
+
+# Of the filter: position, velocity, attitude, body rate; then, where wanted, disturbing angular acceleration, and then
+# disturbing specific force. Torques with memory alone are what most flights need, so they come first.
+STATES = 18
+MEASURED = 12
+
+
+@compiled
+def _transition(dt, decay, turned, rate_turn, middle, specific, jr, x, out):
+    """out = Phi x for x (12, 15 or 18, m): error states of one step by the midpoint rule; decay (6,) of the last six.
+
+    turned (3, 3): -dt middle skew(specific) of the attitude at the start; rate_turn (3, 3): its turn, transposed.
+    """
+    h = 0.5 * dt
+    size = x.shape[0]
+    f0 = f1 = f2 = a0 = a1 = a2 = 0.0
+    for j in range(x.shape[1]):
+        t0, t1, t2 = x[6, j], x[7, j], x[8, j]
+        w0, w1, w2 = x[9, j], x[10, j], x[11, j]
+        if size > 12:
+            a0, a1, a2 = x[12, j], x[13, j], x[14, j]
+        if size > 15:
+            f0, f1, f2 = x[15, j], x[16, j], x[17, j]
+        # attitude in the middle of the step, by the half turn
+        for i in range(3):
+            v = (
+                x[3 + i, j]
+                + turned[i, 0] * t0
+                + turned[i, 1] * t1
+                + turned[i, 2] * t2
+                + h * (specific[i, 0] * w0 + specific[i, 1] * w1 + specific[i, 2] * w2)
+                + dt * (middle[i, 0] * f0 + middle[i, 1] * f1 + middle[i, 2] * f2)
+            )
+            out[i, j] = x[i, j] + h * (x[3 + i, j] + v)
+            out[3 + i, j] = v
+        b0, b1, b2 = dt * w0 + h * dt * a0, dt * w1 + h * dt * a1, dt * w2 + h * dt * a2
+        for i in range(3):
+            out[6 + i, j] = (
+                rate_turn[i, 0] * t0
+                + rate_turn[i, 1] * t1
+                + rate_turn[i, 2] * t2
+                + jr[i, 0] * b0
+                + jr[i, 1] * b1
+                + jr[i, 2] * b2
+            )
+        out[9, j] = w0 + dt * a0
+        out[10, j] = w1 + dt * a1
+        out[11, j] = w2 + dt * a2
+        for i in range(12, size):
+            out[i, j] = decay[i - 12] * x[i, j]
+
+
+@compiled
+def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, disturbance, memory, p0, block,
+          xp, xf, e, s, loglik, score, information):  # fmt: skip
+    """One pass; returns the log-likelihood.
+
+    Args:
+        time: (n,) s.
+        starts: (n,) bool, where the state begins anew at what is measured.
+        y: (n, 13) position, velocity, attitude (x y z w), body rate; NaN where not measured.
+        specific, angular: (n, 3) m/s^2, rad/s^2, body: means over the step that ends at each row.
+        offset: (n, 12) what the measurements show beyond the state (attitude: rotation vector on the right).
+        acting: (n, 6, c) derivative of the accelerations by the first c columns.
+        showing: (n, 12, d) derivative of the offset by the other d columns.
+        q: (6,) variances per second of specific-force and angular-acceleration impulses, body.
+        r: (12,) variances of the measurements.
+        disturbance: (6,) stationary variances of the disturbances with memory; 0 leaves them out.
+        memory: (6,) s, their correlation times.
+        p0: (12,) variances at a start of what is not measured there.
+        block: (n,) int, to which block of `score` and `information` a row adds.
+        xp, xf: (n, 19) receive predicted and filtered state (13) and disturbances (6).
+        e, s: (n, 12) receive innovations and their variances, sequential scalars; s is 0 where nothing was measured.
+        loglik: (n,) receives log-likelihoods.
+        score: (b, c + d) sums of derivative times innovation over variance are added here, by block.
+        information: (b, c + d, c + d) likewise, products of derivatives over variance; the upper triangle.
+    """
+    n = len(time)
+    c, d = acting.shape[2], showing.shape[2]
+    m = c + d
+    size = 12
+    for i in range(6):
+        if disturbance[i] > 0.0:
+            size = max(size, 15 if i >= 3 else 18)
+    which = np.array([3, 4, 5, 0, 1, 2])  # of the disturbances, in the filter's order
+    decay = np.empty(6)
+    cov = np.zeros((size, size))
+    tmp = np.empty((size, size))
+    tra = np.empty((size, size))
+    sens = np.zeros((size, m))
+    new = np.empty((size, m))
+    z = np.empty(m)
+    quat = np.empty(4)
+    turn = np.empty((3, 3))
+    start = np.empty((3, 3))
+    middle = np.empty((3, 3))
+    turned = np.empty((3, 3))
+    by_rate = np.empty((3, 3))
+    rate_turn = np.empty((3, 3))
+    jr = np.empty((3, 3))
+    phi = np.empty(3)
+    gain = np.empty(18)
+    correction = np.empty(18)
+    innov = np.empty(12)
+    f = np.empty(3)
+    total = 0.0
+    for k in range(n):
+        x = xp[k]
+        if starts[k] or k == 0:
+            for i in range(13):
+                x[i] = 0.0 if np.isnan(y[k, i]) else y[k, i]
+            for i in range(13, 19):
+                x[i] = 0.0
+            if np.isnan(y[k, 6]):
+                x[6], x[7], x[8], x[9] = 0.0, 0.0, 0.0, 1.0
+            else:
+                for i in range(3):
+                    phi[i] = -offset[k, 6 + i]
+                half_turn(phi, 1.0, quat)
+                product(y[k, 6:10], quat, x[6:10])
+            cov[:] = 0.0
+            sens[:] = 0.0
+            for i in range(12):
+                column = i if i < 6 else i + 1
+                if i >= 6 and i < 9:
+                    known = not np.isnan(y[k, 6])
+                else:
+                    known = not np.isnan(y[k, column])
+                    if known:
+                        x[column] -= offset[k, i]
+                cov[i, i] = r[i] if known else p0[i]
+                if known:
+                    for j in range(d):
+                        sens[i, c + j] = -showing[k, i, j]
+            for i in range(size - 12):
+                cov[12 + i, 12 + i] = disturbance[which[i]]
+            for i in range(19):
+                xf[k, i] = x[i]
+            for i in range(12):
+                e[k, i] = 0.0
+                s[k, i] = 0.0
+            loglik[k] = 0.0
+            continue
+        dt = time[k] - time[k - 1]
+        h = 0.5 * dt
+        for i in range(6):
+            decay[i] = np.exp(-dt / memory[which[i]])
+        w = xf[k - 1, 10:13]
+        half_turn(w, h, quat)
+        matrix(quat, turn)
+        matrix(xf[k - 1, 6:10], start)
+        for i in range(3):
+            f[i] = specific[k, i] + xf[k - 1, 13 + i]
+            for j in range(3):
+                middle[i, j] = start[i, 0] * turn[0, j] + start[i, 1] * turn[1, j] + start[i, 2] * turn[2, j]
+        for i in range(3):
+            a = middle[i, 0] * f[0] + middle[i, 1] * f[1] + middle[i, 2] * f[2]
+            if i == 2:
+                a -= GRAVITY
+            v = xf[k - 1, 3 + i]
+            x[3 + i] = v + dt * a
+            x[i] = xf[k - 1, i] + h * (v + x[3 + i])
+            x[10 + i] = w[i] + dt * (angular[k, i] + xf[k - 1, 16 + i])
+            phi[i] = h * (w[i] + x[10 + i])
+        half_turn(phi, 1.0, quat)
+        product(xf[k - 1, 6:10], quat, x[6:10])
+        for i in range(6):
+            x[13 + which[i]] = decay[i] * xf[k - 1, 13 + which[i]]
+        # how velocity turns with attitude (at the start) and with body rate (through the middle)
+        for i in range(3):
+            m0, m1, m2 = middle[i, 0], middle[i, 1], middle[i, 2]
+            by_rate[i, 0] = -dt * (m1 * f[2] - m2 * f[1])
+            by_rate[i, 1] = -dt * (m2 * f[0] - m0 * f[2])
+            by_rate[i, 2] = -dt * (m0 * f[1] - m1 * f[0])
+        for i in range(3):  # a turn at the start is turned on into the middle: -dt middle skew(f) turn'
+            for j in range(3):
+                turned[i, j] = by_rate[i, 0] * turn[j, 0] + by_rate[i, 1] * turn[j, 1] + by_rate[i, 2] * turn[j, 2]
+        matrix(quat, turn)
+        for i in range(3):
+            for j in range(3):
+                rate_turn[i, j] = turn[j, i]
+        right_jacobian(phi, jr)
+        _transition(dt, decay, turned, rate_turn, middle, by_rate, jr, cov, tmp)
+        for i in range(size):
+            for j in range(size):
+                tra[i, j] = tmp[j, i]
+        _transition(dt, decay, turned, rate_turn, middle, by_rate, jr, tra, cov)
+        bridge = h * h + dt * dt / 12.0
+        for i in range(3):
+            for j in range(3):
+                v = dt * (
+                    middle[i, 0] * middle[j, 0] * q[0]
+                    + middle[i, 1] * middle[j, 1] * q[1]
+                    + middle[i, 2] * middle[j, 2] * q[2]
+                )
+                cov[3 + i, 3 + j] += v
+                cov[i, 3 + j] += h * v
+                cov[3 + i, j] += h * v
+                cov[i, j] += bridge * v
+                cov[6 + i, 6 + j] += (
+                    bridge * dt * (jr[i, 0] * jr[j, 0] * q[3] + jr[i, 1] * jr[j, 1] * q[4] + jr[i, 2] * jr[j, 2] * q[5])
+                )
+                v = h * dt * jr[i, j] * q[3 + j]
+                cov[6 + i, 9 + j] += v
+                cov[9 + j, 6 + i] += v
+            cov[9 + i, 9 + i] += dt * q[3 + i]
+        for i in range(size - 12):
+            cov[12 + i, 12 + i] += (1.0 - decay[i] * decay[i]) * disturbance[which[i]]
+        if m:
+            _transition(dt, decay, turned, rate_turn, middle, by_rate, jr, sens, new)
+            for j in range(c):
+                f0, f1, f2 = acting[k, 0, j], acting[k, 1, j], acting[k, 2, j]
+                a0, a1, a2 = acting[k, 3, j], acting[k, 4, j], acting[k, 5, j]
+                for i in range(3):
+                    v = dt * (middle[i, 0] * f0 + middle[i, 1] * f1 + middle[i, 2] * f2)
+                    new[3 + i, j] += v
+                    new[i, j] += h * v
+                    new[6 + i, j] += h * dt * (jr[i, 0] * a0 + jr[i, 1] * a1 + jr[i, 2] * a2)
+                new[9, j] += dt * a0
+                new[10, j] += dt * a1
+                new[11, j] += dt * a2
+            sens[:] = new
+        # measurements, one scalar after the other
+        for i in range(6):
+            innov[i] = y[k, i] - x[i] - offset[k, i]
+            innov[6 + i] = np.nan
+        if not np.isnan(y[k, 6]):
+            quat[0], quat[1], quat[2], quat[3] = -x[6], -x[7], -x[8], x[9]
+            product(quat, y[k, 6:10], quat)
+            log(quat, innov[6:9])
+            for i in range(3):
+                innov[6 + i] -= offset[k, 6 + i]
+        for i in range(3):
+            innov[9 + i] = y[k, 10 + i] - x[10 + i] - offset[k, 9 + i]
+        for i in range(18):
+            correction[i] = 0.0
+        ll = 0.0
+        bl = block[k]
+        for i in range(12):
+            if np.isnan(innov[i]):
+                s[k, i] = 0.0
+                e[k, i] = 0.0
+                continue
+            var = cov[i, i] + r[i]
+            err = innov[i] - correction[i]
+            inv = 1.0 / var
+            s[k, i] = var
+            e[k, i] = err
+            for j in range(size):
+                gain[j] = cov[i, j] * inv
+            for j in range(size):
+                correction[j] += gain[j] * err
+                g = gain[j] * var
+                row = cov[j]
+                for i2 in range(size):
+                    row[i2] -= g * gain[i2]
+            if m:
+                for j in range(m):
+                    z[j] = sens[i, j]
+                for j in range(d):
+                    z[c + j] += showing[k, i, j]
+                for i2 in range(size):
+                    g = gain[i2]
+                    if g != 0.0:
+                        for j in range(m):
+                            sens[i2, j] -= g * z[j]
+                weight = err * inv
+                for j in range(m):
+                    score[bl, j] += weight * z[j]
+                    zj = z[j] * inv
+                    if zj != 0.0:
+                        for j2 in range(j, m):
+                            information[bl, j, j2] += zj * z[j2]
+            ll -= 0.5 * (np.log(2 * np.pi * var) + err * err * inv)
+        loglik[k] = ll
+        total += ll
+        for i in range(6):
+            xf[k, i] = x[i] + correction[i]
+            xf[k, 13 + which[i]] = x[13 + which[i]] + correction[12 + i]
+        for i in range(3):
+            xf[k, 10 + i] = x[10 + i] + correction[9 + i]
+        half_turn(correction[6:9], 1.0, quat)
+        product(x[6:10], quat, xf[k, 6:10])
+        for i in range(size):
+            for j in range(i):
+                v = 0.5 * (cov[i, j] + cov[j, i])
+                cov[i, j] = v
+                cov[j, i] = v
+    return total

@@ -1,0 +1,299 @@
+"""A flight under a model: vehicle, effects, noise -> innovations, and their derivatives by any columns."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis import felt
+from crazyem.diagnosis.flight import Flight
+from crazyem.diagnosis.kernel import sweep
+from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.effect import Effects, Situation
+from crazyem.physics.motion import measured, motion, rotor_thrust
+from crazyem.physics.rotations import rotation_matrix
+from crazyem.vehicle import Vehicle
+
+WIDE = np.array([1.0] * 3 + [2.0] * 3 + [0.5] * 3 + [3.0] * 3) ** 2  # variances at a start of what is not measured
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of process and measurement.
+
+    Attributes:
+        impulse: (6,) intensities of specific force [m/s^2 sqrt(s)] and angular acceleration [rad/s^2 sqrt(s)], body.
+        measurement: (4,) standard deviations of position [m], velocity [m/s], attitude [rad], body rate [rad/s].
+        disturbance: (6,) standard deviations of disturbances with memory [m/s^2, rad/s^2], body; 0: none.
+        memory: s, their correlation time; or (6,).
+    """
+
+    impulse: NDArray
+    measurement: NDArray
+    disturbance: NDArray = field(default_factory=lambda: np.zeros(6))
+    memory: float | NDArray = 1.0
+
+
+@dataclass(frozen=True)
+class Point:
+    """A model: vehicle and effects (name -> parameter -> value) and the noise."""
+
+    vehicle: Vehicle
+    effects: Effects
+    noise: Noise
+
+    def with_effects(self, changes: Mapping[str, Mapping[str, Any]]) -> "Point":
+        """The same with some effects' parameters replaced."""
+        merged = {name: dict(values) for name, values in self.effects.items()}
+        for name, values in changes.items():
+            merged[name] = {**merged.get(name, {}), **values}
+        return replace(self, effects=merged)
+
+
+@dataclass(frozen=True)
+class Swept:
+    """What one pass over a flight found.
+
+    Attributes:
+        loglik: of the whole flight [nats].
+        rows: (n,) by row.
+        predicted, filtered: (n, 19) states.
+        innovation, variance: (n, 12), sequential scalars; variance 0 where nothing was measured.
+        score: (b, c) by block; information: (b, c, c) by block. Empty without columns.
+    """
+
+    loglik: float
+    rows: NDArray
+    predicted: NDArray
+    filtered: NDArray
+    innovation: NDArray
+    variance: NDArray
+    score: NDArray
+    information: NDArray
+
+
+@dataclass(frozen=True)
+class Column:
+    """A direction in the space of models: effects displaced, against effects as they are, over the displacement.
+
+    `acting` and `showing` give derivatives that are no effect's: of the accelerations (n, 6), of what is shown (n, 12).
+    """
+
+    name: str
+    plus: Effects | None = None
+    minus: Effects | None = None
+    width: float = 1.0
+    acting: NDArray | None = None
+    showing: NDArray | None = None
+
+
+def initial_path(flight: Flight) -> NDArray:
+    """(n, 19) states to begin with: what was measured, interpolated where it was not."""
+    path = np.zeros((flight.time.size, 19))
+    path[:, 9] = 1.0
+    for c in range(13):
+        known = np.isfinite(flight.y[:, c])
+        if known.any():
+            path[:, c] = np.interp(flight.time, flight.time[known], flight.y[known, c])
+    if not np.isfinite(flight.y[:, 3:6]).any() and np.isfinite(flight.y[:, 0:3]).any():
+        path[:, 3:6] = np.gradient(path[:, 0:3], flight.time, axis=0)
+    path[:, 6:10] /= np.linalg.norm(path[:, 6:10], axis=1, keepdims=True)
+    return path
+
+
+def thrust_of(flight: Flight, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, NDArray]:
+    """Mean thrust of each rotor over the steps, and its rate: (n, 4) N, (n, 4) N/s."""
+    return rotor_thrust(
+        flight.inputs, flight.time, vehicle=vehicle, effects=effects, breaks=np.flatnonzero(flight.starts).tolist()
+    )
+
+
+def situation_of(
+    flight: Flight, path: NDArray, vehicle: Vehicle, thrusts: tuple[NDArray, NDArray], rotation: NDArray | None = None
+) -> Situation:
+    """The situation at the rows of a path (n, 19)."""
+    thrust, rate = thrusts
+    step = np.concatenate([[0.0], np.diff(flight.time)])
+    step[flight.starts] = 0.0
+    rotation = rotation_matrix(path[:, 6:10]) if rotation is None else rotation
+    n = flight.time.size
+    return Situation(
+        time=flight.time, flown=flight.flown, step=step, position=path[:, 0:3],
+        height=np.maximum(path[:, 2] - flight.ground, 0.0), velocity=path[:, 3:6], rotation=rotation,
+        body_rate=path[:, 10:13], specific_force=np.zeros((n, 3)), angular_acceleration=np.zeros((n, 3)),
+        thrust=thrust, thrust_rate=rate, voltage=flight.voltage,
+        rotor_constant=float("nan") if vehicle.rotor_constant is None else vehicle.rotor_constant,
+        air=np.zeros((n, 3)),
+    )  # fmt: skip
+
+
+def causal_middle(filtered: NDArray, predicted: NDArray, starts: NDArray) -> NDArray:
+    """(n, 19) states in the middle of each step: filtered at its begin, predicted to its end."""
+    middle = predicted.copy()
+    before = filtered[:-1]
+    inside = ~starts[1:]
+    sign = np.sign(np.sum(before[:, 6:10] * predicted[1:, 6:10], axis=1, keepdims=True))
+    mean = 0.5 * (before + predicted[1:])
+    mean[:, 6:10] = before[:, 6:10] * np.where(sign == 0, 1.0, sign) + predicted[1:, 6:10]
+    mean[:, 6:10] /= np.linalg.norm(mean[:, 6:10], axis=1, keepdims=True)
+    middle[1:][inside] = mean[inside]
+    return middle
+
+
+@dataclass
+class Model:
+    """A flight under models near one another: remembers the path of the last pass, at which physics is evaluated."""
+
+    flight: Flight
+    path: NDArray | None = None  # (n, 19) in the middle of each step
+    shown: NDArray | None = None  # (n, 19) filtered, at the rows
+    _thrusts: dict[str, tuple[NDArray, NDArray]] = field(default_factory=dict)
+    _rotation: NDArray | None = None
+    _felt_alone: bool | None = None
+    _vibration: NDArray | None = None
+
+    def thrusts(self, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, NDArray]:
+        """Thrusts after the lag; remembered, since most columns change nothing before the rotors."""
+        before = {n: effects[n] for n in effects if _before_rotors(n)}
+        key = f"{vehicle!r} {before!r}"
+        if key not in self._thrusts:
+            if len(self._thrusts) > 8:
+                self._thrusts.clear()
+            self._thrusts[key] = thrust_of(self.flight, vehicle, before)
+        return self._thrusts[key]
+
+    def accelerations(self, point: Point, effects: Effects | None = None) -> tuple[NDArray, Situation]:
+        """(n, 6) specific force and angular acceleration over each step, and the situation."""
+        effects = point.effects if effects is None else effects
+        path = initial_path(self.flight) if self.path is None else self.path
+        if self._rotation is None:
+            self._rotation = rotation_matrix(path[:, 6:10])
+        thrusts = self.thrusts(point.vehicle, effects)
+        situation = situation_of(self.flight, path, point.vehicle, thrusts, self._rotation)
+        moved = motion(situation, vehicle=point.vehicle, effects=effects)
+        return np.concatenate([moved.specific_force, moved.angular_acceleration], axis=1), situation
+
+    def offsets(self, point: Point, accelerations: NDArray, effects: Effects | None = None) -> NDArray:
+        """(n, 12) what the sensors show beyond the truth, evaluated at the filtered states."""
+        effects = point.effects if effects is None else effects
+        if not any(_shows(name) for name in effects):
+            return np.zeros((self.flight.time.size, 12))
+        path = initial_path(self.flight) if self.shown is None else self.shown
+        situation = replace(
+            situation_of(self.flight, path, point.vehicle, self.thrusts(point.vehicle, {})),
+            specific_force=accelerations[:, :3], angular_acceleration=accelerations[:, 3:],
+        )  # fmt: skip
+        return measured(situation, vehicle=point.vehicle, effects=effects).state
+
+    def sweep(self, point: Point, columns: Sequence[Column] = (), *, passes: int = 1) -> Swept:
+        """Filter the flight; with columns, score and information by block. Later passes evaluate physics anew."""
+        for _ in range(max(1, passes) - 1):
+            self._once(point, ())
+        return self._once(point, columns)
+
+    def settle(self, point: Point, passes: int = 2) -> Swept:
+        """Passes without columns until physics is evaluated where the filter is."""
+        return self.sweep(point, passes=passes)
+
+    def _once(self, point: Point, columns: Sequence[Column]) -> Swept:
+        flight = self.flight
+        acceleration, _ = self.accelerations(point)
+        offset = self.offsets(point, acceleration)
+        acting, showing, order = self.derivatives(point, columns, acceleration, offset)
+        swept = run_sweep(flight, acceleration, offset, acting, showing, point.noise)
+        if self._is_felt():
+            swept = self._felt(swept, acceleration, acting)
+        if order is not None:
+            swept = replace(swept, score=swept.score[:, order], information=swept.information[:, order][:, :, order])
+        self.path = causal_middle(swept.filtered, swept.predicted, flight.starts)
+        self.shown, self._rotation = swept.filtered, None
+        return swept
+
+    def _is_felt(self) -> bool:
+        if self._felt_alone is None:
+            self._felt_alone = felt.is_needed(self.flight)
+        return self._felt_alone
+
+    def _felt(self, swept: Swept, acceleration: NDArray, acting: NDArray) -> Swept:
+        """With the accelerometer's evidence added, where nothing else shows forces."""
+        if self._vibration is None:
+            self._vibration = felt.vibration(self.flight, acceleration[:, :3])
+        bias = np.append(np.nanmedian(self.flight.force[:, :2] - acceleration[:, :2], axis=0), 0.0)
+        loglik, score, information = felt.evidence(
+            self.flight, acceleration[:, :3], acting[:, :3], self._vibration, bias
+        )
+        if acting.shape[2] and swept.score.size:
+            swept.score[:, : acting.shape[2]] += score
+            swept.information[:, : acting.shape[2], : acting.shape[2]] += information
+        return replace(swept, loglik=swept.loglik + loglik)
+
+    def derivatives(
+        self, point: Point, columns: Sequence[Column], acceleration: NDArray, offset: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray | None]:
+        """Derivatives of accelerations (n, 6, c) and offsets (n, 12, d), and where each column went (None: no columns).
+
+        A column changes either accelerations or what is shown.
+        """
+        n = self.flight.time.size
+        acting: list[NDArray] = []
+        showing: list[NDArray] = []
+        where: list[tuple[bool, int]] = []
+        for column in columns:
+            d_acting, d_showing = column.acting, column.showing
+            if column.plus is not None:
+                shows = any(_shows(name) for name in column.plus)
+                moves = any(not _shows(name) for name in column.plus)
+                up = self.accelerations(point, column.plus)[0] if moves else acceleration
+                down = acceleration if column.minus is None or not moves else self.accelerations(point, column.minus)[0]
+                d_acting = (up - down) / column.width
+                if shows:
+                    up = self.offsets(point, acceleration, column.plus)
+                    down = offset if column.minus is None else self.offsets(point, acceleration, column.minus)
+                    d_showing = (up - down) / column.width
+                    if not d_showing.any():
+                        d_showing = None
+            if d_showing is not None:
+                where.append((True, len(showing)))
+                showing.append(d_showing)
+            else:
+                where.append((False, len(acting)))
+                acting.append(np.zeros((n, 6)) if d_acting is None else d_acting)
+        if not columns:
+            return np.zeros((n, 6, 0)), np.zeros((n, 12, 0)), None
+        order = np.array([len(acting) + at if shown else at for shown, at in where])
+        stack = (np.stack(acting, 2) if acting else np.zeros((n, 6, 0)),
+                 np.stack(showing, 2) if showing else np.zeros((n, 12, 0)))  # fmt: skip
+        return np.ascontiguousarray(stack[0]), np.ascontiguousarray(stack[1]), order
+
+
+def _before_rotors(name: str) -> bool:
+    effect = CATALOGUE[name]
+    return effect.commanded is not None or effect.timing is not None or effect.speed is not None
+
+
+def _shows(name: str) -> bool:
+    return CATALOGUE[name].measured is not None
+
+
+def run_sweep(
+    flight: Flight, acceleration: NDArray, offset: NDArray, acting: NDArray, showing: NDArray, noise: Noise
+) -> Swept:
+    """The kernel with its arrays made."""
+    n, m = flight.time.size, acting.shape[2] + showing.shape[2]
+    predicted, filtered = np.zeros((n, 19)), np.zeros((n, 19))
+    innovation, variance, rows = np.zeros((n, 12)), np.zeros((n, 12)), np.zeros(n)
+    blocks = flight.blocks if m else 1
+    score, information = np.zeros((blocks, m)), np.zeros((blocks, m, m))
+    loglik = sweep(
+        flight.time, flight.starts, flight.y, np.ascontiguousarray(acceleration[:, :3]),
+        np.ascontiguousarray(acceleration[:, 3:]), offset, acting, showing, np.square(noise.impulse),
+        np.repeat(np.square(noise.measurement), 3), np.square(noise.disturbance),
+        np.broadcast_to(np.asarray(noise.memory, float), (6,)).copy(), WIDE,
+        flight.block if m else np.zeros(n, np.int64), predicted, filtered, innovation, variance, rows, score,
+        information,
+    )  # fmt: skip
+    upper = np.triu(information)
+    information = upper + np.transpose(np.triu(information, 1), (0, 2, 1))
+    return Swept(loglik, rows, predicted, filtered, innovation, variance, score, information)

@@ -1,0 +1,87 @@
+"""A force that depends on place, as a generic rival of the named ones: a constant and a slope by x, y, z for each axis.
+
+A cable, a fan, a wall's draught: none of them is in the catalogue, but wind, ground effect or gusts take their part of
+it. Such a force is the same on the next flight, while the force of gusts correlates with place by chance only; so it
+must hold on flights that it was not fitted to.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.fit import Data
+from crazyem.diagnosis.gram import Gram
+from crazyem.diagnosis.locate import AXES, Finding
+from crazyem.diagnosis.model import Column, Model, Point
+from crazyem.physics.rotations import rotation_matrix
+from crazyem.vehicle import GRAVITY
+
+NATS = 25.0  # that it must gain on the flights fitted and on those held out
+SMALLEST = 0.01  # of the weight, standard deviation along the flight
+WEAK = 1e-4  # (m/s^2)^-2, precision of the prior
+
+
+@dataclass(frozen=True)
+class Place:
+    """A force that depends on place: nats on the flights fitted and held out; what it is as a finding."""
+
+    nats: float
+    held_out: float
+    finding: Finding
+
+
+def depends_on_place(data: Data, apart: Data | None, point: Point) -> Place | None:
+    """Whether a force that depends on place is left beside a model; None if not, or where positions are unknown."""
+    if "position" not in data.signals:
+        return None
+    centre = np.median(np.concatenate([_path(m)[:, :3] for m in data.models]), axis=0)
+    gram = _gram(data, point, centre)
+    prior = np.full(gram.size, WEAK)
+    solution = gram.solve(range(gram.size), precision=prior)
+    dispersion = max(1.0, solution.dispersion)
+    theta, held = solution.theta, solution.held_out
+    if apart is not None:
+        b, a = _gram(apart, point, centre).total(range(gram.size))
+        held = float(b @ theta - 0.5 * theta @ a @ theta)
+    gained = solution.gain / dispersion - gram.size
+    if min(gained, held / dispersion) < NATS:
+        return None
+    place = _path(data.models[0])[:, :3] - centre
+    slopes = theta.reshape(3, 4)[:, 1:]
+    spread = point.vehicle.mass * np.abs(slopes) * place.std(axis=0)
+    i, j = np.unravel_index(int(np.argmax(spread)), spread.shape)
+    if spread[i, j] < SMALLEST * point.vehicle.mass * GRAVITY:
+        return None
+    sd = float(np.sqrt(solution.covariance[4 * i + 1 + j, 4 * i + 1 + j]) * point.vehicle.mass * place[:, j].std())
+    size = float(np.sign(slopes[i, j]) * spread[i, j])
+    time = data.flights[0].time[[0, -1]]
+    finding = Finding("force", AXES[i], f"{AXES[j]} position", AXES[j], (float(time[0]), float(time[1])), size, sd, "N",
+                      float(gained), float(np.exp(-min(gained, 700.0))))  # fmt: skip
+    return Place(float(gained), float(held), finding)
+
+
+def _path(model: Model) -> NDArray:
+    assert model.shown is not None
+    return model.shown
+
+
+def _gram(data: Data, point: Point, centre: NDArray) -> Gram:
+    score, information, flight = [], [], []
+    for k, model in enumerate(data.models):
+        if model.shown is None:
+            model.sweep(point)
+        path = _path(model)
+        axes = rotation_matrix(path[:, 6:10])  # row i: world axis i in the body
+        by = np.column_stack([np.ones(len(path)), path[:, :3] - centre])
+        columns = []
+        for i in range(3):
+            for j in range(4):
+                acting = np.zeros((len(path), 6))
+                acting[:, :3] = axes[:, i] * by[:, j : j + 1]
+                columns.append(Column(f"place{i}{j}", acting=acting))
+        swept = model.sweep(point, columns)
+        score.append(swept.score)
+        information.append(swept.information)
+        flight.append(np.full(len(swept.score), k))
+    return Gram(np.concatenate(score), np.concatenate(information), np.concatenate(flight))

@@ -1,0 +1,138 @@
+"""Pictures of a report: series as lines or bars, drawn by matplotlib (imported on first use) into data URIs."""
+
+import base64
+import io
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+MOST_POINTS = 1500  # of a line; more cannot be seen
+MOST_BARS = 40
+COLORS = ("#2f6f9f", "#d1603d", "#5a9367", "#8a6bbf", "#b58b00", "#4a4a4a")
+ROLES = {"measured": "#222222", "recorded": "#222222", "before": "#d1603d", "after": "#2f6f9f"}
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """One picture.
+
+    Attributes:
+        title: what is to be seen.
+        x: (n,) numbers, or n names for bars.
+        lines: label -> (n,) values. Labels "measured", "before" and "after" have colours of their own.
+        x_label, y_label: with the unit.
+        section: "where" (the mismatch) or "fit" (before and after).
+        kind: "line" or "bar".
+        shaded: intervals of x to be marked.
+        level: a value that counts as nothing (drawn as a band around 0), 0 for none.
+    """
+
+    title: str
+    x: Any
+    lines: Mapping[str, Any]
+    x_label: str = "time [s]"
+    y_label: str = ""
+    section: str = "where"
+    kind: str = "line"
+    shaded: Sequence[tuple[float, float]] = field(default_factory=tuple)
+    level: float = 0.0
+
+
+def data_uri(series: Series) -> str:
+    """The picture as a data URI (SVG), which needs no other file.
+
+    Raises: ValueError if a line has not as many values as there are x.
+    """
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+    from matplotlib.style import context
+
+    lines = {str(label): np.asarray(values, float).ravel() for label, values in series.lines.items()}
+    for label, values in lines.items():
+        if values.size != len(series.x):
+            raise ValueError(f"picture '{series.title}': line '{label}' has {values.size} values for {len(series.x)} x")
+    style = {
+        "font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#999999",
+        "axes.labelcolor": "#333333", "xtick.color": "#555555", "ytick.color": "#555555", "svg.hashsalt": "crazyem",
+        "axes.grid": True, "grid.color": "#e8e8e8", "axes.axisbelow": True, "path.simplify": True,
+    }  # fmt: skip
+    with warnings.catch_warnings(), context(style):
+        warnings.simplefilter("ignore")  # letters that the font has not
+        bars = series.kind == "bar"
+        height = 0.7 + 0.26 * min(len(series.x), MOST_BARS) if bars else 2.3
+        figure = Figure(figsize=(7.4, max(1.6, height)), layout="constrained")
+        canvas = FigureCanvasSVG(figure)
+        axes = figure.add_subplot()
+        if bars:
+            _bars(axes, series, lines)
+        else:
+            _lines(axes, series, lines)
+        if len(lines) > 1:
+            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.02), frameon=False, handlelength=1.2)
+        buffer = io.BytesIO()
+        canvas.print_svg(buffer, metadata={"Date": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def _lines(axes: Any, series: Series, lines: Mapping[str, NDArray]) -> None:
+    x = np.asarray(series.x, float).ravel()
+    for begin, end in series.shaded:
+        if math.isfinite(begin) and math.isfinite(end):
+            axes.axvspan(begin, max(end, begin + 1e-9), color="#f3d9a4", alpha=0.6, linewidth=0)
+    if series.level > 0:
+        axes.axhspan(-series.level, series.level, color="#e9eef2", linewidth=0, zorder=0)
+    for k, (label, values) in enumerate(lines.items()):
+        some, kept = thinned(x, values)
+        wide = 1.6 if label in ("measured", "recorded") else 1.1
+        axes.plot(some, kept, color=_color(label, k), linewidth=wide, label=_text(label))
+    axes.set_xlabel(_text(series.x_label))
+    axes.set_ylabel(_text(series.y_label))
+    axes.margins(x=0.01)
+
+
+def _bars(axes: Any, series: Series, lines: Mapping[str, NDArray]) -> None:
+    names = [_text(str(name)) for name in series.x][:MOST_BARS]
+    place = np.arange(len(names))
+    thick = 0.8 / max(len(lines), 1)
+    for k, (label, values) in enumerate(lines.items()):
+        kept = np.where(np.isfinite(values), values, 0.0)[:MOST_BARS]
+        axes.barh(
+            place + (k - (len(lines) - 1) / 2) * thick, kept, thick * 0.9, color=_color(label, k), label=_text(label)
+        )
+    if series.level > 0:
+        axes.axvspan(-series.level, series.level, color="#e9eef2", linewidth=0, zorder=0)
+    axes.set_yticks(place, names)
+    axes.invert_yaxis()
+    axes.grid(axis="y", visible=False)
+    axes.axvline(0.0, color="#999999", linewidth=0.8)
+    axes.set_xlabel(_text(series.y_label))
+
+
+def _color(label: str, k: int) -> str:
+    return ROLES.get(label.split(" ", maxsplit=1)[0].lower(), COLORS[k % len(COLORS)])
+
+
+def thinned(x: NDArray, values: NDArray) -> tuple[NDArray, NDArray]:
+    """At most about `MOST_POINTS` points that look the same: smallest and largest of each stretch."""
+    if x.size <= MOST_POINTS:
+        return x, values
+    groups = np.array_split(np.arange(x.size), MOST_POINTS // 2)
+    kept: list[int] = []
+    for rows in groups:
+        some = values[rows]
+        if np.isfinite(some).any():
+            kept += sorted({int(rows[np.nanargmin(some)]), int(rows[np.nanargmax(some)])})
+        else:
+            kept.append(int(rows[0]))
+    return x[kept], values[kept]
+
+
+def _text(text: str) -> str:
+    """Text of recordings as it is: no formulas, no control characters."""
+    plain = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+    return plain.replace("\\", "/").replace("$", r"\$")[:120]

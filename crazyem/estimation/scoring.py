@@ -1,0 +1,259 @@
+"""Fisher scoring on the likelihood of the innovations, over parameters and noise scales together.
+
+EM crawls where measurement noise dominates: its steps shrink with the share of the information that the data hold of
+what they would hold if every state were known. Scoring does not. The sensitivities of the innovations give score and
+information of the parameters (`kernels.sensitivities`), the smoother gives the score of the noise scales (Fisher's
+identity), and the derivatives of filter and gain give their information (`kernels.noise_information`). Levenberg's
+damping keeps a step from lowering the posterior. Where the data hold little about a scale, expected and observed
+information differ; the observed one is measured by differences of the score, and updated from successive scores."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.estimation import kernels
+from crazyem.estimation.em import WindowEM, displaced, offset
+from crazyem.estimation.model import Parameters
+
+P = kernels.PARAMETERS
+ALL = P + 11  # coordinates: theta's, then the logarithms of the noise scales
+STEP_THETA, STEP_NOISE = 0.5, 1.5  # longest step of a logarithm (or of a linear parameter in its unit)
+STEP_LAG = 0.2  # the mean inputs are linear in lag and delay only nearby
+CHANGE = -0.1  # of log s, by which the dependence of the score on it is measured
+NEAR = 0.2  # standard deviations from the maximum within which curvature is learnt from the scores on the way only,
+FAR = 3.0  # and so it is after a step from a point within these
+GAIN = 0.1  # share of the expected gain that a step must bring; without that steps can leap to and fro over a ridge
+SLACK = 0.01  # of log-posterior that a step may lose: the score is that of a linearised filter
+ALIKE = 0.05  # of log s, within which the information about the noise scales is not computed again,
+ALIKE_FAR = 0.5  # and where the maximum is still far: steps are tested there whatever curvature they are taken with
+LEAST = 0.05  # eigenvalue of a curvature that is used (the prior alone gives a noise scale 0.44)
+ATTEMPTS = 8  # at one step, each more strongly damped
+NONE = np.zeros(ALL, bool)
+
+
+@dataclass(frozen=True)
+class Point:
+    """Log-posterior at a point with its score and information, in the coordinates (theta's, logarithms of scales).
+
+    Attributes:
+        parameters: the point.
+        value: log-posterior, up to a constant.
+        free: (20,) coordinates that are estimated, and not held at their floor.
+        score: (20,), zero where not free.
+        information: (20, 20) expected, of data and prior; identity where not free.
+        of_noise: (11, 11) information of the data about the logarithms of the noise scales.
+    """
+
+    parameters: Parameters
+    value: float
+    free: NDArray
+    score: NDArray
+    information: NDArray
+    of_noise: NDArray
+
+    @property
+    def decrement(self) -> float:
+        """Length of the scoring step in standard deviations, over all coordinates together."""
+        return float(np.sqrt(max(float(self.score @ np.linalg.solve(self.information, self.score)), 0.0)))
+
+    @property
+    def sd(self) -> NDArray:
+        """(20,) standard deviations of the free coordinates by the information, zero where not free."""
+        variance: NDArray = np.linalg.inv(self.information).diagonal()
+        return np.where(self.free, variance, 0.0) ** 0.5
+
+
+@dataclass(frozen=True)
+class Stop:
+    """A point on the way: theta (9,), and the length of the joint scoring step there in standard deviations."""
+
+    theta: NDArray
+    length: float
+
+
+def log_posterior(em: WindowEM, first: int, last: int, parameters: Parameters) -> float:
+    """Filter the window with these parameters (they stay in `em`): log-likelihood plus log prior, up to a constant."""
+    em.parameters = parameters
+    em.refill_inputs(first, last)
+    return em.forward(first, last, restart=True) + log_prior(em)
+
+
+def log_prior(em: WindowEM) -> float:
+    """Logarithm of the prior where `em` is, up to a constant."""
+    setup, p = em.setup, em.parameters
+    prior = setup.prior
+    theta = offset(p.theta, prior.centre, setup.unit)
+    noise = (p.noise.logs - prior.noise.logs)[~setup.known_scales] / prior.noise_sd
+    return -0.5 * float(np.sum((theta**2 * prior.precision)[setup.free]) + noise @ noise)
+
+
+def point(
+    em: WindowEM, first: int, last: int, value: float, *, of_noise: NDArray | None = None, held: NDArray = NONE
+) -> Point:
+    """Score and information where the window was just filtered; it is smoothed, too.
+
+    Args:
+        em: its tape and parameters.
+        first, last: rows of the window.
+        value: what `log_posterior` returned.
+        of_noise: (11, 11) information about the noise scales, computed unless given.
+        held: (20,) bool, coordinates that stay where they are.
+    """
+    setup, p = em.setup, em.parameters
+    prior = setup.prior
+    of_theta = em.sensitivities(first, last)
+    em.backward(first, last)
+    if of_noise is None:
+        of_noise = em.noise_information(first, last)
+    noise_score = em.noise_terms(first, last).sum(0)
+    # scales that are known in newtons move with mass and inertia
+    carried = setup.carried
+    score, information = np.zeros(ALL), np.zeros((ALL, ALL))
+    score[:P] = em.tape.score[first:last].sum(0) + carried.T @ noise_score
+    score[:P] -= prior.precision * offset(p.theta, prior.centre, setup.unit)
+    score[P:] = noise_score + (prior.noise.logs - p.noise.logs) / prior.noise_sd**2
+    information[:P, :P] = of_theta + carried.T @ of_noise @ carried + np.diag(prior.precision)
+    information[P:, P:] = of_noise + np.eye(11) / prior.noise_sd**2
+    information[P:, :P] = of_noise @ carried
+    information[:P, P:] = information[P:, :P].T
+    floored = (p.noise.logs <= prior.floor + 1e-9) & (score[P:] < 0)
+    free = np.concatenate([setup.free, ~(setup.known_scales | floored)]) & ~held
+    score[~free] = 0.0
+    information[~free, :] = 0.0
+    information[:, ~free] = 0.0
+    information[~free, ~free] = 1.0
+    return Point(p, value, free, score, information, of_noise)
+
+
+def moved(em: WindowEM, start: Parameters, step: NDArray) -> Parameters:
+    """A point displaced by a step (20,), kept above the floors of the noise scales."""
+    setup = em.setup
+    theta = displaced(start.theta, step[:P], setup.unit)
+    logs = np.maximum(start.noise.logs + step[P:], setup.prior.floor)
+    return Parameters(theta, setup.noise_at(theta, logs), start.inertia_products)
+
+
+def climb(
+    em: WindowEM,
+    first: int,
+    last: int,
+    *,
+    steps: int,
+    tolerance: float,
+    of_noise: NDArray | None = None,
+    held: NDArray = NONE,
+    path: list[Stop] | None = None,
+    alike: float = ALIKE,
+) -> Point:
+    """Damped scoring steps from the present point until the next would be shorter than `tolerance`, at most `steps`.
+
+    Returns the last point, with which the tape is left filtered and smoothed; every point on the way, the last one
+    included, is added to `path`. The information about the noise scales is computed again where one of them has moved
+    by more than `alike` in log s since, unless `of_noise` (11, 11) is given for everywhere.
+    """
+    path = [] if path is None else path
+    begin = len(path)
+    known: Point | None = None
+
+    def at(value: float) -> Point:
+        nonlocal known
+        given = of_noise
+        if given is None and known is not None:
+            change = em.parameters.noise.logs - known.parameters.noise.logs
+            given = known.of_noise if np.max(np.abs(change)) < alike else None
+        there = point(em, first, last, value, of_noise=given, held=held)
+        known = there if given is None else known
+        return there
+
+    here = at(log_posterior(em, first, last, em.parameters))
+    path.append(Stop(here.parameters.theta, here.decrement))
+    damping, correction = 0.0, np.zeros((ALL, ALL))
+    before: Point | None = None
+    step = np.zeros(ALL)
+    while len(path) - begin <= steps and path[-1].length >= tolerance:
+        if path[-1].length > NEAR and (before is None or before.decrement > FAR):
+            correction = _observed(em, first, last, here)
+        if before is not None:
+            correction = _secant(correction, before, here, step)
+        for attempt in range(ATTEMPTS):
+            curvature = here.information + (correction if attempt == 0 else 0.0)
+            if attempt == 0 and np.linalg.eigvalsh(curvature)[0] <= LEAST:
+                curvature = here.information
+            step = limited(np.linalg.solve((1.0 + damping) * curvature, here.score))
+            value = log_posterior(em, first, last, moved(em, here.parameters, step))
+            expected = max(float(here.score @ step - 0.5 * step @ here.information @ step), 0.0)
+            if value > here.value + GAIN * expected - SLACK:
+                break
+            if attempt:
+                damping = max(3.0 * damping, 1.0)
+        else:
+            log_posterior(em, first, last, here.parameters)
+            em.backward(first, last)
+            break
+        damping = 0.0 if damping < 0.5 else 0.2 * damping
+        before, here = here, at(value)
+        path.append(Stop(here.parameters.theta, here.decrement))
+    return here
+
+
+def _observed(em: WindowEM, first: int, last: int, here: Point) -> NDArray:
+    """What to add to the expected information for the observed one in the scales of process noise (20, 20).
+
+    By differences of the score. Parameters and scales are independent in expectation, but only where the noise is
+    right: a filter that trusts the model too little puts measurement noise that came back in the torque into inertia,
+    and steps of the two undo each other. And of a scale that the data hardly resolve, expectation says little.
+    """
+    out = np.zeros((ALL, ALL))
+    scales = np.arange(P, P + 6)[here.free[P : P + 6]]
+    for j in scales:
+        there = moved(em, here.parameters, CHANGE * np.eye(ALL)[j])
+        value = log_posterior(em, first, last, there)
+        score = point(em, first, last, value, of_noise=here.of_noise, held=~here.free).score
+        out[:, j] = (here.score - score) / CHANGE - here.information[:, j]
+    out[np.ix_(scales, scales)] *= 0.5
+    rest = np.setdiff1d(np.arange(ALL), scales)
+    out[np.ix_(rest, rest)] = 0.0
+    out += out.T
+    for _ in range(6):
+        if np.linalg.eigvalsh(here.information + out)[0] > LEAST:
+            return out
+        out *= 0.5
+    return np.zeros((ALL, ALL))
+
+
+def limited(step: NDArray) -> NDArray:
+    """A scoring step made safe, in the coordinates in which the data are linear or quadratic.
+
+    Accelerations are linear in 1/m and 1/I. Innovations have variances that are linear in those of the noise: where a
+    scale s is much too large, its score cannot ask for more than half a unit of log s, however far it is off; taken in
+    the variance the same step reaches the end at once, s'^2 = s^2 (1 + 2 step). And where two noises look alike, as
+    those of lateral force and of an accelerometer do, it is the sum of their variances that is known: in logarithms
+    that is a bent ridge, which straight steps fall off.
+    """
+    step = step.copy()
+    step[:4] = -np.log(1.0 - np.minimum(step[:4], 1.0 - np.exp(-STEP_THETA)))
+    step[P:] = 0.5 * np.log(np.clip(1.0 + 2.0 * step[P:], np.exp(-2.0 * STEP_NOISE), np.exp(2.0 * STEP_NOISE)))
+    limits = np.concatenate([np.full(P, STEP_THETA), np.full(11, STEP_NOISE)])
+    limits[kernels.LAG : kernels.OFFSET] = STEP_LAG
+    return np.clip(step, -limits, limits)
+
+
+def _secant(correction: NDArray, before: Point, after: Point, step: NDArray) -> NDArray:
+    """What to add to the expected information to have the observed one along the last step (Dennis, Gay, Welsch 1981).
+
+    The scores before and after a step tell the curvature of the likelihood along it. The expected information differs
+    from it by chance, and by much where the data hold little about a noise scale.
+    """
+    free = before.free & after.free
+    s = np.where(free, step, 0.0)
+    y = np.where(free, before.score - after.score, 0.0)
+    slope = y @ s
+    if slope <= 1e-12:
+        return np.zeros_like(correction)
+    residual = y - after.information @ s
+    along = abs(s @ correction @ s)
+    if along > 0:  # what was learnt where the curvature was larger is shrunk to the present
+        correction = correction * min(1.0, abs(s @ residual) / along)
+    r = residual - correction @ s
+    return correction + (np.outer(r, y) + np.outer(y, r)) / slope - (r @ s) / slope**2 * np.outer(y, y)

@@ -1,0 +1,119 @@
+"""Where a stretch of flight begins when its attitude is not measured: found from what follows, before it is believed.
+
+A state that starts anew is uncertain by a third of a radian in attitude. The filter linearises around its guess and
+around what the first, noisy samples make of it; over such angles the thrust's vertical share is cos, not 1, and mass
+comes out too large by the variance of the angle (0.35 standard deviations in 96 windows of 4 s, little process noise).
+So the first state is smoothed from all later samples, and the filter starts there, as uncertain as a small share of the
+same data leave it: too small a share to count twice, enough to stay where a linear model holds."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from crazyem.compiled import compiled
+from crazyem.estimation.em import WindowEM
+from crazyem.estimation.kernels.algebra import apply_transposed
+from crazyem.estimation.tape import BREAK, START_VARIANCE
+from crazyem.physics.rotations import quaternion_from_rotation_vector, quaternion_product
+
+ITERATIONS = 4
+SHARE = 0.03  # of the information of the window about its first state that the start is given
+SETTLED = 1e-3  # rad
+
+
+@compiled
+def smoothed_error(first, last, time, kind, lead, gain, s, e, blocks, pf, covariance):
+    """Error (12,) of the filtered state at `first` by all later samples up to last - 1, or to the next break.
+
+    `covariance` (12, 12) receives that of the smoothed state (modified Bryson and Frazier, as in `kernels.backward`).
+    """
+    lam = np.zeros((12, 1))
+    back = np.zeros((12, 1))
+    big = np.zeros((12, 12))
+    half = np.empty((12, 12))
+    turned = np.empty((12, 12))
+    column = np.empty(12)
+    for k in range(last - 1, first, -1):
+        if kind[k] == 1:
+            lam[:] = 0.0
+            big[:] = 0.0
+            continue
+        for i in range(11, -1, -1):
+            if s[k, i] == 0.0:
+                continue
+            pull = e[k, i] / s[k, i]
+            both = 1.0 / s[k, i]
+            for j in range(12):
+                pull += gain[k, i, j] * lam[j, 0]
+                column[j] = 0.0
+                for m in range(12):
+                    column[j] += big[j, m] * gain[k, i, m]
+                both += gain[k, i, j] * column[j]
+            lam[i, 0] -= pull
+            for j in range(12):
+                big[i, j] -= column[j]
+                big[j, i] -= column[j]
+            big[i, i] += both
+        dt = time[k] - time[k - 1]
+        apply_transposed(blocks[k], dt, lead * dt, lam, back)
+        lam[:] = back
+        apply_transposed(blocks[k], dt, lead * dt, big, half)
+        turned[:] = half.T
+        apply_transposed(blocks[k], dt, lead * dt, turned, big)
+    error = np.zeros(12)
+    for i in range(12):
+        for j in range(12):
+            error[i] -= pf[first, i, j] * lam[j, 0]
+    covariance[:] = pf[first] - pf[first] @ big @ pf[first]
+    return error
+
+
+def blind(em: WindowEM, first: int) -> bool:
+    """Whether the state starts anew at row `first` without a measured attitude."""
+    return bool(em.tape.kind[first] == BREAK and np.isnan(em.tape.y[first, 6]))
+
+
+def find(em: WindowEM, first: int, last: int) -> None:
+    """Put the state at row `first` where the whole window has it, by a small share of it; filters the window."""
+    t = em.tape
+    vague = np.diag(1.0 / START_VARIANCE)
+    covariance = np.empty((12, 12))
+    for _ in range(ITERATIONS):
+        em.forward(first, last, restart=True)
+        error = smoothed_error(
+            first, last, t.time, t.kind, em.setup.lead, t.gain, t.s, t.e, t.blocks, t.pf, covariance
+        )  # fmt: skip
+        before = np.linalg.inv(t.pp[first])
+        start = _turned(t.xf[first], error)
+        moved = np.linalg.norm(start[6:10] - t.xp[first, 6:10])
+        seen = np.linalg.inv(covariance) - before  # what the data say of the start
+        t.xp[first] = start
+        t.pp[first] = np.linalg.inv(vague + SHARE * 0.5 * (seen + seen.T))
+        if moved < SETTLED:
+            break
+
+
+def _turned(state: np.ndarray, error: np.ndarray) -> np.ndarray:
+    out = state.copy()
+    out[:6] += error[:6]
+    out[6:10] = quaternion_product(state[6:10], quaternion_from_rotation_vector(error[6:9]))
+    out[10:13] += error[9:12]
+    return out
+
+
+@contextmanager
+def beginning(em: WindowEM, first: int, last: int) -> Iterator[Callable[[], None]]:
+    """For the time of the context, a window that begins blindly begins where the window has it.
+
+    Yields a function that looks for it again, with better parameters.
+    """
+    if not blind(em, first):
+        yield lambda: None
+        return
+    em.tape.kind[first] = 0  # its prior is the one on the tape from now on
+    try:
+        find(em, first, last)
+        yield lambda: find(em, first, last)
+    finally:
+        em.tape.kind[first] = BREAK

@@ -1,0 +1,281 @@
+"""The log blocks of one drone: created, received, counted, timed, and brought back after an outage."""
+
+import contextlib
+import math
+import queue
+import statistics
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from crazyem.errors import LinkError, UsageError
+from crazyem.links.asking import Asker
+from crazyem.links.base import LinkLost, LinkStatistics
+from crazyem.links.clock import ClockFit, ClockRelation, LossCounter, StampUnwrapper
+from crazyem.links.log_control import LogControl
+from crazyem.links.packing import pack, period_of
+from crazyem.signals.packet import Block, Packet
+
+LATE_AFTER = 0.1  # s behind the least-delayed packets after which a packet counts as late
+_START_ATTEMPT = 0.5  # s to wait for a block's first packet beyond its period, before asking again
+_START_ATTEMPTS = 4
+_DELAYS = 500  # newest packets of a block whose delays make its median and 99th percentile
+_BACKWARDS_MS = 200  # a clock that is further behind than that was reset
+_AHEAD, _FASTER = 2.0, 3.0  # s, and times what the clocks' relation allows: simulators that were starved catch up
+
+
+class LogBlocks:
+    """Everything about log blocks; used by `crazyflie.CrazyflieLink`.
+
+    Args:
+        uri: for messages.
+        packets: where received packets go, in order of arrival.
+    """
+
+    def __init__(self, uri: str, packets: "queue.SimpleQueue[Packet | LinkLost]") -> None:
+        self._uri, self._packets = uri, packets
+        self._cf: Any = None
+        self._asker: Asker | None = None
+        self._running: dict[int, tuple[Block, Any, Callable[..., None]]] = {}
+        self._counters: dict[int, LossCounter] = {}
+        self._delays: dict[int, deque[float]] = {}
+        self._unwrapper = StampUnwrapper()
+        self._clock = ClockRelation()
+        self._edge: ClockFit | None = None
+        self._lock = threading.Lock()
+        self._held: dict[int, int] | None = None  # while a link comes back: block -> stamp of its first packet [ms]
+        self._newest = -math.inf
+        self.outages = 0
+        self.last_packet = time.monotonic()
+
+    def attach(self, crazyflie: Any) -> None:
+        """Work with this connected Crazyflie object."""
+        self._cf = crazyflie
+        self._asker = Asker(crazyflie)
+        self._control = LogControl(self._asker, self._uri)
+        self.last_packet = time.monotonic()
+
+    @property
+    def asker(self) -> Asker:
+        """For other requests over the same link."""
+        assert self._asker is not None
+        return self._asker
+
+    @property
+    def periods(self) -> list[float]:
+        """Of the running blocks, s."""
+        return [block.period_ms / 1000.0 for block, _, _ in list(self._running.values())]
+
+    def available(self) -> Mapping[str, str]:
+        """Name -> C type of everything the firmware can log."""
+        table = self._cf.log.toc.toc
+        return {f"{group}.{name}": item.ctype for group, items in table.items() for name, item in items.items()}
+
+    # --- starting ---------------------------------------------------------------------------------------------------
+
+    def subscribe(
+        self, variables: Sequence[str], rate_hz: float, groups: Sequence[Sequence[str]] | None, lost: Callable[[], str]
+    ) -> tuple[Block, ...]:
+        """As `CrazyflieLink.subscribe`; `lost()` is why the drone counts as lost, "" while it does not."""
+        in_use = [b for b in self._cf.log.log_blocks if b.added or b.pending or b.started]
+        blocks = pack(
+            variables,
+            self.available(),
+            period_of(rate_hz),
+            groups=groups,
+            first_identifier=max(self._counters, default=-1) + 1,
+            blocks_in_use=len(in_use),
+            variables_in_use=sum(len(b.variables) for b in in_use),
+        )
+        for block in blocks:
+            config = self._configuration(block)
+            receive = self._receiver(block)
+            config.data_received_cb.add_callback(receive)
+            self._counters[block.identifier] = LossCounter(block.period_ms)
+            self._delays[block.identifier] = deque(maxlen=_DELAYS)
+            self.last_packet = time.monotonic()
+            self._running[block.identifier] = (block, config, receive)
+            self._start(block, config, lost)
+        return blocks
+
+    def _configuration(self, block: Block) -> Any:
+        """cflib's object for the block: it numbers blocks and takes packets apart."""
+        config = _new_configuration(f"crazyem {block.identifier}", max(block.period_ms, 10))
+        for variable in block.variables:
+            config.add_variable(variable.name)
+        try:
+            self._cf.log.add_config(config)
+        except (KeyError, AttributeError) as error:
+            raise UsageError(f"The drone does not take log block {block.identifier}: {error}.") from error
+        return config
+
+    def _install(self, block: Block, config: Any) -> None:
+        table = self._cf.log.toc
+        items = [(v.get_storage_and_fetch_byte(), table.get_element_id(v.name)) for v in config.variables]
+        self._control.install(config.id, items)
+        if not self._control.start(config.id, block.period_ms):
+            raise LinkError(f"The drone at {self._uri} lost log block {block.identifier} at once.")
+
+    def _start(self, block: Block, config: Any, lost: Callable[[], str]) -> None:
+        """Start a block and see its first packet."""
+        for _ in range(_START_ATTEMPTS):
+            try:
+                self._install(block, config)
+            except LinkError as error:
+                raise LinkError(lost() or str(error)) from None
+            deadline = time.monotonic() + _START_ATTEMPT + block.period_ms / 1000.0
+            while time.monotonic() < deadline:
+                if lost():
+                    raise LinkError(lost())
+                if self._counters[block.identifier].received:
+                    return
+                time.sleep(0.002)
+        raise LinkError(f"Log block {block.identifier} of {self._uri} does not start: no data came.")
+
+    def remove(self, *, answered: bool) -> None:
+        """Forget every block; delete them on the drone too if it is there to hear it (`answered`)."""
+        for _, config, receive in self._running.values():
+            with contextlib.suppress(ValueError):
+                config.data_received_cb.remove_callback(receive)
+            if answered and self._cf.link is not None:
+                with contextlib.suppress(Exception):
+                    answered = self._control.delete(config.id)
+        for _, config, _ in self._running.values():
+            with contextlib.suppress(ValueError):
+                self._cf.log.log_blocks.remove(config)
+        self._running.clear()
+        if self._asker is not None:
+            with contextlib.suppress(ValueError):
+                self._asker.close()
+
+    # --- receiving --------------------------------------------------------------------------------------------------
+
+    def _receiver(self, block: Block) -> Callable[[int, Mapping[str, float], Any], None]:
+        names = tuple(v.name for v in block.variables)
+        identifier = block.identifier
+
+        def receive(stamp: int, data: Mapping[str, float], _config: Any) -> None:
+            host_time = time.time()
+            self.last_packet = time.monotonic()
+            with self._lock:
+                if self._held is not None:
+                    self._held.setdefault(identifier, stamp)
+                    return
+                firmware_time = self._unwrapper.unwrap(stamp)
+                self._newest = max(self._newest, firmware_time)
+                self._clock.add(firmware_time, host_time)
+                edge, late = self._edge, False
+                if edge is not None:
+                    delay = host_time - edge.to_host(firmware_time)
+                    late = delay > LATE_AFTER
+                    self._delays[identifier].append(delay)
+                self._counters[identifier].count(firmware_time, late=late)
+                # Inside the lock, so that nothing overtakes when held packets are let go.
+                self._packets.put(Packet(identifier, firmware_time, host_time, tuple(data[name] for name in names)))
+
+        return receive
+
+    def refresh(self) -> None:
+        """Fit the clocks anew; call it a few times a second."""
+        with self._lock:
+            self._edge = self._clock.fit()
+
+    def clock(self) -> ClockFit | None:
+        """How the host clock runs against the firmware's, None before the first packet."""
+        with self._lock:
+            return self._clock.fit()
+
+    def statistics(self, round_trip: float = math.nan) -> LinkStatistics:
+        """Packets by fate, in total and per block, their delays and the clocks."""
+        with self._lock:
+            fates = {i: (c.received, c.lost, c.late) for i, c in self._counters.items()}
+            delays = {i: list(d) for i, d in self._delays.items() if d}
+            fit = self._clock.fit()
+        totals = [sum(f[k] for f in fates.values()) for k in range(3)]
+        return LinkStatistics(
+            totals[0], totals[1], totals[2], fates,
+            delays={i: _median_and_p99(d) for i, d in delays.items()},
+            round_trip=round_trip,
+            clock_offset=fit.offset if fit is not None else math.nan,
+            clock_rate=fit.rate if fit is not None else math.nan,
+            outages=self.outages,
+        )  # fmt: skip
+
+    # --- after an outage --------------------------------------------------------------------------------------------
+
+    def hold(self) -> None:
+        """Keep packets back until it is known whose they are."""
+        with self._lock:
+            self._held = {}
+
+    def resume(self, deadline: float) -> int:
+        """Make every block deliver again; returns how many had to be created anew.
+
+        Raises: LinkError: no answer in time.
+        """
+        created = 0
+        for identifier, (block, config, _) in self._running.items():
+            if self._flows(identifier):
+                continue
+            if not self._control.start(config.id, block.period_ms):
+                self._install(block, config)
+                created += 1
+        longest = max(self.periods, default=0.0)
+        until = min(deadline, time.monotonic() + _START_ATTEMPT + 2 * longest)
+        while not all(self._flows(i) for i in self._running):
+            if time.monotonic() > until:
+                raise LinkError(f"The drone at {self._uri} answers, but log data does not come.")
+            time.sleep(0.002)
+        return created
+
+    def _flows(self, identifier: int) -> bool:
+        with self._lock:
+            return self._held is not None and identifier in self._held
+
+    def reset_since(self) -> bool:
+        """Whether the drone's clock, by the packets held back, is another than before the outage: it was restarted."""
+        with self._lock:
+            stamps = list((self._held or {}).values())
+            if not stamps or not math.isfinite(self._newest):
+                return False
+            now = max(self._unwrapper.peek(s) for s in stamps)
+            if now < self._newest - _BACKWARDS_MS:
+                return True
+            fit = self._clock.fit()
+            if fit is None or fit.packets < 300:
+                return False
+            allowed = (time.time() - fit.to_host(self._newest)) / fit.rate * _FASTER + _AHEAD
+            return (now - self._newest) / 1000.0 > allowed
+
+    def release(self) -> float:
+        """Let packets pass again; returns the newest stamp held back, unwrapped, ms.
+
+        Packets held back were only looked at: each block sends others within a period.
+        """
+        with self._lock:
+            after = max((self._unwrapper.peek(s) for s in (self._held or {}).values()), default=math.nan)
+            self._held = None
+            self.outages += 1
+        return after
+
+    @property
+    def newest_ms(self) -> float:
+        """Newest unwrapped stamp, ms; -inf before the first."""
+        return self._newest
+
+
+def _new_configuration(name: str, period_ms: int) -> Any:
+    """A LogConfig that cflib takes for added, or it would start the block when it sees a reply, before it is whole."""
+    from cflib.crazyflie.log import LogConfig
+
+    class Configuration(LogConfig):
+        added = property(lambda self: True, lambda self, value: None)
+
+    return Configuration(name, period_ms)
+
+
+def _median_and_p99(values: list[float]) -> tuple[float, float]:
+    ordered = sorted(values)
+    return statistics.median(ordered), ordered[min(len(ordered) - 1, round(0.99 * (len(ordered) - 1)))]

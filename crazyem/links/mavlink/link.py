@@ -1,0 +1,334 @@
+"""A drone that speaks MAVLink, as a Link: watched, timed, its losses counted, one of its parameters written if asked.
+
+It cannot be flown from here: setpoints of an autopilot belong to whoever flies it.
+"""
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+from crazyem.errors import LinkError, UsageError
+from crazyem.links.base import LinkLost, LinkStatistics, Outage, ParameterWrite
+from crazyem.links.clock import ClockFit
+from crazyem.links.mavlink import motors, streams
+from crazyem.links.mavlink.address import parse
+from crazyem.links.mavlink.frames import number_of
+from crazyem.links.mavlink.parameters import ParameterClient
+from crazyem.links.mavlink.radio import ACCEPTED, Radio
+from crazyem.links.mavlink.receiver import Receiver
+from crazyem.links.mavlink.wires import open_wire
+from crazyem.signals.packet import Block, Packet
+
+_SETTLE, _SETTLE_MOST = 0.7, 5.0  # s of listening after streams were asked for; at most, if something is missing
+HOVER_PARAMETERS = {motors.PX4: "MPC_THR_HOVER", motors.ARDUPILOT: "MOT_THST_HOVER"}
+# another estimator on board that writes the same: parameter, the value that means it is on, what it does
+OWN_HOVER = {
+    motors.PX4: ("MPC_USE_HTE", 1.0, "PX4 flies with its own estimate of hover thrust"),
+    motors.ARDUPILOT: ("MOT_HOVER_LEARN", 2.0, "ArduPilot learns and saves hover thrust itself"),
+}
+
+_Waiter = Callable[[], bool]
+
+
+class MavlinkLink:
+    """One autopilot. Blocks are messages (`streams`); every call has a time limit, none waits for ever.
+
+    Args:
+        uri: see `address.parse`. Raises UsageError.
+
+    Attributes:
+        packets: received, in order; `LinkLost` at the end.
+        on_frame: called with (host time [s], frame) for every sound frame of this drone, in the receiving thread.
+        outputs: how its motors are read.
+    """
+
+    def __init__(self, uri: str) -> None:
+        self.uri = uri
+        self.address = parse(uri)
+        self.packets: queue.SimpleQueue[Packet | LinkLost] = queue.SimpleQueue()
+        self.outputs = motors.Outputs()
+        self._ears: Receiver | None = None
+        self._returning = False
+        self._rate = 0.0
+        self._parameters = ParameterClient(
+            uri,
+            ask_read=lambda name: self._talk().ask_parameter(name),
+            ask_write=lambda name, value, kind: self._talk().set_parameter(name, value, kind),
+            bitwise=lambda: self.autopilot == motors.PX4,
+        )
+
+    # --- connection ---------------------------------------------------------------------------------------------
+
+    def connect(self, timeout: float = 30.0) -> None:
+        """Wait for the heartbeat of a vehicle, then ask what its outputs mean. Raises LinkError."""
+        if self._ears is not None:
+            return
+        self._ears = ears = Receiver(
+            self.uri,
+            Radio(open_wire(self.address)),
+            system=self.address.system,
+            packets=self.packets,
+            on_parameter=self._parameters.heard,
+        )
+        try:
+            if not self._wait(lambda: ears.autopilot >= 0, timeout):
+                raise LinkError(self._nobody(ears, timeout))
+            self._identify(ears)
+        except BaseException:
+            self.close()
+            raise
+
+    def _nobody(self, ears: Receiver, timeout: float) -> str:
+        others = f" Systems {', '.join(map(str, sorted(ears.foreign)))} were heard." if ears.foreign else ""
+        noise = f" {ears.parser.skipped} bytes came that are not MAVLink." if ears.parser.skipped else ""
+        chosen = f"system {self.address.system}" if self.address.system else "a vehicle"
+        return f"no heartbeat of {chosen} came at {self.uri} within {timeout:g} s.{others}{noise}"
+
+    def _identify(self, ears: Receiver) -> None:
+        wanted = [*motors.wanted(ears.autopilot), *self._hover_names()]
+
+        def told() -> bool:
+            version = attempt > 0 or "AUTOPILOT_VERSION" in ears.seen  # not all have one
+            return version and not set(wanted) - self._parameters.known.keys()
+
+        for attempt in range(3):
+            ears.radio.request_message(number_of("AUTOPILOT_VERSION"))
+            for name in wanted:
+                if name not in self._parameters.known:
+                    ears.radio.ask_parameter(name)
+            if self._wait(told, 0.3 * (attempt + 1)):
+                break
+        self.outputs = ears.streams.outputs = motors.Outputs.of(ears.autopilot, self._parameters.known)
+
+    def _hover_names(self) -> list[str]:
+        name, own = HOVER_PARAMETERS.get(self.autopilot), OWN_HOVER.get(self.autopilot)
+        return [n for n in (name, own[0] if own else None) if n]
+
+    def close(self) -> None:
+        """Stop listening and close the wire. What streams were asked for goes on."""
+        ears, self._ears = self._ears, None
+        if ears is not None:
+            ears.close()
+            ears.radio.wire.close()
+
+    def __enter__(self) -> "MavlinkLink":
+        self.connect()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _open(self) -> Receiver:
+        if self._ears is None:
+            raise LinkError(f"The link to {self.uri} is not open.")
+        return self._ears
+
+    def _talk(self) -> Radio:
+        ears = self._open()
+        if ears.lost and not self._returning:
+            raise LinkError(ears.lost)
+        return ears.radio
+
+    def _wait(self, done: Callable[[], bool], seconds: float) -> bool:
+        until = time.monotonic() + seconds
+        while not done():
+            if time.monotonic() > until:
+                return False
+            self._talk()  # raises if the drone is lost
+            time.sleep(0.005)
+        return True
+
+    @property
+    def autopilot(self) -> int:
+        """MAV_AUTOPILOT of the drone, -1 before it is known."""
+        return self._ears.autopilot if self._ears is not None else -1
+
+    @property
+    def simulated(self) -> bool:
+        """Whether it calls itself our simulator. An address says nothing: real drones are relayed to this host too."""
+        return self._ears is not None and self._ears.simulated
+
+    @property
+    def on_frame(self) -> Callable[[float, bytes], None] | None:
+        return self._open().on_frame
+
+    @on_frame.setter
+    def on_frame(self, keep: Callable[[float, bytes], None] | None) -> None:
+        self._open().on_frame = keep
+
+    # --- logging ------------------------------------------------------------------------------------------------
+
+    @property
+    def log_variables(self) -> Mapping[str, str]:
+        """Name -> C type of every variable a block of ours can have."""
+        return {v.name: v.ctype for name in streams.block_names() for v in streams.variables_of(name)}
+
+    def start_streams(self, rate_hz: float) -> tuple[Block, ...]:
+        """Ask for all that the estimator needs, see what comes, and let it flow as blocks.
+
+        Raises: LinkError: position, attitude or the work of the motors does not come.
+        """
+        ears = self._open()
+        self._rate = rate_hz
+        self._ask_streams(rate_hz)
+        ready = time.monotonic() + max(_SETTLE, 2.5 / rate_hz)
+        self._wait(
+            lambda: time.monotonic() > ready and not _missing(ears.seen), ready + _SETTLE_MOST - time.monotonic()
+        )
+        if missing := _missing(ears.seen):
+            raise LinkError(f"the drone at {self.uri} sends no {' and no '.join(missing)}.")
+        names = ears.streams.choose(set(ears.seen), raw_imu=ears.autopilot == motors.ARDUPILOT)
+        blocks = streams.blocks_of(names, rate_hz)
+        ears.use(blocks)
+        return tuple(blocks.values())
+
+    def subscribe(self, variables: Sequence[str], rate_hz: float) -> tuple[Block, ...]:
+        """All streams at once, whatever the variables: an autopilot sends messages, not variables."""
+        unknown = [v for v in variables if v not in self.log_variables]
+        if unknown:
+            raise UsageError(f"a MAVLink drone has no log variable {unknown[0]}.")
+        return self.start_streams(rate_hz)
+
+    def _ask_streams(self, rate_hz: float) -> None:
+        radio = self._talk()
+        answers = 0
+        for names, hertz in ((streams.FAST, rate_hz), (streams.SLOW, min(streams.SLOW_HZ, rate_hz))):
+            for name in names:
+                result = radio.set_interval(number_of(name), hertz)
+                answers += result == ACCEPTED
+                if result is None and not answers:
+                    break  # it does not know the command; do not ask twelve times
+        if not answers:
+            for group, fast in streams.STREAM_GROUPS:
+                radio.request_stream(group, rate_hz if fast else min(streams.SLOW_HZ, rate_hz))
+
+    def statistics(self) -> LinkStatistics:
+        """Messages of this drone by fate: lost by their sequence numbers, repeated ones not counted."""
+        return self._open().statistics()
+
+    def clock(self) -> ClockFit | None:
+        """How the host clock runs against the autopilot's, None before the first packet."""
+        return self._open().fit()
+
+    def account(self) -> Mapping[str, str]:
+        """What became of the bytes, for the end of a recording."""
+        return self._open().account()
+
+    # --- the end of a link --------------------------------------------------------------------------------------
+
+    @property
+    def can_reconnect(self) -> bool:
+        """Whether `reconnect` may bring a lost link back."""
+        return self._ears is not None and not self._ears.hopeless
+
+    def reconnect(self, timeout: float = 5.0, abort: threading.Event | None = None) -> Outage:
+        """After a `LinkLost`: wait for the same drone, whose clock must have gone on; ask for its streams again.
+
+        Raises: LinkError: not in time, or restarted.
+        """
+        ears = self._open()
+        if not ears.lost:
+            raise LinkError(f"The link to {self.uri} is not lost.")
+        before, since, reason = ears.drone_clock.newest_ms, ears.last, ears.lost
+        until = time.monotonic() + timeout
+        self._returning = True
+        try:
+            while ears.last <= since:
+                if ears.hopeless:
+                    raise LinkError(f"The drone at {self.uri} was restarted.")
+                if time.monotonic() > until or (abort is not None and abort.is_set()):
+                    raise LinkError(f"The drone at {self.uri} did not come back within {timeout:g} s.")
+                if ears.unplugged:
+                    self._reopen(ears)
+                time.sleep(0.05)
+            self._ask_streams(self._rate)
+        finally:
+            self._returning = False
+        ears.came_back()
+        return Outage(reason, ears.last - since, before, ears.drone_clock.newest_ms, 0)
+
+    def _reopen(self, ears: Receiver) -> None:
+        """A serial port that was unplugged has to be opened anew."""
+        try:
+            wire = open_wire(self.address)
+        except LinkError:
+            return
+        old, ears.radio.wire = ears.radio.wire, wire
+        ears.unplugged = False
+        old.close()
+
+    # --- parameters ---------------------------------------------------------------------------------------------
+
+    @property
+    def parameters(self) -> Mapping[str, str]:
+        """Name -> C type of the parameters heard of so far: the whole list takes minutes over a telemetry radio."""
+        return self._parameters.types()
+
+    @property
+    def parameter_fault(self) -> str:
+        """Why the last parameter access went unanswered; "" while parameters work."""
+        return self._parameters.fault
+
+    @property
+    def hover_parameter(self) -> str:
+        """The hover thrust parameter of this kind of autopilot, "" if it has none that we know."""
+        return HOVER_PARAMETERS.get(self.autopilot, "")
+
+    @property
+    def own_hover_estimate(self) -> str:
+        """What on board writes or replaces the same parameter, one clause; "" if nothing does."""
+        name, value, what = OWN_HOVER.get(self.autopilot, ("", 0.0, ""))
+        return f"{what} ({name} = {value:g})" if self._parameters.known.get(name) == value else ""
+
+    @property
+    def cells(self) -> int:
+        """Of the battery; 0 while unknown."""
+        return self._open().streams.cells
+
+    @property
+    def about(self) -> Mapping[str, Mapping[str, str]]:
+        """For recordings: sections "mavlink" and "parameter_values" (those read)."""
+        ears = self._open()
+        told = {
+            "system": str(ears.system),
+            "component": str(ears.component),
+            "autopilot": str(ears.autopilot),
+            "vehicle_type": str(ears.kind),
+            "our_simulator": str(ears.simulated).lower(),
+            "assumed": "; ".join(self.outputs.assumed),
+            "outputs.channels": " ".join(str(c + 1) for c in self.outputs.channels),
+            "outputs.motors": " ".join(str(m + 1) for m in self.outputs.motors),
+        }
+        return {"mavlink": told, "parameter_values": {n: repr(v) for n, v in self._parameters.known.items()}}
+
+    def read_parameter(self, name: str, timeout: float = 2.0) -> float:
+        """The value in the drone now. Raises LinkError or UsageError."""
+        self._talk()
+        return self._parameters.read(name, timeout)
+
+    def write_parameter(self, name: str, value: float, timeout: float = 1.0) -> ParameterWrite:
+        """Write and verify by PARAM_VALUE: `verified` only if the drone sent back exactly the bits written."""
+        self._talk()
+        return self._parameters.write(name, value, timeout)
+
+    # --- flying: not from here ----------------------------------------------------------------------------------
+
+    def _not_flown(self, *_: object, **__: object) -> None:
+        raise UsageError("a MAVLink drone is watched, not flown: fly it with its own ground station.")
+
+    arm = take_off = land = go_to = _not_flown
+    send_full_state = send_position = send_hover = _not_flown
+    release_setpoints = stop = _not_flown
+
+
+def _missing(seen: Mapping[str, int]) -> list[str]:
+    """What the estimator cannot do without and has not come."""
+    needs = {
+        "LOCAL_POSITION_NED (has it no position?)": ("LOCAL_POSITION_NED",),
+        "attitude": ("ATTITUDE_QUATERNION", "ATTITUDE"),
+        "motor outputs or rotor speeds (ACTUATOR_OUTPUT_STATUS, SERVO_OUTPUT_RAW, ESC_STATUS)": (
+            *("ACTUATOR_OUTPUT_STATUS", "SERVO_OUTPUT_RAW", "ESC_STATUS", "ESC_TELEMETRY_1_TO_4"),
+        ),
+    }
+    return [what for what, names in needs.items() if not any(n in seen for n in names)]

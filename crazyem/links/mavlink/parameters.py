@@ -1,0 +1,143 @@
+"""The parameter protocol: one value read or written at a time, asked for again while no answer comes.
+
+Values travel as floats: PX4 sends the bits of an integer in them, ArduPilot its value.
+Source: mavlink.io/en/services/parameter.html.
+"""
+
+import queue
+import struct
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from crazyem.errors import LinkError, UsageError
+from crazyem.links.base import ParameterWrite
+
+RESEND_AFTER = 0.3  # s
+# MAV_PARAM_TYPE -> name, struct format
+TYPES = {1: ("uint8_t", "B"), 2: ("int8_t", "b"), 3: ("uint16_t", "H"), 4: ("int16_t", "h"), 5: ("uint32_t", "I"),
+         6: ("int32_t", "i"), 9: ("float", "f")}  # fmt: skip
+_REAL32 = 9
+
+
+def decode(value: float, kind: int, *, bitwise: bool) -> float:
+    """What a PARAM_VALUE means; NaN for a type that does not fit into a float."""
+    if kind not in TYPES:
+        return float("nan")
+    if kind == _REAL32 or not bitwise:
+        return value
+    form = TYPES[kind][1]
+    return float(struct.unpack_from("<" + form, struct.pack("<f", value))[0])
+
+
+def encode(value: float, kind: int, *, bitwise: bool) -> float:
+    """The float that carries a value in a PARAM_SET. Raises UsageError if the type cannot hold it."""
+    name, form = TYPES.get(kind, ("unknown", ""))
+    try:
+        if kind == _REAL32:
+            return float(struct.unpack("<f", struct.pack("<f", value))[0])
+        if not form or value != int(value):
+            raise ValueError
+        packed = struct.pack("<" + form, int(value))
+    except (ValueError, OverflowError, struct.error):
+        raise UsageError(f"a parameter of type {name} cannot hold {value:g}.") from None
+    return float(struct.unpack("<f", packed.ljust(4, b"\0"))[0]) if bitwise else float(value)
+
+
+class ParameterClient:
+    """Asks through `read` and `write` (which send a request), hears through `heard` (called by the receiving thread).
+
+    Args:
+        uri: for messages.
+        ask_read, ask_write: send PARAM_REQUEST_READ of a name; PARAM_SET of a name, float and type.
+        bitwise: whether integers travel as bits (PX4).
+    """
+
+    def __init__(
+        self,
+        uri: str,
+        *,
+        ask_read: Callable[[str], None],
+        ask_write: Callable[[str, float, int], None],
+        bitwise: Callable[[], bool],
+    ) -> None:
+        self._uri, self._ask_read, self._ask_write, self._bitwise = uri, ask_read, ask_write, bitwise
+        self._known: dict[str, tuple[float, int]] = {}
+        self._replies: queue.SimpleQueue[tuple[float, int]] = queue.SimpleQueue()
+        self._waiting = ""
+        self._lock = threading.Lock()
+        self.fault = ""
+
+    @property
+    def known(self) -> Mapping[str, float]:
+        """Every value heard so far."""
+        return {name: decode(v, kind, bitwise=self._bitwise()) for name, (v, kind) in dict(self._known).items()}
+
+    def types(self) -> Mapping[str, str]:
+        """C type of every parameter heard of."""
+        return {name: TYPES[kind][0] for name, (_, kind) in dict(self._known).items() if kind in TYPES}
+
+    def heard(self, fields: Mapping[str, Any]) -> None:
+        """A PARAM_VALUE has come."""
+        name = bytes(fields["param_id"]).split(b"\0")[0].decode("ascii", "replace")
+        value, kind = float(fields["param_value"]), int(fields["param_type"])
+        if len(self._known) < 5000 or name in self._known:
+            self._known[name] = (value, kind)
+        if name and name == self._waiting:
+            self._replies.put((value, kind))
+
+    def read(self, name: str, timeout: float) -> float:
+        """The value in the drone now. Raises LinkError: no answer (some autopilots do not answer for unknown names)."""
+        with self._lock:
+            for value, kind in self._exchange(name, lambda: self._ask_read(name), timeout):
+                self.fault = ""
+                return decode(value, kind, bitwise=self._bitwise())
+        self.fault = f"The drone at {self._uri} did not answer a read of {name} within {timeout:g} s."
+        raise LinkError(self.fault)
+
+    def write(self, name: str, value: float, timeout: float) -> ParameterWrite:
+        """Write and wait for the echo: `verified` only if the drone sent back exactly the bits written.
+
+        Raises: UsageError: unknown parameter, or its type cannot hold the value.
+        """
+        if name not in self._known:
+            try:
+                self.read(name, timeout)
+            except LinkError:
+                raise UsageError(f'the drone has no parameter "{name}", or does not answer for it.') from None
+        kind = self._known[name][1]
+        bitwise = self._bitwise()
+        wire = encode(value, kind, bitwise=bitwise)
+        echoed: float | None = None
+        with self._lock:
+            for heard, heard_kind in self._exchange(name, lambda: self._ask_write(name, wire, kind), timeout):
+                echoed = decode(heard, heard_kind, bitwise=bitwise)
+                # An echo with another value belongs to an earlier write: keep waiting for ours.
+                if heard_kind == kind and struct.pack("<f", heard) == struct.pack("<f", wire):
+                    self.fault = ""
+                    return ParameterWrite(name, value, echoed, True, time.time())
+        said = f"answered {name} = {value:g} with {echoed:g}" if echoed is not None else f"did not confirm {name}"
+        self.fault = f"The drone at {self._uri} {said} within {timeout:g} s."
+        return ParameterWrite(name, value, echoed, False, time.time())
+
+    def _exchange(self, name: str, ask: Callable[[], None], timeout: float) -> Any:
+        """Ask until the deadline, yielding each answer for the name."""
+        if not name or len(name) > 16 or not name.isascii():
+            raise UsageError(f'"{name[:40]}" is no name of a MAVLink parameter.')
+        while not self._replies.empty():
+            self._replies.get_nowait()
+        self._waiting = name
+        deadline = time.monotonic() + timeout
+        again = 0.0
+        try:
+            while (now := time.monotonic()) < deadline:
+                if now >= again:
+                    ask()
+                    again = now + RESEND_AFTER
+                try:
+                    yield self._replies.get(timeout=max(0.001, min(deadline, again) - now))
+                except queue.Empty:
+                    continue
+        finally:
+            self._waiting = ""

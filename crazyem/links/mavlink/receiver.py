@@ -1,0 +1,262 @@
+"""The receiving half of a MAVLink link: frames in, the drone chosen, stamped, counted, turned into packets of blocks.
+
+One thread; it also says our heartbeats and asks for the time, since it wakes up often enough.
+"""
+
+import math
+import queue
+import statistics
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from crazyem.errors import LinkError
+from crazyem.links.base import LinkLost, LinkStatistics
+from crazyem.links.clock import ClockFit, ClockRelation
+from crazyem.links.mavlink import streams
+from crazyem.links.mavlink.frames import Frame, FrameParser, number_of
+from crazyem.links.mavlink.radio import Radio
+from crazyem.links.mavlink.sequence import SequenceCounter
+from crazyem.links.mavlink.stamps import DroneClock, RestartedError
+from crazyem.links.mavlink.wires import Sender
+from crazyem.signals.packet import Block, Packet
+
+SILENT_AFTER = 2.0  # s
+_BEAT_EVERY, _TIME_EVERY = 1.0, 1.0  # s
+_NOT_A_VEHICLE = {6, 18, 26, 27, 28, 30}  # MAV_TYPE of ground stations, onboard computers, gimbals, cameras ...
+_NO_AUTOPILOT = 8
+_LATE_MS = 100.0
+_MOST_FOREIGN = 256
+OUR_SIMULATOR = b"crazyem firmware"  # begins AUTOPILOT_VERSION.uid2 of firmware_sim
+
+
+class Receiver:
+    """Everything that is heard.
+
+    Args:
+        uri: for messages. radio: its wire is listened to. system: the one to choose, None: the first heard.
+        packets: where packets of blocks go, and `LinkLost` at the end.
+        on_parameter: told each PARAM_VALUE.
+
+    Attributes:
+        autopilot, kind: MAV_AUTOPILOT and MAV_TYPE of the chosen, -1 before. system, component: its numbers.
+        simulated: whether it calls itself our simulator.
+        seen: messages of it so far, by name. foreign: frames of other systems, by number.
+        refused: values that were none: NaN, masked, out of range.
+        on_frame: called with (host time [s], frame) for every sound frame of the chosen one.
+        blocks: what becomes packets. lost: why the link counts as lost, "". hopeless: there is no coming back.
+        unplugged: the wire is gone and has to be opened anew.
+        last: when it was last heard, of time.monotonic().
+    """
+
+    def __init__(
+        self,
+        uri: str,
+        radio: Radio,
+        *,
+        system: int | None,
+        packets: "queue.SimpleQueue[Packet | LinkLost]",
+        on_parameter: Callable[[Mapping[str, Any]], None],
+    ) -> None:
+        self.uri, self.radio, self._wanted, self._packets = uri, radio, system, packets
+        self._on_parameter = on_parameter
+        self.on_frame: Callable[[float, bytes], None] | None = None
+        self.autopilot = self.kind = -1
+        self.system = self.component = 0
+        self.simulated = False
+        self.seen: dict[str, int] = {}
+        self.foreign: dict[int, int] = {}
+        self.refused = self.outages = 0
+        self.lost = ""
+        self.hopeless = self.unplugged = False
+        self.last = time.monotonic()
+        self.parser, self.sequence = FrameParser(), SequenceCounter()
+        self.drone_clock, self.relation = DroneClock(), ClockRelation()
+        self.streams = streams.Streams()
+        self.blocks: dict[str, Block] = {}
+        self._received: dict[int, int] = {}
+        self._numbers = {number_of(n) for n in self.streams.messages}
+        self._round_trips: deque[float] = deque(maxlen=50)
+        self._edge: ClockFit | None = None
+        self._late = 0
+        self._peer: Sender = None
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="crazyem-mavlink", daemon=True)
+        self._thread.start()
+
+    def use(self, blocks: dict[str, Block]) -> None:
+        """From now on these become packets."""
+        with self._lock:
+            self._received = {b.identifier: 0 for b in blocks.values()}
+            self.blocks = blocks
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._stop.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(timeout=2.0)
+
+    def came_back(self) -> None:
+        """The link is there again."""
+        with self._lock:
+            self.lost = ""
+            self.outages += 1
+
+    def statistics(self) -> LinkStatistics:
+        """Messages of this drone by fate: lost by their sequence numbers, repeated ones not counted."""
+        trips = list(self._round_trips)
+        with self._lock:
+            fit = self.relation.fit()
+            per_block = {i: (n, 0, 0) for i, n in self._received.items()}
+        return LinkStatistics(
+            self.sequence.received,
+            self.sequence.lost,
+            self._late + self.sequence.late,
+            per_block,
+            round_trip=statistics.median(trips) if trips else math.nan,
+            clock_offset=fit.offset if fit is not None else math.nan,
+            clock_rate=fit.rate if fit is not None else math.nan,
+            outages=self.outages,
+        )
+
+    def account(self) -> Mapping[str, str]:
+        """What became of the bytes, for the end of a recording."""
+        return {
+            "repeated": str(self.sequence.repeated),
+            "damaged": str(self.parser.damaged),
+            "unknown": str(self.parser.unknown),
+            "skipped_bytes": str(self.parser.skipped),
+            "refused": str(self.refused + self.drone_clock.refused),
+            "other_systems": " ".join(f"{s}:{n}" for s, n in sorted(self.foreign.items())),
+        }
+
+    def fit(self) -> ClockFit | None:
+        """How the host clock runs against the autopilot's, None before the first packet."""
+        with self._lock:
+            return self.relation.fit()
+
+    def _run(self) -> None:
+        try:
+            self._listen()
+        except Exception as error:  # a fault of ours must reach whoever flies, not only a log
+            self._report_lost(f"Receiving from {self.uri} failed: {error!r}.")
+
+    def _listen(self) -> None:
+        beat = asked = refreshed = 0.0
+        while not self._stop.is_set():
+            radio = self.radio
+            now = time.monotonic()
+            if now - beat >= _BEAT_EVERY:
+                beat = now
+                radio.heartbeat()
+            if self.autopilot >= 0 and now - asked >= _TIME_EVERY:
+                asked = now
+                radio.ask_time()
+            if now - refreshed >= 0.2:
+                refreshed = now
+                with self._lock:
+                    self._edge = self.relation.fit()
+            if self.blocks and not self.lost and now - self.last > SILENT_AFTER:
+                self._report_lost(f"The drone at {self.uri} was lost: nothing has come for {SILENT_AFTER:g} s.")
+            try:
+                data, sender = radio.wire.receive(0.02)
+            except LinkError as error:
+                self.unplugged = True
+                self._report_lost(f"The drone at {self.uri} was lost: {error}")
+                self._stop.wait(0.1)
+                continue
+            if self._peer is not None and sender is not None and sender != self._peer:
+                continue  # somebody else: whoever began is whom we talk to
+            for frame in self.parser.feed(data) if data else ():
+                self._frame(radio, frame, sender)
+
+    def _frame(self, radio: Radio, frame: Frame, sender: Sender) -> None:
+        if self.autopilot < 0:
+            self._consider(radio, frame, sender)
+            if self.autopilot < 0:
+                return
+        if frame.system != self.system:
+            if len(self.foreign) < _MOST_FOREIGN:
+                self.foreign[frame.system] = self.foreign.get(frame.system, 0) + 1
+            return
+        if frame.component != self.component:
+            return  # a camera or a gimbal of the same drone counts for itself
+        if not self.sequence.take(frame.sequence, frame.raw):
+            return
+        host_time = time.time()
+        if self.on_frame is not None:
+            self.on_frame(host_time, frame.raw)
+        self._message(radio, frame, host_time)
+
+    def _consider(self, radio: Radio, frame: Frame, sender: Sender) -> None:
+        """Whether this is the heartbeat of the vehicle that is to be watched."""
+        fields = frame.fields() if frame.name == "HEARTBEAT" else None
+        wanted = self._wanted
+        vehicle = fields and fields["autopilot"] != _NO_AUTOPILOT and fields["type"] not in _NOT_A_VEHICLE
+        if fields is None or not vehicle or (wanted is not None and frame.system != wanted):
+            if len(self.foreign) < _MOST_FOREIGN:
+                self.foreign[frame.system] = self.foreign.get(frame.system, 0) + 1
+            return
+        self.system, self.component = frame.system, frame.component
+        self.foreign.pop(frame.system, None)
+        self.kind, self.autopilot = int(fields["type"]), int(fields["autopilot"])
+        self._peer = sender
+        radio.wire.answer(sender)
+        radio.target = (frame.system, frame.component)
+
+    def _message(self, radio: Radio, frame: Frame, host_time: float) -> None:
+        name = frame.name
+        self.seen[name] = self.seen.get(name, 0) + 1
+        if name == "PARAM_VALUE":
+            self._on_parameter(frame.fields())
+        elif name == "COMMAND_ACK":
+            radio.acknowledged(frame.fields())
+        elif name == "TIMESYNC":
+            self._time(radio, frame.fields())
+        elif name == "AUTOPILOT_VERSION":
+            self.simulated = bytes(frame.fields()["uid2"]).startswith(OUR_SIMULATOR)
+        if frame.message in self._numbers:
+            self._values(name, frame.fields(), host_time)
+
+    def _time(self, radio: Radio, fields: Mapping[str, Any]) -> None:
+        if fields["tc1"] == 0:
+            radio.answer_time(int(fields["ts1"]))
+            return
+        took = (time.monotonic_ns() - int(fields["ts1"])) / 1e9
+        if 0.0 <= took < 10.0:  # else it is somebody else's
+            self._round_trips.append(took)
+
+    def _values(self, name: str, fields: Mapping[str, Any], host_time: float) -> None:
+        now = time.monotonic()
+        try:
+            stamp = self.drone_clock.place(fields, now)
+        except RestartedError:
+            self.hopeless = True
+            self._report_lost(f"The drone at {self.uri} was restarted: its clock has begun anew.")
+            return
+        if stamp is None or not self.streams.uses(name):
+            return
+        found = self.streams.values(name, fields)
+        if found is None:
+            self.refused += 1
+            return
+        self.last = now
+        block = self.blocks.get(found[0])
+        if block is None or self.lost:
+            return
+        with self._lock:
+            self.relation.add(stamp, host_time)
+            edge = self._edge
+            self._late += edge is not None and 1000.0 * (host_time - edge.to_host(stamp)) > _LATE_MS
+            self._received[block.identifier] += 1
+        self._packets.put(Packet(block.identifier, stamp, host_time, tuple(map(float, found[1]))))
+
+    def _report_lost(self, reason: str) -> None:
+        with self._lock:
+            if self.lost or self._stop.is_set():
+                return
+            self.lost = reason
+        self._packets.put(LinkLost(reason, time.time()))

@@ -1,0 +1,31 @@
+"""What the sequence numbers of one component say: messages lost, late and repeated (8 bits, one count for all)."""
+
+from collections import deque
+
+_MEMORY = 64  # newest frames that a repetition is recognised among
+_LATE = 128  # numbers behind count as late, numbers ahead as a gap
+
+
+class SequenceCounter:
+    """Attributes: received, lost (at least: 256 lost in a row look like none), late, repeated."""
+
+    def __init__(self) -> None:
+        self.received = self.lost = self.late = self.repeated = 0
+        self._newest: int | None = None
+        self._seen: deque[bytes] = deque(maxlen=_MEMORY)
+
+    def take(self, sequence: int, raw: bytes) -> bool:
+        """Account for a frame; False: it was here before, drop it."""
+        if raw in self._seen:
+            self.repeated += 1
+            return False
+        self._seen.append(raw)
+        self.received += 1
+        ahead = 1 if self._newest is None else (sequence - self._newest) % 256
+        if 0 < ahead <= _LATE:
+            self.lost += ahead - 1
+            self._newest = sequence
+        elif ahead:  # 0: 256 lost, or a sender that does not count
+            self.late += 1
+            self.lost = max(self.lost - 1, 0)
+        return True

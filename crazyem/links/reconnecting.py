@@ -1,0 +1,110 @@
+"""Bringing a lost link back without reading the tables again: they are the drone's, and it is the same drone."""
+
+import contextlib
+import datetime
+import threading
+import time
+from typing import Any
+
+from crazyem.errors import LinkError
+from crazyem.links import connecting
+from crazyem.links.blocks import LogBlocks
+from crazyem.links.courier import Courier
+
+_TABLES = (5, 2)  # ports: log, parameters
+_INFO = b"\x03"
+_ANSWER_WITHIN, _REPEAT_AFTER = 0.4, 0.1  # s
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.05, 0.8  # s between attempts
+_OWN_SOCKET = 2  # attempts with the driver that is still there, before another takes its place
+
+
+class AnotherDroneError(LinkError):
+    """Somebody answers, but there is no going on with it: another firmware, or the same one started anew."""
+
+
+class Reviver:
+    """Keeps what is needed to go on with a drone after its link was lost.
+
+    Args:
+        crazyflie: connected through `connecting.connect`.
+        uri: where.
+    """
+
+    def __init__(self, crazyflie: Any, uri: str) -> None:
+        self._cf, self._uri = crazyflie, uri
+        # cflib forgets these when a driver reports an error
+        self._table, self._values = crazyflie.param.toc, crazyflie.param.values
+        self._described = dict(crazyflie.link.tables) if isinstance(crazyflie.link, Courier) else {}
+
+    def revive(self, blocks: LogBlocks, timeout: float, abort: threading.Event) -> int:
+        """Log data flows again when this returns, held back by `blocks`; returns how many blocks were created anew.
+
+        Raises: LinkError: not within `timeout` [s], or `abort` was set. AnotherDroneError: never will.
+        """
+        deadline = time.monotonic() + timeout
+        pause, attempt, why = _FIRST_PAUSE, 0, "nothing answers"
+        while not abort.is_set():
+            try:
+                return self._attempt(blocks, deadline, another=attempt >= _OWN_SOCKET)
+            except AnotherDroneError:
+                raise
+            except LinkError as error:
+                why = str(error).rstrip(".")
+            if time.monotonic() + pause >= deadline:
+                break
+            abort.wait(pause)
+            pause, attempt = min(2 * pause, _LONGEST_PAUSE), attempt + 1
+        raise LinkError(f"The drone at {self._uri} did not come back within {timeout:g} s: {why}.")
+
+    def _attempt(self, blocks: LogBlocks, deadline: float, *, another: bool) -> int:
+        if self._cf.link is None or another:
+            self._another_driver()
+        self._check_tables(blocks)
+        created = blocks.resume(deadline)
+        if blocks.reset_since():
+            raise AnotherDroneError(f"The drone at {self._uri} was restarted: what it knew of the flight is gone.")
+        if self._cf.link is None:
+            raise LinkError("the link was lost again")
+        self._restore()
+        return created
+
+    def _another_driver(self) -> None:
+        """A fresh driver, and a fresh thread that reads from it: the old one may sleep for a second, or have died."""
+        cf = self._cf
+        from cflib.crazyflie import State
+
+        old = connecting.take_link(cf)
+        callbacks = list(cf.incoming.cb)
+        cf.incoming.stop()
+        if old is not None:
+            with contextlib.suppress(Exception):
+                old.in_queue.put(None)
+            with contextlib.suppress(Exception):
+                old.close()
+        cf.incoming = type(cf.incoming)(cf)
+        cf.incoming.cb = callbacks
+        cf.state = State.DISCONNECTED
+        try:
+            cf.link = connecting.new_driver(cf, self._uri)
+        except Exception as error:  # a driver may raise anything: the dongle may be out
+            raise LinkError(str(error) or type(error).__name__) from None
+        connecting.shorten_naps(cf)
+        cf.incoming.start()
+
+    def _check_tables(self, blocks: LogBlocks) -> None:
+        for port in _TABLES:
+            reply = blocks.asker.ask(port, 0, _INFO, timeout=_ANSWER_WITHIN, repeat_after=_REPEAT_AFTER)
+            if reply is None:
+                raise LinkError("nothing answers")
+            if reply != self._described.get(port, reply):
+                raise AnotherDroneError(f"Another firmware answers at {self._uri} now: its tables differ.")
+
+    def _restore(self) -> None:
+        """What cflib takes down when a driver reports an error."""
+        from cflib.crazyflie import State
+
+        cf = self._cf
+        cf.param.toc, cf.param.values = self._table, self._values
+        cf.state = State.SETUP_FINISHED
+        cf.connected_ts = cf.connected_ts or datetime.datetime.now()
+        cf.link_statistics.start()

@@ -1,0 +1,197 @@
+"""Estimating for many drones at once: a few workers, and updates that are left out when they cannot keep up.
+
+A worker takes the drone that has waited longest and gives its estimator what has arrived. Kernels release the
+interpreter lock, so as many updates run at a time as there are workers. Where that is not enough, updates are left
+out, never samples: the next update uses them all.
+"""
+
+import math
+import os
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from crazyem.estimation.result import Estimate
+from crazyem.live.pipeline import Estimator
+from crazyem.signals.sample import Sample
+
+TURN = 0.01  # s a worker stays with one drone while others wait
+OLDEST = 1.0  # s of the drone's clock after which an update is made however late it comes
+NEVER = 1 << 30  # samples between updates: none
+FULL_PASSES_EVERY = 12  # updates; the costly ones of several drones should not fall together
+
+
+class Mailbox:
+    """What has arrived for one drone; worked off in order, by one worker at a time.
+
+    Args:
+        work: takes an item; an exception ends the mailbox, and goes to `failed`.
+    """
+
+    def __init__(self, crew: "Crew", work: Callable[[Any], None], failed: Callable[[Exception], None]) -> None:
+        self._crew, self._work, self._failed = crew, work, failed
+        self._items: deque[Any] = deque()
+        self._lock = threading.Lock()
+        self._queued = False
+        self._ended = False
+        self._idle = threading.Event()
+        self._idle.set()
+
+    def put(self, item: Any) -> None:
+        """One more item; returns at once."""
+        with self._lock:
+            if self._ended:
+                return
+            self._items.append(item)
+            self._idle.clear()
+            if self._queued:
+                return
+            self._queued = True
+        self._crew.enqueue(self)
+
+    def wait(self, timeout: float) -> bool:
+        """Until everything was worked off, at most `timeout` [s]; whether it was."""
+        return self._idle.wait(timeout)
+
+    def turn(self) -> None:
+        """Work off items for a while (a worker's thread)."""
+        until = time.monotonic() + TURN
+        while True:
+            with self._lock:
+                if not self._items:
+                    self._queued = False
+                    self._idle.set()
+                    return
+                item = self._items.popleft()
+            try:
+                self._work(item)
+            except Exception as error:
+                with self._lock:
+                    self._ended, self._queued = True, False
+                    self._items.clear()
+                self._idle.set()
+                self._failed(error)
+                return
+            if time.monotonic() >= until:
+                break
+        self._crew.enqueue(self)  # behind those that wait
+
+
+class Crew:
+    """Threads that work for all mailboxes, first come, first served.
+
+    Args:
+        workers: None takes one a core.
+    """
+
+    def __init__(self, workers: int | None = None) -> None:
+        self.workers = workers or max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
+        self._ready: queue.SimpleQueue[Mailbox | None] = queue.SimpleQueue()
+        self._threads = [
+            threading.Thread(target=self._run, name=f"crazyem-estimate-{i}", daemon=True) for i in range(self.workers)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def mailbox(self, work: Callable[[Any], None], failed: Callable[[Exception], None]) -> Mailbox:
+        """A new one; see `Mailbox`."""
+        return Mailbox(self, work, failed)
+
+    def enqueue(self, mailbox: Mailbox) -> None:
+        """A mailbox waits for a worker (called by mailboxes)."""
+        self._ready.put(mailbox)
+
+    def close(self) -> None:
+        """End the workers; what is in mailboxes by then stays there."""
+        for _ in self._threads:
+            self._ready.put(None)
+        for thread in self._threads:
+            thread.join(timeout=10.0)
+
+    def _run(self) -> None:
+        while (mailbox := self._ready.get()) is not None:
+            mailbox.turn()
+
+
+class Paced:
+    """An estimator that leaves updates out while it is late, and whose updates are out of step with the others'.
+
+    Args:
+        inner: an OnlineEstimator, or one with its `feed`, `finish` and the attribute `every`.
+        number, of: this drone among all: shifts its first update by a share of a full round of updates.
+        late: s behind the newest packet at which an update is left out; None takes an update's share of time at 100 Hz.
+
+    Attributes:
+        skipped: updates left out.
+        behind: s from the newest sample fed to the newest packet received.
+    """
+
+    def __init__(self, inner: Any, *, number: int = 0, of: int = 1, late: float | None = None) -> None:
+        self.inner = inner
+        self.newest: Callable[[], float] = lambda: math.nan  # s, the drone's clock as received; set by the session
+        self.skipped = 0
+        self._every = int(inner.every)
+        self._late = late if late is not None else 0.01 * self._every
+        self._phase = round(number * self._every * FULL_PASSES_EVERY / of)
+        self._held = 0  # samples of one signal for which an update was due and none was made
+        self._last = math.nan
+        self._time = math.nan
+        self._hold = False
+        self.behind = 0.0
+
+    @property
+    def every(self) -> int:
+        """Samples between updates, as asked for."""
+        return self._every
+
+    @property
+    def airborne(self) -> bool:
+        """Of the inner estimator."""
+        return bool(self.inner.airborne)
+
+    @property
+    def update_seconds(self) -> Sequence[float]:
+        """Of the inner estimator."""
+        seconds: Sequence[float] = self.inner.update_seconds
+        return seconds
+
+    @property
+    def residual(self) -> Any:
+        """Of the inner estimator, None where it has none."""
+        return getattr(self.inner, "residual", None)
+
+    def feed(self, sample: Sample) -> Estimate | None:
+        """One sample; see `OnlineEstimator.feed`."""
+        if sample.time != self._time:  # an instant has several samples; the first of the next one makes updates
+            self._begin(sample.time)
+        estimate: Estimate | None = self.inner.feed(sample)
+        if self._hold and sample.signal == "position":
+            self._held += 1
+        if estimate is not None:
+            self.skipped += self._held // self._every
+            self._held = self._phase = 0
+            self._last = sample.time
+        return estimate
+
+    def _begin(self, time: float) -> None:
+        """Whether an update may be made when the samples of `time` [s] begin to come in."""
+        self._time = time
+        if math.isnan(self._last):
+            self._last = time
+        self.behind = self.newest() - time
+        self._hold = self.behind > self._late and time - self._last <= OLDEST
+        self.inner.every = NEVER if self._hold else self._every + self._phase
+
+    def finish(self) -> Estimate:
+        """The final estimate, whatever it takes."""
+        self.inner.every = self._every
+        estimate: Estimate = self.inner.finish()
+        return estimate
+
+
+def paced(inner: Estimator, *, number: int, of: int) -> Paced:
+    """The estimator of drone `number` among `of`."""
+    return Paced(inner, number=number, of=of)

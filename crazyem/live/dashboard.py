@@ -1,0 +1,320 @@
+"""The live view in a terminal: drones as a table, one of them in full; a thread of its own draws frozen snapshots.
+
+Drawing never delays a flight: it takes no lock of the session's, and if a terminal is slow only this thread waits.
+"""
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from crazyem.live.keys import Keys
+from crazyem.live.views import NOT_PUSHED, ParameterView, Snapshot
+
+FRAME, FRAME_OF_MANY, MANY = 0.25, 1.0, 8  # s between pictures; drones from which they are rarer: each costs some ms
+BARS = "▁▂▃▄▅▆▇█"
+HELP = "p push on/off   r revert   m mark   l land   q quit view   Ctrl-C land all, twice: cut"
+CHOOSE = "↹ next drone   "
+LOW_VOLTAGE = 3.3  # V, shown in red
+HIGH_LOSS = 0.05
+
+
+class Controls(Protocol):
+    """What keys do to one drone; each returns one sentence for the status line."""
+
+    def toggle_push(self) -> str: ...
+    def revert(self) -> str: ...
+    def mark(self) -> str: ...
+    def land(self) -> str: ...
+
+
+def sparkline(values: Sequence[float], width: int = 24) -> str:
+    """Newest `width` values as bars between their least and largest; a flat line where they hardly differ."""
+    shown = [v for v in values if math.isfinite(v)][-width:]
+    if not shown:
+        return ""
+    low, high = min(shown) / 2, max(shown) / 2  # halves, as the whole span may be beyond the largest number
+    if high - low <= 1e-3 * max(abs(low), abs(high)):
+        return BARS[3] * len(shown)
+    return "".join(BARS[min(int((v / 2 - low) / (high - low) * len(BARS)), len(BARS) - 1)] for v in shown)
+
+
+def number(value: float, digits: int = 2) -> str:
+    """A number, or a dash where none is known."""
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+
+
+def safe(text: str, style: str = "") -> Text:
+    """Text as it is: no markup, and nothing that steers a terminal, whoever wrote it."""
+    return Text("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text), style=style)
+
+
+def _milliseconds(seconds: float) -> str:
+    return f"{1e3 * seconds:.0f} ms" if math.isfinite(seconds) else "-"
+
+
+def _interval(p: ParameterView) -> str:
+    if not (math.isfinite(p.low) and math.isfinite(p.high)):
+        return "-"
+    half = (p.high - p.low) / 2
+    return f"± {half:.2f}" if half < 1e3 else "± >999"
+
+
+def parameter_table(parameters: Sequence[ParameterView]) -> RenderableType:
+    """Values with intervals and trend; what cannot be identified says why."""
+    if not parameters:
+        return Text("no estimate yet: the drone has not flown", style="dim")
+    table = Table(box=None, pad_edge=False, expand=True)
+    table.add_column("parameter", no_wrap=True)
+    table.add_column("value", justify="right", no_wrap=True)
+    table.add_column("95 %", no_wrap=True)
+    table.add_column("unit", style="dim", no_wrap=True)
+    table.add_column("last minute", no_wrap=True)
+    table.add_column("identifiable", ratio=1)
+    for p in parameters:
+        style = "" if p.identifiable else "yellow"
+        verdict = Text("yes", style="green") if p.identifiable else safe(p.reason or "no", "yellow")
+        table.add_row(
+            Text(p.label, style=style), Text(number(p.value), style=style), _interval(p), p.unit,
+            Text(sparkline(p.trend), style="cyan"), verdict,
+        )  # fmt: skip
+    return table
+
+
+def link_text(s: Snapshot) -> Text:
+    """One line on the link."""
+    link = s.link
+    if link.gone:
+        return Text("link lost", style="bold red")
+    loss = f"{100 * link.loss:.1f} %" if math.isfinite(link.loss) else "-"
+    text = Text(f"{number(link.rate, 0)} packets/s, lost ")
+    text.append(loss, style="red" if link.loss > HIGH_LOSS else "")
+    text.append(f" ({link.lost} in all), late {link.late}, echo {_milliseconds(link.round_trip)}")
+    text.append(f", delay {_milliseconds(link.delay)}")
+    if link.outages:
+        text.append(f", {link.outages} outages", style="yellow")
+    return text
+
+
+def guard_text(s: Snapshot) -> Text:
+    """One line on the guard: its mode, and what it does or why it does nothing."""
+    if not s.guard:
+        return Text(NOT_PUSHED, style="dim")
+    if s.stopped:
+        return safe(f"stopped: {s.stopped}", "bold red")
+    if s.paused:
+        return Text(f"{s.guard}: switched off by you (p)", style="yellow")
+    return safe(f"{s.guard}: {s.decision or 'waits for estimates'}")
+
+
+def push_lines(s: Snapshot) -> list[Text]:
+    """The last writes, newest first."""
+    lines = []
+    for at, name, value, verified, purpose in reversed(s.pushes):
+        what = "" if purpose == "push" else f" ({purpose})"
+        mark = Text("ok ", style="green") if verified else Text("?? ", style="bold red")
+        lines.append(mark.append_text(safe(f"{at:8.1f} s  {name} = {value:.6g}{what}", "default")))
+    return lines
+
+
+def _battery(s: Snapshot) -> Text:
+    return Text(f"{number(s.voltage)} V", style="red" if s.voltage < LOW_VOLTAGE else "")
+
+
+def _status(s: Snapshot) -> Text:
+    text = safe(f"{s.phase or '-'} {s.seconds:.0f} s   ", "bold")
+    text.append("in the air" if s.airborne else "on the ground", style="default")
+    text.append(f", height {number(s.height)} m, ", style="default")
+    text.append_text(_battery(s))
+    text.append(f"   {s.updates} updates" + (", converged" if s.converged else ""), style="default")
+    if s.skipped:
+        text.append(f", {s.skipped} left out", style="yellow")
+    if s.behind > 0.5:
+        text.append(f", {s.behind:.1f} s behind", style="red")
+    if s.marks:
+        text.append(f", {s.marks} marks", style="default")
+    return text
+
+
+def detail(s: Snapshot) -> Panel:
+    """One drone in full."""
+    facts = Table.grid(padding=(0, 2))
+    facts.add_column(style="dim", no_wrap=True)
+    facts.add_column()
+    facts.add_row("link", link_text(s))
+    facts.add_row("guard", guard_text(s))
+    for i, line in enumerate(push_lines(s)):
+        facts.add_row(f"writes {s.writes}" if i == 0 else "", line)
+    for i, alarm in enumerate(s.alarms[:4]):
+        facts.add_row("alarms" if i == 0 else "", safe(alarm, "bold red" if i == 0 else "yellow"))
+    if s.ended:
+        facts.add_row("ended", safe(s.ended, "yellow"))
+    parts = (_status(s), Text(), parameter_table(s.parameters), Text(), facts)
+    return Panel(Group(*parts), title=safe(f"{s.name}  {s.uri}"), title_align="left", border_style="blue")
+
+
+def overview(snapshots: Sequence[Snapshot], selected: int, rows: int) -> Table:
+    """A row per drone, `rows` of them around the selected one."""
+    table = Table(box=None, pad_edge=False, expand=True)
+    columns = ("drone", "phase", "mass g", "Ixx", "Iyy", "Izz 10⁻⁶", "lost", "rate", "battery", "writes", "state")
+    for name in columns:
+        table.add_column(name, no_wrap=True, justify="left" if name in ("drone", "phase", "state") else "right")
+    first = min(max(selected - rows // 2, 0), max(len(snapshots) - rows, 0))
+    for i, s in enumerate(snapshots[first : first + rows], start=first):
+        values = {p.label: Text(number(p.value), style="" if p.identifiable else "yellow") for p in s.parameters}
+        table.add_row(
+            safe(s.name), safe(f"{s.phase} {s.seconds:.0f} s"),
+            *(values.get(n, Text("-")) for n in ("mass", "Ixx", "Iyy", "Izz")),
+            Text(str(s.link.lost)), Text(number(s.link.rate, 0)), _battery(s), Text(str(s.writes)), _state(s),
+            style="reverse" if i == selected else "",
+        )  # fmt: skip
+    return table
+
+
+def _state(s: Snapshot) -> Text:
+    if s.ended:
+        return safe(s.ended, "yellow")
+    if s.alarms:
+        return safe(s.alarms[0], "bold red")
+    if s.stopped or s.paused:
+        return Text("pushing stopped" if s.stopped else "push off", style="yellow")
+    return Text("ok", style="green")
+
+
+def picture(
+    snapshots: Sequence[Snapshot], *, selected: int = 0, message: str = "", keys: bool = True, height: int = 40
+) -> RenderableType:
+    """The whole view."""
+    if not snapshots:
+        return Text("no drone yet", style="dim")
+    selected = min(max(selected, 0), len(snapshots) - 1)
+    parts: list[RenderableType] = []
+    if len(snapshots) > 1:
+        parts.append(overview(snapshots, selected, max(height - 24, 3)))
+    parts.append(detail(snapshots[selected]))
+    if message:
+        parts.append(safe(message, "bold"))
+    if keys:
+        parts.append(Text((CHOOSE if len(snapshots) > 1 else "") + HELP, style="dim"))
+    return Group(*parts)
+
+
+class Dashboard:
+    """Draws until closed, or until the user presses q; a context manager.
+
+    Args:
+        snapshots: makes the present ones; called in the dashboard's thread. An exception there ends the view, not the
+            flight.
+        controls: of each drone, in the order of the snapshots; called when keys ask for something.
+        console: where to draw. keys: where they come from.
+    """
+
+    def __init__(
+        self,
+        snapshots: Callable[[], Sequence[Snapshot]],
+        controls: Callable[[], Sequence[Controls]] = lambda: (),
+        *,
+        console: Console,
+        keys: Keys | None = None,
+    ) -> None:
+        self._snapshots, self._controls = snapshots, controls
+        self.console = console
+        self.keys = keys or Keys()
+        self.selected = 0
+        self.message = ""
+        self.failure = ""
+        self.frames = 0
+        self.drawing_seconds = 0.0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="crazyem-dashboard", daemon=True)
+
+    @property
+    def showing(self) -> bool:
+        """Whether the view is there; plain lines take its place otherwise."""
+        return self._thread.is_alive() and not self._stop.is_set()
+
+    def __enter__(self) -> "Dashboard":
+        self.keys.begin()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the view and put the terminal back; returns when that is done, or cannot be waited for."""
+        self._stop.set()
+        if self._thread.ident is not None and threading.current_thread() is not self._thread:
+            self._thread.join(timeout=3.0)
+        self.keys.end()
+
+    def _run(self) -> None:
+        try:
+            with Live(
+                console=self.console, screen=self.console.is_terminal, auto_refresh=False, redirect_stdout=False,
+                redirect_stderr=False,
+            ) as live:  # fmt: skip
+                while not self._stop.is_set():
+                    many = self._draw(live) >= MANY
+                    self._wait(FRAME_OF_MANY if many else FRAME)
+        except Exception as error:  # a view that fails must not take a flight with it
+            self.failure = f"the live view ended: {error!r}."
+        finally:
+            self._stop.set()
+            self.keys.end()
+
+    def _draw(self, live: Any) -> int:
+        begun = time.thread_time()
+        snapshots = self._snapshots()
+        self.selected = min(self.selected, max(len(snapshots) - 1, 0))
+        live.update(
+            picture(
+                snapshots, selected=self.selected, message=self.message, keys=self.keys.reading,
+                height=self.console.height,
+            ),
+            refresh=True,
+        )  # fmt: skip
+        self.frames += 1
+        self.drawing_seconds += time.thread_time() - begun
+        return len(snapshots)
+
+    def _wait(self, seconds: float) -> None:
+        """Until the next picture is due, or a key was pressed."""
+        if not self.keys.reading:
+            self._stop.wait(seconds)
+            return
+        key = self.keys.read(seconds)
+        if key:
+            self.press(key)
+
+    def press(self, key: str) -> None:
+        """What a key does."""
+        if key in ("q", "Q"):
+            self._stop.set()
+            return
+        controls = list(self._controls())
+        if key == "\t" and controls:
+            self.selected = (self.selected + 1) % len(controls)
+            return
+        action = {"p": "toggle_push", "r": "revert", "m": "mark", "l": "land"}.get(key.lower())
+        if action is None or not self.selected < len(controls):
+            return
+        try:
+            self.message = getattr(controls[self.selected], action)()
+        except Exception as error:
+            self.message = f"that failed: {error!r}"
+
+
+def terminal_console(stream: Any) -> Console:
+    """A console for a terminal's stream."""
+    with contextlib.suppress(ValueError, OSError):
+        return Console(file=stream, highlight=False)
+    return Console(stderr=True, highlight=False)

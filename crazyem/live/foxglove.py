@@ -1,0 +1,194 @@
+"""Streams a session to Foxglove while it runs: the topics and messages of a recording, over a WebSocket on this host.
+
+The messages are made by the recorder's own code (`RecordingWriter`), so that the layout of `crazyem layout` shows a
+flight and its recording alike. The server is foxglove-sdk's, with threads of its own; a slow viewer loses messages.
+"""
+
+import contextlib
+import math
+from collections.abc import Mapping, Sequence
+from types import ModuleType
+from typing import Any
+
+from crazyem.errors import UsageError
+from crazyem.live.recorder import Recorder
+from crazyem.recordings.mcap.writer import RecordingWriter
+
+PORT = 8765  # what viewers propose
+HOST = "127.0.0.1"  # anybody who reaches the port sees the flight
+FRAME = "foxglove.FrameTransform"
+
+
+def sdk() -> ModuleType:
+    """The module foxglove. Raises UsageError where it is not installed."""
+    try:
+        import foxglove
+    except ImportError:
+        raise UsageError("--foxglove needs the extra 'foxglove': pip install 'crazyem[foxglove]'.") from None
+    return foxglove  # type: ignore[no-any-return, unused-ignore]
+
+
+class FoxgloveServer:
+    """A WebSocket server for viewers; a context manager.
+
+    Args:
+        port: 0 takes any free one.
+
+    Raises: UsageError: foxglove-sdk is missing, or the port is not to be had.
+    """
+
+    def __init__(self, port: int = PORT) -> None:
+        module = sdk()
+        self._context = module.Context()
+        try:
+            self._server: Any = module.start_server(name="crazyem", host=HOST, port=port, context=self._context)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise UsageError(f"the live stream cannot listen on {HOST}:{port}: {error}.") from None
+        self.port = int(self._server.port)
+
+    def __enter__(self) -> "FoxgloveServer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def url(self) -> str:
+        """Where a viewer connects to."""
+        return f"ws://{HOST}:{self.port}"
+
+    def recorder(self, name: str = "", metadata: Mapping[str, Mapping[str, str]] | None = None) -> RecordingWriter:
+        """What a session streams through.
+
+        Args:
+            name: of the drone, put before its topics (/NAME/estimate, frame NAME); "" where there is only one.
+            metadata: as of a recording; viewers do not get it.
+        """
+        return RecordingWriter("", metadata, output=Topics(self._context, name))
+
+    def close(self) -> None:
+        """End the server."""
+        server, self._server = self._server, None
+        if server is not None:
+            with contextlib.suppress(RuntimeError):
+                server.stop()
+
+
+class Topics:
+    """Takes what a recording's `Output` takes and gives it to the server's channels."""
+
+    def __init__(self, context: Any, name: str) -> None:
+        self._foxglove = sdk()
+        self._context, self._name = context, name
+        self._schemas: list[Any] = []
+        self._channels: list[Any] = []
+        self._frames: set[int] = set()
+
+    def start(self, profile: str, library: str) -> None:
+        """Nothing to say."""
+
+    def schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Number of a schema."""
+        self._schemas.append(self._foxglove.Schema(name=name, encoding=encoding, data=data))
+        return len(self._schemas)
+
+    def channel(self, topic: str, encoding: str, schema: int, metadata: Mapping[str, str] | None = None) -> int:
+        """Number of a new topic."""
+        kind = self._schemas[schema - 1]
+        prefix = f"/{self._name}" if self._name and kind.name != FRAME else ""  # frames have names of their own
+        self._channels.append(
+            self._foxglove.Channel(
+                f"{prefix}{topic}", schema=kind, message_encoding=encoding, context=self._context,
+                metadata=dict(metadata or {}),
+            )
+        )  # fmt: skip
+        if kind.name == FRAME:
+            self._frames.add(len(self._channels))
+        return len(self._channels)
+
+    def message(self, channel: int, log_time: int, data: bytes, *, sequence: int, publish_time: int) -> None:
+        """One message, `log_time` in ns since the epoch."""
+        if self._name and channel in self._frames:
+            data = self._renamed(data)
+        self._channels[channel - 1].log(data, log_time=log_time)
+
+    def _renamed(self, data: bytes) -> bytes:
+        """A transform of this drone's frame instead of every drone's."""
+        from crazyem.recordings.mcap.schemas import message_class
+
+        message = message_class(FRAME).FromString(data)
+        message.child_frame_id = self._name
+        return bytes(message.SerializeToString())
+
+    def metadata(self, name: str, entries: Mapping[str, str]) -> None:
+        """Not for viewers."""
+
+    def flush(self, *, sync: bool = False) -> None:
+        """Messages have left already."""
+
+    def finish(self) -> None:
+        """See `close`."""
+
+    def close(self) -> None:
+        """Take the topics away."""
+        for channel in self._channels:
+            channel.close()
+
+
+class Both:
+    """Two recorders as one: a file, and a stream beside it.
+
+    The file counts: its path, its failure. A stream that fails ends alone.
+    """
+
+    def __init__(self, file: Recorder | None, stream: Recorder) -> None:
+        self._file = file
+        self._all: list[Recorder] = [r for r in (file, stream) if r is not None]
+
+    @property
+    def path(self) -> str:
+        """Of the file, "" without one."""
+        return self._file.path if self._file is not None else ""
+
+    @property
+    def failure(self) -> str:
+        """Of the file, "" without one."""
+        return self._file.failure if self._file is not None else ""
+
+    def blocks(self, blocks: Sequence[Any]) -> None:
+        """See `Recorder`; so are the others."""
+        self._each("blocks", blocks)
+
+    def packet(self, packet: Any) -> None:
+        self._each("packet", packet)
+
+    def frame(self, *arguments: Any) -> None:
+        self._each("frame", *arguments)
+
+    def setpoint(self, time: float, reference: Any) -> None:
+        self._each("setpoint", time, reference)
+
+    def parameter_write(self, write: Any) -> None:
+        self._each("parameter_write", write)
+
+    def estimate(self, estimate: Any) -> None:
+        self._each("estimate", estimate)
+
+    def link(self, statistics: Any, latency: float = math.nan) -> None:
+        self._each("link", statistics, latency)
+
+    def residual(self, time: float, values: Sequence[float], sd: Sequence[float]) -> None:
+        self._each("residual", time, values, sd)
+
+    def metadata(self, section: str, entries: Mapping[str, str]) -> None:
+        self._each("metadata", section, entries)
+
+    def event(self, text: str) -> None:
+        self._each("event", text)
+
+    def close(self) -> None:
+        self._each("close")
+
+    def _each(self, method: str, *arguments: Any) -> None:
+        for recorder in self._all:
+            getattr(recorder, method)(*arguments)

@@ -1,0 +1,296 @@
+"""All that stands between estimates and a flying drone: guard, health, confirmation, watch, and the account of them.
+
+The pipeline asks `consider` after every estimate. What it answers is written by the pusher; a dry run only tells.
+The watch after a write runs with the packets, not with the estimates: an estimator that stalls cannot blind it.
+"""
+
+import math
+import re
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from crazyem.estimation.result import Estimate, Step
+from crazyem.live.controllers import EQUAL, writes_back
+from crazyem.live.guard import Decision, Guard
+from crazyem.live.health import Health
+from crazyem.live.history import History
+from crazyem.live.policy import Policy
+from crazyem.live.push import Pusher
+from crazyem.live.telemetry import FLYING, Telemetry
+from crazyem.live.watchdog import Watchdog
+from crazyem.signals.sample import Sample
+
+LOOK_EVERY = 0.04  # s between looks of the watch
+GROUNDED_WITHIN = 3.0  # s; the firmware says that it flies for 2 s after its motors stopped
+HOLD_EVERY = 1.0  # s between notes on why nothing is written; only when the reason is another one
+MOST_ENTRIES = 5000  # in the account: bounded, however long the flight
+
+Ask = Callable[[str, threading.Event], bool]
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How estimates may reach the drone.
+
+    Attributes:
+        policy: see `Policy`.
+        dry_run: decide and tell, but write nothing.
+        ask: asked once, in a thread of its own, before the first write: takes the question and an event that is set
+            when nobody waits for the answer any more; True lets pushing begin. None: nobody is asked.
+    """
+
+    policy: Policy = field(default_factory=Policy)
+    dry_run: bool = False
+    ask: Ask | None = None
+
+    @property
+    def mode(self) -> str:
+        """For the summary."""
+        return "dry run" if self.dry_run else "push after confirmation" if self.ask else "push"
+
+
+class Oversight:
+    """See the module. `take` is called from the receiving thread, `consider` from the estimating one.
+
+    Args:
+        guard: decides by the estimates.
+        rules: how.
+        originals: parameter values at connect.
+        history: gets notices and the account.
+        telemetry: what the supervisor says.
+        now: newest time on the drone's clock, s.
+        residual: time [s], innovations and their standard deviations of the newest sample, or None.
+        enabled: whether a time [s] is in a phase of the flight in which parameters are pushed.
+        tell: takes a line for the recording.
+    """
+
+    def __init__(
+        self,
+        guard: Guard,
+        rules: Rules,
+        *,
+        originals: Mapping[str, float],
+        history: History,
+        telemetry: Telemetry,
+        now: Callable[[], float],
+        residual: Callable[[], Any] = lambda: None,
+        enabled: Callable[[float], bool] = lambda time: True,
+        tell: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self.guard, self.rules = guard, rules
+        self.originals, self.good = dict(originals), dict(originals)
+        self.history, self.now, self.tell = history, now, tell
+        self.telemetry = telemetry
+        self.health = Health(rules.policy.health, telemetry)
+        self.watch = Watchdog(rules.policy.watch)
+        guard.capped = rules.policy.watch.enabled and not rules.dry_run
+        self.pusher: Pusher | None = None
+        self._residual, self._enabled = residual, enabled
+        self._airborne = self._reverted = False
+        self._looked = -math.inf
+        self._residual_time = -math.inf
+        self._held = ("", -math.inf)
+        self._allowed = rules.ask is None or rules.dry_run
+        self._asking: threading.Thread | None = None
+        self._ended = threading.Event()
+        self._reported_stop = ""
+        self._stopped: str | None = None
+        self._lock = threading.Lock()
+        self.entries: list[dict[str, Any]] = []
+        history.guard = {"mode": rules.mode, "policy": rules.policy.name, "decisions": self.entries}
+        tell(f"guard: {rules.mode}, policy {rules.policy.name}")
+
+    def take(self, samples: Iterable[Sample]) -> None:
+        """Samples of the flight as they arrive; takes back what made it worse."""
+        for sample in samples:
+            self.health.take(sample)
+            self.watch.take(sample)
+        newest = self.watch.newest
+        if self.watch.judging and newest - self._looked >= LOOK_EVERY:
+            self._looked = newest
+            if self._airborne and self._enabled(newest):
+                self._judge(newest)
+
+    def consider(self, estimate: Estimate, time: float, *, airborne: bool, enabled: bool = True) -> Decision:
+        """What to write after this estimate; see `Guard.consider`."""
+        self._innovations()
+        self._airborne = airborne
+        decision = self.guard.consider(estimate, time, airborne=airborne, enabled=enabled, objection=self._hold(time))
+        if self.guard.stopped and self.guard.stopped != self._reported_stop:
+            self._reported_stop = self.guard.stopped
+            self._enter("stopped", time, reason=self.guard.stopped)
+        if not decision.writes:
+            self._held_back(decision)
+            return decision
+        if not self._allowed:
+            self.guard.withdraw()
+            self._begin_asking(decision)
+            return Decision(time, reason="waits for confirmation")
+        if self.rules.dry_run:
+            self._enter("would write", time, writes=decision.writes, reason=decision.why)
+            return Decision(time, reason=f"dry run: would write {decision}")
+        self._enter("write", time, writes=decision.writes, reason=decision.why)
+        return decision
+
+    def stepped(self, step: Step, time: float) -> None:
+        """A change of mass was noticed, or it was decided what it was, at `time` [s] (the estimating thread)."""
+        self.guard.stepped(step)
+        self.watch.stepped(began=step.time, now=time, real=step.real)
+
+    def done(self, decision: Decision, complete: bool) -> None:
+        """The pusher is through with a decision (its thread)."""
+        if decision.kind == "push" and complete:
+            self.watch.wrote(decision.time, max(self.now(), decision.time))
+        self._enter("written" if complete else "not written", self.now(), reason=decision.kind)
+
+    def take_back(self) -> str:
+        """A person wants the last good values back: those at connect, where the last good ones are in the drone.
+
+        Nothing more is pushed in this flight. Returns one sentence on what is done.
+        """
+        if self.pusher is None or not self.history.pushes:
+            return "nothing was written to this drone: there is nothing to take back."
+        if self._reverted:
+            return "it was taken back already."
+        known = self.pusher.known
+        if all(math.isclose(known[name], value, rel_tol=EQUAL) for name, value in self.good.items()):
+            self.good = dict(self.originals)
+        return self._revert(self.now(), "asked for by the user", asked=True)
+
+    def end(self, outcome: str) -> None:
+        """The flight is over: keep what was written or put it back, as the policy says for this outcome.
+
+        Args:
+            outcome: landed, interrupted, failed or link_lost.
+        """
+        self._ended.set()
+        rule = getattr(self.rules.policy.end, outcome)
+        self._stopped = self.guard.stopped  # the end of the flight is no reason worth telling
+        self.guard.stop(f"the flight is over ({outcome.replace('_', ' ')})")
+        if self.pusher is None or rule == "keep" or not self.history.pushes:
+            return
+        target = self.good if rule == "good" else self.originals
+        # What is still in flight is finished before this; whatever is right by then is not written again.
+        values = "the values at connect" if rule == "restore" else "the last values judged good"
+        until = time.monotonic() + GROUNDED_WITHIN
+        while outcome != "link_lost" and self.telemetry.has(FLYING) and time.monotonic() < until:
+            time.sleep(0.01)
+        if outcome != "link_lost" and self.telemetry.has(FLYING):
+            self._say(f"{values} were not written back: the drone still flies.")
+            return
+        self._enter("restore", self.now(), writes=tuple(target.items()), reason=f"{outcome}: {rule}")
+        self.pusher.submit(Decision(self.now(), writes=tuple(target.items()), reason=rule, kind="restore"))
+
+    def close(self) -> None:
+        """After the pusher has ended: completes the account, and says whether a restore succeeded."""
+        self._ended.set()
+        account = self.history.guard
+        account["stopped"] = self.guard.stopped if self._stopped is None else self._stopped
+        account["at_connect"] = dict(self.originals)
+        account["in_drone"] = dict(self.pusher.known) if self.pusher is not None else dict(self.originals)
+        asked = next((e for e in reversed(self.entries) if e["action"] == "restore"), None)
+        if asked is not None:
+            left = [n for n, v in asked["writes"] if not math.isclose(account["in_drone"][n], v, rel_tol=1e-6)]
+            self._say(
+                f"{', '.join(left)} could not be put back: the drone may keep what was pushed until it is restarted."
+                if left
+                else f"the parameters were put back ({asked['reason']})."
+            )
+
+    # parts
+
+    def _innovations(self) -> None:
+        newest = self._residual()
+        if newest is None or not newest[0] > self._residual_time:
+            return
+        self._residual_time = newest[0]
+        squares = [(e / s) ** 2 for e, s in zip(newest[1], newest[2]) if s > 0 and math.isfinite(e)]
+        if squares:
+            self.watch.innovation(newest[0], float(sum(squares) / len(squares)))
+
+    def _hold(self, time: float) -> str:
+        if self.pusher is not None and self.pusher.busy:
+            return "the last set is still being written"
+        if self._asking is not None and not self._allowed:
+            return "waits for confirmation"
+        if self.watch.full:
+            return "what was written is still being judged"
+        return self.health.objection(age=self.now() - time)
+
+    def _judge(self, time: float) -> None:
+        if self.pusher is None or self.pusher.busy or self._reverted:
+            return
+        verdict, why = self.watch.judge(time)
+        if verdict == "good":
+            self.good = dict(self.pusher.known)
+            self.guard.trust()
+            self.watch.forget()
+            self._enter("judged good", time, reason=why)
+        elif verdict == "worse":
+            self._revert(time, why)
+
+    def _revert(self, time: float, why: str, *, asked: bool = False) -> str:
+        assert self.pusher is not None
+        self._reverted = True
+        wrong = dict(self.pusher.known)
+        back = writes_back(self.guard.controller, self.good, now=wrong)
+        undone = ", ".join(f"{n} = {wrong[n]:.6g}" for n, _ in back)
+        sentence = f"the drone flew worse after {undone} ({why}): back to the last good values, nothing more is pushed."
+        if asked:
+            sentence = f"{undone} taken back as asked, nothing more is pushed."
+        self.guard.stop(sentence)
+        self._reported_stop = self.guard.stopped
+        self.history.notice(sentence)
+        self._enter("revert", time, writes=back, reason=why)
+        self.watch.forget()
+        # All of the good values: a set that is submitted in this moment is taken back with the rest.
+        self.pusher.submit(Decision(time, writes=tuple(self.good.items()), reason=sentence, kind="revert"))
+        return sentence
+
+    def _begin_asking(self, decision: Decision) -> None:
+        question = f"first write to the drone: {decision}"
+        self._enter("asked", decision.time, writes=decision.writes)
+        self._asking = threading.Thread(target=self._ask, args=(question,), name="crazyem-confirm", daemon=True)
+        self._asking.start()
+
+    def _ask(self, question: str) -> None:
+        assert self.rules.ask is not None
+        try:
+            agreed = self.rules.ask(question, self._ended)
+        except Exception as error:  # nobody could be asked: that is no agreement
+            agreed = False
+            self.history.notice(f"the confirmation of the first write could not be asked for: {error!r}.")
+        if self._ended.is_set():
+            return
+        self._enter("confirmed" if agreed else "declined", self.now())
+        if agreed:
+            self._allowed = True
+        else:
+            self.guard.stop("the first write was not confirmed by the user")
+            self.history.notice("the first write was not confirmed by the user: nothing was pushed.")
+
+    def _held_back(self, decision: Decision) -> None:
+        kind = re.sub(r"[-+\d.,e]+", "#", decision.why)
+        if kind != self._held[0] and decision.time - self._held[1] >= HOLD_EVERY:
+            self._held = (kind, decision.time)
+            self._enter("hold", decision.time, reason=decision.why)
+
+    def _say(self, sentence: str) -> None:
+        self.history.notice(sentence)
+        self.tell(f"guard: {sentence}")
+
+    def _enter(self, action: str, time: float, *, writes: tuple[tuple[str, float], ...] = (), reason: str = "") -> None:
+        """Into the account and the recording."""
+        entry: dict[str, Any] = {"time": time, "action": action, "reason": reason}
+        if writes:
+            entry["writes"] = [list(w) for w in writes]
+        with self._lock:
+            if len(self.entries) < MOST_ENTRIES or action not in ("hold", "would write"):
+                self.entries.append(entry)
+        text = ", ".join(f"{n} = {v:.6g}" for n, v in writes)
+        self.tell(
+            f"guard {action} at {time:.3f} s" + (f": {text}" if text else "") + (f" ({reason})" if reason else "")
+        )

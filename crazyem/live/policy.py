@@ -1,0 +1,293 @@
+"""The policy of the guard: what may be written to a flying drone, when it is taken back; TOML <-> dataclasses.
+
+`crazyem/policies/default.toml` is the shipped one and explains every key.
+"""
+
+import math
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from crazyem.errors import FileFormatError, UsageError
+from crazyem.live.guard import INERTIA, Limits
+
+LARGEST_FILE = 65536  # bytes
+NAMES = ("mass", *INERTIA)
+ENDS = ("keep", "good", "restore")
+
+
+@dataclass(frozen=True)
+class HealthLimits:
+    """What the drone must be like for a write.
+
+    Attributes:
+        supervisor: whether the firmware must say that it flies and that nothing is wrong.
+        battery: V, mean of the last second. tilt: rad. stale: s, age of the newest estimate on the drone's clock.
+    """
+
+    supervisor: bool = True
+    battery: float = 3.2
+    tilt: float = math.radians(60.0)
+    stale: float = 3.0
+
+
+@dataclass(frozen=True)
+class WatchLimits:
+    """What counts as worse after a write than before.
+
+    Attributes:
+        before, settle, after: s, lengths of the stretches.
+        unjudged: sets of writes that may follow each other before they were judged.
+        tracking_ratio, tracking, tracking_alarm: position error, relative to before, and over it [m].
+        innovation_ratio, innovation: normalised innovation, relative to before, and at least (standard deviations).
+        oscillation_ratio, oscillation, oscillation_alarm: fast part of the body rates, relative, and over it [rad/s].
+        tilt_alarm: rad.
+    """
+
+    enabled: bool = True
+    before: float = 2.0
+    settle: float = 0.5
+    after: float = 2.5
+    unjudged: int = 4
+    tracking_ratio: float = 1.5
+    tracking: float = 0.10
+    tracking_alarm: float = 0.50
+    innovation_ratio: float = 2.0
+    innovation: float = 3.0
+    oscillation_ratio: float = 2.5
+    oscillation: float = 1.5
+    oscillation_alarm: float = 8.0
+    tilt_alarm: float = math.radians(75.0)
+
+
+@dataclass(frozen=True)
+class EndRules:
+    """What is left in the drone after a flight that landed, was interrupted, failed, lost its link: one of `ENDS`."""
+
+    landed: str = "keep"
+    interrupted: str = "keep"
+    failed: str = "restore"
+    link_lost: str = "restore"
+
+
+@dataclass(frozen=True)
+class Policy:
+    """All of it."""
+
+    name: str = "default"
+    limits: Limits = field(default_factory=Limits)
+    health: HealthLimits = field(default_factory=HealthLimits)
+    watch: WatchLimits = field(default_factory=WatchLimits)
+    end: EndRules = field(default_factory=EndRules)
+
+    def entries(self) -> dict[str, dict[str, Any]]:
+        """Section -> key -> value, in the units of the file."""
+        table: dict[str, dict[str, Any]] = {}
+        for section, key, part, name, kind in _KEYS:
+            table.setdefault(section, {})[key] = kind.shown(getattr(getattr(self, part), name))
+        return table
+
+    def to_json(self) -> dict[str, Any]:
+        """For programs."""
+        return {"name": self.name, **self.entries()}
+
+    def to_toml(self, *, against: "Policy | None" = None) -> str:
+        """The text of a policy file; reading it back gives an equal policy. Differences to `against` are remarked."""
+        lines = [f"name = {_text(self.name)}"]
+        others = against.entries() if against else {}
+        for section, values in self.entries().items():
+            lines += ["", f"[{section}]"]
+            for key, value in values.items():
+                other = others.get(section, {}).get(key, value)
+                remark = f" # {against.name}: {_text(other)}" if against and other != value else ""
+                lines.append(f"{key} = {_text(value)}{remark}")
+        return "\n".join(lines) + "\n"
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """How a key is checked and what it is in SI: `read` gives the value or raises ValueError with what it must be."""
+
+    read: Callable[[Any], Any]
+    shown: Callable[[Any], Any] = lambda value: value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _number(low: float, high: float, *, scale: float = 1.0) -> _Kind:
+    def read(value: Any) -> float:
+        if not _is_number(value) or not low <= value <= high:
+            raise ValueError(f"a number in [{low:g}, {high:g}]")
+        return float(value) * scale
+
+    return _Kind(read, lambda value: float(f"{value / scale:.12g}"))
+
+
+def _range(low: float, high: float) -> _Kind:
+    def read(value: Any) -> tuple[float, float]:
+        if not isinstance(value, list) or len(value) != 2 or not all(map(_is_number, value)):
+            raise ValueError("two numbers, lower and upper")
+        if not low <= value[0] < value[1] <= high:
+            raise ValueError(f"rising and within [{low:g}, {high:g}]")
+        return float(value[0]), float(value[1])
+
+    return _Kind(read, list)
+
+
+def _whole(low: int, high: int) -> _Kind:
+    def read(value: Any) -> int:
+        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+            raise ValueError(f"a whole number in [{low}, {high}]")
+        return value
+
+    return _Kind(read)
+
+
+def _read_flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError("true or false")
+    return value
+
+
+def _read_names(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(v, str) and v in NAMES for v in value):
+        raise ValueError(f"a list of {', '.join(NAMES)}")
+    if ("Ixx" in value) != ("Iyy" in value):
+        raise ValueError("without Ixx or with Iyy, too: roll and pitch share their scale of gains")
+    return tuple(n for n in NAMES if n in value)
+
+
+def _read_end(value: Any) -> str:
+    if value not in ENDS:
+        raise ValueError(f"one of {', '.join(ENDS)}")
+    return str(value)
+
+
+_FLAG, _PARAMETERS, _END = _Kind(_read_flag), _Kind(_read_names, list), _Kind(_read_end)
+_SECONDS, _SHARE, _RATIO = _number(0.0, 60.0), _number(0.0, 1.0), _number(1.0, 1000.0)
+_DEGREE = math.radians(1.0)
+
+# section, key, part of the policy, its field, kind
+_KEYS: tuple[tuple[str, str, str, str, _Kind], ...] = (
+    ("push", "parameters", "limits", "parameters", _PARAMETERS),
+    ("push", "interval_s", "limits", "interval", _number(0.05, 600.0)),
+    ("push", "slew", "limits", "slew", _number(0.001, 0.5)),
+    ("push", "unjudged_change", "limits", "unjudged", _SHARE),
+    ("push", "agreement_time_s", "limits", "agreement_time", _SECONDS),
+    ("mass", "bounds_kg", "limits", "mass_absolute", _range(1e-3, 100.0)),
+    ("mass", "bounds_relative", "limits", "mass_bounds", _range(0.05, 20.0)),
+    ("mass", "half_width", "limits", "mass_half_width", _SHARE),
+    ("mass", "agreement", "limits", "mass_agreement", _SHARE),
+    ("mass", "deadband", "limits", "mass_deadband", _SHARE),
+    ("inertia", "bounds_kg_m2", "limits", "inertia_absolute", _range(1e-8, 100.0)),
+    ("inertia", "bounds_relative", "limits", "inertia_bounds", _range(0.05, 20.0)),
+    ("inertia", "half_width", "limits", "inertia_half_width", _SHARE),
+    ("inertia", "agreement", "limits", "inertia_agreement", _SHARE),
+    ("inertia", "deadband", "limits", "inertia_deadband", _SHARE),
+    ("health", "supervisor", "health", "supervisor", _FLAG),
+    ("health", "battery_V", "health", "battery", _number(0.0, 100.0)),
+    ("health", "tilt_deg", "health", "tilt", _number(1.0, 180.0, scale=_DEGREE)),
+    ("health", "stale_s", "health", "stale", _number(0.05, 60.0)),
+    ("watch", "enabled", "watch", "enabled", _FLAG),
+    ("watch", "before_s", "watch", "before", _number(0.5, 60.0)),
+    ("watch", "settle_s", "watch", "settle", _SECONDS),
+    ("watch", "after_s", "watch", "after", _number(0.5, 60.0)),
+    ("watch", "unjudged_writes", "watch", "unjudged", _whole(1, 1000)),
+    ("watch", "tracking_ratio", "watch", "tracking_ratio", _RATIO),
+    ("watch", "tracking_m", "watch", "tracking", _number(0.0, 100.0)),
+    ("watch", "tracking_alarm_m", "watch", "tracking_alarm", _number(0.0, 100.0)),
+    ("watch", "innovation_ratio", "watch", "innovation_ratio", _RATIO),
+    ("watch", "innovation_sd", "watch", "innovation", _number(0.0, 1e6)),
+    ("watch", "oscillation_ratio", "watch", "oscillation_ratio", _RATIO),
+    ("watch", "oscillation_rad_s", "watch", "oscillation", _number(0.0, 100.0)),
+    ("watch", "oscillation_alarm_rad_s", "watch", "oscillation_alarm", _number(0.0, 100.0)),
+    ("watch", "tilt_alarm_deg", "watch", "tilt_alarm", _number(1.0, 180.0, scale=_DEGREE)),
+    ("end", "landed", "end", "landed", _END),
+    ("end", "interrupted", "end", "interrupted", _END),
+    ("end", "failed", "end", "failed", _END),
+    ("end", "link_lost", "end", "link_lost", _END),
+)  # fmt: skip
+_PARTS = ("limits", "health", "watch", "end")
+
+
+def default_text() -> str:
+    """The shipped policy, with its comments."""
+    return (resources.files("crazyem") / "policies" / "default.toml").read_text(encoding="utf-8")
+
+
+def load_policy(path: str | Path | None = None) -> Policy:
+    """The policy of a file, or the shipped one.
+
+    Raises:
+        UsageError: no such file. FileFormatError: it is not a policy; the message names the key.
+    """
+    if path is None:
+        return parse_policy(default_text(), where="the default policy")
+    try:
+        with Path(path).open("rb") as file:
+            data = file.read(LARGEST_FILE + 1)
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else str(error)
+        raise UsageError(f"cannot read the policy {path}: {why}.") from None
+    if len(data) > LARGEST_FILE:
+        raise FileFormatError(f"{path}: not a policy file: larger than {LARGEST_FILE} bytes.")
+    try:
+        source = data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{path}: not a policy file: not UTF-8 at byte {error.start}.") from None
+    return parse_policy(source, where=str(path))
+
+
+def parse_policy(source: str, *, where: str = "policy") -> Policy:
+    """Policy from the text of a file; `where` names it in errors (FileFormatError)."""
+    try:
+        data = tomllib.loads(source)
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        raise FileFormatError(f"{where}: not valid TOML: {error}") from None
+    name = data.pop("name", "unnamed")
+    if not isinstance(name, str) or not name.isprintable() or len(name) > 100:
+        raise FileFormatError(f"{where}: key 'name' must be a short text")
+    _check_names(data, where)
+    policy = Policy(name=name)
+    changes: dict[str, dict[str, Any]] = {part: {} for part in _PARTS}
+    for section, key, part, attribute, kind in _KEYS:
+        if key not in data.get(section, {}):
+            continue
+        value = data[section][key]
+        try:
+            changes[part][attribute] = kind.read(value)
+        except ValueError as error:
+            raise FileFormatError(f"{where}: key '{section}.{key}' must be {error}, got {str(value)[:60]!r}") from None
+    return replace(policy, **{part: replace(getattr(policy, part), **c) for part, c in changes.items()})
+
+
+def _check_names(data: Mapping[str, Any], where: str) -> None:
+    known: dict[str, list[str]] = {}
+    for section, key, *_ in _KEYS:
+        known.setdefault(section, []).append(key)
+    for section, values in data.items():
+        if section not in known:
+            raise FileFormatError(f"{where}: unknown key '{section[:60]}' (known: name, {', '.join(known)})")
+        if not isinstance(values, dict):
+            raise FileFormatError(f"{where}: '{section}' must be a table [{section}]")
+        for key in values:
+            if key not in known[section]:
+                raise FileFormatError(
+                    f"{where}: unknown key '{section}.{key[:60]}' (known: {', '.join(known[section])})"
+                )
+
+
+def _text(value: Any) -> str:
+    """A value as TOML."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_text, value)) + "]"
+    return repr(value)

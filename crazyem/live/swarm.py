@@ -1,0 +1,203 @@
+"""Several drones in one process: the swarm file, the way from where each stands to where it flies, and their distances.
+
+A swarm file is TOML; what it leaves out is as on the command line:
+
+    [[drone]]
+    name = "alpha"                      # of the recording and in the summary; default: drone0, drone1, ...
+    uri = "radio://0/80/2M/E7E7E7E701"
+    vehicle = "cf2"
+    trajectory = "figure8"              # or ["waypoints", "path.csv"], relative to the swarm file
+    offset = [0.5, 0.0, 0.2]            # m, world: from above its take-off place to where its trajectory begins
+"""
+
+import itertools
+import math
+import re
+import sys
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from crazyem.control.trajectories import Reference, Trajectory, Vector, smooth_step
+from crazyem.errors import FileFormatError, UsageError
+
+MOST = 100  # drones
+LARGEST_FILE = 1 << 18  # bytes
+CLOSEST = 0.3  # m between two drones: three times the width of a Crazyflie, and out of the worst of its downwash
+FARTHEST = 20.0  # m of an offset
+SPEED = 0.5  # m/s, mean, on the way to an offset
+STEP, LOOKS = 0.1, 2000  # s between looks at distances along trajectories, and how many at most
+SWITCH_INTERVAL = 0.0005  # s; the interpreter's 5 ms would be an eighth of an update's budget at every hand-over
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
+_KEYS = ("name", "uri", "vehicle", "trajectory", "offset")
+
+Maker = Callable[[Vector, float], Trajectory]
+
+
+@dataclass(frozen=True)
+class Member:
+    """One drone of a swarm: where it is reached, what it is and flies. offset: m, world; trajectory: words."""
+
+    name: str
+    uri: str
+    vehicle: str = "cf2"
+    trajectory: tuple[str, ...] = ("hover",)
+    offset: Vector = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Course:
+    """Where a drone stands, where its trajectory begins [m, world], and all it flies once it hovers."""
+
+    stand: Vector
+    begin: Vector
+    path: Trajectory
+
+
+def settle_interpreter() -> None:
+    """Let threads hand over the interpreter ten times as often as usual: many of them wait for each other here."""
+    sys.setswitchinterval(SWITCH_INTERVAL)
+
+
+def members_of(uris: Sequence[str], *, vehicle: str, trajectory: Sequence[str]) -> list[Member]:
+    """Drones named on the command line. Raises UsageError: too many, or one twice."""
+    if len(uris) > MOST:
+        raise UsageError(f"at most {MOST} drones can be flown or watched at once, not {len(uris)}.")
+    double = next((u for i, u in enumerate(uris) if u in uris[:i]), None)
+    if double is not None:
+        raise UsageError(f"{double} is given twice.")
+    return [Member(f"drone{i}", uri, vehicle, tuple(trajectory)) for i, uri in enumerate(uris)]
+
+
+def read_swarm(path: str | Path, *, vehicle: str, trajectory: Sequence[str]) -> list[Member]:
+    """The drones of a swarm file.
+
+    Args:
+        vehicle, trajectory: of drones that do not say.
+
+    Raises:
+        FileFormatError: not a swarm file; names the drone and the key. UsageError: no such file.
+    """
+    try:
+        with open(path, "rb") as file:
+            data = file.read(LARGEST_FILE + 1)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}.") from None
+    if len(data) > LARGEST_FILE:
+        raise FileFormatError(f"{path}: larger than {LARGEST_FILE} bytes, not a swarm file.")
+    try:
+        table = tomllib.loads(data.decode())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise FileFormatError(f"{path}: not a TOML file ({error}).") from None
+    entries = table.pop("drone", None)
+    if table:
+        raise FileFormatError(f"{path}: {next(iter(table))} is not part of a swarm (only [[drone]] is).")
+    if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
+        raise FileFormatError(f"{path}: a swarm needs at least one [[drone]].")
+    if len(entries) > MOST:
+        raise FileFormatError(f"{path}: a swarm has at most {MOST} drones, not {len(entries)}.")
+    members = [
+        _member(entry, f"{path}: drone {i}", Member(f"drone{i}", "", vehicle, tuple(trajectory)), Path(path).parent)
+        for i, entry in enumerate(entries)
+    ]
+    for what in ("name", "uri"):
+        values = [getattr(m, what) for m in members]
+        double = next((v for i, v in enumerate(values) if v in values[:i]), None)
+        if double is not None:
+            raise FileFormatError(f"{path}: two drones have the {what} {double}.")
+    return members
+
+
+def _member(entry: Mapping[str, Any], where: str, base: Member, folder: Path) -> Member:
+    unknown = next((key for key in entry if key not in _KEYS), None)
+    if unknown is not None:
+        raise FileFormatError(f"{where}: {unknown} is not a key of a drone (known: {', '.join(_KEYS)}).")
+    values: dict[str, Any] = {}
+    for key in ("uri", "vehicle", "name"):
+        if key in entry:
+            if not isinstance(entry[key], str) or not entry[key]:
+                raise FileFormatError(f"{where}: {key} must be a text, not {entry[key]!r}.")
+            values[key] = entry[key]
+    if "uri" not in values:
+        raise FileFormatError(f"{where}: uri is missing.")
+    if not _NAME.fullmatch(values.get("name", "a")):
+        raise FileFormatError(f"{where}: name must be 1 to 40 letters, digits, - or _, not {values['name']!r}.")
+    if "vehicle" in values and (folder / values["vehicle"]).is_file():
+        values["vehicle"] = str(folder / values["vehicle"])
+    if "trajectory" in entry:
+        values["trajectory"] = _words(entry["trajectory"], where, folder)
+    if "offset" in entry:
+        values["offset"] = _vector(entry["offset"], f"{where}: offset")
+    return replace(base, **values)
+
+
+def _words(value: Any, where: str, folder: Path) -> tuple[str, ...]:
+    words = [value] if isinstance(value, str) else value
+    if not isinstance(words, list) or not words or not all(isinstance(w, str) and w for w in words):
+        raise FileFormatError(f'{where}: trajectory must be a name or ["waypoints", FILE], not {value!r}.')
+    if words[0] == "waypoints" and len(words) == 2:
+        return "waypoints", str(folder / words[1])
+    return tuple(words)
+
+
+def _vector(value: Any, where: str) -> Vector:
+    if not isinstance(value, list) or len(value) != 3:
+        raise FileFormatError(f"{where} must be 3 numbers, not {value!r}.")
+    for v in value:
+        if isinstance(v, bool) or not isinstance(v, int | float) or not -FARTHEST <= v <= FARTHEST:
+            raise FileFormatError(f"{where} must lie between {-FARTHEST:g} and {FARTHEST:g} m, not {v!r}.")
+    return float(value[0]), float(value[1]), float(value[2])
+
+
+def displaced(make: Maker, offset: Vector) -> Maker:
+    """Trajectories that begin `offset` [m, world] away: the way there first, at rest at both of its ends."""
+    distance = math.hypot(*offset)
+    if distance == 0.0:
+        return make
+    # The polynomial's top speed is 35/16 of its mean.
+    duration = max(2.0, distance / SPEED)
+
+    def maker(position: Vector, yaw: float) -> Trajectory:
+        goal = (position[0] + offset[0], position[1] + offset[1], position[2] + offset[2])
+        inner = make(goal, yaw)
+
+        def at(t: float) -> Reference:
+            if t >= duration:
+                return inner.at(t - duration)
+            s = smooth_step(t / duration)
+            rates = [s[n] / duration**n for n in (1, 2, 3)]
+            velocity, acceleration, jerk = ((r * offset[0], r * offset[1], r * offset[2]) for r in rates)
+            place = tuple(p + s[0] * o for p, o in zip(position, offset))
+            return Reference((place[0], place[1], place[2]), velocity, acceleration, jerk, yaw=yaw)
+
+        return Trajectory(inner.name, inner.duration + duration, at)
+
+    return maker
+
+
+def check_distances(courses: Mapping[str, Course]) -> None:
+    """Refuse drones that would come too close. All are taken to begin together, as far as that is known before.
+
+    Raises:
+        UsageError: two stand, begin, or fly at the same time, closer than `CLOSEST`; names them, the distance and when.
+    """
+    for a, b in itertools.combinations(courses, 2):
+        for what in ("stand", "begin"):
+            distance = math.dist(getattr(courses[a], what), getattr(courses[b], what))
+            if not distance >= CLOSEST:  # also where a position is not known
+                raise UsageError(f"{a} and {b} {what} {distance:.2f} m apart, less than {CLOSEST:g} m: not flown.")
+    longest = max((c.path.duration for c in courses.values()), default=0.0)
+    times = np.linspace(0.0, longest, 2 + min(math.ceil(longest / STEP), LOOKS))
+    tracks = {name: np.array([c.path.at(float(t)).position for t in times]) for name, c in courses.items()}
+    for a, b in itertools.combinations(tracks, 2):
+        distances = np.linalg.norm(tracks[a] - tracks[b], axis=1)
+        worst = int(np.argmin(distances))
+        if distances[worst] < CLOSEST:
+            raise UsageError(
+                f"{a} and {b} would come within {distances[worst]:.2f} m of each other {times[worst]:.1f} s into their "
+                f"trajectories, less than {CLOSEST:g} m: not flown."
+            )

@@ -1,0 +1,204 @@
+"""What a person is shown of a running drone, as frozen values: taken from a session, rendered elsewhere and later."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from crazyem.live.session import Session
+
+TREND = 60.0  # s of estimates in a trend
+POINTS = 24  # of a trend
+NOT_PUSHED = "no guard: nothing is written"
+MARK = "user_"  # of marks by the user, a number after it
+
+# parameter -> label, unit, factor
+SHOWN = (
+    ("mass", "mass", "g", 1e3),
+    ("Ixx", "Ixx", "10⁻⁶ kg m²", 1e6),
+    ("Iyy", "Iyy", "10⁻⁶ kg m²", 1e6),
+    ("Izz", "Izz", "10⁻⁶ kg m²", 1e6),
+    ("motor_time_constant", "motor lag", "ms", 1e3),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterView:
+    """One parameter, in the unit shown; low and high are its 95 % interval, trend its values over the last minute."""
+
+    label: str
+    unit: str
+    value: float
+    low: float
+    high: float
+    identifiable: bool
+    reason: str
+    trend: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class LinkView:
+    """Packets a second, share lost over the last second, totals, median echo [s], delay of the newest packets [s]."""
+
+    rate: float = math.nan
+    loss: float = math.nan
+    lost: int = 0
+    late: int = 0
+    round_trip: float = math.nan
+    delay: float = math.nan
+    outages: int = 0
+    gone: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """A drone at one moment.
+
+    Attributes:
+        name: of the drone. uri: of its link.
+        phase: of the flight; seconds: in it. ended: why it is over, "" while it is not.
+        parameters: newest estimate, empty before the first.
+        guard: mode; decision: why nothing is written now, or what was; paused: by the user; stopped: for good.
+        pushes: newest last: time [s], parameter, value, verified, purpose.
+        alarms: what needs a look, most urgent first.
+        voltage: V. height: m. behind: s the estimator is late. skipped: updates it left out. marks: by the user.
+    """
+
+    name: str
+    uri: str = ""
+    phase: str = ""
+    seconds: float = 0.0
+    ended: str = ""
+    parameters: tuple[ParameterView, ...] = ()
+    updates: int = 0
+    converged: bool = False
+    airborne: bool = False
+    link: LinkView = field(default_factory=LinkView)
+    guard: str = ""
+    decision: str = ""
+    paused: bool = False
+    stopped: str = ""
+    pushes: tuple[tuple[float, str, float, bool, str], ...] = ()
+    writes: int = 0
+    alarms: tuple[str, ...] = ()
+    voltage: float = math.nan
+    height: float = math.nan
+    behind: float = 0.0
+    skipped: int = 0
+    marks: int = 0
+
+
+class Observer:
+    """Takes snapshots of a session; reads only, from any thread, without a lock.
+
+    Args:
+        session: running, or not yet started.
+        name: of the drone.
+        phase: phase of the flight and seconds in it.
+        ended: why the flight is over, "" while it is not.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        *,
+        name: str,
+        phase: Callable[[], tuple[str, float]],
+        ended: Callable[[], str] = lambda: "",
+    ) -> None:
+        self.session, self.name = session, name
+        self._phase, self._ended = phase, ended
+        self._counted: tuple[float, int, int] | None = None
+        self._link = LinkView()
+
+    def snapshot(self) -> Snapshot:
+        """The drone now."""
+        session = self.session
+        history, estimate = session.history, session.estimate
+        phase, seconds = self._phase()
+        account: Any = history.guard
+        pushes = history.pushes[-3:]
+        guard = getattr(session.oversight, "guard", None)
+        decision = session.pipeline.decision
+        return Snapshot(
+            name=self.name,
+            uri=session.link.uri,
+            phase=phase,
+            seconds=seconds,
+            ended=self._ended(),
+            parameters=self._parameters(),
+            updates=estimate.updates if estimate is not None else 0,
+            converged=estimate.converged if estimate is not None else False,
+            airborne=bool(session.pipeline.estimator.airborne),
+            link=self._link_view(),
+            guard=str(account.get("mode", "")) if account else "",
+            decision=str(decision) if decision is not None else "",
+            paused=session.pipeline.paused,
+            stopped=str(getattr(guard, "stopped", "")),
+            pushes=tuple((p.time, p.parameter, p.value, p.verified, p.purpose) for p in pushes),
+            writes=len(history.pushes),
+            alarms=self._alarms(),
+            voltage=session.telemetry.voltage,
+            height=session.telemetry.height,
+            behind=float(getattr(session.pipeline.estimator, "behind", 0.0)),
+            skipped=int(getattr(session.pipeline.estimator, "skipped", 0)),
+            marks=sum(name.startswith(MARK) for name in tuple(history.marks)),
+        )
+
+    def _parameters(self) -> tuple[ParameterView, ...]:
+        estimates = self.session.history.estimates
+        count = len(estimates)
+        if not count or not estimates[count - 1].parameters:
+            return ()
+        newest = estimates[count - 1]
+        # Evenly over the minute; the list only grows, so what is read here stays.
+        span = min(count, round(TREND * 25))
+        first = count - span
+        chosen = sorted({first + (span - 1) * i // max(POINTS - 1, 1) for i in range(POINTS)})
+        views = []
+        for name, label, unit, factor in SHOWN:
+            p = newest.parameters.get(name)
+            if p is None:
+                continue
+            trend = [estimates[i].parameters[name] for i in chosen if name in estimates[i].parameters]
+            views.append(
+                ParameterView(
+                    label, unit, p.value * factor, p.ci95[0] * factor, p.ci95[1] * factor, p.identifiable, p.reason,
+                    tuple(t.value * factor for t in trend if math.isfinite(t.value)),
+                )
+            )  # fmt: skip
+        return tuple(views)
+
+    def _link_view(self) -> LinkView:
+        """Renewed once a second: counting takes the link some time."""
+        now = time.monotonic()
+        if self._counted is not None and now - self._counted[0] < 1.0:
+            return self._link
+        s = self.session.link.statistics()
+        rate = loss = math.nan
+        if self._counted is not None:
+            received, lost = s.received - self._counted[1], max(s.lost - self._counted[2], 0)
+            rate = received / (now - self._counted[0])
+            loss = lost / (received + lost) if received + lost > 0 else math.nan
+        self._counted = (now, s.received, s.lost)
+        delay = max((median for median, _ in s.delays.values()), default=math.nan)
+        gone = self.session.returning or self.session.lost is not None
+        self._link = LinkView(rate, loss, s.lost, s.late, s.round_trip, delay, s.outages, gone)
+        return self._link
+
+    def _alarms(self) -> tuple[str, ...]:
+        session = self.session
+        alarms = []
+        if session.failure is not None:
+            alarms.append(str(session.failure))
+        if session.lost is not None:
+            alarms.append(session.lost_sentence())
+        elif session.returning:
+            alarms.append("the link is lost and being brought back")
+        grounded = session.telemetry.grounded_reason()
+        if grounded:
+            alarms.append(grounded)
+        if session.recorder is not None and session.recorder.failure:
+            alarms.append(session.recorder.failure)
+        return (*alarms, *reversed(session.history.notices[-4:]))

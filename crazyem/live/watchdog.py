@@ -1,0 +1,267 @@
+"""Before against after: whether the drone flies worse since parameters were written, judged by three figures.
+
+How far it is from its setpoint, how surprising its motion is to the estimator's model, and how much it trembles. All
+time is the drone's; the same samples and writes give the same verdicts.
+"""
+
+import math
+import threading
+from collections import deque
+from dataclasses import dataclass, replace
+
+from crazyem.live.policy import WatchLimits
+from crazyem.signals.sample import Sample
+
+FAST = 0.1  # s, time constant of the high-pass on body rates: 1.6 Hz, above what trajectories ask for
+ALARM = 0.3  # s over which an alarm is taken
+LEAD = 0.1  # s by which a drone may follow a moving setpoint late without that being an error
+SPEED_OVER = 0.1  # s over which the setpoint's speed is taken: logged positions come in whole millimetres
+FEWEST = 20  # values without which a stretch says nothing
+KEPT = 4096  # values of each series: bounded memory, whatever the rates
+OFF = 1.0  # m; a drone that far from its setpoint before any write is not following it
+RETURN = 2.5  # s that a drone may take to its setpoint after its mass has changed, and after the new mass was written
+AFTER_GUST = 1.0  # s, the same after a gust that looked like one
+EXCUSED_ALARM = 0.5  # m by which it may be further away than the alarm meanwhile
+GAP = 0.5  # s without a sample after which the high-pass begins anew
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Root mean squares over a stretch; NaN where unknown.
+
+    Attributes:
+        tracking: distance from the setpoint, m. speed: of the setpoint, m/s.
+        innovation: normalised, 1 where the model's noise is right. oscillation: fast part of the body rates, rad/s.
+    """
+
+    tracking: float = math.nan
+    speed: float = math.nan
+    innovation: float = math.nan
+    oscillation: float = math.nan
+
+
+class _Series:
+    """Squares over time, the newest `KEPT`."""
+
+    def __init__(self) -> None:
+        self._items: deque[tuple[float, float]] = deque(maxlen=KEPT)
+
+    def add(self, time: float, square: float) -> None:
+        if math.isfinite(square):
+            self._items.append((time, square))
+
+    def forget(self, since: float) -> None:
+        """What was added of a time after `since` [s]."""
+        self._items = deque((i for i in self._items if i[0] <= since), maxlen=KEPT)
+
+    def rms(self, start: float, end: float, fewest: int = FEWEST) -> float:
+        """Over [start, end], NaN with fewer than `fewest` values."""
+        total, count = 0.0, 0
+        for time, square in reversed(tuple(self._items)):  # a copy: another thread adds to it
+            if time < start:
+                break
+            if time <= end:
+                total += square
+                count += 1
+        return math.sqrt(total / count) if count >= fewest else math.nan
+
+
+class Watchdog:
+    """Judges writes by what comes after them.
+
+    Several writes that follow each other closely are judged together, against the stretch before the first. Samples,
+    innovations and writes may come from three threads.
+    """
+
+    def __init__(self, limits: WatchLimits | None = None) -> None:
+        self.limits = limits or WatchLimits()
+        self._lock = threading.RLock()
+        self._tracking, self._speed = _Series(), _Series()
+        self._innovation, self._oscillation = _Series(), _Series()
+        self._setpoints: deque[tuple[float, tuple[float, ...]]] = deque(maxlen=64)
+        self._rate: tuple[float, tuple[float, ...]] | None = None
+        self._slow: tuple[float, ...] = (0.0, 0.0, 0.0)
+        self._tilt = 0.0
+        self._raw = _Series()  # the distance from the setpoint, excused or not
+        self._excused = (math.inf, -math.inf)  # from when until when the mass changed, not the parameters
+        self._unwritten = False  # the new mass is not in the drone yet
+        self._reference: Figures | None = None
+        self._first = self._last = -math.inf
+        self.newest = -math.inf
+        self.unjudged = 0
+
+    # what is seen
+
+    def take(self, sample: Sample) -> None:
+        """One sample of the flight."""
+        with self._lock:
+            self.newest = max(self.newest, sample.time)
+            if sample.signal == "setpoint_position":
+                self._setpoint(sample.time, sample.value)
+            elif sample.signal == "position":
+                self._position(sample.time, sample.value)
+            elif sample.signal == "body_rate":
+                self._body_rate(sample.time, sample.value)
+            elif sample.signal == "attitude":
+                x, y = sample.value[0], sample.value[1]
+                self._tilt = math.acos(min(max(1.0 - 2.0 * (x * x + y * y), -1.0), 1.0))
+
+    def innovation(self, time: float, mean_square: float) -> None:
+        """Mean square of the normalised innovations of a sample at `time` [s]."""
+        with self._lock:
+            if not self._excuses(time):
+                self._innovation.add(time, mean_square)
+
+    def stepped(self, *, began: float, now: float, real: bool | None) -> None:
+        """The mass changed at `began` [s], or may have (None), or has not after all (False).
+
+        How far the drone is from its setpoint then says nothing about what was written, neither before nor after. Its
+        body rates go on being watched, and an alarm if it is very far.
+        """
+        with self._lock:
+            if real is None:
+                self._excused = (began, now + RETURN)  # not for ever: the estimator that has to decide may stall
+                self._tracking.forget(began)
+                self._innovation.forget(began)
+                self.unjudged = min(self.unjudged, self.limits.unjudged - 1)  # the new mass does not wait for verdicts
+            elif began == self._excused[0]:
+                self._excused = (began, now + (RETURN if real else AFTER_GUST))
+                self._unwritten = real
+
+    def _excuses(self, time: float) -> bool:
+        return self._excused[0] < time < self._excused[1]
+
+    def _setpoint(self, time: float, wanted: tuple[float, ...]) -> None:
+        self._setpoints.append((time, wanted))
+        for before, value in tuple(self._setpoints):
+            if 0.0 < time - before <= SPEED_OVER + 1e-6:
+                self._speed.add(time, math.dist(wanted, value) ** 2 / (time - before) ** 2)
+                break
+
+    def _position(self, time: float, position: tuple[float, ...]) -> None:
+        if self._setpoints and abs(time - self._setpoints[-1][0]) <= SPEED_OVER:
+            square = math.dist(position, self._setpoints[-1][1]) ** 2
+            self._raw.add(time, square)
+            if not self._excuses(time):
+                self._tracking.add(time, square)
+
+    def _body_rate(self, time: float, rate: tuple[float, ...]) -> None:
+        before, self._rate = self._rate, (time, rate)
+        if before is None or not 0.0 < time - before[0] < GAP:
+            self._slow = rate
+            return
+        share = 1.0 - math.exp(-(time - before[0]) / FAST)
+        self._slow = tuple(s + share * (r - s) for s, r in zip(self._slow, rate))
+        self._oscillation.add(time, math.dist(rate, self._slow) ** 2)
+
+    def figures(self, start: float, end: float, fewest: int = FEWEST) -> Figures:
+        """What was seen between two times [s]."""
+        return Figures(
+            tracking=self._tracking.rms(start, end, fewest),
+            speed=self._speed.rms(start, end, 1),
+            innovation=self._innovation.rms(start, end, 5),  # one an update
+            oscillation=self._oscillation.rms(start, end, fewest),
+        )
+
+    # what is judged
+
+    @property
+    def judging(self) -> bool:
+        """Whether a write is not yet judged."""
+        return self._reference is not None
+
+    @property
+    def full(self) -> bool:
+        """Whether what was written has to be judged before more is."""
+        return self.limits.enabled and self.unjudged >= self.limits.unjudged
+
+    def wrote(self, begun: float, ended: float) -> None:
+        """A set of parameters was written between `begun` and `ended` [s]."""
+        with self._lock:
+            if self._excuses(begun):
+                self._excused = (self._excused[0], max(self._excused[1], ended + RETURN))
+            self._unwritten = False
+            if self._reference is None:
+                until = self._excused[0] if self._excuses(begun) else begun
+                self._reference = self.figures(until - self.limits.before, until)
+                self._first = begun
+            self._last = max(self._last, ended)
+            self.unjudged += 1
+
+    def forget(self) -> None:
+        """What was written is good, or undone."""
+        with self._lock:
+            self._reference = None
+            self._first = self._last = -math.inf
+            self.unjudged = 0
+
+    def judge(self, time: float) -> tuple[str, str]:
+        """At `time` [s]: ("", "") undecided or nothing to judge, ("good", figures) or ("worse", why)."""
+        with self._lock:
+            return self._judge(self._reference, self._last, time)
+
+    def _judge(self, before: Figures | None, last: float, time: float) -> tuple[str, str]:
+        if before is None or not self.limits.enabled:
+            return "", ""
+        alarm = self._alarm(before, time)
+        if alarm:
+            return "worse", alarm
+        start = last + self.limits.settle
+        if self._excused[1] > self._first:
+            start = max(start, self._excused[1])
+            if self._unwritten:  # it is off because of a mass that was not written, not because of what was
+                before = replace(before, tracking=math.nan)
+        if time - start < min(1.0, self.limits.after):
+            return "", ""
+        after = self.figures(start, time)
+        why = self._worse(before, after)
+        if why:
+            return "worse", why
+        if time - start < self.limits.after:
+            return "", ""
+        if math.isnan(after.tracking) and math.isnan(after.oscillation):
+            return "", ""  # an outage: nothing was seen, so nothing is good yet
+        return "good", f"{_said(before)} before, {_said(after)} after"
+
+    def _alarm(self, before: Figures, time: float) -> str:
+        limits, now = self.limits, self.figures(time - ALARM, time, 5)
+        if self._tilt > limits.tilt_alarm:
+            return f"the drone leans {math.degrees(self._tilt):.0f} degrees"
+        base, distance = _or(before.tracking, 0.0), self._raw.rms(time - ALARM, time, 5)
+        alarm = limits.tracking_alarm + (EXCUSED_ALARM if self._excuses(time) or self._unwritten else 0.0)
+        if base < OFF and time - self._first > 0 and distance > base + alarm + LEAD * now.speed:
+            return f"{distance:.2f} m from the setpoint, {base:.2f} m before"
+        if now.oscillation > _or(before.oscillation, 0.0) + limits.oscillation_alarm:
+            return f"body rates oscillate by {now.oscillation:.1f} rad/s"
+        return ""
+
+    def _worse(self, before: Figures, after: Figures) -> str:
+        """Comparisons with NaN are false: what is not known is not worse."""
+        limits = self.limits
+        moving = LEAD * max(_or(after.speed, 0.0) - _or(before.speed, 0.0), 0.0)
+        allowed = max(limits.tracking_ratio * before.tracking, before.tracking + limits.tracking) + moving
+        if before.tracking < OFF and after.tracking > allowed:
+            return f"{after.tracking:.3f} m rms from the setpoint, {before.tracking:.3f} m before"
+        if after.innovation > max(limits.innovation_ratio * before.innovation, limits.innovation):
+            return f"innovations of {after.innovation:.1f} standard deviations, {before.innovation:.1f} before"
+        allowed = max(limits.oscillation_ratio * before.oscillation, before.oscillation + limits.oscillation)
+        if after.oscillation > allowed:
+            return f"body rates oscillate by {after.oscillation:.2f} rad/s, {before.oscillation:.2f} before"
+        return ""
+
+
+def _or(value: float, otherwise: float) -> float:
+    return otherwise if math.isnan(value) else value
+
+
+def _said(f: Figures) -> str:
+    parts = [
+        text
+        for value, text in (
+            (f.tracking, f"{f.tracking:.3f} m"),
+            (f.innovation, f"{f.innovation:.2f} sd"),
+            (f.oscillation, f"{f.oscillation:.2f} rad/s"),
+        )
+        if not math.isnan(value)
+    ]
+    return ", ".join(parts) or "nothing known"

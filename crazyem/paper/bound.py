@@ -1,0 +1,379 @@
+"""The Cramer-Rao bound of mass and inertia for a stretch of a paper flight, found without the product's estimator.
+
+A Kalman filter of its own, in Euler angles and with the explicit Euler step of eq. 56, runs along the flight with the
+true parameters. The innovations e_k and their covariances S_k are differentiated by central differences in the
+logarithms of all parameters (mass, inertia, noise scales). The information is
+
+    I_ij = sum_k  de_k/di' S_k^-1 de_k/dj  +  1/2 tr(S_k^-1 dS_k/di S_k^-1 dS_k/dj)
+
+(expected, given the flight; the first sum is what the course of the innovations says, the second what their size says).
+Noise acts through thrust and torque only (rank 4, eq. 55). Noise scales that are not known are parameters too, and the
+bound of mass and inertia is that of the whole matrix inverted.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.compiled import compiled
+from crazyem.errors import UsageError
+from crazyem.paper.flight import Flight
+from crazyem.paper.plant import derivative, thrust_axis
+
+PARAMETERS = ("mass", "Ixx", "Iyy", "Izz")
+PROCESS = ("force", "torque_x", "torque_y", "torque_z")
+SENSORS = ("position", "velocity", "attitude", "body_rate", "specific_force")
+MEASURED = {
+    "A": ("position", "body_rate", "specific_force"),
+    "B": ("position", "velocity", "attitude", "body_rate"),
+    "C": ("position", "velocity", "body_rate"),
+}
+NOISE = ("free", "common", "single", "known")
+# m, m/s, rad, rad/s around the true state at the start: little beside what half a second of data says (wider, the bound
+# of mass grows by 0.5 % at most), but narrow enough that the filter is linear there. From 0.3 rad of attitude its own
+# start biases the score of mass by 0.3 of the bound (sensor A).
+START_SD = np.repeat([0.05, 0.1, 0.03, 1.0], 3)
+STEP = 1e-4  # of a logarithm, for the central differences
+CHUNK = 400  # rows at a time, so that memory does not grow with the flight
+
+
+@compiled
+def _slopes(x, specific, inertia, a):
+    """Jacobian of f at x (12,) into its blocks a (4, 3, 3): dv/dangles, dangles/dangles, dangles/drate, drate/drate.
+
+    specific: m/s^2 along body z.
+    """
+    sr, cr = np.sin(x[6]), np.cos(x[6])
+    sp, cp = np.sin(x[7]), np.cos(x[7])
+    sy, cy = np.sin(x[8]), np.cos(x[8])
+    tp = sp / cp
+    wy, wz = x[10], x[11]
+    a[:] = 0.0
+    a[0, 0, 0] = specific * (-sr * sp * cy + cr * sy)
+    a[0, 0, 1] = specific * cr * cp * cy
+    a[0, 0, 2] = specific * (-cr * sp * sy + sr * cy)
+    a[0, 1, 0] = specific * (-sr * sp * sy - cr * cy)
+    a[0, 1, 1] = specific * cr * cp * sy
+    a[0, 1, 2] = specific * (cr * sp * cy + sr * sy)
+    a[0, 2, 0] = -specific * sr * cp
+    a[0, 2, 1] = -specific * cr * sp
+    a[1, 0, 0] = tp * (cr * wy - sr * wz)
+    a[1, 0, 1] = (sr * wy + cr * wz) / cp**2
+    a[1, 1, 0] = -sr * wy - cr * wz
+    a[1, 2, 0] = (cr * wy - sr * wz) / cp
+    a[1, 2, 1] = (sr * wy + cr * wz) * tp / cp
+    a[2, 0, 0] = 1.0
+    a[2, 0, 1] = sr * tp
+    a[2, 0, 2] = cr * tp
+    a[2, 1, 1] = cr
+    a[2, 1, 2] = -sr
+    a[2, 2, 1] = sr / cp
+    a[2, 2, 2] = cr / cp
+    for i in range(3):
+        j = (i + 1) % 3
+        k = (i + 2) % 3
+        g = (inertia[k] - inertia[j]) / inertia[i]
+        a[3, i, j] = -g * x[9 + k]
+        a[3, i, k] = -g * x[9 + j]
+
+
+@compiled
+def _propagate(a, dt, p, out):
+    """out = ((1 + dt A) p)', for A of `_slopes` and p (12, 12); twice, it is the prediction of a covariance."""
+    for m in range(12):
+        for i in range(3):
+            v = 0.0
+            t = 0.0
+            w = 0.0
+            for j in range(3):
+                v += a[0, i, j] * p[6 + j, m]
+                t += a[1, i, j] * p[6 + j, m] + a[2, i, j] * p[9 + j, m]
+                w += a[3, i, j] * p[9 + j, m]
+            out[m, i] = p[i, m] + dt * p[3 + i, m]
+            out[m, 3 + i] = p[3 + i, m] + dt * v
+            out[m, 6 + i] = p[6 + i, m] + dt * t
+            out[m, 9 + i] = p[9 + i, m] + dt * w
+
+
+@compiled
+def innovations(begin, end, y, wrench, x, p, dt, mass, inertia, process, sensor_sd, e, s):
+    """Run the filter over rows begin..end-1; fill the innovations and their covariances, given the rows before.
+
+    Args:
+        begin, end: rows; only row 0 has no step before it.
+        y: (n, 15) position m, velocity m/s, angles rad, rate rad/s, mean specific force m/s^2 (body) of the step that
+            ended; NaN is not measured.
+        wrench: (n, 4) N, N m held from each row on.
+        x, p: (12,), (12, 12) state and covariance before row `begin`; left as they are after row end - 1.
+        dt: s.
+        mass, inertia: kg, (3,) kg m^2.
+        process: (4,) intensities of thrust N sqrt(s) and torque N m sqrt(s).
+        sensor_sd: (5,) standard deviations of the five groups of y.
+        e, s: (end - begin, 15), (end - begin, 15, 15); the specific force comes first, the state's innovations are
+            given it. Not measured is 0 with a variance of 1, whatever the parameters.
+    """
+    a = np.empty((4, 3, 3))
+    tmp = np.empty((12, 12))
+    axis = np.empty(3)
+    slope = np.empty(12)
+    gain = np.empty(12)
+    before = np.empty(12)
+    e[:] = 0.0
+    s[:] = 0.0
+    for k in range(begin, end):
+        row = s[k - begin]
+        error = e[k - begin]
+        for i in range(15):
+            row[i, i] = 1.0
+        if k > 0:
+            thrust = wrench[k - 1, 0]
+            scatter = process[0] ** 2 / (dt * mass**2)  # variance of the step's specific force along body z
+            for i in range(3):
+                if np.isnan(y[k, 12 + i]):
+                    continue
+                row[12 + i, 12 + i] = sensor_sd[4] ** 2
+                error[12 + i] = y[k, 12 + i]
+                if i == 2:
+                    # it sees the very disturbance that moves the drone in this step: the state's noise given it
+                    row[14, 14] += scatter
+                    error[14] -= thrust / mass
+                    share = scatter / row[14, 14]
+                    thrust += mass * share * error[14]
+                    scatter *= 1.0 - share
+            thrust_axis(x[6:9], axis)
+            _slopes(x, thrust / mass, inertia, a)
+            derivative(x, thrust, wrench[k - 1, 1:], mass, inertia, slope)
+            for i in range(12):
+                x[i] += dt * slope[i]
+            _propagate(a, dt, p, tmp)
+            _propagate(a, dt, tmp, p)
+            for i in range(3):
+                for j in range(3):
+                    p[3 + i, 3 + j] += dt * dt * scatter * axis[i] * axis[j]
+                p[9 + i, 9 + i] += dt * (process[1 + i] / inertia[i]) ** 2
+        for i in range(12):
+            before[i] = x[i]
+            if np.isnan(y[k, i]):
+                continue
+            error[i] = y[k, i] - x[i]
+            for j in range(12):
+                if not np.isnan(y[k, j]):
+                    row[i, j] = p[i, j]
+            row[i, i] += sensor_sd[i // 3] ** 2
+        for i in range(12):  # one scalar after the other: the same as all at once, and nothing is inverted
+            if np.isnan(y[k, i]):
+                continue
+            variance = p[i, i] + sensor_sd[i // 3] ** 2
+            for j in range(12):
+                gain[j] = p[i, j] / variance
+            left = error[i] - (x[i] - before[i])
+            for j in range(12):
+                x[j] += gain[j] * left
+                f = gain[j] * variance
+                for m in range(12):
+                    p[j, m] -= f * gain[m]
+
+
+@dataclass(frozen=True)
+class Bound:
+    """What can be known of mass and inertia from one stretch of flight.
+
+    Attributes:
+        names: (p) parameters; the logarithm of each is the coordinate. The first four are mass, Ixx, Iyy, Izz.
+        information: (p, p) Fisher information of the logarithms, given this flight.
+        score: (p,) gradient of the log-likelihood at the truth. Over flights its mean is 0 and its covariance the
+            information.
+    """
+
+    names: tuple[str, ...]
+    information: NDArray
+    score: NDArray
+
+    @property
+    def covariance(self) -> NDArray:
+        """(p, p) the bound on the covariance of the logarithms."""
+        scale = np.sqrt(np.diag(self.information))
+        return np.linalg.inv(self.information / np.outer(scale, scale)) / np.outer(scale, scale)
+
+    @property
+    def sd(self) -> NDArray:
+        """(4,) smallest relative standard deviation of mass, Ixx, Iyy, Izz."""
+        return np.sqrt(np.diag(self.covariance))[:4]
+
+    @property
+    def efficient(self) -> NDArray:
+        """(4,) relative error that an efficient estimator makes on this very stretch (first order): I^-1 score.
+
+        Its standard deviation over flights is `sd`. The error of an estimator minus this is what it wastes.
+        """
+        return (self.covariance @ self.score)[:4]
+
+    def under(self, noise: str, *, sensors: str = "free") -> "Bound":
+        """The bound if more were known of the noise; from a bound with everything free, at no cost.
+
+        Args:
+            noise: free, common (one intensity for the three torques), single (one number for thrust and torques: their
+                ratio is known) or known.
+            sensors: free or known: standard deviations of the measurements.
+
+        Raises:
+            UsageError: there is no such option, or this bound lacks the scales.
+        """
+        if noise not in NOISE:
+            raise UsageError(f"unknown noise '{noise}' (known: {', '.join(NOISE)})")
+        if sensors not in {"free", "known"}:
+            raise UsageError(f"sensors are free or known, not '{sensors}'")
+        if any(name not in self.names for name in PROCESS):
+            raise UsageError("this bound has no free noise scales to tie together")
+        groups: list[tuple[str, tuple[str, ...]]] = [(name, (name,)) for name in PARAMETERS]
+        if noise == "free":
+            groups += [(name, (name,)) for name in PROCESS]
+        elif noise == "common":
+            groups += [("force", ("force",)), ("torque", PROCESS[1:])]
+        elif noise == "single":
+            groups += [("noise", PROCESS)]
+        if sensors == "free":
+            groups += [(name, (name,)) for name in self.names if name in SENSORS]
+        tie = np.array([[float(name in members) for name in self.names] for _, members in groups])
+        return Bound(tuple(name for name, _ in groups), tie @ self.information @ tie.T, tie @ self.score)
+
+
+def observed(flight: Flight, sensor: str, first: int, last: int, *, accelerometer: bool = True) -> NDArray:
+    """(last - first, 15) what sensor A, B or C read in these rows, NaN for what it does not read.
+
+    Raises:
+        UsageError: there is no such sensor, or the flight has no such rows.
+    """
+    if sensor not in MEASURED:
+        raise UsageError(f"unknown sensor '{sensor}' (known: {', '.join(MEASURED)})")
+    if not 0 <= first < last <= flight.size:
+        raise UsageError(f"rows {first} to {last} are not in a flight of {flight.size} rows")
+    y = np.full((last - first, 15), np.nan)
+    for group, name in enumerate(SENSORS):
+        if name in MEASURED[sensor] and (accelerometer or name != "specific_force"):
+            at = slice(3 * group, 3 * group + 3)
+            source = slice(15, 18) if name == "specific_force" else at
+            y[:, at] = flight.readings[first:last, source]
+    y[0, 12:] = np.nan  # of the step before the stretch
+    return y
+
+
+@compiled
+def _whiten(low, rows):
+    """low^-1 rows for a lower triangle low (m, m), in place of rows (m, n): each row is a vector operation."""
+    for i in range(len(low)):
+        for j in range(i):
+            c = low[i, j]
+            for a in range(rows.shape[1]):
+                rows[i, a] -= c * rows[j, a]
+        c = 1.0 / low[i, i]
+        for a in range(rows.shape[1]):
+            rows[i, a] *= c
+
+
+@compiled
+def _add(seen, e, cov, step, information, score):
+    """Add what some rows say to the information (p, p) and the score (p,), both filled in place.
+
+    Args:
+        seen: (m,) columns that are measured at all.
+        e, cov: (2 p + 1, n, 15), (2 p + 1, n, 15, 15) of the truth, then a step up and one down for each parameter.
+        step: of the logarithms.
+    """
+    m, count = len(seen), len(score)
+    low = np.zeros((m, m))  # Cholesky factor of the covariance: it whitens, and the sums become plain products
+    white = np.empty((m, 1 + count))  # innovation, and its derivative by each parameter
+    spread = np.empty((m, count * m))  # derivatives of the covariance, side by side
+    turned = np.empty((m, count * m))
+    terms = np.empty((count, m * m))
+    for k in range(e.shape[1]):
+        for i in range(m):
+            for j in range(i + 1):
+                v = cov[0, k, seen[i], seen[j]]
+                for c in range(j):
+                    v -= low[i, c] * low[j, c]
+                low[i, j] = np.sqrt(v) if i == j else v / low[j, j]
+        for i in range(m):
+            white[i, 0] = e[0, k, seen[i]]
+            for u in range(count):
+                up, down = 2 * u + 1, 2 * u + 2
+                white[i, 1 + u] = (e[up, k, seen[i]] - e[down, k, seen[i]]) / (2 * step)
+                for j in range(m):
+                    spread[i, u * m + j] = (cov[up, k, seen[i], seen[j]] - cov[down, k, seen[i], seen[j]]) / (2 * step)
+        _whiten(low, white)
+        _whiten(low, spread)
+        for u in range(count):
+            for i in range(m):
+                for j in range(m):
+                    turned[j, u * m + i] = spread[i, u * m + j]
+        _whiten(low, turned)
+        for u in range(count):
+            for i in range(m):
+                score[u] -= white[i, 1 + u] * white[i, 0] + 0.5 * turned[i, u * m + i]
+                for j in range(m):
+                    terms[u, i * m + j] = turned[i, u * m + j]
+                    score[u] += 0.5 * turned[i, u * m + j] * white[i, 0] * white[j, 0]
+            for w in range(u + 1):
+                v = 0.0
+                for a in range(m * m):
+                    v += terms[u, a] * terms[w, a]
+                v *= 0.5
+                for i in range(m):
+                    v += white[i, 1 + u] * white[i, 1 + w]
+                information[u, w] += v
+                if w < u:
+                    information[w, u] += v
+
+
+def bound(
+    flight: Flight,
+    sensor: str,
+    first: int = 0,
+    last: int | None = None,
+    *,
+    noise: str = "free",
+    sensors: str = "free",
+    accelerometer: bool = True,
+    start_sd: NDArray = START_SD,
+) -> Bound:
+    """Cramer-Rao bound of mass and inertia from rows first..last-1 of a flight.
+
+    Args:
+        flight: any; its true state is used as the centre of the start only, its true parameters throughout.
+        sensor: A, B or C.
+        first, last: rows; last defaults to all that is known.
+        noise, sensors: what is known of the noise, see `Bound.under`.
+        accelerometer: whether sensor A reads the specific force, too.
+        start_sd: (12,) standard deviations of what is known of the state at the start [m, m/s, rad, rad/s].
+
+    Raises:
+        UsageError: no such sensor, rows or option.
+    """
+    last = flight.size if last is None else last
+    y = observed(flight, sensor, first, last, accelerometer=accelerometer)
+    wrench = np.ascontiguousarray(flight.wrench[first:last])
+    s = flight.settings
+    sds = (s.position_sd, s.velocity_sd, s.attitude_sd, s.body_rate_sd, s.acceleration_sd)
+    truth = np.array([s.mass, *s.inertia, s.force_noise, *[s.torque_noise] * 3, *sds])
+    free = [*range(8)] + [8 + g for g in range(5) if not np.all(np.isnan(y[:, 3 * g]))]
+    names = (*PARAMETERS, *PROCESS, *SENSORS)
+
+    seen = np.flatnonzero(~np.all(np.isnan(y), axis=0))
+    points = [truth]
+    for i in free:
+        factor = np.exp(STEP * (np.arange(len(truth)) == i))
+        points += [truth * factor, truth / factor]
+    runs = [(point, flight.truth[first].copy(), np.diag(np.square(start_sd))) for point in points]
+    information, score = np.zeros((len(free), len(free))), np.zeros(len(free))
+    for begin in range(0, len(y), CHUNK):
+        end = min(begin + CHUNK, len(y))
+        n = end - begin
+        e, cov = np.empty((len(runs), n, 15)), np.empty((len(runs), n, 15, 15))
+        for i, (v, x, p) in enumerate(runs):
+            innovations(begin, end, y, wrench, x, p, s.dt, v[0], v[1:4], v[4:8], v[8:13], e[i], cov[i])
+        _add(seen, e, cov, STEP, information, score)
+    whole = Bound(tuple(names[i] for i in free), information, score)
+    if (noise, sensors) == ("free", "free"):
+        return whole
+    return whole.under(noise, sensors=sensors)

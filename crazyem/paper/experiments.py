@@ -1,0 +1,278 @@
+"""The paper's simulations as tasks, one each per experiment, sensor, method and seed; a task is a function of its name.
+
+A record is what JSON can hold: SI, numbers rounded to seven digits, null for what is no number. `timing` is kept apart,
+so that everything else can be compared bit by bit.
+"""
+
+import math
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.paper.bound import bound
+from crazyem.paper.flight import Flight, fly
+from crazyem.paper.product import ProductOnline, product_offline
+from crazyem.paper.published import PublishedOnline, published_offline
+from crazyem.paper.published_values import PARAMETERS
+from crazyem.paper.settings import Settings
+
+SETTLED = 8.0  # s: windows of an online flight that begin later count as converged
+ITERATIONS = 20  # of EM, offline
+PATH_POINTS = 200
+_DENSE, _EVERY = 50, 10  # intervals over time: the first so many updates, then every so many-th
+_CHECK = 25  # updates between two looks at whether the drone has crashed
+NEAR = {"mass_5": (0, 0.05), "mass_1": (0, 0.01), "Ixx_25": (1, 0.25), "Iyy_25": (2, 0.25), "Izz_25": (3, 0.25)}
+
+
+@dataclass(frozen=True, order=True)
+class Task:
+    """One simulation.
+
+    Attributes:
+        experiment: table1, offline or online.
+        sensor: A, B or C.
+        method: published, crazyem, bound (offline: what can be known from the flight) or filter (table1).
+        seed: of all noise.
+    """
+
+    experiment: str
+    sensor: str
+    method: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Of its file, and in messages."""
+        return f"{self.experiment}-{self.sensor}-{self.method}-{self.seed:04d}"
+
+
+def plan(experiments: Iterable[str], sensors: Iterable[str], methods: Iterable[str], seeds: int) -> list[Task]:
+    """Every task that was asked for, in an order that suits processes which begin together on a fresh machine.
+
+    The first of each kind compiles its kernels; while one process compiles the estimator's, the others have tasks that
+    need none of them. At the end there are enough short ones for no process to be left with a long one alone.
+    """
+    experiments, sensors, methods = tuple(experiments), tuple(sensors), tuple(methods)
+
+    def group(experiment: str, method: str, *needs: str) -> list[Task]:
+        if experiment not in experiments or not set(needs) <= set(methods):
+            return []
+        return [Task(experiment, s, method, k) for s in sensors for k in range(seeds)]
+
+    online, offline = group("online", "crazyem", "crazyem"), group("offline", "crazyem", "crazyem")
+    tasks = online[:1] + group("online", "published", "published") + offline[:1] + group("offline", "bound")
+    tasks += online[1:] + offline[1:] + group("offline", "published", "published")
+    if "table1" in experiments:
+        tasks += [Task("table1", "A", "filter", k) for k in range(seeds)]
+    return tasks
+
+
+def run_task(task: Task, settings: Settings) -> dict[str, Any]:
+    """The record of a task: its name's parts, the results, and `timing`."""
+    run: Callable[[Task, Settings], dict[str, Any]] = {
+        ("table1", "filter"): _table1,
+        ("offline", "published"): _offline_published,
+        ("offline", "crazyem"): _offline_crazyem,
+        ("offline", "bound"): _offline_bound,
+        ("online", "published"): _online_published,
+        ("online", "crazyem"): _online_crazyem,
+    }[task.experiment, task.method]
+    begin, cpu = time.perf_counter(), time.process_time()
+    results = run(task, settings)
+    timing = {
+        "seconds": round(time.perf_counter() - begin, 4),
+        "cpu_seconds": round(time.process_time() - cpu, 4),  # what it takes where nothing else runs
+        **results.pop("timing", {}),
+    }
+    return {
+        "experiment": task.experiment, "sensor": task.sensor, "method": task.method, "seed": task.seed,
+        **results, "timing": timing,
+    }  # fmt: skip
+
+
+def short(value: Any) -> Any:
+    """Numbers to seven digits for JSON; arrays become lists, NaN and infinity null."""
+    if isinstance(value, np.ndarray | list | tuple):
+        return [short(v) for v in value]
+    number = float(value)
+    return float(f"{number:.7g}") if math.isfinite(number) else None
+
+
+# offline ------------------------------------------------------------------------------------------------------
+
+
+def _table1(task: Task, settings: Settings) -> dict[str, Any]:
+    flight = fly(settings, task.seed)
+    error = flight.estimate - flight.truth
+    record: dict[str, Any] = {}
+    for name, columns in (("position", slice(0, 3)), ("angles", slice(6, 9))):
+        # of one axis each: sd over mean is printed as 0.755 = sqrt(pi / 2 - 1), as |Gaussian| numbers have it
+        size = np.abs(error[:, columns])
+        record[name] = {"mean": short(size.mean()), "sd": short(size.std()), "max": short(size.max())}
+    # Fig. 5: what share of all components stays where the text says
+    record["velocity_within"] = short(np.mean(np.abs(error[:, 3:6]) < 3e-2))
+    record["rate_within"] = short(np.mean(np.abs(error[:, 9:12]) < 0.15))
+    return record
+
+
+def _offline_published(task: Task, settings: Settings) -> dict[str, Any]:
+    flight = fly(settings, task.seed)
+    theta = published_offline(flight, task.sensor, iterations=ITERATIONS).theta
+    record: dict[str, Any] = {"theta": short(theta), "final": short(theta[-1])}
+    if task.sensor == "C":
+        theta = published_offline(flight, "C", angles="dead-reckoned", iterations=ITERATIONS).theta
+        record["dead_reckoned"] = short(theta[-1])
+    return record
+
+
+def _offline_crazyem(task: Task, settings: Settings) -> dict[str, Any]:
+    fit = product_offline(fly(settings, task.seed), task.sensor)
+    history = getattr(fit, "history", None)
+    return {
+        "final": short(fit.value), "sd": short(fit.sd), "ci95": short(fit.ci95), "converged": bool(fit.converged),
+        "theta": None if history is None or not len(history) else short(np.asarray(history)[:, :4]),
+    }  # fmt: skip
+
+
+def _offline_bound(task: Task, settings: Settings) -> dict[str, Any]:
+    """Of the whole flight; the methods' flights are the same, so it stands once for both."""
+    return _bounds(fly(settings, task.seed), task.sensor, 0, settings.steps + 1)
+
+
+def _bounds(flight: Flight, sensor: str, first: int, last: int) -> dict[str, Any]:
+    free = bound(flight, sensor, first, last)
+    return {
+        "bound": short(free.sd),
+        "bound_noise_known": short(free.under("known").sd),
+        "bound_noise_single": short(free.under("single").sd),
+    }
+
+
+# online -------------------------------------------------------------------------------------------------------
+
+
+def window_ends(settings: Settings) -> list[int]:
+    """Rows behind the last of disjoint windows, counted from the end, that begin after 8 s; at least the last one."""
+    ends = list(range(settings.steps + 1, settings.window, -settings.window))
+    late = [end for end in ends if (end - settings.window) * settings.dt >= SETTLED]
+    return (late or ends[:1])[::-1]
+
+
+def thin(count: int) -> list[int]:
+    """Which updates keep their intervals: all at first, then every tenth, and the last."""
+    return sorted({*range(min(count, _DENSE)), *range(0, count, _EVERY), *([count - 1] if count else [])})
+
+
+def _fly_online(
+    flight: Flight, update: Callable[[Flight], tuple[float, Any]], after: Callable[[], None] | None = None
+) -> tuple[NDArray, list[float]]:
+    """A flight from m0 and I0: 4 steps, an update, its result to the controller, and so on to the end or the crash.
+
+    Returns: (updates, 4) mass kg, Ixx, Iyy, Izz kg m^2; s each update took.
+    """
+    s = flight.settings
+    mass, inertia = s.mass_start, np.array(s.inertia_start)
+    theta, seconds = [], []
+    while flight.size <= s.steps:
+        flight.advance(s.every, mass=mass, inertia=inertia)
+        begin = time.perf_counter()
+        mass, inertia = update(flight)
+        seconds.append(time.perf_counter() - begin)
+        theta.append((float(mass), *(float(i) for i in inertia)))
+        if after is not None:
+            after()
+        if len(theta) % _CHECK == 0 and flight.crashed:
+            break
+    return np.array(theta), seconds
+
+
+def _online_published(task: Task, settings: Settings) -> dict[str, Any]:
+    """As printed; if that ends in a crash, once more with estimates kept positive, and the record says so."""
+    flight = Flight(settings, task.seed)
+    theta, seconds = _fly_online(flight, PublishedOnline(settings, task.sensor).update)
+    crashed_after = short((flight.size - 1) * settings.dt) if flight.crashed else None
+    if flight.crashed:
+        flight = Flight(settings, task.seed)
+        theta, seconds = _fly_online(flight, PublishedOnline(settings, task.sensor, clamp=True).update)
+    record = _online_record(task, flight, theta, seconds)
+    return {**record, "crashed_as_printed_after_s": crashed_after}
+
+
+def _online_crazyem(task: Task, settings: Settings) -> dict[str, Any]:
+    flight = Flight(settings, task.seed)
+    product = ProductOnline(settings, task.sensor)
+    intervals: list[Any] = []
+
+    def keep() -> None:
+        estimate = product.estimate
+        intervals.append(None if estimate is None else [estimate[name].ci95 for name in PARAMETERS])
+
+    theta, seconds = _fly_online(flight, product.update, keep)
+    record = _online_record(task, flight, theta, seconds)
+    rows = thin(len(intervals))
+    record["interval_rows"] = rows
+    record["intervals"] = [None if intervals[i] is None else short(intervals[i]) for i in rows]
+    for window in record["windows"]:
+        ci95 = intervals[window["update"]]
+        window["ci95"] = None if ci95 is None else short(ci95)
+    own = list(product.update_seconds)
+    if own:  # what the estimator itself took, without handing over samples
+        record["timing"] |= {f"estimator_{k}": v for k, v in _quantiles(own).items()}
+    return record
+
+
+def _online_record(task: Task, flight: Flight, theta: NDArray, seconds: list[float]) -> dict[str, Any]:
+    s = flight.settings
+    windows = []
+    for end in window_ends(s):
+        update = -(-(end - 1) // s.every) - 1
+        if flight.crashed or update >= len(theta):
+            continue
+        last = min(1 + s.every * (update + 1), flight.size)
+        bounds = _bounds(flight, task.sensor, last - s.window, last)
+        windows.append({"update": update, "value": short(theta[update]), **bounds})
+    step = max(1, s.steps // PATH_POINTS)
+    return {
+        "theta": short(theta),
+        "windows": windows,
+        "crashed": bool(flight.crashed),
+        "flown_s": short((flight.size - 1) * s.dt),
+        "tracking_rms_m": _tracking(flight),
+        "tracking_rms_known_m": _tracking(fly(s, task.seed)),
+        "times": _times(theta, s),
+        "path": [[round(float(v), 4) for v in row] for row in np.nan_to_num(flight.truth[: flight.size : step, :3])],
+        "timing": {f"update_{k}": v for k, v in _quantiles(seconds).items()},
+    }
+
+
+def _tracking(flight: Flight) -> float | None:
+    """m, rms distance from the reference after one window (the first leg is spent finding the parameters)."""
+    first = min(flight.settings.window, flight.size // 2)
+    error = flight.truth[first : flight.size, :3] - flight.reference[first : flight.size, :3]
+    result: float | None = short(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+    return result
+
+
+def _times(theta: NDArray, settings: Settings) -> dict[str, Any]:
+    """s from the start: the first update within so much of the truth, and the one after which all are."""
+    truth = np.array([settings.mass, *settings.inertia])
+    times = np.minimum(settings.every * (np.arange(len(theta)) + 1), settings.steps) * settings.dt
+    found: dict[str, Any] = {}
+    for name, (column, share) in NEAR.items():
+        inside = np.abs(theta[:, column] / truth[column] - 1) <= share  # NaN is outside
+        outside = np.flatnonzero(~inside)
+        stays = outside[-1] + 1 if outside.size else 0
+        found[name] = {
+            "first": short(times[np.argmax(inside)]) if inside.any() else None,
+            "stays": short(times[stays]) if stays < len(theta) else None,
+        }
+    return found
+
+
+def _quantiles(seconds: list[float]) -> dict[str, float]:
+    ms = 1e3 * np.array(seconds)
+    return {"median_ms": round(float(np.median(ms)), 4), "p99_ms": round(float(np.percentile(ms, 99)), 4)}

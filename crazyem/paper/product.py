@@ -1,0 +1,203 @@
+"""The product's own estimator on the paper's flights: the very `OnlineEstimator` that flies, fed with samples.
+
+It is told what a user could tell it: that thrust and torque are its inputs, how the simulator steps (explicitly by eq.
+56, unless it takes smaller steps than it samples) and whether there is an accelerometer. It is told neither parameters
+nor noise: the paper's cold start (eq. 116, 117) stands where the vehicle file's constants would, with its wide prior.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.errors import UsageError
+from crazyem.estimation.model import KnownNoise
+from crazyem.estimation.online import OnlineEstimator
+from crazyem.estimation.result import Estimate
+from crazyem.paper.flight import Flight
+from crazyem.paper.settings import Settings
+from crazyem.signals.sample import Sample
+from crazyem.vehicle import load_vehicle
+
+PARAMETERS = ("mass", "Ixx", "Iyy", "Izz")
+NEVER = 10**9  # samples between updates when only the last one is wanted
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What the estimator says of one stretch of flight.
+
+    Attributes:
+        value: (4,) mass kg, Ixx, Iyy, Izz kg m^2.
+        sd: (4,) standard deviations, same units.
+        ci95: (4, 2) 95 % intervals.
+        converged: whether the score test was passed.
+        passes: full passes that it took; 0 where the estimator does not say.
+        history: (passes + 1, 4) value before each pass and at the end; empty where the estimator does not say.
+        noise: scales by name, as `Estimate.noise`.
+        seconds: wall-clock time without handing over the samples.
+    """
+
+    value: NDArray
+    sd: NDArray
+    ci95: NDArray
+    converged: bool
+    passes: int
+    history: NDArray
+    noise: dict[str, float]
+    seconds: float
+
+
+def known_noise(settings: Settings) -> KnownNoise:
+    """The intensities of the simulation's process noise, for an estimator that is told h (all else stays unknown)."""
+    return KnownNoise(force=settings.force_noise, torque=settings.torque_noise, lateral_force=0.0)
+
+
+def estimator_for(
+    settings: Settings,
+    sensor: str,
+    *,
+    window: int | None = None,
+    every: int | None = None,
+    mass: float | None = None,
+    inertia: tuple[float, float, float] | None = None,
+    known: KnownNoise | None = None,
+    accelerometer: bool = True,
+) -> OnlineEstimator:
+    """A new estimator for flights with these settings.
+
+    Args:
+        settings: window, update interval, start values and the way of stepping are taken from it, nothing else.
+        sensor: A, B or C; A has an accelerometer.
+        window, every: samples, where they differ from the settings.
+        mass, inertia: kg, (3,) kg m^2 to start from, where they differ from the settings.
+        known: noise it is told.
+        accelerometer: whether A's is used.
+
+    Raises:
+        UsageError: there is no such sensor, or a value the estimator refuses.
+    """
+    if sensor not in {"A", "B", "C"}:
+        raise UsageError(f"unknown sensor '{sensor}' (known: A, B, C)")
+    mass = settings.mass_start if mass is None else mass
+    inertia = settings.inertia_start if inertia is None else inertia
+    vehicle = replace(load_vehicle("zhao"), mass=mass, inertia=inertia)  # the preset holds the truth
+    return OnlineEstimator(
+        vehicle,
+        window=settings.window if window is None else window,
+        every=settings.every if every is None else every,
+        input_signal="wrench_command",
+        mass=mass,
+        inertia=inertia,
+        integration="euler" if settings.substeps == 1 else "midpoint",
+        accelerometer=sensor == "A" and accelerometer,
+        known_noise=known,
+    )
+
+
+def product_offline(
+    flight: Flight,
+    sensor: str,
+    first: int = 0,
+    last: int | None = None,
+    *,
+    mass: float | None = None,
+    inertia: tuple[float, float, float] | None = None,
+    known: KnownNoise | None = None,
+    accelerometer: bool = True,
+) -> Fit:
+    """One estimate from rows first..last-1 as a single window, converged.
+
+    Args:
+        flight: its samples are read, nothing else.
+        sensor, mass, inertia, known, accelerometer: as for `estimator_for`.
+        first, last: rows; last defaults to all that is known.
+
+    Raises:
+        UsageError: no such sensor, or too few rows.
+    """
+    last = flight.size if last is None else last
+    if not 0 <= first < last <= flight.size:
+        raise UsageError(f"rows {first} to {last} are not in a flight of {flight.size} rows")
+    estimator = estimator_for(
+        flight.settings, sensor, window=last - first, every=NEVER, mass=mass, inertia=inertia, known=known,
+        accelerometer=accelerometer,
+    )  # fmt: skip
+    for sample in flight.samples(sensor, first, last):
+        estimator.feed(sample)
+    begin = time.perf_counter()
+    estimate = estimator.finish()
+    seconds = time.perf_counter() - begin
+    trace = np.array([theta[:4] for theta in _trace(estimator)]).reshape(-1, 4)
+    said = [estimate[name] for name in PARAMETERS]
+    return Fit(
+        value=np.array([p.value for p in said]),
+        sd=np.array([p.sd for p in said]),
+        ci95=np.array([p.ci95 for p in said]),
+        converged=estimate.converged,
+        passes=max(len(trace) - 1, 0),
+        history=trace,
+        noise=dict(estimate.noise),
+        seconds=seconds,
+    )
+
+
+def _trace(estimator: OnlineEstimator) -> Sequence[NDArray]:
+    """Parameters (9,) before each full pass of the last convergence, and at its end, where the estimator keeps them."""
+    return getattr(estimator, "trace", ())
+
+
+class ProductOnline:
+    """The estimator in the loop: after every piece of flight it gets the new rows and says mass and inertia.
+
+    It uses a row once the next one is there, with its wrench: of a flight of n rows, the first n - 2. Pieces of 4 rows
+    after a first one of 5 therefore end with an update each.
+
+    Attributes:
+        estimate: the latest, None before the first.
+        estimator: the product's own.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        sensor: str,
+        *,
+        known: KnownNoise | None = None,
+        accelerometer: bool = True,
+    ) -> None:
+        """Args: as for `estimator_for`."""
+        self.estimator = estimator_for(settings, sensor, known=known, accelerometer=accelerometer)
+        self.estimate: Estimate | None = None
+        self._sensor = sensor
+        self._mass = settings.mass_start
+        self._inertia = np.array(settings.inertia_start)
+        self._rows = 0
+
+    @property
+    def update_seconds(self) -> list[float]:
+        """Wall-clock cost of each of the estimator's updates [s]."""
+        return self.estimator.update_seconds
+
+    def update(self, flight: Flight) -> tuple[float, NDArray]:
+        """Hand over the rows since the last call; returns mass [kg] and inertia (3,) [kg m^2] for the controller.
+
+        They are the start values until the estimator has said something.
+        """
+        if 0 < self._rows < flight.size:  # the wrench of what was then the newest row is known now
+            k = self._rows - 1
+            self._feed(Sample("wrench_command", k * flight.settings.dt, tuple(flight.wrench[k].tolist())))
+        for sample in flight.samples(self._sensor, self._rows, flight.size):
+            self._feed(sample)
+        self._rows = flight.size
+        return self._mass, self._inertia
+
+    def _feed(self, sample: Sample) -> None:
+        estimate = self.estimator.feed(sample)
+        if estimate is None:
+            return
+        self.estimate = estimate
+        mass, *inertia = (estimate[name].value for name in PARAMETERS)
+        self._mass, self._inertia = mass, np.array(inertia)

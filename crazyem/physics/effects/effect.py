@@ -1,0 +1,201 @@
+"""What an effect is: a named group of parameters with neutral values, and the places where it changes the rigid body.
+
+The rigid body is every effect at its neutral value. An effect is one file in this folder that makes an `Effect`; the
+catalogue finds it there. All functions are vectorised over n moments (steps of a flight, or starts of a prediction)
+and take the parameters as keywords. `crazyem/physics/motion.py` puts them together.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Values = Mapping[str, Any]  # one effect: parameter -> value
+Effects = Mapping[str, Values]  # effect -> its parameters; as in a vehicle file
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an effect.
+
+    Attributes:
+        name, unit: SI.
+        neutral: the value at which the effect is absent; NaN: the vehicle's own value (see `Effect.neutral`).
+        low, high: what is admitted.
+        scale: a change that is visible but small, for finite differences and for starting points.
+        chosen: a discrete choice (a rotor, a stream, a length from a list), searched and not differentiated.
+        among: the value is a list of some of these; `chosen` are the lists that are searched.
+        needs, without: as in `Effect`, for this parameter alone.
+    """
+
+    name: str
+    unit: str
+    neutral: Any
+    low: float
+    high: float
+    scale: float
+    chosen: tuple[Any, ...] = ()
+    among: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Body:
+    """What is accelerated. mass kg; inertia (3, 3) kg m^2 about the centre of mass; centre (3,) m from the origin O.
+
+    O is the middle of the rotors; position and velocity of the drone are those of O.
+    """
+
+    mass: float
+    inertia: NDArray
+    centre: NDArray
+
+
+@dataclass(frozen=True)
+class Situation:
+    """Where the drone is and what it does, at n moments; the means over the steps that end there.
+
+    Attributes:
+        time: (n,) s, clock of the recording.
+        flown: (n,) s since the feet left the floor.
+        step: (n,) s, length of each step.
+        position: (n, 3) m, world.
+        height: (n,) m above the floor, not below 0.
+        velocity: (n, 3) m/s, world.
+        rotation: (n, 3, 3) body to world.
+        body_rate: (n, 3) rad/s, body.
+        specific_force: (n, 3) m/s^2, body, of the rigid body as last computed (0 where unknown).
+        angular_acceleration: (n, 3) rad/s^2, body, likewise.
+        thrust: (n, 4) N of each rotor, after the lag.
+        thrust_rate: (n, 4) N/s, its mean derivative over the step.
+        voltage: (n,) V; NaN where unknown.
+        rotor_constant: N/(rad/s)^2 or NaN.
+        air: (n, 3) m/s, world: velocity of the air (wind).
+        shaken: whether some effect couples the air to the body (a drag); without, wind is a constant force.
+        lagged: (n, 4) N after the lag, before what changes thrust at the same rotor speed; None: as `thrust`.
+        swing: (n, 6) direction of a load's string (unit, world) and its derivative [1/s]; None: found along the rows.
+    """
+
+    time: NDArray
+    flown: NDArray
+    step: NDArray
+    position: NDArray
+    height: NDArray
+    velocity: NDArray
+    rotation: NDArray
+    body_rate: NDArray
+    specific_force: NDArray
+    angular_acceleration: NDArray
+    thrust: NDArray
+    thrust_rate: NDArray
+    voltage: NDArray
+    rotor_constant: float
+    air: NDArray
+    shaken: bool = False
+    lagged: NDArray | None = None
+    swing: NDArray | None = None
+
+    @property
+    def size(self) -> int:
+        return len(self.time)
+
+    @property
+    def airspeed(self) -> NDArray:
+        """(n, 3) m/s: velocity of O through the air, body axes."""
+        return np.einsum("nji,nj->ni", self.rotation, self.velocity - self.air)
+
+    def to_body(self, world: NDArray) -> NDArray:
+        """(n, 3) or (3,) world vectors in body axes (n, 3)."""
+        return np.einsum("nji,nj->ni", self.rotation, np.broadcast_to(world, (self.size, 3)))
+
+    def with_thrust(self, thrust: NDArray) -> "Situation":
+        return replace(self, thrust=thrust)
+
+
+@dataclass(frozen=True)
+class Wrench:
+    """Force (n, 3) N acting at O and torque (n, 3) N m, body axes."""
+
+    force: NDArray
+    torque: NDArray
+
+
+@dataclass(frozen=True)
+class Offset:
+    """What a measurement shows beyond the truth, at n moments.
+
+    Attributes:
+        state: (n, 12) position m and velocity m/s (world), attitude rad (body: shown = true * exp(offset)), rate rad/s.
+        specific_force: (n, 3) m/s^2, body.
+    """
+
+    state: NDArray
+    specific_force: NDArray
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A named group of parameters and what it does; the functions that are None it leaves alone.
+
+    Attributes:
+        name: in vehicle files, reports, `--candidates`.
+        parameters: see `Parameter`.
+        order: effects act in this order (then by name) where several change the same thing.
+        commanded: (thrust (m, 4) N settled, before the lag, at m stamps; time (m,), flown (m,), voltage (m,); hover: N
+            of one rotor in hover; limit: N of one rotor at most; **parameters) -> (m, 4). Not applied to measured
+            rotor speeds.
+        timing: (lag s, delay s; **parameters) -> (lag, delay) of the rotors' thrust.
+        speed: (thrust (m, 4) N from measured rotor speeds; **parameters) -> (m, 4). Only where speeds are measured.
+        rotors: (situation; **parameters) -> (n, 4) thrust after the lag [N].
+        turning: (torque (n, 3) of the rotors about O; **parameters) -> (n, 3).
+        body: (body; **parameters) -> body.
+        air: (situation; **parameters) -> (n, 3) velocity of the air, world, added up.
+        couples_air: whether the effect lets moving air act on the drone.
+        external: (situation; body; **parameters) -> Wrench, added up.
+        tied: the same, for a force that itself answers to the drone's acceleration: here `situation.specific_force`
+            is that at O under everything else.
+        measured: (situation; **parameters) -> Offset, added up.
+        needs: at least one of these signals must be recorded, else nothing can be said: "voltage", "rotor_speed",
+            "motor_command", "specific_force", "position", "attitude", "body_rate", "velocity".
+        without: signals with which it cannot be (sag in time only matters where no voltage is known).
+        separates: what would tell it from its look-alikes, in words.
+        nudge: small values at which every parameter matters (a ground effect's height says nothing at strength 0);
+            the fit begins with derivatives there. Empty: neutral will do.
+        amplitude: the parameter without which the others say nothing ("strength"); "" if there is none.
+        alternatives: sets of parameters that are fitted together, one of which is enough; empty: all of them.
+        beginnings: parameter -> values to begin from, where the likelihood may have several maxima.
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    order: int = 50
+    commanded: Callable[..., NDArray] | None = None
+    timing: Callable[..., tuple[float, float]] | None = None
+    speed: Callable[..., NDArray] | None = None
+    rotors: Callable[..., NDArray] | None = None
+    turning: Callable[..., NDArray] | None = None
+    body: Callable[..., Body] | None = None
+    air: Callable[..., NDArray] | None = None
+    couples_air: bool = False
+    external: Callable[..., Wrench] | None = None
+    tied: Callable[..., Wrench] | None = None
+    measured: Callable[..., Offset] | None = None
+    needs: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    separates: str = ""
+    nudge: Values = field(default_factory=dict)
+    amplitude: str = ""
+    alternatives: tuple[tuple[str, ...], ...] = ()
+    beginnings: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+    def complete(self, values: Values, own: Values) -> dict[str, Any]:
+        """All parameters: those given, else neutral; `own` are the vehicle's values for those whose neutral is NaN."""
+        found = {}
+        for p in self.parameters:
+            neutral = own.get(p.name, 0.0) if isinstance(p.neutral, float) and math.isnan(p.neutral) else p.neutral
+            found[p.name] = values.get(p.name, neutral)
+        return found

@@ -1,0 +1,41 @@
+"""inertia and inertia_products: the bare body's inertia matrix, elements where the vehicle file is wrong."""
+
+import math
+from dataclasses import replace
+
+from crazyem.physics.effects.effect import Body, Effect, Parameter
+
+
+def diagonal(body: Body, *, xx: float, yy: float, zz: float) -> Body:
+    """Replace the diagonal of the matrix about the body's centre of mass [kg m^2]."""
+    inertia = body.inertia.copy()
+    inertia[0, 0], inertia[1, 1], inertia[2, 2] = xx, yy, zz
+    return replace(body, inertia=inertia)
+
+
+def products(body: Body, *, xy: float, xz: float, yz: float) -> Body:
+    """Replace the elements J_xy, J_xz, J_yz (not their negatives) of the same matrix [kg m^2]."""
+    inertia = body.inertia.copy()
+    inertia[0, 1] = inertia[1, 0] = xy
+    inertia[0, 2] = inertia[2, 0] = xz
+    inertia[1, 2] = inertia[2, 1] = yz
+    return replace(body, inertia=inertia)
+
+
+INERTIA = Effect(
+    "inertia",
+    tuple(Parameter(axis, "kg m^2", math.nan, 1e-7, 1e-1, 3e-7) for axis in ("xx", "yy", "zz")),
+    order=10,
+    body=diagonal,
+    needs=("body_rate", "attitude"),
+    separates="swing the drone on two threads (bifilar pendulum), or measure the rotors' torque on a stand",
+)
+
+INERTIA_PRODUCTS = Effect(
+    "inertia_products",
+    tuple(Parameter(axis, "kg m^2", math.nan, -1e-2, 1e-2, 3e-7) for axis in ("xy", "xz", "yz")),
+    order=11,
+    body=products,
+    needs=("body_rate", "attitude"),
+    separates="excite one axis at a time: roll, pitch and yaw for 5 s each at 2 Hz",
+)

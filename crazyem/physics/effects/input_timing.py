@@ -1,0 +1,34 @@
+"""motor_lag and input_delay: how long the rotors take to answer."""
+
+import math
+
+from crazyem.physics.effects.effect import Effect, Parameter
+
+
+def slow(lag: float, delay: float, *, time_constant: float) -> tuple[float, float]:
+    """Replace the first-order lag of thrust [s]."""
+    return time_constant, delay
+
+
+def late(lag: float, before: float, *, delay: float) -> tuple[float, float]:
+    """The command of t acts at t + delay, before the lag [s]."""
+    return lag, before + delay
+
+
+MOTOR_LAG = Effect(
+    "motor_lag",
+    (Parameter("time_constant", "s", math.nan, 0.0, 1.0, 2e-3),),
+    order=22,
+    timing=slow,
+    needs=("motor_command",),
+    separates="log rotor speeds; or motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
+)
+
+INPUT_DELAY = Effect(
+    "input_delay",
+    (Parameter("delay", "s", 0.0, 0.0, 0.1, 1e-3),),
+    order=23,
+    timing=late,
+    needs=("motor_command", "rotor_speed"),
+    separates="log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
+)

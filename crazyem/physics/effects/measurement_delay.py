@@ -1,0 +1,92 @@
+"""measurement_delay: a stream of measurements shows the past."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
+from crazyem.physics.effects.rotation import rotation_between
+
+LONGEST_STEP = 0.1  # s: across a longer one nothing is interpolated
+SHOWN = {  # which of position, velocity, attitude, rate, specific force a stream shows
+    "state": ("position", "velocity", "attitude"),
+    "pose": ("position", "attitude"),
+    "gyro": ("body_rate",),
+    "accelerometer": ("specific_force",),
+}
+
+
+def late(situation: Situation, *, delay: float, streams: str | Sequence[str]) -> Offset:
+    """What was `delay` [s] ago, less what is now, for the streams "state", "pose", "gyro", "accelerometer".
+
+    Interpolates between rows, which are one path broken where a step is 0 or longer than 0.1 s. Before the first row of
+    a stretch the drone moved and turned as in that row.
+    """
+    offset = Offset(np.zeros((situation.size, 12)), np.zeros((situation.size, 3)))
+    if delay == 0.0 or not situation.size:
+        return offset
+    names = [streams] if isinstance(streams, str) else streams
+    shown = {quantity for name in names for quantity in SHOWN[name]}
+    row, part, before = _looked_up(situation, delay)
+    if "position" in shown:
+        offset.state[:, 0:3] = _past(situation.position, row, part) - before * situation.velocity.take(row, axis=0)
+        offset.state[:, 0:3] -= situation.position
+    if "velocity" in shown:
+        offset.state[:, 3:6] = _past(situation.velocity, row, part) - situation.velocity
+    if "attitude" in shown:
+        offset.state[:, 6:9] = _turned(situation, row, part, before)
+    if "body_rate" in shown:
+        offset.state[:, 9:12] = _past(situation.body_rate, row, part) - situation.body_rate
+    if "specific_force" in shown:
+        offset.specific_force[:] = _past(situation.specific_force, row, part) - situation.specific_force
+    return offset
+
+
+def stretches(situation: Situation) -> tuple[NDArray, NDArray]:
+    """Where rows hang together: (n,) s from the row before to each row (0 at breaks), (n,) whether a break."""
+    gap = np.diff(situation.time, prepend=situation.time[:1])
+    broken = ~((situation.step > 0) & (situation.step <= LONGEST_STEP) & (gap > 0) & (gap <= LONGEST_STEP))
+    broken[:1] = True
+    return np.where(broken, 0.0, gap), broken
+
+
+def _looked_up(situation: Situation, delay: float) -> tuple[NDArray, NDArray, NDArray]:
+    """For each moment: the last row before t - delay, the part of the way to the next, and s before the first row."""
+    gap, broken = stretches(situation)
+    clock = np.cumsum(np.where(broken, 1.0, gap))  # stretches further apart than any delay
+    first = np.maximum.accumulate(np.where(broken, np.arange(situation.size), 0))
+    wanted = clock - delay
+    row = np.maximum(np.searchsorted(clock, wanted, "right") - 1, first)
+    before = np.maximum(clock[first] - wanted, 0.0)
+    following = np.minimum(row + 1, situation.size - 1)
+    length = clock[following] - clock[row]
+    part = np.where((length > 0) & (before == 0.0), (wanted - clock[row]) / np.where(length > 0, length, 1.0), 0.0)
+    return row, np.clip(part, 0.0, 1.0)[:, None], before[:, None]
+
+
+def _past(values: NDArray, row: NDArray, part: NDArray) -> NDArray:
+    shown = values.take(row, axis=0)
+    return shown + part * (values.take(np.minimum(row + 1, len(values) - 1), axis=0) - shown)
+
+
+def _turned(situation: Situation, row: NDArray, part: NDArray, before: NDArray) -> NDArray:
+    """(n, 3) rad: rotation from the attitude now to the one shown, body axes; between rows along the chord."""
+    rotation = situation.rotation
+    shown = _past(rotation.reshape(-1, 9), row, part).reshape(-1, 3, 3)
+    return rotation_between(rotation, shown) - before * situation.body_rate.take(row, axis=0)
+
+
+MEASUREMENT_DELAY = Effect(
+    "measurement_delay",
+    (
+        Parameter("delay", "s", 0.0, 0.0, 0.1, 1e-3),
+        Parameter(
+            "streams", "", ("state",), 0, 0, 0, chosen=(("state",), ("gyro",), ("accelerometer",)), among=tuple(SHOWN)
+        ),
+    ),
+    order=84,
+    measured=late,
+    needs=("position", "velocity", "attitude", "body_rate", "specific_force"),
+    separates="log the gyro and the pose at 100 Hz or more, and turn and stop sharply several times",
+)

@@ -1,0 +1,44 @@
+"""velocity_moment and rate_damping: torques of the air against motion and rotation."""
+
+import numpy as np
+
+from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
+
+
+def flapping(situation: Situation, body: Body, *, roll_per_vy: float, pitch_per_vx: float) -> Wrench:
+    """Torque (roll_per_vy v_y, pitch_per_vx v_x, 0) of the air's flow on the rotors [N m s/m], body axes."""
+    airspeed = situation.airspeed
+    torque = np.zeros((situation.size, 3))
+    torque[:, 0] = roll_per_vy * airspeed[:, 1]
+    torque[:, 1] = pitch_per_vx * airspeed[:, 0]
+    return Wrench(np.zeros((situation.size, 3)), torque)
+
+
+def damping(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
+    """Torque -B w, x, y, z [N m s]."""
+    return Wrench(np.zeros((situation.size, 3)), -np.array([x, y, z]) * situation.body_rate)
+
+
+VELOCITY_MOMENT = Effect(
+    "velocity_moment",
+    (
+        Parameter("roll_per_vy", "N m s/m", 0.0, -5e-3, 5e-3, 5e-6),
+        Parameter("pitch_per_vx", "N m s/m", 0.0, -5e-3, 5e-3, 5e-6),
+    ),
+    order=62,
+    external=flapping,
+    needs=("velocity", "position"),
+    separates="fly straight legs forward and back, then left and right, at 1 and 2 m/s, and hover between them",
+)
+
+RATE_DAMPING = Effect(
+    "rate_damping",
+    tuple(Parameter(axis, "N m s", 0.0, 0.0, 1e-3, 2e-6) for axis in "xyz"),
+    order=63,
+    external=damping,
+    needs=("body_rate", "attitude"),
+    separates=(
+        "turn at several steady yaw rates; and step roll and pitch with the gyro logged at 500 Hz or more (a lag shows"
+        " in the first 50 ms, damping throughout)"
+    ),
+)

@@ -1,0 +1,78 @@
+"""attitude_misalignment, accelerometer_misalignment, gyro_bias, velocity_scale: what sensors show beyond the truth."""
+
+import numpy as np
+
+from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
+from crazyem.physics.effects.rotation import axes
+from crazyem.physics.rotations import quaternion_from_euler, rotation_vector_from_quaternion
+
+
+def tilted_pose(situation: Situation, *, roll: float, pitch: float, yaw: float) -> Offset:
+    """The pose shows R R_P, R_P = Rz(yaw) Ry(pitch) Rx(roll): the pose frame's axes in the body [rad]."""
+    offset = _nothing(situation)
+    offset.state[:, 6:9] = rotation_vector_from_quaternion(quaternion_from_euler(roll, pitch, yaw))
+    return offset
+
+
+def tilted_accelerometer(situation: Situation, *, roll: float, pitch: float, yaw: float) -> Offset:
+    """The accelerometer reads R_A' f, R_A likewise its axes in the body [rad]."""
+    offset = _nothing(situation)
+    offset.specific_force[:] = situation.specific_force @ axes(roll, pitch, yaw) - situation.specific_force
+    return offset
+
+
+def biased_gyro(situation: Situation, *, x: float, y: float, z: float) -> Offset:
+    """The gyro shows w + bias [rad/s], body."""
+    offset = _nothing(situation)
+    offset.state[:, 9:12] = (x, y, z)
+    return offset
+
+
+def scaled_velocity(situation: Situation, *, x: float, y: float, z: float) -> Offset:
+    """The velocity estimate shows scale times velocity, world axes; position is right."""
+    offset = _nothing(situation)
+    offset.state[:, 3:6] = (np.array([x, y, z]) - 1) * situation.velocity
+    return offset
+
+
+def _nothing(situation: Situation) -> Offset:
+    return Offset(np.zeros((situation.size, 12)), np.zeros((situation.size, 3)))
+
+
+_ANGLES = tuple(Parameter(name, "rad", 0.0, -np.pi, np.pi, 5e-3) for name in ("roll", "pitch", "yaw"))
+
+ATTITUDE_MISALIGNMENT = Effect(
+    "attitude_misalignment",
+    _ANGLES,
+    order=80,
+    measured=tilted_pose,
+    needs=("attitude",),
+    separates="hover for 5 s at each of four headings: a tilted frame turns with the drone, wind stays in the world",
+)
+
+ACCELEROMETER_MISALIGNMENT = Effect(
+    "accelerometer_misalignment",
+    _ANGLES,
+    order=81,
+    measured=tilted_accelerometer,
+    needs=("specific_force",),
+    separates="record the accelerometer for 10 s with the drone standing on a level floor, then turned by 180 degrees",
+)
+
+GYRO_BIAS = Effect(
+    "gyro_bias",
+    tuple(Parameter(axis, "rad/s", 0.0, -1.0, 1.0, 5e-3) for axis in "xyz"),
+    order=82,
+    measured=biased_gyro,
+    needs=("body_rate",),
+    separates="record the gyro for 10 s with the drone at rest",
+)
+
+VELOCITY_SCALE = Effect(
+    "velocity_scale",
+    tuple(Parameter(axis, "", 1.0, 0.0, 3.0, 0.01) for axis in "xyz"),
+    order=83,
+    measured=scaled_velocity,
+    needs=("velocity",),
+    separates="log position from motion capture or beacons, and fly straight legs of known length",
+)

@@ -1,0 +1,54 @@
+"""thrust_curve and battery_sag: settled thrust, before the lag, when the map from command to thrust is wrong."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.physics.effects.effect import Effect, Parameter
+
+REFERENCE_VOLTAGE = 3.7  # V, where gain_per_volt changes nothing: one nearly empty cell
+
+
+def steeper(
+    thrust: NDArray, *, time: NDArray, flown: NDArray, voltage: NDArray, hover: float, limit: float, slope_error: float
+) -> NDArray:
+    """f + slope_error (f - hover), within [0, limit]; nothing where nothing is commanded."""
+    if slope_error == 0.0:
+        return thrust
+    changed = np.clip(thrust + slope_error * (thrust - hover), 0.0, limit)
+    return np.where(thrust == 0.0, 0.0, changed)
+
+
+def sagging(
+    thrust: NDArray, *, time: NDArray, flown: NDArray, voltage: NDArray, hover: float, limit: float,
+    gain_per_volt: float, gain_per_second: float,
+) -> NDArray:  # fmt: skip
+    """Thrust times max(0, 1 + gain (V - 3.7 V)), or 1 + gain t with t [s] since the feet left the floor.
+
+    Where the voltage is unknown gain_per_volt does nothing.
+    """
+    volts = np.where(np.isnan(voltage), 0.0, voltage - REFERENCE_VOLTAGE)
+    factor = 1 + gain_per_volt * volts + gain_per_second * np.maximum(flown, 0.0)
+    return thrust * np.maximum(factor, 0.0)[:, None]
+
+
+THRUST_CURVE = Effect(
+    "thrust_curve",
+    (Parameter("slope_error", "", 0.0, -0.9, 3.0, 0.02),),
+    order=20,
+    commanded=steeper,
+    needs=("motor_command",),
+    separates="climb and sink hard with the same battery, or measure thrust over command on a stand",
+)
+
+BATTERY_SAG = Effect(
+    "battery_sag",
+    (
+        Parameter("gain_per_volt", "1/V", 0.0, -2.0, 2.0, 0.02, needs=("voltage",)),
+        Parameter("gain_per_second", "1/s", 0.0, -0.1, 0.1, 2e-4, without=("voltage",)),
+    ),
+    order=21,
+    commanded=sagging,
+    needs=("motor_command",),
+    alternatives=(("gain_per_volt",), ("gain_per_second",)),
+    separates="log pm.vbat, and fly the same battery from full to empty",
+)

@@ -1,0 +1,54 @@
+"""suspended_load: a point mass on a massless string at O, swinging below the drone; its tension acts on the drone."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
+from crazyem.physics.effects.measurement_delay import stretches
+from crazyem.physics.effects.pendulum import DAMPING, swing_along
+from crazyem.physics.rotations import skew
+
+
+def pulled(situation: Situation, body: Body, *, mass: float, length: float) -> Wrench:
+    """The string's force at O; mass [kg], length [m]. Always taut: in free fall it pushes like a rod.
+
+    The load accelerates with a_O + L d2n/dt2, of which the part along n is fixed by the string; a_O is that under all
+    other forces plus A n T, A the mobility of O. Solved for T there is no acceleration left to be known beforehand:
+
+        T (1 + m n'A n) = m (n'd + L |dn/dt|^2 - n'f)
+
+    with f the specific force at O without the string and d the drag of the load over its mass. The swing comes from
+    the drone's path (or `situation.swing`).
+    """
+    swing = situation.swing if situation.swing is not None else swing_of(situation, length=length)
+    direction, turning = swing[:, :3], swing[:, 3:]
+    drag = -DAMPING * (situation.velocity + length * turning - situation.air)
+    along = situation.to_body(direction)
+    centre = skew(body.centre)
+    mobility = np.eye(3) / body.mass - centre @ np.linalg.inv(body.inertia) @ centre
+    taut = _dot(direction, drag) + length * _dot(turning, turning) - _dot(along, situation.specific_force)
+    tension = mass * taut / (1 + mass * _dot(along @ mobility, along))
+    return Wrench(tension[:, None] * along, np.zeros((situation.size, 3)))
+
+
+def _dot(a: NDArray, b: NDArray) -> NDArray:
+    return np.einsum("ni,ni->n", a, b)
+
+
+def swing_of(situation: Situation, *, length: float) -> NDArray:
+    """(n, 6) direction of the string (unit, world) and its derivative [1/s] along the rows of a situation."""
+    gap, broken = stretches(situation)
+    return swing_along(gap=gap, broken=broken, velocity=situation.velocity, air=situation.air, length=length)
+
+
+SUSPENDED_LOAD = Effect(
+    "suspended_load",
+    (Parameter("mass", "kg", 0.0, 0.0, 0.5, 5e-4), Parameter("length", "m", 0.3, 0.02, 10.0, 0.02)),
+    order=70,
+    tied=pulled,
+    needs=("position", "velocity", "specific_force"),
+    separates="stop sharply from a straight leg and hover for 10 s, so that what hangs can be seen swinging",
+    nudge={"mass": 5e-4},
+    amplitude="mass",
+    beginnings={"length": (0.1, 0.2, 0.35, 0.6, 1.2)},  # a pendulum of the wrong period fits no better than none
+)

@@ -1,0 +1,25 @@
+"""trim: the steady torque that every real drone needs.
+
+No four rotors are equal or upright, and no battery sits in the middle. It goes with the thrust, so nothing acts on a
+drone with its rotors at rest. For a vehicle file that has it, the day's trim differs a little from the file's; how much
+is in `crazyem/diagnosis/always.py`.
+"""
+
+import numpy as np
+
+from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
+
+
+def trimmed(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
+    """Torque (x, y, z) [m, that is N m per N] times the thrust of all rotors, body axes."""
+    total = situation.thrust.sum(axis=1)[:, None]
+    return Wrench(np.zeros((situation.size, 3)), np.array([x, y, z]) * total)
+
+
+TRIM = Effect(
+    "trim",
+    tuple(Parameter(axis, "m", 0.0, -0.02, 0.02, 1e-4) for axis in "xyz"),
+    order=41,
+    external=trimmed,
+    separates="fly the same drone on several days: a trim comes back with every battery, a little different",
+)

@@ -1,0 +1,43 @@
+"""wind and gusts: the air moves.
+
+Gusts are a random process: they have parameters here and a likelihood elsewhere, and add nothing to the mean motion.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
+
+ALONE = 0.007  # N s/m: the force of wind on a drone whose drag nobody knows
+
+
+def blowing(situation: Situation, *, x: float, y: float, z: float) -> NDArray:
+    """Constant velocity of the air [m/s], world."""
+    return np.broadcast_to(np.array([x, y, z], float), (situation.size, 3))
+
+
+def pushing(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
+    """Without a drag: the constant force 0.007 N s/m times wind, world axes; the drone's own motion is not damped."""
+    none = np.zeros((situation.size, 3))
+    return Wrench(none if situation.shaken else situation.to_body(ALONE * np.array([x, y, z])), none)
+
+
+WIND = Effect(
+    "wind",
+    tuple(Parameter(axis, "m/s", 0.0, -30.0, 30.0, 0.2) for axis in "xyz"),
+    order=64,
+    air=blowing,
+    external=pushing,
+    separates="hover for 5 s at each of four headings: wind stays in the world, a tilted frame turns with the drone",
+)
+
+GUSTS = Effect(
+    "gusts",
+    (
+        Parameter("standard_deviation", "m/s", 0.0, 0.0, 10.0, 0.1),
+        Parameter("correlation_time", "s", 1.0, 0.01, 100.0, 0.1),
+    ),
+    order=65,
+    separates="fly the same manoeuvre in still air",
+    amplitude="standard_deviation",
+)

@@ -1,0 +1,91 @@
+"""Vehicles with fitted effects for those who know none: what a rigid body with four rotors can express, folded in.
+
+The online estimator, and the firmware that it writes to, know mass, inertia, the thrust of the rotors and their lag. A
+payload, another inertia, a thrust scale or a lag is such a number; a drag is not.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from crazyem.errors import FileFormatError
+from crazyem.physics.effects.catalogue import CATALOGUE, check_effects
+from crazyem.physics.motion import active, body_of
+from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
+
+_BODY = ("inertia", "inertia_products", "payload")
+_SCALES = ("thrust_scale", "torque_scale")
+
+
+def load(name_or_path: str | Path) -> Vehicle:
+    """A preset or vehicle file, its effects checked against the catalogue. Raises as `load_vehicle`."""
+    return _checked(load_vehicle(name_or_path), str(name_or_path))
+
+
+def parse(source: str, *, where: str) -> Vehicle:
+    """The text of a vehicle file, its effects checked. Raises FileFormatError that names `where` and the key."""
+    return _checked(parse_vehicle(source, where=where), where)
+
+
+def _checked(vehicle: Vehicle, where: str) -> Vehicle:
+    check_effects(vehicle.effects, where=where)
+    if vehicle.effects and np.linalg.eigvalsh(body_of(vehicle, vehicle.effects).inertia)[0] <= 0:
+        raise FileFormatError(f"{where}: the inertia with [effects] is not a positive definite matrix")
+    return vehicle
+
+
+def fold(vehicle: Vehicle) -> tuple[Vehicle, list[str]]:
+    """A vehicle without effects that is as near as one can be, and the names of effects that it leaves out.
+
+    Folded: payload, inertia and inertia_products into mass and inertia (about the common centre of mass; that it lies
+    off the middle is the estimator's torque offset), thrust_scale into the rotors' thrust, torque_scale into the arms,
+    motor_lag into the time constant. Without rotors thrust and torque are inputs, and there is nothing to scale.
+    """
+    if not vehicle.effects:
+        return vehicle, []
+    values = {effect.name: found for effect, found in active(vehicle.effects, vehicle)}
+    used = {name for name in (*_BODY, *_SCALES, "motor_lag") if name in values}
+    body = body_of(vehicle, {name: values[name] for name in _BODY if name in values})
+    matrix = body.inertia
+    plain = replace(
+        vehicle,
+        mass=float(body.mass),
+        inertia=(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[2, 2])),
+        inertia_products=(float(matrix[0, 1]), float(matrix[0, 2]), float(matrix[1, 2])),
+        effects={},
+    )
+    if "motor_lag" in values:
+        plain = replace(plain, motor_time_constant=float(values["motor_lag"]["time_constant"]))
+    if not vehicle.thrust_curve and vehicle.rotor_constant is None:
+        used -= set(_SCALES)
+    else:
+        plain = _scaled(
+            plain,
+            thrust=float(values.get("thrust_scale", {}).get("scale", 1.0)),
+            torque=float(values.get("torque_scale", {}).get("scale", 1.0)),
+        )
+    return plain, [name for name in CATALOGUE if name in vehicle.effects and name not in used]
+
+
+def _scaled(vehicle: Vehicle, *, thrust: float, torque: float) -> Vehicle:
+    """Rotors that give `thrust` times as much, and torques that are `torque` times as large on top of that."""
+    constant = vehicle.rotor_constant
+    return replace(
+        vehicle,
+        thrust_curve=tuple(c * thrust for c in vehicle.thrust_curve),
+        rotor_constant=None if constant is None else constant * thrust,
+        thrust_max=vehicle.thrust_max * thrust,
+        arm=(vehicle.arm[0] * torque, vehicle.arm[1] * torque),
+        torque_per_thrust=vehicle.torque_per_thrust * torque,
+    )
+
+
+def notice(left_out: list[str]) -> str:
+    """What to tell the user about effects that are not used; "" if all are."""
+    if not left_out:
+        return ""
+    return (
+        f"the vehicle file's effects {', '.join(left_out)} are not used: the online estimator knows mass, inertia, "
+        "thrust and rotor lag only."
+    )

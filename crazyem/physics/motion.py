@@ -1,0 +1,190 @@
+"""The rigid body with its effects: from rotor thrusts and state to specific force and angular acceleration.
+
+Vectorised over n moments; used by diagnosis and prediction. In neutral every effect drops out, and what is left is
+
+    f = e3 sum(thrust)/m,   alpha = I^-1 (M - w x I w).
+
+With the centre of mass at c from O (middle of the rotors; positions and velocities are those of O), torques are taken
+about the centre of mass, and the specific force at O is F/m - alpha x c - w x (w x c).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.effect import Body, Effect, Effects, Offset, Situation
+from crazyem.physics.lag import CAUSAL, HOLD, LINEAR, fit_predictor, hold_predictor, lagged_means
+from crazyem.physics.rotors import wrench
+from crazyem.vehicle import GRAVITY, Vehicle
+
+
+@dataclass(frozen=True)
+class RotorInput:
+    """What the rotors were told, or what they were seen to do, at m stamps.
+
+    Attributes:
+        time: (m,) s, increasing.
+        thrust: (m, 4) N: settled thrust of each command, or thrust at each measured speed.
+        voltage: (m,) V, NaN where unknown.
+        flown: (m,) s since the feet left the floor.
+        measured: thrusts come from measured rotor speeds: no lag, and nothing that comes before it.
+        aged: commands of a sampled closed loop: a step must not look at commands later than its start.
+        delay: s, known beforehand: how long a command is held, and the low pass of the rates that answer to it.
+    """
+
+    time: NDArray
+    thrust: NDArray
+    voltage: NDArray
+    flown: NDArray
+    measured: bool
+    aged: bool = True
+    delay: float = 0.0
+
+
+@dataclass(frozen=True)
+class Motion:
+    """specific_force (n, 3) m/s^2 and angular_acceleration (n, 3) rad/s^2, body axes, of O, gravity not included."""
+
+    specific_force: NDArray
+    angular_acceleration: NDArray
+
+
+def own_values(vehicle: Vehicle) -> dict[str, dict[str, float]]:
+    """The vehicle's own values for parameters whose neutral value is the vehicle's."""
+    xx, yy, zz = vehicle.inertia
+    xy, xz, yz = vehicle.inertia_products
+    return {
+        "inertia": {"xx": xx, "yy": yy, "zz": zz},
+        "inertia_products": {"xy": xy, "xz": xz, "yz": yz},
+        "motor_lag": {"time_constant": vehicle.motor_time_constant},
+    }
+
+
+def active(effects: Effects, vehicle: Vehicle) -> list[tuple[Effect, dict]]:
+    """Effects with complete parameters, in the order of the catalogue."""
+    own = own_values(vehicle)
+    return [(CATALOGUE[n], CATALOGUE[n].complete(effects[n], own.get(n, {}))) for n in CATALOGUE if n in effects]
+
+
+def settled(inputs: RotorInput, *, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, float, float]:
+    """What the rotors would settle at, stamp by stamp, and how they get there.
+
+    Returns: (m, 4) N, not above what a rotor can give; the lag [s]; the delay [s].
+    """
+    thrust = inputs.thrust
+    lag, delay = (0.0 if inputs.measured else vehicle.motor_time_constant), inputs.delay
+    if not inputs.measured and vehicle.thrust_curve:
+        thrust = np.minimum(thrust, vehicle.thrust_max)
+    for effect, values in active(effects, vehicle):
+        if effect.commanded is not None and not inputs.measured:
+            thrust = effect.commanded(
+                thrust, time=inputs.time, flown=inputs.flown, voltage=inputs.voltage,
+                hover=vehicle.mass * GRAVITY / 4, limit=vehicle.thrust_max, **values,
+            )  # fmt: skip
+        if effect.speed is not None and inputs.measured:
+            thrust = effect.speed(thrust, **values)
+        if effect.timing is not None:
+            lag, delay = effect.timing(lag, delay, **values)
+    return np.ascontiguousarray(thrust, float), (0.0 if inputs.measured else lag), delay
+
+
+def rotor_thrust(
+    inputs: RotorInput, nodes: NDArray, *, vehicle: Vehicle, effects: Effects, breaks: Sequence[int] = ()
+) -> tuple[NDArray, NDArray]:
+    """Mean thrust of each rotor, and its mean derivative, over the steps that end at nodes (n,) [s].
+
+    `breaks`: rows at which a new stretch begins (their step means nothing). Returns (n, 4) N and (n, 4) N/s.
+    """
+    thrust, lag, delay = settled(inputs, vehicle=vehicle, effects=effects)
+    mode = LINEAR if inputs.measured else (CAUSAL if lag > 0 and inputs.aged else HOLD)
+    mean, rate = np.zeros((len(nodes), 4)), np.zeros((len(nodes), 4))
+    scratch = np.zeros((len(nodes), 4))
+    predictor = fit_predictor(thrust) if mode == CAUSAL else hold_predictor()
+    state = np.zeros(13)
+    starts = sorted({0, *breaks, len(nodes)})
+    for first, last in pairwise(starts):
+        begin = nodes[first] - delay - 10 * max(lag, 0.02)
+        at = max(0, int(np.searchsorted(inputs.time, begin, "right")) - 1)
+        state[:12] = np.tile(thrust[at], 3)
+        state[12] = inputs.time[at]
+        lagged_means(inputs.time, thrust, at, len(inputs.time), predictor, nodes, first, last, mode, lag, delay, state,
+                     mean, scratch, rate)  # fmt: skip
+    return mean, -rate
+
+
+def body_of(vehicle: Vehicle, effects: Effects) -> Body:
+    """What is accelerated, with the effects that change it."""
+    xx, yy, zz = vehicle.inertia
+    xy, xz, yz = vehicle.inertia_products
+    body = Body(vehicle.mass, np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), np.zeros(3))
+    for effect, values in active(effects, vehicle):
+        if effect.body is not None:
+            body = effect.body(body, **values)
+    return body
+
+
+def motion(situation: Situation, *, vehicle: Vehicle, effects: Effects) -> Motion:
+    """Specific force and angular acceleration at n moments; `situation.thrust` is that after the lag."""
+    acting = active(effects, vehicle)
+    n = situation.size
+    body = body_of(vehicle, effects)
+    situation = replace(situation, lagged=situation.thrust)
+    for effect, values in acting:
+        if effect.rotors is not None:
+            situation = situation.with_thrust(effect.rotors(situation, **values))
+    shaken = any(effect.couples_air for effect, _ in acting)
+    air = np.zeros((n, 3))
+    for effect, values in acting:
+        if effect.air is not None:
+            air = air + effect.air(situation, **values)
+    situation = replace(situation, air=air, shaken=shaken)
+    rotors = wrench(situation.thrust, arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust)
+    torque = rotors[:, 1:]
+    for effect, values in acting:
+        if effect.turning is not None:
+            torque = effect.turning(torque, **values)
+    force = np.zeros((n, 3))
+    force[:, 2] = rotors[:, 0]
+    for effect, values in acting:
+        if effect.external is not None:
+            added = effect.external(situation, body, **values)
+            force = force + added.force
+            torque = torque + added.torque
+    free = accelerated(force, torque, body=body, body_rate=situation.body_rate)
+    tied = [(effect, values) for effect, values in acting if effect.tied is not None]
+    if not tied:
+        return free
+    situation = replace(situation, specific_force=free.specific_force, angular_acceleration=free.angular_acceleration)
+    for effect, values in tied:
+        added = effect.tied(situation, body, **values)  # type: ignore[misc]
+        force = force + added.force
+        torque = torque + added.torque
+    return accelerated(force, torque, body=body, body_rate=situation.body_rate)
+
+
+def accelerated(force: NDArray, torque: NDArray, *, body: Body, body_rate: NDArray) -> Motion:
+    """Newton and Euler: force (n, 3) N at O and torque (n, 3) N m about O to the motion of O, body axes."""
+    centre = body.centre
+    shifted = bool(centre.any())
+    if shifted:
+        torque = torque - np.cross(centre, force)
+    angular = (torque - np.cross(body_rate, body_rate @ body.inertia)) @ np.linalg.inv(body.inertia)
+    specific = force / body.mass
+    if shifted:
+        specific = specific - np.cross(angular, centre) - np.cross(body_rate, np.cross(body_rate, centre))
+    return Motion(specific, angular)
+
+
+def measured(situation: Situation, *, vehicle: Vehicle, effects: Effects) -> Offset:
+    """What the sensors show beyond the truth."""
+    state, force = np.zeros((situation.size, 12)), np.zeros((situation.size, 3))
+    for effect, values in active(effects, vehicle):
+        if effect.measured is not None:
+            added = effect.measured(situation, **values)
+            state += added.state
+            force += added.specific_force
+    return Offset(state, force)

@@ -1,0 +1,80 @@
+"""Which fields of which MAVLink messages are which signals: one table for live links and for the reader of tlogs.
+
+PX4 and MAVLink speak FRD bodies and a north-east-down world; ours are FLU and north-west-up: half a turn about x.
+Sources: mavlink.io/en/messages/common.html; units of RAW_IMU: ArduPilot's GCS_MAVLINK.
+"""
+
+import math
+from dataclasses import dataclass
+
+MILLI_G = 9.80665e-3  # m/s^2, the standard gravity of autopilots
+RPM = 2.0 * math.pi / 60.0
+
+# s between attitudes that an estimator uses. An autopilot's filter integrates its gyro and takes a fix now and then, so
+# its attitude errs as its rates do and for far longer than a message lasts: as ten independent attitudes in 0.1 s they
+# contradict the rates, and inertia comes out a fifth too high in hover (docs/mavlink.md).
+ATTITUDE_PERIOD = 0.05
+
+# What is put together of several messages and parameters has names of its own, in our units and our order of rotors.
+OUTPUTS, ROTORS, BATTERY, INFO = "outputs", "rotors", "battery", "supervisor"
+
+
+@dataclass(frozen=True, slots=True)
+class Mapping:
+    """Fields of one message that are a signal.
+
+    Attributes:
+        signal: key of `crazyem.signals.sample.SIGNALS`.
+        message, fields: names, as MAVLink has them; of what has none, see `OUTPUTS`.
+        kind: how frames turn: "vector", "quaternion" (w x y z), "angles" (roll, pitch, yaw), "plain" (not at all).
+        factor: to SI units.
+    """
+
+    signal: str
+    message: str
+    fields: tuple[str, ...]
+    kind: str = "vector"
+    factor: float = 1.0
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names in log blocks."""
+        return tuple(f"{self.message}.{name}" for name in self.fields)
+
+
+def _named(pattern: str, parts: str) -> tuple[str, ...]:
+    return tuple(pattern.replace("*", part) for part in parts.split())
+
+
+_XYZ, _V = _named("*", "x y z"), _named("v*", "x y z")
+_ANGLES, _SPEEDS = _named("*", "roll pitch yaw"), _named("*speed", "roll pitch yaw")
+_ACC, _GYRO = _named("*acc", "x y z"), _named("*gyro", "x y z")
+_FOUR = _named("m*", "1 2 3 4")
+
+# Best first within a signal: body rates that come with their attitude beat those of another instant.
+MAPPINGS: tuple[Mapping, ...] = (
+    Mapping("position", "LOCAL_POSITION_NED", _XYZ),
+    Mapping("velocity", "LOCAL_POSITION_NED", _V),
+    Mapping("attitude", "ATTITUDE_QUATERNION", _named("q*", "1 2 3 4"), "quaternion"),
+    Mapping("attitude", "ATTITUDE", _ANGLES, "angles"),
+    Mapping("body_rate", "ATTITUDE_QUATERNION", _SPEEDS),
+    Mapping("body_rate", "ATTITUDE", _SPEEDS),
+    Mapping("body_rate", "HIGHRES_IMU", _GYRO),
+    Mapping("body_rate", "SCALED_IMU", _GYRO, factor=1e-3),
+    Mapping("body_rate", "RAW_IMU", _GYRO, factor=1e-3),
+    Mapping("specific_force", "HIGHRES_IMU", _ACC),
+    Mapping("specific_force", "SCALED_IMU", _ACC, factor=MILLI_G),
+    Mapping("specific_force", "RAW_IMU", _ACC, factor=MILLI_G),
+    Mapping("motor_command", OUTPUTS, _FOUR, "plain"),
+    Mapping("rotor_speed", ROTORS, _FOUR, "plain", RPM),
+    Mapping("voltage", BATTERY, ("mV",), "plain", 1e-3),
+    Mapping("setpoint_position", "POSITION_TARGET_LOCAL_NED", _XYZ),
+)
+
+
+def mapping(signal: str, message: str) -> Mapping:
+    """The row of a signal and a message; KeyError if there is none."""
+    for row in MAPPINGS:
+        if (row.signal, row.message) == (signal, message):
+            return row
+    raise KeyError((signal, message))

@@ -1,0 +1,115 @@
+"""Everything that acts on a body with effects, about its centre of mass c; stands in for ground.contact in the body.
+
+Floor, air, cable and the forces of `external` act at the geometric origin, b = -c from the centre of mass: the force
+passes, and the torque gains b x force. The state's position and velocity are those of the centre of mass; `origin` and
+`origin_velocity` give those of the geometric origin, which is what positions, truth files and feet refer to.
+"""
+
+import numpy as np
+
+from firmware_sim.kernel import kernel
+from firmware_sim.plant import layout as at
+from firmware_sim.plant.effects.air import air_forces
+from firmware_sim.plant.effects.hidden import pull_cable
+from firmware_sim.plant.ground import GRAVITY, contact
+from firmware_sim.plant.quaternion import matrix
+
+
+@kernel
+def act(truth, x, u, force, torque, ambient, R, f, t, v):
+    """f [N, world] and t [N m, body, about the centre of mass] = what acts on a body in state x; no weight, no load.
+
+    u: [F, Mx, My, Mz] of the rotors. force, torque: held over the step, at the origin. ambient: velocity of the air
+    [m/s, world] and the rotors' angular momentum [N m s]. v = velocity of the origin. Returns the feet on the floor.
+    """
+    w, p, at_origin = x[10:13], np.empty(3), np.empty(3)
+    shift(truth, x[0:3], x[3:6], R, w, p, v)
+    for i in range(3):
+        at_origin[i] = force[i]
+        f[i] = R[i, 2] * u[0]
+        t[i] = u[1 + i] + torque[i]
+    touching = contact(truth, p, v, R, w, at_origin, t)
+    air_forces(truth, R, v, w, ambient, at_origin, t)
+    pull_cable(truth, p, at_origin)
+    for i in range(3):
+        f[i] += at_origin[i]
+    gx = R[0, 0] * at_origin[0] + R[1, 0] * at_origin[1] + R[2, 0] * at_origin[2]
+    gy = R[0, 1] * at_origin[0] + R[1, 1] * at_origin[1] + R[2, 1] * at_origin[2]
+    gz = R[0, 2] * at_origin[0] + R[1, 2] * at_origin[1] + R[2, 2] * at_origin[2]
+    cx, cy, cz = truth[at.COM], truth[at.COM + 1], truth[at.COM + 2]
+    t[0] -= cy * gz - cz * gy
+    t[1] -= cz * gx - cx * gz
+    t[2] -= cx * gy - cy * gx
+    t[0] -= w[1] * ambient[3]
+    t[1] += w[0] * ambient[3]
+    return touching
+
+
+@kernel
+def shift(truth, p, v, R, w, p_origin, v_origin):
+    """Position and velocity of the geometric origin from those of the centre of mass (world)."""
+    cx, cy, cz = truth[at.COM], truth[at.COM + 1], truth[at.COM + 2]
+    ux, uy, uz = w[1] * cz - w[2] * cy, w[2] * cx - w[0] * cz, w[0] * cy - w[1] * cx
+    for i in range(3):
+        p_origin[i] = p[i] - (R[i, 0] * cx + R[i, 1] * cy + R[i, 2] * cz)
+        v_origin[i] = v[i] - (R[i, 0] * ux + R[i, 1] * uy + R[i, 2] * uz)
+
+
+@kernel
+def origin(truth, state, p, v):
+    """p, v: position [m] and velocity [m/s] of the geometric origin, world."""
+    R = np.empty((3, 3))
+    matrix(state, at.QUAT, R)
+    shift(truth, state[at.POS : at.POS + 3], state[at.VEL : at.VEL + 3], R, state[at.OMEGA : at.OMEGA + 3], p, v)
+
+
+@kernel
+def surroundings(truth, state, ambient):
+    """ambient = velocity of the air [m/s, world] and the rotors' angular momentum along body z [N m s]."""
+    for i in range(3):
+        ambient[i] = truth[at.WIND + i] + state[at.GUST + i]
+    ambient[3] = state[at.SPIN]
+
+
+@kernel
+def still_forces(truth, state, ambient, force, torque, out_force, out_torque):
+    """What acts on a drone that stands still, besides floor and weight: held, of the air and of the cable."""
+    R, p, v = np.empty((3, 3)), np.empty(3), np.empty(3)
+    matrix(state, at.QUAT, R)
+    origin(truth, state, p, v)
+    for i in range(3):
+        out_force[i], out_torque[i] = force[i], torque[i]
+    air_forces(truth, R, v, state[at.OMEGA : at.OMEGA + 3], ambient, out_force, out_torque)
+    pull_cable(truth, p, out_force)
+
+
+@kernel
+def newton_euler(truth, x, w, f, t, dx):
+    """dx/dt of x = [p, v, q, w] under force f [N, world] and torque t [N m, body] about the centre of mass, and weight.
+
+    w is x[10:13]; t gains the gyroscopic torque.
+    """
+    gyroscopic(truth, w, t)
+    V = at.INERTIA_INV
+    for i in range(3):
+        dx[i] = x[3 + i]
+        dx[3 + i] = f[i] / truth[at.MASS]
+        dx[10 + i] = truth[V + 3 * i] * t[0] + truth[V + 3 * i + 1] * t[1] + truth[V + 3 * i + 2] * t[2]
+    dx[5] -= GRAVITY
+    qw, qx, qy, qz = x[6], x[7], x[8], x[9]
+    dx[6] = 0.5 * (-qx * w[0] - qy * w[1] - qz * w[2])
+    dx[7] = 0.5 * (qw * w[0] + qy * w[2] - qz * w[1])
+    dx[8] = 0.5 * (qw * w[1] + qz * w[0] - qx * w[2])
+    dx[9] = 0.5 * (qw * w[2] + qx * w[1] - qy * w[0])
+
+
+@kernel
+def gyroscopic(truth, w, t):
+    """t <- t - w x J w."""
+    J = at.INERTIA
+    hx = truth[J] * w[0] + truth[J + 1] * w[1] + truth[J + 2] * w[2]
+    hy = truth[J + 3] * w[0] + truth[J + 4] * w[1] + truth[J + 5] * w[2]
+    hz = truth[J + 6] * w[0] + truth[J + 7] * w[1] + truth[J + 8] * w[2]
+    t[0] -= w[1] * hz - w[2] * hy
+    t[1] -= w[2] * hx - w[0] * hz
+    t[2] -= w[0] * hy - w[1] * hx

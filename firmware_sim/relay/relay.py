@@ -1,0 +1,156 @@
+"""The relay's sockets: one that hosts talk to, one towards the drone for each host, faults in between."""
+
+import contextlib
+import selectors
+import socket
+import time
+from collections.abc import Callable
+
+from firmware_sim.relay.errors import RelayError
+from firmware_sim.relay.faults import DOWN, UP, Engine
+
+Address = tuple[str, int]
+MOST_HOSTS = 64  # the one that was silent longest goes first: every scan is a host of its own
+_BUFFER = 1 << 20  # bytes
+_LONGEST_NAP = 0.05  # s between two looks at the schedule
+
+
+def parse_target(text: str) -> Address:
+    """Host and port of "udp://host:port" or "host:port". Raises RelayError."""
+    host, _, port = text.removeprefix("udp://").rpartition(":")
+    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise RelayError(f'"{text}" is no drone; it should look like udp://127.0.0.1:19850')
+    try:
+        return socket.gethostbyname(host), int(port)
+    except OSError:
+        raise RelayError(f'the host "{host}" is not known') from None
+
+
+class Relay:
+    """Hosts on one side, a drone on the other; every packet goes through the engine.
+
+    Args:
+        target: address of the drone.
+        engine: what goes wrong.
+        host, port: where to listen; port 0 picks a free one.
+
+    Raises: RelayError: the port cannot be listened on.
+    """
+
+    def __init__(self, target: Address, engine: Engine, *, host: str = "127.0.0.1", port: int = 0) -> None:
+        self.target, self.engine = target, engine
+        self.stopping = False
+        self._selector = selectors.DefaultSelector()
+        self._drones: dict[Address, socket.socket] = {}  # host -> the socket that speaks to the drone for it
+        self._heard: dict[Address, float] = {}
+        self._address: Address = (host, port)
+        self._listener: socket.socket | None = None
+        self._open()
+
+    @property
+    def address(self) -> Address:
+        """Where hosts connect to."""
+        return self._address
+
+    @property
+    def uri(self) -> str:
+        """The same as a URI."""
+        return f"udp://{self._address[0]}:{self._address[1]}"
+
+    def run(self, until: Callable[[], bool] | None = None) -> None:
+        """Relay until `stopping` is set or `until()` says so; closes everything."""
+        try:
+            while not self.stopping and not (until is not None and until()):
+                now = time.monotonic()
+                dead = self.engine.dead(now)
+                if dead and self._listener is not None:
+                    self._close_listener()
+                elif not dead and self._listener is None:
+                    self._open()
+                due = self.engine.next_time()
+                nap = _LONGEST_NAP if due is None else min(max(due - now, 0.0), _LONGEST_NAP)
+                for key, _ in self._selector.select(nap):
+                    self._receive(key.fileobj, key.data)  # type: ignore[arg-type]
+                self._send()
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Give back every socket; safe to call twice."""
+        self._close_listener()
+        for host in list(self._drones):
+            self._forget(host)
+        self._selector.close()
+
+    def _open(self) -> None:
+        sock = _socket()
+        try:
+            sock.bind(self._address)
+        except (OSError, OverflowError) as error:
+            sock.close()
+            host, port = self._address
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+            raise RelayError(f"cannot listen on udp://{host}:{port}: {reason}") from None
+        self._address = sock.getsockname()
+        self._listener = sock
+        self._selector.register(sock, selectors.EVENT_READ, None)
+
+    def _close_listener(self) -> None:
+        if self._listener is not None:
+            self._selector.unregister(self._listener)
+            self._listener.close()
+            self._listener = None
+
+    def _receive(self, sock: socket.socket, host: Address | None) -> None:
+        """Everything that has arrived at one socket; `host` is None for the listener."""
+        for _ in range(256):
+            try:
+                datagram, sender = sock.recvfrom(2048)
+            except BlockingIOError:
+                return
+            except OSError:  # an ICMP error of a peer that has gone: over UDP nobody says goodbye
+                return
+            now = time.monotonic()
+            if host is None:
+                self._adopt(sender, now)
+                self.engine.take(now, sender, UP, datagram)
+            elif self._listener is not None:  # a dead drone sends nothing
+                self.engine.take(now, host, DOWN, datagram)
+
+    def _adopt(self, host: Address, now: float) -> None:
+        self._heard[host] = now
+        if host in self._drones:
+            return
+        if len(self._drones) >= MOST_HOSTS:
+            self._forget(min(self._drones, key=self._heard.__getitem__))
+        sock = _socket()
+        sock.connect(self.target)
+        self._drones[host] = sock
+        self._selector.register(sock, selectors.EVENT_READ, host)
+
+    def _forget(self, host: Address) -> None:
+        sock = self._drones.pop(host)
+        self.engine.forget(host)
+        self._heard.pop(host, None)
+        self._selector.unregister(sock)
+        sock.close()
+
+    def _send(self) -> None:
+        for route, direction, datagram in self.engine.due(time.monotonic()):
+            assert isinstance(route, tuple)
+            drone = self._drones.get(route)
+            if drone is None:
+                continue
+            with contextlib.suppress(OSError):  # no room or nobody there: lost, as over the air
+                if direction == UP:
+                    drone.send(datagram)
+                elif self._listener is not None:
+                    self._listener.sendto(datagram, route)
+
+
+def _socket() -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
+        sock.setsockopt(socket.SOL_SOCKET, option, _BUFFER)
+    sock.setblocking(False)
+    return sock

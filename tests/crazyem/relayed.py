@@ -1,0 +1,37 @@
+"""The fault relay in a thread, between a test's link and its drone."""
+
+import contextlib
+import threading
+
+from firmware_sim.relay.faults import Engine, Fault
+from firmware_sim.relay.relay import Relay, parse_target
+
+
+@contextlib.contextmanager
+def relayed(uri, *faults, seed=0):
+    """A running relay in front of `uri`; its `uri` is where to connect, `engine.replace` changes its faults."""
+    relay = Relay(parse_target(uri), Engine(faults, seed))
+    thread = threading.Thread(target=relay.run, daemon=True)
+    thread.start()
+    try:
+        yield relay
+    finally:
+        relay.stopping = True
+        thread.join(10)
+        assert not thread.is_alive()
+
+
+def down(what, **options):
+    """A fault on the way from the drone to the host."""
+    return Fault(what, direction="down", **{**options, "kinds": frozenset(options.get("kinds", ()))})
+
+
+def up(what, **options):
+    """A fault on the way from the host to the drone."""
+    return Fault(what, direction="up", **{**options, "kinds": frozenset(options.get("kinds", ()))})
+
+
+def now_on(relay, *faults):
+    """These faults from now on: their times count from here."""
+    relay.engine.began = None
+    relay.engine.replace(faults)

@@ -1,0 +1,69 @@
+"""What the diagnosis judges beside the regression: a tilted accelerometer, gusts, a simulated recording; on the shipped
+flight, changed here by known amounts."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from crazyem.diagnosis import accelerometer
+from crazyem.diagnosis.compare import compare
+from crazyem.diagnosis.fit import Data, nominal, starting_point
+from crazyem.diagnosis.flight import flight_of, without
+from crazyem.diagnosis.gusts import find_gusts
+from crazyem.diagnosis.model import Point
+from crazyem.errors import DataError
+from crazyem.recordings import open_recording
+from crazyem.vehicle import load_vehicle
+
+FLIGHT = Path(__file__).parents[2] / "logs" / "clean_figure8.mcap"
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return open_recording(FLIGHT)
+
+
+def with_values(recording, name, change):
+    array = recording.signals[name]
+    return replace(recording, signals={**recording.signals, name: replace(array, value=change(array.value.copy()))})
+
+
+def fitted(recording):
+    vehicle = load_vehicle("cf2")
+    data = Data([flight_of(recording, vehicle)])
+    return data, nominal(data, starting_point(Point(vehicle, {}, None)))
+
+
+def test_a_tilted_accelerometer_is_measured_and_an_upright_one_is_not_accused(recording):
+    roll, pitch = 0.03, -0.02
+    axes = Rotation.from_euler("ZYX", [0.0, pitch, roll]).as_matrix()  # of the sensor, in the body
+    turned = with_values(recording, "specific_force", lambda value: value @ axes)
+    for flown, true in ((turned, (roll, pitch)), (recording, (0.0, 0.0))):
+        solution, _ = accelerometer.tilt(*fitted(flown))
+        sd = np.sqrt(np.diag(solution.covariance)[:2])
+        assert np.all(np.abs(solution.theta[:2] - true) < 4 * sd)
+        assert np.all(sd < 2e-3)
+        assert (solution.p_value < 1e-6) == (flown is turned)
+
+
+def test_without_an_accelerometer_nothing_is_said(recording):
+    assert accelerometer.tilt(*fitted(without(recording, ["specific_force"]))) is None
+
+
+def test_a_calm_flight_has_no_gusts(recording):
+    assert find_gusts(*fitted(recording)) is None
+
+
+def test_a_recording_compared_with_itself_and_with_itself_moved(recording):
+    same = compare(recording, recording)["signals"]
+    assert all(entry["rms"] < 1e-6 for entry in same.values())
+    moved = with_values(recording, "position", lambda value: value + np.array([0.3, 0.0, 0.4]))
+    assert compare(recording, moved)["signals"]["position"]["rms"] == pytest.approx(0.5, rel=1e-6)
+
+
+def test_a_signal_that_is_not_there_cannot_be_withheld(recording):
+    with pytest.raises(DataError, match=r"no signal 'pm\.vbta'"):
+        without(recording, ["pm.vbta"])

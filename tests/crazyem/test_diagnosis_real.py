@@ -1,0 +1,182 @@
+"""What real recordings need: streams with clocks of their own, flights without a pose, signals by other names."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_flight import array_of
+from numpy.typing import NDArray
+
+from crazyem.diagnosis import felt
+from crazyem.diagnosis.alignment import Alignment
+from crazyem.diagnosis.flight import Flight, controlled_rates, flight_of, without
+from crazyem.diagnosis.inputs import inputs_of
+from crazyem.diagnosis.predict import predict, recorded
+from crazyem.errors import DataError
+from crazyem.physics.motion import RotorInput
+from crazyem.recordings import open_recording
+from crazyem.recordings.recording import Recording
+from crazyem.vehicle import load_vehicle
+
+VEHICLE = load_vehicle("cf21bl-busetto")
+FINE = 1e-3  # s
+MIXING = np.array([[1, 1, 1, 1], [-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]) / 4.0
+
+
+def shaken(*, delay: float, seconds: float = 16.0, seed: int = 0, related: bool = True) -> Recording:
+    """A hovering drone whose rates answer to torques of 2 to 6 Hz; rotor speeds are stamped `delay` too early."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, seconds, FINE)
+    wave = [sum(np.sin(2 * np.pi * f * t + rng.uniform(0, 7)) for f in rng.uniform(2, 6, 5)) for _ in range(2)]
+    torque = 1e-4 * np.stack([*wave, np.zeros(t.size)], 1)
+    rate = np.cumsum(torque / np.array(VEHICLE.inertia), axis=0) * FINE
+    rate -= rate.mean(0)
+    if not related:
+        torque = rng.permutation(torque)
+    lift = np.full(t.size, VEHICLE.mass * 9.81)
+    arm = np.array([1.0, VEHICLE.arm[1], VEHICLE.arm[0], VEHICLE.torque_per_thrust])
+    wrench = np.concatenate([lift[:, None], torque], axis=1)
+    speed = np.sqrt(np.maximum(np.linalg.solve((4 * MIXING) * arm[:, None], wrench.T).T, 0) / VEHICLE.rotor_constant)
+    grid = np.arange(0.3, seconds - 0.3, 0.01)
+
+    def at(values: NDArray, when: NDArray) -> NDArray:
+        return np.stack([np.interp(when, t, c) for c in values.T], 1)
+
+    noise = 0.01 * rng.standard_normal((grid.size, 3))
+    signals = {
+        "position": np.tile([0.0, 0.0, 1.0], (grid.size, 1)),
+        "velocity": np.zeros((grid.size, 3)),
+        "attitude": np.tile([0.0, 0.0, 0.0, 1.0], (grid.size, 1)),
+        "body_rate": at(rate, grid) + noise,
+        "rotor_speed": at(speed, grid + delay),
+    }
+    return Recording("made", "csv", {n: array_of(n, grid, v, place=k) for k, (n, v) in enumerate(signals.items())})
+
+
+def found(recording: Recording) -> Alignment:
+    alignment = inputs_of(recording, VEHICLE).alignment
+    assert alignment is not None
+    return alignment
+
+
+@settings(max_examples=4, deadline=None)
+@given(delay=st.floats(-0.06, 0.06), seed=st.integers(0, 5))
+def test_the_delay_of_rotor_speeds_is_found_whatever_its_sign(delay: float, seed: int) -> None:
+    alignment = found(shaken(delay=delay, seed=seed))
+    assert alignment.delay == pytest.approx(delay, abs=1e-3)
+    assert alignment.roll == pytest.approx(alignment.pitch, abs=2e-3)
+    assert alignment.running[-1] == pytest.approx(delay, abs=2e-3)
+
+
+def test_without_a_relation_nothing_is_said() -> None:
+    inputs = inputs_of(shaken(delay=0.01, related=False), VEHICLE)
+    assert inputs.alignment is None
+    assert inputs.rotor.delay == 0.0
+
+
+def test_it_is_used_and_said() -> None:
+    inputs = inputs_of(shaken(delay=-0.02), VEHICLE)
+    assert inputs.rotor.delay == pytest.approx(-0.02, abs=1e-3)
+    assert any("after their stamps" in notice for notice in inputs.notices)
+
+
+def test_a_prediction_knows_of_the_delay_what_came_before_its_start() -> None:
+    first = shaken(delay=0.03)
+    late = first.signals["rotor_speed"]
+    other = shaken(delay=-0.03, seed=1).signals["rotor_speed"].value
+    changed = np.where(late.time[:, None] > 10.0, other, late.value)
+    second = replace(first, signals={**first.signals, "rotor_speed": replace(late, value=changed)})
+    one, two = (predict(recorded(r, VEHICLE), horizon=10) for r in (first, second))
+    before = one.time[:, -1] < 9.9
+    assert before.sum() > 500
+    assert np.allclose(one.prediction[before], two.prediction[before], rtol=0, atol=1e-9)
+
+
+def test_rates_of_the_controllers_log_are_turned_into_body_axes() -> None:
+    time = np.arange(0.0, 1.0, 0.01)
+    parts = {}
+    for place, (name, value) in enumerate([("roll", 1.0), ("pitch", 2.0), ("yaw", 3.0)]):
+        one = array_of("voltage", time, np.full((100, 1), value), place=place)
+        parts[f"controller.r_{name}"] = replace(one, quantity="")
+    when, rate = controlled_rates(Recording("made", "usd:2", parts))
+    assert np.array_equal(when, time)
+    assert np.allclose(rate, [1.0, -2.0, 3.0])
+
+
+def test_a_signal_may_be_withheld_by_the_name_that_the_firmware_has_for_it() -> None:
+    volts = replace(array_of("voltage", np.arange(5.0), np.full((5, 1), 3.8), place=0), source=("pwr_pm_vbat",))
+    made = Recording("made", "csv", {"voltage": volts})
+    for name in ("pm.vbat", "voltage", "pwr_pm_vbat"):
+        assert "voltage" not in without(made, [name]).signals
+    with pytest.raises(DataError, match=r"no signal .m\.vbat. to withhold"):
+        without(made, ["m.vbat"])
+
+
+# -- the accelerometer as evidence -------------------------------------------------------------------------------------
+
+
+def felt_flight(force: NDArray, *, position: bool = False) -> Flight:
+    n = len(force)
+    time = np.arange(n) * 0.01
+    y = np.full((n, 13), np.nan)
+    y[:, 10:13] = 0.0
+    if position:
+        y[:, 0:3] = 0.0
+    starts = np.arange(n) == 0
+    rotor = RotorInput(time, np.zeros((n, 4)), np.full(n, np.nan), time, measured=False)
+    return Flight("made", time, starts, y, force, np.full(n, np.nan), time, 0.0, (np.arange(n) // 100).astype(np.int64),
+                  rotor, frozenset({"body_rate", "specific_force"}))  # fmt: skip
+
+
+def test_the_accelerometer_counts_only_where_nothing_else_shows_forces() -> None:
+    force = np.zeros((300, 3))
+    assert felt.is_needed(felt_flight(force))
+    assert not felt.is_needed(felt_flight(force, position=True))
+    assert not felt.is_needed(felt_flight(np.full((300, 3), np.nan)))
+
+
+def test_score_and_information_are_derivatives_of_its_likelihood() -> None:
+    rng = np.random.default_rng(2)
+    force = rng.normal(size=(350, 3))
+    force[40] = np.nan
+    flight = felt_flight(force)
+    model, acting = rng.normal(size=(350, 3)), 0.1 * rng.normal(size=(350, 3, 4))
+    noise, bias = np.array([0.8, 1.0, 1.3]), np.array([0.1, -0.2, 0.0])
+
+    def loglik(theta: NDArray) -> float:
+        return felt.evidence(flight, model + acting @ theta, acting[:, :, :0], noise, bias)[0]
+
+    _, score, information = felt.evidence(flight, model, acting, noise, bias)
+    h = 1e-4
+    for i in range(4):
+        e = np.eye(4)[i] * h
+        assert score.sum(0)[i] == pytest.approx((loglik(e) - loglik(-e)) / (2 * h), rel=1e-4)
+        bend = (loglik(e) - 2 * loglik(0 * e) + loglik(-e)) / h**2
+        assert information.sum(0)[i, i] == pytest.approx(-bend, rel=1e-2)
+
+
+def test_vibration_is_what_is_faster_than_motion() -> None:
+    rng = np.random.default_rng(3)
+    slow = np.sin(np.arange(3000) * 0.01)[:, None] * np.array([1.0, 2.0, 3.0])
+    quiet = felt_flight(slow + 0.3 * rng.standard_normal((3000, 3)))
+    assert felt.vibration(quiet, np.zeros((3000, 3))) == pytest.approx([0.3, 0.3, 0.3], rel=0.1)
+
+
+# -- real recordings ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("run", ["raw/square_run1", "raw/square_run2", "processed/square_run4"])
+def test_roll_and_pitch_agree_on_the_delay_of_a_real_run(shared_recordings, run: str) -> None:
+    alignment = found(open_recording(shared_recordings / "nanodrone" / f"{run}.csv.gz"))
+    assert abs(alignment.roll - alignment.pitch) < 2e-3
+    assert alignment.explained > 0.7
+    assert alignment.sd < 2e-3
+
+
+def test_controller_tables_become_flights(shared_recordings) -> None:
+    path = shared_recordings / "crazypad" / "controller__normal_flight__E8_log00"
+    flight = flight_of(open_recording(path), load_vehicle("cf2-legacy"))
+    assert {"position", "body_rate", "mixer_command"} <= flight.signals
+    assert flight.duration > 14

@@ -1,0 +1,167 @@
+"""The HTML report: whole, self-contained, escaped, and made from any document of that shape."""
+
+import base64
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_diagnosis import document, pictures
+
+from crazyem.diagnosis.report import Series, write_report
+from crazyem.diagnosis.report.html import report, verdict
+from crazyem.diagnosis.report.pictures import data_uri, thinned
+from crazyem.errors import UsageError
+
+VOID = {"meta", "img", "br", "line"}
+HOSTILE = "<script>alert('x')</script>\x1b[31m & \"quoted\" $\\frac{1}"
+
+
+class Checked(HTMLParser):
+    """Collects text and sources; fails on tags that do not match, on scripts, and on anything from elsewhere."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.images: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        assert tag not in ("script", "link", "iframe", "object", "base")
+        for name, value in attrs:
+            assert not name.startswith("on")
+            if name in ("src", "href"):
+                assert (value or "").startswith("data:image/svg+xml;base64,")
+                self.images.append(value or "")
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] != "style":
+            self.text.append(data)
+
+
+def checked(text: str) -> tuple[str, list[str]]:
+    parser = Checked()
+    parser.feed(text)
+    parser.close()
+    assert parser.open == []
+    return " ".join(" ".join(parser.text).split()), parser.images
+
+
+def test_a_report_says_everything_that_the_document_has(tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    write_report(path, document(), pictures())
+    text, images = checked(path.read_text(encoding="utf-8"))
+    assert len(images) == 3
+    for wanted in (
+        "The model lacks thrust scale (or payload, which this flight cannot tell from it) (99 % sure) and linear drag",
+        "position error after 0.5 s falls from 0.77 m to 34 mm on flight it has not seen",
+        "0.6123 ± 0.0041", "0.604 to 0.621", "body z", "3.2 to 41 s", "812", "ground effect",
+        "cannot be told apart", "weigh the drone", "mass against thrust", "voltage was withheld", "500 ms",
+    ):  # fmt: skip
+        assert wanted in text, wanted
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_every_picture_is_a_picture_with_its_data() -> None:
+    for series in pictures().values():
+        image = base64.b64decode(data_uri(series).split(",")[1])
+        root = ElementTree.fromstring(image)
+        assert root.tag.endswith("svg")
+        assert image.count(b"<path") > 10
+    assert data_uri(pictures()["force"]) == data_uri(pictures()["force"])  # a replay writes the same file
+
+
+def test_a_document_without_a_mismatch_says_so() -> None:
+    text, _ = checked(report({"mismatch": False, "effects": []}, {}))
+    assert "agree as far as this flight can show" in text
+    assert "None of the effects of the catalogue is claimed" in text
+
+
+def test_what_none_explains_is_said() -> None:
+    assert "none of the known effects explains it" in verdict({"mismatch": True, "effects": []})
+
+
+def test_a_simulated_flight_is_compared_signal_by_signal() -> None:
+    signals = {"body_rate": {"rms": 0.1234, "unit": "rad/s", "largest": 1.5}}
+    against = {"simulated": "sim.mcap", "seconds": 12.0, "signals": signals}
+    text, _ = checked(report({**document(), "against": against}, {}))
+    assert "against sim.mcap" in text
+    assert "body rate 0.123 rad/s 1.5" in text
+
+
+def test_what_is_left_over_is_told_by_place_or_as_nothing() -> None:
+    nothing = report({**document(), "unexplained": {"found": False, "nats": 1.0, "where": []}}, {})
+    assert "Nothing beyond the noise." in checked(nothing)[0]
+    place = {"signal": "torque", "axis": "body x", "regime": "fast", "interval": [1.0, 2.0], "effect_size": 1e-4}
+    text, _ = checked(report({**document(), "unexplained": {"found": True, "nats": 80.0, "where": [place]}}, {}))
+    assert "nats 80 signal axis regime when size torque body x fast 1 to 2 s 0.0001" in text
+    closed = {**document()["fit"], "gap_closed": {"position": 0.987, "attitude": None}}
+    assert "took away: position 99 %." in checked(report({**document(), "fit": closed}, {}))[0]
+
+
+def test_text_of_recordings_is_escaped() -> None:
+    """In every place where a text can stand, and in pictures, where $ would begin a formula."""
+
+    def poisoned(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {(HOSTILE if k in ("x", "scale") else k): poisoned(v) for k, v in value.items()}
+        if isinstance(value, list):
+            return [poisoned(v) for v in value]
+        return HOSTILE if isinstance(value, str) else value
+
+    series = Series(HOSTILE, np.arange(5.0), {HOSTILE: np.arange(5.0), "b": np.ones(5)}, HOSTILE, HOSTILE)
+    bars = Series(HOSTILE, [HOSTILE, "b"], {HOSTILE: np.ones(2)}, kind="bar")
+    text = report(poisoned(document()), {HOSTILE: series, "bars": bars})
+    assert "<script" not in text
+    assert "\x1b" not in text
+    shown, images = checked(text)
+    assert "<script>alert('x')</script>" in shown
+    assert len(images) == 2
+
+
+def test_a_picture_of_unequal_lengths_is_refused() -> None:
+    with pytest.raises(ValueError, match="line 'a' has 3 values for 5 x"):
+        data_uri(Series("t", np.arange(5.0), {"a": np.ones(3)}))
+
+
+def test_long_lines_are_thinned_and_keep_their_peaks() -> None:
+    x = np.linspace(0, 100, 100_000)
+    y = np.sin(x)
+    y[54_321] = 7.0
+    y[1000:3000] = np.nan
+    some, kept = thinned(x, y)
+    assert some.size <= 2000
+    assert np.nanmax(kept) == 7.0
+    assert (np.diff(some) > 0).all()
+
+
+def test_a_folder_that_is_not_there_is_an_error_of_the_user(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="cannot write"):
+        write_report(tmp_path / "none" / "r.html", document())
+
+
+anything = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=6), inner, max_size=3),
+    max_leaves=6,
+)
+KEYS = ("mismatch", "where", "effects", "indistinguishable", "would_separate", "unexplained", "fit", "not_identifiable")
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.dictionaries(st.sampled_from((*KEYS, "ranking", "notices", "recordings", "vehicle", "against")), anything))
+def test_no_document_breaks_it(found: dict[str, Any]) -> None:
+    text = report(found, {})
+    checked(text)
+    assert re.search(r"<h1>.+</h1>", text)

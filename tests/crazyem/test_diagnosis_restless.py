@@ -1,0 +1,100 @@
+"""Random torques of one rotor or of one band: signs and humps made by hand, and a flight that shakes."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from closed_loop import DRONE, SIGNS, fly
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.fit import Data, nominal
+from crazyem.diagnosis.flight import flight_of
+from crazyem.diagnosis.model import Noise, Point
+from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.restless import amplitude_of, beside_peaks, erratic_rotor, hump, humps, peaks, spectrum
+
+ROWS, STEP = 2500, 0.01
+
+
+def model_of(rates: NDArray[np.float64]) -> Any:
+    """Stands for a flight whose rates' innovations (n, 3) have unit variance."""
+    n = len(rates)
+    innovation, variance = np.zeros((n, 12)), np.ones((n, 12))
+    innovation[:, 9:] = rates
+    time = STEP * np.arange(n)
+    flight = SimpleNamespace(time=time, block=(time // 1.0).astype(int), blocks=int(time[-1]) + 1)
+    return SimpleNamespace(flight=flight, sweep=lambda point: SimpleNamespace(innovation=innovation, variance=variance))
+
+
+POINT = Point(DRONE, {}, Noise(np.ones(6), np.ones(4)))
+
+
+@pytest.mark.parametrize("rotor", [0, 1, 2, 3])
+def test_a_rotor_that_disturbs_is_told_by_the_signs_of_its_place(rotor: int) -> None:
+    rng = np.random.default_rng(rotor)
+    rates = rng.normal(size=(ROWS, 3)) + 0.35 * rng.normal(size=(ROWS, 1)) * SIGNS[:, rotor]
+    found = erratic_rotor([model_of(rates)], POINT)
+    assert found is not None
+    assert (found.signal, found.regime, found.variable) == ("torque", f"rotor {rotor + 1} at random", "rotor")
+    assert found.effect_size > 0
+
+
+def test_noise_and_a_product_of_inertia_are_no_rotor() -> None:
+    mixed = 0
+    for seed in range(40):
+        rates = np.random.default_rng(seed).normal(size=(ROWS, 3))
+        assert erratic_rotor([model_of(rates)], POINT) is None
+        rates[:, 1] += 0.5 * rates[:, 0]  # two axes of three
+        mixed += erratic_rotor([model_of(rates)], POINT) is not None
+    assert mixed <= 3  # two rotors have each sign, so it is one in fifty by chance
+
+
+def test_all_rotors_alike_are_noise() -> None:
+    rng = np.random.default_rng(0)
+    each = rng.normal(size=(ROWS, 4)) @ SIGNS.T
+    assert erratic_rotor([model_of(each)], POINT) is None
+
+
+def test_a_spectrum_holds_the_variance() -> None:
+    """Parseval, for noise and for a sine of amplitude 2."""
+    time = STEP * np.arange(ROWS)
+    for values, variance in (
+        (np.random.default_rng(1).normal(size=ROWS), 1.0),
+        (2 * np.sin(2 * np.pi * 7 * time), 2.0),
+    ):
+        frequency, power, _ = spectrum(values, STEP)
+        assert np.trapezoid(power, frequency) == pytest.approx(variance, rel=0.1)
+    assert hump(frequency, power + 1e-3)[1] > 100
+    assert frequency[hump(frequency, power + 1e-3)[0]] == pytest.approx(7.0, abs=0.2)
+
+
+def test_noise_has_no_hump() -> None:
+    for seed in range(20):
+        assert not peaks(model_of(np.random.default_rng(seed).normal(size=(ROWS, 3))), POINT)
+    assert not peaks(model_of(np.ones((300, 3))), POINT)  # too short for a spectrum
+
+
+@pytest.mark.slow
+def test_a_flight_that_shakes() -> None:
+    """3 rad/s^2 in roll and pitch about 6 Hz: found there with its torque; beside the hump little is known of it."""
+    data = Data([flight_of(fly(vibration=3.0), DRONE)])
+    point = nominal(data, Point(DRONE, {}, first_guess()))
+    found = humps(data.models[0], point)
+    assert {f.axis for f in found} == {"x", "y"}
+    for f, inertia in zip(sorted(found, key=lambda f: f.axis), DRONE.inertia, strict=False):
+        assert 5.5 < float(f.regime.split()[1]) < 6.5
+        assert f.effect_size == pytest.approx(3.0 * inertia, rel=0.3)
+    assert amplitude_of(data.models[0], point, 2, 6.0)[0] < 0.5
+    columns = Candidate("torque_scale", (), ("scale",)).columns(point)
+    whole = beside_peaks(data, point, columns, [[]])
+    beside = beside_peaks(data, point, columns, [peaks(data.models[0], point)])
+    assert 0 < beside.information.sum() < whole.information.sum()
+
+
+def test_a_healthy_made_flight_has_neither() -> None:
+    data = Data([flight_of(fly(seconds=7.0), DRONE)])
+    point = nominal(data, Point(DRONE, {}, first_guess()))
+    assert not humps(data.models[0], point)
+    assert erratic_rotor(data.models, point) is None

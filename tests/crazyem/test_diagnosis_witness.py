@@ -1,0 +1,131 @@
+"""What tells apart where the filter cannot: an accelerometer, commands beside rotor speeds, flights held out by place.
+
+Recordings are made by hand or flown by `closed_loop.py`, which shares no line with the diagnosis.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from closed_loop import DRONE, Hidden, fly
+from made_flight import array_of
+
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.fit import Data, nominal, remembering, starting_point
+from crazyem.diagnosis.flight import flight_of
+from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.place import depends_on_place
+from crazyem.diagnosis.select import Trial, both, margin, told_apart
+from crazyem.diagnosis.witness import false_speed, late_measurements
+from crazyem.recordings.recording import Recording
+
+
+def point_of(data: Data) -> Point:
+    return nominal(data, starting_point(Point(DRONE, {}, None)))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return fly(seconds=15.0)
+
+
+def with_speeds(recording: Recording, factors: tuple[float, ...]) -> Recording:
+    """Speeds that go with the square root of the command, times factors; healthy rotors differ by 0.1 %."""
+    command = recording.signals["motor_command"]
+    speed = 2000.0 * np.sqrt(np.maximum(command.value, 1e-3)) * factors * [1.001, 1.0, 0.999, 1.0]
+    shown = array_of("rotor_speed", command.time, speed, place=90)
+    return replace(recording, signals={**recording.signals, "rotor_speed": shown})
+
+
+def test_commands_tell_a_sensor_that_counts_wrong_from_a_weak_rotor(recording: Recording) -> None:
+    counts_wrong = with_speeds(recording, (1.0, 1.06, 1.0, 1.0))
+    healthy = with_speeds(recording, (1.0, 1.0, 1.0, 1.0))
+    lag = 1e-3  # the made speeds answer at once
+    said, unsaid = false_speed([counts_wrong], 2, 1.06, lag), false_speed([healthy], 2, 1.06, lag)
+    assert said is not None
+    assert unsaid is not None
+    assert said > 10.0
+    assert unsaid < -10.0
+    assert abs(said + unsaid) < 4.0  # the two hypotheses are each other's mirror
+    assert false_speed([recording], 2, 1.06, lag) is None  # no speeds
+
+
+def test_an_accelerometer_tells_late_forces_from_late_measurements(recording: Recording) -> None:
+    """The thrust of the made drone itself, low-passed as its rotors are, as the accelerometer; then 10 ms late."""
+    command = recording.signals["motor_command"]
+    volts = recording.signals["voltage"].value
+    lag = DRONE.motor_time_constant
+    f = (command.value * volts * 0.04).sum(1)
+    thrust = f.copy()
+    for k in range(1, len(f)):
+        thrust[k] = f[k - 1] + (thrust[k - 1] - f[k - 1]) * np.exp(-0.01 / lag)
+    noise = np.random.default_rng(1).normal(size=(len(f), 3)) * 0.02
+
+    def seen(late: float) -> Recording:
+        z = np.interp(command.time - 4.5e-3 - late, command.time, thrust) / DRONE.mass
+        shown = array_of("specific_force", command.time, np.column_stack([0 * z, 0 * z, z]) + noise, place=91)
+        return replace(recording, signals={**recording.signals, "specific_force": shown})
+
+    said = []
+    for late in (0.0, 0.010):
+        data = Data([flight_of(seen(late), DRONE)])
+        found = late_measurements(data, point_of(data), 0.010)
+        assert found is not None
+        said.append(found)
+    assert said[0] > said[1] + 3.0  # punctual forces speak for late measurements, late ones for late inputs
+    data = Data([flight_of(recording, DRONE)])
+    assert late_measurements(data, point_of(data), 0.010) is None  # no accelerometer
+
+
+def test_sampled_commands_are_torques_with_the_memory_of_the_lag() -> None:
+    """A noisy gyro at 500 Hz makes commands of which the log at 100 Hz sees every fifth."""
+    data = Data([flight_of(fly(rate_noise=0.15, shake=0.02, seconds=12.0), DRONE)])
+    white = starting_point(Point(DRONE, {}, None))  # type: ignore[arg-type]
+    data.settle(white)
+    white = data.fit_noise(white)
+    remembered = remembering(data, white)
+    assert remembered.noise.memory == DRONE.motor_time_constant
+    assert np.all(remembered.noise.disturbance[3:] > 0.1)
+    assert data.loglik(remembered) > data.loglik(white) + 3.0
+
+
+def test_a_force_that_depends_on_place_holds_on_the_next_flight() -> None:
+    pulled = [Data([flight_of(fly(Hidden(rope=0.02), seed=s, seconds=12.0), DRONE)]) for s in (1, 2)]
+    free = [Data([flight_of(fly(seed=s, seconds=12.0), DRONE)]) for s in (1, 2)]
+    found = depends_on_place(pulled[0], pulled[1], settled(pulled))
+    assert found is not None
+    assert (found.finding.signal, found.finding.axis, found.finding.variable) == ("force", "x", "x")
+    assert depends_on_place(free[0], free[1], settled(free)) is None
+
+
+def settled(both: list[Data]) -> Point:
+    point = point_of(both[0])
+    both[1].settle(point)
+    return point
+
+
+def trial(blocks: np.ndarray, parameters: int = 1) -> Trial:
+    names = ("x", "y", "z")[:parameters]
+    return Trial(Candidate("linear_drag", (), names), 0.0, 0.0, 1.0, 0.0, 0.0, blocks=blocks)
+
+
+def test_what_two_explanations_share_does_not_blur_their_difference() -> None:
+    rng = np.random.default_rng(0)
+    shared = 100.0 * rng.normal(size=50)  # what both miss
+    better = trial(shared + 0.3 + 0.1 * rng.normal(size=50))
+    nats, sd = margin(better, trial(shared))
+    assert nats == pytest.approx(15.0, abs=3.0)
+    assert sd < 2.0
+    assert told_apart(better, trial(shared))
+    assert not told_apart(trial(shared), trial(shared))
+    assert not told_apart(trial(shared + 2.0 * rng.normal(size=50) + 0.1), trial(shared))
+    assert margin(trial(shared, 3), trial(shared, 1))[0] == pytest.approx(-2.0)  # a parameter costs a nat
+
+
+def test_flights_held_out_lower_a_p_value_that_is_small_already() -> None:
+    assert both(5e-3, 10.0) == pytest.approx(5e-3 * np.exp(-10.0))
+    assert both(5e-3, -10.0) == 5e-3  # they do not raise it: what does not hold there is left out by its gain
+    assert both(0.05, 100.0) == 0.05
+    rng = np.random.default_rng(0)  # a likelihood ratio of two fixed Gaussians, drawn from the first
+    ratio = rng.normal(size=20000) * 2.0 - 2.0
+    assert np.mean(np.exp(ratio) > 20.0) < 1 / 20

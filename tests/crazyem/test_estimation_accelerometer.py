@@ -1,0 +1,220 @@
+"""The accelerometer, a measurement of a step's mean specific force: against the augmented filter, by simulation."""
+
+import numpy as np
+import pytest
+import test_estimation_kernels as plain
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_estimation_kernels import INERTIA, MASS, R_FORCE, THETA, Q, R, filled_tape, scaled
+
+from crazyem.estimation import kernels, reference
+from crazyem.physics.rigid_body import State, step
+from crazyem.vehicle import GRAVITY
+
+ACCELEROMETER = 4  # group of its noise
+
+
+def measured_tape(seed: int, n: int = 40, *, missing: float = 0.3, force_missing: float = 0.3):
+    """A tape with readings of an accelerometer that scatter as much as the filter expects, axes missing at times."""
+    tape = filled_tape(seed, n, missing=missing)
+    rng = np.random.default_rng(seed + 1)
+    for k in range(1, tape.size):
+        dt = tape.time[k] - tape.time[k - 1]
+        spread = np.sqrt(Q[:3] / dt + R_FORCE)
+        tape.force[k] = [0.0, 0.0, tape.thrust[k] / MASS] + rng.normal(size=3) * spread
+        tape.force[k, rng.uniform(size=3) < force_missing] = np.nan
+    tape.force[0] = 1e3  # of no step on the tape: must not be looked at
+    return tape
+
+
+def twin(tape, *, lead=0.5):
+    return reference.augmented_smoother(
+        tape.time, tape.y, tape.force, tape.thrust, tape.torque, prior=reference.state_of(tape.xp[0]),
+        prior_cov=tape.pp[0], mass=MASS, inertia=INERTIA, q=Q, r=R, r_force=R_FORCE, lead=lead,
+    )  # fmt: skip
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3, 0.8]), st.sampled_from([0.0, 0.5, 1.0]))
+@settings(max_examples=10, deadline=None)
+def test_filter_is_that_of_the_state_augmented_by_the_impulse(seed, missing, lead):
+    tape = measured_tape(seed, missing=missing)
+    value = plain.forward(tape, lead=lead)
+    expected = twin(tape, lead=lead)
+    assert value == pytest.approx(expected.log_likelihood, rel=1e-9, abs=1e-6)
+    assert value == pytest.approx(tape.loglik.sum(), rel=1e-12)
+    for k in range(tape.size):
+        plain.assert_same_state(tape.xf[k], expected.filtered[k])
+    np.testing.assert_allclose(scaled(tape.pf), scaled(expected.filtered_cov, tape.pf), atol=1e-6)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3]), st.sampled_from([0.5, 0.0]))
+@settings(max_examples=6, deadline=None)
+def test_smoothed_impulses_and_residuals_are_those_of_the_augmented_smoother(seed, missing, lead):
+    tape = measured_tape(seed, missing=missing)
+    plain.forward(tape, lead=lead)
+    plain.backward(tape, lead=lead)
+    smoothed = twin(tape, lead=lead)
+    dt = np.diff(tape.time)[:, None]
+    model = np.zeros((tape.size - 1, 3))
+    model[:, 2] = tape.thrust[1:] / MASS
+    force = model + smoothed.impulse[1:, :3] / dt
+    variance = np.einsum("kii->ki", smoothed.impulse_cov)[1:]
+    spread = np.sqrt(Q / 0.01)
+    # equal to second order in the smoother's correction of the attitude, as without accelerometer
+    np.testing.assert_allclose(tape.moments[1:, :3] / spread[:3], force / spread[:3], atol=0.02)
+    impulses = slice(kernels.IMPULSE, kernels.IMPULSE + 6)
+    expected = (smoothed.impulse[1:] ** 2 + variance) / dt
+    np.testing.assert_allclose(tape.stats[1:, impulses] / Q, expected / Q, atol=0.03)
+    seen = slice(kernels.IMPULSE_SEEN, kernels.IMPULSE_SEEN + 6)
+    np.testing.assert_allclose(tape.stats[1:, seen], (1 - variance / (Q * dt)) ** 2, atol=0.01)
+
+    there = ~np.isnan(tape.force[1:])
+    left = variance[:, :3] / dt**2
+    residual = np.where(there, (tape.force[1:] - force) ** 2 + left, 0.0).sum(1)
+    ours = tape.stats[1:, kernels.RESIDUAL + ACCELEROMETER]
+    np.testing.assert_allclose(ours / R_FORCE, residual / R_FORCE, atol=0.05)
+    np.testing.assert_array_equal(tape.stats[1:, kernels.MEASURED + ACCELEROMETER], there.sum(1))
+    known = np.where(there, (1 - left / R_FORCE) ** 2, 0.0).sum(1)
+    np.testing.assert_allclose(tape.stats[1:, kernels.RESIDUAL_SEEN + ACCELEROMETER], known, atol=0.01)
+
+    squares = ((force[:, 2] ** 2 + left[:, 2]) * dt[:, 0]).sum()
+    assert tape.stats[1:, kernels.MASS].sum() == pytest.approx(squares, rel=1e-3)
+
+
+def test_without_readings_it_is_the_filter_without_accelerometer():
+    """The augmented twin, too, is then the plain one: two textbook forms of one thing."""
+    tape = filled_tape(4)
+    value = plain.forward(tape)
+    plain.backward(tape)
+    augmented = twin(tape)
+    filtered, smoothed = plain.twin(tape)
+    assert augmented.log_likelihood == pytest.approx(filtered.log_likelihood, rel=1e-9)
+    assert value == pytest.approx(filtered.log_likelihood, rel=1e-9)
+    # impulses are corrections in the tangent space of different points: equal to second order in the correction
+    spread = np.sqrt(Q * np.diff(tape.time)[:, None])
+    np.testing.assert_allclose(augmented.impulse[1:] / spread, smoothed.impulse[1:] / spread, atol=0.01)
+    np.testing.assert_allclose(scaled(augmented.smoothed_cov), scaled(smoothed.cov, augmented.smoothed_cov), atol=1e-4)
+    assert not tape.stats[:, kernels.RESIDUAL + ACCELEROMETER].any()
+    assert not tape.stats[:, kernels.MEASURED + ACCELEROMETER].any()
+
+
+def test_a_worthless_accelerometer_changes_nothing_and_a_perfect_one_says_all():
+    bare, worthless, perfect = filled_tape(2), measured_tape(2), measured_tape(2, force_missing=0.0)
+    run(bare)
+    run(worthless, r_force=1e12)
+    run(perfect, r_force=1e-12)
+    np.testing.assert_allclose(worthless.xf, bare.xf, atol=1e-8)
+    np.testing.assert_allclose(worthless.moments, bare.moments, atol=1e-5)
+    np.testing.assert_allclose(perfect.moments[1:, :3], perfect.force[1:], atol=1e-6)
+
+
+def run(tape, *, r_force=R_FORCE):
+    """Filter and smoother with another noise of the accelerometer."""
+    t, inverse = tape, np.linalg.inv(INERTIA)
+    kernels.forward(
+        0, t.size, True, t.time, t.kind, t.y, t.force, t.thrust, t.torque, MASS, INERTIA, inverse, Q, R, r_force, 0.5,
+        plain.START_VARIANCE, t.xp, t.pp, t.xf, t.pf, t.gain, t.s, t.e, t.blocks, t.middle, t.loglik,
+    )  # fmt: skip
+    kernels.backward(
+        0, t.size, t.time, t.kind, t.usable, t.force, t.thrust, t.torque, t.thrust_tau, t.torque_tau, t.thrust_delay,
+        t.torque_delay, THETA[4], THETA[5], plain.OFFSET, MASS, INERTIA, inverse, Q, R, r_force, 0.5, t.xf, t.pf,
+        t.gain, t.s, t.e, t.blocks, t.middle, t.stats, t.moments,
+    )  # fmt: skip
+
+
+def run_moved(name, step_):
+    """Log-likelihood, innovations of the state and of the accelerometer's z axis with one parameter moved."""
+    tape = measured_tape(7, missing=0.2)
+    theta = plain.displaced(name, step_)
+    tau, delay, *offset = (theta - THETA)[4:]
+    tape.thrust += tau * tape.thrust_tau + delay * tape.thrust_delay
+    tape.torque += tau * tape.torque_tau + delay * tape.torque_delay + np.array(offset)
+    value = plain.forward(tape, mass=theta[0], inertia=INERTIA + np.diag(theta[1:4] - THETA[1:4]))
+    return value, tape.e.copy(), tape.force[1:, 2] - tape.thrust[1:] / theta[0]
+
+
+@pytest.mark.parametrize("name", range(9))
+def test_score_and_information_against_finite_differences(name):
+    tape = measured_tape(7, missing=0.2)
+    plain.forward(tape)
+    info = plain.sensitivities(tape)
+    np.testing.assert_allclose(info, info.T, rtol=1e-9)
+    h = 1e-4
+    (high, e_high, z_high), (low, e_low, z_low) = run_moved(name, h), run_moved(name, -h)
+    sd = 1 / np.sqrt(info[name, name])
+    assert tape.score[:, name].sum() * sd == pytest.approx((high - low) / (2 * h) * sd, abs=0.05)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        squares = np.where(tape.s > 0, ((e_high - e_low) / (2 * h)) ** 2 / tape.s, 0.0).sum()
+    squares += np.nansum(((z_high - z_low) / (2 * h)) ** 2 / (Q[2] / np.diff(tape.time) + R_FORCE))
+    assert info[name, name] == pytest.approx(squares, rel=0.02)
+
+
+def test_alone_it_tells_of_mass_what_its_noise_and_that_of_the_thrust_leave():
+    """Without position and velocity the only news of mass is F/m against the readings: a closed form."""
+    tape = measured_tape(7, force_missing=0.0)
+    tape.y[:, :6] = np.nan
+    plain.forward(tape)
+    variance = Q[2] / np.diff(tape.time) + R_FORCE
+    model = tape.thrust[1:] / MASS
+    assert plain.sensitivities(tape)[0, 0] == pytest.approx(np.sum(model**2 / variance), rel=1e-9)
+    score = -np.sum((tape.force[1:, 2] - model) * model / variance)
+    assert tape.score[:, 0].sum() == pytest.approx(score, rel=1e-9)
+
+
+@given(st.lists(st.tuples(st.integers(0, 39), st.integers(0, 2)), max_size=60), st.integers(0, 39), st.booleans())
+@settings(max_examples=15, deadline=None)
+def test_missing_readings_breaks_and_unusable_steps_never_spread(holes, special, breaks):
+    tape = measured_tape(4, force_missing=0.0)
+    for row, axis in holes:
+        tape.force[row, axis] = np.nan
+    tape.kind[special] = plain.BREAK if breaks else tape.kind[special]
+    tape.usable[special] = False
+    assert np.isfinite(plain.forward(tape))
+    plain.backward(tape)
+    info = plain.sensitivities(tape)
+    for name in ("xp", "pp", "xf", "pf", "stats", "moments", "score", "loglik"):
+        assert np.all(np.isfinite(getattr(tape, name))), name
+    assert np.all(np.isfinite(info))
+    assert np.linalg.eigvalsh(tape.pf).min() > -1e-12
+    assert tape.stats[special, kernels.MEASURED + ACCELEROMETER] == 0.0
+    counted = ~np.isnan(tape.force)
+    counted[[0, special]] = False
+    assert tape.stats[:, kernels.MEASURED + ACCELEROMETER].sum() == counted.sum()
+
+
+def test_simulated_readings_are_consistent_with_the_filter():
+    """A drone stepped by the model with noise: innovations of state and accelerometer have the variance expected.
+
+    And the noise that the smoother finds in the accelerometer is the noise that was put in.
+    """
+    rng = np.random.default_rng(8)
+    n, dt = 600, 0.01
+    tape = plain.Tape(n)
+    x = State(np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+    for k in range(n):
+        if k:
+            torque = INERTIA @ (-3.0 * x.body_rate + rng.normal(size=3))
+            thrust = MASS * GRAVITY * rng.uniform(0.8, 1.2)
+            impulse = rng.normal(size=6) * np.sqrt(Q * dt)
+            x = step(x, thrust, torque, dt=dt, mass=MASS, inertia=INERTIA, impulse=impulse, lead=0.0)
+        seen = x.plus(rng.normal(size=12) * np.sqrt(R))
+        y = np.concatenate([seen.position, seen.velocity, seen.attitude, seen.body_rate])
+        tape.append(k * dt, y, starts=k == 0, keep=n)
+        if k:
+            tape.mean[k] = [thrust, *torque]
+            z = [0.0, 0.0, thrust / MASS] + impulse[:3] / dt
+            tape.force[k] = z + rng.normal(size=3) * np.sqrt(R_FORCE)
+        else:
+            tape.xp[0] = np.concatenate([x.position, x.velocity, x.attitude, x.body_rate])
+    tape.spread_inputs(0, n, np.zeros(3))
+    tape.kind[0] = 0
+    tape.pp[0] = np.diag(R)
+    with_readings = plain.forward(tape, lead=0.0)
+    plain.backward(tape, lead=0.0)
+    mean_square = np.mean(tape.e[1:] ** 2 / tape.s[1:])
+    assert mean_square == pytest.approx(1.0, abs=4 * np.sqrt(2 / (12 * n)))
+    found = tape.stats[:, kernels.RESIDUAL + ACCELEROMETER].sum() / (3 * (n - 1))
+    resolved = tape.stats[:, kernels.RESIDUAL_SEEN + ACCELEROMETER].sum()
+    assert found / R_FORCE == pytest.approx(1.0, abs=4 * np.sqrt(2 / resolved))
+    tape.force[:] *= 1.2  # readings of a wrong scale are less likely
+    assert plain.forward(tape, lead=0.0) < with_readings - 100

@@ -1,0 +1,102 @@
+"""Payloads attached and released in flight: found, told from gusts, and the mass right again within a second."""
+
+import math
+from functools import cache
+
+import pytest
+from hovering import INERTIA, hover
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crazyem.estimation.online import OnlineEstimator
+from crazyem.estimation.steps import DRIFT, MOST, THRESHOLD, CumulativeSum, StepAwareEstimator
+from crazyem.vehicle import Vehicle
+
+VEHICLE = Vehicle("hovering", 0.029, INERTIA, motor_time_constant=0.05)
+AT = 4.0  # s
+
+
+@cache
+def flown(before, after, seed, *, gust=0.0, aware=True, duration=6.0):
+    """Estimates (time, mass, sd) and the estimator of a hover whose mass changes at AT; `gust` N for 0.15 s there."""
+    samples = hover([(0.0, before), (AT, after)], seed=seed, duration=duration, gust=(AT, AT + 0.15, gust))
+    estimator = OnlineEstimator(VEHICLE)
+    estimator = StepAwareEstimator(estimator) if aware else estimator
+    estimates = [e for e in map(estimator.feed, samples) if e is not None]
+    return [(e.time, e["mass"].value, e["mass"].sd) for e in estimates], estimator
+
+
+@pytest.mark.parametrize(("before", "after", "seed"), [(0.029, 0.034, 0), (0.034, 0.029, 1), (0.029, 0.0315, 2)])
+def test_a_step_is_found_and_the_mass_is_right_within_a_second(before, after, seed):
+    rows, estimator = flown(before, after, seed)
+    (step,) = estimator.steps
+    assert step.real
+    assert step.time == pytest.approx(AT, abs=0.1)
+    assert AT < step.found < AT + 0.8
+    assert step.before == pytest.approx(before, rel=0.02)
+    assert step.after == pytest.approx(after, rel=0.02)
+    assert all(abs(m / after - 1) < 0.02 for t, m, _ in rows if t > AT + 1.0)
+
+
+def test_without_it_the_old_mass_lingers():
+    """The test above tests something: the window of eight seconds still holds four of the old mass."""
+    rows, _ = flown(0.029, 0.034, 0, aware=False)
+    assert abs(rows[-1][1] / 0.034 - 1) > 0.05
+
+
+def test_after_a_step_the_window_grows_again():
+    _, estimator = flown(0.029, 0.034, 0)
+    samples = 100 * (6.0 - estimator.steps[0].found)
+    assert estimator.inner.window == pytest.approx(samples, abs=6)
+    assert estimator.adapting
+
+
+def test_where_nothing_steps_nothing_changes():
+    plain, _ = flown(0.029, 0.029, 5, aware=False)
+    rows, estimator = flown(0.029, 0.029, 5)
+    assert rows == plain  # bit for bit
+    assert estimator.steps == []
+    assert not estimator.adapting
+
+
+def test_a_gust_is_noticed_and_dismissed():
+    rows, estimator = flown(0.029, 0.029, 4, gust=-0.08)
+    assert [s.real for s in estimator.steps] == [False]
+    assert estimator.inner.window == estimator.window
+    assert abs(rows[-1][1] / 0.029 - 1) < 0.02
+
+
+# --- the cumulative sum ---------------------------------------------------------------------------------------------
+
+
+def plainly(values):
+    """Where and when it must alarm: the largest sum of any tail, minus drift, on either side."""
+    for k in range(len(values)):
+        for sign in (1, -1):
+            tails = [(sum(min(max(sign * v, -MOST), MOST) - DRIFT for v in values[j : k + 1]), j) for j in range(k + 1)]
+            if max(tails)[0] > THRESHOLD:
+                return k
+    return None
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.integers(-8, 8), max_size=40))
+def test_it_alarms_when_some_tail_sums_up(values):
+    detector, found = CumulativeSum(), None
+    for k, value in enumerate(values):
+        if detector.add(float(k), value) is not None:
+            found = k
+            break
+    assert found == plainly(values)
+
+
+def test_when_it_began():
+    detector = CumulativeSum()
+    for k in range(50):
+        assert detector.add(0.04 * k, 0.4) is None
+    alarms = [detector.add(2.0 + 0.04 * k, -4.0) for k in range(6)]
+    assert alarms[:5] == [None] * 5  # 2.6 each: six of them are beyond 14
+    assert alarms[5] == pytest.approx(2.0)
+    detector.reset()
+    assert detector.add(3.0, math.nan) is None
+    assert detector.add(3.0, 100.0) is None  # one outlier is no step

@@ -1,0 +1,236 @@
+"""Outages in flight: the window is kept, the recording goes on, writes are made up for, and a fall is told as one."""
+
+import itertools
+import queue
+import time
+
+import fake_drone as fake
+import pytest
+from relayed import down, now_on, relayed, up
+
+from crazyem.control.trajectories import excite, hover
+from crazyem.errors import CrazyemError, LinkError
+from crazyem.estimation.online import OnlineEstimator
+from crazyem.links.base import LinkLost, LinkStatistics, Outage, ParameterWrite
+from crazyem.links.crazyflie import CrazyflieLink
+from crazyem.live.controllers import LEE
+from crazyem.live.flight import Flight, FlightPlan
+from crazyem.live.mcap_recorder import open_recorder
+from crazyem.live.session import Session, link_account
+from crazyem.recordings import open_recording
+from crazyem.vehicle import load_vehicle
+
+
+class LosingLink(fake.FakeLink):
+    """A FakeLink that is gone for a while, once, and comes back if it is asked to."""
+
+    def __init__(self, *, gone_at=7000, comes_back=True, **options):
+        super().__init__(**options)
+        self.gone_at, self.comes_back = gone_at, comes_back
+        self.gone = False
+        self.can_reconnect = True
+        self._all = self.packets
+        self.packets = queue.SimpleQueue()
+        self.refused = 0
+
+    def connect(self, timeout=15.0):
+        pass
+
+    def _run(self):
+        passed, self.packets = self.packets, _Filter(self)
+        self._passed = passed
+        super()._run()
+
+    def write_parameter(self, name, value, timeout=1.0):
+        if self.gone:
+            self.refused += 1
+            raise LinkError("the link is lost.")
+        return super().write_parameter(name, value, timeout)
+
+    def send_full_state(self, *a):
+        if self.gone:
+            raise LinkError("the link is lost.")
+        super().send_full_state(*a)
+
+    def reconnect(self, timeout, abort):
+        before = self.fm
+        time.sleep(0.1)
+        if not self.comes_back:
+            raise LinkError("The drone did not come back.")
+        self.gone = False
+        return Outage("it was away.", 0.1, float(before), float(self.fm), 0)
+
+
+class _Filter:
+    """What the fake puts into its queue, less what an outage swallows."""
+
+    def __init__(self, link):
+        self.link = link
+
+    def put(self, item):
+        link = self.link
+        if link.gone_at is not None and link.fm > link.gone_at:
+            link.gone_at, link.gone = None, True
+            link._passed.put(LinkLost("it was away.", time.time()))
+        if not link.gone:
+            link._passed.put(item)
+
+    def get(self, timeout=None):
+        return self.link._passed.get(timeout=timeout)
+
+
+def fly(link, kind=excite, duration=8.0, recorder=None):
+    session = Session(link, vehicle=load_vehicle("cf2"), estimator=fake.FakeEstimator(), recorder=recorder)
+    plan = FlightPlan(
+        trajectory=lambda position, yaw: kind(position=position, yaw=yaw, duration=duration), controller=LEE
+    )
+    session.start()
+    try:
+        Flight(session, plan).fly()
+    finally:
+        session.close()
+        link.close()
+    return session
+
+
+def test_a_flight_goes_on_after_an_outage():
+    link = LosingLink(speed=5.0)
+    session = fly(link)
+    assert [o.reason for o in session.outages] == ["it was away."]
+    assert session.lost is None
+    assert any("was gone for 0.1 s" in n for n in session.history.notices)
+    assert link.calls[-1] == "stop"
+    assert "land" in link.calls
+    times = [e.time for e in session.history.estimates]
+    assert min(times) < session.outages[0].before_ms / 1000 < session.outages[0].after_ms / 1000 < max(times)
+    assert [e.samples for e in session.history.estimates] == sorted(e.samples for e in session.history.estimates)
+
+
+def test_an_outage_that_lasts_ends_the_flight_in_one_sentence():
+    link = LosingLink(speed=5.0, comes_back=False)
+    with pytest.raises(
+        LinkError, match=r"^the drone at fake://0 was lost: it was away; the drone did not come back\.$"
+    ):
+        fly(link)
+
+
+def test_a_link_that_cannot_come_back_is_not_asked():
+    link = LosingLink(speed=5.0)
+    link.can_reconnect = False
+    with pytest.raises(LinkError, match="was lost: it was away"):
+        fly(link)
+
+
+def test_a_write_that_falls_into_an_outage_is_made_up_for():
+    """The first push finds the link gone; it is written when the link is back, and pushing goes on."""
+    link = LosingLink(speed=5.0, gone_at=None)
+    write = link.write_parameter
+
+    def lost_with_the_first_push(name, value, timeout=1.0):
+        if name == "ctrlLee.mass" and not link.refused:
+            link.gone_at = 0
+            while not link.gone:
+                time.sleep(0.001)
+        return write(name, value, timeout)
+
+    link.write_parameter = lost_with_the_first_push
+    session = fly(link, hover)
+    assert link.refused
+    assert session.history.pushes
+    assert all(p.verified for p in session.history.pushes)
+    assert link.values["ctrlLee.mass"] == pytest.approx(0.036, rel=0.01)
+
+
+def test_every_attempt_of_a_write_is_recorded():
+    from crazyem.live.guard import Guard
+    from crazyem.live.history import History
+    from crazyem.live.push import ATTEMPTS, Pusher
+
+    link = fake.FakeLink(lose_echo_after=0)
+    nominal = {"mass": 0.03, "Ixx": 1e-5, "Iyy": 1e-5, "Izz": 1e-5}
+    guard = Guard(LEE, nominal=nominal, originals=dict(link.values))
+    written: list[ParameterWrite] = []
+    history = History()
+    pusher = Pusher(link, guard, history=history, on_write=written.append)
+    pusher._write(1.0, "ctrlLee.mass", 0.03)
+    pusher.close()
+    assert len(written) == ATTEMPTS
+    assert [p.verified for p in history.pushes] == [False]
+    assert guard.stopped
+
+
+def test_the_account_of_a_link():
+    statistics = LinkStatistics(
+        100, 3, 1, {0: (100, 3, 1)}, delays={0: (0.001, 0.02)}, round_trip=0.004, clock_offset=5.0, clock_rate=1.00001
+    )
+    account = link_account(statistics, [Outage("gone.", 2.0, 100.0, 2100.0, 0)])
+    assert account["clock.drift_ppm"] == "10.000"
+    assert account["round_trip_s"] == "0.004000"
+    assert account["outage.0"] == "100 ms to 2100 ms: gone."
+    assert account["block.0.packets"] == "100 received, 3 lost, 1 late"
+    assert account["block.0.delay_s"] == "0.001000 median, 0.020000 99th percentile"
+
+
+# --- the simulated firmware -----------------------------------------------------------------------------------------
+
+
+def flown(uri, tmp_path, faults, *, at):
+    """A recorded 12 s flight through a relay, with faults from `at` s after take-off on: session and its error."""
+    vehicle = load_vehicle("cf2")
+    with relayed(uri) as relay:
+        link = CrazyflieLink(relay.uri)
+        link.connect(30.0)
+        recorder = open_recorder(str(tmp_path / "f.mcap"), configuration={}, vehicle=vehicle, link=link)
+        session = Session(link, vehicle=vehicle, estimator=OnlineEstimator(vehicle), recorder=recorder)
+        plan = FlightPlan(
+            trajectory=lambda position, yaw: excite(position=position, yaw=yaw, duration=9.0), controller=LEE
+        )
+        begun, error = [], None
+
+        def progress(phase, seconds):
+            if phase == "excite" and not begun and seconds > at:
+                begun.append(seconds)
+                now_on(relay, *faults)
+
+        try:
+            session.start()
+            Flight(session, plan, progress=progress).fly()
+        except CrazyemError as e:
+            error = e
+        session.close()
+        recorder.close()
+        link.close()
+        assert begun
+        return session, error
+
+
+@pytest.mark.slow
+def test_deaf_for_three_seconds_in_flight(simulator, tmp_path):
+    """Only the way down is lost: setpoints go on, the drone flies on, the window is kept, the recording too."""
+    drone = simulator("--seed", "3")
+    session, error = flown(drone.uri, tmp_path, [down("silence", end=3.0)], at=2.0)
+    assert error is None
+    (outage,) = session.outages
+    assert 2.5 < (outage.after_ms - outage.before_ms) / 1000 < 4.5
+    final = session.pipeline.finish()
+    before = [e for e in session.history.estimates if e.time <= outage.before_ms / 1000 + 0.1][-1]
+    first = next(e for e in session.history.estimates if e.time > outage.after_ms / 1000)
+    assert first.samples >= before.samples
+    assert final["mass"].value == pytest.approx(0.029, rel=0.03)
+    recording = open_recording(tmp_path / "f.mcap")
+    time_ = recording.signals["position"].time
+    gaps = [b - a for a, b in itertools.pairwise(time_) if b - a > 0.5]
+    assert len(gaps) == 1
+    assert time_[-1] > outage.after_ms / 1000 + 2.0
+    assert any("came back" in str(e.data.get("message", "")) for e in recording.events)
+    assert float(recording.metadata["link"]["clock.rate"]) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.slow
+def test_a_drone_that_heard_nothing_for_three_seconds_has_fallen(simulator, tmp_path):
+    """The firmware cuts the motors two seconds after the last setpoint: no return undoes that, but we say so."""
+    drone = simulator("--seed", "4")
+    session, error = flown(drone.uri, tmp_path, [down("silence", end=3.5), up("silence", end=3.5)], at=1.0)
+    assert len(session.outages) == 1
+    assert "fell while the link was gone" in str(error)
+    assert "locked" in str(error)

@@ -1,0 +1,109 @@
+"""The guard over the real link: wrong masses pushed to the simulated firmware in flight, with and without the watch."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from crazyem.cli import main
+from crazyem.control.trajectories import hover
+from crazyem.estimation.online import OnlineEstimator
+from crazyem.links import open_link
+from crazyem.live.controllers import LEE
+from crazyem.live.flight import Flight, FlightPlan
+from crazyem.live.mcap_recorder import open_recorder
+from crazyem.live.oversight import Rules
+from crazyem.live.policy import Policy, WatchLimits
+from crazyem.live.session import Session
+from crazyem.live.warm_up import warm_up
+from crazyem.recordings import open_recording
+from crazyem.vehicle import load_vehicle
+
+pytestmark = pytest.mark.slow
+
+
+class Biased:
+    """The estimator as if a sensor lied: its mass times `factor`, everything else as it is."""
+
+    def __init__(self, vehicle, factor):
+        self.inner, self.factor = OnlineEstimator(vehicle), factor
+
+    def __getattr__(self, name):
+        return getattr(self.inner, name)
+
+    def _lie(self, estimate):
+        if estimate is None:
+            return None
+        p = estimate["mass"]
+        low, high = (self.factor * x for x in p.ci95)
+        wrong = replace(p, value=self.factor * p.value, sd=self.factor * p.sd, ci95=(low, high))
+        return replace(estimate, parameters={**estimate.parameters, "mass": wrong})
+
+    def feed(self, sample):
+        return self._lie(self.inner.feed(sample))
+
+    def finish(self):
+        return self._lie(self.inner.finish())
+
+
+def fly(uri, path, rules, factor=1.3):
+    """12 s of hover with lies about the mass; session and link's last belief."""
+    vehicle = load_vehicle("cf2")
+    warm_up(vehicle)  # as every command does: an estimator that compiles in flight is late, and the guard waits for it
+    link = open_link(uri)
+    try:
+        link.connect(30.0)
+        recorder = open_recorder(str(path), configuration={}, vehicle=vehicle, link=link)
+        session = Session(link, vehicle=vehicle, estimator=Biased(vehicle, factor), recorder=recorder)
+        plan = FlightPlan(
+            trajectory=lambda position, yaw: hover(position=position, yaw=yaw, duration=12.0),
+            controller=LEE, rules=rules,
+        )  # fmt: skip
+        try:
+            session.start()
+            Flight(session, plan).fly()
+        finally:
+            session.close()
+            recorder.close()
+        return session, link.read_parameter("ctrlLee.mass")
+    finally:
+        link.close()
+
+
+def test_a_lie_about_the_mass_is_taken_back_in_flight(tmp_path, simulator):
+    session, mass = fly(simulator("--speed", "2").uri, tmp_path / "f.mcap", Rules())
+    history = session.history
+    pushed = [p.value for p in history.pushes if p.parameter == "ctrlLee.mass" and p.purpose == "push"]
+    assert pushed, history.guard["decisions"]
+    assert max(pushed) > 0.033  # it was believed
+    assert mass == pytest.approx(0.029, rel=0.01)
+    assert any("flew worse after" in n for n in history.notices)
+    recording = open_recording(tmp_path / "f.mcap")
+    written = [e.data for e in recording.events if e.kind == "parameter_write"]
+    ours = [w for w in written if str(w["name"]).startswith("ctrlLee.")]
+    assert len(ours) == len(history.pushes)
+    lines = [str(e.data.get("message", "")) for e in recording.events if e.kind == "log"]
+    for action in ("write", "revert"):
+        assert any(line.startswith(f"guard {action} at") for line in lines)
+    assert len([line for line in lines if line.startswith("guard ")]) == len(history.guard["decisions"])
+
+
+def test_without_the_watch_the_lie_stays(tmp_path, simulator):
+    rules = Rules(Policy(watch=WatchLimits(enabled=False)))
+    session, mass = fly(simulator("--speed", "2").uri, tmp_path / "f.mcap", rules)
+    assert mass == pytest.approx(1.3 * 0.029, rel=0.02)
+    assert not any("flew worse" in n for n in session.history.notices)
+
+
+def test_a_dry_run_from_the_command_line(tmp_path):
+    out = tmp_path / "f.json"
+    scenario = tmp_path / "s.toml"
+    scenario.write_text('[vehicle]\nmass = 0.036\n[parameters]\n"ctrlLee.mass" = 0.029\n')
+    assert main(["fly", "--trajectory", "hover", "--duration", "8", "--scenario", str(scenario), "--speed", "2",
+                 "--dry-run", "--json", str(out), "--record", str(tmp_path / "f.mcap")]) == 0  # fmt: skip
+    summary = json.loads(out.read_text())
+    assert summary["pushes"] == []
+    assert summary["guard"]["mode"] == "dry run"
+    assert [d for d in summary["guard"]["decisions"] if d["action"] == "would write"]
+    written = [e for e in open_recording(tmp_path / "f.mcap").events if e.kind == "parameter_write"]
+    assert not [e for e in written if str(e.data["name"]).startswith("ctrlLee.")]

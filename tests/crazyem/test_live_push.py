@@ -1,0 +1,220 @@
+"""Sets of parameters reach a drone whole or not at all: the order of writes, losses inside a set, the way back."""
+
+import itertools
+import math
+import time
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crazyem.errors import LinkError
+from crazyem.links.base import ParameterWrite
+from crazyem.live.controllers import EQUAL, LEE, writes_back, writes_for
+from crazyem.live.guard import Decision, Guard
+from crazyem.live.history import History
+from crazyem.live.push import ATTEMPTS, Pusher
+
+NOMINAL = {"mass": 0.029, "Ixx": 1.66e-5, "Iyy": 1.67e-5, "Izz": 2.93e-5}
+ORIGINALS = {
+    "ctrlLee.mass": 0.029, "ctrlLee.J_x": 1.66e-5, "ctrlLee.J_y": 1.67e-5, "ctrlLee.J_z": 2.93e-5,
+    "ctrlLee.KR_x": 0.007, "ctrlLee.KR_y": 0.007, "ctrlLee.KR_z": 0.008,
+    "ctrlLee.Kw_x": 0.00115, "ctrlLee.Kw_y": 0.00115, "ctrlLee.Kw_z": 0.002,
+}  # fmt: skip
+NEW = {"mass": 0.033, "Ixx": 1.9e-5, "Iyy": 1.9e-5, "Izz": 3.3e-5}
+
+
+class Drone:
+    """Parameters that can be written; `deaf(n)` says whether the n-th attempt goes unanswered; `applied`: it counts."""
+
+    uri = "fake://0"
+
+    def __init__(self, deaf=lambda n: False, applied=False):
+        self.values, self.deaf, self.applied = dict(ORIGINALS), deaf, applied
+        self.log, self.attempts = [], 0
+
+    def write_parameter(self, name, value, timeout=1.0):
+        self.attempts += 1
+        lost = self.deaf(self.attempts)
+        if not lost or self.applied:
+            self.values[name] = value
+            self.log.append((name, value))
+        return ParameterWrite(name, value, None if lost else value, not lost, time.time())
+
+
+def a_set(changed=None):
+    return Decision(1.0, writes=writes_for(LEE, changed or NEW, beliefs=NOMINAL, originals=ORIGINALS))
+
+
+def run(drone, *decisions, **kw):
+    guard, history = Guard(LEE, nominal=NOMINAL, originals=ORIGINALS), History()
+    done = []
+    pusher = Pusher(drone, guard, history=history, timeout=0.01, known=ORIGINALS,
+                    on_done=lambda d, complete: done.append((d.kind, complete)), **kw)  # fmt: skip
+    for decision in decisions:
+        pusher.submit(decision)
+    pusher.close()
+    assert not pusher.busy
+    return guard, history, done, pusher
+
+
+def test_a_whole_set():
+    drone = Drone()
+    guard, history, done, pusher = run(drone, a_set())
+    assert drone.log == list(a_set().writes)
+    assert done == [("push", True)]
+    assert not guard.stopped
+    assert pusher.known == drone.values
+    assert {p.purpose for p in history.pushes} == {"push"}
+
+
+@pytest.mark.parametrize("applied", [False, True])
+@pytest.mark.parametrize("at", range(10))
+def test_a_set_that_breaks_anywhere_is_undone_completely(at, applied):
+    """All attempts at write `at` go unanswered, whether it arrived or not; then the drone answers again."""
+    drone = Drone(lambda n: at < n <= at + ATTEMPTS, applied)
+    guard, history, done, pusher = run(drone, a_set(), a_set())
+    assert drone.values == ORIGINALS
+    assert pusher.known == ORIGINALS
+    assert done == [("push", False), ("push", False)]
+    assert "not confirmed" in guard.stopped
+    assert any("undone" in n for n in history.notices)
+    assert [p for p in history.pushes if not p.verified] == [history.pushes[at]]  # and no write went unaccounted
+    assert sum(p.verified for p in history.pushes) == len(drone.log) - (ATTEMPTS if applied else 0)
+
+
+def test_one_lost_echo_is_tried_again():
+    drone = Drone(lambda n: n == 3)
+    guard, _, done, _ = run(drone, a_set())
+    assert done == [("push", True)]
+    assert not guard.stopped
+    assert drone.attempts == len(a_set().writes) + 1
+
+
+def test_an_attempt_during_which_the_link_was_lost_counts_for_nothing():
+    """The link goes in the third attempt at the fifth write, is noticed to be gone only then, and comes back."""
+    drone = Drone(lambda n: 5 <= n <= 7)
+    guard, _, done, _ = run(drone, a_set(), outages=lambda: int(drone.attempts >= 7))
+    assert done == [("push", True)]
+    assert not guard.stopped
+    assert drone.attempts == len(a_set().writes) + 3
+
+
+def test_a_link_that_keeps_going_does_not_keep_a_write_for_ever():
+    drone = Drone(lambda n: True)
+    guard, _, _, _ = run(drone, a_set(), outages=lambda: drone.attempts)
+    assert guard.stopped
+    assert drone.attempts == 2 * 2 * ATTEMPTS  # the write, and its undoing
+
+
+def test_what_cannot_be_undone_is_said():
+    drone = Drone(lambda n: n > 4)
+    guard, history, _, pusher = run(drone, a_set())
+    assert guard.stopped
+    assert any("could not be written back" in n for n in history.notices)
+    assert math.isnan(pusher.known["ctrlLee.mass"])
+    assert drone.attempts == 4 + 2 * ATTEMPTS
+
+
+def test_a_link_that_is_gone_costs_one_attempt_each():
+    def gone(name, value, timeout=1.0):
+        raise LinkError("gone.")
+
+    drone = Drone()
+    drone.write_parameter = gone
+    _, history, _, _ = run(drone, a_set(), wait_for_link=lambda: False)
+    assert [(p.parameter, p.purpose) for p in history.pushes] == [("ctrlLee.mass", "push"), ("ctrlLee.mass", "undo")]
+
+
+def test_a_stop_before_a_set_drops_it_and_one_within_completes_it():
+    drone = Drone()
+    guard = Guard(LEE, nominal=NOMINAL, originals=ORIGINALS)
+    write = drone.write_parameter
+
+    def stop_in_the_middle(name, value, timeout=1.0):
+        guard.stop("somebody said so")
+        return write(name, value, timeout)
+
+    drone.write_parameter = stop_in_the_middle
+    done = []
+    pusher = Pusher(drone, guard, history=History(), known=ORIGINALS, on_done=lambda d, c: done.append(c))
+    pusher.submit(a_set())
+    pusher.submit(a_set({"mass": 0.036}))
+    pusher.close()
+    assert done == [True, False]
+    assert drone.log == list(a_set().writes)
+
+
+def test_a_revert_passes_a_guard_that_has_stopped_and_writes_only_what_differs():
+    drone = Drone()
+    guard, history, _, _ = run(
+        drone, a_set({"mass": 0.033}), Decision(2.0, writes=tuple(ORIGINALS.items()), kind="revert")
+    )
+    assert drone.values == ORIGINALS
+    assert drone.log == [("ctrlLee.mass", 0.033), ("ctrlLee.mass", 0.029)]
+    assert [p.purpose for p in history.pushes] == ["push", "revert"]
+    guard, *_ = run(Drone(lambda n: n == 99), Decision(2.0, writes=tuple(ORIGINALS.items()), kind="restore"))
+    assert not guard.stopped
+
+
+def test_a_fault_of_ours_in_the_account_ends_the_pushing():
+    drone = Drone()
+
+    def broken(write):
+        raise OSError("disk full")
+
+    guard, _, done, _ = run(drone, a_set(), a_set({"mass": 0.036}), on_write=broken)
+    assert done == [("push", True), ("push", False)]  # not left half written, and nothing after it
+    assert "disk full" in guard.stopped
+
+
+# --- safe at every step ---------------------------------------------------------------------------------------------
+
+factor = st.floats(0.4, 2.5)
+
+
+def damping(values, axis):
+    """Of the attitude loop J x'' + Kw x' + KR x = 0, times 2 sqrt(J): only its ratio between states matters."""
+    return values[f"ctrlLee.Kw_{axis}"] / math.sqrt(values[f"ctrlLee.KR_{axis}"])
+
+
+def states(start, writes):
+    values = dict(start)
+    yield dict(values)
+    for name, value in writes:
+        values[name] = value
+        yield dict(values)
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.tuples(factor, factor, factor), st.tuples(factor, factor, factor), factor)
+def test_no_step_of_a_set_or_of_its_way_back_is_less_damped_than_both_ends(first, second, mass):
+    believed = dict(NOMINAL)
+    values = dict(ORIGINALS)
+    for factors in (first, second):
+        changed = {n: NOMINAL[n] * f for n, f in zip(("Ixx", "Iyy", "Izz"), factors)} | {"mass": 0.029 * mass}
+        writes = writes_for(LEE, changed, beliefs=believed, originals=ORIGINALS)
+        passed = list(states(values, writes))
+        end = passed[-1]
+        back = writes_back(LEE, values, now=end)
+        for course in (passed, list(states(end, back))):
+            for axis, state in itertools.product("xyz", course):
+                least = min(damping(course[0], axis), damping(course[-1], axis))
+                assert damping(state, axis) >= least * (1 - 1e-9)
+        assert list(states(end, back))[-1] == pytest.approx(values, rel=1.01 * EQUAL)
+        believed, values = {**believed, **changed}, end
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.tuples(factor, factor, factor), st.integers(0, 9), st.booleans())
+def test_undoing_half_a_set_is_as_damped_whether_the_lost_write_arrived_or_not(factors, at, arrived):
+    changed = {n: NOMINAL[n] * f for n, f in zip(("Ixx", "Iyy", "Izz"), factors)} | {"mass": 0.033}
+    writes = writes_for(LEE, changed, beliefs=NOMINAL, originals=ORIGINALS)
+    at = min(at, len(writes) - 1)
+    drone = Drone(lambda n: at < n <= at + ATTEMPTS, arrived)
+    run(drone, replace(a_set(), writes=writes))
+    assert drone.values == pytest.approx(ORIGINALS, rel=1.01 * EQUAL)
+    full = list(states(ORIGINALS, writes))[-1]
+    for axis, state in itertools.product("xyz", states(ORIGINALS, drone.log)):
+        assert damping(state, axis) >= min(damping(ORIGINALS, axis), damping(full, axis)) * (1 - 1e-9)

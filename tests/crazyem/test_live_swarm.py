@@ -1,0 +1,311 @@
+"""Several drones: whole commands, with made-up drones and with the simulator."""
+
+import argparse
+import io
+import json
+import math
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from fake_drone import FakeEstimator, FakeLink
+from rich.console import Console
+
+from crazyem.cli import main, parser
+from crazyem.commands import swarm as command
+from crazyem.commands import view
+from crazyem.errors import CrazyemError, DataError, LinkError, UsageError
+from crazyem.live.flight import Interrupts
+from crazyem.live.swarm import members_of
+from crazyem.recordings import open_recording
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+# whole commands
+@pytest.fixture
+def fake(monkeypatch, tmp_path):
+    """`crazyem` with drones of a few lines at fake://0, fake://1, ...; yields the links by URI."""
+    links = {}
+
+    def open_link(uri):
+        link = links[uri]
+        if isinstance(link, Exception):
+            raise link
+        return link
+
+    for i in range(4):
+        link = FakeLink(speed=20.0)
+        link.uri, link.wanted = f"fake://{i}", (float(i), 0.0, 0.0)
+        links[link.uri] = link
+    monkeypatch.setattr(command, "open_link", open_link)
+    monkeypatch.setattr(command, "compile_kernels", lambda vehicle: None)
+    monkeypatch.setattr(command, "new_estimator", lambda vehicle, arguments, **_: FakeEstimator())
+    monkeypatch.chdir(tmp_path)
+    return links
+
+
+def flown(*arguments):
+    code = main(["fly", "--duration", "4", "--json", "out.json", *arguments])
+    with open("out.json") as file:
+        return code, json.load(file)
+
+
+URIS = ["--uri", "fake://0", "--uri", "fake://1", "--uri", "fake://2"]
+
+
+def test_drones_fly_side_by_side_with_a_recording_and_a_row_each(fake, capsys, tmp_path):
+    code, said = flown(*URIS, "--push", "--record", "f.mcap")
+    assert code == 0
+    assert [d["name"] for d in said["drones"]] == ["drone0", "drone1", "drone2"]
+    for i, drone in enumerate(said["drones"]):
+        assert drone["outcome"] == "landed"
+        assert drone["uri"] == f"fake://{i}"
+        assert drone["estimates"]["mass"]["value"] == pytest.approx(0.036)
+        assert drone["log"] == f"f.drone{i}.mcap"
+        recording = open_recording(tmp_path / drone["log"])
+        assert recording.metadata["estimator"] == {"updates_left_out": str(drone["updates_left_out"])}
+        assert recording.metadata["configuration"]["drone"] == f'"drone{i}"'
+        assert any(p["parameter"] == "ctrlLee.mass" for p in drone["pushes"])
+        assert fake[f"fake://{i}"].values["ctrlLee.mass"] == pytest.approx(0.036, rel=0.01)
+    captured = capsys.readouterr()
+    assert captured.out.count("landed") == 3
+    assert "drone1   hover" in captured.err
+
+
+def test_what_happens_to_one_drone_does_not_stop_the_others(fake):
+    fake["fake://0"].lost_at = 9000
+    fake["fake://1"] = LinkError("nothing answers at fake://1")
+    fake["fake://3"].controllers = (1,)
+    code, said = flown(*URIS, "--uri", "fake://3")
+    lost, absent, good, refused = said["drones"]
+    assert code == 4
+    assert "was lost" in lost["error"]
+    assert lost["estimates"]["mass"]["value"] == pytest.approx(0.036)
+    assert absent["error"] == "nothing answers at fake://1"
+    assert "estimates" not in absent
+    assert good["outcome"] == "landed"
+    assert "error" not in good
+    assert "does not have the controller" in refused["error"]
+    assert "take_off" not in fake["fake://3"].calls
+
+
+def test_drones_that_stand_too_close_do_not_fly_at_all(fake, capsys):
+    fake["fake://1"].wanted = (0.1, 0.0, 0.0)
+    assert main(["fly", *URIS]) == 2
+    assert "drone0 and drone1 stand 0.10 m apart" in capsys.readouterr().err
+    assert not any("take_off" in fake[f"fake://{i}"].calls for i in range(3))
+
+
+def test_an_offset_that_leads_to_another_drone_is_refused(fake, tmp_path, capsys):
+    (tmp_path / "s.toml").write_text(
+        '[[drone]]\nname = "a"\nuri = "fake://0"\noffset = [1, 0.1, 0]\n[[drone]]\nname = "b"\nuri = "fake://1"\n'
+    )
+    assert main(["fly", "--swarm", "s.toml"]) == 2
+    assert "a and b begin 0.10 m apart" in capsys.readouterr().err
+
+
+def test_an_offset_is_where_the_trajectory_is_flown(fake, tmp_path):
+    (tmp_path / "s.toml").write_text(
+        '[[drone]]\nname = "a"\nuri = "fake://0"\noffset = [0, 0.5, 0.25]\n[[drone]]\nname = "b"\nuri = "fake://1"\n'
+    )
+    code, said = flown("--swarm", "s.toml", "--no-push")
+    assert code == 0
+    assert [d["offset"] for d in said["drones"]] == [[0.0, 0.5, 0.25], [0.0, 0.0, 0.0]]
+    assert fake["fake://0"].wanted[:2] == pytest.approx((0.0, 0.5), abs=0.01)
+    assert fake["fake://1"].wanted[:2] == pytest.approx((1.0, 0.0), abs=0.01)
+
+
+@pytest.mark.parametrize(("count", "outcome"), [(1, "landed on request"), (2, "motors cut")])
+def test_one_interrupt_lands_all_and_a_second_one_cuts_all(fake, monkeypatch, count, outcome):
+    everyone, over = [], threading.Event()
+    real = view.Everyone
+
+    def caught(ones):
+        everyone.append(real(ones))
+        return everyone[0]
+
+    monkeypatch.setattr(command, "Everyone", caught)
+
+    def interrupt():
+        while not all("setpoint" in fake[f"fake://{i}"].calls for i in range(3)):
+            if over.wait(0.01):
+                return  # what it ended with says why
+        for _ in range(count):
+            everyone[0]()
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    code, said = flown(*URIS, "--duration", "600")
+    over.set()
+    thread.join()
+    assert (code, [d["outcome"] for d in said["drones"]]) == (130, [outcome] * 3), said["drones"]
+    for i in range(3):
+        calls = fake[f"fake://{i}"].calls
+        assert calls[-1] == "stop"
+        assert "land" in calls or count == 2
+        assert not fake[f"fake://{i}"].motors
+
+
+def test_landing_by_key_never_cuts_and_control_c_after_it_does_not_either():
+    ones = [Interrupts(), Interrupts()]
+    everyone = view.Everyone(ones)
+    for _ in range(3):
+        view.landing(ones[0])()
+    assert [o.count for o in ones] == [1, 0]
+    everyone()
+    assert [o.count for o in ones] == [1, 1]
+    everyone()
+    assert [o.count for o in ones] == [2, 2]
+
+
+def test_drones_are_watched_together_and_commanded_never(fake):
+    for i in range(3):
+        link = fake[f"fake://{i}"]
+        link.motors, link.wanted = True, (float(i), 0.0, 1.0)
+    assert main(["watch", *URIS, "--duration", "3", "--json", "out.json"]) == 0
+    with open("out.json") as file:
+        said = json.load(file)
+    assert [d["outcome"] for d in said["drones"]] == ["watched"] * 3
+    assert all(not fake[f"fake://{i}"].calls for i in range(3))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["fly", "--uri", "udp://h:1", "--uri", "udp://h:1"], "given twice"),
+        (["fly", "--uri", "udp://h:1", "--swarm", "s.toml"], "not both"),
+        (["fly", "--swarm", "no.toml"], "cannot read no.toml"),
+        (["fly", "--uri", "udp://h:1", "--seed", "3"], "built-in simulator"),
+        (["fly", "--uri", "mavlink:udpin:h:1"], "ground station"),
+        (["watch", "--uri", "udp://h:1", "--push"], "watched only"),
+        (["watch"], "needs a URI"),
+        (["fly", "--live"], "--live needs a terminal"),
+        (["fly", "--uri", "udp://h:1", "--trajectory", "loop"], "unknown trajectory"),
+    ],
+)
+def test_wrong_arguments_are_one_sentence(capsys, arguments, says):
+    assert main(arguments) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("crazyem: ")]
+    assert len(lines) == 1
+    assert says in lines[0]
+
+
+def test_a_drone_that_never_flew_is_a_row_with_its_reason(fake, monkeypatch):
+    class Nothing(FakeEstimator):
+        def finish(self):
+            raise DataError("nothing to estimate from")
+
+    monkeypatch.setattr(command, "new_estimator", lambda vehicle, arguments, **_: Nothing())
+    code, said = flown(*URIS, "--no-push")
+    assert code == DataError.exit_code
+    assert all("nothing to estimate from" in d["error"] for d in said["drones"])
+
+
+def test_the_table_shows_what_is_not_known():
+    text = command.table(
+        [
+            {"name": "a", "outcome": "failed", "notices": ["why", "said"], "error": "said"},
+            {
+                "name": "b",
+                "outcome": "landed",
+                "estimates": {"mass": {"value": 0.03, "ci95": [0.02, math.inf], "identifiable": False}},
+            },
+        ]
+    )
+    assert "30.00+->99?" in text
+    assert "a: note: why" in text
+    assert "note: said" not in text
+
+
+# views
+@pytest.mark.parametrize(
+    ("given", "out", "err", "expected"),
+    [
+        ([], True, True, True), ([], False, True, False), ([], True, False, False), (["--no-live"], True, True, False),
+        (["--live"], False, True, True), (["--confirm"], True, True, False),
+    ],
+)  # fmt: skip
+def test_a_live_view_is_for_terminals(monkeypatch, given, out, err, expected):
+    class Stream:
+        def __init__(self, terminal):
+            self.isatty = lambda: terminal
+
+    monkeypatch.setattr(view, "sys", argparse.Namespace(stdout=Stream(out), stderr=Stream(err)))
+    monkeypatch.setenv("TERM", "dumb")
+    if given != ["--live"]:
+        assert view.wants_view(parser().parse_args(["fly", *given])) is False
+    monkeypatch.setenv("TERM", "xterm")
+    assert view.wants_view(parser().parse_args(["fly", *given])) is expected
+
+
+def test_the_view_takes_the_place_of_the_lines_and_leaves_the_summary(fake, monkeypatch, capsys):
+    drawn = io.StringIO()
+    monkeypatch.setattr(command, "wants_view", lambda arguments: True)
+    monkeypatch.setattr(
+        "crazyem.live.dashboard.terminal_console",
+        lambda stream: Console(file=drawn, width=140, height=40, force_terminal=True),
+    )
+    code, said = flown(*URIS, "--no-push", "--duration", "30")
+    assert code == 0
+    picture = drawn.getvalue()
+    assert picture.count("\x1b[?1049h") == picture.count("\x1b[?1049l") == 1
+    assert "drone2" in picture
+    assert "no guard: nothing is written" in picture
+    captured = capsys.readouterr()
+    assert "drone0   hover" not in captured.err  # no plain line while it shows
+    assert captured.out.count("landed") == 3
+    assert len(said["drones"]) == 3
+
+
+def test_live_and_confirm_do_not_go_together(monkeypatch):
+    monkeypatch.setattr(view, "_terminal", lambda stream: True)
+    monkeypatch.setenv("TERM", "xterm")
+    with pytest.raises(UsageError, match="plain lines"):
+        view.wants_view(parser().parse_args(["fly", "--live", "--confirm"]))
+
+
+def test_errors_of_one_drone_keep_their_exit_code():
+    drone = command.Drone(members_of(["u"], vehicle="cf2", trajectory=["hover"])[0], None, [])
+    drone.failed(LinkError("gone."))
+    drone.failed(CrazyemError("and later."))
+    assert command._error(drone) == {"error": "gone.", "exit_code": 4}
+
+
+@pytest.mark.slow
+def test_two_simulated_drones_of_one_process_are_flown_by_one_process(tmp_path, capsys):
+    arguments = [sys.executable, "-m", "firmware_sim", "--swarm", "2", "--port", "0", "--seed", "3"]
+    scenario = ["--scenario", str(REPOSITORY / "firmware_sim" / "scenarios" / "payload.toml")]
+    with subprocess.Popen([*arguments, *scenario], cwd=REPOSITORY, stdout=subprocess.PIPE, text=True) as simulator:
+        try:
+            uris = [simulator.stdout.readline().split()[1] for _ in range(2)]
+            given = [word for uri in uris for word in ("--uri", uri)]
+            out = tmp_path / "out.json"
+            log = tmp_path / "f.mcap"
+            assert main(["fly", *given, "--duration", "6", "--json", str(out), "--record", str(log)]) == 0
+            drones = json.loads(out.read_text())["drones"]
+        finally:
+            simulator.terminate()
+    assert capsys.readouterr().out.count("landed") == 2
+    for drone in drones:
+        assert drone["estimates"]["mass"]["value"] == pytest.approx(0.036, rel=0.03)
+        # the recording has every sample: its replay estimates as much, whatever was left out in flight
+        again = tmp_path / "again.json"
+        assert main(["replay", drone["log"], "--json", str(again), "--plot", str(tmp_path / "p.png")]) == 0
+        replayed = json.loads(again.read_text())["estimates"]["mass"]
+        assert abs(replayed["value"] - drone["estimates"]["mass"]["value"]) < replayed["sd"]
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_many_drones_runs(tmp_path):
+    script = REPOSITORY / "benchmarks" / "swarm.py"
+    out = tmp_path / "s.json"
+    command_line = [sys.executable, str(script), "--drones", "2", "--seconds", "1", "--json", str(out)]
+    done = subprocess.run(command_line, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["drones"] == 2
+    assert row["updates_per_s_and_drone"] > 0
+    assert "| 2 |" in done.stdout

@@ -1,0 +1,161 @@
+"""Several drones on one computer: the crew that estimates for all, and updates that are left out."""
+
+import time
+
+import pytest
+import synthetic
+
+from crazyem.estimation.online import OnlineEstimator
+from crazyem.live.crew import OLDEST, Crew, Paced
+from crazyem.signals.sample import Sample
+from crazyem.vehicle import Vehicle
+
+
+# the crew
+@pytest.fixture
+def crew():
+    one = Crew(3)
+    yield one
+    one.close()
+
+
+def test_items_of_a_mailbox_are_worked_off_in_order_and_one_at_a_time(crew):
+    done = {i: [] for i in range(20)}
+    inside = dict.fromkeys(done, 0)
+    worst = []
+
+    def worker(i):
+        def work(item):
+            inside[i] += 1
+            worst.append(inside[i])
+            done[i].append(item)
+            if item % 50 == 0:
+                time.sleep(0.001)
+            inside[i] -= 1
+
+        return work
+
+    boxes = {i: crew.mailbox(worker(i), lambda e: None) for i in done}
+    for item in range(200):
+        for box in boxes.values():
+            box.put(item)
+    assert all(box.wait(20.0) for box in boxes.values())
+    assert all(items == list(range(200)) for items in done.values())
+    assert max(worst) == 1
+
+
+def test_a_mailbox_that_fails_ends_alone(crew):
+    errors, done = [], []
+
+    def fails(item):
+        raise ValueError(f"item {item}")
+
+    bad, good = crew.mailbox(fails, errors.append), crew.mailbox(done.append, errors.append)
+    for item in range(3):
+        bad.put(item)
+        good.put(item)
+    assert bad.wait(10.0)
+    assert good.wait(10.0)
+    bad.put(4)
+    assert [str(e) for e in errors] == ["item 0"]
+    assert done == [0, 1, 2]
+
+
+def test_a_busy_drone_does_not_starve_the_others():
+    one = Crew(1)
+    slow = one.mailbox(lambda item: time.sleep(0.005), lambda e: None)
+    times = []
+    quick = one.mailbox(times.append, lambda e: None)
+    for item in range(100):
+        slow.put(item)
+    quick.put("now")
+    assert quick.wait(10.0)
+    assert not slow.wait(0.0)
+    assert times == ["now"]
+    one.close()
+
+
+class Counting:
+    """An estimator that makes an update every `every` samples of position."""
+
+    def __init__(self, every=4):
+        self.every, self.since, self.fed, self.updates = every, 0, 0, []
+        self.airborne, self.update_seconds = True, []
+
+    def feed(self, sample):
+        self.fed += 1
+        if sample.signal != "position":
+            return None
+        self.since += 1
+        if self.since < self.every:
+            return None
+        self.updates.append((sample.time, self.since))
+        self.since = 0
+        return object()
+
+    def finish(self):
+        return self.every
+
+
+def run_paced(lags, **options):
+    inner = Counting()
+    paced = Paced(inner, **options)
+    for k, lag in enumerate(lags):
+        t = 0.01 * k
+        paced.newest = lambda t=t, lag=lag: t + lag
+        for signal in ("position", "velocity", "attitude"):
+            paced.feed(Sample(signal, t, (0.0,)))
+    return inner, paced
+
+
+def test_on_time_nothing_is_left_out():
+    inner, paced = run_paced([0.0] * 400)
+    assert [n for _, n in inner.updates] == [4] * 100
+    assert (paced.skipped, paced.finish()) == (0, 4)
+
+
+def test_late_updates_are_left_out_and_samples_are_not():
+    inner, paced = run_paced([0.0] * 100 + [0.2] * 50 + [0.0] * 50)
+    assert inner.fed == 3 * 200
+    late = [t for t, _ in inner.updates if 1.0 <= t < 1.5]
+    assert late == []
+    assert sum(n for _, n in inner.updates) + inner.since == 200  # every sample is in an update, or waits for one
+    assert paced.skipped == 12
+    assert paced.behind == 0.0
+
+
+def test_however_late_an_update_a_second_is_made():
+    inner, paced = run_paced([5.0] * 1000)
+    assert all(b - a <= OLDEST + 0.05 for (a, _), (b, _) in zip(inner.updates, inner.updates[1:]))
+    assert len(inner.updates) == pytest.approx(10.0 / OLDEST, abs=1)
+    assert paced.behind == pytest.approx(5.0)
+
+
+def test_updates_of_several_drones_are_out_of_step():
+    firsts = [run_paced([0.0] * 200, number=i, of=12)[0].updates for i in range(12)]
+    assert sorted(n for ((_, n), *_) in firsts) == [4 * k for k in range(1, 13)]
+    assert all(n == 4 for updates in firsts for _, n in updates[1:])
+
+
+def test_a_paced_estimator_on_time_is_the_estimator_bit_for_bit_and_a_late_one_close_to_it():
+    vehicle = Vehicle(name="v", mass=0.036, inertia=(2.0e-5, 2.1e-5, 3.6e-5), motor_time_constant=0.06)
+    samples = synthetic.samples(synthetic.fly(duration=2.0))
+    plain, on_time, late = (OnlineEstimator(vehicle, window=60) for _ in range(3))
+    paced = [Paced(on_time), Paced(late)]
+    at = [0.0]
+    paced[0].newest = lambda: at[0]
+    # behind for the first half of every second
+    paced[1].newest = lambda: at[0] + (0.3 if at[0] % 1.0 < 0.5 else 0.0)
+    for sample in samples:
+        at[0] = sample.time
+        expected = plain.feed(sample)
+        assert paced[0].feed(sample) == expected
+        paced[1].feed(sample)
+    final = plain.finish()
+    assert paced[0].finish() == final
+    assert paced[0].skipped == 0
+    assert paced[1].skipped > 10
+    other = paced[1].finish()
+    assert late.counters.nodes == plain.counters.nodes  # not one sample is missing
+    for name in ("mass", "Ixx", "Iyy", "Izz"):
+        assert abs(other[name].value - final[name].value) < 0.1 * final[name].sd

@@ -1,0 +1,307 @@
+"""Signs and sizes of every effect, each by hand from docs/firmware_sim_effects.md, where their meaning is agreed."""
+
+import math
+
+import numpy as np
+import pytest
+from effects_cases import CF2, ROTORS, G, still, wild
+from scipy.spatial.transform import Rotation
+
+from crazyem.physics.effects.effect import Effects, Situation
+from crazyem.physics.effects.rotation import axes, rotation_between
+from crazyem.physics.motion import RotorInput, measured, motion, rotor_thrust
+
+M = CF2.mass
+IXX, IYY, IZZ = CF2.inertia
+ARM = CF2.arm[0]
+
+
+def moved(situation: Situation, effects: Effects) -> tuple[np.ndarray, np.ndarray]:
+    """Force [N] and torque [N m] on the body in the first row, beyond those of the plain rotors."""
+    plain, with_it = (motion(situation, vehicle=ROTORS, effects=e) for e in ({}, effects))
+    force = M * (with_it.specific_force - plain.specific_force)[0]
+    return force, np.diag([IXX, IYY, IZZ]) @ (with_it.angular_acceleration - plain.angular_acceleration)[0]
+
+
+def close(found, force, torque) -> None:
+    np.testing.assert_allclose(found[0], force, atol=1e-12)
+    np.testing.assert_allclose(found[1], torque, atol=1e-15)
+
+
+YAWED = Rotation.from_euler("z", np.pi / 2).as_matrix()  # nose to world +y
+
+
+def test_linear_drag_is_against_the_velocity_in_body_axes() -> None:
+    # flying along world +x with the nose to +y: the air comes from the right, v_body = (0, -2, 0)
+    situation = still(velocity=[2.0, 0, 0], rotation=YAWED)
+    close(moved(situation, {"linear_drag": {"x": 0.5, "y": 0.01}}), [0, 0.02, 0], [0, 0, 0])
+
+
+def test_quadratic_drag_takes_the_whole_airspeed() -> None:
+    situation = still(velocity=[3.0, 0, 4.0])
+    close(moved(situation, {"quadratic_drag": {"x": 0.001, "z": 0.002}}), [-0.015, 0, -0.04], [0, 0, 0])
+
+
+def test_velocity_moment() -> None:
+    situation = still(velocity=[2.0, 3.0, 0])
+    found = moved(situation, {"velocity_moment": {"roll_per_vy": 1e-5, "pitch_per_vx": -2e-5}})
+    close(found, [0, 0, 0], [3e-5, -4e-5, 0])
+
+
+def test_rate_damping() -> None:
+    situation = still(body_rate=[0, 0, 2.0])
+    close(moved(situation, {"rate_damping": {"z": 1e-5}}), [0, 0, 0], [0, 0, -2e-5])
+
+
+def test_wind_alone_is_a_constant_force_in_the_world() -> None:
+    situation = still(velocity=[5.0, 5.0, 0], rotation=YAWED)
+    close(moved(situation, {"wind": {"x": 2.0}}), [0, -0.014, 0], [0, 0, 0])
+
+
+def test_wind_with_drag_blows_on_the_drone() -> None:
+    situation = still(velocity=[1.0, 0, 0])
+    close(moved(situation, {"wind": {"x": 3.0}, "linear_drag": {"x": 0.01}}), [0.02, 0, 0], [0, 0, 0])
+    # the moment of the air feels the wind, but is no drag: the wind's constant force stays
+    found = moved(situation, {"wind": {"x": 3.0}, "velocity_moment": {"pitch_per_vx": -1e-5}})
+    close(found, [0.021, 0, 0], [0, 2e-5, 0])
+
+
+def test_thrust_scale_also_scales_the_drag_torque() -> None:
+    situation = still(thrust=[0.1, 0, 0, 0])
+    kappa = CF2.torque_per_thrust
+    close(
+        moved(situation, {"thrust_scale": {"scale": 1.1}}), [0, 0, 0.01], 0.01 * np.array([-ARM, -ARM, -kappa])
+    )  # M1 is front right: left side down, nose up
+
+
+def test_rotor_fault_from_its_onset() -> None:
+    # M2 back right loses a tenth: the right sinks (positive roll), the tail sinks (negative pitch), less positive yaw
+    kappa = CF2.torque_per_thrust
+    effects: Effects = {"rotor_fault": {"rotor": 2, "scale": 0.9}}
+    close(moved(still(thrust=0.1), effects), [0, 0, -0.01], 0.01 * np.array([ARM, -ARM, -kappa]))
+    path = still(6)
+    dated: Effects = {"rotor_fault": {"rotor": 2, "scale": 0.9, "onset_time": 0.0225}}
+    lost = 4 * 0.07 - M * motion(path, vehicle=ROTORS, effects=dated).specific_force[:, 2]
+    np.testing.assert_allclose(lost / 0.007, [0, 0, 0, 0.75, 1, 1], atol=1e-9)
+
+
+def test_torque_scale_leaves_the_torque_of_a_shifted_centre() -> None:
+    situation = still(thrust=[0.08, 0.07, 0.07, 0.08])  # front stronger: nose up, negative pitch
+    pitch = -0.02 * ARM
+    close(moved(situation, {"torque_scale": {"scale": 1.5}}), [0, 0, 0], [0, 0.5 * pitch, 0])
+    both: Effects = {"torque_scale": {"scale": 1.5}, "center_of_mass": {"x": 0.002}}
+    # thrust F at O, centre of mass 2 mm in front: torque -c x F = +0.002 F about y, unscaled
+    turned = motion(situation, vehicle=ROTORS, effects=both).angular_acceleration[0, 1] * IYY
+    assert turned == pytest.approx(1.5 * pitch + 0.002 * 0.3)
+
+
+def test_ground_effect_at_one_height() -> None:
+    situation = still(thrust=0.07, height=[0.1])
+    close(
+        moved(situation, {"ground_effect": {"strength": 0.2, "height": 0.1}}), [0, 0, 0.28 * 0.2 / math.e], [0, 0, 0]
+    )  # one height up: a fraction 1/e of the strength
+
+
+def test_rotor_inertia_reacts_to_spin_up_and_is_a_gyroscope() -> None:
+    # only M1 turns, counter-clockwise: H along +z. Rolling right-handed about x turns H towards -y; the reaction is +y.
+    k = 2.5e-8
+    speed = math.sqrt(0.1 / k)
+    rolling = still(thrust=[0.1, 0, 0, 0], body_rate=[2.0, 0, 0])
+    close(moved(rolling, {"rotor_inertia": {"inertia": 2e-8}}), [0, 0, 0], [0, 2.0 * 2e-8 * speed, 0])
+    spinning = still(thrust=[0.1, 0, 0, 0], thrust_rate=[0.05, 0, 0, 0])
+    rate = 0.05 / (2 * math.sqrt(k * 0.1))  # dW/dt: M1 speeding up turns the body clockwise
+    np.testing.assert_allclose(
+        moved(spinning, {"rotor_inertia": {"inertia": 2e-8}})[1], [0, 0, -2e-8 * rate], rtol=1e-6
+    )
+
+
+def test_rotor_inertia_goes_with_the_speed_and_not_with_a_lost_blade() -> None:
+    rolling = still(thrust=[0.1, 0, 0, 0], body_rate=[2.0, 0, 0])
+    broken: Effects = {"rotor_fault": {"rotor": 1, "scale": 0.5}}
+    without = motion(rolling, vehicle=ROTORS, effects=broken)
+    with_it = motion(rolling, vehicle=ROTORS, effects={**broken, "rotor_inertia": {"inertia": 2e-8}})
+    gained = (with_it.angular_acceleration - without.angular_acceleration)[0, 1] * IYY
+    assert gained == pytest.approx(2.0 * 2e-8 * math.sqrt(0.1 / 2.5e-8))
+
+
+def test_rotor_inertia_of_a_vehicle_without_rotor_constant_takes_a_typical_one() -> None:
+    rolling = still(thrust=[0.1, 0, 0, 0], body_rate=[2.0, 0, 0], vehicle=CF2)
+    gained = motion(rolling, vehicle=CF2, effects={"rotor_inertia": {"inertia": 2e-8}}).angular_acceleration[0, 1] * IYY
+    plain = motion(rolling, vehicle=CF2, effects={}).angular_acceleration[0, 1] * IYY
+    assert gained - plain == pytest.approx(2.0 * 2e-8 * math.sqrt(0.1 / 3.7e-8))
+
+
+# --- before the lag --------------------------------------------------------------------------------------------------
+
+
+def settled(effects: Effects, *, thrust=0.07, voltage=4.0, flown=10.0, speeds=False) -> np.ndarray:
+    """Mean thrust (4,) long after a constant command."""
+    n = 100
+    inputs = RotorInput(
+        0.01 * np.arange(n), np.full((n, 4), thrust), np.full(n, voltage), np.full(n, flown), measured=speeds
+    )
+    return rotor_thrust(inputs, np.array([0.9, 0.91]), vehicle=ROTORS, effects=effects)[0][-1]
+
+
+def test_thrust_curve_turns_about_hover() -> None:
+    hover = M * G / 4
+    np.testing.assert_allclose(settled({"thrust_curve": {"slope_error": 0.2}}, thrust=hover), hover)
+    np.testing.assert_allclose(settled({"thrust_curve": {"slope_error": 0.2}}, thrust=hover + 0.01), hover + 0.012)
+    np.testing.assert_allclose(settled({"thrust_curve": {"slope_error": 3.0}}, thrust=0.119), CF2.thrust_max)
+    np.testing.assert_allclose(settled({"thrust_curve": {"slope_error": 2.0}}, thrust=0.01), 0.0)
+    np.testing.assert_allclose(settled({"thrust_curve": {"slope_error": -0.5}}, thrust=0.0), 0.0)
+    np.testing.assert_allclose(settled({"thrust_curve": {"slope_error": 0.2}}, thrust=0.09, speeds=True), 0.09)
+
+
+def test_battery_sag_by_voltage_and_by_time() -> None:
+    np.testing.assert_allclose(settled({"battery_sag": {"gain_per_volt": 0.2}}, voltage=3.2), 0.07 * 0.9)
+    np.testing.assert_allclose(settled({"battery_sag": {"gain_per_volt": 0.2}}, voltage=math.nan), 0.07)
+    np.testing.assert_allclose(settled({"battery_sag": {"gain_per_second": -0.004}}, flown=25.0), 0.07 * 0.9)
+    np.testing.assert_allclose(settled({"battery_sag": {"gain_per_second": -0.004}}, flown=-25.0), 0.07)
+    np.testing.assert_allclose(settled({"battery_sag": {"gain_per_second": -0.1}}, flown=25.0), 0.0)
+    np.testing.assert_allclose(settled({"battery_sag": {"gain_per_volt": 0.2}}, voltage=3.2, speeds=True), 0.07)
+
+
+def test_thrust_curve_comes_before_sag() -> None:
+    both: Effects = {"battery_sag": {"gain_per_volt": 0.2}, "thrust_curve": {"slope_error": 0.5}}
+    hover = M * G / 4
+    np.testing.assert_allclose(settled(both, thrust=hover + 0.01, voltage=3.2), 0.9 * (hover + 0.015))
+
+
+def test_rotor_sensor_that_counts_too_much_hides_a_weaker_rotor() -> None:
+    found = settled({"rotor_sensor": {"rotor": 3, "scale": 1.1}}, speeds=True)
+    np.testing.assert_allclose(found, [0.07, 0.07, 0.07 / 1.21, 0.07])
+    np.testing.assert_allclose(settled({"rotor_sensor": {"rotor": 3, "scale": 1.1}}), 0.07)  # commands: nothing
+
+
+def test_lag_and_delay_of_a_step() -> None:
+    """A step of the command at 0.5 s, seen at 0.6 s: 1 - exp(-(0.1 - delay)/tau)."""
+    time = 0.001 * np.arange(1000)
+    thrust = np.where(time[:, None] >= 0.5, 0.1, 0.05) * np.ones(4)
+    inputs = RotorInput(time, thrust, np.full(1000, 4.0), time, measured=False, aged=False)
+    nodes = np.array([0.4, 0.5999, 0.6])
+    for tau, delay in ((0.05, 0.0), (0.02, 0.0), (0.05, 0.03)):
+        effects: Effects = {"motor_lag": {"time_constant": tau}, "input_delay": {"delay": delay}}
+        mean, rate = rotor_thrust(inputs, nodes, vehicle=ROTORS, effects=effects)
+        expected = 0.1 - 0.05 * math.exp(-(0.1 - delay) / tau)
+        np.testing.assert_allclose(mean[-1], expected, rtol=1e-3)
+        np.testing.assert_allclose(rate[-1], (0.1 - expected) / tau, rtol=1e-2)
+
+
+# --- what sensors show -----------------------------------------------------------------------------------------------
+
+
+def test_a_pose_frame_rolled_by_a_reports_roll_more_by_a() -> None:
+    rotation = Rotation.from_euler("x", 0.2)
+    situation = still(rotation=rotation.as_matrix())
+    state = measured(situation, vehicle=CF2, effects={"attitude_misalignment": {"roll": 0.1}}).state[0]
+    np.testing.assert_allclose(state, [0, 0, 0, 0, 0, 0, 0.1, 0, 0, 0, 0, 0], atol=1e-15)
+    shown = rotation * Rotation.from_rotvec(state[6:9])
+    np.testing.assert_allclose(shown.as_euler("ZYX"), [0, 0, 0.3], atol=1e-12)
+    angles = {"roll": 0.3, "pitch": -0.5, "yaw": 1.2}
+    vector = measured(situation, vehicle=CF2, effects={"attitude_misalignment": angles}).state[0, 6:9]
+    expected = Rotation.from_euler("ZYX", [1.2, -0.5, 0.3])
+    np.testing.assert_allclose(Rotation.from_rotvec(vector).as_matrix(), expected.as_matrix(), atol=1e-12)
+
+
+def test_an_accelerometer_pitched_nose_down_sees_thrust_pull_it_back() -> None:
+    situation = still(specific_force=[0, 0, G])
+    shown = measured(situation, vehicle=CF2, effects={"accelerometer_misalignment": {"pitch": 0.1}}).specific_force[0]
+    # the sensor's x axis points (cos, 0, -sin): the upward force has the part -g sin(0.1) along it
+    np.testing.assert_allclose(shown, [-G * math.sin(0.1), 0, G * (math.cos(0.1) - 1)], atol=1e-12)
+
+
+def test_gyro_bias_and_velocity_scale() -> None:
+    situation = still(velocity=[1.0, 2.0, 3.0], rotation=YAWED)
+    effects: Effects = {"gyro_bias": {"y": 0.02}, "velocity_scale": {"x": 1.1, "z": 0.9}}
+    state = measured(situation, vehicle=CF2, effects=effects).state[0]
+    np.testing.assert_allclose(state, [0, 0, 0, 0.1, 0, -0.3, 0, 0, 0, 0, 0.02, 0], atol=1e-15)
+
+
+def path(time: np.ndarray) -> tuple[np.ndarray, np.ndarray, Rotation, np.ndarray]:
+    """Position, velocity, attitude and rate of a smooth flight that turns about a fixed axis."""
+    axis = np.array([0.6, 0.0, 0.8])
+    w = np.array([1.0, 1.3, 0.7])
+    phase = np.multiply.outer(time, w)
+    angle, rate = 1.5 * np.sin(2 * time), 3.0 * np.cos(2 * time)
+    return np.sin(phase), w * np.cos(phase), Rotation.from_rotvec(np.outer(angle, axis)), np.outer(rate, axis)
+
+
+@pytest.mark.parametrize("delay", [0.01, 0.0137, 0.05, 0.1])
+def test_measurement_delay_shows_the_past(delay: float) -> None:
+    n = 300
+    time = 0.01 * np.arange(n)
+    position, velocity, attitude, rate = path(time)
+    force = np.c_[np.sin(time), np.cos(time), time]
+    situation = still(
+        n, position=position, velocity=velocity, rotation=attitude.as_matrix(), body_rate=rate, specific_force=force
+    )
+    before = path(time - delay)
+    late = measured(situation, vehicle=CF2, effects={"measurement_delay": {"delay": delay, "streams": ["state"]}})
+    later = slice(12, None)  # beyond the first moments, whose past was not recorded
+    np.testing.assert_allclose((position + late.state[:, :3])[later], before[0][later], atol=1e-4)
+    np.testing.assert_allclose((velocity + late.state[:, 3:6])[later], before[1][later], atol=1e-4)
+    shown = attitude * Rotation.from_rotvec(late.state[:, 6:9])
+    assert np.max((shown.inv() * before[2]).magnitude()[later]) < 2e-4
+    assert np.max((shown.inv() * before[2]).magnitude()[:12]) < 3 * 0.5 * 6.0 * delay**2 + 1e-4  # held rate
+    np.testing.assert_allclose((position + late.state[:, :3])[:12], before[0][:12], atol=1.0 * delay**2 + 1e-4)
+    assert not late.state[:, 9:].any()
+    assert not late.specific_force.any()
+    gyro = measured(situation, vehicle=CF2, effects={"measurement_delay": {"delay": delay, "streams": "gyro"}})
+    np.testing.assert_allclose((rate + gyro.state[:, 9:])[later], before[3][later], atol=2e-4)
+    assert not gyro.state[:, :9].any()
+    sensed = measured(
+        situation, vehicle=CF2, effects={"measurement_delay": {"delay": delay, "streams": ["accelerometer"]}}
+    ).specific_force
+    np.testing.assert_allclose((force + sensed)[later, 2], (time - delay)[later], atol=1e-9)
+
+
+def test_measurement_delay_does_not_look_across_a_gap() -> None:
+    n = 20
+    jumped = np.where(np.arange(n)[:, None] >= 10, 100.0, 0.0) * np.ones(3)
+    effects: Effects = {"measurement_delay": {"delay": 0.03, "streams": ["state"]}}
+    step = np.where(np.arange(n) % 10 > 0, 0.01, 0.0)
+    assert not measured(still(n, position=jumped, step=step), vehicle=CF2, effects=effects).state.any()
+    back = np.where(np.arange(n) >= 10, -5.0, 0.0) + 0.01 * np.arange(n)  # another recording, its clock begins anew
+    assert not measured(still(n, position=jumped, time=back), vehicle=CF2, effects=effects).state.any()
+    assert measured(still(n, position=jumped), vehicle=CF2, effects=effects).state.any()
+    single = still(3, step=0.0, velocity=[1.0, 0, 0])  # moments that are no path: each for itself
+    np.testing.assert_allclose(measured(single, vehicle=CF2, effects=effects).state[:, 0], -0.03)
+
+
+def test_rotation_between_is_the_logarithm_also_near_half_a_turn() -> None:
+    rng = np.random.default_rng(3)
+    one = Rotation.random(400, random_state=1)
+    axis = rng.standard_normal((400, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    angle = np.concatenate([rng.uniform(0, np.pi, 200), np.pi - 10.0 ** rng.uniform(-9, -1, 100),
+                            10.0 ** rng.uniform(-12, -1, 100)])  # fmt: skip
+    vector = angle[:, None] * axis
+    other = one * Rotation.from_rotvec(vector)
+    found = rotation_between(one.as_matrix(), other.as_matrix())
+    apart = (Rotation.from_rotvec(found).inv() * Rotation.from_rotvec(vector)).magnitude()
+    assert apart.max() < 1e-7
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), angle, atol=1e-7)
+    np.testing.assert_allclose(found[300:], vector[300:], rtol=1e-3, atol=1e-14)
+    exactly = rotation_between(np.eye(3)[None], np.diag([1.0, -1.0, -1.0])[None])
+    np.testing.assert_allclose(np.abs(exactly), [[np.pi, 0, 0]], atol=1e-12)
+
+
+def test_axes_are_yaw_pitch_roll() -> None:
+    np.testing.assert_allclose(
+        axes(0.3, -0.5, 1.2), Rotation.from_euler("ZYX", [1.2, -0.5, 0.3]).as_matrix(), atol=1e-12
+    )
+
+
+def test_effects_do_not_write_into_the_situation() -> None:
+    situation = wild(10, seed=2)
+    before = {k: v.copy() for k, v in vars(situation).items() if isinstance(v, np.ndarray)}
+    effects: Effects = {
+        "rotor_fault": {"scale": 0.5}, "thrust_scale": {"scale": 2.0}, "wind": {"x": 1.0},
+        "rotor_inertia": {"inertia": 1e-8},
+        "suspended_load": {"mass": 0.01}, "velocity_scale": {"x": 2.0}, "measurement_delay": {"delay": 0.01},
+    }  # fmt: skip
+    motion(situation, vehicle=ROTORS, effects=effects)
+    measured(situation, vehicle=ROTORS, effects=effects)
+    for key, value in before.items():
+        np.testing.assert_array_equal(getattr(situation, key), value)

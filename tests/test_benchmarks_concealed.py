@@ -1,0 +1,249 @@
+"""Proof with concealed physics: the draw keeps its promises, made-up answers get the figures counted by hand."""
+
+import json
+import math
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def from_the_root() -> Iterator[None]:
+    """benchmarks is no installed package: `python -m benchmarks.concealed` finds it from the repository's folder."""
+    sys.path.insert(0, str(ROOT))
+    yield
+    sys.path.remove(str(ROOT))
+
+
+def drawn(cases: int, seed: int) -> list[dict[str, Any]]:
+    from benchmarks.concealed.draw import draw
+
+    return draw(cases=cases, seed=seed)
+
+
+# the draw
+
+
+def test_the_same_seed_draws_the_same_cases_and_another_others() -> None:
+    assert drawn(60, 1) == drawn(60, 1)
+    assert drawn(60, 1) != drawn(60, 2)
+    assert json.loads(json.dumps(drawn(20, 3))) == drawn(20, 3)
+
+
+@pytest.mark.parametrize(("cases", "seed"), [(60, 1), (320, 2025)])
+def test_shares_are_as_promised_and_every_effect_is_there(cases: int, seed: int) -> None:
+    from benchmarks.concealed.sizes import CATALOGUE, OUTSIDE
+    from firmware_sim.plant.effects.catalogue import EFFECTS, HIDDEN
+
+    found = drawn(cases, seed)
+    kinds = Counter(c["kind"] for c in found)
+    assert len(found) == len({c["case"] for c in found}) == cases
+    assert kinds["nothing"] >= 0.2 * cases
+    assert abs(kinds["pair"] - 0.15 * cases) <= 1
+    assert abs(kinds["outside"] - 0.1 * cases) <= 1
+    alone = Counter(name for c in found if c["kind"] == "single" for name in c["effects"])
+    # a trim is not drawn: every real drone has one, and none that is simulated here
+    assert set(alone) == set(CATALOGUE) == set(EFFECTS) - {"trim"}
+    assert max(alone.values()) - min(alone.values()) <= 1
+    assert {n for c in found for n in c["hidden"]} == set(OUTSIDE) == set(HIDDEN)
+    assert all(len(c["effects"]) == 2 for c in found if c["kind"] == "pair")
+    assert not any(c["effects"] or c["hidden"] for c in found if c["kind"] == "nothing")
+
+
+def test_order_and_names_tell_nothing_of_the_kind() -> None:
+    kinds = np.array([c["kind"] == "nothing" for c in drawn(320, 2025)], float)
+    assert abs(np.corrcoef(kinds, np.arange(320))[0, 1]) < 4 / math.sqrt(320)
+
+
+def test_every_drawn_scenario_is_one_the_simulator_takes_and_every_path_one_that_can_be_flown(tmp_path: Path) -> None:
+    from benchmarks.concealed.draw import write_cases
+    from benchmarks.concealed.fly import _words
+    from benchmarks.concealed.paths import Study, read
+    from crazyem.control.waypoints import waypoints
+    from firmware_sim.scenario import load_scenario
+
+    study = Study(tmp_path)
+    assert write_cases(study, cases=60, seed=7) == 60
+    assert write_cases(study, cases=60, seed=7) == 0  # what exists stays
+    for name in study.cases():
+        case = read(study.truth(name))
+        assert load_scenario(study.scenario(name)).platform == case["platform"]
+        for flight in case["flights"].values():
+            if flight["waypoints"]:
+                path = waypoints(path=_words(flight, str(tmp_path))[1], position=(0.0, 0.0, 1.0))
+                assert min(path.at(t).position[2] for t in np.linspace(0, 20, 400)) > 0.08
+
+
+def test_the_truth_without_effects_is_the_nominal_vehicle(tmp_path: Path) -> None:
+    from benchmarks.concealed.draw import write_cases
+    from benchmarks.concealed.paths import Study
+    from crazyem.vehicle import load_vehicle
+    from firmware_sim.scenario import load_scenario
+
+    write_cases(Study(tmp_path), cases=1, seed=1)
+    for name in ("cf2", "cf21bl"):
+        file = tmp_path / "plain.toml"
+        file.write_text(f'platform = "{name}"\nvehicle_file = "vehicles/{name}.toml"\n')
+        true, told = load_scenario(file).vehicle, load_vehicle(name)
+        assert true.mass == told.mass
+        assert tuple(true.inertia)[:3] == told.inertia
+        assert tuple(true.thrust_curve) == told.thrust_curve
+        assert true.motor_time_constant == told.motor_time_constant
+
+
+# one answer against one truth
+
+
+def answer(*effects: dict[str, Any], **more: Any) -> dict[str, Any]:
+    return {"mismatch": bool(effects), "effects": list(effects), "indistinguishable": [], "unexplained": {}, **more}
+
+
+def effect(name: str, confidence: float = 0.9, **parameters: tuple[float, float, float]) -> dict[str, Any]:
+    told = {k: {"value": v, "ci95": [low, high]} for k, (v, low, high) in parameters.items()}
+    return {"name": name, "parameters": told, "confidence": confidence}
+
+
+@pytest.mark.parametrize(
+    ("result", "worth"),
+    [
+        (answer(effect("payload")), 1.0),
+        (answer(effect("payload"), indistinguishable=[["payload", "thrust_scale"]]), 0.5),
+        (answer(effect("thrust_scale"), indistinguishable=[["payload", "thrust_scale"]]), 0.5),
+        (answer(effect("thrust_scale")), 0.0),
+        (answer(effect("wind"), effect("payload")), 0.0),
+        (answer(effect("wind"), indistinguishable=[["payload", "thrust_scale"]]), 0.0),
+        (answer(), 0.0),
+        (None, 0.0),
+        ({**answer(effect("payload")), "mismatch": False}, 0.0),
+    ],
+)
+def test_credit_of_a_name(result: dict[str, Any] | None, worth: float) -> None:
+    from benchmarks.concealed.judge import credit
+
+    assert credit("payload", result) == worth
+
+
+def test_errors_are_of_the_size_of_the_effect() -> None:
+    from benchmarks.concealed.judge import coverage, errors
+    from crazyem.vehicle import load_vehicle
+
+    vehicle = load_vehicle("cf2")
+    found = effect("thrust_scale", scale=(1.06, 1.02, 1.10))
+    assert errors("thrust_scale", {"scale": 1.05}, found, vehicle) == {"": pytest.approx(0.2)}
+    found = effect("payload", mass=(0.002, 0.001, 0.003), x=(0.0, -1, 1), y=(0.004, -1, 1), z=(0.0, -1, 1))
+    off = errors("payload", {"mass": 0.0025, "x": 0.003, "y": 0.004, "z": 0.0}, found, vehicle)
+    assert off == {"kg": pytest.approx(0.2), "m": pytest.approx(0.6)}
+    found = effect("motor_lag", time_constant=(0.07, 0.06, 0.065))
+    assert errors("motor_lag", {"time_constant": 0.06}, found, vehicle) == {"s": pytest.approx(1.0)}
+    assert coverage({"time_constant": 0.066}, found) == [("time_constant", False)]
+    assert coverage({"scale": 1.0, "rotor": 2}, found) == [("scale", None)]
+
+
+def test_outside_the_catalogue() -> None:
+    from benchmarks.concealed.judge import outside
+
+    where = [{"signal": "attitude", "axis": "z", "regime": "x -1 to -0.5 m"}]
+    right = {"mismatch": True, "effects": [], "unexplained": {"where": where}}
+    assert outside("magnetic_yaw", right) == {"unexplained": True, "axis": True, "regime": True, "wrong_name": False}
+    assert not outside("vibration", right)["axis"]
+    wrong = {**right, "effects": [effect("wind", 0.8), effect("unexplained", 0.99)]}
+    assert outside("magnetic_yaw", wrong)["wrong_name"]
+    unsure = {**right, "effects": [effect("wind", 0.4)]}
+    assert not outside("magnetic_yaw", unsure)["wrong_name"]
+    assert outside("vibration", None) == dict.fromkeys(("unexplained", "axis", "regime", "wrong_name"), False)
+
+
+# the figures
+
+
+def truth(kind: str, strength: float = 0.9, **effects: Any) -> dict[str, Any]:
+    hidden = {} if kind != "outside" else effects
+    return {
+        "case": "0001", "kind": kind, "platform": "cf2", "effects": {} if hidden else effects, "hidden": hidden,
+        "strength": dict.fromkeys(effects, strength), "flights": {},
+    }  # fmt: skip
+
+
+def test_figures_of_made_up_answers_are_those_counted_by_hand() -> None:
+    from benchmarks.concealed.report import table
+    from benchmarks.concealed.score import QUANTITIES, Outcome, figures
+
+    scale = {"thrust_scale": {"scale": 1.1}}
+    good = effect("thrust_scale", 0.96, scale=(1.11, 1.09, 1.13))
+    one, twice = dict.fromkeys(QUANTITIES, 1.0), dict.fromkeys(QUANTITIES, 2.0)
+    pair = {"thrust_scale": {"scale": 1.1}, "wind": {"x": 1.0, "y": 0.0, "z": 0.0}}
+    group = [["wind", "linear_drag"]]
+    cases = [
+        *[Outcome(truth("nothing"), answer(), 10.0)] * 3,
+        Outcome(truth("nothing"), answer(effect("wind", 0.7)), 20.0),
+        Outcome(truth("single", **scale), answer(good), 10.0, 50.0, {"fitted": one, "true": one}),
+        Outcome(truth("single", 0.2, **scale), answer(), 10.0, 50.0, {"fitted": twice, "true": one}),
+        Outcome(truth("single", 0.1, **scale), answer(), 10.0, 3.0),  # nobody could see it
+        Outcome(truth("pair", **pair), answer(good, effect("linear_drag", 0.6), indistinguishable=group), 10.0, 90.0),
+        Outcome(truth("outside", cable_spring={}), answer(effect("wind", 0.95)), 10.0),
+        Outcome(truth("outside", cable_spring={}), None),
+    ]
+    f = figures(cases)
+    assert f["cases"] == {"nothing": 4, "single": 3, "pair": 1, "outside": 2}
+    assert f["no_answer"] == 1
+    assert f["nothing"]["false_alarms"] == {"n": 4, "share": 0.25}
+    assert f["single"]["detectable"] == {"n": 2, "of": 3}
+    assert f["single"]["named_first_strong"] == {"n": 1, "share": 1.0}
+    assert f["single"]["named_first_all"] == {"n": 2, "share": 0.5}
+    assert f["parameters"]["interval_coverage"] == {"n": 2, "share": 1.0}
+    assert f["parameters"]["error"] == {"n": 2, "median": pytest.approx(0.1)}
+    assert f["pairs"]["both_and_only_both"] == {"n": 1, "share": 0.0}
+    assert f["pairs"]["up_to_declared_groups"] == {"n": 1, "share": 1.0}
+    assert f["outside"]["wrong_confident_name"] == {"n": 2, "share": 0.5}
+    assert f["held_out"] == {"within_10_percent_of_true_model": {"n": 2, "share": 0.5}, "median_ratio": 1.5}
+    # claims: 0.7 wrong, 0.96 right twice, 0.6 right (declared alike), 0.95 wrong
+    assert f["confidence"]["n"] == 5
+    brier = (0.7**2 + 2 * 0.04**2 + 0.4**2 + 0.95**2) / 5
+    assert f["confidence"]["brier"] == pytest.approx(brier)
+    assert [r["why"] for r in f["failures"]] == [
+        "false alarm", "missed", "not both and only both", "wrong confident name", "no answer",
+    ]  # fmt: skip
+    assert "| nothing hidden: false alarms | 25.0 % of 4 | at most 3 % |" in table(f)
+
+
+def test_no_cases_give_no_figures_rather_than_good_ones() -> None:
+    from benchmarks.concealed.report import table
+    from benchmarks.concealed.score import figures
+
+    f = figures([])
+    assert f["nothing"]["false_alarms"] == {"n": 0, "share": None}
+    assert "not measured" in table(f)
+
+
+# the files
+
+
+def test_the_diagnosing_process_sees_two_recordings_and_a_name(tmp_path: Path) -> None:
+    from benchmarks.concealed.diagnose import diagnose_all
+    from benchmarks.concealed.paths import Study, read, write
+    from benchmarks.concealed.report import report
+
+    study = Study(tmp_path / "study")
+    write(study.truth("0001"), {**truth("nothing"), "quality": {}})
+    for flight in ("recording", "held_out"):
+        study.recording("0001", flight).parent.mkdir(parents=True, exist_ok=True)
+        study.recording("0001", flight).write_bytes(b"recorded")
+    spy = tmp_path / "spy.py"
+    spy.write_text(
+        "import json, os, sys\n"
+        "seen = {'mismatch': False, 'effects': [], 'words': sys.argv[1:], 'files': sorted(os.listdir('.'))}\n"
+        "json.dump(seen, open('answer.json', 'w'))\n"
+    )
+    assert diagnose_all(study, command=[sys.executable, str(spy)]) == 1
+    assert diagnose_all(study, command=[sys.executable, str(spy)]) == 0  # answered already
+    result = read(study.answer("0001"))["result"]
+    assert result["files"] == ["held_out.mcap", "recording.mcap"]
+    assert not any(str(tmp_path) in word or "/" in word for word in result["words"])
+    assert "0.0 % of 1" in report(study)
