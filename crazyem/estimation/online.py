@@ -24,7 +24,7 @@ from crazyem.estimation.settling import PASSED, Settled, settle
 from crazyem.estimation.tape import Tape
 from crazyem.estimation.verdict import estimate_of, nothing_known
 from crazyem.physics.lag import CAUSAL, HOLD, LINEAR
-from crazyem.physics.rotors import wrench_from_command, wrench_from_speed
+from crazyem.physics.rotors import wrench_from_one_command, wrench_from_speed
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle
 
@@ -253,16 +253,16 @@ class OnlineEstimator:
         if not _sane(self._input, group[self._input]):
             self.counters.missing += 1
             return
-        value = np.asarray(group[self._input], float)
+        value = group[self._input]
         if self._input == "motor_command":
             if math.isnan(self._voltage):
                 self.counters.unpowered += 1
                 return
-            wrench = wrench_from_command(value, np.float64(self._voltage), self.vehicle)
+            wrench = wrench_from_one_command(value, self._voltage, self.vehicle)
         elif self._input == "rotor_speed":
             wrench = wrench_from_speed(value, self.vehicle)
         else:
-            wrench = value
+            wrench = np.asarray(value, float)
         if self._setup is None:
             self._setup = self._make_setup(lag=self._input != "rotor_speed")
             if not self._setup.free[4]:

@@ -28,6 +28,7 @@ class FirmwareClock:
         self._lock = threading.Lock()
         self._rate = 1.0
         self._line = (0.0, 0.0)
+        self._stale = False
         self._shown: tuple[float, float] | None = None  # host s, firmware s of the last answer
         self.newest = float("nan")
 
@@ -42,10 +43,14 @@ class FirmwareClock:
             self._pairs.append((host, firmware_time))
             while self._pairs[-1][0] - self._pairs[0][0] > OFFSET_SPAN:
                 self._pairs.popleft()
-            last = self._pairs[-1]
             self._measure_rate(host, firmware_time)
-            offset = max(f - self._rate * (h - last[0]) for h, f in self._pairs)
-            self._line = (last[0], offset)
+            self._stale = True  # the line is drawn when it is asked for: packets are many, and watching asks for none
+
+    def _draw_line(self) -> None:
+        """Through the promptest packet of the last while, with the measured rate."""
+        newest = self._pairs[-1][0]
+        self._line = (newest, max(f - self._rate * (h - newest) for h, f in self._pairs))
+        self._stale = False
 
     def _measure_rate(self, host: float, firmware_time: float) -> None:
         """Median slope of half seconds, which one stall cannot bend; the overall slope while there are too few."""
@@ -67,6 +72,8 @@ class FirmwareClock:
         """Firmware time [s] now; never runs backwards."""
         host = time.monotonic() if host is None else host
         with self._lock:
+            if self._stale:
+                self._draw_line()
             # No packet, no progress: do not extrapolate for ever when the drone falls silent.
             ahead = min(host - self._line[0], 1.0)
             value = self._line[1] + self._rate * ahead

@@ -1,8 +1,9 @@
-"""Estimating for many drones at once: a few workers, and updates that are left out when they cannot keep up.
+"""Receiving and estimating for many drones at once: a few threads, and updates left out when they cannot keep up.
 
-A worker takes the drone that has waited longest and gives its estimator what has arrived. Kernels release the
-interpreter lock, so as many updates run at a time as there are workers. Where that is not enough, updates are left
-out, never samples: the next update uses them all.
+One thread takes in what arrives for all: with a thread a drone, waking them costs more than their work. A worker takes
+the drone that has waited longest and gives its estimator what has arrived. Kernels release the interpreter lock, so as
+many updates run at a time as there are workers. Where that is not enough, updates are left out, never samples: the
+next update uses them all.
 """
 
 import math
@@ -18,6 +19,7 @@ from crazyem.estimation.result import Estimate
 from crazyem.live.pipeline import Estimator
 from crazyem.signals.sample import Sample
 
+PAUSE = 0.002  # s between two rounds of receiving: a twentieth of an update's budget
 TURN = 0.01  # s a worker stays with one drone while others wait
 OLDEST = 1.0  # s of the drone's clock after which an update is made however late it comes
 NEVER = 1 << 30  # samples between updates: none
@@ -80,8 +82,47 @@ class Mailbox:
         self._crew.enqueue(self)  # behind those that wait
 
 
+class Rounds:
+    """One thread that goes round all drones and takes in what has arrived for each."""
+
+    def __init__(self) -> None:
+        self._sources: tuple[Callable[[], bool], ...] = ()
+        self._lock = threading.Lock()  # held during a round
+        self._wanted = threading.Event()
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name="crazyem-receive", daemon=True)
+        self._thread.start()
+
+    def add(self, take_in: Callable[[], bool]) -> None:
+        """Call `take_in` again and again from now on; it must not block, and returns whether there was anything."""
+        with self._lock:
+            self._sources = (*self._sources, take_in)
+        self._wanted.set()
+
+    def remove(self, take_in: Callable[[], bool]) -> None:
+        """Not any more; a call that is under way is waited for."""
+        with self._lock:
+            self._sources = tuple(s for s in self._sources if s != take_in)
+
+    def close(self) -> None:
+        """End the thread."""
+        self._ended = True
+        self._wanted.set()
+        self._thread.join(timeout=10.0)
+
+    def _run(self) -> None:
+        while not self._ended:
+            if not self._sources:
+                self._wanted.wait()
+                self._wanted.clear()
+            with self._lock:
+                some = [take_in() for take_in in self._sources]
+            # also a pause where there was something: packets that come singly would each cost a round
+            time.sleep(PAUSE if any(some) else 2 * PAUSE)
+
+
 class Crew:
-    """Threads that work for all mailboxes, first come, first served.
+    """Threads that work for all mailboxes, first come, first served, and the one that receives for all (`rounds`).
 
     Args:
         workers: None takes one a core.
@@ -95,6 +136,7 @@ class Crew:
         ]
         for thread in self._threads:
             thread.start()
+        self.rounds = Rounds()
 
     def mailbox(self, work: Callable[[Any], None], failed: Callable[[Exception], None]) -> Mailbox:
         """A new one; see `Mailbox`."""
@@ -105,7 +147,8 @@ class Crew:
         self._ready.put(mailbox)
 
     def close(self) -> None:
-        """End the workers; what is in mailboxes by then stays there."""
+        """End the threads; what is in mailboxes by then stays there."""
+        self.rounds.close()
         for _ in self._threads:
             self._ready.put(None)
         for thread in self._threads:

@@ -1,7 +1,8 @@
 """A running estimate over an open link: packets in, samples through the pipeline, everything recorded on the way.
 
 Threads: one receives (records, keeps clock and telemetry; cheap, so flying is never blind), one estimates, one writes
-parameters. Setpoints have a thread of their own (stream.py). None of them waits for another.
+parameters. Setpoints have a thread of their own (stream.py). None of them waits for another. Where one process has many
+sessions, a crew receives and estimates for all of them (crew.py).
 """
 
 import math
@@ -90,7 +91,7 @@ class Session:
         rate: of the log, Hz; beyond 100 the firmware must start blocks by the millisecond.
         reconnect_within: s for which a lost link is tried again, 0 = never. The window is kept: the estimator sees the
             gap in the stamps and begins a new stretch after it.
-        crew: whose threads estimate, where one process has many sessions; None: a thread of the session's own.
+        crew: whose threads receive and estimate, where one process has many sessions; None: threads of its own.
     """
 
     def __init__(
@@ -127,7 +128,10 @@ class Session:
         self.pipeline.on_step = self._stepped
         self.blocks: tuple[Block, ...] = ()
         self._samples: queue.SimpleQueue[list[Sample] | None] = queue.SimpleQueue()
+        self._crew = crew
         self._mailbox: Mailbox | None = crew.mailbox(self._feed, self._estimating_failed) if crew is not None else None
+        self._deaf = False  # nothing is received any more
+        self._bringing_back: threading.Thread | None = None  # a lost link, for a crew: its thread must not wait
         self._link_told = -math.inf
         self._end_wanted = False
         self._stop = threading.Event()
@@ -155,8 +159,10 @@ class Session:
             self.recorder.blocks(self.blocks)
         self._decoders = decoders(self.blocks)
         self._names = {b.identifier: tuple(v.name for v in b.variables) for b in self.blocks}
-        mine = ((self._receive, "crazyem-receive"), (self._estimate, "crazyem-estimate"))
-        for target, name in mine if self._mailbox is None else mine[:1]:
+        if self._crew is not None:
+            self._crew.rounds.add(self._take_in)
+            return
+        for target, name in ((self._receive, "crazyem-receive"), (self._estimate, "crazyem-estimate")):
             thread = threading.Thread(target=target, name=name, daemon=True)
             thread.start()
             self._threads.append(thread)
@@ -262,13 +268,16 @@ class Session:
         self._stop.set()
         for thread in self._threads:
             thread.join(timeout=30.0)
-        if self._mailbox is not None:
+        if self._crew is not None and self._mailbox is not None:
+            self._crew.rounds.remove(self._take_in)
+            if self._bringing_back is not None:
+                self._bringing_back.join(timeout=30.0)
             self._mailbox.wait(30.0)
         if self.pusher is not None:
             self.pusher.close()
         if self.oversight is not None:
             self.oversight.close()
-        if self.recorder is not None and self._threads:
+        if self.recorder is not None and self.blocks:
             account: dict[str, str] = dict(getattr(self.link, "account", dict)())
             self.recorder.metadata("link", {**link_account(self.link.statistics(), self.outages), **account})
 
@@ -296,12 +305,45 @@ class Session:
                         continue
                     break
                 self._packet(item)
-        except CrazyemError as error:
-            self.failure = error
-        except Exception as error:  # a fault of ours must reach the flight as well: it has to land
-            self.failure = CrazyemError(f"receiving failed: {error!r}")
+        except Exception as error:
+            self._receiving_failed(error)
         finally:
             self._samples.put(None)
+
+    def _take_in(self) -> bool:
+        """What has arrived, for a crew's thread; whether there was anything. Never waits."""
+        if self._bringing_back is not None:
+            if self._bringing_back.is_alive():
+                return False
+            self._bringing_back = None
+        some = False
+        try:
+            while not self._deaf and not self._stop.is_set():
+                item = self.link.packets.get_nowait()
+                some = True
+                if isinstance(item, LinkLost):
+                    self._bringing_back = threading.Thread(
+                        target=self._try_to_come_back, args=(item,), name="crazyem-reconnect", daemon=True
+                    )
+                    self._bringing_back.start()
+                    break
+                self._packet(item)
+        except queue.Empty:
+            pass
+        except Exception as error:
+            self._receiving_failed(error)
+        return some
+
+    def _try_to_come_back(self, lost: LinkLost) -> None:
+        try:
+            self._deaf = not self._come_back(lost)
+        except Exception as error:
+            self._receiving_failed(error)
+
+    def _receiving_failed(self, error: Exception) -> None:
+        """A fault of ours must reach the flight as well: it has to land."""
+        self._deaf = True
+        self.failure = error if isinstance(error, CrazyemError) else CrazyemError(f"receiving failed: {error!r}")
 
     @property
     def returning(self) -> bool:
@@ -314,7 +356,7 @@ class Session:
         return self._linked.is_set() and self.lost is None
 
     def _come_back(self, lost: LinkLost) -> bool:
-        """Bring the link back, in the receiving thread: there is nothing else to receive. False: lost for good."""
+        """Bring the link back; there is nothing to receive meanwhile. False: lost for good."""
         reconnect = getattr(self.link, "reconnect", None)
         if reconnect is None or not getattr(self.link, "can_reconnect", True) or self.reconnect_within <= 0.0:
             self.lost = lost

@@ -2,11 +2,12 @@
 
 import csv
 import gzip
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crazyem.physics import rotors
@@ -152,3 +153,23 @@ def test_motor_pwm_in_the_truth_file_gives_its_force_and_torque(shared_recording
     assert np.all(residual.std(0) < 0.35 * truth[flying].std(0))
     slopes = [np.polyfit(truth[flying, i], lagged[flying, i], 1)[0] for i in range(4)]
     np.testing.assert_allclose(slopes, 1.0, atol=0.1)
+
+
+@settings(deadline=None)  # the first call may have to compile
+@given(
+    command=st.tuples(*[st.floats(0.0, 1.0) | st.just(0.0) | st.just(1)] * 4),
+    voltage=st.floats(2.5, 4.3),
+    preset=st.sampled_from(["cf2", "cf2-legacy", "cf21bl"]),
+)
+def test_one_command_gives_what_many_give(command, voltage, preset):
+    vehicle = load_vehicle(preset)
+    plain = rotors.wrench_from_command(np.array(command, float), np.float64(voltage), vehicle)
+    scale = np.abs(plain[0]) * np.array([1.0, vehicle.arm[1], vehicle.arm[0], vehicle.torque_per_thrust])
+    assert rotors.wrench_from_one_command(command, voltage, vehicle) == pytest.approx(
+        plain, abs=float(1e-14 * scale.max() + 1e-30)
+    )
+
+
+def test_one_command_keeps_what_is_not_a_number():
+    assert np.isnan(rotors.wrench_from_one_command((0.5, math.nan, 0.5, 0.5), 4.0, CF2)[0])
+    assert np.isnan(rotors.wrench_from_one_command((0.5, 0.5, 0.5, 0.5), math.nan, CF2)[0])
