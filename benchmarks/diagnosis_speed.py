@@ -1,6 +1,6 @@
 """Time of a diagnosis against the length of the flight, and against one plain numpy filter pass in the same run.
 
-    python benchmarks/diagnosis_speed.py [--seconds 30,60,120,300,1800] [--recording FILE] [--json OUT]
+    python benchmarks/diagnosis_speed.py [--seconds 30,60,120,300,1800] [--recording FILE] [--jobs N] [--json OUT]
 
 The flight is the shipped one, its airborne part repeated with a pause of 0.2 s until it is long enough; so the physics
 to be found is the same at every length. Printed: seconds of each diagnosis with all candidates, by the clock and of the
@@ -76,15 +76,16 @@ def main() -> None:
     parser.add_argument("--seconds", default="30,60,120,300,1800")
     parser.add_argument("--recording", default="logs/payload_excite.mcap")
     parser.add_argument("--vehicle", default="cf2")
+    parser.add_argument("--jobs", type=int, help="threads (default: one a core)")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     recording, vehicle = open_recording(arguments.recording), load_vehicle(arguments.vehicle)
-    diagnose([repeated(recording, 10.0)], vehicle)  # compiled
+    diagnose([repeated(recording, 10.0)], vehicle, jobs=arguments.jobs)  # compiled
     rows = []
     for seconds in map(float, arguments.seconds.split(",")):
         long = repeated(recording, seconds)
         begin, since = time.perf_counter(), time.process_time()
-        found = diagnose([long], vehicle)
+        found = diagnose([long], vehicle, jobs=arguments.jobs)
         taken, busy = time.perf_counter() - begin, time.process_time() - since
         peer = peer_seconds(round(seconds * 100))
         rows.append({"flight_s": seconds, "diagnosis_s": round(taken, 2), "processor_s": round(busy, 2),

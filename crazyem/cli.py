@@ -203,6 +203,7 @@ def _diagnose(commands: Any) -> None:
         "--withhold", action="append", default=[], metavar="SIGNAL", help="a signal to leave unused, e.g. pm.vbat"
     )
     p.add_argument("--candidates", metavar="A,B,...", help="effects to look for (default: the whole catalogue)")
+    p.add_argument("--jobs", type=_integer(1, 64), metavar="N", help="threads (default: one a core)")
     p.add_argument("--report", metavar="OUT.html", help="one self-contained page")
     p.add_argument("--json", metavar="OUT.json", help="the diagnosis for programs; - for standard output")
     p.add_argument("--write-vehicle", metavar="FITTED.toml", help="the vehicle with what was found")

@@ -37,7 +37,9 @@ def run(arguments: argparse.Namespace) -> int:
     held_out = [open_recording(p, options) for p in arguments.held_out]
     vehicle = vehicle_of(recordings[0], arguments.vehicle)
     wanted = [n.strip() for n in (arguments.candidates or "").split(",") if n.strip()]
-    found = diagnose(recordings, vehicle, held_out=held_out, wanted=wanted, withhold=arguments.withhold, say=say)
+    found = diagnose(
+        recordings, vehicle, held_out=held_out, wanted=wanted, withhold=arguments.withhold, jobs=arguments.jobs, say=say
+    )
     say("open-loop errors before and after")
     document, pictures = document_of(found, recordings, held_out, withhold=arguments.withhold)
     document["notices"] = _notices(recordings)

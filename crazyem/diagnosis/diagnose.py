@@ -18,9 +18,12 @@ from crazyem.diagnosis.locate import Located, locate
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.place import depends_on_place
-from crazyem.diagnosis.select import ADMITTED, SURE, Selection, Trial, exchanged, margin, select
+from crazyem.diagnosis.prune import ADMITTED
+from crazyem.diagnosis.select import exchanged, select
+from crazyem.diagnosis.trials import SURE, Selection, Trial, margin
 from crazyem.diagnosis.unexplained import Unexplained, unexplained
 from crazyem.diagnosis.witness import false_speed, late_measurements
+from crazyem.diagnosis.workers import Workers
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
@@ -85,9 +88,13 @@ def diagnose(
     held_out: Sequence[Recording] = (),
     wanted: Sequence[str] = (),
     withhold: Sequence[str] = (),
+    jobs: int | None = 1,
     say: Say = lambda text: None,
 ) -> Diagnosis:
     """Which physics is missing from a vehicle's model, by its recordings.
+
+    Args:
+        jobs: threads that share the candidates; None: one a core. The result is the same for any number.
 
     Raises:
         DataError: a recording cannot be used (no flight, no inputs, too short).
@@ -95,7 +102,8 @@ def diagnose(
     """
     flights = [flight_of(r, vehicle, withhold=withhold) for r in recordings]
     kept_apart = [flight_of(r, vehicle, withhold=withhold) for r in held_out]
-    data, apart = Data(flights), Data(kept_apart) if kept_apart else None
+    workers = Workers(jobs)
+    data, apart = Data(flights, workers), Data(kept_apart, workers) if kept_apart else None
     say(f"nominal model of {vehicle.name}: {sum(f.duration for f in flights):.0f} s of flight")
     bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, first_guess())
     nominal = nominal_of(data, bare)

@@ -12,6 +12,7 @@ from crazyem.diagnosis.flight import Flight
 from crazyem.diagnosis.gram import Gram
 from crazyem.diagnosis.model import Column, Model, Point, Swept
 from crazyem.diagnosis.noise import first_guess, fit_noise
+from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 ROUNDS = 6  # of Gauss-Newton
@@ -44,10 +45,21 @@ class Fitted:
 
 
 class Data:
-    """Flights to be explained together."""
+    """Flights to be explained together.
 
-    def __init__(self, flights: Sequence[Flight]) -> None:
+    Args:
+        workers: who shares the work; without, it is done in the calling thread.
+    """
+
+    def __init__(self, flights: Sequence[Flight], workers: Workers | None = None) -> None:
         self.models = [Model(f) for f in flights]
+        self.workers = workers or Workers(1)
+
+    def twin(self) -> "Data":
+        """The same flights, with the paths of the last pass: what is done to the twin leaves this one as it is."""
+        twin = Data((), self.workers)
+        twin.models = [m.twin() for m in self.models]
+        return twin
 
     @property
     def flights(self) -> list[Flight]:
@@ -61,7 +73,7 @@ class Data:
 
     def loglik(self, point: Point, passes: int = 1) -> float:
         """Log-likelihood [nats]; a start is not counted."""
-        return sum(m.sweep(point, passes=passes).loglik for m in self.models)
+        return sum(self.workers.map(lambda m: m.sweep(point, passes=passes).loglik, self.models))
 
     def block_loglik(self, point: Point) -> NDArray:
         """(b,) log-likelihood by blocks of all flights [nats]."""
@@ -69,7 +81,7 @@ class Data:
 
     def settle(self, point: Point) -> list[Swept]:
         """Physics evaluated at the filter's own states."""
-        return [m.settle(point) for m in self.models]
+        return self.workers.map(lambda m: m.settle(point), self.models)
 
     def converge(self, point: Point) -> None:
         """Pass until physics is evaluated where the filter is; where sensors show the state itself, one is enough."""
@@ -88,7 +100,7 @@ class Data:
         for model in self.models:
             acceleration, _ = model.accelerations(point)
             parts.append((model.flight, acceleration, model.offsets(point, acceleration)))
-        return replace(point, noise=fit_noise(parts, point.noise, iterations=iterations))
+        return replace(point, noise=fit_noise(parts, point.noise, iterations=iterations, workers=self.workers))
 
     def leave_out_wild(self, point: Point) -> int:
         """Begin anew where a step fits nothing (a stalled link, pulses of command between samples); returns how many.
@@ -119,8 +131,7 @@ class Data:
     def gram_and_loglik(self, point: Point, columns: Sequence[Column]) -> tuple[Gram, float]:
         """Score and information of columns, and the log-likelihood."""
         score, information, flight, loglik = [], [], [], 0.0
-        for i, model in enumerate(self.models):
-            swept = model.sweep(point, columns)
+        for i, swept in enumerate(self.workers.map(lambda m: m.sweep(point, columns), self.models)):
             score.append(swept.score)
             information.append(swept.information)
             flight.append(np.full(len(swept.score), i))

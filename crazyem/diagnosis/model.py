@@ -154,6 +154,10 @@ class Model:
     _felt_alone: bool | None = None
     _vibration: NDArray | None = None
 
+    def twin(self) -> "Model":
+        """A model that remembers the same; arrays are shared, as they are only ever replaced."""
+        return replace(self, _thrusts=dict(self._thrusts))
+
     def thrusts(self, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, NDArray]:
         """Thrusts after the lag; remembered, since most columns change nothing before the rotors."""
         before = {n: effects[n] for n in effects if _before_rotors(n)}

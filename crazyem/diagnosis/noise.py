@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.flight import Flight
 from crazyem.diagnosis.model import Noise, Swept, run_sweep
+from crazyem.diagnosis.workers import Workers
 
 ROWS = 1500  # of each flight, in a few stretches, from which the scales are taken
 STRETCH = 750  # rows each: short ones begin too often at what was measured, and velocities seem better than they are
@@ -51,7 +52,12 @@ def first_guess() -> Noise:
 
 
 def fit_noise(
-    parts: list[tuple[Flight, NDArray, NDArray]], start: Noise, *, iterations: int = 8, tolerance: float = 0.2
+    parts: list[tuple[Flight, NDArray, NDArray]],
+    start: Noise,
+    *,
+    iterations: int = 8,
+    tolerance: float = 0.2,
+    workers: Workers | None = None,
 ) -> Noise:
     """Noise scales of highest posterior density, the accelerations (n, 6) and offsets (n, 12) of each flight given.
 
@@ -60,12 +66,14 @@ def fit_noise(
     """
     if iterations >= FROM_AFAR and any(f.time.size > FEW for f, _, _ in parts):
         few = [(f.rows(k), a[k], o[k]) for f, a, o in parts for k in (sample_rows(f, rows=FEW, stretch=SHORT),)]
-        start = _scored(few, start, iterations, 5 * tolerance)
+        start = _scored(few, start, iterations, 5 * tolerance, workers or Workers(1))
     chosen = [(f.rows(keep), a[keep], o[keep]) for f, a, o in parts for keep in (sample_rows(f),)]
-    return _scored(chosen, start, iterations, tolerance)
+    return _scored(chosen, start, iterations, tolerance, workers or Workers(1))
 
 
-def _scored(chosen: list[tuple[Flight, NDArray, NDArray]], start: Noise, iterations: int, tolerance: float) -> Noise:
+def _scored(
+    chosen: list[tuple[Flight, NDArray, NDArray]], start: Noise, iterations: int, tolerance: float, workers: Workers
+) -> Noise:
     measured = np.zeros(4, bool)
     for flight, _, _ in chosen:
         measured |= np.array([np.isfinite(flight.y[:, c]).any() for c in (0, 3, 6, 10)])
@@ -88,11 +96,7 @@ def _scored(chosen: list[tuple[Flight, NDArray, NDArray]], start: Noise, iterati
     here = sweep(logs)
     value = posterior(here, logs)
     for _ in range(iterations):
-        slopes = []
-        for i in index:
-            moved = logs.copy()
-            moved[i] += STEP
-            slopes.append(sweep(moved))
+        slopes = workers.map(sweep, logs + STEP * np.eye(logs.size)[index])
         score, information = np.zeros(index.size), np.zeros((index.size, index.size))
         for part, base in enumerate(here):
             seen = base.variance > 0

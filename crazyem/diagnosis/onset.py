@@ -47,7 +47,8 @@ def date(data: Data, fitted: Fitted, candidate: Candidate) -> tuple[Fitted, Cand
     for reach, step in SCANS:
         count = round(reach / step)
         tried = [begins + k * step for k in range(-count, count + 1)]
-        values = [data.loglik(fitted.point.with_effects({candidate.effect: {ONSET: at}})) for at in tried]
+        points = [fitted.point.with_effects({candidate.effect: {ONSET: at}}) for at in tried]
+        values = data.workers.map(lambda point: data.twin().loglik(point), points)
         begins = tried[int(np.argmax(values))]
         moved = replace(candidate, fixed=tuple((n, begins if n == ONSET else v) for n, v in candidate.fixed))
         others = tuple(moved if c is candidate else c for c in fitted.candidates)

@@ -9,7 +9,7 @@ from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.locate import AXES, Finding, Located, strongest
 from crazyem.diagnosis.model import Point, Swept
 from crazyem.diagnosis.restless import erratic_rotor, humps
-from crazyem.diagnosis.select import Selection
+from crazyem.diagnosis.trials import Selection
 from crazyem.vehicle import GRAVITY
 
 STRUCTURE = 25.0  # nats of structure left over that count as unexplained

@@ -15,7 +15,7 @@ from crazyem.diagnosis.fit import Data, nominal, remembering, starting_point
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.place import depends_on_place
-from crazyem.diagnosis.select import Trial, both, margin, told_apart
+from crazyem.diagnosis.trials import Trial, both, margin, told_apart
 from crazyem.diagnosis.witness import false_speed, late_measurements
 from crazyem.recordings.recording import Recording
 

@@ -1,0 +1,136 @@
+"""Leaving out again what the final model does not need, or what noise of another kind explains as well."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from crazyem.diagnosis.always import nuisances, on_held_out, refine_base, without
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.fit import TORQUES, Data, Fitted, moved
+from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.restless import beside_peaks, peaks
+from crazyem.diagnosis.trials import LIKELY, SURE, Step, both, matters, significance, wald
+
+ADMITTED = 8.0  # nats of evidence that an effect must bring
+HELD = 3.0  # nats it must bring on flight held out
+WANDERING = 10.0  # nats that disturbing torques with memory must gain to be allowed for
+
+
+def drop(
+    data: Data,
+    fitted: Fitted,
+    accepted: list[Candidate],
+    steps: list[Step],
+    held_out: Data | None,
+    say: Callable[[str], None],
+) -> tuple[Fitted, list[Candidate], list[Step]]:
+    """Leave out again what the final model does not need, on the flights fitted or on those held out."""
+    accepted, steps = list(accepted), list(steps)
+    while accepted:
+        here = data.loglik(fitted.point, passes=2)
+        held_here = on_held_out(held_out, fitted.point, accepted).loglik if held_out else 0.0
+        judged = []
+        for c, (less, held_less) in zip(accepted, bare_fits(data, held_out, fitted, accepted), strict=True):
+            step = next(s for s in steps if s.taken and s.taken.candidate.effect == c.effect)
+            assert step.taken is not None
+            gain = (here - less.loglik) / step.taken.dispersion
+            held = (held_here - held_less) / step.taken.dispersion
+            judged.append((gain - len(c.free) + held, gain, held, c, less))
+            now = replace(step.taken, gain=gain * step.taken.dispersion, held_out=held * step.taken.dispersion)
+            steps = [replace(s, taken=now) if s is step and held_out else s for s in steps]
+        worst = min(judged, key=lambda j: min(j[0], j[2] + ADMITTED - HELD if held_out else j[0]))
+        if worst[0] > ADMITTED and (held_out is None or worst[2] > HELD):
+            break
+        say(f"  left out again: {worst[3].label}")
+        accepted.remove(worst[3])
+        steps = [s for s in steps if s.taken is None or s.taken.candidate.effect != worst[3].effect]
+        fitted = refine_base(data, worst[4].point, accepted)
+    return fitted, accepted, steps
+
+
+def bare_fits(
+    data: Data, held_out: Data | None, fitted: Fitted, accepted: Sequence[Candidate]
+) -> list[tuple[Fitted, float]]:
+    """The fit without each of the effects, and its log-likelihood on flights held out."""
+
+    def bare(candidate: Candidate) -> tuple[Fitted, float]:
+        rest = [a for a in accepted if a is not candidate]
+        less = refine_base(data.twin(), without(fitted.point, candidate.effect), rest, rounds=2, noise=False)
+        return less, on_held_out(held_out.twin(), less.point, rest).loglik if held_out else 0.0
+
+    return data.workers.map(bare, accepted)
+
+
+def survive(
+    data: Data,
+    fitted: Fitted,
+    accepted: list[Candidate],
+    steps: list[Step],
+    held_out: Data | None,
+    say: Callable[[str], None],
+) -> tuple[Fitted, list[Candidate], list[Step]]:
+    """Leave out what is no longer significant once torques may wander: noise with memory looks like a wrong inertia."""
+    while accepted:
+        noise = replace(fitted.point.noise, disturbance=np.concatenate([np.zeros(3), TORQUES]), memory=1.0)
+        point = data.fit_noise(replace(fitted.point, noise=noise), iterations=5)
+        if data.loglik(point, passes=2) < data.loglik(fitted.point, passes=2) + WANDERING:
+            break
+        wandering = refine_base(data, point, accepted, rounds=2, noise=False)
+        sure, offset = [], 0
+        for c in accepted:
+            p_value = significance(wandering, len(c.free), offset=offset)
+            if held_out and SURE <= p_value < LIKELY:
+                taken = next(s.taken for s in steps if s.taken and s.taken.candidate.effect == c.effect)
+                p_value = both(p_value, held_gain(data, held_out, wandering, accepted, c) / taken.dispersion)
+            sure.append(p_value)
+            offset += len(c.free)
+        worst = int(np.argmax(sure))
+        if sure[worst] < SURE:
+            break
+        say(f"  left out again, torques may wander: {accepted[worst].label}")
+        fitted, accepted, steps = left_out(data, fitted, accepted, steps, accepted[worst])
+    return fitted, accepted, steps
+
+
+def held_gain(data: Data, held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate) -> float:
+    """What an effect as fitted gains on flights held out [nats]."""
+    rest = [a for a in accepted if a is not candidate]
+    less = refine_base(data, without(fitted.point, candidate.effect), rest, rounds=2, noise=False)
+    there = on_held_out(held_out, fitted.point, accepted).loglik
+    return there - on_held_out(held_out, less.point, rest).loglik
+
+
+def outlive(
+    data: Data, nominal: Point, fitted: Fitted, accepted: list[Candidate], steps: list[Step], say: Callable[[str], None]
+) -> tuple[Fitted, list[Candidate], list[Step]]:
+    """Leave out what speaks in a hump of the spectrum only: the loop answers a vibration, so gains seem wrong there."""
+    found = [peaks(m, nominal) for m in data.models]  # before what is always free gave way to them
+    while accepted and any(found):
+        free = [*accepted, *(c for c, _ in nuisances(data, fitted.point, accepted))]
+        gram = beside_peaks(data, fitted.point, [x for c in free for x in c.columns(fitted.point)], found)
+        here = np.array([c.values(fitted.point)[n] - c.neutral(fitted.point)[n] for c in free for n in c.free])
+        away = np.where(fitted.precision > 0, here, 0.0)
+        solution = gram.solve(range(gram.size), precision=fitted.precision, prior=-away)
+        sure, offset = [], 0
+        for c in accepted:
+            at = slice(offset, offset + len(c.free))
+            p_value = wald(here[at] + solution.theta[at], solution.covariance[at, at], gram, gram.size)
+            there = moved(fitted.point, accepted, solution.theta[: sum(len(a.free) for a in accepted)])
+            sure.append(p_value if matters(there, c) else 1.0)
+            offset = at.stop
+        worst = int(np.argmax(sure))
+        if sure[worst] < SURE:
+            break
+        say(f"  left out again, it speaks where something shakes only: {accepted[worst].label}")
+        fitted, accepted, steps = left_out(data, fitted, accepted, steps, accepted[worst])
+    return fitted, accepted, steps
+
+
+def left_out(
+    data: Data, fitted: Fitted, accepted: list[Candidate], steps: list[Step], candidate: Candidate
+) -> tuple[Fitted, list[Candidate], list[Step]]:
+    """Without one of the effects, fitted again."""
+    rest = [a for a in accepted if a is not candidate]
+    kept = [s for s in steps if s.taken is None or s.taken.candidate.effect != candidate.effect]
+    return refine_base(data, without(fitted.point, candidate.effect), rest), rest, kept

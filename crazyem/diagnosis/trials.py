@@ -1,0 +1,142 @@
+"""Effects that were tried, and how two of them are compared: evidence, significance, what cannot be told apart."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from crazyem.diagnosis.always import solved
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.fit import Fitted
+from crazyem.diagnosis.gram import Gram
+from crazyem.diagnosis.model import Point
+
+SURE = 1e-3  # p-value of the score test, before counting candidates,
+LIKELY = 1e-2  # which flights held out may lower where it is below this
+CLOSE = 4.0  # nats within which two explanations cannot be told apart,
+TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks
+# Smaller than this, these are not told from what filters and sampling do: s, s, 1, rad, rad/s, 1.
+LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "velocity_scale": 0.05, "attitude_misalignment": 2e-3,
+         "gyro_bias": 3e-3, "torque_scale": 0.05}  # fmt: skip
+LEAST_INERTIA = 0.06  # relative, the same
+LEAST_CENTRE = {"x": 1e-4, "y": 1e-4, "z": 1e-3}  # m; z shows in lateral accelerations of O alone
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A candidate, tried beside the effects already found.
+
+    Attributes:
+        candidate: which.
+        gain: log-likelihood beyond the model before it [nats], on the flights fitted.
+        held_out: the same on held-out flights or blocks.
+        dispersion: by how much scores scatter more than the model says.
+        p_value: of the score test.
+        evidence: what counts: gain over dispersion less the number of parameters, and the held-out gain.
+        fitted: the model with it; None if only the linear approximation was looked at.
+        blocks: (b,) its log-likelihood by blocks of the flights fitted and of those held out.
+    """
+
+    candidate: Candidate
+    gain: float
+    held_out: float
+    dispersion: float
+    p_value: float
+    evidence: float
+    fitted: Fitted | None = None
+    blocks: NDArray = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True)
+class Step:
+    """One turn of the selection: all trials, best first, and which was taken (None: the end)."""
+
+    trials: tuple[Trial, ...]
+    taken: Trial | None
+    alike: tuple[Trial, ...] = ()
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What was selected: the nominal model, the final one, and how it came about."""
+
+    nominal: Point
+    final: Point
+    steps: tuple[Step, ...]
+    accepted: tuple[Candidate, ...]
+    fitted: Fitted
+    tried: int
+
+
+def margin(best: Trial, other: Trial) -> tuple[float, float]:
+    """Log-likelihood of one less that of the other, each less its number of parameters, with its standard deviation.
+
+    The scatter of the difference over blocks counts, in which all that both miss cancels (Vuong 1989), with half of the
+    covariance of neighbours on each side.
+    """
+    d = best.blocks - other.blocks
+    centred = d - d.mean()
+    variance = float(centred @ centred + max(0.0, float(centred[1:] @ centred[:-1])))
+    return float(d.sum()) - len(best.candidate.free) + len(other.candidate.free), float(np.sqrt(variance)) + 1e-9
+
+
+def told_apart(best: Trial, other: Trial) -> bool:
+    """Whether the flights prefer the one by more than chance."""
+    nats, sd = margin(best, other)
+    return nats > CLOSE and nats > TOLD * sd
+
+
+def weighed(trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
+    """Evidence of each, the same dispersion for all so that likelihoods are compared and not scatters; best first."""
+    if not trials:
+        return []
+    common = float(np.median([t.dispersion for t in trials]))
+    judged = [
+        replace(t, evidence=(t.gain + (t.held_out if counted else 0.0)) / common - len(t.candidate.free))
+        for t in trials
+    ]
+    return sorted(judged, key=lambda t: (t.p_value >= SURE, -t.evidence))
+
+
+def both(p_value: float, held: float) -> float:
+    """p-value on the flights fitted and on those held out, where the effect as fitted brings `held` nats.
+
+    By chance a likelihood ratio of fixed models exceeds exp(held) with a probability of at most exp(-held).
+    """
+    return p_value * float(np.exp(-max(held, 0.0))) if p_value < LIKELY else p_value
+
+
+def own_evidence(trial: Trial, *, counted: bool) -> float:
+    """Evidence by the candidate's own scatter: what it must bring to be admitted."""
+    return (trial.gain + (trial.held_out if counted else 0.0)) / trial.dispersion - len(trial.candidate.free)
+
+
+def significance(fitted: Fitted, count: int, *, offset: int) -> float:
+    """p-value that `count` free parameters from `offset` on are neutral, by their covariance at the maximum (Wald)."""
+    solution, taken = solved(fitted)
+    at = slice(offset, offset + count)
+    away = np.array([c.values(fitted.point)[n] - c.neutral(fitted.point)[n] for c in fitted.candidates for n in c.free])
+    return wald(away[at], solution.covariance[at, at], fitted.gram, taken)
+
+
+def wald(away: NDArray, covariance: NDArray, gram: Gram, columns: float) -> float:
+    """p-value that parameters (k,) `away` from neutral with a covariance (k, k) are neutral, of so many columns."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    z = away / scale
+    distance = float(z @ np.linalg.lstsq(covariance / np.outer(scale, scale), z, rcond=1e-9)[0])
+    return float(stats.f.sf(distance / len(z), len(z), max(len(gram.score) - columns, 3)))
+
+
+def matters(point: Point, candidate: Candidate) -> bool:
+    """Whether the effect is larger than what an onboard filter or the sampling of a log looks like."""
+    least = LEAST.get(candidate.effect)
+    here, neutral = candidate.values(point), candidate.neutral(point)
+    if candidate.effect == "center_of_mass":
+        return any(abs(here[n] - neutral[n]) > LEAST_CENTRE[n] for n in candidate.free)
+    if candidate.effect == "inertia":
+        return any(abs(here[n] / neutral[n] - 1.0) > LEAST_INERTIA for n in candidate.free)
+    if least is None:
+        return True
+    return any(abs(here[n] - neutral[n]) > least for n in candidate.free)
