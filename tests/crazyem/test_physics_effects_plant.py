@@ -16,6 +16,7 @@ from crazyem.physics.effects.effect import Effects, Situation
 from crazyem.physics.motion import RotorInput, measured, motion, rotor_thrust
 from crazyem.vehicle import Vehicle
 from firmware_sim.plant import layout as at
+from firmware_sim.plant.effects.catalogue import EFFECTS
 from firmware_sim.plant.effects.motion import origin
 from firmware_sim.plant.effects.sensing import seen_pose
 from firmware_sim.plant.effects.step import feel, plant_step_with_effects
@@ -159,3 +160,15 @@ def test_every_effect_that_moves_the_drone_is_compared() -> None:
     compared = {name for effects in CASES.values() for name in effects}
     moving = {name for name, e in CATALOGUE.items() if e.measured is None and e.speed is None and name != "gusts"}
     assert compared == moving
+
+
+def test_the_simulator_flies_whatever_a_fit_may_find():
+    """A fitted vehicle must not be refused by the simulator that is to fly like the drone: its bounds hold ours."""
+    narrower = [
+        (name, ours.name)
+        for name, effect in CATALOGUE.items()
+        for ours in effect.parameters
+        for theirs in EFFECTS[name].parameters
+        if theirs.name == ours.name != "onset_time" and not theirs.low <= ours.low <= ours.high <= theirs.high
+    ]
+    assert narrower == []

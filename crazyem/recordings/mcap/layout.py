@@ -3,7 +3,7 @@
 One for a drone and its recording, one for several drones streamed live: /NAME before their topics (live/foxglove.py).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from crazyem.recordings.mcap.messages import WORLD
@@ -56,19 +56,9 @@ def foxglove_layout(topics: Mapping[str, Sequence[str]] | None = None) -> dict[s
         ("Link and power", _columns(_columns("Plot!link", "Plot!latency"), _columns("Plot!motors", "Plot!voltage"))),
         ("Messages", "RawMessages!estimate"),
     )
-    panels["Tab!right"] = {"activeTabIdx": 0, "tabs": [{"title": title, "layout": layout} for title, layout in tabs]}
-    return {
-        "configById": panels,
-        "globalVariables": {},
-        "userNodes": {},
-        "playbackConfig": {"speed": 1},
-        "layout": {
-            "direction": "row",
-            "first": {"direction": "column", "first": "3D!pose", "second": "RosOut!log", "splitPercentage": 70},
-            "second": "Tab!right",
-            "splitPercentage": 45,
-        },
-    }
+    picture = {"direction": "column", "first": "3D!pose", "second": "RosOut!log", "splitPercentage": 70}
+    whole = {"direction": "row", "first": picture, "second": "Tab!right", "splitPercentage": 45}
+    return _document({**panels, "Tab!right": _tabs(tabs)}, whole)
 
 
 def swarm_layout(names: Sequence[str]) -> dict[str, Any]:
@@ -108,14 +98,8 @@ def swarm_layout(names: Sequence[str]) -> dict[str, Any]:
             _columns(own["Plot!link"], own["Plot!latency"]), _columns(own["Plot!motors"], own["Plot!voltage"])
         )
         tabs.append((name, _rows(_rows(left, middle), _rows(right, own["RawMessages!estimate"]))))
-    panels["Tab!drones"] = {"activeTabIdx": 0, "tabs": [{"title": title, "layout": layout} for title, layout in tabs]}
-    return {
-        "configById": panels,
-        "globalVariables": {},
-        "userNodes": {},
-        "playbackConfig": {"speed": 1},
-        "layout": {**_rows("3D!pose", "Tab!drones"), "splitPercentage": 30},
-    }
+    whole = {**_rows("3D!pose", "Tab!drones"), "splitPercentage": 30}
+    return _document({**panels, "Tab!drones": _tabs(tabs)}, whole)
 
 
 def _of_drone(panel: dict[str, Any], name: str) -> dict[str, Any]:
@@ -246,3 +230,18 @@ def _columns(first: Any, second: Any) -> dict[str, Any]:
 def _rows(first: Any, second: Any) -> dict[str, Any]:
     """One beside the other."""
     return {"direction": "row", "first": first, "second": second}
+
+
+def _tabs(tabs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    return {"activeTabIdx": 0, "tabs": [{"title": title, "layout": layout} for title, layout in tabs]}
+
+
+def _document(panels: Mapping[str, Any], layout: Mapping[str, Any]) -> dict[str, Any]:
+    """What the viewer reads: the panels' settings and how the window is divided among them."""
+    return {
+        "configById": dict(panels),
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": dict(layout),
+    }

@@ -61,7 +61,7 @@ EFFECTS: dict[str, Effect] = {
         Effect("center_of_mass", _xyz("m", 0.0, -0.1, 0.1)),
         Effect("linear_drag", _xyz("N s/m", 0.0, 0.0, 0.5)),
         Effect("quadratic_drag", _xyz("N s^2/m^2", 0.0, 0.0, 0.1)),
-        Effect("velocity_moment", _xyz("N m s/m", 0.0, -1e-3, 1e-3, "roll_per_vy pitch_per_vx")),
+        Effect("velocity_moment", _xyz("N m s/m", 0.0, -5e-3, 5e-3, "roll_per_vy pitch_per_vx")),
         Effect("rate_damping", _xyz("N m s", 0.0, 0.0, 1e-3)),
         Effect("motor_lag", (Parameter("time_constant", "s", None, 0.0, 1.0),)),
         Effect("input_delay", (Parameter("delay", "s", 0.0, 0.0, LONGEST_DELAY),)),
