@@ -97,6 +97,7 @@ class OnlineEstimator:
             filter integrates its gyro: its attitude errs as its rates do, and for longer than a sample lasts.
 
     Attributes:
+        every, refresh: samples between updates and updates between full passes (12); both may be changed on the way.
         airborne: verdict of the contact gate on the newest node.
         update_seconds: wall-clock cost of each update [s].
         full_updates: how many updates made full passes.
@@ -129,6 +130,7 @@ class OnlineEstimator:
         self.vehicle = vehicle
         self.window = window
         self.every = every
+        self.refresh = REFRESH
         self._input = input_signal
         self._make_setup = partial(
             setup_for, vehicle, mass=mass, inertia=inertia, integration=integration, known_noise=known_noise
@@ -376,7 +378,7 @@ class OnlineEstimator:
         em.incremental(first, self._fresh, last, lookback=LOOKBACK)
         self._fresh = last
         young = last - first < min(YOUNG, self.window)
-        if young or self._moved(em) or self._updates % REFRESH == 0:
+        if young or self._moved(em) or self._updates % self.refresh == 0:
             passes = 12 if last - first < NEWBORN else 4 if young else 2
             self.full_updates += 1
             self._information = em.converge(first, last, passes=passes, tolerance=CLOSE)

@@ -157,6 +157,15 @@ class StepAwareEstimator:
         self.inner.every = samples
 
     @property
+    def refresh(self) -> int:
+        """Updates between two full passes, as the inner one; may be set."""
+        return self.inner.refresh
+
+    @refresh.setter
+    def refresh(self, updates: int) -> None:
+        self.inner.refresh = updates
+
+    @property
     def adapting(self) -> bool:
         """Whether the window is shorter than usual because of a step."""
         return self.inner.window < self.window

@@ -3,7 +3,7 @@
 import math
 import queue
 import threading
-import time
+import time as clock
 from collections.abc import Callable, Mapping, Sequence
 
 from crazyem.errors import CrazyemError
@@ -13,6 +13,7 @@ from crazyem.live.guard import Decision, Guard
 from crazyem.live.history import History, Push
 
 WRITE_TIMEOUT = 1.0  # s; an echo takes 2 to 30 ms on a working link, and the link asks again three times
+MOMENT = 0.2  # s before the next attempt: a link that refuses at once is known as lost a little later
 ATTEMPTS = 3  # of a write: what was lost in an outage is written again when the link is back
 
 
@@ -98,7 +99,7 @@ class Pusher:
     def close(self) -> None:
         """Finish what is queued, then end; bounded by the time one write and its undoing may take."""
         self._queue.put(None)
-        self._thread.join(timeout=2 * ATTEMPTS * self.timeout + 1.0)
+        self._thread.join(timeout=2 * ATTEMPTS * (self.timeout + 2 * MOMENT) + 1.0)
         if self._thread.is_alive():
             self.history.notice("parameter writes were still waiting for the drone when the session ended.")
 
@@ -150,8 +151,10 @@ class Pusher:
     def _write(self, time: float, name: str, value: float, *, purpose: str = "push") -> bool:
         verified, why, failed = False, "no echo came", 0
         for attempt in range(2 * ATTEMPTS):
-            if attempt and not self.wait_for_link():
-                break
+            if attempt:
+                clock.sleep(MOMENT)
+                if not self.wait_for_link():
+                    break
             outages = self.outages()
             verified, why = self._attempt(name, value)
             # One during which the link was lost was none: an outage is noticed two seconds after its last packet.
@@ -185,7 +188,7 @@ class Pusher:
     @staticmethod
     def _unconfirmed(name: str, value: float) -> ParameterWrite:
         """A write of which nothing is known: its packet may have left before the link failed."""
-        return ParameterWrite(name, value, None, False, time.time())
+        return ParameterWrite(name, value, None, False, clock.time())
 
     def _record(self, write: ParameterWrite) -> None:
         try:

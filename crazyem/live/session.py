@@ -322,6 +322,7 @@ class Session:
                 item = self.link.packets.get_nowait()
                 some = True
                 if isinstance(item, LinkLost):
+                    self._linked.clear()
                     self._bringing_back = threading.Thread(
                         target=self._try_to_come_back, args=(item,), name="crazyem-reconnect", daemon=True
                     )
@@ -339,6 +340,8 @@ class Session:
             self._deaf = not self._come_back(lost)
         except Exception as error:
             self._receiving_failed(error)
+        finally:
+            self._linked.set()
 
     def _receiving_failed(self, error: Exception) -> None:
         """A fault of ours must reach the flight as well: it has to land."""

@@ -15,6 +15,7 @@ from crazyem.estimation.online import OnlineEstimator
 from crazyem.links.base import LinkLost, LinkStatistics, Outage, ParameterWrite
 from crazyem.links.crazyflie import CrazyflieLink
 from crazyem.live.controllers import LEE
+from crazyem.live.crew import Crew
 from crazyem.live.flight import Flight, FlightPlan
 from crazyem.live.mcap_recorder import open_recorder
 from crazyem.live.session import Session, link_account
@@ -79,9 +80,21 @@ class _Filter:
     def get(self, timeout=None):
         return self.link._passed.get(timeout=timeout)
 
+    def get_nowait(self):
+        return self.link._passed.get_nowait()
 
-def fly(link, kind=excite, duration=8.0, recorder=None):
-    session = Session(link, vehicle=load_vehicle("cf2"), estimator=fake.FakeEstimator(), recorder=recorder)
+
+@pytest.fixture(params=["a session's own threads", "a crew's"])
+def crew(request):
+    """One drone among others is received by the thread that receives for all; it must outlive an outage as well."""
+    one = Crew(2) if request.param == "a crew's" else None
+    yield one
+    if one is not None:
+        one.close()
+
+
+def fly(link, kind=excite, duration=8.0, recorder=None, crew=None):
+    session = Session(link, vehicle=load_vehicle("cf2"), estimator=fake.FakeEstimator(), recorder=recorder, crew=crew)
     plan = FlightPlan(
         trajectory=lambda position, yaw: kind(position=position, yaw=yaw, duration=duration), controller=LEE
     )
@@ -94,9 +107,9 @@ def fly(link, kind=excite, duration=8.0, recorder=None):
     return session
 
 
-def test_a_flight_goes_on_after_an_outage():
+def test_a_flight_goes_on_after_an_outage(crew):
     link = LosingLink(speed=5.0)
-    session = fly(link)
+    session = fly(link, crew=crew)
     assert [o.reason for o in session.outages] == ["it was away."]
     assert session.lost is None
     assert any("was gone for 0.1 s" in n for n in session.history.notices)
@@ -107,22 +120,22 @@ def test_a_flight_goes_on_after_an_outage():
     assert [e.samples for e in session.history.estimates] == sorted(e.samples for e in session.history.estimates)
 
 
-def test_an_outage_that_lasts_ends_the_flight_in_one_sentence():
+def test_an_outage_that_lasts_ends_the_flight_in_one_sentence(crew):
     link = LosingLink(speed=5.0, comes_back=False)
     with pytest.raises(
         LinkError, match=r"^the drone at fake://0 was lost: it was away; the drone did not come back\.$"
     ):
-        fly(link)
+        fly(link, crew=crew)
 
 
-def test_a_link_that_cannot_come_back_is_not_asked():
+def test_a_link_that_cannot_come_back_is_not_asked(crew):
     link = LosingLink(speed=5.0)
     link.can_reconnect = False
     with pytest.raises(LinkError, match="was lost: it was away"):
-        fly(link)
+        fly(link, crew=crew)
 
 
-def test_a_write_that_falls_into_an_outage_is_made_up_for():
+def test_a_write_that_falls_into_an_outage_is_made_up_for(crew):
     """The first push finds the link gone; it is written when the link is back, and pushing goes on."""
     link = LosingLink(speed=5.0, gone_at=None)
     write = link.write_parameter
@@ -135,7 +148,7 @@ def test_a_write_that_falls_into_an_outage_is_made_up_for():
         return write(name, value, timeout)
 
     link.write_parameter = lost_with_the_first_push
-    session = fly(link, hover)
+    session = fly(link, hover, crew=crew)
     assert link.refused
     assert session.history.pushes
     assert all(p.verified for p in session.history.pushes)

@@ -1,5 +1,6 @@
 """Several drones on one computer: the crew that estimates for all, and updates that are left out."""
 
+import threading
 import time
 
 import pytest
@@ -44,6 +45,27 @@ def test_items_of_a_mailbox_are_worked_off_in_order_and_one_at_a_time(crew):
     assert max(worst) == 1
 
 
+def test_one_thread_takes_in_for_all_until_it_is_told_not_to(crew):
+    calls = {"a": [], "b": []}
+    sources = {k: lambda k=k: bool(calls[k].append(threading.current_thread().name)) for k in calls}
+    for source in sources.values():
+        crew.rounds.add(source)
+    _until(lambda: min(map(len, calls.values())) > 5)
+    crew.rounds.remove(sources["a"])
+    count = len(calls["a"])
+    after = len(calls["b"])
+    _until(lambda: len(calls["b"]) > after + 5)
+    assert len(calls["a"]) == count
+    assert set(calls["a"] + calls["b"]) == {"crazyem-receive"}
+
+
+def _until(condition):
+    deadline = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+
+
 def test_a_mailbox_that_fails_ends_alone(crew):
     errors, done = [], []
 
@@ -80,6 +102,7 @@ class Counting:
 
     def __init__(self, every=4):
         self.every, self.since, self.fed, self.updates = every, 0, 0, []
+        self.refresh = 12
         self.airborne, self.update_seconds = True, []
 
     def feed(self, sample):
@@ -132,9 +155,16 @@ def test_however_late_an_update_a_second_is_made():
 
 
 def test_updates_of_several_drones_are_out_of_step():
-    firsts = [run_paced([0.0] * 200, number=i, of=12)[0].updates for i in range(12)]
-    assert sorted(n for ((_, n), *_) in firsts) == [4 * k for k in range(1, 13)]
-    assert all(n == 4 for updates in firsts for _, n in updates[1:])
+    inner = [run_paced([0.0] * 200, number=i, of=25)[0] for i in range(25)]
+    assert sorted(n for ((_, n), *_) in (i.updates for i in inner)) == [4 * k for k in range(1, 26)]
+    assert all(n == 4 for i in inner for _, n in i.updates[1:])
+    assert all(i.refresh == 25 for i in inner)  # the costly passes come once a second, each in a turn of its own
+
+
+def test_few_drones_make_full_passes_as_often_as_one():
+    inner = [run_paced([0.0] * 200, number=i, of=3)[0] for i in range(3)]
+    assert [i.updates[0][1] for i in inner] == [4, 4 + 16, 4 + 32]
+    assert all(i.refresh == 12 for i in inner)
 
 
 def test_a_paced_estimator_on_time_is_the_estimator_bit_for_bit_and_a_late_one_close_to_it():
