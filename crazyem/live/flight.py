@@ -17,6 +17,7 @@ from crazyem.live.telemetry import ARMED, CAN_FLY, FLYING, Telemetry
 
 BASELINE = 3.0  # s of hover before anything is pushed: shows what the drone does with what it believes now
 CONFIRMED_WITHIN = 0.25  # s; without setpoints the drone levels out after 0.5 s
+OVERTAKEN = 0.15  # s of host time by which packets may overtake one another
 HAND_OVERS, HAND_OVER_EVERY = 3, 0.04  # times that the drone is handed back to land, s between them
 SILENCE = 3.0  # s of host time without a packet after which the drone counts as lost
 
@@ -214,6 +215,7 @@ class Flight:
         if self._stream is not None:
             self._stream.stop()
             self._stream = None
+            self._let_setpoints_arrive()
         height = self.telemetry.height - self._ground
         duration = 1.0 + 1.5 * max(height if math.isfinite(height) else 1.0, 0.3)
         for _ in range(2):
@@ -230,6 +232,12 @@ class Flight:
         self.link.stop()
         self._may_fly = False
         self._enter("landed")
+
+    def _let_setpoints_arrive(self) -> None:
+        """One that came after the plan to land would make the drone forget it, and the release then stop the motors."""
+        # an accelerated simulator's drone levels out after 0.5 s of its own time without setpoints
+        until = time.monotonic() + OVERTAKEN / max(1.0, self.session.clock.rate / 3.0)
+        self._wait(lambda: time.monotonic() >= until, math.inf)
 
     def _hand_over(self, duration: float) -> None:
         """The drone to the high-level commander, with a plan to land.
