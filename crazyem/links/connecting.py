@@ -70,7 +70,8 @@ class _Progress:
         self.wake = threading.Event()
         self.done = False
         self.failure = ""
-        self.answers = 0
+        self.answers = 0  # different ones
+        self._seen: set[tuple[int, int, bytes]] = set()
         self.last_answer = time.monotonic()
         self.awaited = ""
         crazyflie.packet_sent.add_callback(self._sent)
@@ -98,7 +99,12 @@ class _Progress:
     def _received(self, packet: Any) -> None:
         # Log data of a former session, console text and ping echoes say nothing about our requests.
         key = (packet.port, packet.channel)
-        if key != _LOG_DATA and packet.port != _CONSOLE_PORT and key != (_LINK_PORT, 0):
+        if key == _LOG_DATA or packet.port == _CONSOLE_PORT or key == (_LINK_PORT, 0):
+            return
+        # Nor does an answer that came before: it is what cflib made nothing of, asked for again and again.
+        answer = (*key, bytes(packet.data))
+        if answer not in self._seen:
+            self._seen.add(answer)
             self.answers += 1
             self.last_answer = time.monotonic()
 

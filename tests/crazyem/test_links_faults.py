@@ -4,6 +4,7 @@ import contextlib
 import struct
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 from conftest import FakePeer
@@ -11,6 +12,7 @@ from relayed import down, now_on, relayed, up
 
 from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import LinkLost, Packet
+from crazyem.links.connecting import _Progress, new_crazyflie
 from crazyem.links.crazyflie import CrazyflieLink
 from crazyem.live.session import STATE
 from crazyem.signals.vocabulary import standard_variables
@@ -385,3 +387,15 @@ def test_setpoints_go_on_when_only_the_way_down_is_lost(clock_peer, monkeypatch)
         heard = sum(r[0] >> 4 == 7 for r in clock_peer.requests)
     assert sent > 50
     assert heard > 0.8 * sent
+
+
+def test_an_answer_that_comes_again_and_again_is_no_progress():
+    """cflib may make nothing of an answer that is asked for again: the attempt stands still and has to be given up."""
+    progress = _Progress(new_crazyflie("udp://127.0.0.1:9"))
+    progress._received(SimpleNamespace(port=2, channel=1, data=b"\x07\x00\x00\x01"))
+    first = progress.last_answer = 0.0
+    for data, answers in ((b"\x07\x00\x00\x01", 1), (b"\x07\x00\x00\x02", 2), (b"\x08\x00\x00\x01", 3)):
+        progress._received(SimpleNamespace(port=2, channel=1, data=data))
+        assert progress.answers == answers
+        assert (progress.last_answer > first) == (answers > 1)
+    progress.detach()
