@@ -31,6 +31,7 @@ import numpy as np
 
 BUDGET = 0.040  # s: four samples at 100 Hz
 PREFED = 900  # samples before the clock starts
+SETTLING = 4.0  # s flown before anything is measured: two updates of a window do not settle the estimates
 SLOTS = 5  # moments within 10 ms at which some of the drones' packets arrive
 
 
@@ -142,7 +143,7 @@ def prefeed(link: StreamLink, watched: Watched) -> None:
         for block in (1, 0):
             for sample in decoders[block].decode(Packet(block, 10 * k + 1000, 0.0, link.rows[k][block])):
                 inner.feed(sample)
-    inner.every = every
+    inner.every, inner._since = every, 0  # or all would make their first update at once, and be in step from then on
 
 
 def run_streams(count: int, *, seconds: float, workers: int | None, record: bool, window: int, cold: bool) -> Any:
@@ -157,7 +158,7 @@ def run_streams(count: int, *, seconds: float, workers: int | None, record: bool
     crew = Crew(workers) if workers != 0 else None
     skip = 0 if cold else PREFED
     flown = min(count, 5)  # different flights; making one takes a second
-    links = [StreamLink(1 + i % flown, seconds + skip / 100 + 2.0) for i in range(flown)]
+    links = [StreamLink(1 + i % flown, seconds + skip / 100 + SETTLING + 2.0) for i in range(flown)]
     with tempfile.TemporaryDirectory() as scratch:
         watched = []
         for i in range(count):
@@ -167,25 +168,29 @@ def run_streams(count: int, *, seconds: float, workers: int | None, record: bool
             if not cold:
                 prefeed(link, one)
             watched.append(one)
-        feeder_seconds = [0.0]
-        begin, spent = time.monotonic(), time.process_time()
-        for one in watched:
-            one.begin()
+        settling = 0 if cold else round(100 * SETTLING)
+        since = (0.0, 0.0, 0.0)  # by the clock, of the processor, of it the feeder's
+        first = time.monotonic()
 
         def feed() -> None:
-            started = time.thread_time()
-            for k in range(round(100 * seconds)):
+            nonlocal since
+            for k in range(settling + round(100 * seconds)):
+                if k == settling:
+                    since = (time.monotonic(), time.process_time(), time.thread_time())
+                    for one in watched:
+                        one.begin()
                 for slot in range(SLOTS):
-                    due = begin + 0.01 * k + 0.01 * slot / SLOTS
+                    due = first + 0.01 * k + 0.01 * slot / SLOTS
                     time.sleep(max(due - time.monotonic(), 0.0))
                     for one in watched[slot::SLOTS]:
                         one.link.send(skip + k)
-            feeder_seconds[0] = time.thread_time() - started
+            feeder_seconds.append(time.thread_time() - since[2])
 
+        feeder_seconds: list[float] = []
         feeder = threading.Thread(target=feed)
         feeder.start()
         feeder.join()
-        took, spent = time.monotonic() - begin, time.process_time() - spent
+        took, spent = time.monotonic() - since[0], time.process_time() - since[1]
         results = [one.end() for one in watched]
         for one in watched:
             one.session.close()

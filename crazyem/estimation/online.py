@@ -97,7 +97,7 @@ class OnlineEstimator:
             filter integrates its gyro: its attitude errs as its rates do, and for longer than a sample lasts.
 
     Attributes:
-        every, refresh: samples between updates and updates between full passes (12); both may be changed on the way.
+        every: samples between updates; may be changed on the way.
         airborne: verdict of the contact gate on the newest node.
         update_seconds: wall-clock cost of each update [s].
         full_updates: how many updates made full passes.
@@ -130,7 +130,7 @@ class OnlineEstimator:
         self.vehicle = vehicle
         self.window = window
         self.every = every
-        self.refresh = REFRESH
+        self._refresh, self._deferring, self._owed = REFRESH, False, False
         self._input = input_signal
         self._make_setup = partial(
             setup_for, vehicle, mass=mass, inertia=inertia, integration=integration, known_noise=known_noise
@@ -193,11 +193,24 @@ class OnlineEstimator:
     def feed(self, sample: Sample) -> Estimate | None:
         """Take one sample; returns an estimate when an update was due. Samples of unknown signals are ignored."""
         result = None
+        if self._owed:
+            begin = clock.perf_counter()
+            self._full_passes()
+            self.update_seconds[-1] += clock.perf_counter() - begin
         if sample.time != self._group_time:
             result = self._close_group()
             self._group_time = sample.time
         self._group[sample.signal] = sample.value
         return result
+
+    def share_computer(self, refresh: int) -> None:
+        """Be quick to answer, for one of many: full passes when the estimate is out, and rarer.
+
+        They cost as much as twenty updates, and others wait meanwhile. What they find is in the next estimate. Once the
+        window is full they come every `refresh` updates, twice a window at least, or when a parameter has moved by a
+        standard deviation.
+        """
+        self._refresh, self._deferring = min(refresh, max(REFRESH, self.window // (2 * self.every))), True
 
     def finish(self) -> Estimate:
         """The estimate of the newest window, converged, with fresh uncertainty.
@@ -207,6 +220,7 @@ class OnlineEstimator:
         """
         self._close_group()
         self._admit(flush=True)
+        self._owed = False
         if self._inputs.size == 0:
             raise DataError(
                 f"nothing to estimate from: vehicle '{self.vehicle.name}' needs "
@@ -378,20 +392,31 @@ class OnlineEstimator:
         em.incremental(first, self._fresh, last, lookback=LOOKBACK)
         self._fresh = last
         young = last - first < min(YOUNG, self.window)
-        if young or self._moved(em) or self._updates % self.refresh == 0:
-            passes = 12 if last - first < NEWBORN else 4 if young else 2
-            self.full_updates += 1
-            self._information = em.converge(first, last, passes=passes, tolerance=CLOSE)
-            self._reference = em.parameters
-            self._converged = self._information.decrement < PASSED and self._information.noise_length < PASSED_NOISE
-            self._marginal = self._refreshed.refresh(em, first, last, self._information)
+        refresh = self._refresh if last - first == self.window else REFRESH  # what is known grows with the window
+        if young or self._moved(em) or self._updates % refresh == 0:
+            self._owed = self._deferring and not young and self._information is not None
+            if not self._owed:
+                self._full_passes()
+
+    def _full_passes(self) -> None:
+        em, last = self._em, self._tape.size
+        assert em is not None
+        self._owed = False
+        first = max(0, last - self.window)
+        passes = 12 if last - first < NEWBORN else 4 if last - first < min(YOUNG, self.window) else 2
+        self.full_updates += 1
+        self._information = em.converge(first, last, passes=passes, tolerance=CLOSE)
+        self._reference = em.parameters
+        self._converged = self._information.decrement < PASSED and self._information.noise_length < PASSED_NOISE
+        self._marginal = self._refreshed.refresh(em, first, last, self._information)
 
     def _moved(self, em: WindowEM) -> bool:
         """Whether a parameter has moved since the last full passes by more than older rows' expectations can bear."""
         if self._reference is None or self._information is None:
             return True
         change = np.abs(offset(em.parameters.theta, self._reference.theta, em.setup.unit))[:5]
-        limit = np.minimum(np.maximum(MOVED_SD * self._information.sd[:5], MOVED), MOVED_FAR)
+        bearable = 2.0 * MOVED_SD if self._deferring else MOVED_SD
+        limit = np.minimum(np.maximum(bearable * self._information.sd[:5], MOVED), MOVED_FAR)
         return bool((change > limit).any())
 
     # what goes out ------------------------------------------------------------------------------------------

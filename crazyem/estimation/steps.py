@@ -156,14 +156,9 @@ class StepAwareEstimator:
     def every(self, samples: int) -> None:
         self.inner.every = samples
 
-    @property
-    def refresh(self) -> int:
-        """Updates between two full passes, as the inner one; may be set."""
-        return self.inner.refresh
-
-    @refresh.setter
-    def refresh(self, updates: int) -> None:
-        self.inner.refresh = updates
+    def share_computer(self, refresh: int) -> None:
+        """As `OnlineEstimator.share_computer`."""
+        self.inner.share_computer(refresh)
 
     @property
     def adapting(self) -> bool:

@@ -24,7 +24,7 @@ TURN = 0.01  # s a worker stays with one drone while others wait
 OLDEST = 1.0  # s of the drone's clock after which an update is made however late it comes
 NEVER = 1 << 30  # samples between updates: none
 FULL_PASSES_EVERY = 12  # updates; the costly ones of several drones should not fall together,
-MANY, RARELY = 5, 25  # and beyond so many drones they are made every so many updates: once a second
+MANY, RARELY = 5, 100  # and beyond so many drones they come every so many updates, unless something moves
 
 
 class Mailbox:
@@ -164,7 +164,7 @@ class Paced:
     """An estimator that leaves updates out while it is late, and whose updates are out of step with the others'.
 
     Args:
-        inner: an OnlineEstimator, or one with its `feed`, `finish` and the attributes `every` and `refresh`.
+        inner: an OnlineEstimator, or one with its `feed`, `finish`, `share_computer` and the attribute `every`.
         number, of: this drone among all: shifts its first update by a share of a full round of updates.
         late: s behind the newest packet at which an update is left out; None takes an update's share of time at 100 Hz.
 
@@ -180,7 +180,7 @@ class Paced:
         self._every = int(inner.every)
         self._late = late if late is not None else 0.01 * self._every
         if of > MANY:
-            inner.refresh = RARELY
+            inner.share_computer(RARELY)
         self._phase = round(number * self._every * (RARELY if of > MANY else FULL_PASSES_EVERY) / of)
         self._held = 0  # samples of one signal for which an update was due and none was made
         self._last = math.nan
