@@ -403,6 +403,7 @@ def test_one_of_many_makes_fewer_full_passes_and_says_nearly_the_same(flight):
         assert np.sqrt(np.mean(apart**2)) < 0.4
         assert np.abs(apart).max() < 1.0
         assert all(0.5 < b[name].sd / a[name].sd < 2.0 for a, b in pairs)  # of the last full passes each
-    # the last pass is made whatever was owed
+    # the last passes are made whatever was owed
+    final, other = alone.finish(), shared.finish()
     for name in NAMES:
-        assert shared.finish()[name].value == pytest.approx(alone.finish()[name].value, rel=1e-4)
+        assert other[name].value == pytest.approx(final[name].value, abs=0.05 * final[name].sd)
