@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -31,7 +32,8 @@ def drop(
         here = data.loglik(fitted.point, passes=2)
         held_here = on_held_out(held_out, fitted.point, accepted).loglik if held_out else 0.0
         judged = []
-        for c, (less, held_less) in zip(accepted, bare_fits(data, held_out, fitted, accepted), strict=True):
+        bare = data.workers.map(partial(bare_fit, data, held_out, fitted, accepted), accepted)
+        for c, (less, held_less) in zip(accepted, bare, strict=True):
             step = next(s for s in steps if s.taken and s.taken.candidate.effect == c.effect)
             assert step.taken is not None
             gain = (here - less.loglik) / step.taken.dispersion
@@ -49,17 +51,13 @@ def drop(
     return fitted, accepted, steps
 
 
-def bare_fits(
-    data: Data, held_out: Data | None, fitted: Fitted, accepted: Sequence[Candidate]
-) -> list[tuple[Fitted, float]]:
-    """The fit without each of the effects, and its log-likelihood on flights held out."""
-
-    def bare(candidate: Candidate) -> tuple[Fitted, float]:
-        rest = [a for a in accepted if a is not candidate]
-        less = refine_base(data.twin(), without(fitted.point, candidate.effect), rest, rounds=2, noise=False)
-        return less, on_held_out(held_out.twin(), less.point, rest).loglik if held_out else 0.0
-
-    return data.workers.map(bare, accepted)
+def bare_fit(
+    data: Data, held_out: Data | None, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate
+) -> tuple[Fitted, float]:
+    """The fit without one of the effects, and its log-likelihood on flights held out; changes nothing of the data."""
+    rest = [a for a in accepted if a is not candidate]
+    less = refine_base(data.twin(), without(fitted.point, candidate.effect), rest, rounds=2, noise=False)
+    return less, on_held_out(held_out.twin(), less.point, rest).loglik if held_out else 0.0
 
 
 def survive(
@@ -95,10 +93,8 @@ def survive(
 
 def held_gain(data: Data, held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate) -> float:
     """What an effect as fitted gains on flights held out [nats]."""
-    rest = [a for a in accepted if a is not candidate]
-    less = refine_base(data, without(fitted.point, candidate.effect), rest, rounds=2, noise=False)
     there = on_held_out(held_out, fitted.point, accepted).loglik
-    return there - on_held_out(held_out, less.point, rest).loglik
+    return there - bare_fit(data, held_out, fitted, accepted, candidate)[1]
 
 
 def outlive(
