@@ -24,6 +24,7 @@ from crazyem.diagnosis.trials import SURE, Selection, Trial, margin
 from crazyem.diagnosis.unexplained import Unexplained, unexplained
 from crazyem.diagnosis.witness import false_speed, late_measurements
 from crazyem.diagnosis.workers import Workers
+from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
@@ -190,7 +191,11 @@ def _beside(
         known = gusts is not None and gusts.speed < usual_gusts(point.vehicle)
         if gusts is not None and not known and gusts.moving_air and remains.force_nats < FIXED * gusts.gain:
             memory_sd = gusts.memory * gusts.memory_sd
-            low, high = np.exp(np.log(gusts.memory) + np.array([-1.96, 1.96]) * gusts.memory_sd)
+            # a memory that the flight says nothing of has an interval without end
+            p = next(p for p in CATALOGUE["gusts"].parameters if p.name == "correlation_time")
+            with np.errstate(over="ignore"):
+                around = np.exp(np.log(gusts.memory) + np.array([-1.96, 1.96]) * gusts.memory_sd)
+            low, high = np.clip(around, p.low, p.high)
             values = {
                 "standard_deviation": Value(gusts.speed, "m/s", gusts.speed_sd, _around(gusts.speed, gusts.speed_sd)),
                 "correlation_time": Value(gusts.memory, "s", memory_sd, (float(low), float(high))),
@@ -274,8 +279,6 @@ def _named(
         if alike or equal:
             group = tuple(dict.fromkeys([candidate.effect, *(t.candidate.effect for t in alike), *equal]))
             groups.append(group)
-            from crazyem.physics.effects.catalogue import CATALOGUE
-
             separate += [CATALOGUE[n].separates for n in group if CATALOGUE[n].separates]
     order = sorted(range(len(named)), key=lambda i: -_evidence(selection, i))
     return tuple(named[i] for i in order), tuple(groups), tuple(dict.fromkeys(separate))

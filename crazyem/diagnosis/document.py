@@ -185,16 +185,16 @@ def text_of(document: Mapping[str, Any]) -> str:
 
     lines = [verdict(document)]
     for f in document["where"][:6]:
-        lines.append(
-            f"  where: {f['signal']} {f['axis']}, {f['regime']}: {f['effect_size']:+.3g} +- {f['sd']:.2g} {f['unit']}"
-        )
+        size = f"{_short(f['effect_size'], '+.3g')} +- {_short(f['sd'], '.2g')} {f['unit']}"
+        lines.append(f"  where: {f['signal']} {f['axis']}, {f['regime']}: {size}")
     for e in document["effects"]:
         held = e["evidence"]["held_out_nats"]
-        lines.append(f"  {e['label']}  (confidence {e['confidence']:.2f}, held out {held:.1f} nats)")
+        sure = _short(e["confidence"], ".2f")
+        lines.append(f"  {e['label']}  (confidence {sure}, held out {_short(held, '.1f')} nats)")
         for name, p in e["parameters"].items():
             if "ci95" in p:
-                low, high = p["ci95"]
-                lines.append(f"    {name:16s} {p['value']:.5g} {p['unit']}  (95 %: {low:.5g} to {high:.5g})")
+                value, low, high = (_short(v, ".5g") for v in (p["value"], *p["ci95"]))
+                lines.append(f"    {name:16s} {value} {p['unit']}  (95 %: {low} to {high})")
             else:
                 lines.append(f"    {name:16s} {p['value']}")
     for group in document["indistinguishable"]:
@@ -202,7 +202,7 @@ def text_of(document: Mapping[str, Any]) -> str:
     lines += [f"    would separate them: {text}" for text in document["would_separate"]]
     if document["unexplained"]["found"]:
         for f in document["unexplained"]["where"][:4]:
-            size = f"{f['effect_size']:+.3g} {f['unit']}"
+            size = f"{_short(f['effect_size'], '+.3g')} {f['unit']}"
             lines.append(f"  unexplained: {f['signal']} {f['axis']}, {f['regime']}: {size}")
     for part, title in (("train", "fitted flight"), ("held_out", "held-out flight")):
         both = document["fit"][part]
@@ -217,8 +217,9 @@ def text_of(document: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _short(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
+def _short(value: float | None, how: str = ".3g") -> str:
+    """A number of the document, which has null for what is not finite."""
+    return "-" if value is None else format(value, how)
 
 
 def _number(value: Any) -> float | None:

@@ -10,10 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis import accelerometer
 from crazyem.diagnosis.compare import compare
+from crazyem.diagnosis.diagnose import _beside, diagnose
+from crazyem.diagnosis.document import document_of, text_of
 from crazyem.diagnosis.fit import Data, nominal, starting_point
 from crazyem.diagnosis.flight import flight_of, without
-from crazyem.diagnosis.gusts import find_gusts
+from crazyem.diagnosis.gusts import Gusts, find_gusts
 from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.unexplained import Unexplained
 from crazyem.errors import DataError
 from crazyem.recordings import open_recording
 from crazyem.vehicle import load_vehicle
@@ -55,6 +58,35 @@ def test_without_an_accelerometer_nothing_is_said(recording):
 
 def test_a_calm_flight_has_no_gusts(recording):
     assert find_gusts(*fitted(recording)) is None
+
+
+def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(monkeypatch):
+    """As in a recording whose forces last for one sample each: the logarithm's error was 30 000."""
+    found = Gusts(5000.0, np.ones(3), 0.25, 3e4, True, 1.6, 0.05)
+    monkeypatch.setattr("crazyem.diagnosis.diagnose.find_gusts", lambda data, point: found)
+    vehicle, remains = load_vehicle("cf2"), Unexplained(False, (), 0.0, 1.0)
+    data, point = Data(()), starting_point(Point(vehicle, {}, None))
+    (named,) = _beside(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
+    assert named.parameters["correlation_time"].ci95 == (0.01, 100.0)
+    assert named.parameters["standard_deviation"].ci95 == pytest.approx((1.502, 1.698))
+
+
+def test_what_is_not_finite_is_said_as_a_dash(recording):
+    """The document has null for it."""
+    found = diagnose([recording], load_vehicle("cf2"), wanted=["linear_drag"])
+    document, _ = document_of(found, [recording], [], withhold=[])
+    unknown = {"value": 0.2, "unit": "s", "sd": None, "ci95": [0.01, None]}
+    document["effects"] = [
+        {"name": "gusts", "label": "gusts", "parameters": {"correlation_time": unknown}, "confidence": 0.4,
+         "evidence": {"held_out_nats": None, "p_value": 0.0}}
+    ]  # fmt: skip
+    document["where"] = [
+        {"signal": "force", "axis": "z", "regime": "always", "effect_size": 0.1, "sd": None, "unit": "N"}
+    ]
+    text = text_of(document)
+    assert "held out - nats" in text
+    assert "(95 %: 0.01 to -)" in text
+    assert "+0.1 +- - N" in text
 
 
 def test_a_recording_compared_with_itself_and_with_itself_moved(recording):
