@@ -284,10 +284,22 @@ def tables(done: dict[str, Any]) -> str:
             x, y, z = s["force_rms"]
             out.append(f"| {name.replace('_', ', ')} | {x}, {y}, {z} | {s['position_rms']} |")
         out.append("")
+    if "crazypad" in done:
+        out += ["| crazypad: flight, by the file fitted to | what was said first |", "| --- | --- |"]
+        for name, found in _diagnoses("", done["crazypad"]):
+            out.append(f"| {name.removeprefix(': ')} | {found['text'].strip().splitlines()[0]} |")
+        out.append("")
     for part, entry in done.items():
-        for name, found in _diagnoses(part, entry):
+        for name, found in _diagnoses(part, entry) if part != "crazypad" else []:
             out += [f"### {name}", "", "```text", found["text"].strip(), "```", ""]
     return "\n".join(out)
+
+
+def public(value: Any) -> Any:
+    """Without the places of this machine's files."""
+    if isinstance(value, dict):
+        return {k: public(v) for k, v in value.items() if k != "fitted"}
+    return [public(v) for v in value] if isinstance(value, list) else value
 
 
 def _delay(entry: dict[str, float] | None) -> str:
@@ -315,7 +327,7 @@ def main() -> None:
     for name in filter(None, arguments.parts.split(",")):
         print(f"{name} ...", flush=True)
         done[name] = PARTS[name](arguments.shared, arguments.work)
-        path.write_text(json.dumps({k: done[k] for k in PARTS if k in done}, indent=1) + "\n")
+        path.write_text(json.dumps(public({k: done[k] for k in PARTS if k in done}), indent=1) + "\n")
     page = arguments.docs / "diagnosis_real.md"
     if page.is_file():
         text = page.read_text()
