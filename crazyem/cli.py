@@ -222,6 +222,7 @@ def _predict(commands: Any) -> None:
     p.add_argument(
         "--every", type=_integer(1, 1_000_000), default=1, metavar="K", help="samples from start to start (default: 1)"
     )
+    p.add_argument("--plain", action="store_true", help="the model alone, however wrong its turning was before a start")
     p.add_argument("-o", "--output", required=True, metavar="OUT.npz", help="array `prediction`, and which starts")
     p.add_argument("--force", action="store_true", help="replace what is there (never a recording that is read)")
     _reading(p)

@@ -37,6 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
             horizon=arguments.horizon,
             step=arguments.step,
             every=arguments.every,
+            plain=arguments.plain,
             progress=lambda done, total: progress.show(f"predict: {done} of {total} starts"),
         )
     write(output, found.arrays())

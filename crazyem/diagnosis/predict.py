@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.diagnosis.earned import Turned, earned
 from crazyem.diagnosis.inputs import Inputs, inputs_of
 from crazyem.diagnosis.simulate import Simulator
 from crazyem.doctor.kinematics import quaternion_of_euler
@@ -163,6 +164,7 @@ def predict(
     horizon: int,
     step: float | None = None,
     every: int = 1,
+    plain: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Prediction:
     """Predict `horizon` steps from every `every`-th recorded state.
@@ -173,6 +175,7 @@ def predict(
         step: s between predicted states; None: the recording's own samples, so that row h of start i is the state at
             sample i + h + 1, at its own stamp.
         every: samples from one start to the next.
+        plain: the model alone; else its torque is believed as much as it was right before the start (see `earned`).
         progress: told how many starts of how many are done.
 
     Raises:
@@ -190,11 +193,16 @@ def predict(
     times = np.empty((rows.size, horizon))
     simulator = Simulator(shown.inputs)
     swings = simulator.swings(shown.time, shown.state[:, 3:6])
+    span = horizon * (shown.period if step is None else step)
+    weights = None if plain else earned(turned_by(shown), shown.time[rows], horizon=span)
     done = 0
     for part in _parts(rows, max(1, min(CHUNK, 2_000_000 // horizon))):
         grid = _times(shown, part, horizon=horizon, step=step)
         result[done : done + part.size] = simulator.run(
-            shown.state[part], grid, swing=None if swings is None else swings[part]
+            shown.state[part],
+            grid,
+            swing=None if swings is None else swings[part],
+            weights=None if weights is None else weights.of(slice(done, done + part.size)),
         )
         times[done : done + part.size] = grid[:, 1:]
         done += part.size
@@ -204,6 +212,22 @@ def predict(
         result, times, shown.time[rows], shown.row[rows], shown.age[rows], shown.airborne[rows],
         shown.period if step is None else step,
     )  # fmt: skip
+
+
+def turned_by(shown: Recorded) -> Turned:
+    """What the model says of the turning of a recorded flight, one step ahead of every row."""
+    simulator = Simulator(shown.inputs)
+    swings = simulator.swings(shown.time, shown.state[:, 3:6])
+    gained, flying = np.zeros((shown.time.size, 3)), np.zeros(shown.time.size, bool)
+    rows = np.arange(shown.time.size - 1)
+    rows = rows[np.isfinite(shown.state[rows]).all(axis=1) & shown.airborne[rows] & shown.airborne[rows + 1]]
+    rows = rows[start_rows(shown, rows, horizon=1, step=None) & (np.diff(shown.time)[rows] < MAX_GAP)]
+    for part in _parts(rows, CHUNK):
+        grid = shown.time[part[:, None] + np.arange(2)]
+        ahead = simulator.run(shown.state[part], grid, swing=None if swings is None else swings[part])
+        gained[part] = ahead[:, 0, 10:13] - shown.state[part, 10:13]
+    flying[rows] = True
+    return Turned(shown.time, shown.state[:, 10:13], gained, flying)
 
 
 def start_rows(shown: Recorded, rows: NDArray, *, horizon: int, step: float | None) -> NDArray:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.course import ThrustCourse
+from crazyem.diagnosis.earned import Weights
 from crazyem.diagnosis.inputs import Inputs
 from crazyem.physics.effects.effect import Effects, Situation
 from crazyem.physics.effects.measurement_delay import LONGEST_STEP
@@ -34,6 +35,8 @@ class _Body:
     """States of n simulations, true, not as shown; what hangs below a drone is part of its state.
 
     position, velocity (n, 3) world, attitude (n, 4), rate (n, 3) body, swing (n, 6) of a suspended load or None.
+    Where the model's torque is weighed: since (n,) s from the start, gained (n, 3) rad/s, what its angular acceleration
+    added until now.
     """
 
     position: NDArray
@@ -41,6 +44,8 @@ class _Body:
     attitude: NDArray
     rate: NDArray
     swing: NDArray | None = None
+    since: NDArray | None = None
+    gained: NDArray | None = None
 
     @staticmethod
     def of(state: NDArray) -> "_Body":
@@ -92,6 +97,8 @@ class Simulator:
         self.course = ThrustCourse(inputs.rotor, vehicle=self.vehicle, effects=self.effects)
         sensors = [values for effect, values in active(self.effects, self.vehicle) if effect.measured is not None]
         self._shows = bool(sensors)
+        self._weights: Weights | None = None
+        self._begun = np.zeros((0, 3))
         self._late: NDArray | float = 0.0  # s: what was not known of the delay at each start
         self._looks_back = max((float(values.get("delay", 0.0)) for values in sensors), default=0.0)  # s
         values = {effect.name: found for effect, found in active(self.effects, self.vehicle)}
@@ -123,6 +130,7 @@ class Simulator:
         attitude: Callable[[NDArray], tuple[NDArray, NDArray]] | None = None,
         given: NDArray | None = None,
         substep: float = SUBSTEP,
+        weights: Weights | None = None,
     ) -> NDArray:
         """Predicted states at times[:, 1:].
 
@@ -135,6 +143,7 @@ class Simulator:
             given: (n,) s until when inputs may be known, after which the last is held; None: the beginning of the last
                 step.
             substep: largest step of the integration [s].
+            weights: of the model's angular acceleration, by start and time since; None: 1.
 
         Returns: (n, N, 13), as the recording would show them.
         """
@@ -150,6 +159,9 @@ class Simulator:
             body, before = self._true(start, times[:, 0], known)
             turn = quaternion_product(quaternion_conjugate(start.attitude), body.attitude)
             bias = body.rate - start.rate
+            if weights is not None:
+                body = replace(body, since=np.zeros(len(state)), gained=np.zeros((len(state), 3)))
+                self._weights, self._begun = weights, body.rate
             for k in range(times.shape[1] - 1):
                 begin, span = times[:, k], times[:, k + 1] - times[:, k]
                 pieces = max(1, int(np.ceil(float(span.max(initial=0.0)) / substep - 1e-6)))
@@ -178,7 +190,10 @@ class Simulator:
         h = step[:, None]
         acceleration = np.einsum("nij,nj->ni", rotation, moved.specific_force) - np.array([0.0, 0.0, GRAVITY])
         velocity = body.velocity + h * acceleration
-        rate = body.rate + h * moved.angular_acceleration
+        rate, since, gained = body.rate + h * moved.angular_acceleration, body.since, body.gained
+        if since is not None and gained is not None and self._weights is not None:
+            since, gained = since + step, gained + h * moved.angular_acceleration
+            rate = self._begun + self._weights.changed(since, gained)
         swing = body.swing
         if swing is not None and self._length is not None and (step > 0).all():  # going back, it is left as it is
             air = np.broadcast_to(self._air, velocity.shape)
@@ -191,6 +206,8 @@ class Simulator:
             turned(body.attitude, 0.5 * h * (body.rate + rate)),
             rate,
             swing,
+            since,
+            gained,
         )
 
     def _situation(

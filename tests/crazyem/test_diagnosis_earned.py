@@ -1,0 +1,124 @@
+"""What a model's turning is worth in a prediction: by regression on the past alone, against a plain version."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from crazyem.cli import main
+from crazyem.diagnosis.earned import (
+    LEAST_TIME,
+    MEMORY,
+    OFFSET_SD,
+    WEIGHT_SD,
+    Turned,
+    Weights,
+    earned,
+    regressed,
+)
+
+STEP = 0.01  # s
+
+
+def flight(seed: int, *, seconds: float, weight: float, offset: float, error: float) -> Turned:
+    """Rates that change by `weight` of what the model says, an offset [rad/s^2] and white noise [rad/s]."""
+    draw = np.random.default_rng(seed)
+    time = np.arange(0.0, seconds, STEP)
+    acceleration = 4.0 * np.stack([np.sin(2 * np.pi * f * time) for f in (0.7, 1.1, 1.7)], 1)
+    gained = acceleration * STEP
+    rate = np.concatenate([np.zeros((1, 3)), np.cumsum(weight * gained + offset * STEP, axis=0)[:-1]])
+    return Turned(time, rate + error * draw.standard_normal(rate.shape), gained, np.ones(time.size, bool))
+
+
+def test_weight_and_offset_are_found_by_the_past() -> None:
+    turned = flight(0, seconds=30.0, weight=0.4, offset=1.5, error=0.01)
+    found = earned(turned, np.array([0.5, 29.0]), horizon=0.5)
+    assert np.array_equal(found.weight[0], np.ones((11, 3)))  # nothing was seen yet
+    assert np.array_equal(found.added[0], np.zeros((11, 3)))
+    assert found.weight[1, 4:] == pytest.approx(0.4, abs=0.03)
+    assert found.added[1, 4:] == pytest.approx(1.5 * found.lags[4:, None] * np.ones(3), abs=0.05)
+
+
+def test_a_model_that_is_right_is_believed() -> None:
+    found = earned(flight(1, seconds=30.0, weight=1.0, offset=0.0, error=0.02), np.array([29.0]), horizon=0.5)
+    assert found.weight[0, 2:] == pytest.approx(1.0, abs=0.05)
+    assert np.abs(found.added[0]).max() < 0.05
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 1000), st.floats(3.0, 9.0))
+def test_nothing_after_a_start_counts(seed: int, start: float) -> None:
+    turned = flight(seed, seconds=10.0, weight=0.5, offset=0.0, error=0.1)
+    after = turned.time > start + 1e-9
+    changed = Turned(
+        turned.time,
+        np.where(after[:, None], 7.0 * turned.rate + 3.0, turned.rate),
+        np.where(after[:, None], -turned.gained, turned.gained),
+        turned.flying & ~(turned.time > start + 0.3),
+    )
+    one, other = (earned(t, np.array([start]), horizon=0.5) for t in (turned, changed))
+    assert np.array_equal(one.weight, other.weight)
+    assert np.array_equal(one.added, other.added)
+
+
+def test_the_running_sums_are_those_of_a_plain_loop() -> None:
+    draw = np.random.default_rng(5)
+    x, lag = draw.standard_normal(400), 0.2
+    y = 0.3 * x + 0.1 + 0.2 * draw.standard_normal(400)
+    found = regressed(x, y, lag, STEP)
+    for k in (250, 399):
+        age = np.exp(-(k - np.arange(k + 1)) * STEP / MEMORY)
+        rows = np.stack([x[: k + 1], np.full(k + 1, lag)], 1)
+        a, b = (rows * age[:, None]).T @ rows, (rows * age[:, None]).T @ y[: k + 1]
+        rest = y[: k + 1] - rows @ np.linalg.solve(a, b)
+        noise = (age * rest**2).sum() / age.sum() * (lag / STEP)
+        prior = np.diag([WEIGHT_SD**-2, OFFSET_SD**-2])
+        wanted = np.linalg.solve(a / noise + prior, b / noise + prior @ np.array([1.0, 0.0]))
+        assert found[k] == pytest.approx(wanted, rel=1e-6)
+
+
+def test_gaps_and_missing_rates_are_left_out() -> None:
+    turned = flight(2, seconds=20.0, weight=0.6, offset=0.0, error=0.01)
+    rate = turned.rate.copy()
+    rate[900:1100] += 50.0  # a jump on either side of what is not known
+    rate[898:900] = np.nan
+    rate[1100:1102] = np.nan
+    found = earned(Turned(turned.time, rate, turned.gained, turned.flying), np.array([19.9]), horizon=0.5)
+    assert found.weight[0, 3:] == pytest.approx(0.6, abs=0.03)
+
+
+def test_between_lags_weights_are_interpolated() -> None:
+    lags = np.array([0.0, 0.1, 0.2])
+    weights = Weights(lags, np.ones((1, 3, 3)) * np.array([1.0, 0.5, 0.0])[:, None], np.zeros((1, 3, 3)))
+    for since, wanted in ((0.0, 1.0), (0.05, 0.75), (0.15, 0.25), (0.3, 0.0)):
+        changed: NDArray = weights.changed(np.array([since]), np.full((1, 3), 2.0))
+        assert changed == pytest.approx(2.0 * wanted * np.ones((1, 3)), abs=1e-5)
+
+
+def test_a_short_flight_says_nothing() -> None:
+    turned = flight(3, seconds=LEAST_TIME, weight=0.1, offset=0.0, error=0.0)
+    found = earned(turned, turned.time[-1:], horizon=0.5)
+    assert np.array_equal(found.weight, np.ones((1, 11, 3)))
+
+
+def test_the_command_predicts_better_than_the_model_alone(tmp_path: Path) -> None:
+    """The shipped flight by a file that knows nothing of what was done to the drone."""
+    log = Path(__file__).parents[2] / "logs" / "payload_excite.mcap"
+    errors = {}
+    for name, more in (("earned", []), ("plain", ["--plain"])):
+        out = tmp_path / f"{name}.npz"
+        words = ["predict", str(log), "--vehicle", "cf2", "--horizon", "50", "--every", "10", "-o", str(out), *more]
+        assert main(words) == 0
+        with np.load(out) as found:
+            flying = found["airborne"]
+            last, at = found["prediction"][flying, -1], found["start_index"][flying] + 50
+        from crazyem.recordings import open_recording
+
+        truth = open_recording(str(log)).signals["body_rate"]
+        when = open_recording(str(log)).signals["position"].time[at]
+        shown = np.stack([np.interp(when, truth.time, v) for v in np.asarray(truth.value).T], 1)
+        errors[name] = float(np.sqrt(np.mean(np.sum((last[:, 10:13] - shown) ** 2, axis=1))))
+    assert errors["earned"] < errors["plain"]
