@@ -270,6 +270,9 @@ def _named(
             rivals = [t for t in rivals if t.candidate.effect not in told]
         alike = [t for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}]
         confidence = _trust(remains) * _share(taken.evidence, []) * _preferred(taken, rivals)
+        if candidate.effect in selection.doubted:
+            confidence = min(confidence, DOUBTFUL)
+            separate.append(SHAKES)
         p_value = min(1.0, taken.p_value * max(1, selection.tried))
         name, label, chosen = candidate.effect, candidate.label, dict(candidate.fixed)
         if late:
@@ -292,7 +295,8 @@ def _evidence(selection: Selection, i: int) -> float:
 
 FIXED = 0.3  # share of the gain of gusts that a force which depends on place or motion may have beside it
 CALIBRATED = 0.9  # of the names that nothing speaks against this share was right (docs/diagnosis.md)
-DOUBTFUL = 0.4  # confidence at most where structure is left
+DOUBTFUL = 0.4  # confidence at most where structure is left, or where something that shakes explains as much
+SHAKES = "hold the drone with its rotors turning: what shakes then is not the loop that swings with a wrong model"
 TELLING = 3.0  # nats by which a witness tells two effects apart
 MEASURED_LATE = "measurement_delay"
 WEAK_OR_MISREAD = ("rotor_fault", "rotor_sensor")

@@ -8,13 +8,15 @@ import numpy as np
 
 from crazyem.diagnosis.always import nuisances, on_held_out, refine_base, without
 from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import TORQUES, Data, Fitted, moved
+from crazyem.diagnosis.fit import TORQUES, Data, Fitted
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.restless import beside_peaks, peaks
-from crazyem.diagnosis.trials import LIKELY, SURE, Step, both, matters, significance, wald
+from crazyem.diagnosis.trials import LIKELY, SURE, Step, both, significance, wald
 
 ADMITTED = 8.0  # nats of evidence that an effect must bring
 HELD = 3.0  # nats it must bring on flight held out
+OTHERWISE = 0.01  # p-value of an effect's being the same size beside what shakes (Hausman 1978)
+APART = 1 / 3  # of its size, at least: sampled commands make some per cent of difference
 WANDERING = 10.0  # nats that disturbing torques with memory must gain to be allowed for
 
 
@@ -97,30 +99,36 @@ def held_gain(data: Data, held_out: Data, fitted: Fitted, accepted: Sequence[Can
     return there - bare_fit(data, held_out, fitted, accepted, candidate)[1]
 
 
-def outlive(
-    data: Data, nominal: Point, fitted: Fitted, accepted: list[Candidate], steps: list[Step], say: Callable[[str], None]
-) -> tuple[Fitted, list[Candidate], list[Step]]:
-    """Leave out what speaks in a hump of the spectrum only: the loop answers a vibration, so gains seem wrong there."""
+def shaken(
+    data: Data, nominal: Point, fitted: Fitted, accepted: Sequence[Candidate], say: Callable[[str], None]
+) -> frozenset[str]:
+    """Effects that are another size beside the humps of the spectrum than with them: something shakes there.
+
+    The loop answers a vibration, so gains, delays and inertias seem wrong at its frequency. A delay whose loop swings
+    leaves a hump as well, but is the same delay beside it.
+    """
     found = [peaks(m, nominal) for m in data.models]  # before what is always free gave way to them
-    while accepted and any(found):
-        free = [*accepted, *(c for c, _ in nuisances(data, fitted.point, accepted))]
-        gram = beside_peaks(data, fitted.point, [x for c in free for x in c.columns(fitted.point)], found)
-        here = np.array([c.values(fitted.point)[n] - c.neutral(fitted.point)[n] for c in free for n in c.free])
-        away = np.where(fitted.precision > 0, here, 0.0)
-        solution = gram.solve(range(gram.size), precision=fitted.precision, prior=-away)
-        sure, offset = [], 0
-        for c in accepted:
-            at = slice(offset, offset + len(c.free))
-            p_value = wald(here[at] + solution.theta[at], solution.covariance[at, at], gram, gram.size)
-            there = moved(fitted.point, accepted, solution.theta[: sum(len(a.free) for a in accepted)])
-            sure.append(p_value if matters(there, c) else 1.0)
-            offset = at.stop
-        worst = int(np.argmax(sure))
-        if sure[worst] < SURE:
-            break
-        say(f"  left out again, it speaks where something shakes only: {accepted[worst].label}")
-        fitted, accepted, steps = left_out(data, fitted, accepted, steps, accepted[worst])
-    return fitted, accepted, steps
+    if not accepted or not any(found):
+        return frozenset()
+    free = [*accepted, *(c for c, _ in nuisances(data, fitted.point, accepted))]
+    columns = [x for c in free for x in c.columns(fitted.point)]
+    here = np.array([c.values(fitted.point)[n] - c.neutral(fitted.point)[n] for c in free for n in c.free])
+    away = np.where(fitted.precision > 0, here, 0.0)
+    whole, beside = (
+        (g, g.solve(range(g.size), precision=fitted.precision, prior=-away))
+        for g in (data.gram(fitted.point, columns), beside_peaks(data, fitted.point, columns, found))
+    )
+    doubted, offset = [], 0
+    for c in accepted:
+        at = slice(offset, offset + len(c.free))
+        offset = at.stop
+        covariance = beside[1].covariance[at, at]
+        size, apart = here[at] + whole[1].theta[at], beside[1].theta[at] - whole[1].theta[at]
+        share = float(apart @ np.linalg.pinv(covariance) @ apart) / float(size @ np.linalg.pinv(covariance) @ size)
+        if share > APART**2 and wald(apart, covariance, beside[0], beside[0].size) < OTHERWISE:
+            say(f"  it is another size beside what shakes: {c.label}")
+            doubted.append(c.effect)
+    return frozenset(doubted)
 
 
 def left_out(

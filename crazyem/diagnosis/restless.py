@@ -28,6 +28,7 @@ FEWEST = 4  # pieces
 SLOWEST, FASTEST = 1.5, 0.4  # Hz: below, onboard filters wander; of the sampling rate
 AROUND, APART = 4.0, 1.0  # Hz: surroundings of a hump, and what belongs to the hump itself
 HUMP = 10.0  # power over that of the surroundings; drones with nothing hidden have up to 3.4
+FOOT, FARTHEST = 3.0, 2.0  # of the surroundings; Hz
 SHAKEN = 0.15  # of the angular acceleration in that band: less is a loop that swings under a model a little wrong
 SMALLEST = 0.0004  # of weight times arm
 
@@ -108,12 +109,14 @@ def hump(frequency: NDArray, power: NDArray) -> tuple[int, float]:
 
 
 class Peak(NamedTuple):
-    """A hump: axis 0 to 2, frequency [Hz], power over that of the surroundings, pieces that it is a mean of."""
+    """A hump: axis 0 to 2, frequency [Hz], power over that of the surroundings, pieces that it is a mean of, and how
+    far it reaches to either side [Hz]."""
 
     axis: int
     frequency: float
     ratio: float
     pieces: int
+    reach: float = 0.5
 
 
 def peaks(model: Model, point: Point) -> list[Peak]:
@@ -129,8 +132,20 @@ def peaks(model: Model, point: Point) -> list[Peak]:
         if pieces >= FEWEST:
             k, ratio = hump(frequency, power)
             if ratio > HUMP:
-                found.append(Peak(i, float(frequency[k]), ratio, pieces))
+                found.append(Peak(i, float(frequency[k]), ratio, pieces, reach_of(frequency, power, k, ratio)))
     return found
+
+
+def reach_of(frequency: NDArray, power: NDArray, k: int, ratio: float) -> float:
+    """How far a hump reaches to either side [Hz]: where its power has fallen to `FOOT` of the surroundings.
+
+    What shakes with a rotor wanders with the rotor's speed.
+    """
+    low = power < FOOT / ratio * power[k]
+    below, above = np.flatnonzero(low[:k]), np.flatnonzero(low[k:])
+    left = frequency[k] - frequency[below[-1]] if below.size else 0.0
+    right = frequency[k + above[0]] - frequency[k] if above.size else 0.0
+    return float(np.clip(max(left, right), 0.5, FARTHEST))
 
 
 def beside_peaks(data: Data, point: Point, columns: Sequence[Column], found: Sequence[Sequence[Peak]]) -> Gram:
@@ -141,7 +156,7 @@ def beside_peaks(data: Data, point: Point, columns: Sequence[Column], found: Seq
     score, information, flight = [], [], []
     m = len(columns)
     for k, (model, here) in enumerate(zip(data.models, found, strict=True)):
-        swept = model.sweep(point, [*columns, *(w for p in here for w in waves(model, p.axis, p.frequency))])
+        swept = model.sweep(point, [*columns, *(w for p in here for w in waves(model, p))])
         b, a = swept.score, swept.information
         if here:
             own = np.einsum("bii->bi", a[:, m:, m:])
@@ -154,13 +169,14 @@ def beside_peaks(data: Data, point: Point, columns: Sequence[Column], found: Seq
     return Gram(np.concatenate(score), np.concatenate(information), np.concatenate(flight))
 
 
-def waves(model: Model, axis: int, frequency: float) -> list[Column]:
-    """Torques about an axis at a frequency and half a Hz to either side, sine and cosine."""
+def waves(model: Model, peak: Peak) -> list[Column]:
+    """Torques about the axis of a hump at frequencies half a Hz apart as far as it reaches, sine and cosine."""
     columns = []
-    for at in (frequency - 0.5, frequency, frequency + 0.5):
+    count = round(peak.reach / 0.5)
+    for at in peak.frequency + 0.5 * np.arange(-count, count + 1):
         for wave in (np.cos, np.sin):
             acting = np.zeros((model.flight.time.size, 6))
-            acting[:, 3 + axis] = wave(2 * np.pi * at * model.flight.time)
+            acting[:, 3 + peak.axis] = wave(2 * np.pi * at * model.flight.time)
             columns.append(Column("wave", acting=acting))
     return columns
 
@@ -173,7 +189,7 @@ def humps(model: Model, point: Point) -> list[Finding]:
     span = (float(flight.time[0]), float(flight.time[-1]))
     least = SMALLEST * point.vehicle.mass * GRAVITY * max(*point.vehicle.arm, 0.01)
     found = []
-    for i, at, ratio, pieces in peaks(model, point):
+    for i, at, ratio, pieces, _ in peaks(model, point):
         amplitude, sd = amplitude_of(model, point, i, at)
         assert model.shown is not None
         frequency, rate, _ = spectrum(np.interp(grid, flight.time, model.shown[:, 10 + i]), period)

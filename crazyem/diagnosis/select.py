@@ -18,13 +18,14 @@ from crazyem.diagnosis.fit import Data, held_near, remembering_anew
 from crazyem.diagnosis.gram import Solution
 from crazyem.diagnosis.model import Column, Point
 from crazyem.diagnosis.onset import date, onset_of
-from crazyem.diagnosis.prune import ADMITTED, drop, outlive, survive
+from crazyem.diagnosis.prune import ADMITTED, drop, shaken, survive
 from crazyem.diagnosis.trials import (
     SURE,
     Selection,
     Step,
     Trial,
     both,
+    gain_of_both,
     matters,
     own_evidence,
     significance,
@@ -35,6 +36,9 @@ from crazyem.diagnosis.trials import (
 SHORTLIST = 6
 WORTH, ANYWAY = 0.15, 3  # share of the largest linear gain from which a candidate is fitted, and how many are anyway
 MOST = 4  # effects
+# Angular acceleration is torque over inertia: where the one is fitted, so is the other, to be told apart or not; both
+# at once would be any size.
+PARTNERS = (("torque_scale", "inertia"), ("inertia", "torque_scale"))
 
 
 def linear_trials(
@@ -125,17 +129,18 @@ def tried(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str]
     fit = refine_base(data, with_started(point, trial.candidate, solution), mine, rounds=3, noise=False)
     gain = fit.loglik - basis.value
     blocks = data.block_loglik(fit.point)
-    held = trial.held_out
+    held, value = trial.held_out, gain
     if held_out:
         apart = held_out.twin()
         there = on_held_out(apart, fit.point, mine)
         held, blocks = there.loglik - basis.held_value, np.append(blocks, apart.block_loglik(there.point))
+        value += held + gain_of_both(fit, apart, there, mine)
     k = len(trial.candidate.free)
     wald_p = significance(fit, k, offset=sum(len(c.free) for c in basis.accepted))
     wald_p = by_gain(point, gain / trial.dispersion, k, len(fit.gram.score), wald_p)
     sure = both(max(trial.p_value, wald_p), held / trial.dispersion if held_out else 0.0)
     sure = sure if matters(fit.point, trial.candidate) else 1.0
-    return replace(trial, gain=gain, held_out=held, p_value=sure, fitted=fit, blocks=blocks)
+    return replace(trial, gain=gain, held_out=held, p_value=sure, fitted=fit, blocks=blocks, value=value)
 
 
 def select(
@@ -156,7 +161,11 @@ def select(
     steps: list[Step] = []
     fitted = nominal_fit
     for turn in range(MOST + 1):
-        rest = [c for c in candidates if all(c.effect != a.effect for a in accepted)]
+        rest = [
+            c
+            for c in candidates
+            if all(c.effect != a.effect and (c.effect, a.effect) not in PARTNERS for a in accepted)
+        ]
         say(f"looking for effect {turn + 1} among {len(rest)} candidates")
         linear = linear_trials(data, point, accepted, rest)
         promising = shortlist(linear)
@@ -173,7 +182,7 @@ def select(
             break
         assert best is not None
         assert best.fitted is not None
-        equals = [best, *(t for t in trials[1:] if t.p_value < SURE and not told_apart(best, t))]
+        equals = [best, *(t for t in trials[1:] if rivals(t, counted=held_out is not None) and not told_apart(best, t))]
         simplest = min(equals, key=lambda t: (len(t.candidate.free), -t.evidence))
         if own_evidence(simplest, counted=held_out is not None) > ADMITTED:
             best = simplest
@@ -187,11 +196,12 @@ def select(
         point, value = fitted.point, fitted.loglik
         held_value = on_held_out(held_out, point, accepted).loglik if held_out else 0.0
     fitted, accepted, steps = drop(data, fitted, accepted, steps, held_out, say)
+    doubted: frozenset[str] = frozenset()
     if TRIM not in point.vehicle.effects:  # both judge by the scatter of blocks (see `by_gain`)
-        fitted, accepted, steps = outlive(data, nominal_point, fitted, accepted, steps, say)
         fitted, accepted, steps = survive(data, fitted, accepted, steps, held_out, say)
+        doubted = shaken(data, nominal_point, fitted, accepted, say)
     point = fitted.point
-    return Selection(nominal_fit.point, point, tuple(steps), tuple(accepted), fitted, len(candidates))
+    return Selection(nominal_fit.point, point, tuple(steps), tuple(accepted), fitted, len(candidates), doubted)
 
 
 def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Solution]]:
@@ -209,7 +219,17 @@ def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Sol
             chosen.append(entry)
         if len(chosen) == SHORTLIST:
             break
+    for one, other in PARTNERS:
+        names = {t.candidate.effect for t, _ in chosen}
+        if one in names and other not in names:
+            chosen += [e for e in linear if e[0].candidate.effect == other][:1]
     return chosen
+
+
+def rivals(trial: Trial, *, counted: bool) -> bool:
+    """Whether a candidate that was fitted is an explanation at all: significant, or with evidence enough."""
+    evident = trial.p_value < 1.0 and own_evidence(trial, counted=counted) > ADMITTED
+    return trial.fitted is not None and (trial.p_value < SURE or evident)
 
 
 def exchanged(data: Data, selection: Selection, old: Candidate, new: Candidate, values: Sequence[float]) -> Selection:

@@ -17,7 +17,7 @@ STRUCTURE = 25.0  # nats of structure left over that count as unexplained
 # weight times the arm, rad, m/s.
 TOLERANCE = {"force": 0.01, "torque": 0.0004, "attitude": 5e-3, "velocity": 0.05}
 SLOWEST = 1.5  # Hz: below, onboard filters wander
-LINE = 12.0  # peak of the spectrum over its surroundings (power) that counts as a line
+LINE = 25.0  # nats: peak of the spectrum over its surroundings (power), the number of frequencies allowed for
 SHAKEN = 0.3  # of what an unknown torque would leave of a swing
 NEAR = 0.15  # share of the frequency range that is "surroundings"
 
@@ -60,7 +60,7 @@ def unexplained(data: Data, selection: Selection, after: Located, apart: Data | 
     """Compare what is left with what was gained; random torques are looked for on the flights held out, too."""
     point = selection.final
     # what is always free gives way to a vibration, so that is looked for with it where the vehicle file has it
-    named = {c.effect: point.effects[c.effect] for c in selection.accepted}
+    named = {c.effect: point.effects[c.effect] for c in selection.accepted if c.effect not in selection.doubted}
     filed = replace(point, effects={**point.vehicle.effects, **named})
     left = [f for f in strongest(after.findings, most=40) if f.nats > STRUCTURE and notable(f, point)]
     for model in data.models:

@@ -13,7 +13,17 @@ from crazyem.diagnosis.fit import Data, nominal
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Noise, Point
 from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.restless import amplitude_of, beside_peaks, erratic_rotor, hump, humps, peaks, spectrum
+from crazyem.diagnosis.restless import (
+    FARTHEST,
+    amplitude_of,
+    beside_peaks,
+    erratic_rotor,
+    hump,
+    humps,
+    peaks,
+    reach_of,
+    spectrum,
+)
 
 ROWS, STEP = 2500, 0.01
 
@@ -74,6 +84,15 @@ def test_noise_has_no_hump() -> None:
     for seed in range(20):
         assert not peaks(model_of(np.random.default_rng(seed).normal(size=(ROWS, 3))), POINT)
     assert not peaks(model_of(np.ones((300, 3))), POINT)  # too short for a spectrum
+
+
+@pytest.mark.parametrize(("half", "wanted"), [(0.1, 0.5), (1.2, 1.2), (5.0, FARTHEST)])
+def test_a_hump_reaches_as_far_as_it_stands_out(half: float, wanted: float) -> None:
+    """A hat of twenty times its surroundings, some hertz to either side."""
+    frequency = np.arange(0.0, 50.0, 0.1)
+    power = np.where(np.abs(frequency - 8.0) < half, 20.0, 1.0)
+    k = int(np.argmin(np.abs(frequency - 8.0)))
+    assert reach_of(frequency, power, k, 20.0) == pytest.approx(wanted, abs=0.11)
 
 
 @pytest.mark.slow

@@ -1,18 +1,22 @@
 """Onsets in mid-flight, and names that a vibration alone speaks for; flights in closed loop made elsewhere."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
-from crazyem.diagnosis.always import refine_base
+from crazyem.diagnosis.always import on_held_out, refine_base
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import Data, Fitted, nominal, remembering, remembering_anew
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.onset import ONSET, date
+from crazyem.diagnosis.prune import shaken
+from crazyem.diagnosis.restless import peaks
+from crazyem.diagnosis.trials import gain_of_both
 
 ONSET_TIME = 4.37  # s
 
@@ -54,3 +58,50 @@ def test_noise_is_chosen_anew_as_for_a_flight_seen_first() -> None:
     again = remembering_anew(data, first)
     assert again.noise.memory == first.noise.memory
     assert data.loglik(again) == pytest.approx(data.loglik(first), abs=3.0)
+
+
+INERTIA = Candidate("inertia", (), ("xx", "yy", "zz"))
+LAG = Candidate("motor_lag", (), ("time_constant",))
+
+
+def with_free(data: Data, candidate: Candidate) -> tuple[Point, Fitted]:
+    """The nominal model and one with an effect fitted."""
+    point = nominal(data, Point(DRONE, {}, first_guess()))
+    begun = point.with_effects({candidate.effect: candidate.neutral(point)})
+    return point, refine_base(data, begun, [candidate], rounds=3)
+
+
+@pytest.mark.slow
+def test_an_inertia_that_a_vibration_speaks_for_is_another_beside_it() -> None:
+    data = Data([flight_of(fly(vibration=4.0, seconds=20.0), DRONE)])
+    point, fitted = with_free(data, INERTIA)
+    assert peaks(data.models[0], point)
+    said: list[str] = []
+    assert shaken(data, point, fitted, [INERTIA], said.append) == {"inertia"}
+    assert "inertia" in said[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lag", [0.08, 0.1])
+def test_a_lag_that_makes_its_loop_swing_is_the_same_beside_the_hump(lag: float) -> None:
+    """Twice as slow as the file says, and more: humps at 2 Hz, and nothing that vibrates."""
+    slow = fly(vehicle=replace(DRONE, motor_time_constant=lag), seconds=20.0)
+    data = Data([flight_of(slow, DRONE)])
+    point, fitted = with_free(data, LAG)
+    assert peaks(data.models[0], point)
+    assert fitted.point.effects["motor_lag"]["time_constant"] == pytest.approx(lag, rel=0.1)
+    assert not shaken(data, point, fitted, [LAG], lambda text: None)
+
+
+@pytest.mark.slow
+def test_what_an_effect_would_gain_fitted_to_both_flights_is_what_a_fit_of_both_gains() -> None:
+    drag = Candidate("linear_drag", (), ("x", "y", "z"))
+    one, two = (fly(Hidden(drag=(0.02, 0.02, 0.02)), seconds=s, seed=s) for s in (6, 18))
+    data, apart = (Data([flight_of(r, DRONE)]) for r in (one, two))
+    point = nominal(data, Point(DRONE, {}, first_guess()))
+    fitted = refine_base(data, point.with_effects({"linear_drag": drag.neutral(point)}), [drag], noise=False)
+    there = on_held_out(apart, fitted.point, [drag])
+    joint = Data([flight_of(r, DRONE) for r in (one, two)])
+    both = refine_base(joint, fitted.point, [drag], noise=False)
+    wanted = both.loglik - (fitted.loglik + there.loglik)
+    assert gain_of_both(fitted, apart, there, [drag]) == pytest.approx(wanted, abs=2.0)

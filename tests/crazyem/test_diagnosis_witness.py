@@ -106,7 +106,7 @@ def settled(both: list[Data]) -> Point:
 
 def trial(blocks: np.ndarray, parameters: int = 1) -> Trial:
     names = ("x", "y", "z")[:parameters]
-    return Trial(Candidate("linear_drag", (), names), 0.0, 0.0, 1.0, 0.0, 0.0, blocks=blocks)
+    return Trial(Candidate("linear_drag", (), names), 0.0, 0.0, 1.0, 0.0, 0.0, blocks=blocks, value=float(blocks.sum()))
 
 
 def test_what_two_explanations_share_does_not_blur_their_difference() -> None:
