@@ -133,7 +133,13 @@ def alignment(shared: Path, work: Path) -> dict[str, Any]:
 
 # -- nanobench ---------------------------------------------------------------------------------------------------------
 
-TRAIN = ("B3_figure8_medium_rep1", "B3_figure8_fast_rep1", "B2_circle_medium_rep1", "B2_circle_slow_rep1")
+TRAIN = tuple(
+    f"{kind}_rep{i}"
+    for kind, i in (
+        ("B2_circle_fast", 1), ("B2_circle_fast", 3), ("B2_circle_medium", 1), ("B2_circle_slow", 1),
+        ("B3_figure8_fast", 1), ("B3_figure8_fast", 2), ("B3_figure8_medium", 1), ("B3_figure8_slow", 1),
+    )
+)  # fmt: skip
 LEFT_OUT = ("B9_trefoil_medium_rep1", "B9_trefoil_slow_rep1", "B9_trefoil_fast_rep1", "B6_linear_ramp_rep2")
 WINDOW = 21  # samples of the Savitzky-Golay filter that accelerations come from
 

@@ -21,6 +21,7 @@ from scipy.signal import lfilter
 LAGS = 10  # of them up to the horizon
 MEMORY = 10.0  # s
 WEIGHT_SD, OFFSET_SD = 1.0, 2.0  # 1, rad/s^2: before anything was seen
+FORCE_SD, CORRELATED = 0.5, 0.1  # m/s^2 before anything was seen; s within which one moment is as wrong as the next
 MOST = 2.0  # weight; of a model that is right it is 1
 LEAST_TIME = 2.0  # s of flight before anything is said
 
@@ -33,11 +34,13 @@ class Weights:
         lags: (l,) s, evenly spaced from 0.
         weight: (n, l, 3) of the model's change of the body rate.
         added: (n, l, 3) rad/s beside it.
+        force: (n, 3) m/s^2, specific force that the model lacks, body axes.
     """
 
     lags: NDArray
     weight: NDArray
     added: NDArray
+    force: NDArray
 
     def changed(self, since: NDArray, gained: NDArray) -> NDArray:
         """(n, 3) rad/s: the change of the rate `since` (n,) s, where the model gives `gained` (n, 3) rad/s."""
@@ -51,7 +54,7 @@ class Weights:
 
     def of(self, rows: slice | NDArray) -> "Weights":
         """Of some of the starts."""
-        return Weights(self.lags, self.weight[rows], self.added[rows])
+        return Weights(self.lags, self.weight[rows], self.added[rows], self.force[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +66,14 @@ class Turned:
         rate: (r, 3) rad/s, recorded.
         gained: (r, 3) rad/s, what the model adds from a row to the next one, beginning with the recorded row.
         flying: (r,) bool: the step from a row to the next one counts.
+        lacking: (r,) m/s^2, specific force that the model lacked in that step, body axes (r, 3).
     """
 
     time: NDArray
     rate: NDArray
     gained: NDArray
     flying: NDArray
+    lacking: NDArray
 
     @property
     def period(self) -> float:
@@ -104,7 +109,7 @@ def earned(turned: Turned, starts: NDArray, *, horizon: float) -> Weights:
             weight[known, k, axis] = np.clip(found[:, 0], 0.0, MOST)
             added[known, k, axis] = found[:, 1] * lag
     weight[:, 0] = weight[:, 1]
-    return Weights(lags, weight, added)
+    return Weights(lags, weight, added, lacked(turned, starts))
 
 
 def regressed(x: NDArray, y: NDArray, lag: float, period: float) -> NDArray:
@@ -124,3 +129,22 @@ def regressed(x: NDArray, y: NDArray, lag: float, period: float) -> NDArray:
     information = a / noise[:, None, None] + prior
     solved: NDArray = np.linalg.solve(information, (b / noise[:, None] + prior @ [1.0, 0.0])[:, :, None])[:, :, 0]
     return solved
+
+
+def lacked(turned: Turned, starts: NDArray) -> NDArray:
+    """(n, 3) m/s^2: mean specific force that the model lacked before each start, drawn towards 0."""
+    rows = np.flatnonzero(turned.flying & np.isfinite(turned.lacking).all(1))
+    found = np.zeros((starts.size, 3))
+    if not rows.size:
+        return found
+    value = turned.lacking[rows]
+    forget = np.exp(-turned.period / MEMORY)
+    count, total, squares = (
+        lfilter([1.0], [1.0, -forget], v, axis=0) for v in (np.ones((rows.size, 1)), value, value**2)
+    )
+    spread = np.maximum(squares / count - (total / count) ** 2, 1e-12) * max(1.0, CORRELATED / turned.period)
+    mean = total / (count + spread / FORCE_SD**2)
+    at = np.searchsorted(turned.time[rows] + turned.period, starts + 1e-9, "right") - 1
+    known = (at + 1) * turned.period > LEAST_TIME
+    found[known] = mean[at[known]]
+    return found

@@ -17,6 +17,7 @@ from crazyem.diagnosis.simulate import Simulator
 from crazyem.doctor.kinematics import quaternion_of_euler
 from crazyem.doctor.streams import airtime, inside, ordered
 from crazyem.errors import DataError
+from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.vehicle import Vehicle
 
@@ -218,7 +219,8 @@ def turned_by(shown: Recorded) -> Turned:
     """What the model says of the turning of a recorded flight, one step ahead of every row."""
     simulator = Simulator(shown.inputs)
     swings = simulator.swings(shown.time, shown.state[:, 3:6])
-    gained, flying = np.zeros((shown.time.size, 3)), np.zeros(shown.time.size, bool)
+    gained, lacking = np.zeros((shown.time.size, 3)), np.zeros((shown.time.size, 3))
+    flying = np.zeros(shown.time.size, bool)
     rows = np.arange(shown.time.size - 1)
     rows = rows[np.isfinite(shown.state[rows]).all(axis=1) & shown.airborne[rows] & shown.airborne[rows + 1]]
     rows = rows[start_rows(shown, rows, horizon=1, step=None) & (np.diff(shown.time)[rows] < MAX_GAP)]
@@ -226,8 +228,10 @@ def turned_by(shown: Recorded) -> Turned:
         grid = shown.time[part[:, None] + np.arange(2)]
         ahead = simulator.run(shown.state[part], grid, swing=None if swings is None else swings[part])
         gained[part] = ahead[:, 0, 10:13] - shown.state[part, 10:13]
+        missed = (shown.state[part + 1, 3:6] - ahead[:, 0, 3:6]) / np.diff(grid)
+        lacking[part] = np.einsum("nji,nj->ni", rotation_matrix(shown.state[part, 6:10]), missed)
     flying[rows] = True
-    return Turned(shown.time, shown.state[:, 10:13], gained, flying)
+    return Turned(shown.time, shown.state[:, 10:13], gained, flying, lacking)
 
 
 def start_rows(shown: Recorded, rows: NDArray, *, horizon: int, step: float | None) -> NDArray:

@@ -188,7 +188,10 @@ class Simulator:
     def _advanced(self, body: _Body, rotation: NDArray, moved: Motion, step: NDArray) -> _Body:
         """The state one step later with constant accelerations; the force is turned by `rotation` (n, 3, 3)."""
         h = step[:, None]
-        acceleration = np.einsum("nij,nj->ni", rotation, moved.specific_force) - np.array([0.0, 0.0, GRAVITY])
+        force = moved.specific_force
+        if body.since is not None and self._weights is not None:
+            force = force + self._weights.force
+        acceleration = np.einsum("nij,nj->ni", rotation, force) - np.array([0.0, 0.0, GRAVITY])
         velocity = body.velocity + h * acceleration
         rate, since, gained = body.rate + h * moved.angular_acceleration, body.since, body.gained
         if since is not None and gained is not None and self._weights is not None:

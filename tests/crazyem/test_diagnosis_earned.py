@@ -1,5 +1,6 @@
 """What a model's turning is worth in a prediction: by regression on the past alone, against a plain version."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,8 @@ def flight(seed: int, *, seconds: float, weight: float, offset: float, error: fl
     acceleration = 4.0 * np.stack([np.sin(2 * np.pi * f * time) for f in (0.7, 1.1, 1.7)], 1)
     gained = acceleration * STEP
     rate = np.concatenate([np.zeros((1, 3)), np.cumsum(weight * gained + offset * STEP, axis=0)[:-1]])
-    return Turned(time, rate + error * draw.standard_normal(rate.shape), gained, np.ones(time.size, bool))
+    shown = rate + error * draw.standard_normal(rate.shape)
+    return Turned(time, shown, gained, np.ones(time.size, bool), np.zeros((time.size, 3)))
 
 
 def test_weight_and_offset_are_found_by_the_past() -> None:
@@ -58,10 +60,12 @@ def test_nothing_after_a_start_counts(seed: int, start: float) -> None:
         np.where(after[:, None], 7.0 * turned.rate + 3.0, turned.rate),
         np.where(after[:, None], -turned.gained, turned.gained),
         turned.flying & ~(turned.time > start + 0.3),
+        np.where((turned.time > start - STEP / 2)[:, None], 5.0, turned.lacking),
     )
     one, other = (earned(t, np.array([start]), horizon=0.5) for t in (turned, changed))
     assert np.array_equal(one.weight, other.weight)
     assert np.array_equal(one.added, other.added)
+    assert np.array_equal(one.force, other.force)
 
 
 def test_the_running_sums_are_those_of_a_plain_loop() -> None:
@@ -86,13 +90,25 @@ def test_gaps_and_missing_rates_are_left_out() -> None:
     rate[900:1100] += 50.0  # a jump on either side of what is not known
     rate[898:900] = np.nan
     rate[1100:1102] = np.nan
-    found = earned(Turned(turned.time, rate, turned.gained, turned.flying), np.array([19.9]), horizon=0.5)
+    found = earned(replace(turned, rate=rate), np.array([19.9]), horizon=0.5)
     assert found.weight[0, 3:] == pytest.approx(0.6, abs=0.03)
+
+
+def test_a_force_that_the_model_lacks_is_the_mean_of_what_it_lacked() -> None:
+    turned = flight(4, seconds=40.0, weight=1.0, offset=0.0, error=0.01)
+    draw = np.random.default_rng(4)
+    lacking = np.array([0.1, -0.2, 0.6]) + 0.3 * draw.standard_normal((turned.time.size, 3))
+    lacking[turned.time < 15.0] += 1.0  # long forgotten
+    found = earned(replace(turned, lacking=lacking), np.array([0.5, 39.9]), horizon=0.5)
+    assert np.array_equal(found.force[0], np.zeros(3))
+    assert found.force[1] == pytest.approx([0.1, -0.2, 0.6], abs=0.12)
 
 
 def test_between_lags_weights_are_interpolated() -> None:
     lags = np.array([0.0, 0.1, 0.2])
-    weights = Weights(lags, np.ones((1, 3, 3)) * np.array([1.0, 0.5, 0.0])[:, None], np.zeros((1, 3, 3)))
+    weights = Weights(
+        lags, np.ones((1, 3, 3)) * np.array([1.0, 0.5, 0.0])[:, None], np.zeros((1, 3, 3)), np.zeros((1, 3))
+    )
     for since, wanted in ((0.0, 1.0), (0.05, 0.75), (0.15, 0.25), (0.3, 0.0)):
         changed: NDArray = weights.changed(np.array([since]), np.full((1, 3), 2.0))
         assert changed == pytest.approx(2.0 * wanted * np.ones((1, 3)), abs=1e-5)

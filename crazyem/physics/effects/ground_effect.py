@@ -14,7 +14,7 @@ def lifted(situation: Situation, *, strength: float, height: float) -> NDArray:
 GROUND_EFFECT = Effect(
     "ground_effect",
     (
-        Parameter("strength", "", 0.0, -0.5, 2.0, 0.02),
+        Parameter("strength", "", 0.0, 0.0, 2.0, 0.02),
         Parameter("height", "m", 0.1, 0.005, 10.0, 0.01),
     ),
     order=32,
