@@ -30,7 +30,8 @@ def run(arguments: argparse.Namespace) -> int:
     begin = time.monotonic()
 
     def say(text: str) -> None:
-        print(f"diagnose: {time.monotonic() - begin:5.1f} s  {text}", file=sys.stderr, flush=True)
+        sys.stderr.write(f"diagnose: {time.monotonic() - begin:5.1f} s  {text}\n")  # in one piece: threads speak at once
+        sys.stderr.flush()
 
     options = read_options(arguments)
     recordings = [open_recording(p, options) for p in arguments.files]
