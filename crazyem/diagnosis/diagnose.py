@@ -20,7 +20,8 @@ from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.place import depends_on_place
 from crazyem.diagnosis.prune import ADMITTED
 from crazyem.diagnosis.select import exchanged, select
-from crazyem.diagnosis.trials import SURE, Selection, Trial, margin
+from crazyem.diagnosis.split import LOAD, SHIFTED, WEAKER, as_two
+from crazyem.diagnosis.trials import SURE, Selection, Trial, margin, told_apart
 from crazyem.diagnosis.unexplained import Unexplained, unexplained
 from crazyem.diagnosis.witness import false_speed, late_measurements
 from crazyem.diagnosis.workers import Workers
@@ -131,7 +132,7 @@ def diagnose(
     remains = unexplained(data, selection, after, apart)
     if place is not None:
         remains = remains.beside(place.finding)
-    effects, groups, separate = _named(data, selection, remains, told)
+    effects, groups, separate = _named(data, selection, remains, told, as_two(data, apart, selection))
     beside = _beside(data, apart, selection.final, remains, wanted, left_out, place is not None, say)
     if any(e.name == "gusts" for e in beside):
         remains = remains.without_force()
@@ -241,7 +242,11 @@ def _with_effects(vehicle: Vehicle, selection: Selection, beside: Sequence[Named
 
 
 def _named(
-    data: Data, selection: Selection, remains: Unexplained, told: frozenset[str]
+    data: Data,
+    selection: Selection,
+    remains: Unexplained,
+    told: frozenset[str],
+    in_two: tuple[Trial, Trial] | None,
 ) -> tuple[tuple[Named, ...], tuple[tuple[str, ...], ...], tuple[str, ...]]:
     fitted = selection.fitted
     if not selection.accepted:
@@ -279,6 +284,9 @@ def _named(
             name, label, chosen = MEASURED_LATE, MEASURED_LATE, {"streams": ("state", "gyro")}
         named.append(Named(name, label, parameters, chosen, taken.held_out, p_value, confidence))
         equal = () if candidate.effect in told else SAME.get(candidate.effect, ())
+        if candidate.effect == LOAD and in_two is not None and not told_apart(*in_two):
+            equal = (*equal, WEAKER.effect, SHIFTED.effect)
+            confidence *= _better(*in_two)
         if alike or equal:
             group = tuple(dict.fromkeys([candidate.effect, *(t.candidate.effect for t in alike), *equal]))
             groups.append(group)
@@ -315,9 +323,13 @@ def _preferred(taken: Trial, rivals: Sequence[Trial]) -> float:
     chance = 1.0
     for rival in rivals:
         if rival.fitted is not None and rival.blocks.size == taken.blocks.size:
-            nats, sd = margin(taken, rival)
-            chance *= float(stats.norm.cdf(nats / sd))
+            chance *= _better(taken, rival)
     return chance
+
+
+def _better(one: Trial, other: Trial) -> float:
+    nats, sd = margin(one, other)
+    return float(stats.norm.cdf(nats / sd))
 
 
 def _share(best: float, others: Sequence[float]) -> float:

@@ -159,9 +159,16 @@ def wald(away: NDArray, covariance: NDArray, gram: Gram, columns: float) -> floa
 
 
 def matters(point: Point, candidate: Candidate) -> bool:
-    """Whether the effect is larger than what an onboard filter or the sampling of a log looks like."""
+    """Whether the effect is larger than what onboard filters or the sampling of a log look like, and within its range.
+
+    One number that ends where nothing more is admitted would be more: it stands for something else.
+    """
     least = LEAST.get(candidate.effect)
     here, neutral = candidate.values(point), candidate.neutral(point)
+    if len(candidate.free) == 1:
+        p = candidate.parameter(candidate.free[0])
+        if here[p.name] in (p.low, p.high) and here[p.name] != neutral[p.name]:
+            return False
     if candidate.effect == "center_of_mass":
         return any(abs(here[n] - neutral[n]) > LEAST_CENTRE[n] for n in candidate.free)
     if candidate.effect == "inertia":

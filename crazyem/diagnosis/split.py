@@ -1,0 +1,60 @@
+"""A load against weaker rotors: one cause that looks like two.
+
+A load of unknown weight lowers thrust over mass and shifts the centre of mass, and so do rotors that are all weaker on
+a drone whose centre of mass was never where the file has it. One candidate is tried at a time, so the load wins by
+explaining both; whether it is told apart from the two together is asked here. Only what else they change tells: weaker
+rotors lack torque by the same factor, a load turns with the drone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.always import TRIM, on_held_out, refine_base, without
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.fit import Data
+from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.trials import Selection, Trial, gain_of_both
+from crazyem.physics.effects.catalogue import CATALOGUE
+
+LOAD = "payload"
+WEAKER = Candidate("thrust_scale", (), ("scale",))
+SHIFTED = Candidate("center_of_mass", (), ("x", "y", "z"))
+
+
+def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
+    """The load as a trial and the two in its place as another, to be compared; None where no load was found.
+
+    With a trim in the vehicle file, which is always free, weaker rotors are the only other.
+    """
+    load = next((c for c in selection.accepted if c.effect == LOAD), None)
+    step = next((s for s in selection.steps if s.taken and s.taken.candidate is load), None)
+    if load is None or step is None or step.taken is None:
+        return None
+    two = [WEAKER] if TRIM in selection.final.vehicle.effects else [WEAKER, SHIFTED]
+    rest = [c for c in selection.accepted if c.effect not in {LOAD, *(t.effect for t in two)}]
+    bare = without(selection.final, LOAD)
+    bare = bare.with_effects({c.effect: c.neutral(bare) for c in two})
+    value, blocks = _judged(data, held_out, selection.final, selection.accepted)
+    other, others = _judged(data, held_out, bare, [*rest, *two])
+    other -= np.log(len(CATALOGUE)) * (len(two) - 1)  # that a second effect is there as well is no matter of course
+    free = tuple(f"{c.effect}.{n}" for c in two for n in c.free)  # counted, and no more
+    return (
+        replace(step.taken, value=value, blocks=blocks),
+        Trial(Candidate(WEAKER.effect, (), free), 0.0, 0.0, 1.0, 0.0, 0.0, blocks=others, value=other),
+    )
+
+
+def _judged(data: Data, held_out: Data | None, start: Point, candidates: Sequence[Candidate]) -> tuple[float, NDArray]:
+    """Log-likelihood as fitted to all flights, and by blocks."""
+    here = data.twin()
+    fitted = refine_base(here, start, candidates, noise=False)
+    value, blocks = fitted.loglik, here.block_loglik(fitted.point)
+    if held_out is not None:
+        apart = held_out.twin()
+        there = on_held_out(apart, fitted.point, candidates)
+        value += there.loglik + gain_of_both(fitted, apart, there, candidates)
+        blocks = np.append(blocks, apart.block_loglik(there.point))
+    return value, blocks
