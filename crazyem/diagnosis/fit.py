@@ -13,6 +13,7 @@ from crazyem.diagnosis.gram import Gram
 from crazyem.diagnosis.model import Column, Model, Point, Swept
 from crazyem.diagnosis.noise import first_guess, fit_noise
 from crazyem.diagnosis.workers import Workers
+from crazyem.errors import DataError
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 ROUNDS = 6  # of Gauss-Newton
@@ -42,6 +43,10 @@ class Fitted:
     loglik: float
     gram: Gram
     precision: NDArray
+
+
+class DivergedError(DataError):
+    """A model under which the filter leaves the range of numbers: nothing can be fitted from there."""
 
 
 class Data:
@@ -239,6 +244,8 @@ def refine(
     """Maximum of the posterior near `start`, in which the candidates' effects already stand.
 
     `nuisances` are free too, with Gaussian priors about neutral of these precisions.
+
+    Raises: DivergedError if the filter leaves the range of numbers at `start`.
     """
     point = start
     free = [*candidates, *(c for c, _ in nuisances)]
@@ -254,7 +261,10 @@ def refine(
         return loglik - 0.5 * float(weight @ np.square(away(at))), gram
 
     data.loglik(point)  # physics is evaluated where the filter is
-    value, gram = look(point)
+    with np.errstate(over="ignore", invalid="ignore"):
+        value, gram = look(point)
+    if not np.isfinite(value) or not np.isfinite(gram.information).all():
+        raise DivergedError("the vehicle's model leaves the range of numbers on this flight: is it this drone's?")
     for turn in range(rounds if free else 0):
         low, high = held_near(*bounds_of(free, point), away(point), weight)
         step = gram.solve(range(gram.size), low=low, high=high, precision=weight, prior=-away(point)).theta

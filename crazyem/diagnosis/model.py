@@ -211,8 +211,12 @@ class Model:
             swept = self._felt(swept, acceleration, acting)
         if order is not None:
             swept = replace(swept, score=swept.score[:, order], information=swept.information[:, order][:, :, order])
+        self._rotation = None
+        if not np.isfinite(swept.filtered).all():  # a model that left the range of numbers must not spoil the next one
+            self.path = self.shown = None
+            return swept
         self.path = causal_middle(swept.filtered, swept.predicted, flight.starts)
-        self.shown, self._rotation = swept.filtered, None
+        self.shown = swept.filtered
         return swept
 
     def _is_felt(self) -> bool:

@@ -14,7 +14,8 @@ from crazyem.diagnosis.restless import beside_peaks, peaks
 from crazyem.diagnosis.trials import LIKELY, SURE, Step, both, significance, wald
 
 ADMITTED = 8.0  # nats of evidence that an effect must bring
-HELD = 3.0  # nats it must bring on flight held out
+HELD = 3.0  # nats it must bring on flight held out,
+TELLING = 2.0  # if that is so much less than would be expected there; else it must not cost what it must bring
 OTHERWISE = 0.01  # p-value of an effect's being the same size beside what shakes (Hausman 1978)
 APART = 1 / 3  # of its size, at least: sampled commands make some per cent of difference
 WANDERING = 10.0  # nats that disturbing torques with memory must gain to be allowed for
@@ -40,17 +41,38 @@ def drop(
             assert step.taken is not None
             gain = (here - less.loglik) / step.taken.dispersion
             held = (held_here - held_less) / step.taken.dispersion
-            judged.append((gain - len(c.free) + held, gain, held, c, less))
+            need = HELD if held_out is None or expected(held_out, fitted, accepted, c) > TELLING * HELD else -ADMITTED
+            judged.append((min(gain - len(c.free) + held, held + ADMITTED - need if held_out else np.inf), c, less))
             now = replace(step.taken, gain=gain * step.taken.dispersion, held_out=held * step.taken.dispersion)
             steps = [replace(s, taken=now) if s is step and held_out else s for s in steps]
-        worst = min(judged, key=lambda j: min(j[0], j[2] + ADMITTED - HELD if held_out else j[0]))
-        if worst[0] > ADMITTED and (held_out is None or worst[2] > HELD):
+        worst = min(judged, key=lambda j: j[0])
+        if worst[0] > ADMITTED:
             break
-        say(f"  left out again: {worst[3].label}")
-        accepted.remove(worst[3])
-        steps = [s for s in steps if s.taken is None or s.taken.candidate.effect != worst[3].effect]
-        fitted = refine_base(data, worst[4].point, accepted)
+        say(f"  left out again: {worst[1].label}")
+        accepted.remove(worst[1])
+        steps = [s for s in steps if s.taken is None or s.taken.candidate.effect != worst[1].effect]
+        fitted = refine_base(data, worst[2].point, accepted)
     return fitted, accepted, steps
+
+
+def expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate) -> float:
+    """What an effect of this size would gain on flights held out if it is there [nats]: z'Az/2, the rest profiled out.
+
+    A hover says nothing of a damping, whether it is there or not.
+    """
+    point = fitted.point
+    rest = [c for c in accepted if c is not candidate]
+    free = nuisances(held_out, point, accepted)
+    columns = [x for c in [candidate, *rest, *(c for c, _ in free)] for x in c.columns(point)]
+    held_out.settle(point)
+    _, information = held_out.gram(point, columns).total(range(len(columns)))
+    own = len(candidate.free)
+    weight = np.array([0.0] * sum(len(c.free) for c in [candidate, *rest]) + [w for _, p in free for w in p])
+    a = information + np.diag(weight)
+    inner = a[:own, :own] - a[:own, own:] @ np.linalg.lstsq(a[own:, own:], a[own:, :own], rcond=1e-12)[0]
+    here, neutral = candidate.values(point), candidate.neutral(point)
+    away = np.array([here[n] - neutral[n] for n in candidate.free])
+    return 0.5 * float(away @ inner @ away)
 
 
 def bare_fit(

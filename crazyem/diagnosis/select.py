@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.always import TRIM, by_gain, nuisances, on_held_out, refine_base, with_nuisances, without
 from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, held_near, remembering_anew
+from crazyem.diagnosis.fit import Data, DivergedError, held_near, remembering_anew
 from crazyem.diagnosis.gram import Solution
 from crazyem.diagnosis.model import Column, Point
 from crazyem.diagnosis.onset import date, onset_of
@@ -126,7 +126,10 @@ def tried(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str]
     point, held_out = basis.point, basis.held_out
     say(f"  fitting {trial.candidate.label}")
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
-    fit = refine_base(data, with_started(point, trial.candidate, solution), mine, rounds=3, noise=False)
+    try:
+        fit = refine_base(data, with_started(point, trial.candidate, solution), mine, rounds=3, noise=False)
+    except DivergedError:  # the linear approximation went too far
+        return replace(trial, p_value=1.0)
     gain = fit.loglik - basis.value
     blocks = data.block_loglik(fit.point)
     held, value = trial.held_out, gain

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.always import TRIM, on_held_out, refine_base, without
 from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data
+from crazyem.diagnosis.fit import Data, DivergedError
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.trials import Selection, Trial, gain_of_both
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -25,7 +25,8 @@ SHIFTED = Candidate("center_of_mass", (), ("x", "y", "z"))
 
 
 def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
-    """The load as a trial and the two in its place as another, to be compared; None where no load was found.
+    """The load as a trial and the two in its place as another, to be compared; None where no load was found, or where
+    nothing can be fitted in its place.
 
     With a trim in the vehicle file, which is always free, weaker rotors are the only other.
     """
@@ -37,8 +38,11 @@ def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Tri
     rest = [c for c in selection.accepted if c.effect not in {LOAD, *(t.effect for t in two)}]
     bare = without(selection.final, LOAD)
     bare = bare.with_effects({c.effect: c.neutral(bare) for c in two})
-    value, blocks = _judged(data, held_out, selection.final, selection.accepted)
-    other, others = _judged(data, held_out, bare, [*rest, *two])
+    try:
+        value, blocks = _judged(data, held_out, selection.final, selection.accepted)
+        other, others = _judged(data, held_out, bare, [*rest, *two])
+    except DivergedError:
+        return None
     other -= np.log(len(CATALOGUE)) * (len(two) - 1)  # that a second effect is there as well is no matter of course
     free = tuple(f"{c.effect}.{n}" for c in two for n in c.free)  # counted, and no more
     return (
