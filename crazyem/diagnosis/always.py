@@ -40,7 +40,9 @@ COARSE_REASON = "the recorded commands are mostly faster than their sampling: wh
 TRIM_REASON = "a shifted centre of mass is a trim, and that changes from day to day"
 FAST = ("inertia", "inertia_products", "torque_scale", "rate_damping", "rotor_inertia", "motor_lag", "input_delay",
         "measurement_delay", "gyro_bias", "thrust_curve")  # fmt: skip
-CALM, GUSTIER = 1.0, 2.0  # m/s; times what the file has. Hovering in a room looks like 0 to 0.6 m/s
+# m/s, where trims differ from day to day, and on any drone; times what the file has. Hovering in a real room looks like
+# 0 to 0.6 m/s, and a drone with nothing hidden once like 0.3.
+CALM, ROOM, GUSTIER = 1.0, 0.4, 2.0
 Nuisances = list[tuple[Candidate, tuple[float, ...]]]  # with the precision of each free parameter
 
 
@@ -155,7 +157,7 @@ def by_gain(point: Point, gain: float, count: int, blocks: int, p_value: float) 
 def usual_gusts(vehicle: Vehicle) -> float:
     """Standard deviation of the air's speed [m/s] below which it is the weather, and no finding."""
     filed = float(vehicle.effects.get("gusts", {}).get("standard_deviation", 0.0))
-    return max(GUSTIER * filed, CALM if TRIM in vehicle.effects else 0.0)
+    return max(GUSTIER * filed, CALM if TRIM in vehicle.effects else ROOM)
 
 
 def without(point: Point, effect: str) -> Point:
