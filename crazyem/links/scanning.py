@@ -162,14 +162,20 @@ def _rule_advice(rules: set[str]) -> list[str]:
     ]
 
 
+def _plugged(interface: Interface, devices: list[Device], loaders: list[Device], rules: set[str]) -> None:
+    """Lists what is plugged in, numbered as its address is."""
+    for number, device in enumerate(devices):
+        name = device.name + (f", serial {device.serial}" if device.serial else "")
+        address = f"{interface.name}://{number}"
+        interface.found.append(Found(address, name, "" if device.usable else _no_rights(device, rules)))
+    interface.found += [Found("", device.name, "in its bootloader") for device in loaders]
+
+
 def _radio(devices: list[Device], rules: set[str], search: Callable[[], list[str]] | None) -> Interface:
     interface = Interface("radio")
     radios = [d for d in devices if d.kind == "radio"]
     loaders = [d for d in devices if d.kind == "bootloader" and "radio" in d.name]
-    for number, device in enumerate(radios):
-        name = device.name + (f", serial {device.serial}" if device.serial else "")
-        interface.found.append(Found(f"radio://{number}", name, "" if device.usable else _no_rights(device, rules)))
-    interface.found += [Found("", device.name, "in its bootloader") for device in loaders]
+    _plugged(interface, radios, loaders, rules)
     if not radios and not loaders:
         rule = "" if "1915" in rules else f" (nor is there a udev rule for one; it would go into {RULES_FILE})"
         interface.missing.append(f"no Crazyradio dongle is plugged in{rule}")
@@ -191,10 +197,7 @@ def _usb(devices: list[Device], rules: set[str]) -> Interface:
     interface = Interface("usb")
     drones = [d for d in devices if d.kind == "usb"]
     loaders = [d for d in devices if d.kind == "bootloader" and "Crazyflie" in d.name]
-    for number, device in enumerate(drones):
-        name = device.name + (f", serial {device.serial}" if device.serial else "")
-        interface.found.append(Found(f"usb://{number}", name, "" if device.usable else _no_rights(device, rules)))
-    interface.found += [Found("", device.name, "in its bootloader") for device in loaders]
+    _plugged(interface, drones, loaders, rules)
     if not drones and not loaders:
         interface.missing.append("no Crazyflie is plugged in")
     if any(not d.usable for d in drones):
