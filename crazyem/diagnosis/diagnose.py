@@ -270,7 +270,8 @@ def _named(
             at += 1
         taken = step.taken
         assert taken is not None
-        rivals = [t for t in step.trials if t.p_value < SURE and t.candidate.effect != candidate.effect]
+        others = {candidate.effect, *step.beside}
+        rivals = [t for t in step.trials if t.p_value < SURE and t.candidate.effect not in others]
         if candidate.effect in told:
             rivals = [t for t in rivals if t.candidate.effect not in told]
         alike = [t for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}]

@@ -36,6 +36,7 @@ from crazyem.diagnosis.trials import (
 SHORTLIST = 6
 WORTH, ANYWAY = 0.15, 3  # share of the largest linear gain from which a candidate is fitted, and how many are anyway
 MOST = 4  # effects
+BESIDE = 0.5  # share of its gain that an effect keeps beside another which it is no other name for
 # Angular acceleration is torque over inertia: where the one is fitted, so is the other, to be told apart or not; both
 # at once would be any size.
 PARTNERS = (("torque_scale", "inertia"), ("inertia", "torque_scale"))
@@ -171,6 +172,8 @@ def select(
         ]
         say(f"looking for effect {turn + 1} among {len(rest)} candidates")
         linear = linear_trials(data, point, accepted, rest)
+        if steps:
+            steps[-1] = replace(steps[-1], beside=additions(steps[-1], [t for t, _ in linear]))
         promising = shortlist(linear)
         basis = Basis(data, held_out, point, tuple(accepted), value, held_value)
         trials = data.workers.map(lambda entry: tried(basis, *entry, say=say), promising)  # noqa: B023 - done at once
@@ -227,6 +230,16 @@ def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Sol
         if one in names and other not in names:
             chosen += [e for e in linear if e[0].candidate.effect == other][:1]
     return chosen
+
+
+def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
+    """Effects tried in a turn that gain nearly as much beside the one that was taken: no other name for it, but more.
+
+    Two explanations of one thing gain no more together than the better one alone.
+    """
+    left = {c: max(t.gain for t in later if t.candidate.effect == c) for c in {t.candidate.effect for t in later}}
+    fitted = [t for t in step.trials if t.fitted is not None and t.candidate.effect in left]
+    return frozenset(t.candidate.effect for t in fitted if 0 < BESIDE * t.gain < left[t.candidate.effect])
 
 
 def rivals(trial: Trial, *, counted: bool) -> bool:

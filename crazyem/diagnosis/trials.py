@@ -56,11 +56,13 @@ class Trial:
 
 @dataclass(frozen=True)
 class Step:
-    """One turn of the selection: all trials, best first, and which was taken (None: the end)."""
+    """One turn of the selection: all trials, best first, which was taken (None: the end), what it was not told apart
+    from, and the effects that explain something else as well as it."""
 
     trials: tuple[Trial, ...]
     taken: Trial | None
     alike: tuple[Trial, ...] = ()
+    beside: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
