@@ -30,9 +30,8 @@ def run(arguments: argparse.Namespace) -> int:
     begin = time.monotonic()
 
     def say(text: str) -> None:
-        sys.stderr.write(
-            f"diagnose: {time.monotonic() - begin:5.1f} s  {text}\n"
-        )  # in one piece: threads speak at once
+        # in one piece: threads speak at once
+        sys.stderr.write(f"diagnose: {time.monotonic() - begin:5.1f} s  {text}\n")
         sys.stderr.flush()
 
     options = read_options(arguments)

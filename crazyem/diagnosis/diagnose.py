@@ -20,7 +20,7 @@ from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.place import depends_on_place
 from crazyem.diagnosis.prune import ADMITTED
 from crazyem.diagnosis.select import exchanged, select
-from crazyem.diagnosis.split import LOAD, SHIFTED, WEAKER, as_two
+from crazyem.diagnosis.split import LOAD, as_two, instead_of_a_load
 from crazyem.diagnosis.trials import SURE, Selection, Trial, margin, told_apart
 from crazyem.diagnosis.unexplained import Unexplained, unexplained
 from crazyem.diagnosis.witness import false_speed, late_measurements
@@ -286,7 +286,7 @@ def _named(
         named.append(Named(name, label, parameters, chosen, taken.held_out, p_value, confidence))
         equal = () if candidate.effect in told else SAME.get(candidate.effect, ())
         if candidate.effect == LOAD and in_two is not None and not told_apart(*in_two):
-            equal = (*equal, WEAKER.effect, SHIFTED.effect)
+            equal = (*equal, *(c.effect for c in instead_of_a_load(selection.final.vehicle)))
             confidence *= _better(*in_two)
         if alike or equal:
             group = tuple(dict.fromkeys([candidate.effect, *(t.candidate.effect for t in alike), *equal]))

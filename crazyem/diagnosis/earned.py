@@ -1,4 +1,5 @@
-"""How much of the model's turning to believe in an open-loop prediction, by how right it was before the start.
+"""What an open-loop prediction learns from the flight before its start: how much of the model's turning to believe, and
+the mean force that the model lacks.
 
 A drone in stabilised flight hardly accelerates: a controller that answers to the air makes the recorded torque cancel
 a torque that no model knows. Over some tenths of a second the model's net torque is therefore mostly error, and a body
@@ -9,7 +10,8 @@ and on h itself (a steady torque that the model lacks),
     change that came = weight(h) * change by the model + offset(h) * h,
 
 over the flight so far, never what comes after a start; what is older than `MEMORY` counts less. While little has been
-seen, weight and offset are drawn towards 1 and 0, the model itself.
+seen, weight and offset are drawn towards 1 and 0, the model itself. The force, in body axes, is a battery or a day's
+thrust, which no file knows.
 """
 
 from dataclasses import dataclass

@@ -58,7 +58,8 @@ def drop(
 def expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate) -> float:
     """What an effect of this size would gain on flights held out if it is there [nats]: z'Az/2, the rest profiled out.
 
-    A hover says nothing of a damping, whether it is there or not.
+    A hover says nothing of a damping, whether it is there or not. Without the bounds of what is always free, so rather
+    too little: an order of magnitude, no more.
     """
     point = fitted.point
     rest = [c for c in accepted if c is not candidate]

@@ -143,7 +143,7 @@ class Simulator:
             given: (n,) s until when inputs may be known, after which the last is held; None: the beginning of the last
                 step.
             substep: largest step of the integration [s].
-            weights: of the model's angular acceleration, by start and time since; None: 1.
+            weights: what was learned before each start (see `earned`); None: the model alone.
 
         Returns: (n, N, 13), as the recording would show them.
         """

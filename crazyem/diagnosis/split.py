@@ -18,23 +18,27 @@ from crazyem.diagnosis.fit import Data, DivergedError
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.trials import Selection, Trial, gain_of_both
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.vehicle import Vehicle
 
 LOAD = "payload"
 WEAKER = Candidate("thrust_scale", (), ("scale",))
 SHIFTED = Candidate("center_of_mass", (), ("x", "y", "z"))
 
 
-def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
-    """The load as a trial and the two in its place as another, to be compared; None where no load was found, or where
-    nothing can be fitted in its place.
+def instead_of_a_load(vehicle: Vehicle) -> list[Candidate]:
+    """Weaker rotors and a shifted centre; with a trim in the vehicle file, which is always free, the rotors alone."""
+    return [WEAKER] if TRIM in vehicle.effects else [WEAKER, SHIFTED]
 
-    With a trim in the vehicle file, which is always free, weaker rotors are the only other.
+
+def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
+    """The load as a trial and what may stand in its place as another, to be compared; None where no load was found, or
+    where nothing can be fitted in its place.
     """
     load = next((c for c in selection.accepted if c.effect == LOAD), None)
     step = next((s for s in selection.steps if s.taken and s.taken.candidate is load), None)
     if load is None or step is None or step.taken is None:
         return None
-    two = [WEAKER] if TRIM in selection.final.vehicle.effects else [WEAKER, SHIFTED]
+    two = instead_of_a_load(selection.final.vehicle)
     rest = [c for c in selection.accepted if c.effect not in {LOAD, *(t.effect for t in two)}]
     bare = without(selection.final, LOAD)
     bare = bare.with_effects({c.effect: c.neutral(bare) for c in two})

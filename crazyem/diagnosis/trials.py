@@ -89,9 +89,8 @@ def margin(best: Trial, other: Trial) -> tuple[float, float]:
     d = best.blocks - other.blocks
     centred = d - d.mean()
     variance = float(centred @ centred + max(0.0, float(centred[1:] @ centred[:-1])))
-    return best.value - other.value - len(best.candidate.free) + len(other.candidate.free), float(
-        np.sqrt(variance)
-    ) + 1e-9
+    nats = best.value - other.value - len(best.candidate.free) + len(other.candidate.free)
+    return nats, float(np.sqrt(variance)) + 1e-9
 
 
 def told_apart(best: Trial, other: Trial) -> bool:

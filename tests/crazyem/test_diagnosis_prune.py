@@ -1,15 +1,22 @@
 """What is left out again: an effect that noise explains as well must speak on flights held out, or go."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
-from closed_loop import DRONE
+from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis import prune
+from crazyem.diagnosis.always import on_held_out, refine_base
 from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.fit import Data, nominal
+from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.trials import LIKELY, SURE, Step, Trial
+from crazyem.diagnosis.select import shortlist
+from crazyem.diagnosis.trials import LIKELY, SURE, Step, Trial, matters
+from crazyem.diagnosis.workers import Workers
 
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
 TAKEN = Step((), Trial(DRAG, gain=30.0, held_out=20.0, dispersion=2.0, p_value=1e-6, evidence=12.0))
@@ -62,3 +69,59 @@ def test_where_torques_do_not_wander_nothing_is_asked(monkeypatch):
     accepted, asked = survivors(monkeypatch, p_value=1.0, held=0.0, gained=prune.WANDERING / 2)
     assert accepted == [DRAG]
     assert asked == []
+
+
+@pytest.mark.slow
+def test_what_is_expected_on_flights_held_out_is_what_their_likelihood_would_lose():
+    """Against the curve of the likelihood held out over the size of the effect, what is always free fitted to each."""
+    candidate = Candidate("torque_scale", (), ("scale",))
+    data, apart = (Data([flight_of(fly(Hidden(torque=0.85), seconds=s, seed=s), DRONE)]) for s in (6, 14))
+    point = nominal(data, POINT)
+    begun = point.with_effects({"torque_scale": {"scale": 0.95}})
+    fitted = refine_base(data, begun, [candidate], noise=False)
+    here = fitted.point.effects["torque_scale"]["scale"]
+    scales = here + np.linspace(-0.03, 0.03, 7)  # what is always free stays within its bounds
+    points = [fitted.point.with_effects({"torque_scale": {"scale": s}}) for s in scales]
+    values = [on_held_out(apart, p, [candidate]).loglik for p in points]
+    bend = np.polynomial.Polynomial.fit(scales, values, 2).deriv(2)(here)
+    found = prune.expected(apart, fitted, [candidate], candidate)
+    wanted = -0.5 * bend * (here - 1.0) ** 2
+    # 34 against 52 nats when written: bounds of what is always free and terms of second order are left out. It decides
+    # between a flight that can answer and one that cannot, for which a factor of two does.
+    assert wanted / 2 < found < wanted * 2
+    assert found > prune.TELLING * prune.HELD
+
+
+@pytest.mark.parametrize(("expected", "held", "kept"), [(1.0, -5.0, True), (1.0, -9.0, False), (50.0, -5.0, False),
+                                                        (50.0, 5.0, True)])  # fmt: skip
+def test_flights_held_out_are_asked_where_they_can_answer(monkeypatch, expected, held, kept):
+    """An effect that brings 300 nats where it was fitted, and `held` where `expected` nats would be the effect's."""
+    step = replace(TAKEN, taken=replace(TAKEN.taken, dispersion=1.0))
+    fitted = SimpleNamespace(point=POINT, loglik=0.0)
+    bare = SimpleNamespace(point=POINT, loglik=-300.0)
+    monkeypatch.setattr(prune, "expected", lambda *a: expected)
+    monkeypatch.setattr(prune, "bare_fit", lambda *a: (bare, -held))
+    monkeypatch.setattr(prune, "on_held_out", lambda *a: SimpleNamespace(loglik=0.0))
+    monkeypatch.setattr(prune, "refine_base", lambda *a, **k: bare)
+    data = SimpleNamespace(loglik=lambda point, passes: 0.0, workers=Workers(1))
+    _, accepted, _ = prune.drop(data, fitted, [DRAG], [step], SimpleNamespace(), lambda text: None)
+    assert accepted == ([DRAG] if kept else [])
+
+
+def test_one_number_at_the_end_of_its_range_is_no_finding():
+    slope = Candidate("thrust_curve", (), ("slope_error",))
+    low = slope.parameter("slope_error").low
+    assert not matters(POINT.with_effects({"thrust_curve": {"slope_error": low}}), slope)
+    assert matters(POINT.with_effects({"thrust_curve": {"slope_error": low + 1e-6}}), slope)
+    assert not matters(POINT.with_effects({"thrust_curve": {"slope_error": 0.02}}), slope)
+    assert matters(POINT.with_effects({"linear_drag": {"x": 0.0, "y": 0.01, "z": 0.0}}), DRAG)  # one of three
+
+
+def test_torques_and_inertias_are_fitted_together_or_not_at_all():
+    def entry(effect, gain, p_value=1e-6):
+        trial = Trial(Candidate(effect, (), ("x",)), gain, 0.0, 1.0, p_value, gain - 1.0)
+        return trial, None
+
+    linear = [entry("torque_scale", 100.0), entry("linear_drag", 50.0), entry("inertia", 3.0, p_value=0.5)]
+    assert [t.candidate.effect for t, _ in shortlist(linear)] == ["torque_scale", "linear_drag", "inertia"]
+    assert [t.candidate.effect for t, _ in shortlist(linear[1:])] == ["linear_drag"]

@@ -42,6 +42,7 @@ def test_the_two_pay_for_their_parameters_and_for_being_two(monkeypatch: pytest.
     assert found is not None
     both = ["thrust_scale"] if trim else ["thrust_scale", "center_of_mass"]
     assert asked[0][0] == ["payload", "linear_drag"]
+    assert [c.effect for c in split.instead_of_a_load(point.vehicle)] == both
     assert asked[1] == (["linear_drag", *both], sorted(["linear_drag", *both]))
     wanted = 6.0 - 4 + 1 if trim else 6.0 - 4 + 4 + np.log(len(CATALOGUE))
     assert margin(*found)[0] == pytest.approx(wanted)
