@@ -34,7 +34,9 @@ class Flight:
     Attributes:
         name: of the recording.
         time: (n,) s on the recording's clock, increasing.
-        starts: (n,) bool: where nothing is known of the step before.
+        starts: (n,) bool: where the filter begins anew.
+        gaps: (n,) bool: where nothing is known of the step before, so that nothing can be carried along the path. Each is
+            a start; a start elsewhere leaves out a step whose path is known (see `PIECE`, `Data.leave_out_wild`).
         y: (n, 13) position [m], velocity [m/s], attitude (x y z w), body rate [rad/s]; NaN where not measured.
         force: (n, 3) accelerometer [m/s^2, body]; NaN where not measured.
         voltage: (n,) V; NaN where unknown.
@@ -48,6 +50,7 @@ class Flight:
     name: str
     time: NDArray
     starts: NDArray
+    gaps: NDArray
     y: NDArray
     force: NDArray
     voltage: NDArray
@@ -73,8 +76,8 @@ class Flight:
         broken = np.concatenate([[True], np.diff(index) > 1])
         block = np.unique(self.block[index], return_inverse=True)[1]
         return replace(
-            self, time=self.time[index], starts=self.starts[index] | broken, y=self.y[index], force=self.force[index],
-            voltage=self.voltage[index], flown=self.flown[index], block=block,
+            self, time=self.time[index], starts=self.starts[index] | broken, gaps=self.gaps[index] | broken,
+            y=self.y[index], force=self.force[index], voltage=self.voltage[index], flown=self.flown[index], block=block,
         )  # fmt: skip
 
 
@@ -112,14 +115,14 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
     fresh = np.concatenate([[True], np.any((y[1:] != y[:-1]) & np.isfinite(y[1:]), axis=1)])  # a repeated row is none
     time, y, force = time[fresh], y[fresh], force[fresh]
     y[:, 6:10] /= np.linalg.norm(y[:, 6:10], axis=1, keepdims=True)
-    starts = _starts(time, inputs.time, air.airborne)
+    gaps = _gaps(time, inputs.time, air.airborne)
     voltage = np.full(time.size, np.nan)
     if "voltage" in recording.signals:
         when, value = ordered(recording.signals["voltage"])
         voltage = np.interp(time, when, value[:, 0])
     ground = air.ground if np.isfinite(air.ground) else 0.0
     flight = Flight(
-        name=recording.path, time=time, starts=starts, y=y, force=force, voltage=voltage,
+        name=recording.path, time=time, starts=_starts(time, gaps), gaps=gaps, y=y, force=force, voltage=voltage,
         flown=time - air.airborne[0][0], ground=ground, block=_blocks(time), inputs=inputs,
         signals=frozenset(n for n in (*measured, "specific_force", "voltage", "rotor_speed", *COMMANDS)
                           if n in recording.signals or (n == "body_rate" and n in measured)),
@@ -202,18 +205,22 @@ def _place(target: NDArray, nodes: NDArray, when: NDArray, value: NDArray) -> No
     target[at[near]] = value[near]
 
 
-def _starts(time: NDArray, commands: NDArray, airborne: Sequence[tuple[float, float]]) -> NDArray:
-    """Where a stretch begins: gaps of measurements or inputs, flights, and every `PIECE` seconds."""
-    starts = np.concatenate([[True], np.diff(time) > MAX_GAP])
-    gaps = np.flatnonzero(np.diff(commands) > MAX_GAP)
-    for g in gaps:  # any step that touches a gap of the inputs
-        starts |= (time > commands[g]) & (time <= commands[g + 1] + MAX_GAP)
-    starts |= (time <= commands[0]) | (time > commands[-1] + MAX_GAP)
+def _gaps(time: NDArray, commands: NDArray, airborne: Sequence[tuple[float, float]]) -> NDArray:
+    """Where a stretch of path begins: gaps of measurements or inputs, and flights."""
+    gaps = np.concatenate([[True], np.diff(time) > MAX_GAP])
+    for g in np.flatnonzero(np.diff(commands) > MAX_GAP):  # any step that touches a gap of the inputs
+        gaps |= (time > commands[g]) & (time <= commands[g + 1] + MAX_GAP)
+    gaps |= (time <= commands[0]) | (time > commands[-1] + MAX_GAP)
     for begin, _ in airborne:
         at = int(np.searchsorted(time, begin))
         if at < time.size:
-            starts[at] = True
-    began = time[0]
+            gaps[at] = True
+    return gaps
+
+
+def _starts(time: NDArray, gaps: NDArray) -> NDArray:
+    """Where the filter begins anew: at gaps and every `PIECE` seconds."""
+    starts, began = gaps.copy(), time[0]
     for k in range(time.size):
         if starts[k]:
             began = time[k]

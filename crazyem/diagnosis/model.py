@@ -106,7 +106,7 @@ def initial_path(flight: Flight) -> NDArray:
 def thrust_of(flight: Flight, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, NDArray]:
     """Mean thrust of each rotor over the steps, and its rate: (n, 4) N, (n, 4) N/s."""
     return rotor_thrust(
-        flight.inputs, flight.time, vehicle=vehicle, effects=effects, breaks=np.flatnonzero(flight.starts).tolist()
+        flight.inputs, flight.time, vehicle=vehicle, effects=effects, breaks=np.flatnonzero(flight.gaps).tolist()
     )
 
 
@@ -116,7 +116,7 @@ def situation_of(
     """The situation at the rows of a path (n, 19)."""
     thrust, rate = thrusts
     step = np.concatenate([[0.0], np.diff(flight.time)])
-    step[flight.starts] = 0.0
+    step[flight.gaps] = 0.0
     rotation = rotation_matrix(path[:, 6:10]) if rotation is None else rotation
     n = flight.time.size
     return Situation(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.always import TRIM, by_gain, nuisances, on_held_out, refine_base, with_nuisances, without
+from crazyem.diagnosis.beginnings import best_begun
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import Data, DivergedError, held_near, remembering_anew
 from crazyem.diagnosis.gram import Solution
@@ -171,7 +172,7 @@ def select(
             if all(c.effect != a.effect and (c.effect, a.effect) not in PARTNERS for a in accepted)
         ]
         say(f"looking for effect {turn + 1} among {len(rest)} candidates")
-        linear = linear_trials(data, point, accepted, rest)
+        linear = linear_trials(data, point, accepted, best_begun(data, point, accepted, rest))
         if steps:
             steps[-1] = replace(steps[-1], beside=additions(steps[-1], [t for t, _ in linear]))
         promising = shortlist(linear)
