@@ -13,7 +13,8 @@ from crazyem.physics.effects.effect import Effect, Parameter
 from crazyem.physics.motion import own_values
 
 ON_BOARD = 0.04  # m from the middle of the rotors: no part of a Crazyflie is further away
-ASIDE = ("gusts", "accelerometer_misalignment")  # judged by themselves: gusts.py, accelerometer.py
+# judged by themselves: gusts.py, accelerometer.py; of every log: always.py
+ASIDE = ("gusts", "accelerometer_misalignment", "onboard_filter")
 ASKED = ("trim",)  # looked for only if asked for: near every effect that brings a steady torque
 
 

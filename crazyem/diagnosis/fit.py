@@ -238,12 +238,13 @@ def refine(
     candidates: Sequence[Candidate],
     *,
     nuisances: Sequence[tuple[Candidate, tuple[float, ...]]] = (),
+    about: Point | None = None,
     rounds: int = ROUNDS,
     noise: bool = True,
 ) -> Fitted:
     """Maximum of the posterior near `start`, in which the candidates' effects already stand.
 
-    `nuisances` are free too, with Gaussian priors about neutral of these precisions.
+    `nuisances` are free too, with Gaussian priors of these precisions about neutral, or about their values in `about`.
 
     Raises: DivergedError if the filter leaves the range of numbers at `start`.
     """
@@ -253,7 +254,9 @@ def refine(
     weight = np.array([0.0] * own + [w for _, precision in nuisances for w in precision])
 
     def away(at: Point) -> NDArray:
-        return np.array([0.0] * own + [c.values(at)[n] - c.neutral(at)[n] for c, _ in nuisances for n in c.free])
+        middle = [c.neutral(at) if about is None else c.values(about) for c, _ in nuisances]
+        apart = [c.values(at)[n] - m[n] for (c, _), m in zip(nuisances, middle, strict=True) for n in c.free]
+        return np.array([0.0] * own + apart)
 
     def look(at: Point) -> tuple[float, Gram]:
         data.converge(at)

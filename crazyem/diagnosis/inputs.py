@@ -19,7 +19,9 @@ from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
 NOMINAL_VOLTAGE = 3.85  # V under load, middle of 3.7 to 4.0 V, where none is recorded
-DELAY_OF_COMMANDS = 3.5e-3  # s: a command is held for 2 ms at 500 Hz, rates are low-passed at 80 Hz (2.8 ms)
+# s: a command is held for 2 ms at 500 Hz, rates are low-passed at 80 Hz (2.8 ms). Where the attitude is recorded it is the
+# clock, and rates are behind it (physics/effects/onboard_filter.py).
+DELAY_OF_COMMANDS, BEHIND_ATTITUDE = 3.5e-3, 2.1e-3
 _SAMPLED = ("motor_command", "motor_request", "mixer_command")
 FULL = 65535.0  # counts of PWM
 STAND_IN = 0.01  # m, arm and torque per thrust of a vehicle without rotors; cancels
@@ -87,6 +89,8 @@ def inputs_of(recording: Recording, vehicle: Vehicle, *, flight: Airtime | None 
     ground = flight.ground if flight is not None and np.isfinite(flight.ground) else 0.0
     alignment = align(recording, found.time, found.thrust, flight) if name == "rotor_speed" else None
     late = DELAY_OF_COMMANDS if name in _SAMPLED else alignment.delay if alignment is not None else 0.0
+    if name in _SAMPLED and "attitude" in recording.signals:
+        late -= BEHIND_ATTITUDE
     notices = found.notices if alignment is None else (*found.notices, alignment.said())
     rotor = RotorInput(
         found.time,

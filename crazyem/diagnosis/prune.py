@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from crazyem.diagnosis.always import nuisances, on_held_out, refine_base, without
+from crazyem.diagnosis.always import nuisances, of_each_flight, on_held_out, refine_base, without
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import TORQUES, Data, Fitted
 from crazyem.diagnosis.model import Point
@@ -16,6 +16,7 @@ from crazyem.diagnosis.trials import LIKELY, SURE, Step, both, significance, wal
 ADMITTED = 8.0  # nats of evidence that an effect must bring
 HELD = 3.0  # nats it must bring on flight held out,
 TELLING = 2.0  # if that is so much less than would be expected there; else it must not cost what it must bring
+MISLED = 0.1  # share of its gain that it may cost where it cannot be seen: hovers have biases of their own
 OTHERWISE = 0.01  # p-value of an effect's being the same size beside what shakes (Hausman 1978)
 APART = 1 / 3  # of its size, at least: sampled commands make some per cent of difference
 WANDERING = 10.0  # nats that disturbing torques with memory must gain to be allowed for
@@ -33,7 +34,7 @@ def drop(
     accepted, steps = list(accepted), list(steps)
     while accepted:
         here = data.loglik(fitted.point, passes=2)
-        held_here = on_held_out(held_out, fitted.point, accepted).loglik if held_out else 0.0
+        held_here = on_held_out(held_out, fitted.point, accepted, judging=True).loglik if held_out else 0.0
         judged = []
         bare = data.workers.map(partial(bare_fit, data, held_out, fitted, accepted), accepted)
         for c, (less, held_less) in zip(accepted, bare, strict=True):
@@ -41,7 +42,9 @@ def drop(
             assert step.taken is not None
             gain = (here - less.loglik) / step.taken.dispersion
             held = (held_here - held_less) / step.taken.dispersion
-            need = HELD if held_out is None or expected(held_out, fitted, accepted, c) > TELLING * HELD else -ADMITTED
+            need = -max(ADMITTED, MISLED * gain)
+            if held_out is None or expected(held_out, fitted, accepted, c) > TELLING * HELD * step.taken.dispersion:
+                need = HELD
             judged.append((min(gain - len(c.free) + held, held + ADMITTED - need if held_out else np.inf), c, less))
             now = replace(step.taken, gain=gain * step.taken.dispersion, held_out=held * step.taken.dispersion)
             steps = [replace(s, taken=now) if s is step and held_out else s for s in steps]
@@ -63,7 +66,8 @@ def expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], cand
     """
     point = fitted.point
     rest = [c for c in accepted if c is not candidate]
-    free = nuisances(held_out, point, accepted)
+    taken = {c.effect for c in accepted}
+    free = [(c, p) for c, p in of_each_flight(held_out, point) if c.effect not in taken]
     columns = [x for c in [candidate, *rest, *(c for c, _ in free)] for x in c.columns(point)]
     held_out.settle(point)
     _, information = held_out.gram(point, columns).total(range(len(columns)))
@@ -73,6 +77,10 @@ def expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], cand
     inner = a[:own, :own] - a[:own, own:] @ np.linalg.lstsq(a[own:, own:], a[own:, :own], rcond=1e-12)[0]
     here, neutral = candidate.values(point), candidate.neutral(point)
     away = np.array([here[n] - neutral[n] for n in candidate.free])
+    # an effect of a kind that is always free goes part of the way without being there
+    usual = {n: w for c, p in of_each_flight(held_out, point) if c.effect == candidate.effect for n, w in zip(c.free, p)}
+    spread = np.diag([usual[n] ** -0.5 if n in usual else 0.0 for n in candidate.free])
+    inner = inner @ np.linalg.inv(np.eye(own) + spread @ spread @ inner)
     return 0.5 * float(away @ inner @ away)
 
 
@@ -82,7 +90,7 @@ def bare_fit(
     """The fit without one of the effects, and its log-likelihood on flights held out; changes nothing of the data."""
     rest = [a for a in accepted if a is not candidate]
     less = refine_base(data.twin(), without(fitted.point, candidate.effect), rest, rounds=2, noise=False)
-    return less, on_held_out(held_out.twin(), less.point, rest).loglik if held_out else 0.0
+    return less, on_held_out(held_out.twin(), less.point, rest, judging=True).loglik if held_out else 0.0
 
 
 def survive(
@@ -118,7 +126,7 @@ def survive(
 
 def held_gain(data: Data, held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate) -> float:
     """What an effect as fitted gains on flights held out [nats]."""
-    there = on_held_out(held_out, fitted.point, accepted).loglik
+    there = on_held_out(held_out, fitted.point, accepted, judging=True).loglik
     return there - bare_fit(data, held_out, fitted, accepted, candidate)[1]
 
 

@@ -8,6 +8,7 @@ look-alike.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.always import TRIM, by_gain, nuisances, on_held_out, refine_base, with_nuisances, without
 from crazyem.diagnosis.beginnings import best_begun
 from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, DivergedError, held_near, remembering_anew
+from crazyem.diagnosis.fit import Data, DivergedError, Fitted, held_near, remembering_anew
 from crazyem.diagnosis.gram import Solution
 from crazyem.diagnosis.model import Column, Point
 from crazyem.diagnosis.onset import date, onset_of
@@ -125,25 +126,41 @@ class Basis:
 
 def tried(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str], None]) -> Trial:
     """The trial of the linear approximation after a fit without it; changes nothing of the basis."""
-    point, held_out = basis.point, basis.held_out
+    point = basis.point
     say(f"  fitting {trial.candidate.label}")
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
     try:
         fit = refine_base(data, with_started(point, trial.candidate, solution), mine, rounds=3, noise=False)
     except DivergedError:  # the linear approximation went too far
         return replace(trial, p_value=1.0)
+    return compared(basis, trial, data, fit)
+
+
+def sharpened(basis: Basis, trial: Trial) -> Trial:
+    """A trial with noise scales of its own: under those of the model before it, the right explanation gains little."""
+    assert trial.fitted is not None
+    data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
+    try:
+        fit = refine_base(data, remembering_anew(data, trial.fitted.point), mine, rounds=2)
+    except DivergedError:
+        return trial
+    return compared(basis, trial, data, fit)
+
+
+def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
+    """The trial with what its fit gains, on the flights fitted (`data`, where the fit is) and on those held out."""
     gain = fit.loglik - basis.value
     blocks = data.block_loglik(fit.point)
-    held, value = trial.held_out, gain
-    if held_out:
-        apart = held_out.twin()
+    held, value, mine = trial.held_out, gain, [*basis.accepted, trial.candidate]
+    if basis.held_out:
+        apart = basis.held_out.twin()
         there = on_held_out(apart, fit.point, mine)
         held, blocks = there.loglik - basis.held_value, np.append(blocks, apart.block_loglik(there.point))
         value += held + gain_of_both(fit, apart, there, mine)
     k = len(trial.candidate.free)
     wald_p = significance(fit, k, offset=sum(len(c.free) for c in basis.accepted))
-    wald_p = by_gain(point, gain / trial.dispersion, k, len(fit.gram.score), wald_p)
-    sure = both(max(trial.p_value, wald_p), held / trial.dispersion if held_out else 0.0)
+    wald_p = by_gain(fit.point, gain / trial.dispersion, k, len(fit.gram.score), wald_p)
+    sure = both(max(trial.p_value, wald_p), held / trial.dispersion if basis.held_out else 0.0)
     sure = sure if matters(fit.point, trial.candidate) else 1.0
     return replace(trial, gain=gain, held_out=held, p_value=sure, fitted=fit, blocks=blocks, value=value)
 
@@ -189,7 +206,14 @@ def select(
             break
         assert best is not None
         assert best.fitted is not None
-        equals = [best, *(t for t in trials[1:] if rivals(t, counted=held_out is not None) and not told_apart(best, t))]
+        equals = alike_with(best, trials, counted=held_out is not None)
+        if len(equals) > 1:
+            say(f"  comparing {', '.join(t.candidate.label for t in equals)}")
+            again = data.workers.map(partial(sharpened, basis), equals)
+            trials = weighed([*again, *(t for t in trials if all(t is not e for e in equals))], counted=held_out is not None)
+            close = [t for t in trials if any(t.candidate is a.candidate for a in again)]
+            best = close[0]
+            equals = alike_with(best, close, counted=held_out is not None)
         simplest = min(equals, key=lambda t: (len(t.candidate.free), -t.evidence))
         if own_evidence(simplest, counted=held_out is not None) > ADMITTED:
             best = simplest
@@ -241,6 +265,12 @@ def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
     left = {c: max(t.gain for t in later if t.candidate.effect == c) for c in {t.candidate.effect for t in later}}
     fitted = [t for t in step.trials if t.fitted is not None and t.candidate.effect in left]
     return frozenset(t.candidate.effect for t in fitted if 0 < BESIDE * t.gain < left[t.candidate.effect])
+
+
+def alike_with(best: Trial, trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
+    """The best, and what is not told apart from it."""
+    others = [t for t in trials if t is not best and rivals(t, counted=counted)]
+    return [best, *(t for t in others if not told_apart(best, t))]
 
 
 def rivals(trial: Trial, *, counted: bool) -> bool:

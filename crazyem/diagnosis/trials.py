@@ -19,7 +19,7 @@ CLOSE = 4.0  # nats within which two explanations cannot be told apart,
 TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks
 # Smaller than this, these are not told from what filters, sampling and the air of a room do: s, s, 1, rad, rad/s, 1,
 # m/s, N s/m, N s^2/m^2, 1, N m s/m.
-LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "velocity_scale": 0.05, "attitude_misalignment": 2e-3,
+LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "velocity_scale": 0.035, "attitude_misalignment": 2e-3,
          "gyro_bias": 3e-3, "torque_scale": 0.05, "wind": 0.1, "linear_drag": 1e-3, "quadratic_drag": 1e-3,
          "thrust_curve": 0.03, "velocity_moment": 3e-6}  # fmt: skip
 LEAST_INERTIA = 0.06  # relative, the same
@@ -178,4 +178,6 @@ def matters(point: Point, candidate: Candidate) -> bool:
         return any(abs(here[n] / neutral[n] - 1.0) > LEAST_INERTIA for n in candidate.free)
     if least is None:
         return True
+    if candidate.effect == "input_delay":
+        return bool(here["delay"] - neutral["delay"] > least)  # before it is told to act nothing acts
     return any(abs(here[n] - neutral[n]) > least for n in candidate.free)

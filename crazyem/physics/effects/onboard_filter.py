@@ -1,0 +1,36 @@
+"""onboard_filter: what filters on board do to what is logged.
+
+A gyro is low-passed before it is logged (crazyflie-firmware, sensors_bmi088_bmp3xx.c: second order at 80 Hz, 2.8 ms), and
+so are the accelerations that carry an onboard estimate of velocity from one fix of the pose to the next; attitude and
+position, which the fixes show, are later by less. So rates are behind the attitude and velocities behind the position.
+It belongs to the log and not to the drone: no vehicle file needs it, and diagnosis leaves it free
+(`crazyem/diagnosis/always.py`).
+"""
+
+import numpy as np
+
+from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
+from crazyem.vehicle import GRAVITY
+
+
+def filtered(situation: Situation, *, rate_lag: float, velocity_lag: float) -> Offset:
+    """The gyro shows w - rate_lag dw/dt, the estimate of velocity v - velocity_lag dv/dt; lags in s."""
+    offset = Offset(np.zeros((situation.size, 12)), np.zeros((situation.size, 3)))
+    acceleration = np.einsum("nij,nj->ni", situation.rotation, situation.specific_force)
+    acceleration[:, 2] -= GRAVITY
+    offset.state[:, 3:6] = -velocity_lag * acceleration
+    offset.state[:, 9:12] = -rate_lag * situation.angular_acceleration
+    return offset
+
+
+ONBOARD_FILTER = Effect(
+    "onboard_filter",
+    (
+        Parameter("rate_lag", "s", 0.0, -0.02, 0.02, 1e-3),
+        Parameter("velocity_lag", "s", 0.0, -0.02, 0.02, 1e-3),
+    ),
+    order=85,
+    measured=filtered,
+    needs=("velocity", "body_rate"),
+    separates="log the pose of motion capture beside the onboard estimate",
+)
