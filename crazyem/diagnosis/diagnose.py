@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from crazyem.diagnosis import accelerometer
+from crazyem.diagnosis import accelerometer, rotor_response
 from crazyem.diagnosis.always import abstained, solved, steadied, unsure, usual_gusts
 from crazyem.diagnosis.candidates import Candidate, candidates_for
 from crazyem.diagnosis.fit import Data
@@ -134,6 +134,11 @@ def diagnose(
         remains = remains.beside(place.finding)
     effects, groups, separate = _named(data, selection, remains, told, as_two(data, apart, selection))
     beside = _beside(data, apart, selection.final, remains, wanted, left_out, place is not None, say)
+    if flights[0].inputs.measured and not any(e.name == "input_delay" for e in effects):
+        late, alike = _late_rotors(recordings, held_out, vehicle, wanted, left_out)
+        beside += late
+        groups = (*groups, *alike)
+        separate = tuple(dict.fromkeys((*separate, *(CATALOGUE[n].separates for g in alike for n in g))))
     if any(e.name == "gusts" for e in beside):
         remains = remains.without_force()
     effects = (*effects, *beside)
@@ -223,6 +228,30 @@ def _beside(
                 found.append(Named(accelerometer.EFFECT, accelerometer.EFFECT, values, {}, held, wald,
                                    _share(min(solution.gain / max(1.0, solution.dispersion), held), [])))  # fmt: skip
     return found
+
+
+def _late_rotors(
+    recordings: Sequence[Recording],
+    held_out: Sequence[Recording],
+    vehicle: Vehicle,
+    wanted: Sequence[str],
+    left_out: dict[str, str],
+) -> tuple[list[Named], tuple[tuple[str, ...], ...]]:
+    """Lag and delay of rotors whose speeds were measured, and the group of both where one is as good as the other."""
+    found = rotor_response.response(recordings, vehicle)
+    if found is None:
+        return [], ()
+    left_out.pop("motor_lag", None)
+    late = rotor_response.judged(found, rotor_response.response(held_out, vehicle), vehicle)
+    if late is None or (wanted and not set(late.values) & set(wanted)):
+        return [], ()
+    named = []
+    for name, (value, sd) in late.values.items():
+        p = CATALOGUE[name].parameters[0]
+        values = {p.name: Value(value, p.unit, sd, _around(value, sd))}
+        sure = _share(min(late.nats, late.held_out), []) * (0.5 if late.alike else 1.0)
+        named.append(Named(name, name, values, {}, late.held_out, float(np.exp(-min(late.nats, 700.0))), sure))
+    return named, (("motor_lag", "input_delay"),) if late.alike else ()
 
 
 def _around(value: float, sd: float) -> tuple[float, float]:

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from crazyem.diagnosis.always import nuisances, of_each_flight, on_held_out, refine_base, without
+from crazyem.diagnosis.always import nuisances, on_held_out, refine_base, without
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import TORQUES, Data, Fitted
 from crazyem.diagnosis.model import Point
@@ -34,7 +34,7 @@ def drop(
     accepted, steps = list(accepted), list(steps)
     while accepted:
         here = data.loglik(fitted.point, passes=2)
-        held_here = on_held_out(held_out, fitted.point, accepted, judging=True).loglik if held_out else 0.0
+        held_here = on_held_out(held_out, fitted.point, accepted).loglik if held_out else 0.0
         judged = []
         bare = data.workers.map(partial(bare_fit, data, held_out, fitted, accepted), accepted)
         for c, (less, held_less) in zip(accepted, bare, strict=True):
@@ -66,8 +66,7 @@ def expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], cand
     """
     point = fitted.point
     rest = [c for c in accepted if c is not candidate]
-    taken = {c.effect for c in accepted}
-    free = [(c, p) for c, p in of_each_flight(held_out, point) if c.effect not in taken]
+    free = nuisances(held_out, point, accepted)
     columns = [x for c in [candidate, *rest, *(c for c, _ in free)] for x in c.columns(point)]
     held_out.settle(point)
     _, information = held_out.gram(point, columns).total(range(len(columns)))
@@ -78,7 +77,7 @@ def expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], cand
     here, neutral = candidate.values(point), candidate.neutral(point)
     away = np.array([here[n] - neutral[n] for n in candidate.free])
     # an effect of a kind that is always free goes part of the way without being there
-    usual = {n: w for c, p in of_each_flight(held_out, point) if c.effect == candidate.effect for n, w in zip(c.free, p)}
+    usual = {n: w for c, p in nuisances(held_out, point, ()) if c.effect == candidate.effect for n, w in zip(c.free, p)}
     spread = np.diag([usual[n] ** -0.5 if n in usual else 0.0 for n in candidate.free])
     inner = inner @ np.linalg.inv(np.eye(own) + spread @ spread @ inner)
     return 0.5 * float(away @ inner @ away)
@@ -90,7 +89,7 @@ def bare_fit(
     """The fit without one of the effects, and its log-likelihood on flights held out; changes nothing of the data."""
     rest = [a for a in accepted if a is not candidate]
     less = refine_base(data.twin(), without(fitted.point, candidate.effect), rest, rounds=2, noise=False)
-    return less, on_held_out(held_out.twin(), less.point, rest, judging=True).loglik if held_out else 0.0
+    return less, on_held_out(held_out.twin(), less.point, rest).loglik if held_out else 0.0
 
 
 def survive(
@@ -126,7 +125,7 @@ def survive(
 
 def held_gain(data: Data, held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate) -> float:
     """What an effect as fitted gains on flights held out [nats]."""
-    there = on_held_out(held_out, fitted.point, accepted, judging=True).loglik
+    there = on_held_out(held_out, fitted.point, accepted).loglik
     return there - bare_fit(data, held_out, fitted, accepted, candidate)[1]
 
 
