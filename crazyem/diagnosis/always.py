@@ -53,7 +53,7 @@ Nuisances = list[tuple[Candidate, tuple[float, ...]]]  # with the precision of e
 def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisances:
     """What is always free, with the precisions of its priors about neutral."""
     measured = data.flights[0].inputs.measured
-    found: Nuisances = [(Candidate("input_delay", (), ("delay",)), (DELAY_SD[measured] ** -2,))]
+    found: Nuisances = [(Candidate("input_delay", (), ("delay",), both_ways=True), (DELAY_SD[measured] ** -2,))]
     if "body_rate" in data.signals or "attitude" in data.signals:
         coarse = coarsely_sampled(data, point)
         share = COARSE_INERTIA_SD if coarse else INERTIA_SD

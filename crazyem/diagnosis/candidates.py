@@ -27,12 +27,14 @@ class Candidate:
         fixed: parameters that are chosen (a rotor, a stream).
         free: parameters that are fitted.
         begin: values at which derivatives are taken while the effect is not part of the model.
+        both_ways: it may be less than nothing as well: a delay that is already counted may be counted too long.
     """
 
     effect: str
     fixed: tuple[tuple[str, Any], ...]
     free: tuple[str, ...]
     begin: tuple[tuple[str, float], ...] = ()
+    both_ways: bool = False
 
     @property
     def label(self) -> str:
@@ -45,6 +47,13 @@ class Candidate:
     def parameter(self, name: str) -> Parameter:
         """The parameter of that name."""
         return next(p for p in CATALOGUE[self.effect].parameters if p.name == name)
+
+    def range_of(self, name: str) -> tuple[float, float]:
+        """What is admitted of a parameter while it is fitted: a payload is on the drone."""
+        p, far = self.parameter(name), math.inf
+        if self.effect in ("payload", "center_of_mass") and name in "xyz":
+            far = ON_BOARD
+        return max(-p.high if self.both_ways else p.low, -far), min(p.high, far)
 
     def neutral(self, point: Point) -> dict[str, Any]:
         """All its parameters as the vehicle file has them, else at neutral; the choices made."""
@@ -75,13 +84,9 @@ class Candidate:
     def bounds(self, point: Point) -> tuple[list[float], list[float]]:
         """Admitted changes of the free parameters from where they are."""
         here = self.values(point)
-        ends = [(max(p.low, -r), min(p.high, r)) for p, r in ((self.parameter(n), self.reach(n)) for n in self.free)]
+        ends = [self.range_of(n) for n in self.free]
         low = [min(end[0] - here[n], 0.0) for end, n in zip(ends, self.free, strict=True)]
         return low, [max(end[1] - here[n], 0.0) for end, n in zip(ends, self.free, strict=True)]
-
-    def reach(self, name: str) -> float:
-        """How far from 0 a parameter may go while it is fitted: a payload is on the drone."""
-        return ON_BOARD if self.effect in ("payload", "center_of_mass") and name in "xyz" else math.inf
 
     def started(self, point: Point, change: Sequence[float]) -> dict[str, Any]:
         """Values of the effect after a change found while it was not part of the model.
@@ -107,8 +112,8 @@ class Candidate:
             step = moved[name] * (ratio if grown is not None else 1.0)
             found[name] = base[name] + step
         for name in self.free:
-            p = self.parameter(name)
-            found[name] = min(max(found[name], p.low, -self.reach(name)), p.high, self.reach(name))
+            low, high = self.range_of(name)
+            found[name] = min(max(found[name], low), high)
         return found
 
 

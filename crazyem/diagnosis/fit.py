@@ -225,8 +225,7 @@ def moved(point: Point, candidates: Sequence[Candidate], change: NDArray) -> Poi
     for c in candidates:
         here = c.values(point)
         for name in c.free:
-            p = c.parameter(name)
-            here[name] = float(np.clip(here[name] + change[at], p.low, p.high))
+            here[name] = float(np.clip(here[name] + change[at], *c.range_of(name)))
             at += 1
         changes[c.effect] = {**changes.get(c.effect, {}), **here}
     return point.with_effects(changes)

@@ -19,6 +19,7 @@ TELLING = 2.0  # if that is so much less than would be expected there; else it m
 MISLED = 0.1  # share of its gain that it may cost where it cannot be seen: hovers have biases of their own
 OTHERWISE = 0.01  # p-value of an effect's being the same size beside what shakes (Hausman 1978)
 APART = 1 / 3  # of its size, at least: sampled commands make some per cent of difference
+FORCES = np.full(3, 0.2)  # m/s^2, where wandering forces begin
 WANDERING = 10.0  # nats that disturbing torques with memory must gain to be allowed for
 
 
@@ -100,9 +101,10 @@ def survive(
     held_out: Data | None,
     say: Callable[[str], None],
 ) -> tuple[Fitted, list[Candidate], list[Step]]:
-    """Leave out what is no longer significant once torques may wander: noise with memory looks like a wrong inertia."""
+    """Leave out what is no longer significant once forces and torques may wander: noise with memory looks like a wrong
+    inertia, and gusts like a wrong thrust curve."""
     while accepted:
-        noise = replace(fitted.point.noise, disturbance=np.concatenate([np.zeros(3), TORQUES]), memory=1.0)
+        noise = replace(fitted.point.noise, disturbance=np.concatenate([FORCES, TORQUES]), memory=1.0)
         point = data.fit_noise(replace(fitted.point, noise=noise), iterations=5)
         if data.loglik(point, passes=2) < data.loglik(fitted.point, passes=2) + WANDERING:
             break
@@ -118,7 +120,7 @@ def survive(
         worst = int(np.argmax(sure))
         if sure[worst] < SURE:
             break
-        say(f"  left out again, torques may wander: {accepted[worst].label}")
+        say(f"  left out again, forces and torques may wander: {accepted[worst].label}")
         fitted, accepted, steps = left_out(data, fitted, accepted, steps, accepted[worst])
     return fitted, accepted, steps
 

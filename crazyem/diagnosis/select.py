@@ -95,7 +95,8 @@ def linear_trials(
         near = order[: len(order) - len(mine)]
         lo = np.append(low[near], wide_low[order[len(near) :]])
         hi = np.append(high[near], wide_high[order[len(near) :]])
-        judge(c, [always[i] for i in order], w, lo, hi, centre[order])
+        asked = next(a for a in candidates if a.effect == c.effect)
+        judge(asked, [always[i] for i in order], w, lo, hi, centre[order])
     return sorted(found, key=lambda t: -t[0].evidence)
 
 

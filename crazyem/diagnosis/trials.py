@@ -178,6 +178,4 @@ def matters(point: Point, candidate: Candidate) -> bool:
         return any(abs(here[n] / neutral[n] - 1.0) > LEAST_INERTIA for n in candidate.free)
     if least is None:
         return True
-    if candidate.effect == "input_delay":
-        return bool(here["delay"] - neutral["delay"] > least)  # before it is told to act nothing acts
     return any(abs(here[n] - neutral[n]) > least for n in candidate.free)

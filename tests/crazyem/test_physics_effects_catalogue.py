@@ -27,6 +27,7 @@ AGREED = {  # issue 5: names are an interface
     "rotor_inertia": "inertia", "inertia": "xx yy zz", "inertia_products": "xy xz yz", "torque_scale": "scale",
     "suspended_load": "mass length", "rotor_sensor": "rotor scale",
     "trim": "x y z",  # not of the issue: what real drones need
+    "onboard_filter": "rate_lag velocity_lag",  # nor this: what every log needs
 }  # fmt: skip
 
 SIGNALS = {
@@ -117,7 +118,7 @@ def everything(name: str, values: dict) -> np.ndarray:
     path = still(60, velocity=np.c_[np.sin(5 * t), np.cos(3 * t), np.sin(4 * t)],
                  body_rate=np.c_[t, np.sin(9 * t), 1 - t],
                  specific_force=[1.0, 2.0, 9.0], thrust=[0.08, 0.07, 0.07, 0.07], thrust_rate=[0.1, 0, 0, 0],
-                 height=np.full(60, 0.1))  # fmt: skip
+                 angular_acceleration=np.c_[np.cos(t), 9 * np.cos(9 * t), t], height=np.full(60, 0.1))  # fmt: skip
     effects: Effects = {name: values}
     moved, shown = (f(path, vehicle=ROTORS, effects=effects) for f in (motion, measured))
     found = [moved.specific_force, moved.angular_acceleration, shown.state, shown.specific_force]

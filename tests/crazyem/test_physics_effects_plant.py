@@ -167,6 +167,7 @@ def test_the_simulator_flies_whatever_a_fit_may_find():
     narrower = [
         (name, ours.name)
         for name, effect in CATALOGUE.items()
+        if name != "onboard_filter"  # is of the log; no fit puts it into a vehicle
         for ours in effect.parameters
         for theirs in EFFECTS[name].parameters
         if theirs.name == ours.name != "onset_time" and not theirs.low <= ours.low <= ours.high <= theirs.high

@@ -26,8 +26,7 @@ MOTOR_LAG = Effect(
 
 INPUT_DELAY = Effect(
     "input_delay",
-    # below 0 only where stamps are: what is known of the inputs' delay (RotorInput.delay) may be too much
-    (Parameter("delay", "s", 0.0, -0.02, 0.1, 1e-3),),
+    (Parameter("delay", "s", 0.0, 0.0, 0.1, 1e-3),),
     order=23,
     timing=late,
     needs=("motor_command", "rotor_speed"),
