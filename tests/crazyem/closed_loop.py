@@ -38,6 +38,7 @@ class Hidden:
         torque: factor on the rotors' torques.
         drag: (3,) N s/m, body axes.
         rope: N, along world x where x is beyond 0.1 m: nothing of the catalogue does that.
+        load: kg and m of a weight on a string that swings little: a plane pendulum, its weight, and no more.
     """
 
     thrust: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
@@ -45,6 +46,7 @@ class Hidden:
     torque: float = 1.0
     drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rope: float = 0.0
+    load: tuple[float, float] = (0.0, 1.0)
 
 
 def wanted(seed: int, time: Array) -> tuple[Array, Array, Array, Array]:
@@ -74,11 +76,12 @@ def turned(r, by):
 
 
 @compiled
-def loop(goal, goal_v, goal_a, yaw, noise, kicks, sway, weak, onset, scale, drag, rope, mass, inertia, levers, signs,
-         unmix, lag, most, h, rows):  # fmt: skip
+def loop(goal, goal_v, goal_a, yaw, noise, kicks, sway, weak, onset, scale, drag, rope, load, mass, inertia, levers,
+         signs, unmix, lag, most, h, rows):  # fmt: skip
     p, v, r, w = goal[0].copy(), goal_v[0].copy(), np.eye(3), np.zeros(3)
     f, integral = np.full(4, mass * G / 4), np.zeros(3)
     sa, sb = np.zeros((4, 3)), np.zeros((4, 3))
+    aside, slide, stiff = np.zeros(3), np.zeros(3), G / load[1]
     for k in range(len(goal)):
         p_s, v_s, w_s = p + noise[k, :3], v + noise[k, 3:6], w + noise[k, 9:]
         r_s = turned(r, noise[k, 6:9])
@@ -113,9 +116,15 @@ def loop(goal, goal_v, goal_a, yaw, noise, kicks, sway, weak, onset, scale, drag
             world = at @ body
             if p[0] > 0.1:
                 world[0] += rope
+            world += load[0] * stiff * aside
+            world[2] -= load[0] * G
             sa[i] = world / mass
             sa[i, 2] -= G
             sb[i] = (scale * levers * (signs @ real) - cross(w_at, inertia * w_at)) / inertia + sway[k]
+        moved = -stiff * aside - sa[0] - 0.1 * (v + slide)  # the same drag over mass as the catalogue's
+        moved[2] = 0.0
+        slide = slide + h * moved
+        aside = aside + h * slide
         p = p + h * v + h * h / 6 * (sa[0] + sa[1] + sa[2])
         r = turned(r, h * w + h * h / 6 * (sb[0] + sb[1] + sb[2]))
         v = v + h / 6 * (sa[0] + 2 * sa[1] + 2 * sa[2] + sa[3]) + kicks[k, :3]
@@ -159,7 +168,7 @@ def fly(
     rows = np.zeros((steps, 22))
     loop(
         *wanted(seed, time), noise, kicks, wander, np.array(hidden.thrust), hidden.onset, hidden.torque,
-        np.array(hidden.drag), hidden.rope, vehicle.mass, np.array(vehicle.inertia), levers, SIGNS,
+        np.array(hidden.drag), hidden.rope, np.array(hidden.load), vehicle.mass, np.array(vehicle.inertia), levers, SIGNS,
         np.ascontiguousarray(unmix), vehicle.motor_time_constant, vehicle.thrust_max, CONTROL, rows,
     )  # fmt: skip
     every = round(LOG / CONTROL)

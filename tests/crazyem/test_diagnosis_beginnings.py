@@ -1,0 +1,68 @@
+"""Where effects with many maxima are begun, and what swings on through steps that the filter leaves out.
+
+Loads are those of `closed_loop.py`: plane pendulums, which share no line with the catalogue's.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from closed_loop import DRONE, Hidden, fly
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crazyem.diagnosis.always import refine_base
+from crazyem.diagnosis.beginnings import KEPT, best_begun, peaks
+from crazyem.diagnosis.candidates import Candidate, variants
+from crazyem.diagnosis.fit import Data, nominal, starting_point
+from crazyem.diagnosis.flight import flight_of
+from crazyem.diagnosis.model import Model, Point
+from crazyem.physics.effects.catalogue import CATALOGUE
+
+LOAD = CATALOGUE["suspended_load"]
+POINT = starting_point(Point(DRONE, {}, None))  # type: ignore[arg-type]
+
+
+@given(st.lists(st.floats(0, 1e6), min_size=1, max_size=30))
+def test_of_many_beginnings_the_highest_peaks_are_kept(gains):
+    kept = peaks(gains)
+    assert 1 <= len(kept) <= KEPT
+    assert gains[kept[0]] == max(gains)
+    for i in kept:
+        assert i == 0 or gains[i - 1] < gains[i]
+        assert i == len(gains) - 1 or gains[i + 1] <= gains[i]
+
+
+@pytest.mark.parametrize("length", [0.15, 0.27, 0.5])
+def test_a_load_is_begun_at_the_length_whose_swing_the_flight_shows(length):
+    recording = fly(Hidden(load=(0.0015, length)), seconds=20.0, seed=3)
+    data = Data([flight_of(recording, DRONE)])
+    point = refine_base(data, nominal(data, POINT), ()).point
+    candidates = [*variants(LOAD, point, data.signals), Candidate("thrust_scale", (), ("scale",))]
+    left = best_begun(data, point, (), candidates)
+    assert candidates[-1] in left  # has one beginning only
+    begun = [dict(c.begin)["length"] for c in left[:-1]]
+    assert len(begun) <= KEPT
+    assert min(abs(np.log(b / length)) for b in begun) < 0.06
+
+
+def test_what_swings_goes_on_through_steps_that_are_left_out():
+    flight = flight_of(fly(seconds=8.0), DRONE)
+    point = POINT.with_effects({"suspended_load": {"mass": 0.002, "length": 0.3}})
+    middle = np.arange(flight.time.size) == flight.time.size // 2
+    as_it_is, left_out, torn = (
+        Model(f).accelerations(point)[0]
+        for f in (
+            flight,
+            replace(flight, starts=flight.starts | middle),
+            replace(flight, starts=flight.starts | middle, gaps=flight.gaps | middle),
+        )
+    )
+    assert np.array_equal(as_it_is, left_out)
+    assert np.abs(as_it_is - torn)[middle.argmax() :].max() > 0.01
+
+
+def test_long_flights_are_swept_in_pieces_of_one_path():
+    flight = flight_of(fly(seconds=70.0, seed=2), DRONE)
+    assert flight.starts.sum() == 2
+    assert flight.gaps.sum() == 1

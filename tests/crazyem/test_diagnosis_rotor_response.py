@@ -1,0 +1,100 @@
+"""Lag and delay of measured rotors from their commands, on rotors made by a recursion of 2 ms that the code does not have."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from closed_loop import DRONE, fly
+from made_flight import array_of
+
+from crazyem.diagnosis.rotor_response import DELAY_SD, ENOUGH, LAG_BIAS, PUNCTUAL, Response, judged, response
+from crazyem.recordings.recording import Recording
+
+ROTORS = replace(DRONE, rotor_constant=2e-8, motor_time_constant=0.03)
+
+
+@pytest.fixture(scope="module")
+def flown() -> Recording:
+    return fly(seconds=16.0)
+
+
+def answering(flown: Recording, lag: float, late: float, *, seed: int = 0, noise: float = 0.0) -> Recording:
+    """Commands of a controller at 500 Hz, of which every fifth is logged, and what rotors make of all of them."""
+    rng = np.random.default_rng(seed)
+    start, end = flown.signals["motor_command"].time[[0, -1]]
+    step = 0.002
+    time = np.arange(start, end, step)
+    smooth = np.hanning(25) / np.hanning(25).sum()  # to some 20 Hz
+    quick = np.stack([np.convolve(c, smooth, "same") for c in rng.normal(size=(4, time.size))], 1)
+    command = np.clip(0.5 + 0.4 * quick + 0.01 * rng.normal(size=quick.shape), 0.1, 1.0)
+    wanted = 0.06 * command + 0.08 * command**2  # N
+    behind = round(late / step)
+    acting = np.vstack([np.repeat(wanted[:1], behind, axis=0), wanted[: len(wanted) - behind]])
+    thrust = np.empty_like(acting)
+    thrust[0] = acting[0]
+    for k in range(1, len(acting)):
+        thrust[k] = acting[k - 1] + (thrust[k - 1] - acting[k - 1]) * np.exp(-step / lag)
+    speed = np.sqrt(thrust / 2e-8) * (1 + noise * rng.normal(size=thrust.shape))
+    signals = {
+        **flown.signals,
+        "motor_command": array_of("motor_command", time[::5], command[::5], place=80),
+        "rotor_speed": array_of("rotor_speed", time[::5], speed[::5], place=90),
+    }
+    return replace(flown, signals=signals)
+
+
+@pytest.mark.parametrize(("lag", "late"), [(0.015, 0.0), (0.03, 0.006), (0.03, 0.0), (0.06, 0.01)])
+def test_lag_and_delay_are_those_of_the_rotors(flown, lag, late):
+    found = response([answering(flown, lag, late)], ROTORS)
+    assert found is not None
+    assert found.lag * LAG_BIAS == pytest.approx(lag, rel=0.06)
+    assert found.delay + PUNCTUAL == pytest.approx(late + 1e-3, abs=1e-3)  # a command is held for 2 ms
+
+
+def test_what_does_not_answer_says_nothing(flown):
+    assert response([flown], ROTORS) is None  # no speeds
+    made = answering(flown, 0.03, 0.0)
+    assert response([made], DRONE) is None  # no rotor constant
+    other = answering(flown, 0.03, 0.0, seed=1)
+    strange = replace(made, signals={**made.signals, "rotor_speed": other.signals["rotor_speed"]})
+    assert response([strange], ROTORS) is None
+    held = made.signals["rotor_speed"]
+    stuck = array_of("rotor_speed", held.time, np.full_like(held.value, 2000.0), place=90)
+    assert response([replace(made, signals={**made.signals, "rotor_speed": stuck})], ROTORS) is None
+
+
+def found(lag: float, delay: float, sd: float = 1.4e-3) -> Response:
+    return Response(lag, delay, np.diag([sd**2, DELAY_SD**2]))
+
+
+def test_a_lag_or_a_delay_or_both_are_named():
+    assert judged(found(0.031, 0.0005), None, ROTORS) is None
+    slow = judged(found(0.045, 0.0), found(0.044, 0.001), ROTORS)
+    assert slow is not None
+    assert slow.values == {"motor_lag": (pytest.approx(0.045), pytest.approx(1.4e-3))}
+    assert slow.nats == pytest.approx(0.5 * (0.015 / 1.4e-3) ** 2)
+    late = judged(found(0.03, 0.008), None, ROTORS)
+    assert late is not None
+    assert list(late.values) == ["input_delay"]
+    both = judged(found(0.045, 0.008), None, ROTORS)
+    assert both is not None
+    assert set(both.values) == {"motor_lag", "input_delay"}
+    assert judged(found(0.03, -0.008), None, ROTORS) is None  # no rotor answers before it is told to
+
+
+def test_flights_held_out_must_agree():
+    assert judged(found(0.045, 0.0), found(0.03, 0.0), ROTORS) is None
+    agreed = judged(found(0.045, 0.0), found(0.045, 0.0), ROTORS)
+    assert agreed is not None
+    assert agreed.held_out > ENOUGH
+
+
+def test_where_one_is_as_good_as_the_other_both_are_said():
+    """Estimates that go up and down together: a lag of 6 ms more is a delay of 4 ms more."""
+    sd, late = 3e-3, 2e-3
+    together = Response(0.036, 0.004, np.array([[sd**2, 0.97 * sd * late], [0.97 * sd * late, late**2]]) / 9)
+    said = judged(together, None, ROTORS)
+    if said is not None:
+        assert len(said.values) == 2 or said.alike
+    alike = judged(Response(0.036, 0.0038, np.array([[1.0, -0.2], [-0.2, 0.4]]) * 1e-6), None, ROTORS)
+    assert alike is not None
