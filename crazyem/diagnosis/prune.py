@@ -14,8 +14,8 @@ from crazyem.diagnosis.restless import beside_peaks, peaks
 from crazyem.diagnosis.trials import LIKELY, SURE, Step, both, significance, wald
 
 ADMITTED = 8.0  # nats of evidence that an effect must bring
-HELD = 3.0  # nats it must bring on flight held out,
-TELLING = 2.0  # if that is so much less than would be expected there; else it must not cost what it must bring
+HELD = 1.0  # nats it must bring on flight held out,
+TELLING = 6.0  # if so many are to be expected there; else it must not cost what it must bring
 MISLED = 0.1  # share of its gain that it may cost where it cannot be seen: hovers have biases of their own
 OTHERWISE = 0.01  # p-value of an effect's being the same size beside what shakes (Hausman 1978)
 APART = 1 / 3  # of its size, at least: sampled commands make some per cent of difference
@@ -44,7 +44,7 @@ def drop(
             gain = (here - less.loglik) / step.taken.dispersion
             held = (held_here - held_less) / step.taken.dispersion
             need = -max(ADMITTED, MISLED * gain)
-            if held_out is None or expected(held_out, fitted, accepted, c) > TELLING * HELD * step.taken.dispersion:
+            if held_out is None or expected(held_out, fitted, accepted, c) > TELLING * step.taken.dispersion:
                 need = HELD
             judged.append((min(gain - len(c.free) + held, held + ADMITTED - need if held_out else np.inf), c, less))
             now = replace(step.taken, gain=gain * step.taken.dispersion, held_out=held * step.taken.dispersion)

@@ -275,9 +275,11 @@ def alike_with(best: Trial, trials: Sequence[Trial], *, counted: bool) -> list[T
 
 
 def rivals(trial: Trial, *, counted: bool) -> bool:
-    """Whether a candidate that was fitted is an explanation at all: significant, or with evidence enough."""
-    evident = trial.p_value < 1.0 and own_evidence(trial, counted=counted) > ADMITTED
-    return trial.fitted is not None and (trial.p_value < SURE or evident)
+    """Whether a candidate that was fitted is an explanation at all: significant, or with evidence enough, and of some use
+    on all flights together."""
+    evidence = own_evidence(trial, counted=counted)
+    sure = trial.p_value < SURE or (trial.p_value < 1.0 and evidence > ADMITTED)
+    return trial.fitted is not None and sure and evidence > 0
 
 
 def exchanged(data: Data, selection: Selection, old: Candidate, new: Candidate, values: Sequence[float]) -> Selection:

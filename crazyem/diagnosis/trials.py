@@ -21,7 +21,7 @@ TOLD = 1.64  # or standard deviations of the difference of their likelihoods, ov
 # m/s, N s/m, N s^2/m^2, 1, N m s/m.
 LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "velocity_scale": 0.035, "attitude_misalignment": 2e-3,
          "gyro_bias": 3e-3, "torque_scale": 0.08, "wind": 0.1, "linear_drag": 1e-3, "quadratic_drag": 1e-3,
-         "thrust_curve": 0.045, "velocity_moment": 3e-6}  # fmt: skip
+         "thrust_curve": 0.06, "velocity_moment": 3e-6}  # fmt: skip
 LEAST_INERTIA = 0.08  # relative, the same
 LEAST_CENTRE = {"x": 1e-4, "y": 1e-4, "z": 1e-3}  # m; z shows in lateral accelerations of O alone
 

@@ -1,0 +1,73 @@
+"""What filters on board do to the log: the offset against a low-passed path, and the lags back from a made flight."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from closed_loop import DRONE, fly
+from made_flight import array_of
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+from crazyem.diagnosis.always import refine_base
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.fit import Data, nominal, starting_point
+from crazyem.diagnosis.flight import flight_of
+from crazyem.diagnosis.model import Point
+from crazyem.physics.effects.effect import Situation
+from crazyem.physics.effects.onboard_filter import filtered
+from crazyem.physics.rotations import rotation_matrix
+from crazyem.recordings.recording import Recording
+
+
+def test_the_offset_is_that_of_a_slow_low_pass():
+    """A first-order low pass of 2 ms, run at 20 kHz on rates and velocities of 2 Hz; second order is left out."""
+    step, lag, pulse = 5e-5, 2e-3, 4 * np.pi
+    time = step * np.arange(40000)
+    rate = np.stack([np.sin(pulse * time), np.cos(pulse * time), 0 * time], 1)
+    velocity = 0.3 * rate[:, [1, 2, 0]]
+    keep = np.exp(-step / lag)
+    shown = lfilter([1 - keep], [1, -keep], np.hstack([velocity, rate]), axis=0)
+    at = np.arange(20000, 40000, 200)  # settled
+    turned = Rotation.from_rotvec([0.3, -0.2, 0.5])
+    acceleration = np.gradient(velocity, step, axis=0)[at] + [0, 0, 9.81]
+    n = at.size
+    none = np.zeros((n, 3))
+    situation = Situation(
+        time=time[at], flown=time[at], step=np.full(n, step), position=none, height=np.zeros(n), velocity=velocity[at],
+        rotation=np.tile(rotation_matrix(turned.as_quat()), (n, 1, 1)), body_rate=rate[at],
+        specific_force=turned.inv().apply(acceleration), angular_acceleration=np.gradient(rate, step, axis=0)[at],
+        thrust=np.zeros((n, 4)), thrust_rate=np.zeros((n, 4)), voltage=np.zeros(n), rotor_constant=np.nan, air=none,
+    )  # fmt: skip
+    offset = filtered(situation, rate_lag=lag, velocity_lag=lag).state
+    wanted = (shown - np.hstack([velocity, rate]))[at]
+    second_order = (pulse * lag) ** 2
+    assert np.abs(offset[:, 9:] - wanted[:, 3:]).max() < 1.5 * second_order
+    assert np.abs(offset[:, 3:6] - wanted[:, :3]).max() < 1.5 * 0.3 * second_order
+    assert np.abs(wanted).max() > 10 * second_order  # not a comparison of nothings
+    assert not offset[:, [0, 1, 2, 6, 7, 8]].any()
+
+
+def behind(recording: Recording, name: str, lag: float) -> Recording:
+    """The signal as it was `lag` s ago."""
+    signal = recording.signals[name]
+    then = np.stack([np.interp(signal.time - lag, signal.time, c) for c in signal.value.T], 1)
+    return replace(recording, signals={**recording.signals, name: array_of(name, signal.time, then, place=95)})
+
+
+@pytest.mark.parametrize(("name", "parameter", "lags"), [("body_rate", "rate_lag", (0.0, 2e-3)),
+                                                         ("velocity", "velocity_lag", (0.0, 1.5e-3))])  # fmt: skip
+def test_lags_of_the_log_are_found(name, parameter, lags):
+    """What is put on comes back where there is no prior about it.
+
+    The drone is hardly shaken: the model does not know the derivative of what random impulses do, so with `shake` 1 the
+    rates' lag comes out as 1.2 ms.
+    """
+    free, found = Candidate("onboard_filter", (), ("rate_lag", "velocity_lag")), []
+    for lag in lags:
+        recording = behind(fly(seconds=20.0, seed=5, rate_noise=2e-3, shake=0.05), name, lag)
+        data = Data([flight_of(recording, DRONE)])
+        point = nominal(data, starting_point(Point(DRONE, {}, None)))  # type: ignore[arg-type]
+        begun = point.with_effects({"onboard_filter": {"rate_lag": 0.0, "velocity_lag": 0.0}})
+        found.append(refine_base(data, begun, [free]).point.effects["onboard_filter"][parameter])
+    assert found[1] - found[0] == pytest.approx(lags[1], abs=0.3e-3)
