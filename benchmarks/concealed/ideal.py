@@ -36,9 +36,10 @@ def ideal_nats(recording: Path, vehicle: Vehicle, effects: Mapping[str, Mapping[
     torques or without, and what is always free. None where the likelihood of the flight is not what shows the effect:
     an accelerometer, gusts, and what acts before rotors whose speeds are measured.
     """
-    if ASIDE & set(effects) or (BEFORE_ROTORS & set(effects) and "rotor_speed" in open_recording(str(recording)).signals):
+    seen = open_recording(str(recording))
+    if ASIDE & set(effects) or (BEFORE_ROTORS & set(effects) and "rotor_speed" in seen.signals):
         return None
-    data = Data([flight_of(open_recording(str(recording)), vehicle)])
+    data = Data([flight_of(seen, vehicle)])
     bare = nominal(data, Point(vehicle, {}, first_guess()))
 
     def best(point: Point) -> Fitted:

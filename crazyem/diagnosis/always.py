@@ -25,8 +25,8 @@ VELOCITY_SD = 2e-3  # relative: no onboard filter is better
 # s: rates behind the attitude, velocities behind the position, by the filters of the firmware; in flights with nothing
 # hidden 0 (hover) to 2.2 and 1.3 ms (quick ones).
 FILTER, FILTER_SD = (("rate_lag", 1.2e-3), ("velocity_lag", 0.6e-3)), 0.7e-3
-# Relative: in 36 flights of drones with nothing hidden torques look 5 % too weak to 11 % too strong; a longer lag with more
-# torque is nearly the same to a loop whose commands are sampled.
+# Relative: in 36 flights of drones with nothing hidden torques look 5 % too weak to 11 % too strong; a longer lag with
+# more torque is nearly the same to a loop whose commands are sampled.
 TORQUE_SD = 0.04
 # From one day to the next, of a drone whose file has a trim: batteries are put in again, propellers and feet bent.
 # Healthy and damaged flights of two drones on several days scatter like this (docs/diagnosis_real.md).
@@ -198,8 +198,8 @@ def with_nuisances(point: Point, free: Nuisances) -> Point:
 def on_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate]) -> Fitted:
     """The model on flights kept apart: effects as they are, what is always free belongs to each flight.
 
-    Where an effect is of a kind that is always free, it is so about what was found: otherwise inertias as fitted would be
-    compared with torques that come with inertias to each flight's liking.
+    Where an effect is of a kind that is always free, it is so about what was found: otherwise inertias as fitted would
+    be compared with torques that come with inertias to each flight's liking.
     """
     free = nuisances(held_out, point, ())
     found = {c.effect for c in accepted}

@@ -1,4 +1,4 @@
-"""Where to begin an effect whose likelihood has many maxima: a load on a string explains a swing of its own period only.
+"""Where to begin an effect whose likelihood has many maxima: a load explains a swing of its own period only.
 
 A pendulum of a wrong period falls out of step within the time it is damped in, so the likelihood over lengths has a
 peak some per cent wide, and a fit that begins beside it stays there. One pass gives what the amplitude alone explains
@@ -35,11 +35,11 @@ def best_begun(
     point = with_nuisances(point, free)
     base = [*accepted, *(c for c, _ in free)]
     columns = [x for c in base for x in c.columns(point)]
-    always, weights = len(columns), np.array([0.0] * sum(len(c.free) for c in accepted) + [w for _, p in free for w in p])
+    weights = np.array([0.0] * sum(len(c.free) for c in accepted) + [w for _, p in free for w in p])
     for family in many:
         columns += [_amplitude(c, point) for c in family]
     gram = data.gram(point, columns)
-    dropped, at = set[Candidate](), always
+    dropped, at = set[Candidate](), len(weights)
     for family in many:
         gains = [_gain(gram, weights, at + i) for i in range(len(family))]
         at += len(family)

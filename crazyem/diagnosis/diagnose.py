@@ -7,18 +7,17 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from crazyem.diagnosis import accelerometer, rotor_response
-from crazyem.diagnosis.always import abstained, solved, steadied, unsure, usual_gusts
+from crazyem.diagnosis.always import abstained, solved, steadied, unsure
+from crazyem.diagnosis.beside import beside_the_regression, late_rotors
 from crazyem.diagnosis.candidates import Candidate, candidates_for
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.fit import nominal as nominal_of
 from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.gusts import find_gusts
 from crazyem.diagnosis.locate import Located, locate
 from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.named import DOUBTFUL, Named, Value, share, trust
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.place import depends_on_place
-from crazyem.diagnosis.prune import ADMITTED
 from crazyem.diagnosis.select import exchanged, select
 from crazyem.diagnosis.split import LOAD, as_two, instead_of_a_load
 from crazyem.diagnosis.trials import SURE, Selection, Trial, margin, told_apart
@@ -30,37 +29,6 @@ from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
 Say = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Value:
-    """An estimated parameter: value and sd in `unit`, ci95 (low, high)."""
-
-    value: float
-    unit: str
-    sd: float
-    ci95: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Named:
-    """An effect that was found.
-
-    Attributes:
-        name: in the catalogue; `label` with its choices.
-        parameters: those fitted; `chosen`: those searched.
-        held_out_nats: log-likelihood it brings on flight that it was not fitted to.
-        p_value: of its score test, the number of candidates allowed for.
-        confidence: probability that this effect is there and not a look-alike.
-    """
-
-    name: str
-    label: str
-    parameters: dict[str, Value]
-    chosen: dict[str, object]
-    held_out_nats: float
-    p_value: float
-    confidence: float
 
 
 @dataclass(frozen=True)
@@ -133,9 +101,9 @@ def diagnose(
     if place is not None:
         remains = remains.beside(place.finding)
     effects, groups, separate = _named(data, selection, remains, told, as_two(data, apart, selection))
-    beside = _beside(data, apart, selection.final, remains, wanted, left_out, place is not None, say)
+    beside = beside_the_regression(data, apart, selection.final, remains, wanted, left_out, place is not None, say)
     if flights[0].inputs.measured and not any(e.name == "input_delay" for e in effects):
-        late, alike = _late_rotors(recordings, held_out, vehicle, wanted, left_out)
+        late, alike = late_rotors(recordings, held_out, vehicle, wanted, left_out)
         beside += late
         groups = (*groups, *alike)
         separate = tuple(dict.fromkeys((*separate, *(CATALOGUE[n].separates for g in alike for n in g))))
@@ -177,85 +145,6 @@ def _asked(data: Data, selection: Selection, recordings: Sequence[Recording]) ->
             if nats > 0:
                 selection = exchanged(data, selection, candidate, other, [start])
     return selection, frozenset(told)
-
-
-def _beside(
-    data: Data,
-    apart: Data | None,
-    point: Point,
-    remains: Unexplained,
-    wanted: Sequence[str],
-    left_out: dict[str, str],
-    by_place: bool,
-    say: Say,
-) -> list[Named]:
-    """What is no column of the regression: gusts, unless a force depends on place, and a tilted accelerometer."""
-    found = []
-    if (not wanted or "gusts" in wanted) and "gusts" not in left_out and not by_place:
-        say("gusts")
-        gusts = find_gusts(data, point)
-        known = gusts is not None and gusts.speed < usual_gusts(point.vehicle)
-        if gusts is not None and not known and gusts.moving_air and remains.force_nats < FIXED * gusts.gain:
-            memory_sd = gusts.memory * gusts.memory_sd
-            # a memory that the flight says nothing of has an interval without end
-            p = next(p for p in CATALOGUE["gusts"].parameters if p.name == "correlation_time")
-            with np.errstate(over="ignore"):
-                around = np.exp(np.log(gusts.memory) + np.array([-1.96, 1.96]) * gusts.memory_sd)
-            low, high = np.clip(around, p.low, p.high)
-            values = {
-                "standard_deviation": Value(gusts.speed, "m/s", gusts.speed_sd, _around(gusts.speed, gusts.speed_sd)),
-                "correlation_time": Value(gusts.memory, "s", memory_sd, (float(low), float(high))),
-            }
-            held = gusts.gain
-            if apart is not None:
-                there = find_gusts(apart, point)
-                held = there.gain if there else 0.0
-            if held > 0:
-                found.append(Named("gusts", "gusts", values, {}, held, float(np.exp(-min(held, 700.0))),
-                                   _trust(remains.without_force()) * _share(min(gusts.gain, held), [])))  # fmt: skip
-    if not wanted or accelerometer.EFFECT in wanted:
-        tilted = accelerometer.tilt(data, point)
-        if tilted is not None:
-            solution, gram = tilted
-            sd = np.sqrt(np.diag(solution.covariance)[:3])
-            angles = solution.theta[:3]
-            wald = float(stats.f.sf(np.sum((angles / sd)[:2] ** 2) / 2, 2, max(len(gram.score) - 7, 3)))
-            held = accelerometer.held_out_gain(apart or data, point, angles)
-            sure = max(solution.p_value, wald) < SURE and held > ADMITTED
-            if sure and np.abs(angles).max() > accelerometer.LEAST:
-                values = {n: Value(float(a), "rad", float(e), _around(float(a), float(e)))
-                          for n, a, e in zip(accelerometer.ANGLES, angles, sd, strict=True)}  # fmt: skip
-                found.append(Named(accelerometer.EFFECT, accelerometer.EFFECT, values, {}, held, wald,
-                                   _share(min(solution.gain / max(1.0, solution.dispersion), held), [])))  # fmt: skip
-    return found
-
-
-def _late_rotors(
-    recordings: Sequence[Recording],
-    held_out: Sequence[Recording],
-    vehicle: Vehicle,
-    wanted: Sequence[str],
-    left_out: dict[str, str],
-) -> tuple[list[Named], tuple[tuple[str, ...], ...]]:
-    """Lag and delay of rotors whose speeds were measured, and the group of both where one is as good as the other."""
-    found = rotor_response.response(recordings, vehicle)
-    if found is None:
-        return [], ()
-    left_out.pop("motor_lag", None)
-    late = rotor_response.judged(found, rotor_response.response(held_out, vehicle), vehicle)
-    if late is None or (wanted and not set(late.values) & set(wanted)):
-        return [], ()
-    named = []
-    for name, (value, sd) in late.values.items():
-        p = CATALOGUE[name].parameters[0]
-        values = {p.name: Value(value, p.unit, sd, _around(value, sd))}
-        sure = _share(min(late.nats, late.held_out), []) * (0.5 if late.alike else 1.0)
-        named.append(Named(name, name, values, {}, late.held_out, float(np.exp(-min(late.nats, 700.0))), sure))
-    return named, (("motor_lag", "input_delay"),) if late.alike else ()
-
-
-def _around(value: float, sd: float) -> tuple[float, float]:
-    return value - 1.96 * sd, value + 1.96 * sd
 
 
 def _with_effects(vehicle: Vehicle, selection: Selection, beside: Sequence[Named]) -> Vehicle:
@@ -304,7 +193,7 @@ def _named(
         if candidate.effect in told:
             rivals = [t for t in rivals if t.candidate.effect not in told]
         alike = [t for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}]
-        confidence = _trust(remains) * _share(taken.evidence, []) * _preferred(taken, rivals)
+        confidence = trust(remains) * share(taken.evidence, []) * _preferred(taken, rivals)
         if candidate.effect in selection.doubted:
             confidence = min(confidence, DOUBTFUL)
             separate.append(SHAKES)
@@ -331,21 +220,12 @@ def _evidence(selection: Selection, i: int) -> float:
     return taken.evidence
 
 
-FIXED = 0.3  # share of the gain of gusts that a force which depends on place or motion may have beside it
-CALIBRATED = 0.9  # of the names that nothing speaks against this share was right (docs/diagnosis.md)
-DOUBTFUL = 0.4  # confidence at most where structure is left, or where something that shakes explains as much
 SHAKES = "hold the drone with its rotors turning: what shakes then is not the loop that swings with a wrong model"
 TELLING = 3.0  # nats by which a witness tells two effects apart
 MEASURED_LATE = "measurement_delay"
 WEAK_OR_MISREAD = ("rotor_fault", "rotor_sensor")
 # Exactly the same to every signal: inputs that act late, and measurements that are all late together.
 SAME = {"input_delay": ("measurement_delay",)}
-TEMPER = 0.5  # evidence counts half: models are approximate, and candidates were chosen by it
-
-
-def _trust(remains: Unexplained) -> float:
-    """What a name is worth beside structure that it does not explain: the right model leaves none."""
-    return min(remains.explained, DOUBTFUL) if remains.found else remains.explained
 
 
 def _preferred(taken: Trial, rivals: Sequence[Trial]) -> float:
@@ -360,9 +240,3 @@ def _preferred(taken: Trial, rivals: Sequence[Trial]) -> float:
 def _better(one: Trial, other: Trial) -> float:
     nats, sd = margin(one, other)
     return float(stats.norm.cdf(nats / sd))
-
-
-def _share(best: float, others: Sequence[float]) -> float:
-    """Probability of the best against its rivals and against nothing (evidence 0)."""
-    weights = np.exp(np.clip(TEMPER * (np.array([*others, 0.0]) - best), -700, 0))
-    return CALIBRATED / float(1.0 + weights.sum())

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from crazyem.diagnosis.diagnose import Diagnosis, Named
+from crazyem.diagnosis.diagnose import Diagnosis
 from crazyem.diagnosis.flight import without
 from crazyem.diagnosis.horizon import HorizonErrors, Windows, errors, open_loop, windows
 from crazyem.diagnosis.locate import Finding, strongest
+from crazyem.diagnosis.named import Named
 from crazyem.diagnosis.predict import NAMES, Recorded, recorded
 from crazyem.diagnosis.report import Series
 from crazyem.errors import DataError

@@ -35,8 +35,8 @@ class Flight:
         name: of the recording.
         time: (n,) s on the recording's clock, increasing.
         starts: (n,) bool: where the filter begins anew.
-        gaps: (n,) bool: where nothing is known of the step before, so that nothing can be carried along the path. Each is
-            a start; a start elsewhere leaves out a step whose path is known (see `PIECE`, `Data.leave_out_wild`).
+        gaps: (n,) bool: where nothing is known of the step before, so that nothing can be carried along the path.
+            Each is a start; a start elsewhere leaves out a step whose path is known (`PIECE`, `Data.leave_out_wild`).
         y: (n, 13) position [m], velocity [m/s], attitude (x y z w), body rate [rad/s]; NaN where not measured.
         force: (n, 3) accelerometer [m/s^2, body]; NaN where not measured.
         voltage: (n,) V; NaN where unknown.

@@ -19,8 +19,8 @@ from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
 NOMINAL_VOLTAGE = 3.85  # V under load, middle of 3.7 to 4.0 V, where none is recorded
-# s: a command is held for 2 ms at 500 Hz, rates are low-passed at 80 Hz (2.8 ms). Where the attitude is recorded it is the
-# clock, and rates are behind it (physics/effects/onboard_filter.py).
+# s: a command is held for 2 ms at 500 Hz, rates are low-passed at 80 Hz (2.8 ms). Where the attitude is recorded it is
+# the clock, and rates are behind it (physics/effects/onboard_filter.py).
 DELAY_OF_COMMANDS, BEHIND_ATTITUDE = 3.5e-3, 2.1e-3
 _SAMPLED = ("motor_command", "motor_request", "mixer_command")
 FULL = 65535.0  # counts of PWM

@@ -207,14 +207,8 @@ def select(
             break
         assert best is not None
         assert best.fitted is not None
-        equals = alike_with(best, trials, counted=held_out is not None)
-        if len(equals) > 1:
-            say(f"  comparing {', '.join(t.candidate.label for t in equals)}")
-            again = data.workers.map(partial(sharpened, basis), equals)
-            trials = weighed([*again, *(t for t in trials if all(t is not e for e in equals))], counted=held_out is not None)
-            close = [t for t in trials if any(t.candidate is a.candidate for a in again)]
-            best = close[0]
-            equals = alike_with(best, close, counted=held_out is not None)
+        trials, equals = compared_again(basis, trials, say=say)
+        best = equals[0]
         simplest = min(equals, key=lambda t: (len(t.candidate.free), -t.evidence))
         if own_evidence(simplest, counted=held_out is not None) > ADMITTED:
             best = simplest
@@ -268,6 +262,20 @@ def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
     return frozenset(t.candidate.effect for t in fitted if 0 < BESIDE * t.gain < left[t.candidate.effect])
 
 
+def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], None]) -> tuple[list[Trial], list[Trial]]:
+    """The trials, and the best of them with what is not told apart from it, each of these with noise of its own."""
+    counted = basis.held_out is not None
+    equals = alike_with(trials[0], trials, counted=counted)
+    if len(equals) == 1:
+        return trials, equals
+    say(f"  comparing {', '.join(t.candidate.label for t in equals)}")
+    again = basis.data.workers.map(partial(sharpened, basis), equals)
+    rest = [t for t in trials if all(t is not e for e in equals)]
+    trials = weighed([*again, *rest], counted=counted)
+    close = [t for t in trials if any(t.candidate is a.candidate for a in again)]
+    return trials, alike_with(close[0], close, counted=counted)
+
+
 def alike_with(best: Trial, trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
     """The best, and what is not told apart from it."""
     others = [t for t in trials if t is not best and rivals(t, counted=counted)]
@@ -275,8 +283,8 @@ def alike_with(best: Trial, trials: Sequence[Trial], *, counted: bool) -> list[T
 
 
 def rivals(trial: Trial, *, counted: bool) -> bool:
-    """Whether a candidate that was fitted is an explanation at all: significant, or with evidence enough, and of some use
-    on all flights together."""
+    """Whether a candidate that was fitted is an explanation at all: significant, or with evidence enough; and of some
+    use on all flights together."""
     evidence = own_evidence(trial, counted=counted)
     sure = trial.p_value < SURE or (trial.p_value < 1.0 and evidence > ADMITTED)
     return trial.fitted is not None and sure and evidence > 0

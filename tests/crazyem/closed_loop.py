@@ -168,8 +168,8 @@ def fly(
     rows = np.zeros((steps, 22))
     loop(
         *wanted(seed, time), noise, kicks, wander, np.array(hidden.thrust), hidden.onset, hidden.torque,
-        np.array(hidden.drag), hidden.rope, np.array(hidden.load), vehicle.mass, np.array(vehicle.inertia), levers, SIGNS,
-        np.ascontiguousarray(unmix), vehicle.motor_time_constant, vehicle.thrust_max, CONTROL, rows,
+        np.array(hidden.drag), hidden.rope, np.array(hidden.load), vehicle.mass, np.array(vehicle.inertia), levers,
+        SIGNS, np.ascontiguousarray(unmix), vehicle.motor_time_constant, vehicle.thrust_max, CONTROL, rows,
     )  # fmt: skip
     every = round(LOG / CONTROL)
     return recorded(time[::every], rows[::every])

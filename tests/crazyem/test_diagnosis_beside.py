@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis import accelerometer
+from crazyem.diagnosis.beside import beside_the_regression
 from crazyem.diagnosis.compare import compare
-from crazyem.diagnosis.diagnose import _beside, diagnose
+from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.document import document_of, text_of
 from crazyem.diagnosis.fit import Data, nominal, starting_point
 from crazyem.diagnosis.flight import flight_of, without
@@ -63,10 +64,10 @@ def test_a_calm_flight_has_no_gusts(recording):
 def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(monkeypatch):
     """As in a recording whose forces last for one sample each: the logarithm's error was 30 000."""
     found = Gusts(5000.0, np.ones(3), 0.25, 3e4, True, 1.6, 0.05)
-    monkeypatch.setattr("crazyem.diagnosis.diagnose.find_gusts", lambda data, point: found)
+    monkeypatch.setattr("crazyem.diagnosis.beside.find_gusts", lambda data, point: found)
     vehicle, remains = load_vehicle("cf2"), Unexplained(False, (), 0.0, 1.0)
     data, point = Data(()), starting_point(Point(vehicle, {}, None))
-    (named,) = _beside(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
+    (named,) = beside_the_regression(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
     assert named.parameters["correlation_time"].ci95 == (0.01, 100.0)
     assert named.parameters["standard_deviation"].ci95 == pytest.approx((1.502, 1.698))
 

@@ -1,4 +1,4 @@
-"""Lag and delay of measured rotors from their commands, on rotors made by a recursion of 2 ms that the code does not have."""
+"""Lag and delay of measured rotors from their commands, on rotors made by a recursion that the code does not have."""
 
 from dataclasses import replace
 

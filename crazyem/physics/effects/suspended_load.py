@@ -41,8 +41,8 @@ def swing_of(situation: Situation, *, length: float) -> NDArray:
     return swing_along(gap=gap, broken=broken, velocity=situation.velocity, air=situation.air, length=length)
 
 
-# A pendulum of the wrong period fits no better than none. Over the 10 s that DAMPING leaves it, a length wrong by 3 % at
-# 0.1 m, by 10 % at 1.5 m, puts it about a radian out of step: dL/L = 2 dw/w with dw = 0.1 rad/s and w = sqrt(g/L).
+# A pendulum of the wrong period fits no better than none. In the 10 s that DAMPING leaves it, a length wrong by 2 % at
+# 0.1 m, by 8 % at 1.5 m, puts it a radian out of step: dL/L = 2 dw/w with dw = 0.1 rad/s and w = sqrt(g/L).
 LENGTHS = tuple(round(0.1 * 1.06**k, 4) for k in range(48))
 
 

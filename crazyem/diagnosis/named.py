@@ -1,0 +1,59 @@
+"""An effect that was found, its numbers, and how sure it is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from crazyem.diagnosis.unexplained import Unexplained
+
+CALIBRATED = 0.9  # of the names that nothing speaks against this share was right (docs/diagnosis.md)
+DOUBTFUL = 0.4  # confidence at most where structure is left, or where something that shakes explains as much
+TEMPER = 0.5  # evidence counts half: models are approximate, and candidates were chosen by it
+
+
+@dataclass(frozen=True)
+class Value:
+    """An estimated parameter: value and sd in `unit`, ci95 (low, high)."""
+
+    value: float
+    unit: str
+    sd: float
+    ci95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Named:
+    """An effect that was found.
+
+    Attributes:
+        name: in the catalogue; `label` with its choices.
+        parameters: those fitted; `chosen`: those searched.
+        held_out_nats: log-likelihood it brings on flight that it was not fitted to.
+        p_value: of its score test, the number of candidates allowed for.
+        confidence: probability that this effect is there and not a look-alike.
+    """
+
+    name: str
+    label: str
+    parameters: dict[str, Value]
+    chosen: dict[str, object]
+    held_out_nats: float
+    p_value: float
+    confidence: float
+
+
+def around(value: float, sd: float) -> tuple[float, float]:
+    """The 95 % interval of a normal distribution."""
+    return value - 1.96 * sd, value + 1.96 * sd
+
+
+def trust(remains: Unexplained) -> float:
+    """What a name is worth beside structure that it does not explain: the right model leaves none."""
+    return min(remains.explained, DOUBTFUL) if remains.found else remains.explained
+
+
+def share(best: float, others: Sequence[float]) -> float:
+    """Probability of the best against its rivals and against nothing (evidence 0)."""
+    weights = np.exp(np.clip(TEMPER * (np.array([*others, 0.0]) - best), -700, 0))
+    return CALIBRATED / float(1.0 + weights.sum())
