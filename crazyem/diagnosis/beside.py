@@ -42,8 +42,8 @@ def beside_the_regression(
             # a memory that the flight says nothing of has an interval without end
             p = next(p for p in CATALOGUE["gusts"].parameters if p.name == "correlation_time")
             with np.errstate(over="ignore"):
-                around = np.exp(np.log(gusts.memory) + np.array([-1.96, 1.96]) * gusts.memory_sd)
-            low, high = np.clip(around, p.low, p.high)
+                reach = np.exp(np.log(gusts.memory) + np.array([-1.96, 1.96]) * gusts.memory_sd)
+            low, high = np.clip(reach, p.low, p.high)
             values = {
                 "standard_deviation": Value(gusts.speed, "m/s", gusts.speed_sd, around(gusts.speed, gusts.speed_sd)),
                 "correlation_time": Value(gusts.memory, "s", memory_sd, (float(low), float(high))),
