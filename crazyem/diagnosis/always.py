@@ -143,14 +143,13 @@ def steadied(data: Data, point: Point) -> Point:
 def solved(fitted: Fitted) -> tuple[Solution, float]:
     """The free parameters at the maximum with their covariance, and how many degrees of freedom they take.
 
-    With a trim in the file some 20 things are always free, more than a flight of 16 s has blocks; most of them are what
-    their priors say, and take none.
+    Some 15 things are always free, with a trim in the file 20, nearly as many as a flight of 20 s has blocks; most of
+    them are what their priors say, and take none.
     """
-    real = TRIM in fitted.point.vehicle.effects
     gram, precision = fitted.gram, fitted.precision
-    solution = gram.solve(range(gram.size), precision=precision, effective=real)
+    solution = gram.solve(range(gram.size), precision=precision, effective=True)
     information = gram.total(range(gram.size))[1]
-    return solution, used(information, information + np.diag(precision)) if real else gram.size
+    return solution, used(information, information + np.diag(precision))
 
 
 def by_gain(point: Point, gain: float, count: int, blocks: int, p_value: float) -> float:
