@@ -13,6 +13,7 @@ from crazyem.diagnosis.candidates import Candidate, candidates_for
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.fit import nominal as nominal_of
 from crazyem.diagnosis.flight import flight_of
+from crazyem.diagnosis.heading import heading_by_place
 from crazyem.diagnosis.locate import Located, locate
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.named import DOUBTFUL, Named, Value, share, trust
@@ -100,6 +101,9 @@ def diagnose(
     remains = unexplained(data, selection, after, apart)
     if place is not None:
         remains = remains.beside(place.finding)
+    turned = heading_by_place(data, apart)
+    if turned is not None:
+        remains = remains.beside(turned)
     effects, groups, separate = _named(data, selection, remains, told, as_two(data, apart, selection))
     beside = beside_the_regression(data, apart, selection.final, remains, wanted, left_out, place is not None, say)
     if flights[0].inputs.measured and not any(e.name == "input_delay" for e in effects):

@@ -126,8 +126,9 @@ def felt_flight(force: NDArray, *, position: bool = False) -> Flight:
         y[:, 0:3] = 0.0
     starts = np.arange(n) == 0
     rotor = RotorInput(time, np.zeros((n, 4)), np.full(n, np.nan), time, measured=False)
-    return Flight("made", time, starts, starts, y, force, np.full(n, np.nan), time, 0.0, (np.arange(n) // 100).astype(np.int64),
-                  rotor, frozenset({"body_rate", "specific_force"}))  # fmt: skip
+    block = (np.arange(n) // 100).astype(np.int64)
+    return Flight("made", time, starts, starts, y, force, np.full(n, np.nan), time, 0.0, block, rotor,
+                  frozenset({"body_rate", "specific_force"}))  # fmt: skip
 
 
 def test_the_accelerometer_counts_only_where_nothing_else_shows_forces() -> None:

@@ -1,0 +1,73 @@
+"""A heading that depends on place: attitudes of a made flight turned by a known function of x, which no effect is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from closed_loop import DRONE, fly
+from made_flight import array_of
+from scipy.spatial.transform import Rotation
+
+from crazyem.diagnosis.fit import Data
+from crazyem.diagnosis.flight import flight_of
+from crazyem.diagnosis.heading import heading_by_place
+from crazyem.recordings.recording import Recording
+
+
+def with_attitude(recording: Recording, attitude: Rotation) -> Recording:
+    signal = recording.signals["attitude"]
+    changed = array_of("attitude", signal.time, attitude.as_quat(), place=96)
+    return replace(recording, signals={**recording.signals, "attitude": changed})
+
+
+def magnetic(recording: Recording, size: float) -> Recording:
+    """Turned about the vertical by size * sin(2 pi x / 1.1 m)."""
+    along = recording.signals["position"].value[:, 0]
+    turn = Rotation.from_rotvec(np.outer(size * np.sin(2 * np.pi * along / 1.1), [0, 0, 1]))
+    return with_attitude(recording, turn * Rotation.from_quat(recording.signals["attitude"].value))
+
+
+def data_of(recording: Recording) -> Data:
+    return Data([flight_of(recording, DRONE)])
+
+
+@pytest.fixture(scope="module")
+def flights() -> tuple[Recording, Recording]:
+    return fly(seconds=25.0, seed=3), fly(seconds=25.0, seed=4)
+
+
+def test_a_heading_that_goes_with_x_is_found_with_its_size(flights) -> None:
+    one, other = (data_of(magnetic(f, 0.1)) for f in flights)
+    found = heading_by_place(one, other)
+    assert found is not None
+    assert (found.signal, found.axis, found.regime) == ("attitude", "z", "x position")
+    true = 0.1 * np.sin(2 * np.pi * flights[0].signals["position"].value[:, 0] / 1.1)
+    assert found.effect_size == pytest.approx(true.std(), rel=0.35)
+    assert heading_by_place(one, None) is not None
+
+
+def test_what_is_not_so_on_the_other_flight_is_not_named(flights) -> None:
+    assert heading_by_place(data_of(magnetic(flights[0], 0.1)), data_of(magnetic(flights[1], -0.1))) is None
+
+
+def test_nothing_is_found_where_sensors_are_biased_tilted_scaled_or_late(flights) -> None:
+    tilt = Rotation.from_euler("xyz", [0.05, -0.04, 0.1])
+    for change in ("none", "tilt", "bias", "scale", "late"):
+        changed = []
+        for flight in flights:
+            f, rate = flight, flight.signals["body_rate"]
+            if change == "tilt":
+                f = with_attitude(f, Rotation.from_quat(f.signals["attitude"].value) * tilt)
+            values = {"bias": rate.value + np.array([0.02, -0.03, 0.05]), "scale": 1.03 * rate.value,
+                      "late": np.roll(rate.value, 1, axis=0)}.get(change)  # fmt: skip
+            if values is not None:
+                shown = array_of("body_rate", rate.time, values, place=97)
+                f = replace(f, signals={**f.signals, "body_rate": shown})
+            changed.append(data_of(f))
+        assert heading_by_place(*changed) is None, change
+
+
+def test_without_position_attitude_or_gyro_nothing_is_said(flights) -> None:
+    for name in ("position", "attitude"):
+        signals = {n: a for n, a in flights[0].signals.items() if n != name}
+        assert heading_by_place(data_of(replace(flights[0], signals=signals)), None) is None
