@@ -12,6 +12,7 @@ from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import Data, Fitted
 from crazyem.diagnosis.gram import Gram
 from crazyem.diagnosis.model import Point
+from crazyem.physics.effects.catalogue import CATALOGUE
 
 SURE = 1e-3  # p-value of the score test, before counting candidates,
 LIKELY = 5e-2  # which flights held out may lower where it is below this
@@ -23,6 +24,7 @@ LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "velocity_scale": 0.035
          "gyro_bias": 3e-3, "torque_scale": 0.08, "wind": 0.1, "linear_drag": 1e-3, "quadratic_drag": 1e-3,
          "thrust_curve": 0.06, "velocity_moment": 3e-6}  # fmt: skip
 LEAST_INERTIA = 0.08  # relative, the same
+LEAST_LOAD = 0.005  # of the drone's mass, the same
 LEAST_CENTRE = {"x": 1e-4, "y": 1e-4, "z": 1e-3}  # m; z shows in lateral accelerations of O alone
 
 
@@ -146,10 +148,15 @@ def own_evidence(trial: Trial, *, counted: bool) -> float:
 
 
 def significance(fitted: Fitted, count: int, *, offset: int) -> float:
-    """p-value that `count` free parameters from `offset` on are neutral, by their covariance at the maximum (Wald)."""
+    """p-value that `count` free parameters from `offset` on are neutral, by their covariance at the maximum (Wald).
+
+    Of an effect with an amplitude that alone is asked: a load of no mass has no length, so none is neutral.
+    """
     solution, taken = solved(fitted)
-    at = slice(offset, offset + count)
-    away = np.array([c.values(fitted.point)[n] - c.neutral(fitted.point)[n] for c in fitted.candidates for n in c.free])
+    free = [(c, n) for c in fitted.candidates for n in c.free]
+    own = [offset + i for i, (c, n) in enumerate(free[offset : offset + count]) if n == CATALOGUE[c.effect].amplitude]
+    at = slice(own[0], own[0] + 1) if own else slice(offset, offset + count)
+    away = np.array([c.values(fitted.point)[n] - c.neutral(fitted.point)[n] for c, n in free])
     return wald(away[at], solution.covariance[at, at], fitted.gram, taken)
 
 
@@ -174,6 +181,8 @@ def matters(point: Point, candidate: Candidate) -> bool:
             return False
     if candidate.effect == "center_of_mass":
         return any(abs(here[n] - neutral[n]) > LEAST_CENTRE[n] for n in candidate.free)
+    if candidate.effect in ("payload", "suspended_load"):
+        return bool(here["mass"] > LEAST_LOAD * point.vehicle.mass)
     if candidate.effect == "inertia":
         return any(abs(here[n] / neutral[n] - 1.0) > LEAST_INERTIA for n in candidate.free)
     if least is None:

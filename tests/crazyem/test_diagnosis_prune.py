@@ -10,12 +10,13 @@ from closed_loop import DRONE, Hidden, fly
 from crazyem.diagnosis import prune
 from crazyem.diagnosis.always import on_held_out, refine_base
 from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, nominal
+from crazyem.diagnosis.fit import Data, Fitted, nominal
 from crazyem.diagnosis.flight import flight_of
+from crazyem.diagnosis.gram import Gram
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.select import shortlist
-from crazyem.diagnosis.trials import LIKELY, SURE, Step, Trial, matters
+from crazyem.diagnosis.trials import LIKELY, SURE, Step, Trial, matters, significance
 from crazyem.diagnosis.workers import Workers
 
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
@@ -118,6 +119,27 @@ def test_one_number_at_the_end_of_its_range_is_no_finding():
     assert matters(POINT.with_effects({"thrust_curve": {"slope_error": low + 1e-6}}), slope)
     assert not matters(POINT.with_effects({"thrust_curve": {"slope_error": 0.02}}), slope)
     assert matters(POINT.with_effects({"linear_drag": {"x": 0.0, "y": 0.01, "z": 0.0}}), DRAG)  # one of three
+
+
+def test_a_load_counts_from_a_share_of_the_drone_s_mass_on_whatever_its_length():
+    load = Candidate("suspended_load", (), ("mass", "length"))
+    few, some = (POINT.with_effects({"suspended_load": {"mass": m, "length": 1.5}}) for m in (1e-4, 4e-4))
+    assert not matters(few, load)
+    assert matters(some, load)
+
+
+def test_a_load_is_as_significant_as_its_mass():
+    """A length far from the one where fits begin, and exactly known, says nothing where the mass may be 0."""
+    load = Candidate("suspended_load", (), ("mass", "length"))
+    point = POINT.with_effects({"suspended_load": {"mass": 1e-4, "length": 1.5}})
+    rng = np.random.default_rng(0)
+    for mass_sd, sure in ((1e-4, False), (1e-5, True)):
+        information = np.tile(np.diag([mass_sd**-2, 1e8]) / 40, (40, 1, 1))
+        score = rng.normal(size=(40, 2)) * np.sqrt(np.diag(information[0]))
+        score -= score.mean(axis=0)
+        gram = Gram(score, information, np.zeros(40, int))
+        fitted = Fitted(point, (load,), 0.0, gram, np.zeros(2))
+        assert (significance(fitted, 2, offset=0) < SURE) == sure
 
 
 def test_torques_and_inertias_are_fitted_together_or_not_at_all():
