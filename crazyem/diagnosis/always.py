@@ -140,13 +140,16 @@ def steadied(data: Data, point: Point) -> Point:
     return replace(point, noise=found.noise)
 
 
-def solved(fitted: Fitted) -> tuple[Solution, float]:
+def solved(fitted: Fitted, *, wide: bool = False) -> tuple[Solution, float]:
     """The free parameters at the maximum with their covariance, and how many degrees of freedom they take.
 
     Some 15 things are always free, with a trim in the file 20, nearly as many as a flight of 20 s has blocks; most of
-    them are what their priors say, and take none.
+    them are what their priors say, and take none. `wide` for intervals: all take one (but with a trim, where too few
+    would be left), because what priors leave out is more than scatter shows.
     """
     gram, precision = fitted.gram, fitted.precision
+    if wide and TRIM not in fitted.point.vehicle.effects:
+        return gram.solve(range(gram.size), precision=precision), gram.size
     solution = gram.solve(range(gram.size), precision=precision, effective=True)
     information = gram.total(range(gram.size))[1]
     return solution, used(information, information + np.diag(precision))

@@ -173,7 +173,7 @@ def _named(
     fitted = selection.fitted
     if not selection.accepted:
         return (), (), ()
-    solution, used = solved(fitted)
+    solution, used = solved(fitted, wide=True)
     sd = np.sqrt(np.maximum(np.diag(solution.covariance), 0.0))
     freedom = max(len(fitted.gram.score) - used, 3)
     width = float(stats.t.ppf(0.975, freedom))
