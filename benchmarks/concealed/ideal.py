@@ -23,7 +23,7 @@ from crazyem.diagnosis.noise import first_guess
 from crazyem.recordings.registry import open_recording
 from crazyem.vehicle import Vehicle
 
-ASIDE = {"gusts", "accelerometer_misalignment"}
+ASIDE = {"gusts", "accelerometer_misalignment", "measurement_delay"}  # the last changes the onboard estimate, too
 BEFORE_ROTORS = {"motor_lag", "input_delay"}
 HORIZON = 50  # steps of the recording's 100 Hz: 0.5 s
 EVERY = 10  # samples between starts
