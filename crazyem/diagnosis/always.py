@@ -81,6 +81,8 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
     if "attitude" not in data.signals and any(np.isfinite(f.y[:, 6]).any() for f in data.flights):
         found.append((Candidate("attitude_misalignment", (), ANGLES), tuple(sd**-2 for sd in LEANING_SD)))
     taken = {c.effect for c in accepted}
+    if "motor_lag" in taken:  # both free, with a lag that has no prior, go along their ridge: a lag 8 ms too long
+        taken.add("torque_scale")
     return [(c, p) for c, p in found if c.effect not in taken]
 
 

@@ -40,8 +40,9 @@ WORTH, ANYWAY = 0.15, 3  # share of the largest linear gain from which a candida
 MOST = 4  # effects
 BESIDE = 0.5  # share of its gain that an effect keeps beside another which it is no other name for
 # Angular acceleration is torque over inertia: where the one is fitted, so is the other, to be told apart or not; both
-# at once would be any size.
-PARTNERS = (("torque_scale", "inertia"), ("inertia", "torque_scale"))
+# at once would be any size. A longer lag with more torque is nearly the same as neither.
+PARTNERS = (("torque_scale", "inertia"), ("inertia", "torque_scale"), ("torque_scale", "motor_lag"),
+            ("motor_lag", "torque_scale"))  # fmt: skip
 
 
 def linear_trials(

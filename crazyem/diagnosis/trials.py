@@ -18,11 +18,11 @@ SURE = 1e-3  # p-value of the score test, before counting candidates,
 LIKELY = 5e-2  # which flights held out may lower where it is below this
 CLOSE = 4.0  # nats within which two explanations cannot be told apart,
 TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks
-# Smaller than this, these are not told from what filters, sampling and the air of a room do: s, s, 1, rad, rad/s, 1,
+# Smaller than this, these are not told from what filters, sampling and the air of a room do: s, s, s, 1, rad, rad/s, 1,
 # m/s, N s/m, N s^2/m^2, 1, N m s/m.
-LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "velocity_scale": 0.035, "attitude_misalignment": 2e-3,
-         "gyro_bias": 3e-3, "torque_scale": 0.08, "wind": 0.1, "linear_drag": 1e-3, "quadratic_drag": 1e-3,
-         "thrust_curve": 0.06, "velocity_moment": 3e-6}  # fmt: skip
+LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "motor_lag": 7.5e-3, "velocity_scale": 0.035,
+         "attitude_misalignment": 2e-3, "gyro_bias": 3e-3, "torque_scale": 0.08, "wind": 0.1, "linear_drag": 1e-3,
+         "quadratic_drag": 1e-3, "thrust_curve": 0.06, "velocity_moment": 3e-6}  # fmt: skip
 LEAST_INERTIA = 0.08  # relative, the same
 LEAST_LOAD = 0.005  # of the drone's mass, the same
 LEAST_CENTRE = {"x": 1e-4, "y": 1e-4, "z": 1e-3}  # m; z shows in lateral accelerations of O alone
