@@ -119,7 +119,7 @@ def _without(usual: NDArray, columns: NDArray) -> NDArray:
 
 
 def _ridge(x: NDArray) -> NDArray:
-    return x.T @ x + DRAWN * np.trace(x.T @ x) / x.shape[1] * np.eye(x.shape[1])
+    return x.T @ x + (DRAWN * np.trace(x.T @ x) / x.shape[1] + 1e-12) * np.eye(x.shape[1])  # where nothing moves, too
 
 
 def _used(x: NDArray) -> float:

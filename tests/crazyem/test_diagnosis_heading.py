@@ -71,3 +71,11 @@ def test_without_position_attitude_or_gyro_nothing_is_said(flights) -> None:
     for name in ("position", "attitude"):
         signals = {n: a for n, a in flights[0].signals.items() if n != name}
         assert heading_by_place(data_of(replace(flights[0], signals=signals)), None) is None
+
+
+def test_where_the_drone_does_not_move_nothing_is_said(flights) -> None:
+    still = flights[0].signals["position"]
+    there = array_of("position", still.time, np.tile([0.1, 0.2, 1.0], (still.time.size, 1)), place=98)
+    held = data_of(replace(flights[0], signals={**flights[0].signals, "position": there}))
+    assert heading_by_place(held, None) is None
+    assert heading_by_place(held, held) is None
