@@ -22,11 +22,11 @@ INERTIA_SD = np.array([0.02, 0.02, 0.04])  # relative
 LAG_SD = 2e-3  # s
 CENTRE_SD = (2e-5, 2e-5, 7e-4)  # m; a height of -0.4 to -0.8 mm is what velocities of onboard filters look like
 VELOCITY_SD = 2e-3  # relative: no onboard filter is better
-# s: rates behind the attitude, velocities behind the position, by the filters of the firmware; in flights with nothing
-# hidden 0 (hover) to 2.2 and 1.3 ms (quick ones).
+# s: rates behind the attitude, velocities behind the position, by the filters of the firmware; in 80 flights with
+# nothing hidden 0.0 to 2.4 and 0.0 to 1.6 ms, most in quick ones.
 FILTER, FILTER_SD = (("rate_lag", 1.2e-3), ("velocity_lag", 0.6e-3)), 0.7e-3
-# Relative: in 36 flights of drones with nothing hidden torques look 5 % too weak to 11 % too strong; a longer lag with
-# more torque is nearly the same to a loop whose commands are sampled.
+# Relative: in 80 flights of drones with nothing hidden torques look 6 +- 4 % too strong (-7 to +15 %); a longer lag
+# with more torque is nearly the same to a loop whose commands are sampled.
 TORQUE_SD = 0.04
 # From one day to the next, of a drone whose file has a trim: batteries are put in again, propellers and feet bent.
 # Healthy and damaged flights of two drones on several days scatter like this (docs/diagnosis_real.md).

@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.flight import Flight
 from crazyem.diagnosis.locate import AXES, Finding
-from crazyem.physics.rotations import rotation_matrix, rotation_vector_from_quaternion
+from crazyem.physics.rotations import (
+    quaternion_conjugate,
+    quaternion_product,
+    rotation_matrix,
+    rotation_vector_from_quaternion,
+)
 
 WINDOW = 0.05  # s, between the attitudes that are compared
 NATS, HELD = 15.0, 5.0  # that it must gain on the flights fitted, and on those held out; healthy flights: 5 at most
@@ -85,18 +90,11 @@ def _turns(flight: Flight) -> _Turns | None:
     first, last = first[whole], last[whole]
     if first.size < FEWEST:
         return None
-    turn = rotation_vector_from_quaternion(_between(y[first, 6:10], y[last, 6:10]))
+    turned = quaternion_product(y[last, 6:10], quaternion_conjugate(y[first, 6:10]))  # about world axes
+    turn = rotation_vector_from_quaternion(turned)
     shown = angle[last] - angle[first]
     usual = np.column_stack([time[last] - time[first], shown, rate[last] - rate[first], shown[:, 2] ** 2])
     return _Turns(turn[:, 2] - shown[:, 2], usual, y[last, :3], y[first, :3])
-
-
-def _between(one: NDArray, other: NDArray) -> NDArray:
-    """(n, 4) quaternions x y z w that turn the one attitude into the other, about world axes."""
-    v, w = -one[:, :3], one[:, 3:]
-    a, b = other[:, :3], other[:, 3:]
-    product = np.hstack([b * v + w * a + np.cross(a, v), b * w - np.sum(a * v, axis=1, keepdims=True)])
-    return product * np.where(product[:, 3:] < 0, -1.0, 1.0)
 
 
 def _joined(turns: list[_Turns]) -> _Turns:

@@ -75,7 +75,7 @@ def inputs_of(recording: Recording, vehicle: Vehicle, *, flight: Airtime | None 
         DataError: the recording has no signal that this vehicle can turn into thrust.
     """
     for name, read in _CHOICES:
-        time, value = _samples(recording, name)
+        time, value = samples(recording, name)
         found = read(recording, vehicle, time, value) if time.size >= 2 else None
         if found is not None and found.time.size >= 2:
             break
@@ -115,7 +115,7 @@ class _Found:
 _Array = NDArray[np.float64]
 
 
-def _samples(recording: Recording, name: str) -> tuple[_Array, _Array]:
+def samples(recording: Recording, name: str) -> tuple[_Array, _Array]:
     """Whole samples of a signal with increasing stamps; of several with one stamp the first."""
     array = recording.signals.get(name)
     if array is None:
@@ -130,7 +130,7 @@ def _samples(recording: Recording, name: str) -> tuple[_Array, _Array]:
 
 def _voltage(recording: Recording, time: _Array) -> _Array:
     """(m,) V: the newest at each stamp; NaN before the first one."""
-    when, volts = _samples(recording, "voltage")
+    when, volts = samples(recording, "voltage")
     sound = (volts[:, 0] > 0.5) & (volts[:, 0] < 60.0)
     when, volts = when[sound], volts[sound, 0]
     if not when.size:
