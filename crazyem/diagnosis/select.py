@@ -163,7 +163,7 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
     wald_p = significance(fit, k, offset=sum(len(c.free) for c in basis.accepted))
     wald_p = by_gain(fit.point, gain / trial.dispersion, k, len(fit.gram.score), wald_p)
     sure = both(max(trial.p_value, wald_p), held / trial.dispersion if basis.held_out else 0.0)
-    sure = sure if matters(fit.point, trial.candidate) else 1.0
+    sure = sure if matters(fit.point, trial.candidate, data) else 1.0
     return replace(trial, gain=gain, held_out=held, p_value=sure, fitted=fit, blocks=blocks, value=value)
 
 

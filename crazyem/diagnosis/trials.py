@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.diagnosis.always import nuisances, solved
+from crazyem.diagnosis.always import jittery, nuisances, solved
 from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, Fitted
+from crazyem.diagnosis.fit import Data, Fitted, moved
 from crazyem.diagnosis.gram import Gram
 from crazyem.diagnosis.model import Point
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -17,12 +17,14 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 SURE = 1e-3  # p-value of the score test, before counting candidates,
 LIKELY = 5e-2  # which flights held out may lower where it is below this
 CLOSE = 4.0  # nats within which two explanations cannot be told apart,
+FAR = 20.0  # nats that one step is believed to bring without looking
 TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks
 # Smaller than this, these are not told from what filters, sampling and the air of a room do: s, s, s, 1, rad, rad/s, 1,
 # m/s, N s/m, N s^2/m^2, 1, N m s/m.
 LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "motor_lag": 7.5e-3, "velocity_scale": 0.035,
          "attitude_misalignment": 2e-3, "gyro_bias": 3e-3, "torque_scale": 0.08, "wind": 0.1, "linear_drag": 1e-3,
          "quadratic_drag": 1e-3, "thrust_curve": 0.06, "velocity_moment": 3e-6}  # fmt: skip
+VELOCITY_LEAST = 2.0  # times what the jitter of an onboard estimate looks like
 LEAST_INERTIA = 0.08  # relative, the same
 LEAST_LOAD = 0.005  # of the drone's mass, the same
 LEAST_CENTRE = {"x": 1e-4, "y": 1e-4, "z": 1e-3}  # m; z shows in lateral accelerations of O alone
@@ -139,7 +141,19 @@ def gain_of_both(fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequen
     known[own:, own:] = np.diag([w for _, precision in free for w in precision])
     rest = score.copy()
     rest[own:] = 0.0  # those of `there` are at their maximum
-    return 0.5 * float(rest @ np.linalg.lstsq(information + known, rest, rcond=1e-12)[0])
+    step = np.linalg.lstsq(information + known, rest, rcond=1e-12)[0]
+    told = 0.5 * float(rest @ step)
+    if told < FAR:
+        return told
+    # So much is told by slopes where an effect is far from what these flights want; what such a step brings is another matter
+    begin, best = held_out.loglik(there.point), 0.0
+    for part in (1.0, 0.5, 0.25):
+        moves = part * step
+        with np.errstate(over="ignore", invalid="ignore"):
+            brought = held_out.loglik(moved(there.point, [*accepted, *(c for c, _ in free)], moves), passes=2) - begin
+        brought -= 0.5 * float(moves[:own] @ known[:own, :own] @ moves[:own])
+        best = max(best, brought if np.isfinite(brought) else 0.0)
+    return min(best, told)
 
 
 def own_evidence(trial: Trial, *, counted: bool) -> float:
@@ -168,10 +182,11 @@ def wald(away: NDArray, covariance: NDArray, gram: Gram, columns: float) -> floa
     return float(stats.f.sf(distance / len(z), len(z), max(len(gram.score) - columns, 3)))
 
 
-def matters(point: Point, candidate: Candidate) -> bool:
+def matters(point: Point, candidate: Candidate, data: Data | None = None) -> bool:
     """Whether the effect is larger than what onboard filters or the sampling of a log look like, and within its range.
 
-    One number that ends where nothing more is admitted would be more: it stands for something else.
+    One number that ends where nothing more is admitted would be more: it stands for something else. With the flights it
+    was fitted to, a scale of velocities must be more than the jitter of the estimate in them, too.
     """
     least = LEAST.get(candidate.effect)
     here, neutral = candidate.values(point), candidate.neutral(point)
@@ -185,6 +200,9 @@ def matters(point: Point, candidate: Candidate) -> bool:
         return bool(here["mass"] > LEAST_LOAD * point.vehicle.mass)
     if candidate.effect == "inertia":
         return any(abs(here[n] / neutral[n] - 1.0) > LEAST_INERTIA for n in candidate.free)
+    if candidate.effect == "velocity_scale" and data is not None:
+        jitter = np.maximum(VELOCITY_LEAST * jittery(data), least or 0.0)
+        return any(abs(here[n] - neutral[n]) > j for n, j in zip("xyz", jitter, strict=True) if n in candidate.free)
     if least is None:
         return True
     return any(abs(here[n] - neutral[n]) > least for n in candidate.free)

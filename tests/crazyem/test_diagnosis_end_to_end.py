@@ -217,7 +217,7 @@ def test_disturbances_that_the_controller_fights_do_not_shrink_a_gain() -> None:
     assert np.all(regressed(recording) < 0.5)
     value, sd = gain(recording, sway=2.0)
     assert abs(value - 0.8) < 2.5 * sd
-    assert sd < 0.07
+    assert sd < 0.08  # 0.071; 0.063 while a late gyro was reckoned with the model's accelerations, without what swayed
 
 
 # -- the command ----------------------------------------------------------------------------------------------------

@@ -121,6 +121,17 @@ def test_one_number_at_the_end_of_its_range_is_no_finding():
     assert matters(POINT.with_effects({"linear_drag": {"x": 0.0, "y": 0.01, "z": 0.0}}), DRAG)  # one of three
 
 
+def test_a_scale_of_velocities_must_be_more_than_the_jitter_of_the_estimate():
+    """20 % of the 7 mm/s of a hover are a millimetre a second: any onboard estimate is as wrong; of 0.7 m/s they are not."""
+    scale = Candidate("velocity_scale", (), ("x", "y", "z"))
+    point = POINT.with_effects({"velocity_scale": {"x": 1.2, "y": 1.0, "z": 1.0}})
+    for speed, counts in ((0.007, False), (0.7, True)):
+        moving = np.zeros((100, 13))
+        moving[:, 3:6] = speed * np.sin(np.arange(100.0))[:, None]
+        data = SimpleNamespace(flights=[SimpleNamespace(y=moving)])
+        assert matters(point, scale, data) == counts
+
+
 def test_a_load_counts_from_a_share_of_the_drone_s_mass_on_whatever_its_length():
     load = Candidate("suspended_load", (), ("mass", "length"))
     few, some = (POINT.with_effects({"suspended_load": {"mass": m, "length": 1.5}}) for m in (1e-4, 4e-4))

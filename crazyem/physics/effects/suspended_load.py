@@ -41,14 +41,14 @@ def swing_of(situation: Situation, *, length: float) -> NDArray:
     return swing_along(gap=gap, broken=broken, velocity=situation.velocity, air=situation.air, length=length)
 
 
-# A pendulum of the wrong period fits no better than none. In the 10 s that DAMPING leaves it, a length wrong by 2 % at
-# 0.1 m, by 8 % at 1.5 m, puts it a radian out of step: dL/L = 2 dw/w with dw = 0.1 rad/s and w = sqrt(g/L).
-LENGTHS = tuple(round(0.1 * 1.06**k, 4) for k in range(48))
+# A pendulum of the wrong period fits no better than none: in the 10 s that DAMPING leaves it, 0.1 rad/s put it a radian out of
+# step. So the lengths to begin from, 1.6 m to 0.1 m, are 0.14 rad/s apart, and the derivative is taken over a step far below that.
+LENGTHS = tuple(round(9.81 / (2.48 + 0.14 * k) ** 2, 4) for k in range(54))
 
 
 SUSPENDED_LOAD = Effect(
     "suspended_load",
-    (Parameter("mass", "kg", 0.0, 0.0, 0.5, 5e-4), Parameter("length", "m", 0.3, 0.02, 10.0, 0.02)),
+    (Parameter("mass", "kg", 0.0, 0.0, 0.5, 5e-4), Parameter("length", "m", 0.3, 0.02, 10.0, 2e-4)),
     order=70,
     tied=pulled,
     needs=("position", "velocity", "specific_force"),
