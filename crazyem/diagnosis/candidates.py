@@ -13,6 +13,7 @@ from crazyem.physics.effects.effect import Effect, Parameter
 from crazyem.physics.motion import own_values
 
 ON_BOARD = 0.04  # m from the middle of the rotors: no part of a Crazyflie is further away
+STRONGEST = 1.1  # a worn, cut or bent propeller pulls less than the others; a new one among worn ones a little more
 # judged by themselves: gusts.py, accelerometer.py; of every log: always.py
 ASIDE = ("gusts", "accelerometer_misalignment", "onboard_filter")
 ASKED = ("trim",)  # looked for only if asked for: near every effect that brings a steady torque
@@ -49,10 +50,12 @@ class Candidate:
         return next(p for p in CATALOGUE[self.effect].parameters if p.name == name)
 
     def range_of(self, name: str) -> tuple[float, float]:
-        """What is admitted of a parameter while it is fitted: a payload is on the drone."""
+        """What is admitted of a parameter while it is fitted: a payload is on the drone, a faulty rotor no stronger."""
         p, far = self.parameter(name), math.inf
         if self.effect in ("payload", "center_of_mass") and name in "xyz":
             far = ON_BOARD
+        elif self.effect == "rotor_fault" and name == "scale":
+            far = STRONGEST
         return max(-p.high if self.both_ways else p.low, -far), min(p.high, far)
 
     def neutral(self, point: Point) -> dict[str, Any]:

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fit import Data
-from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.model import Noise, Point
 
 MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)  # s
 GAINED = 40.0  # nats
+FAR = 25  # iterations of the first fit
 SMALLEST = 0.08  # m/s^2: less is what onboard filters leave
 ALIKE = 3.0  # largest ratio between the axes' spreads for moving air; a force on one axis alone is none
 PUSH = 0.007  # N s/m: of moving air on a drone whose drag is not known (docs/effects.md)
@@ -45,17 +46,23 @@ def find_gusts(data: Data, point: Point) -> Gusts | None:
     """Whether a disturbing force with memory is there; None if the likelihood gains nothing by it."""
     white = data.loglik(point, passes=2)
 
-    def fitted(memory: float) -> tuple[float, Point]:
+    def fitted(memory: float, start: Noise, spread: NDArray, iterations: int) -> tuple[float, Point]:
         torques = point.noise.disturbance[3:], np.broadcast_to(np.asarray(point.noise.memory, float), (6,))[3:]
-        noise = replace(point.noise, disturbance=np.concatenate([np.full(3, 0.1), torques[0]]),
+        noise = replace(start, disturbance=np.concatenate([spread, torques[0]]),
                         memory=np.concatenate([np.full(3, memory), torques[1]]))  # fmt: skip
-        found = data.fit_noise(replace(point, noise=noise), iterations=5)
+        found = data.fit_noise(replace(point, noise=noise), iterations=iterations)
         return data.loglik(found, passes=2), found
 
-    first = fitted(1.0)
+    first = fitted(1.0, point.noise, np.full(3, 0.1), 5)
     if first[0] - white < 0.5 * GAINED or first[1].noise.disturbance[:3].max() < 0.7 * SMALLEST:
         return None
-    tried = {1.0: first, **{m: fitted(m) for m in MEMORIES if m != 1.0}}
+    # what was white until now stood in all scales: short of the maximum, 250 nats of them pass for a longer memory
+    first = fitted(1.0, first[1].noise, first[1].noise.disturbance[:3], FAR)
+    reached = first[1].noise
+    tried = {1.0: first}
+    for m in MEMORIES:
+        if m != 1.0:
+            tried[m] = fitted(m, reached, np.sqrt(m) * reached.disturbance[:3], 8)
     best = max(tried, key=lambda m: tried[m][0])
     gain = tried[best][0] - white
     spread = tried[best][1].noise.disturbance[:3]
@@ -69,7 +76,7 @@ def find_gusts(data: Data, point: Point) -> Gusts | None:
     seconds = sum(f.duration for f in data.flights)
     independent = max(3.0 * seconds / (2.0 * memory), 2.0)
     memory_sd = max(1.0 / np.sqrt(max(-2 * curve[0], 1e-9)), np.sqrt(2.0 / independent))
-    size = float(np.sqrt(np.mean(spread**2)))
+    size = float(np.median(spread))  # along z thrust is a little wrong as well
     push = drag_of(point) or PUSH
     speed = size * point.vehicle.mass / push
     alike = bool(spread.max() < ALIKE * spread.min())

@@ -145,7 +145,7 @@ def gain_of_both(fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequen
     told = 0.5 * float(rest @ step)
     if told < FAR:
         return told
-    # So much is told by slopes where an effect is far from what these flights want; what such a step brings is another matter
+    # So much is told by slopes where an effect is far from what these flights want; what the step brings is to be seen
     begin, best = held_out.loglik(there.point), 0.0
     for part in (1.0, 0.5, 0.25):
         moves = part * step
@@ -192,7 +192,7 @@ def matters(point: Point, candidate: Candidate, data: Data | None = None) -> boo
     here, neutral = candidate.values(point), candidate.neutral(point)
     if len(candidate.free) == 1:
         p = candidate.parameter(candidate.free[0])
-        if here[p.name] in (p.low, p.high) and here[p.name] != neutral[p.name]:
+        if here[p.name] in candidate.range_of(p.name) and here[p.name] != neutral[p.name]:
             return False
     if candidate.effect == "center_of_mass":
         return any(abs(here[n] - neutral[n]) > LEAST_CENTRE[n] for n in candidate.free)

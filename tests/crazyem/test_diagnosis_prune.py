@@ -121,8 +121,19 @@ def test_one_number_at_the_end_of_its_range_is_no_finding():
     assert matters(POINT.with_effects({"linear_drag": {"x": 0.0, "y": 0.01, "z": 0.0}}), DRAG)  # one of three
 
 
+def test_a_rotor_that_is_much_stronger_than_the_others_is_no_faulty_one():
+    """1.2 and 1.3 were said of real drones with another propeller cut."""
+    fault = Candidate("rotor_fault", (("rotor", 2), ("onset_time", None)), ("scale",))
+    low, high = fault.range_of("scale")
+    assert low == 0.0
+    assert 1.0 < high < 1.2
+    for scale, counts in ((0.8, True), (1.05, True), (high, False)):
+        point = POINT.with_effects({"rotor_fault": {"rotor": 2, "scale": scale, "onset_time": None}})
+        assert matters(point, fault) == counts
+
+
 def test_a_scale_of_velocities_must_be_more_than_the_jitter_of_the_estimate():
-    """20 % of the 7 mm/s of a hover are a millimetre a second: any onboard estimate is as wrong; of 0.7 m/s they are not."""
+    """20 % of the 7 mm/s of a hover are 1 mm/s, and any onboard estimate is as wrong; 20 % of 0.7 m/s are more."""
     scale = Candidate("velocity_scale", (), ("x", "y", "z"))
     point = POINT.with_effects({"velocity_scale": {"x": 1.2, "y": 1.0, "z": 1.0}})
     for speed, counts in ((0.007, False), (0.7, True)):

@@ -41,8 +41,9 @@ def swing_of(situation: Situation, *, length: float) -> NDArray:
     return swing_along(gap=gap, broken=broken, velocity=situation.velocity, air=situation.air, length=length)
 
 
-# A pendulum of the wrong period fits no better than none: in the 10 s that DAMPING leaves it, 0.1 rad/s put it a radian out of
-# step. So the lengths to begin from, 1.6 m to 0.1 m, are 0.14 rad/s apart, and the derivative is taken over a step far below that.
+# A pendulum of the wrong period fits no better than none: in the 10 s that DAMPING leaves it, 0.1 rad/s put it a
+# radian out of step. So the lengths to begin from, 1.6 m to 0.1 m, are 0.14 rad/s apart, and derivatives are taken over
+# a step far below that.
 LENGTHS = tuple(round(9.81 / (2.48 + 0.14 * k) ** 2, 4) for k in range(54))
 
 
