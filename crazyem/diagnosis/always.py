@@ -20,17 +20,18 @@ from crazyem.vehicle import Vehicle
 # onboard filter does to velocities. An effect is more.
 DELAY_SD = {False: 2e-3, True: 5e-3}  # s, by whether rotor speeds are measured
 INERTIA_SD = np.array([0.02, 0.02, 0.04])  # relative
-# s: in 28 flights with nothing hidden, lag and torques free, 49 to 60 ms instead of 50; the high frequencies of sampled
-# commands are partly noise that acted for 2 ms, so the response to them looks weak, as a longer lag makes it.
-LAG_SD = 4e-3
+LAG_SD = 2e-3  # s: with nothing hidden and torques as free, 51 to 55 ms instead of 50 in ten flights
+# Relative, about z: rotors that are heavy answer with torque at once, without the lag that hides what sampled commands
+# miss, and then yaw looks too heavy by 20 to 40 %.
+AT_ONCE_SD = 0.25
 CENTRE_SD = (2e-5, 2e-5, 7e-4)  # m; a height of -0.4 to -0.8 mm is what velocities of onboard filters look like
 VELOCITY_SD, JITTER = 2e-3, 3e-3  # relative: no onboard filter is better; m/s, see `jittery`
 # s: rates behind the attitude, velocities behind the position, by the filters of the firmware; in 80 flights with
 # nothing hidden 0.0 to 2.4 and 0.0 to 1.6 ms, most in quick ones.
 FILTER, FILTER_SD = (("rate_lag", 1.2e-3), ("velocity_lag", 0.6e-3)), 0.7e-3
-# Relative: in 80 flights of drones with nothing hidden torques look 6 +- 4 % too strong (-7 to +15 %); a longer lag
-# with more torque is nearly the same to a loop whose commands are sampled.
-TORQUE_SD = 0.04
+# Relative: in ten flights with nothing hidden, with the lag free, torques look 2 +- 2 % too strong (-1 to +5 %); a
+# longer lag with more torque is nearly the same to a loop whose commands are sampled.
+TORQUE_SD = 0.03
 # From one day to the next, of a drone whose file has a trim: batteries are put in again, propellers and feet bent.
 # Healthy and damaged flights of two drones on several days scatter like this (docs/diagnosis_real.md).
 TRIM_SD = (5e-4, 5e-4, 1.6e-4)  # m: torque per thrust
@@ -65,6 +66,8 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
     if "body_rate" in data.signals or "attitude" in data.signals:
         coarse = coarsely_sampled(data, point)
         share = COARSE_INERTIA_SD if coarse else INERTIA_SD
+        if not coarse and not measured and point.effects.get("rotor_inertia", {}).get("inertia", 0.0) > 0.0:
+            share = np.array([*INERTIA_SD[:2], AT_ONCE_SD])
         moments = tuple((share * np.array(point.vehicle.inertia)) ** -2.0)
         found.append((Candidate("inertia", (), ("xx", "yy", "zz")), moments))
         if not coarse:

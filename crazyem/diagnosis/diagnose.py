@@ -10,6 +10,7 @@ from scipy import stats
 from crazyem.diagnosis.always import abstained, solved, steadied, unsure
 from crazyem.diagnosis.beside import beside_the_regression, late_rotors
 from crazyem.diagnosis.candidates import Candidate, candidates_for
+from crazyem.diagnosis.exchange import named_again
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.fit import nominal as nominal_of
 from crazyem.diagnosis.flight import flight_of
@@ -88,6 +89,7 @@ def diagnose(
     candidates, left_out = abstained(data, nominal, candidates, left_out)
     nominal = steadied(data, nominal)
     selection = select(data, nominal, candidates, held_out=apart, say=say)
+    selection = named_again(data, apart, selection, say)
     selection, told = _asked(data, selection, recordings)
     say("where the nominal model fails")
     data.settle(selection.nominal)

@@ -125,7 +125,7 @@ class Data:
             wild[1:] |= wild[:-1].copy()
             if wild.any():
                 count += int(wild.sum())
-                flight = replace(model.flight, starts=model.flight.starts | wild)
+                flight = model.flight.started(model.flight.starts | wild)
                 self.models[i] = Model(flight)
         return count
 

@@ -105,7 +105,7 @@ def survive(
     inertia, and gusts like a wrong thrust curve."""
     while accepted:
         noise = replace(fitted.point.noise, disturbance=np.concatenate([FORCES, TORQUES]), memory=1.0)
-        point = data.fit_noise(replace(fitted.point, noise=noise), iterations=5)
+        point = data.fit_noise(replace(fitted.point, noise=noise), iterations=20)  # far from where white noise was
         if data.loglik(point, passes=2) < data.loglik(fitted.point, passes=2) + WANDERING:
             break
         wandering = refine_base(data, point, accepted, rounds=2, noise=False)

@@ -43,8 +43,8 @@ def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Tri
     bare = without(selection.final, LOAD)
     bare = bare.with_effects({c.effect: c.neutral(bare) for c in two})
     try:
-        value, blocks = _judged(data, held_out, selection.final, selection.accepted)
-        other, others = _judged(data, held_out, bare, [*rest, *two])
+        value, blocks = judged(data, held_out, selection.final, selection.accepted)
+        other, others = judged(data, held_out, bare, [*rest, *two])
     except DivergedError:
         return None
     other -= np.log(len(CATALOGUE)) * (len(two) - 1)  # that a second effect is there as well is no matter of course
@@ -55,7 +55,7 @@ def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Tri
     )
 
 
-def _judged(data: Data, held_out: Data | None, start: Point, candidates: Sequence[Candidate]) -> tuple[float, NDArray]:
+def judged(data: Data, held_out: Data | None, start: Point, candidates: Sequence[Candidate]) -> tuple[float, NDArray]:
     """Log-likelihood as fitted to all flights, and by blocks."""
     here = data.twin()
     fitted = refine_base(here, start, candidates, noise=False)

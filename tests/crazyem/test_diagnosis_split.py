@@ -37,7 +37,7 @@ def test_the_two_pay_for_their_parameters_and_for_being_two(monkeypatch: pytest.
         asked.append(([c.effect for c in candidates], sorted(start.effects)))
         return (110.0 if len(asked) == 1 else 104.0), np.zeros(5)
 
-    monkeypatch.setattr(split, "_judged", judged)
+    monkeypatch.setattr(split, "judged", judged)
     found = split.as_two(SimpleNamespace(), None, selection_of(point, (LOAD, DRAG)))  # type: ignore[arg-type]
     assert found is not None
     both = ["thrust_scale"] if trim else ["thrust_scale", "center_of_mass"]

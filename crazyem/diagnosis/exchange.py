@@ -1,0 +1,88 @@
+"""Names that were given before the rest was known: each is asked again, beside all the others, against its rivals.
+
+Effects are found one after the other, and the first is named while the second still passes for noise or is taken up by
+a parameter that the right name does not have: a load off the centre wins over weaker rotors where a flapping moment,
+found later, is what was off the centre.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from crazyem.diagnosis.always import TRIM, refine_base, without
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.fit import Data, DivergedError, remembering_anew
+from crazyem.diagnosis.split import judged
+from crazyem.diagnosis.trials import SURE, Selection, Step, Trial, margin, matters, told_apart
+
+NEAR = 100.0  # nats by which a rival may have been worse when it was tried
+
+
+def named_again(
+    data: Data, held_out: Data | None, selection: Selection, say: Callable[[str], None] = lambda text: None
+) -> Selection:
+    """The selection with every name that a rival explains better, or as well with fewer parameters, exchanged for it.
+
+    With one effect there is nothing new to ask; with a trim in the vehicle file noise scales are not fitted again.
+    """
+    if len(selection.accepted) < 2 or TRIM in selection.final.vehicle.effects:
+        return selection
+    for name in [c.effect for c in selection.accepted]:
+        try:
+            selection = _asked_again(data, held_out, selection, name, say)
+        except DivergedError:
+            continue
+    return selection
+
+
+def rivals(step: Step, accepted: Sequence[Candidate]) -> list[Trial]:
+    """What else was nearly as good when the effect was taken, and is not part of the model by now."""
+    taken, names = step.taken, {c.effect for c in accepted}
+    assert taken is not None
+    tried = [t for t in step.trials if t.fitted is not None and t.blocks.size == taken.blocks.size]
+    return [t for t in tried if t.candidate.effect not in names and t.p_value < SURE and margin(taken, t)[0] < NEAR]
+
+
+def _asked_again(
+    data: Data, held_out: Data | None, selection: Selection, name: str, say: Callable[[str], None]
+) -> Selection:
+    step = next(s for s in selection.steps if s.taken and s.taken.candidate.effect == name)
+    others = rivals(step, selection.accepted)
+    mine = next(c for c in selection.accepted if c.effect == name)
+    if not others:
+        return selection
+    say(f"  asking again: {mine.label} or {', '.join(t.candidate.label for t in others)}")
+    assert step.taken is not None
+    value, blocks = judged(data, held_out, selection.final, selection.accepted)
+    now = replace(step.taken, candidate=mine, value=value, blocks=blocks)
+    tried = []
+    for rival in others:
+        assert rival.fitted is not None
+        bare = without(selection.final, name)
+        point = bare.with_effects({rival.candidate.effect: rival.candidate.values(rival.fitted.point)})
+        value, blocks = judged(data, held_out, point, _in_place(selection.accepted, mine, rival.candidate))
+        tried.append(replace(rival, value=value, blocks=blocks))
+    best = max([now, *tried], key=lambda t: t.value - len(t.candidate.free))
+    equals = [t for t in [now, *tried] if t is best or not told_apart(best, t)]
+    chosen = min(equals, key=lambda t: (len(t.candidate.free), -t.value))
+    trials = tuple(next((n for n in [now, *tried] if n.candidate is t.candidate), t) for t in step.trials)
+    if now.candidate is not step.taken.candidate:  # it was dated since
+        trials = (now, *(t for t in trials if t is not step.taken))
+    if any(t is now for t in equals) and len(chosen.candidate.free) == len(mine.free):
+        chosen = now
+    alike = tuple(t for t in equals if t is not chosen and t.candidate.effect != chosen.candidate.effect)
+    steps = tuple(replace(step, taken=chosen, trials=trials, alike=alike) if s is step else s for s in selection.steps)
+    if chosen is now:
+        return replace(selection, steps=steps)
+    accepted = _in_place(selection.accepted, mine, chosen.candidate)
+    assert chosen.fitted is not None
+    values = {chosen.candidate.effect: chosen.candidate.values(chosen.fitted.point)}
+    point = refine_base(data, without(selection.final, name).with_effects(values), accepted).point
+    fitted = refine_base(data, remembering_anew(data, point), accepted)
+    if not matters(fitted.point, chosen.candidate, data):
+        return selection
+    say(f"  beside the others it is {chosen.candidate.label}")
+    return replace(selection, final=fitted.point, fitted=fitted, accepted=tuple(accepted), steps=steps)
+
+
+def _in_place(accepted: Sequence[Candidate], old: Candidate, new: Candidate) -> list[Candidate]:
+    return [new if c is old else c for c in accepted]

@@ -1,0 +1,88 @@
+"""Names asked again beside the rest: exchanged where a rival is better, or as good with fewer parameters."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from closed_loop import DRONE
+
+from crazyem.diagnosis import exchange
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.trials import Selection, Step, Trial
+
+LOAD = Candidate("payload", (), ("mass", "x", "y", "z"))
+WEAKER = Candidate("thrust_scale", (), ("scale",))
+FLAPPING = Candidate("velocity_moment", (), ("roll_per_vy", "pitch_per_vx"))
+BARE = Point(DRONE, {}, first_guess())
+POINT = BARE.with_effects({"payload": {**LOAD.neutral(BARE), "mass": 0.004},
+                           "velocity_moment": {"roll_per_vy": 1e-5, "pitch_per_vx": 1e-5}})  # fmt: skip
+THERE = BARE.with_effects({"thrust_scale": {"scale": 0.9}})
+BLOCKS = np.linspace(-1.0, 1.0, 20)
+
+
+def trial(candidate: Candidate, value: float, point: Point) -> Trial:
+    return Trial(candidate, value, 0.0, 1.0, 1e-9, value, SimpleNamespace(point=point), BLOCKS, value)  # type: ignore[arg-type]
+
+
+def asked(monkeypatch: pytest.MonkeyPatch, *, load: float, weaker: float, was: float = 30.0) -> Selection:
+    """The selection after the load (`load` nats beside the flapping) was held against weaker rotors (`weaker`), which
+    were worse by `was` nats when it was taken."""
+    taken, other = trial(LOAD, 100.0, POINT), trial(WEAKER, 100.0 - was, THERE)
+    steps = (Step((taken, other), taken), Step((), trial(FLAPPING, 20.0, POINT)))
+    selection = Selection(BARE, POINT, steps, (LOAD, FLAPPING), SimpleNamespace(), 34)  # type: ignore[arg-type]
+
+    def judged(data, held_out, start, candidates):
+        assert [c.effect for c in candidates][1] == "velocity_moment"
+        if candidates[0] is LOAD:
+            return load, BLOCKS + load / 20
+        assert "payload" not in start.effects
+        assert start.effects["thrust_scale"]["scale"] == 0.9
+        return weaker, BLOCKS + weaker / 20
+
+    monkeypatch.setattr(exchange, "judged", judged)
+    monkeypatch.setattr(exchange, "remembering_anew", lambda data, point: point)
+    monkeypatch.setattr(exchange, "refine_base", lambda data, point, accepted: SimpleNamespace(point=point))
+    return exchange.named_again(SimpleNamespace(), None, selection)  # type: ignore[arg-type]
+
+
+def names(selection: Selection) -> list[str]:
+    taken = [s.taken.candidate.effect for s in selection.steps if s.taken]
+    assert [c.effect for c in selection.accepted] == taken
+    assert set(taken) <= set(selection.final.effects)
+    return taken
+
+
+def test_a_rival_that_is_better_beside_the_rest_takes_the_place(monkeypatch):
+    found = asked(monkeypatch, load=100.0, weaker=130.0)
+    assert names(found) == ["thrust_scale", "velocity_moment"]
+    assert "payload" not in found.final.effects
+    assert found.steps[0].alike == ()
+
+
+def test_of_two_that_are_as_good_the_one_with_fewer_parameters(monkeypatch):
+    found = asked(monkeypatch, load=102.0, weaker=100.0)
+    assert names(found) == ["thrust_scale", "velocity_moment"]
+    assert [t.candidate for t in found.steps[0].alike] == [LOAD]  # and it is said
+
+
+def test_a_name_that_is_still_the_best_stays(monkeypatch):
+    found = asked(monkeypatch, load=130.0, weaker=100.0)
+    assert names(found) == ["payload", "velocity_moment"]
+    assert found.final is POINT
+    assert found.steps[0].alike == ()
+
+
+def test_what_was_far_worse_is_not_asked(monkeypatch):
+    monkeypatch.setattr(exchange, "NEAR", 20.0)
+    assert names(asked(monkeypatch, load=100.0, weaker=130.0)) == ["payload", "velocity_moment"]
+
+
+def test_one_effect_alone_is_not_asked_again(monkeypatch):
+    monkeypatch.setattr(exchange, "judged", lambda *a: pytest.fail("nothing is new"))
+    taken = trial(LOAD, 100.0, POINT)
+    alone = Selection(BARE, POINT, (Step((taken, trial(WEAKER, 99.0, THERE)), taken),), (LOAD,), SimpleNamespace(), 34)  # type: ignore[arg-type]
+    assert exchange.named_again(SimpleNamespace(), None, alone) is alone  # type: ignore[arg-type]
+    assert replace(alone) == alone
