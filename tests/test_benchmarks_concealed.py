@@ -187,28 +187,33 @@ def test_figures_of_made_up_answers_are_those_counted_by_hand() -> None:
         Outcome(truth("single", 0.2, **scale), answer(), 10.0, 50.0, {"fitted": twice, "true": one}),
         Outcome(truth("single", 0.1, **scale), answer(), 10.0, 3.0),  # nobody could see it
         Outcome(truth("pair", **pair), answer(good, effect("linear_drag", 0.6), indistinguishable=group), 10.0, 90.0),
+        Outcome(truth("pair", **pair), answer(good, effect("wind", 0.9)), 10.0, 90.0, {}, {"thrust_scale": 80.0}),
+        Outcome(truth("pair", **pair), answer(good), 10.0, 90.0, {}, {"thrust_scale": 80.0, "wind": 4.0}),
         Outcome(truth("outside", cable_spring={}), answer(effect("wind", 0.95)), 10.0),
         Outcome(truth("outside", cable_spring={}), None),
     ]
     f = figures(cases)
-    assert f["cases"] == {"nothing": 4, "single": 3, "pair": 1, "outside": 2}
+    assert f["cases"] == {"nothing": 4, "single": 3, "pair": 3, "outside": 2}
     assert f["no_answer"] == 1
     assert f["nothing"]["false_alarms"] == {"n": 4, "share": 0.25}
     assert f["single"]["detectable"] == {"n": 2, "of": 3}
     assert f["single"]["named_first_strong"] == {"n": 1, "share": 1.0}
     assert f["single"]["named_first_all"] == {"n": 2, "share": 0.5}
-    assert f["parameters"]["interval_coverage"] == {"n": 2, "share": 1.0}
-    assert f["parameters"]["error"] == {"n": 2, "median": pytest.approx(0.1)}
-    assert f["pairs"]["both_and_only_both"] == {"n": 1, "share": 0.0}
-    assert f["pairs"]["up_to_declared_groups"] == {"n": 1, "share": 1.0}
+    assert f["parameters"]["interval_coverage"] == {"n": 4, "share": 1.0}
+    assert f["parameters"]["error"] == {"n": 5, "median": pytest.approx(0.1)}  # 0.1 four times, a wind without numbers
+    assert f["pairs"]["both_and_only_both"] == {"n": 3, "share": pytest.approx(1 / 3)}
+    assert f["pairs"]["each_detectable"] == {"n": 2, "share": 0.5}  # of the third one effect only could be seen
+    assert f["pairs"]["each_known"] == 2
+    assert f["pairs"]["up_to_declared_groups"] == {"n": 3, "share": pytest.approx(2 / 3)}
     assert f["outside"]["wrong_confident_name"] == {"n": 2, "share": 0.5}
     assert f["held_out"] == {"within_10_percent_of_true_model": {"n": 2, "share": 0.5}, "median_ratio": 1.5}
-    # claims: 0.7 wrong, 0.96 right twice, 0.6 right (declared alike), 0.95 wrong
-    assert f["confidence"]["n"] == 5
-    brier = (0.7**2 + 2 * 0.04**2 + 0.4**2 + 0.95**2) / 5
+    # claims: 0.7 wrong, 0.96 right four times, 0.6 right (declared alike), 0.9 right, 0.95 wrong
+    assert f["confidence"]["n"] == 8
+    brier = (0.7**2 + 4 * 0.04**2 + 0.4**2 + 0.1**2 + 0.95**2) / 8
     assert f["confidence"]["brier"] == pytest.approx(brier)
     assert [r["why"] for r in f["failures"]] == [
-        "false alarm", "missed", "not both and only both", "wrong confident name", "no answer",
+        "false alarm", "missed", "not both and only both", "not both and only both", "wrong confident name",
+        "no answer",
     ]  # fmt: skip
     assert "| nothing hidden: false alarms | 25.0 % of 4 | at most 3 % |" in table(f)
 

@@ -20,6 +20,7 @@ from crazyem.diagnosis.fit import Data, Fitted, nominal, remembering_anew
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
+from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording
 from crazyem.vehicle import Vehicle
 
@@ -37,21 +38,48 @@ def ideal_nats(recording: Path, vehicle: Vehicle, effects: Mapping[str, Mapping[
     an accelerometer, gusts, and what acts before rotors whose speeds are measured.
     """
     seen = open_recording(str(recording))
-    if ASIDE & set(effects) or (BEFORE_ROTORS & set(effects) and "rotor_speed" in seen.signals):
+    if _beyond(effects, seen):
         return None
     data = Data([flight_of(seen, vehicle)])
-    bare = nominal(data, Point(vehicle, {}, first_guess()))
+    without = _best(data, nominal(data, Point(vehicle, {}, first_guess())))
+    return _under(data, without.point, effects) - without.loglik
 
-    def best(point: Point) -> Fitted:
-        known = [Candidate(name, (), ()) for name in effects if name in point.effects]
-        once = refine_base(data, point, known)
-        again = refine_base(data, remembering_anew(data, once.point), known)
-        return max(once, again, key=lambda f: f.loglik)
 
-    without = best(bare)
-    true = replace(without.point, effects={name: dict(table) for name, table in effects.items()})
-    data.settle(true)
-    return best(true).loglik - without.loglik
+def ideal_nats_of_each(
+    recording: Path, vehicle: Vehicle, effects: Mapping[str, Mapping[str, Any]]
+) -> dict[str, float | None]:
+    """By effect: log-likelihood of the recording under all true effects less that under all but this one, as above;
+    None: not available. Of a pair an ideal observer may see that something is there and still only one of the two."""
+    seen = open_recording(str(recording))
+    if _beyond(effects, seen):
+        return dict.fromkeys(effects)
+    data = Data([flight_of(seen, vehicle)])
+    start = _best(data, nominal(data, Point(vehicle, {}, first_guess()))).point
+    whole = _under(data, start, effects)
+    return {
+        name: whole - _under(data, start, {other: table for other, table in effects.items() if other != name})
+        for name in effects
+    }
+
+
+def _beyond(effects: Mapping[str, Mapping[str, Any]], seen: Recording) -> bool:
+    """Whether the likelihood of the flight is not what shows these effects."""
+    return bool(ASIDE & set(effects) or (BEFORE_ROTORS & set(effects) and "rotor_speed" in seen.signals))
+
+
+def _under(data: Data, start: Point, effects: Mapping[str, Mapping[str, Any]]) -> float:
+    """Log-likelihood under known effects."""
+    point = replace(start, effects={name: dict(table) for name, table in effects.items()})
+    data.settle(point)
+    return _best(data, point).loglik
+
+
+def _best(data: Data, point: Point) -> Fitted:
+    """What suits a model best beside its effects: noise scales, memory of the torques or none, what is always free."""
+    known = [Candidate(name, (), ()) for name in point.effects]
+    once = refine_base(data, point, known)
+    again = refine_base(data, remembering_anew(data, once.point), known)
+    return max(once, again, key=lambda f: f.loglik)
 
 
 def held_out_error(recording: Path, vehicle_file: str) -> dict[str, float] | None:

@@ -6,7 +6,7 @@ from typing import Any
 
 from crazyem.vehicle import load_vehicle
 
-from .ideal import held_out_error, ideal_nats
+from .ideal import held_out_error, ideal_nats, ideal_nats_of_each
 from .paths import Study, read, write
 from .score import Outcome, figures
 
@@ -23,7 +23,8 @@ def outcomes(study: Study, *, ideal: bool = True) -> list[Outcome]:
         if answer is None:
             continue
         known = _ideal(study, case, truth) if ideal else read(study.folder / "ideal" / f"{case}.json") or {}
-        out.append(Outcome(truth, answer["result"], answer["seconds"], known.get("nats"), known.get("held_out", {})))
+        out.append(Outcome(truth, answer["result"], answer["seconds"], known.get("nats"), known.get("held_out", {}),
+                           known.get("of_each", {})))  # fmt: skip
     return out
 
 
@@ -34,6 +35,8 @@ def _ideal(study: Study, case: str, truth: dict[str, Any]) -> dict[str, Any]:
     vehicle = load_vehicle(truth["platform"])
     if known.get("nats") is None and truth["kind"] in ("single", "pair"):
         known["nats"] = ideal_nats(study.recording(case, "recording"), vehicle, truth["effects"])
+    if known.get("of_each") is None and truth["kind"] == "pair":
+        known["of_each"] = ideal_nats_of_each(study.recording(case, "recording"), vehicle, truth["effects"])
     folder = study.folder / "vehicles"
     models = {"nominal": folder / f"{truth['platform']}.toml", "fitted": study.fitted(case)}
     if truth["effects"] and not truth["hidden"]:
@@ -76,6 +79,8 @@ def table(f: dict[str, Any]) -> str:
         ("95 % intervals that hold the truth", percent(p["interval_coverage"]), "90 to 98 %"),
         ("median error of a parameter, of the effect's size", _number(p["error"]["median"], "{:.1%}"), "under 10 %"),
         ("pairs: both and only both", percent(f["pairs"]["both_and_only_both"]), "75 %"),
+        (f"the same, without those of which the ideal observer (asked in {f['pairs']['each_known']}) sees one only",
+         percent(f["pairs"]["each_detectable"]), ""),
         ("pairs, up to declared groups", percent(f["pairs"]["up_to_declared_groups"]), ""),
         ("outside: unexplained, right axis and regime", percent(o["unexplained_right_axis_and_regime"]), "80 %"),
         ("outside: wrong confident name", percent(o["wrong_confident_name"]), "under 5 %"),
@@ -112,7 +117,8 @@ def table(f: dict[str, Any]) -> str:
         true = ", ".join(f"{n} ({u:.2f})" for n, u in row["strength"].items()) or "nothing"
         said = ", ".join(_said(e) for e in row["said"]) or "nothing"
         groups = "; ".join(" = ".join(g) for g in row["indistinguishable"])
-        nats = "" if row["nats"] is None else f"{row['nats']:.0f}"
+        each = [n for n in row["nats_of_each"].values() if n is not None]
+        nats = ", ".join(f"{n:.0f}" for n in each) if each else "" if row["nats"] is None else f"{row['nats']:.0f}"
         lines.append(f"| {row['case']} | {row['why']} | {true} | {said} | {groups} | {nats} |")
     return "\n".join(lines)
 

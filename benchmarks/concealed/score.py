@@ -24,6 +24,7 @@ class Outcome:
     Attributes:
         truth: see draw.draw. result: the answer's JSON, None if there was none. seconds: it took.
         nats: of an ideal observer, None where not known. held_out: "nominal", "fitted", "true" -> quantity -> error.
+        of_each: of a pair, effect -> nats of an ideal observer for it beside the other; None or absent: not known.
     """
 
     truth: Document
@@ -31,6 +32,7 @@ class Outcome:
     seconds: float = 0.0
     nats: float | None = None
     held_out: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    of_each: Mapping[str, float | None] = field(default_factory=dict)
 
     @property
     def kind(self) -> str:
@@ -48,6 +50,11 @@ class Outcome:
     def detectable(self) -> bool:
         """Also where no ideal observer is known: then every case counts, which can only lower the figures."""
         return self.nats is None or self.nats > DETECTABLE
+
+    @property
+    def each_detectable(self) -> bool:
+        """Whether every effect could be detected beside the others; likewise."""
+        return self.detectable and all(n is None or n > DETECTABLE for n in self.of_each.values())
 
 
 def _share(values: Sequence[float]) -> dict[str, Any]:
@@ -77,6 +84,8 @@ def figures(outcomes: Iterable[Outcome]) -> dict[str, Any]:
         "pairs": {
             "both_and_only_both": _share([float(judge.right_pair(c.names, c.result)) for c in pairs]),
             "up_to_declared_groups": _share([float(_loose(c)) for c in pairs]),
+            "each_detectable": _share([float(judge.right_pair(c.names, c.result)) for c in pairs if c.each_detectable]),
+            "each_known": sum(any(n is not None for n in c.of_each.values()) for c in pairs),
         },
         "outside": _outside(kinds["outside"]),
         "held_out": _held_out(cases),
@@ -214,6 +223,7 @@ def failures(cases: Iterable[Outcome]) -> list[dict[str, Any]]:
                 "strength": case.truth["strength"],
                 "styles": [f["style"] for f in case.truth["flights"].values()],
                 "nats": case.nats,
+                "nats_of_each": dict(case.of_each),
                 "said": [{"name": e.get("name"), "confidence": e.get("confidence")}
                          for e in (case.result or {}).get("effects") or []],
                 "indistinguishable": (case.result or {}).get("indistinguishable") or [],
