@@ -10,7 +10,7 @@ from scipy import stats
 from crazyem.diagnosis.always import abstained, solved, steadied, unsure
 from crazyem.diagnosis.beside import beside_the_regression, late_rotors
 from crazyem.diagnosis.candidates import Candidate, candidates_for
-from crazyem.diagnosis.exchange import named_again
+from crazyem.diagnosis.exchange import exchanged, named_again
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.fit import nominal as nominal_of
 from crazyem.diagnosis.flight import flight_of
@@ -20,7 +20,7 @@ from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.named import DOUBTFUL, Named, Value, share, trust
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.place import depends_on_place
-from crazyem.diagnosis.select import exchanged, select
+from crazyem.diagnosis.select import select
 from crazyem.diagnosis.split import LOAD, as_two, instead_of_a_load
 from crazyem.diagnosis.trials import SURE, Selection, Trial, margin, told_apart
 from crazyem.diagnosis.unexplained import Unexplained, unexplained

@@ -84,5 +84,18 @@ def _asked_again(
     return replace(selection, final=fitted.point, fitted=fitted, accepted=tuple(accepted), steps=steps)
 
 
+def exchanged(data: Data, selection: Selection, old: Candidate, new: Candidate, values: Sequence[float]) -> Selection:
+    """The selection with an effect in the place of another, its free parameters beginning at `values`."""
+    bare = without(selection.final, old.effect)
+    point = bare.with_effects({new.effect: {**new.neutral(bare), **dict(zip(new.free, values, strict=True))}})
+    accepted = tuple(new if c is old else c for c in selection.accepted)
+    fitted = refine_base(data, point, accepted, rounds=3, noise=False)
+    steps = tuple(
+        replace(s, taken=replace(s.taken, candidate=new)) if s.taken and s.taken.candidate.effect == old.effect else s
+        for s in selection.steps
+    )
+    return replace(selection, final=fitted.point, fitted=fitted, accepted=accepted, steps=steps)
+
+
 def _in_place(accepted: Sequence[Candidate], old: Candidate, new: Candidate) -> list[Candidate]:
     return [new if c is old else c for c in accepted]

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.always import TRIM, by_gain, nuisances, on_held_out, refine_base, with_nuisances, without
+from crazyem.diagnosis.always import TRIM, by_gain, nuisances, on_held_out, refine_base, with_nuisances
 from crazyem.diagnosis.beginnings import best_begun
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import Data, DivergedError, Fitted, held_near, remembering_anew
@@ -289,16 +289,3 @@ def rivals(trial: Trial, *, counted: bool) -> bool:
     evidence = own_evidence(trial, counted=counted)
     sure = trial.p_value < SURE or (trial.p_value < 1.0 and evidence > ADMITTED)
     return trial.fitted is not None and sure and evidence > 0
-
-
-def exchanged(data: Data, selection: Selection, old: Candidate, new: Candidate, values: Sequence[float]) -> Selection:
-    """The selection with an effect in the place of another, its free parameters beginning at `values`."""
-    bare = without(selection.final, old.effect)
-    point = bare.with_effects({new.effect: {**new.neutral(bare), **dict(zip(new.free, values, strict=True))}})
-    accepted = tuple(new if c is old else c for c in selection.accepted)
-    fitted = refine_base(data, point, accepted, rounds=3, noise=False)
-    steps = tuple(
-        replace(s, taken=replace(s.taken, candidate=new)) if s.taken and s.taken.candidate.effect == old.effect else s
-        for s in selection.steps
-    )
-    return replace(selection, final=fitted.point, fitted=fitted, accepted=accepted, steps=steps)
