@@ -180,7 +180,7 @@ def _named(
     freedom = max(len(fitted.gram.score) - used, 3)
     width = float(stats.t.ppf(0.975, freedom))
     named, groups, separate = [], [], []
-    at, never = 0, unsure(data, selection.nominal)
+    at, never = 0, unsure(data, selection.final)
     for candidate, step in zip(fitted.candidates, (s for s in selection.steps if s.taken), strict=True):
         # late inputs and late measurements are one model, so it is fitted as the first, whatever it is called
         late = candidate.effect == "input_delay" and MEASURED_LATE in told

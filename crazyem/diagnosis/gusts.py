@@ -15,6 +15,7 @@ from crazyem.diagnosis.model import Noise, Point
 
 MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)  # s
 GAINED = 40.0  # nats
+SHARE_SD = 0.2  # relative: of the spread, for the memory that goes with it and what else is wrong in the forces
 FAR = 25  # iterations of the first fit
 SMALLEST = 0.08  # m/s^2: less is what onboard filters leave
 ALIKE = 3.0  # largest ratio between the axes' spreads for moving air; a force on one axis alone is none
@@ -80,7 +81,8 @@ def find_gusts(data: Data, point: Point) -> Gusts | None:
     push = drag_of(point) or PUSH
     speed = size * point.vehicle.mass / push
     alike = bool(spread.max() < ALIKE * spread.min())
-    return Gusts(gain, spread, memory, float(memory_sd), alike, speed, speed / float(np.sqrt(2 * independent)))
+    speed_sd = speed * float(np.hypot(1.0 / np.sqrt(2 * independent), SHARE_SD))
+    return Gusts(gain, spread, memory, float(memory_sd), alike, speed, speed_sd)
 
 
 def drag_of(point: Point) -> float:
