@@ -147,16 +147,18 @@ def causal_middle(filtered: NDArray, predicted: NDArray, starts: NDArray) -> NDA
 def lacking(swept: Swept, flight: Flight) -> NDArray:
     """(n, 6) specific force m/s^2 and angular acceleration rad/s^2, body axes, that a model lacks along a flight.
 
-    The disturbances with a memory, and the mean of what measurements corrected over the last `RECENT`.
+    The mean over the last `RECENT` of the disturbances with a memory and of what measurements corrected: what comes
+    and goes faster is known to the filter too late, and would look like a gyro that is early.
     """
     step = np.diff(flight.time, prepend=flight.time[0])
     known = (step > 0) & ~flight.starts
     corrected = swept.filtered - swept.predicted
     force = np.einsum("nji,nj->ni", rotation_matrix(swept.filtered[:, 6:10]), corrected[:, 3:6])
-    impulse = np.where(known[:, None], np.concatenate([force, corrected[:, 10:13]], axis=1), 0.0)
+    carried = swept.filtered[:, 13:19] * step[:, None]
+    impulse = np.where(known[:, None], carried + np.concatenate([force, corrected[:, 10:13]], axis=1), 0.0)
     forget = [1.0, -np.exp(-float(np.median(step[known])) / RECENT)] if known.any() else [1.0, 0.0]
     total, span = (lfilter([1.0], forget, v, axis=0) for v in (impulse, np.where(known, step, 0.0)[:, None]))
-    mean: NDArray = swept.filtered[:, 13:19] + total / np.maximum(span, RECENT)
+    mean: NDArray = total / np.maximum(span, RECENT)
     return mean
 
 
