@@ -8,11 +8,13 @@ found later, is what was off the centre.
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from crazyem.diagnosis.always import TRIM, refine_base, without
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import Data, DivergedError, remembering_anew
 from crazyem.diagnosis.split import judged
-from crazyem.diagnosis.trials import SURE, Selection, Step, Trial, margin, matters, told_apart
+from crazyem.diagnosis.trials import SURE, Selection, Step, Trial, at_the_end, margin, matters, told_apart
 
 NEAR = 100.0  # nats by which a rival may have been worse when it was tried
 
@@ -34,20 +36,21 @@ def named_again(
     return selection
 
 
-def rivals(step: Step, accepted: Sequence[Candidate]) -> list[Trial]:
-    """What else was nearly as good when the effect was taken, and is not part of the model by now."""
+def rivals(step: Step, accepted: Sequence[Candidate], *, near: float = NEAR) -> list[Trial]:
+    """What else was within `near` nats when the effect was taken, and is not part of the model by now."""
     taken, names = step.taken, {c.effect for c in accepted}
     assert taken is not None
     tried = [t for t in step.trials if t.fitted is not None and t.blocks.size == taken.blocks.size]
-    return [t for t in tried if t.candidate.effect not in names and t.p_value < SURE and margin(taken, t)[0] < NEAR]
+    return [t for t in tried if t.candidate.effect not in names and t.p_value < SURE and margin(taken, t)[0] < near]
 
 
 def _asked_again(
     data: Data, held_out: Data | None, selection: Selection, name: str, say: Callable[[str], None]
 ) -> Selection:
     step = next(s for s in selection.steps if s.taken and s.taken.candidate.effect == name)
-    others = rivals(step, selection.accepted)
     mine = next(c for c in selection.accepted if c.effect == name)
+    ended = at_the_end(selection.final, mine)  # beside the others: it stands for something else, whatever that is worth
+    others = rivals(step, selection.accepted, near=np.inf if ended else NEAR)
     if not others:
         return selection
     say(f"  asking again: {mine.label} or {', '.join(t.candidate.label for t in others)}")
@@ -61,8 +64,9 @@ def _asked_again(
         point = bare.with_effects({rival.candidate.effect: rival.candidate.values(rival.fitted.point)})
         value, blocks = judged(data, held_out, point, _in_place(selection.accepted, mine, rival.candidate))
         tried.append(replace(rival, value=value, blocks=blocks))
-    best = max([now, *tried], key=lambda t: t.value - len(t.candidate.free))
-    equals = [t for t in [now, *tried] if t is best or not told_apart(best, t)]
+    asked = tried if ended else [now, *tried]
+    best = max(asked, key=lambda t: t.value - len(t.candidate.free))
+    equals = [t for t in asked if t is best or not told_apart(best, t)]
     chosen = min(equals, key=lambda t: (len(t.candidate.free), -t.value))
     trials = tuple(next((n for n in [now, *tried] if n.candidate is t.candidate), t) for t in step.trials)
     if now.candidate is not step.taken.candidate:  # it was dated since

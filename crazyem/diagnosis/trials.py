@@ -182,6 +182,15 @@ def wald(away: NDArray, covariance: NDArray, gram: Gram, columns: float) -> floa
     return float(stats.f.sf(distance / len(z), len(z), max(len(gram.score) - columns, 3)))
 
 
+def at_the_end(point: Point, candidate: Candidate) -> bool:
+    """Whether an effect of one number is where nothing more of it is admitted."""
+    if len(candidate.free) != 1:
+        return False
+    name = candidate.free[0]
+    here = candidate.values(point)[name]
+    return here in candidate.range_of(name) and here != candidate.neutral(point)[name]
+
+
 def matters(point: Point, candidate: Candidate, data: Data | None = None) -> bool:
     """Whether the effect is larger than what onboard filters or the sampling of a log look like, and within its range.
 
@@ -190,10 +199,8 @@ def matters(point: Point, candidate: Candidate, data: Data | None = None) -> boo
     """
     least = LEAST.get(candidate.effect)
     here, neutral = candidate.values(point), candidate.neutral(point)
-    if len(candidate.free) == 1:
-        p = candidate.parameter(candidate.free[0])
-        if here[p.name] in candidate.range_of(p.name) and here[p.name] != neutral[p.name]:
-            return False
+    if at_the_end(point, candidate):
+        return False
     if candidate.effect == "center_of_mass":
         return any(abs(here[n] - neutral[n]) > LEAST_CENTRE[n] for n in candidate.free)
     if candidate.effect in ("payload", "suspended_load"):

@@ -86,3 +86,21 @@ def test_one_effect_alone_is_not_asked_again(monkeypatch):
     alone = Selection(BARE, POINT, (Step((taken, trial(WEAKER, 99.0, THERE)), taken),), (LOAD,), SimpleNamespace(), 34)  # type: ignore[arg-type]
     assert exchange.named_again(SimpleNamespace(), None, alone) is alone  # type: ignore[arg-type]
     assert replace(alone) == alone
+
+
+def test_what_ended_where_its_range_ends_gives_way_to_whatever_is_next(monkeypatch):
+    """A thrust curve of -0.9 beside a drag, in real flights, stood for weaker rotors; worse by 900 nats or not."""
+    slope = Candidate("thrust_curve", (), ("slope_error",))
+    low = slope.range_of("slope_error")[0]
+    for end, name in ((low, "thrust_scale"), (low + 1e-3, "thrust_curve")):
+        point = BARE.with_effects({"thrust_curve": {"slope_error": end},
+                                   "velocity_moment": {"roll_per_vy": 1e-5, "pitch_per_vx": 1e-5}})  # fmt: skip
+        taken, other = trial(slope, 1000.0, point), trial(WEAKER, 100.0, THERE)
+        steps = (Step((taken, other), taken), Step((), trial(FLAPPING, 20.0, point)))
+        selection = Selection(BARE, point, steps, (slope, FLAPPING), SimpleNamespace(), 34)  # type: ignore[arg-type]
+        monkeypatch.setattr(exchange, "judged", lambda data, held_out, start, candidates: (
+            (1000.0 if candidates[0] is slope else 100.0), BLOCKS))  # fmt: skip
+        monkeypatch.setattr(exchange, "remembering_anew", lambda data, point: point)
+        monkeypatch.setattr(exchange, "refine_base", lambda data, point, accepted: SimpleNamespace(point=point))
+        found = exchange.named_again(SimpleNamespace(), None, selection)  # type: ignore[arg-type]
+        assert names(found) == [name, "velocity_moment"]

@@ -121,8 +121,10 @@ def test_a_terminal_that_hangs_up_ends_the_keys_once(terminal):
         assert keys.read(60.0) == ""
 
 
+# A shell without job control starts what is in its background with Ctrl-C ignored, and so the tests and their children.
 CHILD = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from crazyem.live.keys import Keys
 keys = Keys(0)
 keys.begin()
