@@ -31,12 +31,12 @@ def named_again(
     for name in [c.effect for c in selection.accepted]:
         try:
             selection = _asked_again(data, held_out, selection, name, say)
-        except DivergedError:
+        except DivergedError:  # one of the rivals leaves the range of numbers beside the others: the name stays
             continue
     return selection
 
 
-def rivals(step: Step, accepted: Sequence[Candidate], *, near: float = NEAR) -> list[Trial]:
+def nearly_as_good(step: Step, accepted: Sequence[Candidate], *, near: float = NEAR) -> list[Trial]:
     """What else was within `near` nats when the effect was taken, and is not part of the model by now."""
     taken, names = step.taken, {c.effect for c in accepted}
     assert taken is not None
@@ -50,7 +50,7 @@ def _asked_again(
     step = next(s for s in selection.steps if s.taken and s.taken.candidate.effect == name)
     mine = next(c for c in selection.accepted if c.effect == name)
     ended = at_the_end(selection.final, mine)  # beside the others: it stands for something else, whatever that is worth
-    others = rivals(step, selection.accepted, near=np.inf if ended else NEAR)
+    others = nearly_as_good(step, selection.accepted, near=np.inf if ended else NEAR)
     if not others:
         return selection
     say(f"  asking again: {mine.label} or {', '.join(t.candidate.label for t in others)}")
@@ -68,9 +68,8 @@ def _asked_again(
     best = max(asked, key=lambda t: t.value - len(t.candidate.free))
     equals = [t for t in asked if t is best or not told_apart(best, t)]
     chosen = min(equals, key=lambda t: (len(t.candidate.free), -t.value))
-    trials = tuple(next((n for n in [now, *tried] if n.candidate is t.candidate), t) for t in step.trials)
-    if now.candidate is not step.taken.candidate:  # it was dated since
-        trials = (now, *(t for t in trials if t is not step.taken))
+    rest = [t for t in step.trials if t is not step.taken and all(t.candidate is not r.candidate for r in tried)]
+    trials = (*asked, *rest)  # what ended is no rival of what takes its place
     if any(t is now for t in equals) and len(chosen.candidate.free) == len(mine.free):
         chosen = now
     alike = tuple(t for t in equals if t is not chosen and t.candidate.effect != chosen.candidate.effect)

@@ -146,12 +146,16 @@ def gain_of_both(fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequen
     if told < FAR:
         return told
     # So much is told by slopes where an effect is far from what these flights want; what the step brings is to be seen
-    begin, best = held_out.loglik(there.point), 0.0
+    looked, parts = held_out.twin(), [*accepted, *(c for c, _ in free)]
+    away = np.array(
+        [0.0] * own + [c.values(there.point)[n] - c.neutral(there.point)[n] for c, _ in free for n in c.free]
+    )
+    begin, best = looked.loglik(there.point) - 0.5 * float(away @ known @ away), 0.0
     for part in (1.0, 0.5, 0.25):
         moves = part * step
         with np.errstate(over="ignore", invalid="ignore"):
-            brought = held_out.loglik(moved(there.point, [*accepted, *(c for c, _ in free)], moves), passes=2) - begin
-        brought -= 0.5 * float(moves[:own] @ known[:own, :own] @ moves[:own])
+            brought = looked.loglik(moved(there.point, parts, moves), passes=2) - begin
+        brought -= 0.5 * float((away + moves) @ known @ (away + moves))
         best = max(best, brought if np.isfinite(brought) else 0.0)
     return min(best, told)
 

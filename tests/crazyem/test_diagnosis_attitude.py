@@ -58,6 +58,16 @@ def test_of_onboard_attitudes_one_in_so_many_is_used_and_none_is_lost() -> None:
     assert np.array_equal(flight.y[:, 10:], whole.y[:, 10:])
 
 
+@pytest.mark.parametrize("late", [0.0, 2e-3, 4e-3, 5e-3, 8e-3])
+def test_attitudes_in_a_log_block_of_their_own_are_not_lost(late: float) -> None:
+    """Blocks have stamps of their own: of rows that begin with the others, none may hold an attitude."""
+    recording = onboard(fly(seconds=6.0))
+    signal = recording.signals["attitude"]
+    apart = replace(recording, signals={**recording.signals, "attitude": replace(signal, time=signal.time + late)})
+    flight = flight_of(apart, DRONE)
+    assert np.allclose(np.diff(seen(flight)), APART, atol=0.011)
+
+
 def test_where_the_filter_begins_anew_there_is_an_attitude() -> None:
     flight = flight_of(onboard(fly(seconds=6.0)), DRONE)
     starts = flight.starts.copy()

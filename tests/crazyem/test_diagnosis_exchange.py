@@ -60,6 +60,7 @@ def test_a_rival_that_is_better_beside_the_rest_takes_the_place(monkeypatch):
     assert names(found) == ["thrust_scale", "velocity_moment"]
     assert "payload" not in found.final.effects
     assert found.steps[0].alike == ()
+    assert {t.candidate: t.value for t in found.steps[0].trials} == {LOAD: 100.0, WEAKER: 130.0}  # as they are now
 
 
 def test_of_two_that_are_as_good_the_one_with_fewer_parameters(monkeypatch):
@@ -104,3 +105,4 @@ def test_what_ended_where_its_range_ends_gives_way_to_whatever_is_next(monkeypat
         monkeypatch.setattr(exchange, "refine_base", lambda data, point, accepted: SimpleNamespace(point=point))
         found = exchange.named_again(SimpleNamespace(), None, selection)  # type: ignore[arg-type]
         assert names(found) == [name, "velocity_moment"]
+        assert (slope in [t.candidate for t in found.steps[0].trials]) == (name == "thrust_curve")
