@@ -81,6 +81,19 @@ def test_every_drawn_scenario_is_one_the_simulator_takes_and_every_path_one_that
                 assert min(path.at(t).position[2] for t in np.linspace(0, 20, 400)) > 0.08
 
 
+def test_drawn_products_of_inertia_belong_to_a_body() -> None:
+    from benchmarks.concealed.sizes import CATALOGUE
+    from crazyem.vehicle import load_vehicle
+
+    vehicle, random = load_vehicle("cf2"), np.random.default_rng(0)
+    for u in (0.0, 0.9, 1.0):
+        for _ in range(300):
+            p = CATALOGUE["inertia_products"].draw(u, random, vehicle)
+            xy, xz, yz = p["xy"], p["xz"], p["yz"]
+            moments = np.linalg.eigvalsh(np.diag(vehicle.inertia) + [[0, xy, xz], [xy, 0, yz], [xz, yz, 0]])
+            assert moments[2] < moments[0] + moments[1]
+
+
 def test_the_truth_without_effects_is_the_nominal_vehicle(tmp_path: Path) -> None:
     from benchmarks.concealed.draw import write_cases
     from benchmarks.concealed.paths import Study
