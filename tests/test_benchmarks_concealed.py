@@ -90,7 +90,8 @@ def test_drawn_products_of_inertia_belong_to_a_body() -> None:
         for _ in range(300):
             p = CATALOGUE["inertia_products"].draw(u, random, vehicle)
             xy, xz, yz = p["xy"], p["xz"], p["yz"]
-            moments = np.linalg.eigvalsh(np.diag(vehicle.inertia) + [[0, xy, xz], [xy, 0, yz], [xz, yz, 0]])
+            products = np.array([[0, xy, xz], [xy, 0, yz], [xz, yz, 0]])
+            moments = np.linalg.eigvalsh(np.diag(vehicle.inertia) + products)
             assert moments[2] < moments[0] + moments[1]
 
 

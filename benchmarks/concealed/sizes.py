@@ -174,7 +174,7 @@ def _inertia_products(u: float, random: Random, vehicle: Vehicle) -> Table:
     size = between(u, SIZES["inertia_products"]["share of Ixx"]) * vehicle.inertia[0]
     for _ in range(100):  # the largest, along some directions, belong to no body
         x, y, z = size * _direction(random)
-        moments = np.linalg.eigvalsh(np.diag(vehicle.inertia) + [[0, x, y], [x, 0, z], [y, z, 0]])
+        moments = np.linalg.eigvalsh(np.diag(vehicle.inertia) + np.array([[0, x, y], [x, 0, z], [y, z, 0]]))
         if moments[-1] < 0.999 * moments[:-1].sum():
             return _table(xy=float(x), xz=float(y), yz=float(z))
     raise ValueError(f"no body has products of inertia of {size} kg m^2")

@@ -14,8 +14,8 @@ from crazyem.physics.motion import own_values
 
 ON_BOARD = 0.04  # m from the middle of the rotors: no part of a Crazyflie is further away
 STRONGEST = 1.1  # a worn, cut or bent propeller pulls less than the others; a new one among worn ones a little more
-# judged by themselves: gusts.py, accelerometer.py; of every log: always.py
-ASIDE = ("gusts", "accelerometer_misalignment", "onboard_filter")
+# judged by themselves: gusts.py, accelerometer.py, imitated.py; of every log: always.py
+ASIDE = ("gusts", "accelerometer_misalignment", "onboard_filter", "force_by_place")
 ASKED = ("trim",)  # looked for only if asked for: near every effect that brings a steady torque
 
 

@@ -15,6 +15,7 @@ from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.fit import nominal as nominal_of
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.heading import heading_by_place
+from crazyem.diagnosis.imitated import by_place
 from crazyem.diagnosis.locate import Located, locate
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.named import DOUBTFUL, Named, Value, share, trust
@@ -90,6 +91,7 @@ def diagnose(
     nominal = steadied(data, nominal)
     selection = select(data, nominal, candidates, held_out=apart, say=say)
     selection = named_again(data, apart, selection, say)
+    selection, pull = by_place(data, apart, selection, say)
     selection, told = _asked(data, selection, recordings)
     say("where the nominal model fails")
     data.settle(selection.nominal)
@@ -101,13 +103,14 @@ def diagnose(
         after = locate(data, selection.final)
     place = depends_on_place(data, apart, selection.final)
     remains = unexplained(data, selection, after, apart)
-    if place is not None:
-        remains = remains.beside(place.finding)
+    pulls = [*([pull] if pull else []), *([place.finding] if place else [])]
+    for finding in pulls:
+        remains = remains.beside(finding)
     turned = heading_by_place(data, apart)
     if turned is not None:
         remains = remains.beside(turned)
     effects, groups, separate = _named(data, selection, remains, told, as_two(data, apart, selection))
-    beside = beside_the_regression(data, apart, selection.final, remains, wanted, left_out, place is not None, say)
+    beside = beside_the_regression(data, apart, selection.final, remains, wanted, left_out, bool(pulls), say)
     if flights[0].inputs.measured and not any(e.name == "input_delay" for e in effects):
         late, alike = late_rotors(recordings, held_out, vehicle, wanted, left_out)
         beside += late
@@ -181,7 +184,7 @@ def _named(
     width = float(stats.t.ppf(0.975, freedom))
     named, groups, separate = [], [], []
     at, never = 0, unsure(data, selection.final)
-    for candidate, step in zip(fitted.candidates, (s for s in selection.steps if s.taken), strict=True):
+    for candidate, step in zip(selection.accepted, (s for s in selection.steps if s.taken), strict=True):
         # late inputs and late measurements are one model, so it is fitted as the first, whatever it is called
         late = candidate.effect == "input_delay" and MEASURED_LATE in told
         values = candidate.values(selection.final)

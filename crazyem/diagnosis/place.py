@@ -15,7 +15,7 @@ from crazyem.diagnosis.gram import Gram
 from crazyem.diagnosis.locate import AXES, Finding
 from crazyem.diagnosis.model import Column, Model, Point
 from crazyem.physics.rotations import rotation_matrix
-from crazyem.vehicle import GRAVITY
+from crazyem.vehicle import GRAVITY, Vehicle
 
 NATS = 25.0  # that it must gain on the flights fitted and on those held out
 SMALLEST = 0.01  # of the weight, standard deviation along the flight
@@ -47,18 +47,24 @@ def depends_on_place(data: Data, apart: Data | None, point: Point) -> Place | No
     gained = solution.gain / dispersion - gram.size
     if min(gained, held / dispersion) < NATS:
         return None
-    place = _path(data.models[0])[:, :3] - centre
-    slopes = theta.reshape(3, 4)[:, 1:]
-    spread = point.vehicle.mass * np.abs(slopes) * place.std(axis=0)
-    i, j = np.unravel_index(int(np.argmax(spread)), spread.shape)
-    if spread[i, j] < SMALLEST * point.vehicle.mass * GRAVITY:
+    covariance = solution.covariance
+    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(3, 4)[:, 1:]
+    mass = point.vehicle.mass
+    finding = slope_finding(data, mass * theta.reshape(3, 4)[:, 1:], mass * errors, float(gained), point.vehicle)
+    return None if finding is None else Place(float(gained), float(held), finding)
+
+
+def slope_finding(data: Data, slopes: NDArray, errors: NDArray, nats: float, vehicle: Vehicle) -> Finding | None:
+    """The strongest slope of a force by place, (3, 3) N/m with its standard deviations, as a finding on the first
+    flight; None where it moves the force by less than counts."""
+    spread = _path(data.models[0])[:, :3].std(axis=0)
+    sizes = slopes * spread
+    i, j = np.unravel_index(int(np.argmax(np.abs(sizes))), sizes.shape)
+    if abs(sizes[i, j]) < SMALLEST * vehicle.mass * GRAVITY:
         return None
-    sd = float(np.sqrt(solution.covariance[4 * i + 1 + j, 4 * i + 1 + j]) * point.vehicle.mass * place[:, j].std())
-    size = float(np.sign(slopes[i, j]) * spread[i, j])
-    time = data.flights[0].time[[0, -1]]
-    finding = Finding("force", AXES[i], f"{AXES[j]} position", AXES[j], (float(time[0]), float(time[1])), size, sd, "N",
-                      float(gained), float(np.exp(-min(gained, 700.0))))  # fmt: skip
-    return Place(float(gained), float(held), finding)
+    begin, end = (float(t) for t in data.flights[0].time[[0, -1]])
+    size, sd, chance = float(sizes[i, j]), float(errors[i, j] * spread[j]), float(np.exp(-min(nats, 700.0)))
+    return Finding("force", AXES[i], f"{AXES[j]} position", AXES[j], (begin, end), size, sd, "N", nats, chance)
 
 
 def _path(model: Model) -> NDArray:

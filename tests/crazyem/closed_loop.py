@@ -39,6 +39,8 @@ class Hidden:
         drag: (3,) N s/m, body axes.
         rope: N, along world x where x is beyond 0.1 m: nothing of the catalogue does that.
         load: kg and m of a weight on a string that swings little: a plane pendulum, its weight, and no more.
+        breeze: (3,) N, world, constant.
+        cable: N/m and m: stiffness and length of a slack cable to a point of the floor, (0.5, -0.7, 0).
     """
 
     thrust: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
@@ -47,6 +49,8 @@ class Hidden:
     drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rope: float = 0.0
     load: tuple[float, float] = (0.0, 1.0)
+    breeze: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    cable: tuple[float, float] = (0.0, 0.4)
 
 
 def wanted(seed: int, time: Array) -> tuple[Array, Array, Array, Array]:
@@ -76,8 +80,8 @@ def turned(r, by):
 
 
 @compiled
-def loop(goal, goal_v, goal_a, yaw, noise, kicks, sway, weak, onset, scale, drag, rope, load, mass, inertia, levers,
-         signs, unmix, lag, most, h, rows):  # fmt: skip
+def loop(goal, goal_v, goal_a, yaw, noise, kicks, sway, weak, onset, scale, drag, rope, load, breeze, cable, mass,
+         inertia, levers, signs, unmix, lag, most, h, rows):  # fmt: skip
     p, v, r, w = goal[0].copy(), goal_v[0].copy(), np.eye(3), np.zeros(3)
     f, integral = np.full(4, mass * G / 4), np.zeros(3)
     sa, sb = np.zeros((4, 3)), np.zeros((4, 3))
@@ -116,7 +120,11 @@ def loop(goal, goal_v, goal_a, yaw, noise, kicks, sway, weak, onset, scale, drag
             world = at @ body
             if p[0] > 0.1:
                 world[0] += rope
-            world += load[0] * stiff * aside
+            world += load[0] * stiff * aside + breeze
+            away = p - np.array([0.5, -0.7, 0.0])
+            far = np.sqrt(np.sum(away * away))
+            if far > cable[1]:
+                world -= cable[0] * (1.0 - cable[1] / far) * away
             world[2] -= load[0] * G
             sa[i] = world / mass
             sa[i, 2] -= G
@@ -168,8 +176,9 @@ def fly(
     rows = np.zeros((steps, 22))
     loop(
         *wanted(seed, time), noise, kicks, wander, np.array(hidden.thrust), hidden.onset, hidden.torque,
-        np.array(hidden.drag), hidden.rope, np.array(hidden.load), vehicle.mass, np.array(vehicle.inertia), levers,
-        SIGNS, np.ascontiguousarray(unmix), vehicle.motor_time_constant, vehicle.thrust_max, CONTROL, rows,
+        np.array(hidden.drag), hidden.rope, np.array(hidden.load), np.array(hidden.breeze), np.array(hidden.cable),
+        vehicle.mass, np.array(vehicle.inertia), levers, SIGNS, np.ascontiguousarray(unmix),
+        vehicle.motor_time_constant, vehicle.thrust_max, CONTROL, rows,
     )  # fmt: skip
     every = round(LOG / CONTROL)
     return recorded(time[::every], rows[::every])

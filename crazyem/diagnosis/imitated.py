@@ -1,0 +1,69 @@
+"""Names that only imitate a force by place: wind and ground effect against a constant and slopes by x, y, z.
+
+A cable pulls down the more the higher the drone is, and to one side: near the floor that looks like lift, and on the
+whole like wind. Such names are compared, all of them together, with the force that they would have to be; where that
+explains the flights better, those kept apart as well, what is there is none of the effects.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from crazyem.diagnosis.always import refine_base, solved, without
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.fit import Data, DivergedError, Fitted, remembering_anew
+from crazyem.diagnosis.locate import AXES, Finding
+from crazyem.diagnosis.place import NATS, slope_finding
+from crazyem.diagnosis.split import judged
+from crazyem.diagnosis.trials import Selection, Trial, told_apart
+from crazyem.physics.effects.force_by_place import FORCE_BY_PLACE
+
+IMITATE = ("wind", "ground_effect")
+FORCE = Candidate(FORCE_BY_PLACE.name, (), tuple(p.name for p in FORCE_BY_PLACE.parameters))
+
+
+def by_place(
+    data: Data, held_out: Data | None, selection: Selection, say: Callable[[str], None] = lambda text: None
+) -> tuple[Selection, Finding | None]:
+    """The selection without what imitates a force by place, and that force as a finding; else as it was, and None.
+
+    The force stays in the final model, but is no candidate of it: it has no name, and is never written anywhere.
+    """
+    names = [c for c in selection.accepted if c.effect in IMITATE]
+    if not names or "position" not in data.signals:
+        return selection, None
+    rest = [c for c in selection.accepted if c not in names]
+    bare = selection.final
+    for c in names:
+        bare = without(bare, c.effect)
+    bare = bare.with_effects({FORCE.effect: FORCE.neutral(bare)})
+    say(f"  asking again: {', '.join(c.label for c in names)}, or a force by place")
+    try:
+        found = refine_base(data, remembering_anew(data, refine_base(data, bare, [*rest, FORCE]).point), [*rest, FORCE])
+        ours, our_blocks = judged(data, held_out, found.point, [*rest, FORCE])
+        theirs, their_blocks = judged(data, held_out, selection.final, selection.accepted)
+    except DivergedError:
+        return selection, None
+    given = Candidate("", (), tuple(f"{c.effect}.{n}" for c in names for n in c.free))  # counted, and no more
+    instead = Trial(FORCE, 0.0, 0.0, 1.0, 0.0, 0.0, blocks=our_blocks, value=ours)
+    named = Trial(given, 0.0, 0.0, 1.0, 0.0, 0.0, blocks=their_blocks, value=theirs)
+    better = ours - theirs - len(FORCE.free) + len(given.free)
+    if better < NATS or not told_apart(instead, named):
+        return selection, None
+    finding = _finding(data, found, better)
+    if finding is None:
+        return selection, None
+    say("  it is a force by place")
+    gone = {c.effect for c in names}
+    steps = tuple(s for s in selection.steps if not (s.taken and s.taken.candidate.effect in gone))
+    return replace(selection, final=found.point, fitted=found, accepted=tuple(rest), steps=steps), finding
+
+
+def _finding(data: Data, found: Fitted, nats: float) -> Finding | None:
+    k = len(AXES)
+    end = sum(len(c.free) for c in found.candidates)  # the force is the last of them, its slopes after its constant
+    sd = np.sqrt(np.maximum(np.diag(solved(found)[0].covariance), 0.0))[end - k * k : end].reshape(k, k)
+    values = FORCE.values(found.point)
+    slopes = np.array([[float(values[i + j]) for j in AXES] for i in AXES])
+    return slope_finding(data, slopes, sd, nats, found.point.vehicle)

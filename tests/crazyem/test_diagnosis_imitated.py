@@ -1,0 +1,90 @@
+"""A cable is no wind and no lift near the floor; wind stays wind. Flown by `closed_loop.py`."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from closed_loop import DRONE, Hidden, fly
+
+from crazyem.diagnosis import imitated
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.diagnose import Diagnosis, diagnose
+from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.trials import Selection, Step, Trial
+from crazyem.physics.effects.effect import Body
+from crazyem.physics.effects.force_by_place import FORCE_BY_PLACE, pulling
+
+AIR = ("wind", "ground_effect", "linear_drag")
+WIND = Candidate("wind", (), ("x", "y", "z"))
+DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
+
+
+def test_the_force_is_a_constant_and_a_matrix_times_the_place() -> None:
+    """By hand: 90 degrees of yaw take world x to body -y."""
+    quarter = np.array([[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
+    there = SimpleNamespace(size=1, position=np.array([[1.0, 2.0, 3.0]]))
+    there.to_body = lambda world: np.einsum("nji,nj->ni", quarter, world)
+    values = FORCE_BY_PLACE.complete({"x": 0.1, "z": -0.2, "xy": 0.01, "zz": -0.05}, {})
+    found = pulling(there, Body(0.03, np.eye(3), np.zeros(3)), **values)  # type: ignore[arg-type]
+    np.testing.assert_allclose(found.force, [[0.0, -(0.1 + 0.01 * 2.0), -0.2 - 0.05 * 3.0]], atol=1e-15)
+    assert not found.torque.any()
+
+
+def diagnosed(hidden: Hidden) -> Diagnosis:
+    return diagnose([fly(hidden)], DRONE, held_out=[fly(hidden, seed=1)], wanted=AIR)
+
+
+def test_a_cable_is_unexplained_and_told_by_place() -> None:
+    """Pulled down the more the higher it is, and to one side: wind and lift near the floor to the catalogue."""
+    found = diagnosed(Hidden(cable=(0.06, 0.4)))
+    assert not {"wind", "ground_effect", "gusts"} & {e.name for e in found.effects}
+    assert found.mismatch
+    worst = found.unexplained.findings[0]
+    assert (worst.signal, worst.regime) == ("force", f"{worst.axis} position")  # it pulls back from all sides
+    assert worst.effect_size < 0
+    assert "force_by_place" not in found.fitted_vehicle.effects
+
+
+def test_wind_stays_wind() -> None:
+    found = diagnosed(Hidden(breeze=(0.02, -0.01, 0.0)))
+    assert [e.name for e in found.effects] == ["wind"]
+    assert not found.unexplained.found
+
+
+def asked(monkeypatch: pytest.MonkeyPatch, *, named: float, force: float, even: bool = True) -> Selection:
+    """Wind and a drag, worth `named` nats, against a force by place and the drag, worth `force`."""
+    bare = Point(DRONE, {}, first_guess())
+    point = bare.with_effects({"wind": {"x": 1.0, "y": 0.0, "z": 0.0}, "linear_drag": {"x": 0.01, "y": 0.0, "z": 0.0}})
+    steps = tuple(Step((), Trial(c, 50.0, 50.0, 1.0, 1e-9, 50.0)) for c in (WIND, DRAG))
+    selection = Selection(bare, point, steps, (WIND, DRAG), SimpleNamespace(), 30)  # type: ignore[arg-type]
+    scatter = np.zeros(20) if even else np.tile([-60.0, 60.0], 10)
+
+    def judged(data, held_out, start, candidates):
+        if WIND in candidates:
+            return named, np.full(20, named / 20)
+        assert candidates == [DRAG, imitated.FORCE]
+        assert "wind" not in start.effects
+        return force, force / 20 + scatter
+
+    fitted = lambda data, at, accepted: SimpleNamespace(point=at, candidates=tuple(accepted))  # noqa: E731
+    monkeypatch.setattr(imitated, "judged", judged)
+    monkeypatch.setattr(imitated, "refine_base", fitted)
+    monkeypatch.setattr(imitated, "remembering_anew", lambda data, at: at)
+    monkeypatch.setattr(imitated, "_finding", lambda data, found, nats: SimpleNamespace(nats=nats))
+    found, finding = imitated.by_place(SimpleNamespace(signals={"position"}), None, selection)  # type: ignore[arg-type]
+    assert (finding is None) == (found is selection)
+    assert finding is None or finding.nats == force - named - 9  # twelve parameters against three
+    return found
+
+
+def test_what_is_better_as_a_force_by_place_loses_its_name_and_the_rest_stays(monkeypatch) -> None:
+    found = asked(monkeypatch, named=100.0, force=150.0)
+    assert found.accepted == (DRAG,)
+    assert [s.taken.candidate for s in found.steps if s.taken] == [DRAG]
+    assert "force_by_place" in found.final.effects
+
+
+@pytest.mark.parametrize(("force", "even"), [(100.0, True), (130.0, True), (150.0, False)])
+def test_what_is_little_better_or_here_and_there_only_keeps_it(monkeypatch, force: float, even: bool) -> None:
+    assert asked(monkeypatch, named=100.0, force=force, even=even).accepted == (WIND, DRAG)
