@@ -66,6 +66,12 @@ class Data:
         twin.models = [m.twin() for m in self.models]
         return twin
 
+    def together_with(self, other: "Data | None") -> "Data":
+        """A twin of these flights and of others, to be explained alike."""
+        both = self.twin()
+        both.models += other.twin().models if other is not None else []
+        return both
+
     @property
     def flights(self) -> list[Flight]:
         """The flights."""

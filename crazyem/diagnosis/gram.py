@@ -100,7 +100,7 @@ class Gram:
             held += float(b_out @ t - 0.5 * t @ a_out @ t)
         covariance, dispersion, meat = self._sandwich(scores, infos, theta, a + np.diag(weight), effective)
         which = np.arange(k) if tested is None else np.asarray(tested, int)
-        p_value = self._p_value(scores, infos, a + np.diag(weight), meat, which, len(scores))
+        p_value = self._p_value(b + weight * centre, infos, a + np.diag(weight), meat, which, len(scores))
         return Solution(theta, gain, held, p_value, covariance, dispersion)
 
     @staticmethod
@@ -127,8 +127,12 @@ class Gram:
         return sandwich * np.outer(larger, larger), ratio, meat
 
     @staticmethod
-    def _p_value(scores: NDArray, infos: NDArray, a: NDArray, meat: NDArray, which: NDArray, blocks: int) -> float:
-        """Score test of the tested columns, the others profiled out, by the scatter of the blocks."""
+    def _p_value(total: NDArray, infos: NDArray, a: NDArray, meat: NDArray, which: NDArray, blocks: int) -> float:
+        """Score test of the tested columns, the others profiled out, by the scatter of the blocks.
+
+        `total` counts what priors pull: where they hold the others at the maximum, theirs is zero. Without it, what
+        an effect has already bent of them would speak against it.
+        """
         k = which.size
         if k == 0:
             return 1.0
@@ -140,7 +144,7 @@ class Gram:
             project[:, others] = -np.linalg.solve(
                 a[np.ix_(others, others)] + np.diag(1e-12 * own + (own <= 0)), a[np.ix_(others, which)]
             ).T
-        b = project @ scores.sum(0)
+        b = project @ total
         v = project @ meat @ project.T
         plain = project @ infos.sum(0) @ project.T
         scale = np.sqrt(np.maximum(np.diag(plain), 1e-300))

@@ -15,8 +15,7 @@ from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import Data, DivergedError, Fitted, remembering_anew
 from crazyem.diagnosis.locate import AXES, Finding
 from crazyem.diagnosis.place import NATS, slope_finding
-from crazyem.diagnosis.split import judged
-from crazyem.diagnosis.trials import Selection, Trial, told_apart
+from crazyem.diagnosis.trials import TOLD, Selection, scatter
 from crazyem.physics.effects.force_by_place import FORCE_BY_PLACE
 
 IMITATE = ("wind", "ground_effect")
@@ -39,20 +38,21 @@ def by_place(
         bare = without(bare, c.effect)
     bare = bare.with_effects({FORCE.effect: FORCE.neutral(bare)})
     say(f"  asking again: {', '.join(c.label for c in names)}, or a force by place")
+    together = data.together_with(held_out)  # a hover to fit does not show slopes
     try:
-        found = refine_base(data, remembering_anew(data, refine_base(data, bare, [*rest, FORCE]).point), [*rest, FORCE])
-        ours, our_blocks = judged(data, held_out, found.point, [*rest, FORCE])
-        theirs, their_blocks = judged(data, held_out, selection.final, selection.accepted)
+        named = refine_base(together, remembering_anew(together, selection.final), selection.accepted)
+        theirs = together.block_loglik(named.point)
+        instead = refine_base(together, remembering_anew(together, bare), [*rest, FORCE])
+        instead = refine_base(together, remembering_anew(together, instead.point), [*rest, FORCE])
+        ours = together.block_loglik(instead.point)
+        better = instead.loglik - named.loglik - len(FORCE.free) + sum(len(c.free) for c in names)
+        if better < NATS or better < TOLD * scatter(ours - theirs):
+            return selection, None
+        finding = _finding(together, instead, better)
+        if finding is None:
+            return selection, None
+        found = refine_base(data, remembering_anew(data, instead.point), [*rest, FORCE])
     except DivergedError:
-        return selection, None
-    given = Candidate("", (), tuple(f"{c.effect}.{n}" for c in names for n in c.free))  # counted, and no more
-    instead = Trial(FORCE, 0.0, 0.0, 1.0, 0.0, 0.0, blocks=our_blocks, value=ours)
-    named = Trial(given, 0.0, 0.0, 1.0, 0.0, 0.0, blocks=their_blocks, value=theirs)
-    better = ours - theirs - len(FORCE.free) + len(given.free)
-    if better < NATS or not told_apart(instead, named):
-        return selection, None
-    finding = _finding(data, found, better)
-    if finding is None:
         return selection, None
     say("  it is a force by place")
     gone = {c.effect for c in names}

@@ -55,9 +55,9 @@ def depends_on_place(data: Data, apart: Data | None, point: Point) -> Place | No
 
 
 def slope_finding(data: Data, slopes: NDArray, errors: NDArray, nats: float, vehicle: Vehicle) -> Finding | None:
-    """The strongest slope of a force by place, (3, 3) N/m with its standard deviations, as a finding on the first
-    flight; None where it moves the force by less than counts."""
-    spread = _path(data.models[0])[:, :3].std(axis=0)
+    """The strongest slope of a force by place, (3, 3) N/m with its standard deviations, as a finding; None where it
+    moves the force by less than counts along these flights."""
+    spread = np.concatenate([_path(m)[:, :3] for m in data.models]).std(axis=0)
     sizes = slopes * spread
     i, j = np.unravel_index(int(np.argmax(np.abs(sizes))), sizes.shape)
     if abs(sizes[i, j]) < SMALLEST * vehicle.mass * GRAVITY:

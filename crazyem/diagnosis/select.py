@@ -38,6 +38,7 @@ from crazyem.diagnosis.trials import (
 SHORTLIST = 6
 WORTH, ANYWAY = 0.15, 3  # share of the largest linear gain from which a candidate is fitted, and how many are anyway
 MOST = 4  # effects
+NEARLY, MOST_COMPARED = 0.8, 3  # share of the best's gain from which, and how many, explanations get noise of their own
 BESIDE = 0.5  # share of its gain that an effect keeps beside another which it is no other name for
 # Angular acceleration is torque over inertia: where the one is fitted, so is the other, to be told apart or not; both
 # at once would be any size. A longer lag with more torque is nearly the same as neither.
@@ -264,9 +265,15 @@ def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
 
 
 def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], None]) -> tuple[list[Trial], list[Trial]]:
-    """The trials, and the best of them with what is not told apart from it, each of these with noise of its own."""
+    """The trials, and the best of them with what is not told apart from it, each of these with noise of its own.
+
+    So is what explains nearly as much: under the noise of a model without either, much of which is the effect, a torque
+    scale that is wrong by some per cent for each axis is better by 90 nats than the inertias that are right.
+    """
     counted = basis.held_out is not None
     equals = alike_with(trials[0], trials, counted=counted)
+    nearly = [t for t in trials if t.value > NEARLY * trials[0].value and rivals(t, counted=counted)]
+    equals += [t for t in nearly[:MOST_COMPARED] if all(t is not e for e in equals)]
     if len(equals) == 1:
         return trials, equals
     say(f"  comparing {', '.join(t.candidate.label for t in equals)}")

@@ -20,13 +20,14 @@ CLOSE = 4.0  # nats within which two explanations cannot be told apart,
 FAR = 20.0  # nats that one step is believed to bring without looking
 TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks
 # Smaller than this, these are not told from what filters, sampling and the air of a room do: s, s, s, 1, rad, rad/s, 1,
-# m/s, N s/m, N s^2/m^2, 1, N m s/m.
+# m/s, 1, N m s/m.
 LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "motor_lag": 7.5e-3, "velocity_scale": 0.035,
-         "attitude_misalignment": 2e-3, "gyro_bias": 3e-3, "torque_scale": 0.08, "wind": 0.1, "linear_drag": 1e-3,
-         "quadratic_drag": 1e-3, "thrust_curve": 0.06, "velocity_moment": 3e-6}  # fmt: skip
+         "attitude_misalignment": 2e-3, "gyro_bias": 3e-3, "torque_scale": 0.08, "wind": 0.1, "thrust_curve": 0.06,
+         "velocity_moment": 3e-6}  # fmt: skip
 VELOCITY_LEAST = 2.0  # times what the jitter of an onboard estimate looks like
 LEAST_INERTIA = 0.08  # relative, the same
 LEAST_LOAD = 0.005  # of the drone's mass, the same
+LEAST_DRAG = {"x": 1e-3, "y": 1e-3, "z": 3e-3}  # N s/m or N s^2/m^2; along z thrust is a little wrong (see SYSTEMATIC)
 LEAST_CENTRE = {"x": 1e-4, "y": 1e-4, "z": 1e-3}  # m; z shows in lateral accelerations of O alone
 
 
@@ -90,11 +91,14 @@ def margin(best: Trial, other: Trial) -> tuple[float, float]:
     be bent is the worse for it. The scatter of the difference over blocks counts, in which all that both miss cancels
     (Vuong 1989), with half of the covariance of neighbours on each side.
     """
-    d = best.blocks - other.blocks
-    centred = d - d.mean()
-    variance = float(centred @ centred + max(0.0, float(centred[1:] @ centred[:-1])))
     nats = best.value - other.value - len(best.candidate.free) + len(other.candidate.free)
-    return nats, float(np.sqrt(variance)) + 1e-9
+    return nats, scatter(best.blocks - other.blocks)
+
+
+def scatter(differences: NDArray) -> float:
+    """Standard deviation of the sum of differences of log-likelihoods (b,) by blocks, neighbours alike by half."""
+    centred = differences - differences.mean()
+    return float(np.sqrt(centred @ centred + max(0.0, float(centred[1:] @ centred[:-1])))) + 1e-9
 
 
 def told_apart(best: Trial, other: Trial) -> bool:
@@ -205,8 +209,9 @@ def matters(point: Point, candidate: Candidate, data: Data | None = None) -> boo
     here, neutral = candidate.values(point), candidate.neutral(point)
     if at_the_end(point, candidate):
         return False
-    if candidate.effect == "center_of_mass":
-        return any(abs(here[n] - neutral[n]) > LEAST_CENTRE[n] for n in candidate.free)
+    by_axis = {"center_of_mass": LEAST_CENTRE, "linear_drag": LEAST_DRAG, "quadratic_drag": LEAST_DRAG}
+    if candidate.effect in by_axis:
+        return any(abs(here[n] - neutral[n]) > by_axis[candidate.effect][n] for n in candidate.free)
     if candidate.effect in ("payload", "suspended_load"):
         return bool(here["mass"] > LEAST_LOAD * point.vehicle.mass)
     if candidate.effect == "inertia":

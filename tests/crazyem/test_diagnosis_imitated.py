@@ -18,6 +18,7 @@ from crazyem.physics.effects.force_by_place import FORCE_BY_PLACE, pulling
 AIR = ("wind", "ground_effect", "linear_drag")
 WIND = Candidate("wind", (), ("x", "y", "z"))
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
+BLOCKS = np.linspace(-1.0, 1.0, 20)
 
 
 def test_the_force_is_a_constant_and_a_matrix_times_the_place() -> None:
@@ -60,19 +61,17 @@ def asked(monkeypatch: pytest.MonkeyPatch, *, named: float, force: float, even: 
     selection = Selection(bare, point, steps, (WIND, DRAG), SimpleNamespace(), 30)  # type: ignore[arg-type]
     scatter = np.zeros(20) if even else np.tile([-60.0, 60.0], 10)
 
-    def judged(data, held_out, start, candidates):
-        if WIND in candidates:
-            return named, np.full(20, named / 20)
-        assert candidates == [DRAG, imitated.FORCE]
-        assert "wind" not in start.effects
-        return force, force / 20 + scatter
+    together = SimpleNamespace(block_loglik=lambda at: BLOCKS if "wind" in at.effects else BLOCKS + scatter)
+    data = SimpleNamespace(signals={"position"}, together_with=lambda other: together)
 
-    fitted = lambda data, at, accepted: SimpleNamespace(point=at, candidates=tuple(accepted))  # noqa: E731
-    monkeypatch.setattr(imitated, "judged", judged)
+    def fitted(flights, at, accepted):
+        assert list(accepted) == ([WIND, DRAG] if "wind" in at.effects else [DRAG, imitated.FORCE])
+        return SimpleNamespace(point=at, candidates=tuple(accepted), loglik=named if WIND in accepted else force)
+
     monkeypatch.setattr(imitated, "refine_base", fitted)
     monkeypatch.setattr(imitated, "remembering_anew", lambda data, at: at)
     monkeypatch.setattr(imitated, "_finding", lambda data, found, nats: SimpleNamespace(nats=nats))
-    found, finding = imitated.by_place(SimpleNamespace(signals={"position"}), None, selection)  # type: ignore[arg-type]
+    found, finding = imitated.by_place(data, None, selection)  # type: ignore[arg-type]
     assert (finding is None) == (found is selection)
     assert finding is None or finding.nats == force - named - 9  # twelve parameters against three
     return found
