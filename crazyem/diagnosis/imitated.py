@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from crazyem.diagnosis.always import refine_base, solved, without
+from crazyem.diagnosis.always import TRIM, refine_base, solved, without
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import Data, DivergedError, Fitted, remembering_anew
 from crazyem.diagnosis.locate import AXES, Finding
@@ -27,10 +27,11 @@ def by_place(
 ) -> tuple[Selection, Finding | None]:
     """The selection without what imitates a force by place, and that force as a finding; else as it was, and None.
 
-    The force stays in the final model, but is no candidate of it: it has no name, and is never written anywhere.
+    The force stays in the final model, but is no candidate of it: it has no name, and is never written anywhere. With a
+    trim in the vehicle file noise scales are not fitted again, and nothing is compared.
     """
     names = [c for c in selection.accepted if c.effect in IMITATE]
-    if not names or "position" not in data.signals:
+    if not names or "position" not in data.signals or TRIM in selection.final.vehicle.effects:
         return selection, None
     rest = [c for c in selection.accepted if c not in names]
     bare = selection.final

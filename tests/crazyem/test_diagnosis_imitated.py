@@ -1,5 +1,6 @@
 """A cable is no wind and no lift near the floor; wind stays wind. Flown by `closed_loop.py`."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,6 +15,7 @@ from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.trials import Selection, Step, Trial
 from crazyem.physics.effects.effect import Body
 from crazyem.physics.effects.force_by_place import FORCE_BY_PLACE, pulling
+from crazyem.vehicle import Vehicle
 
 AIR = ("wind", "ground_effect", "linear_drag")
 WIND = Candidate("wind", (), ("x", "y", "z"))
@@ -53,9 +55,11 @@ def test_wind_stays_wind() -> None:
     assert not found.unexplained.found
 
 
-def asked(monkeypatch: pytest.MonkeyPatch, *, named: float, force: float, even: bool = True) -> Selection:
+def asked(
+    monkeypatch: pytest.MonkeyPatch, *, named: float, force: float, even: bool = True, vehicle: Vehicle = DRONE
+) -> Selection:
     """Wind and a drag, worth `named` nats, against a force by place and the drag, worth `force`."""
-    bare = Point(DRONE, {}, first_guess())
+    bare = Point(vehicle, {}, first_guess())
     point = bare.with_effects({"wind": {"x": 1.0, "y": 0.0, "z": 0.0}, "linear_drag": {"x": 0.01, "y": 0.0, "z": 0.0}})
     steps = tuple(Step((), Trial(c, 50.0, 50.0, 1.0, 1e-9, 50.0)) for c in (WIND, DRAG))
     selection = Selection(bare, point, steps, (WIND, DRAG), SimpleNamespace(), 30)  # type: ignore[arg-type]
@@ -87,3 +91,8 @@ def test_what_is_better_as_a_force_by_place_loses_its_name_and_the_rest_stays(mo
 @pytest.mark.parametrize(("force", "even"), [(100.0, True), (130.0, True), (150.0, False)])
 def test_what_is_little_better_or_here_and_there_only_keeps_it(monkeypatch, force: float, even: bool) -> None:
     assert asked(monkeypatch, named=100.0, force=force, even=even).accepted == (WIND, DRAG)
+
+
+def test_beside_a_trim_nothing_is_compared(monkeypatch) -> None:
+    trimmed = replace(DRONE, effects={"trim": {"x": 0.0, "y": 0.0, "z": 0.0}})
+    assert asked(monkeypatch, named=100.0, force=150.0, vehicle=trimmed).accepted == (WIND, DRAG)
