@@ -32,6 +32,9 @@ FILTER, FILTER_SD = (("rate_lag", 1.2e-3), ("velocity_lag", 0.6e-3)), 0.7e-3
 # Relative: in ten flights with nothing hidden, with the lag free, torques look 2 +- 2 % too strong (-1 to +5 %); a
 # longer lag with more torque is nearly the same to a loop whose commands are sampled.
 TORQUE_SD = 0.03
+# N m s: speeds logged at 100 Hz miss what the loop does in between, which looks like a damping of 1 to 11e-6 in quick
+# flights of 12 drones with nothing hidden (and of 9e-5 in hovers, which hardly show it).
+DAMPING_SD = 6e-6
 # From one day to the next, of a drone whose file has a trim: batteries are put in again, propellers and feet bent.
 # Healthy and damaged flights of two drones on several days scatter like this (docs/diagnosis_real.md).
 TRIM_SD = (5e-4, 5e-4, 1.6e-4)  # m: torque per thrust
@@ -79,8 +82,9 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
         found.append((Candidate("inertia", (), ("xx", "yy", "zz")), moments))
         if not coarse:
             found.append((Candidate("torque_scale", (), ("scale",)), (TORQUE_SD**-2,)))
-        else:
-            found.append((Candidate("rate_damping", (), ("x", "y", "z")), (COARSE_DAMPING_SD**-2,) * 3))
+        if coarse or measured:
+            damping = COARSE_DAMPING_SD if coarse else DAMPING_SD
+            found.append((Candidate("rate_damping", (), ("x", "y", "z")), (damping**-2,) * 3))
         if "velocity" in data.signals:
             found.append((Candidate("center_of_mass", (), ("x", "y", "z")), tuple(sd**-2 for sd in CENTRE_SD)))
         if not measured and point.vehicle.motor_time_constant > 0:

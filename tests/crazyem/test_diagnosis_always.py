@@ -8,6 +8,7 @@ from closed_loop import DRONE
 
 from crazyem.diagnosis.always import (
     AT_ONCE_SD,
+    DAMPING_SD,
     INERTIA_SD,
     JITTER,
     PULL,
@@ -49,6 +50,12 @@ def test_a_biased_gyro_tilts_the_attitude_that_a_filter_makes_of_it():
     assert sd_of(flown(speed=0.1), biased, "attitude_misalignment") == pytest.approx(np.full(3, PULL * 0.05))
     unbiased = POINT.with_effects({"gyro_bias": dict.fromkeys("xyz", 0.0)})
     assert sd_of(flown(speed=0.1), unbiased, "attitude_misalignment").size == 0
+
+
+def test_speeds_logged_too_seldom_look_like_a_damping_and_commands_have_their_own_way():
+    """Without speeds, what commands miss is a torque with memory."""
+    assert sd_of(flown(speed=0.1, measured=True), POINT, "rate_damping") == pytest.approx(np.full(3, DAMPING_SD))
+    assert sd_of(flown(speed=0.1), POINT, "rate_damping").size == 0
 
 
 def test_beside_heavy_rotors_the_yaw_inertia_is_hardly_known():
