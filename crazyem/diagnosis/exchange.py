@@ -55,15 +55,15 @@ def _asked_again(
         return selection
     say(f"  asking again: {mine.label} or {', '.join(t.candidate.label for t in others)}")
     assert step.taken is not None
-    value, blocks = judged(data, held_out, selection.final, selection.accepted)
-    now = replace(step.taken, candidate=mine, value=value, blocks=blocks)
-    tried = []
+    bare = without(selection.final, name)
+    starts = [(selection.final, list(selection.accepted))]
     for rival in others:
         assert rival.fitted is not None
-        bare = without(selection.final, name)
         point = bare.with_effects({rival.candidate.effect: rival.candidate.values(rival.fitted.point)})
-        value, blocks = judged(data, held_out, point, _in_place(selection.accepted, mine, rival.candidate))
-        tried.append(replace(rival, value=value, blocks=blocks))
+        starts.append((point, _in_place(selection.accepted, mine, rival.candidate)))
+    found = data.workers.map(lambda start: judged(data, held_out, *start), starts)
+    now = replace(step.taken, candidate=mine, value=found[0][0], blocks=found[0][1])
+    tried = [replace(t, value=value, blocks=blocks) for t, (value, blocks) in zip(others, found[1:], strict=True)]
     asked = tried if ended else [now, *tried]
     best = max(asked, key=lambda t: t.value - len(t.candidate.free))
     equals = [t for t in asked if t is best or not told_apart(best, t)]

@@ -14,7 +14,8 @@ from crazyem.diagnosis.always import TRIM, refine_base, solved, without
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import Data, DivergedError, Fitted, remembering_anew
 from crazyem.diagnosis.locate import AXES, Finding
-from crazyem.diagnosis.place import NATS, slope_finding
+from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.place import NATS, left_by_place, slope_finding
 from crazyem.diagnosis.trials import TOLD, Selection, scatter
 from crazyem.physics.effects.force_by_place import FORCE_BY_PLACE
 
@@ -33,23 +34,31 @@ def by_place(
     names = [c for c in selection.accepted if c.effect in IMITATE]
     if not names or "position" not in data.signals or TRIM in selection.final.vehicle.effects:
         return selection, None
+    # what imitates has another shape: something is left by place, on the flights fitted or on those kept apart
+    if max(left_by_place(d.twin(), selection.final) for d in (data, held_out) if d is not None) < NATS:
+        return selection, None
     rest = [c for c in selection.accepted if c not in names]
     bare = selection.final
     for c in names:
         bare = without(bare, c.effect)
     bare = bare.with_effects({FORCE.effect: FORCE.neutral(bare)})
     say(f"  asking again: {', '.join(c.label for c in names)}, or a force by place")
-    together = data.together_with(held_out)  # a hover to fit does not show slopes
+
+    def both(start: Point, candidates: list[Candidate], rounds: int) -> tuple[Fitted, Data]:
+        together = data.together_with(held_out)  # a hover to fit does not show slopes
+        for _ in range(rounds):  # noise of a model that lacks the force at first
+            fit = refine_base(together, remembering_anew(together, start), candidates)
+            start = fit.point
+        return fit, together
+
+    runs = [(selection.final, list(selection.accepted), 1), (bare, [*rest, FORCE], 2)]
     try:
-        named = refine_base(together, remembering_anew(together, selection.final), selection.accepted)
-        theirs = together.block_loglik(named.point)
-        instead = refine_base(together, remembering_anew(together, bare), [*rest, FORCE])
-        instead = refine_base(together, remembering_anew(together, instead.point), [*rest, FORCE])
-        ours = together.block_loglik(instead.point)
+        (named, flights), (instead, again) = data.workers.map(lambda run: both(*run), runs)
+        theirs, ours = flights.block_loglik(named.point), again.block_loglik(instead.point)
         better = instead.loglik - named.loglik - len(FORCE.free) + sum(len(c.free) for c in names)
         if better < NATS or better < TOLD * scatter(ours - theirs):
             return selection, None
-        finding = _finding(together, instead, better)
+        finding = _finding(again, instead, better)
         if finding is None:
             return selection, None
         found = refine_base(data, remembering_anew(data, instead.point), [*rest, FORCE])

@@ -54,6 +54,13 @@ def depends_on_place(data: Data, apart: Data | None, point: Point) -> Place | No
     return None if finding is None else Place(float(gained), float(held), finding)
 
 
+def left_by_place(data: Data, point: Point) -> float:
+    """Nats that a force by place would gain beside a model, beyond its parameters, in the linear approximation."""
+    gram = _gram(data, point, np.median(np.concatenate([_path(m)[:, :3] for m in data.models]), axis=0))
+    solution = gram.solve(range(gram.size), precision=np.full(gram.size, WEAK))
+    return float(solution.gain / max(1.0, solution.dispersion) - gram.size)
+
+
 def slope_finding(data: Data, slopes: NDArray, errors: NDArray, nats: float, vehicle: Vehicle) -> Finding | None:
     """The strongest slope of a force by place, (3, 3) N/m with its standard deviations, as a finding; None where it
     moves the force by less than counts along these flights."""

@@ -195,7 +195,7 @@ def select(
         linear = linear_trials(data, point, accepted, best_begun(data, point, accepted, rest))
         if steps:
             steps[-1] = replace(steps[-1], beside=additions(steps[-1], [t for t, _ in linear]))
-        promising = shortlist(linear)
+        promising = shortlist(linear) if turn < MOST else []  # after the last, only what stands beside it is asked
         basis = Basis(data, held_out, point, tuple(accepted), value, held_value)
         trials = data.workers.map(lambda entry: tried(basis, *entry, say=say), promising)  # noqa: B023 - done at once
         trials = weighed(trials, counted=held_out is not None)

@@ -12,6 +12,7 @@ from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.trials import Selection, Step, Trial
+from crazyem.diagnosis.workers import Workers
 
 LOAD = Candidate("payload", (), ("mass", "x", "y", "z"))
 WEAKER = Candidate("thrust_scale", (), ("scale",))
@@ -45,7 +46,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, *, load: float, weaker: float, was: f
     monkeypatch.setattr(exchange, "judged", judged)
     monkeypatch.setattr(exchange, "remembering_anew", lambda data, point: point)
     monkeypatch.setattr(exchange, "refine_base", lambda data, point, accepted: SimpleNamespace(point=point))
-    return exchange.named_again(SimpleNamespace(), None, selection)  # type: ignore[arg-type]
+    return exchange.named_again(SimpleNamespace(workers=Workers(1)), None, selection)  # type: ignore[arg-type]
 
 
 def names(selection: Selection) -> list[str]:
@@ -85,7 +86,7 @@ def test_one_effect_alone_is_not_asked_again(monkeypatch):
     monkeypatch.setattr(exchange, "judged", lambda *a: pytest.fail("nothing is new"))
     taken = trial(LOAD, 100.0, POINT)
     alone = Selection(BARE, POINT, (Step((taken, trial(WEAKER, 99.0, THERE)), taken),), (LOAD,), SimpleNamespace(), 34)  # type: ignore[arg-type]
-    assert exchange.named_again(SimpleNamespace(), None, alone) is alone  # type: ignore[arg-type]
+    assert exchange.named_again(SimpleNamespace(workers=Workers(1)), None, alone) is alone  # type: ignore[arg-type]
     assert replace(alone) == alone
 
 
@@ -103,6 +104,6 @@ def test_what_ended_where_its_range_ends_gives_way_to_whatever_is_next(monkeypat
             (1000.0 if candidates[0] is slope else 100.0), BLOCKS))  # fmt: skip
         monkeypatch.setattr(exchange, "remembering_anew", lambda data, point: point)
         monkeypatch.setattr(exchange, "refine_base", lambda data, point, accepted: SimpleNamespace(point=point))
-        found = exchange.named_again(SimpleNamespace(), None, selection)  # type: ignore[arg-type]
+        found = exchange.named_again(SimpleNamespace(workers=Workers(1)), None, selection)  # type: ignore[arg-type]
         assert names(found) == [name, "velocity_moment"]
         assert (slope in [t.candidate for t in found.steps[0].trials]) == (name == "thrust_curve")

@@ -13,6 +13,7 @@ from crazyem.diagnosis.diagnose import Diagnosis, diagnose
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.trials import Selection, Step, Trial
+from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.effect import Body
 from crazyem.physics.effects.force_by_place import FORCE_BY_PLACE, pulling
 from crazyem.vehicle import Vehicle
@@ -56,7 +57,13 @@ def test_wind_stays_wind() -> None:
 
 
 def asked(
-    monkeypatch: pytest.MonkeyPatch, *, named: float, force: float, even: bool = True, vehicle: Vehicle = DRONE
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    named: float,
+    force: float,
+    even: bool = True,
+    vehicle: Vehicle = DRONE,
+    left: float = 30.0,
 ) -> Selection:
     """Wind and a drag, worth `named` nats, against a force by place and the drag, worth `force`."""
     bare = Point(vehicle, {}, first_guess())
@@ -66,12 +73,14 @@ def asked(
     scatter = np.zeros(20) if even else np.tile([-60.0, 60.0], 10)
 
     together = SimpleNamespace(block_loglik=lambda at: BLOCKS if "wind" in at.effects else BLOCKS + scatter)
-    data = SimpleNamespace(signals={"position"}, together_with=lambda other: together)
+    data = SimpleNamespace(signals={"position"}, together_with=lambda other: together, workers=Workers(1))
+    data.twin = lambda: data
 
     def fitted(flights, at, accepted):
         assert list(accepted) == ([WIND, DRAG] if "wind" in at.effects else [DRAG, imitated.FORCE])
         return SimpleNamespace(point=at, candidates=tuple(accepted), loglik=named if WIND in accepted else force)
 
+    monkeypatch.setattr(imitated, "left_by_place", lambda data, point: left)
     monkeypatch.setattr(imitated, "refine_base", fitted)
     monkeypatch.setattr(imitated, "remembering_anew", lambda data, at: at)
     monkeypatch.setattr(imitated, "_finding", lambda data, found, nats: SimpleNamespace(nats=nats))
@@ -91,6 +100,10 @@ def test_what_is_better_as_a_force_by_place_loses_its_name_and_the_rest_stays(mo
 @pytest.mark.parametrize(("force", "even"), [(100.0, True), (130.0, True), (150.0, False)])
 def test_what_is_little_better_or_here_and_there_only_keeps_it(monkeypatch, force: float, even: bool) -> None:
     assert asked(monkeypatch, named=100.0, force=force, even=even).accepted == (WIND, DRAG)
+
+
+def test_where_nothing_is_left_by_place_nothing_is_compared(monkeypatch) -> None:
+    assert asked(monkeypatch, named=100.0, force=150.0, left=20.0).accepted == (WIND, DRAG)
 
 
 def test_beside_a_trim_nothing_is_compared(monkeypatch) -> None:
