@@ -38,6 +38,7 @@ class Table:
     ctypes: Mapping[str, str] = field(default_factory=dict)
 
 
+@np.errstate(invalid="ignore")  # a signalling NaN, as damaged bytes may be, becomes a quiet one by the cast to double
 def signals_from_tables(tables: Iterable[Table], *, motor: str | None) -> dict[str, SignalArray]:
     """Signals by name: those of the vocabulary from their best source, then every other variable under its own name.
 

@@ -123,3 +123,13 @@ def test_host_times_are_kept():
 )
 def test_units_of_variables_outside_the_vocabulary(name, unit):
     assert unit_of(name) == unit
+
+
+def test_a_signalling_nan_of_damaged_bytes_is_a_nan_and_no_warning() -> None:
+    """0x7f81ffff: casting it to double raises the invalid flag of the processor, which numpy warns of."""
+    damaged = np.frombuffer(b"\x00\x00\x00\x3f\xff\xff\x81\x7f", "<f4")
+    time, order = np.array([0.0, 0.1]), np.arange(2)
+    columns = {"acc.x": damaged, "acc.y": damaged, "acc.z": damaged, "other.name": damaged}
+    signals = signals_from_tables([Table("t", columns, time, order)], motor=None)
+    for value in (signals["specific_force"].value[:, 0], signals["other.name"].value[:, 0]):
+        assert np.isfinite(value).tolist() == [True, False]
