@@ -29,11 +29,11 @@ VELOCITY_SD, JITTER = 2e-3, 3e-3  # relative: no onboard filter is better; m/s, 
 # s: rates behind the attitude, velocities behind the position, by the filters of the firmware; in 80 flights with
 # nothing hidden 0.0 to 2.4 and 0.0 to 1.6 ms, most in quick ones.
 FILTER, FILTER_SD = (("rate_lag", 1.2e-3), ("velocity_lag", 0.6e-3)), 0.7e-3
-# Relative: in ten flights with nothing hidden, with the lag free, torques look 2 +- 2 % too strong (-1 to +5 %); a
+# Relative: in ten flights with nothing hidden, with the lag free, torques look 2 +- 2 % too strong (-0.5 to +4 %); a
 # longer lag with more torque is nearly the same to a loop whose commands are sampled.
 TORQUE_SD = 0.03
 # N m s: speeds logged at 100 Hz miss what the loop does in between, which looks like a damping of 1 to 11e-6 in quick
-# flights of 12 drones with nothing hidden (and of 9e-5 in hovers, which hardly show it).
+# flights of 11 drones with nothing hidden (and of 8e-5 to 2.4e-4 in hovers, which hardly show it).
 DAMPING_SD = 6e-6
 # From one day to the next, of a drone whose file has a trim: batteries are put in again, propellers and feet bent.
 # Healthy and damaged flights of two drones on several days scatter like this (docs/diagnosis_real.md).

@@ -62,7 +62,7 @@ def by_place(
         if finding is None:
             return selection, None
         found = refine_base(data, remembering_anew(data, instead.point), [*rest, FORCE])
-    except DivergedError:
+    except DivergedError:  # without the names the model leaves the range of numbers: they stay
         return selection, None
     say("  it is a force by place")
     gone = {c.effect for c in names}

@@ -1,10 +1,17 @@
 """Two explanations of one thing gain no more together than the better one alone; two things do."""
 
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+import pytest
+
+from crazyem.diagnosis import select
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.select import additions
 from crazyem.diagnosis.trials import Step, Trial
+from crazyem.diagnosis.workers import Workers
 
 
 def trial(effect: str, gain: float, *, fitted: bool = True, fixed: tuple[tuple[str, object], ...] = ()) -> Trial:
@@ -35,3 +42,21 @@ def test_what_keeps_its_gain_is_another_thing() -> None:
 
 def test_what_was_not_asked_again_stays_a_rival() -> None:
     assert additions(Step((trial("inertia", 50.0),), None), []) == frozenset()
+
+
+def test_what_explains_nearly_as_much_is_compared_with_noise_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Told apart under noise that still is the effect; with noise of its own the second is the better."""
+    gained = {"torque_scale": 2000.0, "inertia": 2100.0, "wind": 5000.0}
+
+    def sharpened(basis: Any, t: Trial) -> Trial:
+        return replace(t, gain=gained[t.candidate.effect], value=gained[t.candidate.effect])
+
+    monkeypatch.setattr(select, "sharpened", sharpened)
+    basis: Any = SimpleNamespace(held_out=None, data=SimpleNamespace(workers=Workers(1)))
+    first = [
+        replace(trial(effect, gain), value=gain, blocks=np.full(20, gain / 20))
+        for effect, gain in (("torque_scale", 1200.0), ("inertia", 1100.0), ("wind", 900.0))  # wind: 0.75 of the best
+    ]
+    trials, equals = select.compared_again(basis, first, say=lambda text: None)
+    assert [t.candidate.effect for t in equals] == ["inertia"]
+    assert {t.candidate.effect: t.value for t in trials} == {"inertia": 2100.0, "torque_scale": 2000.0, "wind": 900.0}

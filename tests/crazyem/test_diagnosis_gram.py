@@ -61,6 +61,21 @@ def test_priors_pull_to_where_they_say() -> None:
     assert found.gain == pytest.approx(posterior(best.x) - posterior(np.zeros(3)))
 
 
+@pytest.mark.parametrize("weight", [0.0, 5.0, 300.0])
+def test_what_a_prior_has_taken_up_does_not_speak_against_an_effect(weight: float) -> None:
+    """The same test from where nothing has moved and from where the others are at their maximum under their prior."""
+    gram = simulated(4, truth=np.array([0.0, 0.1, 0.2]))
+    precision = np.array([weight, weight, 0.0])
+    neutral = gram.solve(range(3), precision=precision, tested=[2])
+    b, a = gram.total([0, 1])
+    taken_up = np.append(np.linalg.solve(a + weight * np.eye(2), b), 0.0)
+    there = Gram(gram.score - gram.information @ taken_up, gram.information, gram.flight)
+    again = there.solve(range(3), precision=precision, prior=-taken_up, tested=[2])
+    np.testing.assert_allclose(again.theta + taken_up, neutral.theta, rtol=1e-7)
+    assert again.p_value == pytest.approx(neutral.p_value, rel=1e-6)
+    assert neutral.p_value < 1e-3
+
+
 def by_enumeration(a: Array, b: Array, low: Array, high: Array) -> float:
     """The best of all solutions in which each column is free, at its lower or at its upper bound [nats]."""
     best = -np.inf
