@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from crazyem.cli import main
+from crazyem.live.history import History
 from crazyem.recordings import open_recording
 
 PAYLOAD = """
@@ -53,7 +54,7 @@ def wait_for(process, word, seconds=90.0):
     raise AssertionError(f"no '{word}' in {''.join(lines)}")
 
 
-def test_a_flight_learns_its_mass_pushes_it_and_replays_bit_for_bit(tmp_path, payload, capsys):
+def test_a_flight_learns_its_mass_pushes_it_and_replays_bit_for_bit(tmp_path, payload, capsys, monkeypatch):
     out, log = tmp_path / "f.json", tmp_path / "f.mcap"
     code = main(["fly", "--trajectory", "hover", "--duration", "11", "--scenario", payload, "--speed", "2",
                  "--record", str(log), "--json", str(out)])  # fmt: skip
@@ -68,6 +69,8 @@ def test_a_flight_learns_its_mass_pushes_it_and_replays_bit_for_bit(tmp_path, pa
     assert re.search(r"hovering .* mass 3[56]", capsys.readouterr().err)
 
     again = tmp_path / "r.json"
+    told, keep = [], History.keep
+    monkeypatch.setattr(History, "keep", lambda self, estimate: (told.append(estimate.updates), keep(self, estimate)))
     assert main(["replay", str(log), "--json", str(again)]) == 0
     replayed = json.loads(again.read_text())
     assert replayed["estimates"] == summary["estimates"]  # bit for bit
@@ -77,8 +80,11 @@ def test_a_flight_learns_its_mass_pushes_it_and_replays_bit_for_bit(tmp_path, pa
         summary["tracking_rms_m"]["before_push"], rel=0.01
     )
 
-    recorded = [e.data for e in open_recording(log).events if e.kind == "estimate"]
-    assert len(recorded) == summary["updates"] - 1  # the final one is made after the recording is closed
+    # Two updates that late packets bring at once give one estimate, and the last one is made after the recording is
+    # closed: how many are recorded depends on the link, which ones does not.
+    recorded = [e.data["updates"] for e in open_recording(log).events if e.kind == "estimate"]
+    assert recorded == told[:-1]
+    assert len(recorded) > 0.9 * summary["updates"]
 
 
 def test_bad_scenario_is_one_sentence_naming_the_key(tmp_path, capsys):
