@@ -59,13 +59,20 @@ ANGLES = ("roll", "pitch", "yaw")
 # heavy and damped. Share of the power of roll and pitch torques above half of the Nyquist frequency (white: a half):
 COARSE = 0.2  # simulated flights have up to 0.12
 COARSE_INERTIA_SD, COARSE_DAMPING_SD = 1.0, 3e-4  # relative; N m s
+# Streams that were put onto another clock by straight lines do not look white any more. Their torques explain so little
+# of the turning that the drone would have to be as heavy to turn as if all its mass were this many times as far out as
+# its rotors: no body of that size is, and what it stands for says nothing of the drone.
+FAR_OUT = 2.0
 COARSE_REASON = "the recorded commands are mostly faster than their sampling: what acted in between is not known"
 TRIM_REASON = "a shifted centre of mass is a trim, and that changes from day to day"
+LEVEL_REASON = "no battery voltage is recorded, so how heavy or strong the drone is cannot be told"
+HEAVY_OR_STRONG = ("payload", "thrust_scale")
 FAST = ("inertia", "inertia_products", "torque_scale", "rate_damping", "rotor_inertia", "motor_lag", "input_delay",
         "measurement_delay", "gyro_bias", "thrust_curve")  # fmt: skip
 # m/s, where trims differ from day to day, and on any drone; times what the file has. Hovering in a real room looks like
 # 0 to 0.6 m/s, and a drone with nothing hidden once like 0.3.
 CALM, ROOM, GUSTIER = 1.0, 0.4, 2.0
+STILL = 0.1  # m/s of steady wind
 Nuisances = list[tuple[Candidate, tuple[float, ...]]]  # with the precision of each free parameter
 
 
@@ -127,10 +134,19 @@ def _bias(point: Point) -> float:
 
 def coarsely_sampled(data: Data, point: Point) -> bool:
     """Whether the commands of most flights are faster than their sampling (see `COARSE`); with a trim in the file."""
+    if all(f.coarse for f in data.flights):
+        return True
     if TRIM not in point.vehicle.effects:
         return False
     shares = [fast_share(f, point.vehicle) for f in data.flights if not f.inputs.measured]
     return bool(shares) and float(np.median(shares)) > COARSE
+
+
+def unlike_a_body(point: Point, accepted: Sequence[Candidate]) -> bool:
+    """Whether the inertia that was found is more than a drone of this mass and size can have (see `FAR_OUT`)."""
+    moments = [v for c in accepted if c.effect == "inertia" for v in c.values(point).values()]
+    most = point.vehicle.mass * (FAR_OUT * float(np.hypot(*point.vehicle.arm))) ** 2
+    return most > 0 and any(float(v) > most for v in moments)
 
 
 def fast_share(flight: Flight, vehicle: Vehicle) -> float:
@@ -153,10 +169,12 @@ def fast_share(flight: Flight, vehicle: Vehicle) -> float:
 def abstained(
     data: Data, point: Point, candidates: Sequence[Candidate], left_out: dict[str, str]
 ) -> tuple[list[Candidate], dict[str, str]]:
-    """The candidates without those that coarsely sampled commands cannot speak of, and the reasons with theirs."""
+    """The candidates without those that such recordings cannot speak of, and the reasons with theirs."""
     gone = {}
     if TRIM in point.vehicle.effects:
         gone = {c.effect: TRIM_REASON for c in candidates if c.effect == "center_of_mass"}
+    if all(f.levelled for f in data.flights):
+        gone |= {c.effect: LEVEL_REASON for c in candidates if c.effect in HEAVY_OR_STRONG}
     if coarsely_sampled(data, point):
         gone |= {c.effect: COARSE_REASON for c in candidates if c.effect in FAST}
     return [c for c in candidates if c.effect not in gone], {**left_out, **gone}
@@ -211,6 +229,12 @@ def usual_gusts(vehicle: Vehicle) -> float:
     """Standard deviation of the air's speed [m/s] below which it is the weather, and no finding."""
     filed = float(vehicle.effects.get("gusts", {}).get("standard_deviation", 0.0))
     return max(GUSTIER * filed, CALM if TRIM in vehicle.effects else ROOM)
+
+
+def usual_wind(vehicle: Vehicle) -> float:
+    """Horizontal speed of the air [m/s] up to which wind is no finding: a room's draft, where trims differ from day to
+    day and a drone's answer to air is not known; on others what filters and sampling look like."""
+    return CALM if TRIM in vehicle.effects else STILL
 
 
 def without(point: Point, effect: str) -> Point:

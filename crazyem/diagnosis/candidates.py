@@ -13,7 +13,8 @@ from crazyem.physics.effects.effect import Effect, Parameter
 from crazyem.physics.motion import own_values
 
 ON_BOARD = 0.04  # m from the middle of the rotors: no part of a Crazyflie is further away
-STRONGEST = 1.1  # a worn, cut or bent propeller pulls less than the others; a new one among worn ones a little more
+STRONGEST = 1.1  # a worn, cut or bent propeller pulls less than the others; a new one among worn ones a little more,
+NO_STRONGER = 1.0  # and none gets stronger in flight
 # judged by themselves: gusts.py, accelerometer.py, imitated.py; of every log: always.py
 ASIDE = ("gusts", "accelerometer_misalignment", "onboard_filter", "force_by_place")
 ASKED = ("trim",)  # looked for only if asked for: near every effect that brings a steady torque
@@ -55,7 +56,7 @@ class Candidate:
         if self.effect in ("payload", "center_of_mass") and name in "xyz":
             far = ON_BOARD
         elif self.effect == "rotor_fault" and name == "scale":
-            far = STRONGEST
+            far = STRONGEST if dict(self.fixed).get("onset_time") is None else NO_STRONGER
         return max(-p.high if self.both_ways else p.low, -far), min(p.high, far)
 
     def neutral(self, point: Point) -> dict[str, Any]:
@@ -104,11 +105,12 @@ class Candidate:
         if amplitude in moved and amplitude in dict(self.begin):
             neutral = self.neutral(point)[amplitude]
             small = base[amplitude] - neutral
-            grown = neutral + moved[amplitude]
-            found[amplitude] = grown
             p = self.parameter(amplitude)
-            sound = abs(moved[amplitude]) > 0.05 * abs(small) and p.low <= grown <= p.high
-            ratio = small / moved[amplitude] if sound else 0.0
+            grown = neutral + moved[amplitude]
+            if abs(moved[amplitude]) < 0.05 * abs(small) or not p.low <= grown <= p.high:
+                grown = base[amplitude]  # of nothing the others have no derivatives: a weight that only tilts
+            found[amplitude] = grown
+            ratio = small / (grown - neutral)
         for name in self.free:
             if name == amplitude and grown is not None:
                 continue

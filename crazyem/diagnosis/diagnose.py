@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from crazyem.diagnosis.always import abstained, solved, steadied, unsure
+from crazyem.diagnosis.always import TRIM, abstained, solved, steadied, unlike_a_body, unsure
 from crazyem.diagnosis.beside import beside_the_regression, late_rotors
 from crazyem.diagnosis.candidates import Candidate, candidates_for
 from crazyem.diagnosis.exchange import exchanged, named_again
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.fit import nominal as nominal_of
-from crazyem.diagnosis.flight import flight_of
+from crazyem.diagnosis.flight import Flight, flight_of
 from crazyem.diagnosis.heading import heading_by_place
 from crazyem.diagnosis.imitated import by_place
 from crazyem.diagnosis.locate import Located, locate
@@ -23,7 +23,7 @@ from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.place import depends_on_place
 from crazyem.diagnosis.select import select
 from crazyem.diagnosis.split import LOAD, as_two, instead_of_a_load
-from crazyem.diagnosis.trials import SURE, Selection, Trial, margin, told_apart
+from crazyem.diagnosis.trials import SURE, Selection, Trial, margin, told_apart, wald
 from crazyem.diagnosis.unexplained import Unexplained, unexplained
 from crazyem.diagnosis.witness import false_speed, late_measurements
 from crazyem.diagnosis.workers import Workers
@@ -76,20 +76,12 @@ def diagnose(
     flights = [flight_of(r, vehicle, withhold=withhold) for r in recordings]
     kept_apart = [flight_of(r, vehicle, withhold=withhold) for r in held_out]
     workers = Workers(jobs)
-    data, apart = Data(flights, workers), Data(kept_apart, workers) if kept_apart else None
     say(f"nominal model of {vehicle.name}: {sum(f.duration for f in flights):.0f} s of flight")
-    bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, first_guess())
-    nominal = nominal_of(data, bare)
-    if apart:
-        apart.settle(nominal)
-        apart.leave_out_wild(nominal)
-        apart.settle(nominal)
-    candidates, left_out = candidates_for(
-        nominal, data.signals, measured_speeds=flights[0].inputs.measured, wanted=wanted
-    )
-    candidates, left_out = abstained(data, nominal, candidates, left_out)
-    nominal = steadied(data, nominal)
-    selection = select(data, nominal, candidates, held_out=apart, say=say)
+    data, apart, selection, left_out = _selected(flights, kept_apart, vehicle, wanted, workers, say)
+    if unlike_a_body(selection.final, selection.accepted) and not any(f.coarse for f in flights):
+        say("the turning does not follow the commands as they were recorded: once more without what is fast")
+        flights, kept_apart = ([replace(f, coarse=True) for f in part] for part in (flights, kept_apart))
+        data, apart, selection, left_out = _selected(flights, kept_apart, vehicle, wanted, workers, say)
     selection = named_again(data, apart, selection, say)
     selection, pull = by_place(data, apart, selection, say)
     selection, told = _asked(data, selection, recordings)
@@ -125,6 +117,30 @@ def diagnose(
         vehicle, fitted_vehicle, tuple(r.path for r in recordings), tuple(r.path for r in held_out), mismatch,
         before, after, effects, groups, separate, remains, selection, left_out, remains.explained,
     )  # fmt: skip
+
+
+def _selected(
+    flights: Sequence[Flight],
+    kept_apart: Sequence[Flight],
+    vehicle: Vehicle,
+    wanted: Sequence[str],
+    workers: Workers,
+    say: Say,
+) -> tuple[Data, Data | None, Selection, dict[str, str]]:
+    """The flights, those kept apart, what they ask for, and the effects that they cannot speak of with the reasons."""
+    data, apart = Data(flights, workers), Data(kept_apart, workers) if kept_apart else None
+    bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, first_guess())
+    nominal = nominal_of(data, bare)
+    if apart:
+        apart.settle(nominal)
+        apart.leave_out_wild(nominal)
+        apart.settle(nominal)
+    candidates, left_out = candidates_for(
+        nominal, data.signals, measured_speeds=flights[0].inputs.measured, wanted=wanted
+    )
+    candidates, left_out = abstained(data, nominal, candidates, left_out)
+    nominal = steadied(data, nominal)
+    return data, apart, select(data, nominal, candidates, held_out=apart, say=say), left_out
 
 
 def _asked(data: Data, selection: Selection, recordings: Sequence[Recording]) -> tuple[Selection, frozenset[str]]:
@@ -187,8 +203,8 @@ def _named(
     for candidate, step in zip(selection.accepted, (s for s in selection.steps if s.taken), strict=True):
         # late inputs and late measurements are one model, so it is fitted as the first, whatever it is called
         late = candidate.effect == "input_delay" and MEASURED_LATE in told
-        values = candidate.values(selection.final)
-        parameters = {}
+        values, neutral = candidate.values(selection.final), candidate.neutral(selection.final)
+        parameters, own = {}, slice(at, at + len(candidate.free))
         for name in candidate.free:
             p = candidate.parameter(name)
             error = float(np.hypot(sd[at], never.get((candidate.effect, name), 0.0)))
@@ -203,6 +219,9 @@ def _named(
             rivals = [t for t in rivals if t.candidate.effect not in told]
         alike = [t for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}]
         confidence = trust(remains) * share(taken.evidence, []) * _preferred(taken, rivals)
+        away = np.array([values[n] - neutral[n] for n in candidate.free])
+        if wald(away, solution.covariance[own, own], fitted.gram, used) > WITHIN:
+            confidence = min(confidence, DOUBTFUL)
         if candidate.effect in selection.doubted:
             confidence = min(confidence, DOUBTFUL)
             separate.append(SHAKES)
@@ -215,6 +234,8 @@ def _named(
         if candidate.effect == LOAD and in_two is not None and not told_apart(*in_two):
             equal = (*equal, *(c.effect for c in instead_of_a_load(selection.final.vehicle)))
             confidence *= _better(*in_two)
+        if candidate.effect == LOAD and TRIM in selection.final.vehicle.effects:
+            equal = (*equal, TWO_WEAK)
         if alike or equal:
             group = tuple(dict.fromkeys([candidate.effect, *(t.candidate.effect for t in alike), *equal]))
             groups.append(group)
@@ -229,10 +250,14 @@ def _evidence(selection: Selection, i: int) -> float:
     return taken.evidence
 
 
+WITHIN = 0.05  # p-value from which an effect's own uncertainty holds that there is none of it
 SHAKES = "hold the drone with its rotors turning: what shakes then is not the loop that swings with a wrong model"
 TELLING = 3.0  # nats by which a witness tells two effects apart
 MEASURED_LATE = "measurement_delay"
 WEAK_OR_MISREAD = ("rotor_fault", "rotor_sensor")
+# Two weak rotors beside each other lack thrust and tilt the drone as a weight on their side does, with no torque about
+# z; only what turns tells, which a drone whose trim changes from day to day does not show.
+TWO_WEAK = "rotor_fault"
 # Exactly the same to every signal: inputs that act late, and measurements that are all late together.
 SAME = {"input_delay": ("measurement_delay",)}
 

@@ -52,6 +52,8 @@ class Flight:
         signals: names of what is measured.
         attitude: (n, 4) all that was logged, where an onboard filter made it, of which `y` has one in `APART` seconds
             and those at starts; None: `y` has all.
+        levelled: the voltage is not recorded, and the thrust of its beginning is the weight by assumption.
+        coarse: what turned the drone is not in the commands as recorded (see `always.FAR_OUT`).
     """
 
     name: str
@@ -67,6 +69,8 @@ class Flight:
     inputs: RotorInput
     signals: frozenset[str]
     attitude: NDArray | None = None
+    levelled: bool = False
+    coarse: bool = False
 
     @property
     def blocks(self) -> int:
@@ -111,8 +115,9 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
         DataError: no inputs, no attitude or rates, no flight, or one that is too short.
     """
     recording = without(recording, withhold)
-    inputs = inputs_of(recording, vehicle).rotor
     air = airtime(recording)
+    found = inputs_of(recording, vehicle, flight=air)
+    inputs = found.rotor
     if air is None or not air.airborne:
         raise DataError(f"{recording.path}: nothing was flown in this recording, so there is nothing to diagnose")
     measured = {name: ordered(recording.signals[name]) for name in COLUMNS if name in recording.signals}
@@ -149,7 +154,7 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
         flown=time - air.airborne[0][0], ground=ground, block=_blocks(time), inputs=inputs,
         signals=frozenset(n for n in (*measured, "specific_force", "voltage", "rotor_speed", *COMMANDS)
                           if n in recording.signals or (n == "body_rate" and n in measured)),
-        attitude=y[:, 6:10].copy() if onboard_attitude(recording) else None,
+        attitude=y[:, 6:10].copy() if onboard_attitude(recording) else None, levelled=found.level is not None,
     )  # fmt: skip
     flight = flight.started(flight.starts)
     if flight.duration < SHORTEST:

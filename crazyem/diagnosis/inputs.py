@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.alignment import Alignment, align
+from crazyem.diagnosis.level import Level, level_of
 from crazyem.doctor.streams import Airtime, airtime, ordered
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
@@ -47,6 +48,7 @@ class Inputs:
         ground: height of the floor in the frame of the position [m]; 0 where unknown.
         took_off: when the drone first left the floor [s]; the first input where that is unknown.
         alignment: how late measured rotor speeds are behind the body rates, in this recording; None where unknown.
+        level: the voltage that was taken, where none is recorded and the flight shows one; else None.
     """
 
     rotor: RotorInput
@@ -56,6 +58,7 @@ class Inputs:
     ground: float
     took_off: float
     alignment: Alignment | None = None
+    level: Level | None = None
 
 
 def rotor_input(recording: Recording, vehicle: Vehicle) -> RotorInput:
@@ -63,13 +66,17 @@ def rotor_input(recording: Recording, vehicle: Vehicle) -> RotorInput:
     return inputs_of(recording, vehicle).rotor
 
 
-def inputs_of(recording: Recording, vehicle: Vehicle, *, flight: Airtime | None = None) -> Inputs:
+def inputs_of(
+    recording: Recording, vehicle: Vehicle, *, flight: Airtime | None = None, until: float = np.inf
+) -> Inputs:
     """What a vehicle's rotors were told or seen to do in a recording.
 
     Args:
         recording: of any format.
         vehicle: decides which signals can become thrust.
         flight: `crazyem.doctor.streams.airtime(recording)` where it is known already.
+        until: s, a voltage that is not recorded is taken from the flight (see `level`), but from nothing later; before
+            anything shows it, a nominal one.
 
     Raises:
         DataError: the recording has no signal that this vehicle can turn into thrust.
@@ -87,6 +94,10 @@ def inputs_of(recording: Recording, vehicle: Vehicle, *, flight: Airtime | None 
     flight = airtime(recording) if flight is None else flight
     took_off = flight.airborne[0][0] if flight is not None and flight.airborne else float(found.time[0])
     ground = flight.ground if flight is not None and np.isfinite(flight.ground) else 0.0
+    level = None
+    if found.sent is not None:
+        level = level_of(recording, vehicle, flight, found.time, found.sent, nominal=NOMINAL_VOLTAGE, until=until)
+        found = found if level is None else _sent(vehicle, found.time, found.sent, level)
     alignment = align(recording, found.time, found.thrust, flight) if name == "rotor_speed" else None
     late = DELAY_OF_COMMANDS if name in _SAMPLED else alignment.delay if alignment is not None else 0.0
     if name in _SAMPLED and "attitude" in recording.signals:
@@ -100,7 +111,7 @@ def inputs_of(recording: Recording, vehicle: Vehicle, *, flight: Airtime | None 
         measured=name == "rotor_speed",
         delay=late,
     )
-    return Inputs(rotor, name, found.vehicle or vehicle, notices, ground, took_off, alignment)
+    return Inputs(rotor, name, found.vehicle or vehicle, notices, ground, took_off, alignment, level)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +121,7 @@ class _Found:
     voltage: NDArray[np.float64]  # (m,) V
     notices: tuple[str, ...] = ()
     vehicle: Vehicle | None = None  # where it is not the one given
+    sent: NDArray[np.float64] | None = None  # (m, 4) duty where no voltage is recorded
 
 
 _Array = NDArray[np.float64]
@@ -162,13 +174,21 @@ def _from_command_alone(recording: Recording, vehicle: Vehicle, time: _Array, va
     """Without any voltage."""
     if not vehicle.thrust_curve:
         return None
-    nominal = np.full(time.size, NOMINAL_VOLTAGE)
-    thrust = thrust_from_command(value, nominal, thrust_curve=vehicle.thrust_curve)
-    notice = (
-        f"no battery voltage is recorded: {NOMINAL_VOLTAGE:g} V is assumed throughout, the middle of the 3.7 to 4.0 V "
-        "of a loaded battery; a drift of thrust with time may be the battery's"
+    return _sent(vehicle, time, value, None)
+
+
+def _sent(vehicle: Vehicle, time: _Array, value: _Array, level: Level | None) -> _Found:
+    """What was sent, by a voltage that nobody measured."""
+    volts = NOMINAL_VOLTAGE if level is None else level.voltage
+    thrust = thrust_from_command(value, np.full(time.size, volts), thrust_curve=vehicle.thrust_curve)
+    why = (
+        f"{volts:g} V is assumed throughout, the middle of the 3.7 to 4.0 V of a loaded battery"
+        if level is None
+        else f"{volts:.2f} V is taken throughout, by which the thrust of the first seconds in the air carries the "
+        "vehicle; how heavy or strong it is cannot be told from this recording"
     )
-    return _Found(time, thrust, np.full(time.size, np.nan), (notice,))
+    notice = f"no battery voltage is recorded: {why}; a drift of thrust with time may be the battery's"
+    return _Found(time, thrust, np.full(time.size, np.nan), (notice,), sent=value)
 
 
 def _from_request(recording: Recording, vehicle: Vehicle, time: _Array, value: _Array) -> _Found | None:

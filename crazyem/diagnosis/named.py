@@ -7,8 +7,8 @@ import numpy as np
 
 from crazyem.diagnosis.unexplained import Unexplained
 
-CALIBRATED = 0.9  # of the names that nothing speaks against this share was right (docs/diagnosis.md)
-DOUBTFUL = 0.4  # confidence at most where structure is left, or where something that shakes explains as much
+CALIBRATED = 0.95  # of the names that nothing speaks against this share was right (docs/diagnosis.md)
+DOUBTFUL = 0.45  # confidence at most where structure is left, or where something that shakes explains as much
 TEMPER = 0.5  # evidence counts half: models are approximate, and candidates were chosen by it
 
 
@@ -50,7 +50,8 @@ def around(value: float, sd: float) -> tuple[float, float]:
 
 def trust(remains: Unexplained) -> float:
     """What a name is worth beside structure that it does not explain: the right model leaves none."""
-    return min(remains.explained, DOUBTFUL) if remains.found else remains.explained
+    explained = max(remains.explained, 0.0)
+    return min(explained, DOUBTFUL) if remains.found else explained
 
 
 def share(best: float, others: Sequence[float]) -> float:

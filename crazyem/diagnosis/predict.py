@@ -6,13 +6,14 @@ A prediction is of what the recording would show.
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.earned import Turned, earned
 from crazyem.diagnosis.inputs import Inputs, inputs_of
+from crazyem.diagnosis.level import LOOKS
 from crazyem.diagnosis.simulate import Simulator
 from crazyem.doctor.kinematics import quaternion_of_euler
 from crazyem.doctor.streams import airtime, inside, ordered
@@ -43,6 +44,8 @@ class Recorded:
         inputs: what the rotors were told.
         parts: samples of position, velocity, attitude and body_rate as recorded: (k,) s and (k, 3 or 4), by name.
         flights: intervals in the air [s].
+        before: inputs as they were known before their level was (see `level`), by what was known when: for starts
+            until then. Empty where the voltage is recorded.
     """
 
     path: str
@@ -54,6 +57,7 @@ class Recorded:
     inputs: Inputs
     parts: Mapping[str, tuple[NDArray, NDArray]]
     flights: tuple[tuple[float, float], ...]
+    before: tuple[Inputs, ...] = ()
 
     @property
     def period(self) -> float:
@@ -131,7 +135,9 @@ def recorded(recording: Recording, vehicle: Vehicle) -> Recorded:
         state[known, columns] = value[at[known]]
         age = np.maximum(age, np.maximum(since, 0.0))
     flights = () if flight is None else flight.airborne
-    return Recorded(recording.path, time, state, age, row, inside(time, flights), inputs, parts, flights)
+    looks = () if inputs.level is None or flight is None else (0.0, *LOOKS)
+    before = tuple(inputs_of(recording, vehicle, flight=flight, until=inputs.took_off + s) for s in looks)
+    return Recorded(recording.path, time, state, age, row, inside(time, flights), inputs, parts, flights, before)
 
 
 def _state_signals(recording: Recording) -> dict[str, SignalArray]:
@@ -184,35 +190,41 @@ def predict(
     """
     rows = np.arange(0, shown.time.size, every)
     rows = rows[start_rows(shown, rows, horizon=horizon, step=step)]
+    span = horizon * (shown.period if step is None else step)
     if not rows.size:
-        span = horizon * (shown.period if step is None else step)
         raise DataError(
             f"{shown.path}: no state can be predicted from: none is whole and followed by {span:.3g} s "
             "of inputs without a gap"
         )
-    result = np.empty((rows.size, horizon, 13))
-    times = np.empty((rows.size, horizon))
-    simulator = Simulator(shown.inputs)
-    swings = simulator.swings(shown.time, shown.state[:, 3:6])
-    span = horizon * (shown.period if step is None else step)
-    weights = None if plain else earned(turned_by(shown), shown.time[rows], horizon=span)
-    done = 0
-    for part in _parts(rows, max(1, min(CHUNK, 2_000_000 // horizon))):
-        grid = _times(shown, part, horizon=horizon, step=step)
-        result[done : done + part.size] = simulator.run(
-            shown.state[part],
-            grid,
-            swing=None if swings is None else swings[part],
-            weights=None if weights is None else weights.of(slice(done, done + part.size)),
-        )
-        times[done : done + part.size] = grid[:, 1:]
-        done += part.size
-        if progress is not None:
-            progress(done, rows.size)
+    pieces, done = [], 0
+    for known, those in _by_knowledge(shown, rows):
+        weights = None if plain else earned(turned_by(known), known.time[those], horizon=span)
+        simulator = Simulator(known.inputs)
+        swings = simulator.swings(known.time, known.state[:, 3:6])
+        at = 0
+        for part in _parts(those, max(1, min(CHUNK, 2_000_000 // horizon))):
+            grid = _times(known, part, horizon=horizon, step=step)
+            swing = None if swings is None else swings[part]
+            believed = None if weights is None else weights.of(slice(at, at + part.size))
+            pieces.append((simulator.run(known.state[part], grid, swing=swing, weights=believed), grid[:, 1:]))
+            at += part.size
+            if progress is not None:
+                progress(done + at, rows.size)
+        done += at
+    result, times = (np.concatenate(whole) for whole in zip(*pieces, strict=True))
     return Prediction(
         result, times, shown.time[rows], shown.row[rows], shown.age[rows], shown.airborne[rows],
         shown.period if step is None else step,
     )  # fmt: skip
+
+
+def _by_knowledge(shown: Recorded, rows: NDArray) -> list[tuple[Recorded, NDArray]]:
+    """The starts, each with what was known of the battery by then."""
+    stages = [(i.level.known, i) for i in (*shown.before, shown.inputs) if i.level is not None]
+    stages.insert(0, (-np.inf, shown.before[0] if shown.before else shown.inputs))
+    known = np.array([when for when, _ in stages])
+    stage = np.searchsorted(known, shown.time[rows], "right") - 1
+    return [(replace(shown, inputs=stages[k][1]), rows[stage == k]) for k in np.unique(stage)]
 
 
 def turned_by(shown: Recorded) -> Turned:

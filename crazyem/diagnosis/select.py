@@ -13,7 +13,15 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.always import TRIM, by_gain, nuisances, on_held_out, refine_base, with_nuisances
+from crazyem.diagnosis.always import (
+    TRIM,
+    by_gain,
+    nuisances,
+    on_held_out,
+    refine_base,
+    unlike_a_body,
+    with_nuisances,
+)
 from crazyem.diagnosis.beginnings import best_begun
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import Data, DivergedError, Fitted, held_near, remembering_anew
@@ -222,6 +230,8 @@ def select(
         say(f"  found {candidate.label}: {best.evidence:.1f} nats")
         fitted = refine_base(data, remembering_anew(data, dated.point), accepted)
         point, value = fitted.point, fitted.loglik
+        if unlike_a_body(point, accepted):  # told by other means, or not at all: see `diagnose`
+            return Selection(nominal_fit.point, point, tuple(steps), tuple(accepted), fitted, len(candidates))
         held_value = on_held_out(held_out, point, accepted).loglik if held_out else 0.0
     fitted, accepted, steps = drop(data, fitted, accepted, steps, held_out, say)
     doubted: frozenset[str] = frozenset()

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.diagnosis.always import jittery, nuisances, solved
+from crazyem.diagnosis.always import jittery, nuisances, solved, usual_wind
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import Data, Fitted, moved
 from crazyem.diagnosis.gram import Gram
@@ -20,14 +20,15 @@ CLOSE = 4.0  # nats within which two explanations cannot be told apart,
 FAR = 20.0  # nats that one step is believed to bring without looking
 TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks
 # Smaller than this, these are not told from what filters, sampling and the air of a room do: s, s, s, 1, rad, rad/s, 1,
-# m/s, 1, N m s/m.
+# 1, N m s/m.
 LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "motor_lag": 7.5e-3, "velocity_scale": 0.035,
-         "attitude_misalignment": 2e-3, "gyro_bias": 3e-3, "torque_scale": 0.08, "wind": 0.1, "thrust_curve": 0.06,
+         "attitude_misalignment": 2e-3, "gyro_bias": 3e-3, "torque_scale": 0.08, "thrust_curve": 0.06,
          "velocity_moment": 3e-6}  # fmt: skip
 VELOCITY_LEAST = 2.0  # times what the jitter of an onboard estimate looks like
 LEAST_INERTIA = 0.08  # relative, the same
 LEAST_LOAD = 0.005  # of the drone's mass, the same
 LEAST_DRAG = {"x": 1e-3, "y": 1e-3, "z": 3e-3}  # N s/m or N s^2/m^2; along z thrust is a little wrong (see SYSTEMATIC)
+DRAG_MOST = {"linear_drag": 5.0, "quadratic_drag": 3.0}  # 1/s, 1/m, times the mass: more than air has
 LEAST_CENTRE = {"x": 1e-4, "y": 1e-4, "z": 1e-3}  # m; z shows in lateral accelerations of O alone
 
 
@@ -191,12 +192,15 @@ def wald(away: NDArray, covariance: NDArray, gram: Gram, columns: float) -> floa
 
 
 def at_the_end(point: Point, candidate: Candidate) -> bool:
-    """Whether an effect of one number is where nothing more of it is admitted."""
+    """Whether an effect of one number is where nothing more of it is admitted, or a drag is none that air has."""
+    here = candidate.values(point)
+    if candidate.effect in DRAG_MOST:
+        most = DRAG_MOST[candidate.effect] * point.vehicle.mass
+        return any(here[n] > most for n in candidate.free)
     if len(candidate.free) != 1:
         return False
     name = candidate.free[0]
-    here = candidate.values(point)[name]
-    return here in candidate.range_of(name) and here != candidate.neutral(point)[name]
+    return here[name] in candidate.range_of(name) and here[name] != candidate.neutral(point)[name]
 
 
 def matters(point: Point, candidate: Candidate, data: Data | None = None) -> bool:
@@ -212,6 +216,8 @@ def matters(point: Point, candidate: Candidate, data: Data | None = None) -> boo
     by_axis = {"center_of_mass": LEAST_CENTRE, "linear_drag": LEAST_DRAG, "quadratic_drag": LEAST_DRAG}
     if candidate.effect in by_axis:
         return any(abs(here[n] - neutral[n]) > by_axis[candidate.effect][n] for n in candidate.free)
+    if candidate.effect == "wind":  # what only rises or sinks is thrust that is a little wrong
+        return float(np.hypot(here["x"], here["y"])) > usual_wind(point.vehicle)
     if candidate.effect in ("payload", "suspended_load"):
         return bool(here["mass"] > LEAST_LOAD * point.vehicle.mass)
     if candidate.effect == "inertia":

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.diagnosis.always import TRIM
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.locate import AXES, Finding, Located, strongest
 from crazyem.diagnosis.model import Point, Swept
@@ -16,6 +17,7 @@ STRUCTURE = 25.0  # nats of structure left over that count as unexplained
 # Smaller than this is what onboard filters and sampled commands leave in every flight: share of weight, share of the
 # weight times the arm, rad, m/s.
 TOLERANCE = {"force": 0.01, "torque": 0.0004, "attitude": 5e-3, "velocity": 0.05}
+DAILY = 2.0  # times that, where trims, thrust and leaning differ by 2 % from day to day (see always.py)
 SLOWEST = 1.5  # Hz: below, onboard filters wander
 LINE = 25.0  # nats: peak of the spectrum over its surroundings (power), the number of frequencies allowed for
 SHAKEN = 0.3  # of what an unknown torque would leave of a swing
@@ -80,7 +82,8 @@ def notable(finding: Finding, point: Point) -> bool:
     weight = point.vehicle.mass * GRAVITY
     arm = max(point.vehicle.arm) or 0.03
     size = {"force": weight, "torque": weight * arm}.get(finding.signal, 1.0)
-    return abs(finding.effect_size) > TOLERANCE.get(finding.signal, 0.0) * size
+    daily = DAILY if TRIM in point.vehicle.effects else 1.0
+    return abs(finding.effect_size) > TOLERANCE.get(finding.signal, 0.0) * daily * size
 
 
 def shaking(rate: NDArray, window: NDArray, k: int) -> float:

@@ -241,7 +241,7 @@ def graded(share: float, *, degrades: float, unusable: float = math.inf) -> Grad
 
 SHORTEST_FLIGHT = 0.4  # s of lift; less is a hop or a test of the rotors
 LONGEST_FALL = 0.6  # s without lift that a manoeuvre may have
-LIFTED = 0.03  # m above the ground
+LIFTED, CLEAR = 0.03, 0.1  # m above the ground: in the air; and surely so
 _POSSIBLE = {"rotor_speed": 8000.0, "motor_command": 1.5, "motor_request": 1.5}
 _RAW_MOTORS = ("motor.m1", "motor.m2", "motor.m3", "motor.m4")
 _LIFT_SIGNALS = ("motor_command", "motor_request", "rotor_speed", "wrench_command", "mixer_command")
@@ -333,12 +333,25 @@ def _from_rotors(
     ground = float(np.median(z[resting]))
     airborne = []
     for start, end in lifting:
-        rows = np.flatnonzero((when >= start) & (when <= end) & (z > ground + LIFTED))
+        within = np.flatnonzero((when >= start) & (when <= end))
+        rows = within[_off_the_ground(z[within] - ground)]
         if rows.size:
             airborne.append((float(when[rows[0]]), float(when[rows[-1]])))
         elif not ((when >= start) & (when <= end)).any():
             airborne.append((start, end))
     return Airtime(lifting, tuple(airborne), ground, peak, climbed, float(time[0]), float(time[-1]))
+
+
+def _off_the_ground(height: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Rows (n,) in the air, of heights above the ground [m]: without bounces before the climb and after the descent."""
+    lifted = height > LIFTED
+    high = np.flatnonzero(height > CLEAR)
+    if high.size:
+        down = np.flatnonzero(~lifted)
+        first, last = np.searchsorted(down, high[0]) - 1, np.searchsorted(down, high[-1])
+        lifted[: down[first] if first >= 0 else 0] = False
+        lifted[down[last] if last < down.size else height.size :] = False
+    return lifted
 
 
 def _closed(time: NDArray[np.float64], flags: NDArray[np.bool_]) -> Intervals:

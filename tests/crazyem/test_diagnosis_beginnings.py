@@ -75,3 +75,15 @@ def test_long_flights_are_swept_in_pieces_of_one_path():
     flight = flight_of(fly(seconds=70.0, seed=2), DRONE)
     assert flight.starts.sum() == 2
     assert flight.gaps.sum() == 1
+
+
+def test_a_weight_that_only_tilts_begins_with_some_weight():
+    """The linear approximation may want a moment and no weight: of none, where it sits has no derivatives, and the fit
+    would stay there for ever."""
+    load = Candidate("payload", (), ("mass", "x", "y", "z"), (("mass", 5e-4),))
+    for mass in (0.0, -1e-3, 1e-6):
+        assert load.started(POINT, [mass, 0.01, 0.02, 0.0]) == {"mass": 5e-4, "x": 0.01, "y": 0.02, "z": 0.0}
+    twice = load.started(
+        POINT, [1e-3, 0.01, 0.02, 0.0]
+    )  # twice the weight where derivatives were taken: half as far out
+    assert twice == pytest.approx({"mass": 1e-3, "x": 0.005, "y": 0.01, "z": 0.0})

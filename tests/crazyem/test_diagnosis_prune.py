@@ -16,7 +16,7 @@ from crazyem.diagnosis.gram import Gram
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.select import shortlist
-from crazyem.diagnosis.trials import LIKELY, SURE, Step, Trial, matters, significance
+from crazyem.diagnosis.trials import LIKELY, SURE, Step, Trial, at_the_end, matters, significance
 from crazyem.diagnosis.workers import Workers
 
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
@@ -133,6 +133,34 @@ def test_a_rotor_that_is_much_stronger_than_the_others_is_no_faulty_one():
     for scale, counts in ((0.8, True), (1.05, True), (high, False)):
         point = POINT.with_effects({"rotor_fault": {"rotor": 2, "scale": scale, "onset_time": None}})
         assert matters(point, fault) == counts
+
+
+def test_no_rotor_gets_stronger_in_flight():
+    later = Candidate("rotor_fault", (("rotor", 2), ("onset_time", 11.0)), ("scale",))
+    assert later.range_of("scale") == (0.0, 1.0)
+
+
+def test_a_drag_that_no_air_has_stands_for_something_else():
+    """0.5 N s/m along y, the end of its range, was said of a drone of 31 g that flew along x."""
+    for drag, size, counts in (
+        ("linear_drag", 4.0, True), ("linear_drag", 6.0, False),
+        ("quadratic_drag", 2.5, True), ("quadratic_drag", 3.5, False),
+    ):  # fmt: skip
+        point = POINT.with_effects({drag: {"x": 0.01, "y": size * DRONE.mass, "z": 0.0}})
+        candidate = Candidate(drag, (), ("x", "y", "z"))
+        assert matters(point, candidate) == counts
+        assert at_the_end(point, candidate) != counts
+
+
+def test_wind_that_only_sinks_is_thrust_that_is_a_little_wrong():
+    wind = Candidate("wind", (), ("x", "y", "z"))
+    trimmed = replace(DRONE, effects={"trim": dict.fromkeys("xyz", 0.0)})
+    for vehicle, values, counts in (
+        (DRONE, (0.05, 0.05, 3.0), False), (DRONE, (0.2, 0.0, 0.0), True), (trimmed, (0.2, 0.0, 0.0), False),
+        (trimmed, (0.9, 0.9, 0.0), True),
+    ):  # fmt: skip
+        point = Point(vehicle, {"wind": dict(zip("xyz", values, strict=True))}, first_guess())
+        assert matters(point, wind) == counts
 
 
 def test_a_scale_of_velocities_must_be_more_than_the_jitter_of_the_estimate():

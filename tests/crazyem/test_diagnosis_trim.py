@@ -148,22 +148,62 @@ def test_rotors_relabelled_by_symmetry_give_the_relabelled_gains(name: str) -> N
     np.testing.assert_allclose(other[np.array(to) - 1], one, rtol=1e-2)
 
 
-@pytest.mark.slow
-@pytest.mark.xfail(reason="wanted, not reached: by a file of trim and thrust alone other effects come before the rotor")
-def test_a_cut_propeller_is_named_and_relabelled(shared_recordings) -> None:
-    """Rotor 3 of a real drone has 3.5 mm less on each blade; the file is of a flight with whole propellers."""
-    folder = shared_recordings / "crazypad"
+def trimmed_by(folder, name: str) -> Vehicle:
+    """The file of drone E8 by a flight with whole propellers."""
     bare = replace(load_vehicle("cf2-legacy"), name="e8", mass=0.031, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}})
-    healthy = diagnose(
-        [open_recording(folder / "motor__normal_flight__E8_log00")], bare, wanted=(TRIM, "thrust_scale")
-    ).fitted_vehicle
-    cut = open_recording(folder / "motor__cut_propeller_M3_3.5mm_3.5mm_40mm__E8_log00")
+    wanted = (TRIM, "thrust_scale", "velocity_moment")
+    return diagnose([open_recording(folder / name)], bare, wanted=wanted).fitted_vehicle
+
+
+@pytest.fixture(scope="module")
+def healthy(shared_recordings) -> Vehicle:
+    return trimmed_by(shared_recordings / "crazypad", "motor__normal_flight__E8_log00")
+
+
+CUT = "motor__cut_propeller_M3_3.5mm_3.5mm_40mm__E8_log00"
+
+
+@pytest.mark.slow
+def test_a_cut_propeller_is_named_and_relabelled(shared_recordings, healthy) -> None:
+    """Rotor 3 of a real drone has 3.5 mm less on each blade; the file is of a flight with whole propellers."""
+    cut = open_recording(shared_recordings / "crazypad" / CUT)
     polar, to = SYMMETRIES["left and right"]
+    scales = []
     for recording, vehicle, rotor in (
         (cut, healthy, 3),
         (relabelled(cut, polar, to), turned_file(healthy, polar), to[2]),
     ):
         effect = diagnose([recording], vehicle).effects[0]
         assert (effect.name, effect.chosen["rotor"]) == ("rotor_fault", rotor)
-        low, high = effect.parameters["scale"].ci95
-        assert low < 0.7 < high < 0.95
+        scales.append(effect.parameters["scale"].value)
+    assert 0.7 < scales[0] < 0.9
+    assert scales[1] == pytest.approx(scales[0], abs=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(reason="wanted, not reached: from one day to the next rotors of healthy flights differ by 4 to 5 %")
+def test_how_much_a_cut_propeller_lacks_is_known(shared_recordings, healthy) -> None:
+    effect = diagnose([open_recording(shared_recordings / "crazypad" / CUT)], healthy).effects[0]
+    assert effect.parameters["scale"].ci95[1] < 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    ["controller__normal_flight__E8_log00", "motor__normal_flight__E8_log03", "motor__tape_on_propeller_M3__E8_log00"],
+)
+def test_another_day_of_a_healthy_drone_is_no_finding(shared_recordings, healthy, name: str) -> None:
+    assert not diagnose([open_recording(shared_recordings / "crazypad" / name)], healthy).mismatch
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("table", ["controller", "motor"])
+def test_a_weight_by_two_rotors_is_one_or_those_are_weak(shared_recordings, healthy, table: str) -> None:
+    """Taped between rotors 3 and 4, on the left; in steady flight two weak rotors there do the same."""
+    found = diagnose(
+        [open_recording(shared_recordings / "crazypad" / f"{table}__add_weight_W1_near_M3_M4__E8_log00")], healthy
+    )
+    load = found.effects[0]
+    assert load.name == "payload"
+    assert load.parameters["y"].value > 0.01
+    assert any({"payload", "rotor_fault"} <= set(group) for group in found.indistinguishable)

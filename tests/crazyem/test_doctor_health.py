@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_flight import array_of, changed, made_flight, without
 
-from crazyem.doctor.streams import airtime
+from crazyem.doctor.streams import _off_the_ground, airtime
 from crazyem.recordings.finding import Grade
 from crazyem.recordings.recording import Recording
 
@@ -311,3 +311,14 @@ def test_rotors_cut_at_height(good, height):
     speed = found["The drone hits the ground"].evidence["speed_m_s"]
     assert speed == pytest.approx(np.sqrt(2 * 9.81 * (height - 0.05)), rel=0.15)
     assert found["The rotors"].evidence["height_m"] == pytest.approx(height, abs=0.05)
+
+
+def test_bounces_before_the_climb_and_after_the_landing_are_no_flight():
+    """A touch is a force of the floor, several times the weight for a tenth of a second."""
+    hop, down = [0.0, 0.04, 0.05, 0.0, 0.02], [0.02, 0.0, 0.05, 0.06, 0.04, 0.0, 0.0]
+    flight = [0.04, 0.2, 1.0, 0.02, 0.6, 0.3, 0.05]  # with a touch in between, which is left as it is
+    found = _off_the_ground(np.array([*hop, *flight, *down]))
+    lifted = np.array(flight) > 0.03
+    assert found.tolist() == [*[False] * len(hop), *lifted.tolist(), *[False] * len(down)]
+    assert _off_the_ground(np.array([0.0, 0.04, 0.05, 0.0])).tolist() == [False, True, True, False]  # a hop alone
+    assert _off_the_ground(np.array([0.04, 0.2, 0.3])).all()  # begins and ends in the air
