@@ -77,12 +77,17 @@ def diagnose(
     kept_apart = [flight_of(r, vehicle, withhold=withhold) for r in held_out]
     workers = Workers(jobs)
     say(f"nominal model of {vehicle.name}: {sum(f.duration for f in flights):.0f} s of flight")
-    data, apart, selection, left_out = _selected(flights, kept_apart, vehicle, wanted, workers, say)
+    data, apart, selection, candidates, left_out = _selected(flights, kept_apart, vehicle, wanted, workers, say)
     if unlike_a_body(selection.final, selection.accepted) and not any(f.coarse for f in flights):
         say("the turning does not follow the commands as they were recorded: once more without what is fast")
         flights, kept_apart = ([replace(f, coarse=True) for f in part] for part in (flights, kept_apart))
-        data, apart, selection, left_out = _selected(flights, kept_apart, vehicle, wanted, workers, say)
+        data, apart, selection, candidates, left_out = _selected(flights, kept_apart, vehicle, wanted, workers, say)
+    named = selection.accepted
     selection = named_again(data, apart, selection, say)
+    if {c.effect for c in selection.accepted} != {c.effect for c in named}:
+        # what another name took with it is looked for again, but for what was left out
+        left = [c for c in candidates if c.effect not in {a.effect for a in named}]
+        selection = select(data, selection.nominal, left, held_out=apart, begun=selection, say=say)
     selection, pull = by_place(data, apart, selection, say)
     selection, told = _asked(data, selection, recordings)
     say("where the nominal model fails")
@@ -126,8 +131,8 @@ def _selected(
     wanted: Sequence[str],
     workers: Workers,
     say: Say,
-) -> tuple[Data, Data | None, Selection, dict[str, str]]:
-    """The flights, those kept apart, what they ask for, and the effects that they cannot speak of with the reasons."""
+) -> tuple[Data, Data | None, Selection, list[Candidate], dict[str, str]]:
+    """The flights, those kept apart, what they ask for, what was asked, and what they cannot speak of and why."""
     data, apart = Data(flights, workers), Data(kept_apart, workers) if kept_apart else None
     bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, first_guess())
     nominal = nominal_of(data, bare)
@@ -140,7 +145,7 @@ def _selected(
     )
     candidates, left_out = abstained(data, nominal, candidates, left_out)
     nominal = steadied(data, nominal)
-    return data, apart, select(data, nominal, candidates, held_out=apart, say=say), left_out
+    return data, apart, select(data, nominal, candidates, held_out=apart, say=say), candidates, left_out
 
 
 def _asked(data: Data, selection: Selection, recordings: Sequence[Recording]) -> tuple[Selection, frozenset[str]]:

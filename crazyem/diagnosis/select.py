@@ -182,18 +182,18 @@ def select(
     candidates: Sequence[Candidate],
     *,
     held_out: Data | None = None,
+    begun: Selection | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Selection:
-    """The effects that the flights ask for."""
-    point = nominal_point
-    nominal_fit = refine_base(data, point, ())
-    point = nominal_fit.point
-    value = nominal_fit.loglik
-    held_value = on_held_out(held_out, point, ()).loglik if held_out else 0.0
-    accepted: list[Candidate] = []
-    steps: list[Step] = []
-    fitted = nominal_fit
-    for turn in range(MOST + 1):
+    """The effects that the flights ask for; beyond those `begun` with, where there are some."""
+    fitted = refine_base(data, nominal_point, ()) if begun is None else begun.fitted
+    nominal = fitted.point if begun is None else begun.nominal
+    point, value = fitted.point, fitted.loglik
+    accepted: list[Candidate] = [] if begun is None else list(begun.accepted)
+    steps: list[Step] = [] if begun is None else [s for s in begun.steps if s.taken]
+    held_value = on_held_out(held_out, point, accepted).loglik if held_out else 0.0
+    first = len(accepted)
+    for turn in range(first, MOST + 1):
         rest = [
             c
             for c in candidates
@@ -201,7 +201,7 @@ def select(
         ]
         say(f"looking for effect {turn + 1} among {len(rest)} candidates")
         linear = linear_trials(data, point, accepted, best_begun(data, point, accepted, rest))
-        if steps:
+        if turn > first:
             steps[-1] = replace(steps[-1], beside=additions(steps[-1], [t for t, _ in linear]))
         promising = shortlist(linear) if turn < MOST else []  # after the last, only what stands beside it is asked
         basis = Basis(data, held_out, point, tuple(accepted), value, held_value)
@@ -231,7 +231,7 @@ def select(
         fitted = refine_base(data, remembering_anew(data, dated.point), accepted)
         point, value = fitted.point, fitted.loglik
         if unlike_a_body(point, accepted):  # told by other means, or not at all: see `diagnose`
-            return Selection(nominal_fit.point, point, tuple(steps), tuple(accepted), fitted, len(candidates))
+            return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))
         held_value = on_held_out(held_out, point, accepted).loglik if held_out else 0.0
     fitted, accepted, steps = drop(data, fitted, accepted, steps, held_out, say)
     doubted: frozenset[str] = frozenset()
@@ -239,7 +239,7 @@ def select(
         fitted, accepted, steps = survive(data, fitted, accepted, steps, held_out, say)
         doubted = shaken(data, nominal_point, fitted, accepted, say)
     point = fitted.point
-    return Selection(nominal_fit.point, point, tuple(steps), tuple(accepted), fitted, len(candidates), doubted)
+    return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates), doubted)
 
 
 def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Solution]]:
