@@ -144,28 +144,36 @@ LEFT_OUT = ("B9_trefoil_medium_rep1", "B9_trefoil_slow_rep1", "B9_trefoil_fast_r
 WINDOW = 21  # samples of the Savitzky-Golay filter that accelerations come from
 
 
-def forces(path: Path, vehicle: str, withhold: Sequence[str]) -> tuple[NDArray, float, int]:
+def forces(path: Path, vehicle: str, withhold: Sequence[str], *, learned: bool = False) -> tuple[NDArray, float, int]:
     """Residual of the specific force (n, 3) m/s^2 in body axes at recorded states, and the rms of the position error
-    after 0.5 s with the attitude as measured [m], of how many starts."""
+    after 0.5 s with the attitude as measured [m], of how many starts. `learned`: as `crazyem predict` has it, with
+    the force that was missing before each start; else the model alone."""
     from crazyem.diagnosis.flight import without
     from crazyem.diagnosis.horizon import errors, open_loop, windows
-    from crazyem.diagnosis.predict import recorded
+    from crazyem.diagnosis.predict import predict, recorded
     from crazyem.recordings import open_recording
     from crazyem.vehicle import load_vehicle
 
     shown = recorded(without(open_recording(path), withhold), load_vehicle(vehicle))
     at = windows(shown)
     position = errors(open_loop(shown, at, measured_attitude=True), at)
-    step = 0.01
-    short = windows(shown, horizons=(step,), spacing=step)  # one step from every sample: the model's acceleration
-    one = open_loop(shown, short, measured_attitude=True)[:, 0]
-    span = (short.times[:, 1] - short.times[:, 0])[:, None]
-    model = (one[:, 3:6] - shown.state[short.rows, 3:6]) / span
+    step = 0.01  # one step from every sample: the model's acceleration
+    if learned:
+        found = predict(shown, horizon=1)
+        starts = np.searchsorted(shown.time, found.start_time)
+        keep = found.airborne & shown.airborne[starts + 1]
+        starts, span = starts[keep], (found.time[keep, 0] - found.start_time[keep])[:, None]
+        model = (found.prediction[keep, 0, 3:6] - shown.state[starts, 3:6]) / span
+    else:
+        short = windows(shown, horizons=(step,), spacing=step)
+        one = open_loop(shown, short, measured_attitude=True)[:, 0]
+        starts, span = short.rows, (short.times[:, 1] - short.times[:, 0])[:, None]
+        model = (one[:, 3:6] - shown.state[starts, 3:6]) / span
     rest = []
-    for rows in np.split(np.arange(short.rows.size), np.flatnonzero(np.diff(short.rows) > 1) + 1):
+    for rows in np.split(np.arange(starts.size), np.flatnonzero(np.diff(starts) > 1) + 1):
         if rows.size < 5 * WINDOW:
             continue
-        time, state = shown.time[short.rows[rows]], shown.state[short.rows[rows]]
+        time, state = shown.time[starts[rows]], shown.state[starts[rows]]
         grid = np.arange(time[0], time[-1], step)
         place = np.stack([np.interp(grid, time, c) for c in state[:, :3].T], 1)
         acceleration = np.stack([np.interp(grid, time, c) for c in model[rows].T], 1)
@@ -177,13 +185,26 @@ def forces(path: Path, vehicle: str, withhold: Sequence[str]) -> tuple[NDArray, 
 
 
 def judged(folder: Path, vehicle: str, withhold: Sequence[str] = ()) -> dict[str, Any]:
-    """Pooled over the flights of types that were not fitted."""
-    parts = [forces(folder / f"{n}.csv.gz", vehicle, withhold) for n in LEFT_OUT]
-    rest = np.concatenate([p[0] for p in parts])
+    """Pooled over the flights of types that were not fitted, and each of them."""
+    paths = [folder / f"{n}.csv.gz" for n in LEFT_OUT]
+    parts = [forces(p, vehicle, withhold) for p in paths]
+    learned = [forces(p, vehicle, withhold, learned=True)[0] for p in paths]
     starts = np.array([p[2] for p in parts], float)
     position = float(np.sqrt(np.sum(starts * np.square([p[1] for p in parts])) / starts.sum()))
-    rms = np.sqrt(np.mean(rest**2, axis=0))
-    return {"force_rms": [round(float(v), 3) for v in rms], "position_rms": round(position, 4)}
+    return {
+        "force_rms": rms_of(np.concatenate([p[0] for p in parts])),
+        "predicted_force_rms": rms_of(np.concatenate(learned)),
+        "position_rms": round(position, 4),
+        "flights": {
+            n: {"force_rms": rms_of(p[0]), "predicted_force_rms": rms_of(by), "position_rms": round(float(p[1]), 4)}
+            for n, p, by in zip(LEFT_OUT, parts, learned, strict=True)
+        },
+    }
+
+
+def rms_of(rest: NDArray) -> list[float]:
+    """By axis, (n, 3) -> 3."""
+    return [round(float(v), 3) for v in np.sqrt(np.mean(rest**2, axis=0))]
 
 
 def nanobench(shared: Path, work: Path) -> dict[str, Any]:
@@ -283,12 +304,14 @@ def tables(done: dict[str, Any]) -> str:
             out.append(f"| {name} | {_delay(delays[f'raw/{name}'])} | {_delay(delays.get(f'processed/{name}'))} |")
         out.append("")
     if "nanobench" in done:
-        out += ["| nanobench, types left out | force residual x, y, z m/s² | position after 0.5 s m |",
-                "| --- | --- | --- |"]  # fmt: skip
+        out += ["| nanobench, types left out | force residual x, y, z m/s² | by `predict` | position after 0.5 s m |",
+                "| --- | --- | --- | --- |"]  # fmt: skip
         for name in ("before", "after", "withheld_before", "withheld_after"):
             s = done["nanobench"][name]
-            x, y, z = s["force_rms"]
-            out.append(f"| {name.replace('_', ', ')} | {x}, {y}, {z} | {s['position_rms']} |")
+            for flight, scores in ((name.replace("_", ", "), s), *s.get("flights", {}).items()):
+                x, y, z = scores["force_rms"]
+                by = ", ".join(map(str, scores.get("predicted_force_rms", ["-"])))
+                out.append(f"| {flight} | {x}, {y}, {z} | {by} | {scores['position_rms']} |")
         out.append("")
     if "crazypad" in done:
         out += ["| crazypad: flight, by the file fitted to | what was said first |", "| --- | --- |"]

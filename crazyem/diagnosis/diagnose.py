@@ -1,6 +1,6 @@
 """From recordings and a vehicle to a diagnosis: nominal model, where it fails, which effects, the fit, what remains."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +22,7 @@ from crazyem.diagnosis.named import DOUBTFUL, Named, Value, share, trust
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.place import depends_on_place
 from crazyem.diagnosis.select import select
-from crazyem.diagnosis.split import LOAD, as_two, instead_of_a_load
+from crazyem.diagnosis.split import LOAD, WEAKER, as_load, as_two, instead_of_a_load
 from crazyem.diagnosis.trials import SURE, Selection, Trial, margin, told_apart, wald
 from crazyem.diagnosis.unexplained import Unexplained, unexplained
 from crazyem.diagnosis.witness import false_speed, late_measurements
@@ -85,9 +85,8 @@ def diagnose(
     named = selection.accepted
     selection = named_again(data, apart, selection, say)
     if {c.effect for c in selection.accepted} != {c.effect for c in named}:
-        # what another name took with it is looked for again, but for what was left out
-        left = [c for c in candidates if c.effect not in {a.effect for a in named}]
-        selection = select(data, selection.nominal, left, held_out=apart, begun=selection, say=say)
+        # beside the new name there may be room for others
+        selection = select(data, selection.nominal, candidates, held_out=apart, begun=selection, say=say)
     selection, pull = by_place(data, apart, selection, say)
     selection, told = _asked(data, selection, recordings)
     say("where the nominal model fails")
@@ -106,7 +105,8 @@ def diagnose(
     turned = heading_by_place(data, apart)
     if turned is not None:
         remains = remains.beside(turned)
-    effects, groups, separate = _named(data, selection, remains, told, as_two(data, apart, selection))
+    in_place = {LOAD: as_two(data, apart, selection), WEAKER.effect: as_load(data, apart, selection)}
+    effects, groups, separate = _named(data, selection, remains, told, in_place)
     beside = beside_the_regression(data, apart, selection.final, remains, wanted, left_out, bool(pulls), say)
     if flights[0].inputs.measured and not any(e.name == "input_delay" for e in effects):
         late, alike = late_rotors(recordings, held_out, vehicle, wanted, left_out)
@@ -194,7 +194,7 @@ def _named(
     selection: Selection,
     remains: Unexplained,
     told: frozenset[str],
-    in_two: tuple[Trial, Trial] | None,
+    in_place: Mapping[str, tuple[Trial, Trial] | None],
 ) -> tuple[tuple[Named, ...], tuple[tuple[str, ...], ...], tuple[str, ...]]:
     fitted = selection.fitted
     if not selection.accepted:
@@ -236,9 +236,11 @@ def _named(
             name, label, chosen = MEASURED_LATE, MEASURED_LATE, {"streams": ("state", "gyro")}
         named.append(Named(name, label, parameters, chosen, taken.held_out, p_value, confidence))
         equal = () if candidate.effect in told else SAME.get(candidate.effect, ())
-        if candidate.effect == LOAD and in_two is not None and not told_apart(*in_two):
-            equal = (*equal, *(c.effect for c in instead_of_a_load(selection.final.vehicle)))
-            confidence *= _better(*in_two)
+        pair = in_place.get(candidate.effect)
+        if pair is not None and not told_apart(*pair):
+            instead = [c.effect for c in instead_of_a_load(selection.final.vehicle)]
+            equal = (*equal, *(instead if candidate.effect == LOAD else [LOAD]))
+            confidence *= _better(*pair)
         if candidate.effect == LOAD and TRIM in selection.final.vehicle.effects:
             equal = (*equal, TWO_WEAK)
         if alike or equal:

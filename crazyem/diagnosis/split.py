@@ -1,4 +1,4 @@
-"""A load against weaker rotors: one cause that looks like two.
+"""A load against weaker rotors: one cause that looks like two, or like another.
 
 A load of unknown weight lowers thrust over mass and shifts the centre of mass, and so do rotors that are all weaker on
 a drone whose centre of mass was never where the file has it. One candidate is tried at a time, so the load wins by
@@ -21,6 +21,7 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.vehicle import Vehicle
 
 LOAD = "payload"
+HEAVIER = Candidate(LOAD, (), ("mass", "x", "y", "z"))
 WEAKER = Candidate("thrust_scale", (), ("scale",))
 SHIFTED = Candidate("center_of_mass", (), ("x", "y", "z"))
 
@@ -52,6 +53,32 @@ def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Tri
     return (
         replace(step.taken, value=value, blocks=blocks),
         Trial(Candidate(WEAKER.effect, (), free), 0.0, 0.0, 1.0, 0.0, 0.0, blocks=others, value=other),
+    )
+
+
+def as_load(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
+    """Weaker rotors as a trial and a load in their place as another; None where there are none, or where the load was
+    tried beside them anyway.
+    """
+    weaker = next((c for c in selection.accepted if c.effect == WEAKER.effect), None)
+    step = next((s for s in selection.steps if s.taken and s.taken.candidate is weaker), None)
+    if weaker is None or step is None or step.taken is None or any(c.effect == LOAD for c in selection.accepted):
+        return None
+    share = weaker.values(selection.final)["scale"]
+    if share >= 1.0 or any(t.candidate.effect == LOAD and t.fitted is not None for t in step.trials):
+        return None
+    rest = [c for c in selection.accepted if c is not weaker]
+    bare = without(selection.final, WEAKER.effect)
+    mass = selection.final.vehicle.mass * (1.0 / share - 1.0)
+    loaded = bare.with_effects({LOAD: {**HEAVIER.neutral(bare), "mass": mass}})
+    try:
+        value, blocks = judged(data, held_out, selection.final, selection.accepted)
+        other, others = judged(data, held_out, loaded, [*rest, HEAVIER])
+    except DivergedError:
+        return None
+    return (
+        replace(step.taken, value=value, blocks=blocks),
+        Trial(HEAVIER, 0.0, 0.0, 1.0, 0.0, 0.0, blocks=others, value=other),
     )
 
 

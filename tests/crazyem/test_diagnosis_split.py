@@ -1,5 +1,6 @@
 """A load against weaker rotors: what is compared, and what a shipped flight says of it."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -51,6 +52,30 @@ def test_the_two_pay_for_their_parameters_and_for_being_two(monkeypatch: pytest.
 def test_without_a_load_nothing_is_asked() -> None:
     point = Point(DRONE, {"linear_drag": dict.fromkeys("xyz", 0.01)}, first_guess())
     assert split.as_two(SimpleNamespace(), None, selection_of(point, (DRAG,))) is None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("scale", "tried", "asked_for"), [(0.8, False, True), (1.1, False, False), (0.8, True, False)])
+def test_a_load_in_the_place_of_weaker_rotors_weighs_what_they_lack(
+    monkeypatch: pytest.MonkeyPatch, scale: float, tried: bool, asked_for: bool
+) -> None:
+    point = Point(DRONE, {"thrust_scale": {"scale": scale}, "linear_drag": dict.fromkeys("xyz", 0.01)}, first_guess())
+    asked = []
+
+    def judged(data: Any, held_out: Any, start: Point, candidates: Any) -> tuple[float, Any]:
+        asked.append(([c.effect for c in candidates], start.effects))
+        return (110.0 if len(asked) == 1 else 104.0), np.zeros(5)
+
+    monkeypatch.setattr(split, "judged", judged)
+    chosen = selection_of(point, (split.WEAKER, DRAG))
+    beside = Trial(LOAD, 1.0, 1.0, 1.0, 0.1, 1.0, fitted=SimpleNamespace() if tried else None)  # type: ignore[arg-type]
+    chosen = replace(chosen, steps=(replace(chosen.steps[0], trials=(beside,)), *chosen.steps[1:]))
+    found = split.as_load(SimpleNamespace(), None, chosen)  # type: ignore[arg-type]
+    assert (found is not None) == asked_for == bool(asked)
+    if found is not None:
+        assert [names for names, _ in asked] == [["thrust_scale", "linear_drag"], ["linear_drag", "payload"]]
+        assert asked[1][1]["payload"]["mass"] == pytest.approx(DRONE.mass * (1 / scale - 1))
+        assert "thrust_scale" not in asked[1][1]
+        assert margin(*found)[0] == pytest.approx(6.0 - 1 + 4)
 
 
 @pytest.mark.slow
