@@ -20,6 +20,9 @@ STEP = 0.02  # in the logarithm, for differences
 LARGEST = 1.5  # step of scoring in the logarithm
 TYPICAL = Noise(np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), np.array([1e-3, 1e-2, 3e-3, 1e-2]))
 FLOOR = np.log(np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2, 1e-5, 1e-4, 1e-4, 1e-4, *[1e-4] * 3, *[1e-3] * 3]))
+# rad: no attitude made from an acceleration is better; in quiet flights 4 to 5 mrad. Believed to 0.5 mrad, every tremor
+# of the acceleration is a torque, and a steady one (a weak rotor) is lost among these.
+LEANING_FLOOR = 3e-3
 TYPICAL_DISTURBANCE = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
 
 
@@ -78,8 +81,10 @@ def _scored(
     for flight, _, _ in chosen:
         measured |= np.array([np.isfinite(flight.y[:, c]).any() for c in (0, 3, 6, 10)])
     free = np.concatenate([np.ones(6, bool), measured, start.disturbance > 0])
-    logs, memory = logs_of(start), start.memory
-    logs = np.maximum(logs, np.where(free, FLOOR, -np.inf))
+    logs, memory, floor = logs_of(start), start.memory, FLOOR.copy()
+    if any("attitude" not in f.signals and np.isfinite(f.y[:, 6]).any() for f, _, _ in chosen):
+        floor[8] = np.log(LEANING_FLOOR)
+    logs = np.maximum(logs, np.where(free, floor, -np.inf))
     typical = logs_of(Noise(TYPICAL.impulse, TYPICAL.measurement, TYPICAL_DISTURBANCE))
     index = np.flatnonzero(free)
 
@@ -110,7 +115,7 @@ def _scored(
         step = np.clip(np.linalg.solve(information, score), -LARGEST, LARGEST)
         for _ in range(5):
             there = logs.copy()
-            there[index] = np.maximum(logs[index] + step, FLOOR[index])
+            there[index] = np.maximum(logs[index] + step, floor[index])
             swept = sweep(there)
             gained = posterior(swept, there)
             if gained > value - 1e-9:

@@ -1,5 +1,7 @@
 """Noise scales come back from data drawn with them, and what nothing measures stays as it was."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -7,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.flight import Flight
 from crazyem.diagnosis.model import Noise
-from crazyem.diagnosis.noise import ROWS, fit_noise, logs_of, noise_of, sample_rows
+from crazyem.diagnosis.noise import LEANING_FLOOR, ROWS, fit_noise, logs_of, noise_of, sample_rows
 from crazyem.physics.motion import RotorInput
 
 Array = NDArray[np.float64]
@@ -48,7 +50,7 @@ def drawn(seed: int, noise: Noise, *, rows: int = 900, dt: float = 0.01) -> tupl
     nothing = np.full(rows, np.nan)
     inputs = RotorInput(time, np.zeros((rows, 4)), nothing, time, True)
     flight = Flight("drawn", time, starts, starts, y, np.full((rows, 3), np.nan), nothing, time, 0.0,
-                    (time // 1.0).astype(np.int64), inputs, frozenset())  # fmt: skip
+                    (time // 1.0).astype(np.int64), inputs, frozenset({"position", "velocity", "attitude", "body_rate"}))  # fmt: skip
     return flight, acceleration, np.zeros((rows, 12))
 
 
@@ -88,6 +90,16 @@ def test_a_scale_that_nothing_measures_stays() -> None:
     found = fit_noise([(flight, acceleration, offset)], START)
     assert found.measurement[1] == pytest.approx(START.measurement[1], rel=1e-12)
     assert found.measurement[0] == pytest.approx(TRUE.measurement[0], rel=0.3)
+
+
+def test_no_attitude_made_from_an_acceleration_is_very_good() -> None:
+    """A motion capture's may be."""
+    better = Noise(TRUE.impulse, np.array([1e-3, 8e-3, 1e-3, 1.5e-2]))
+    flight, acceleration, offset = drawn(7, better)
+    leaning = replace(flight, signals=flight.signals - {"attitude"})
+    found, floored = (fit_noise([(f, acceleration, offset)], START).measurement[2] for f in (flight, leaning))
+    assert found == pytest.approx(1e-3, rel=0.2)
+    assert floored == pytest.approx(LEANING_FLOOR)
 
 
 def test_long_flights_are_judged_by_stretches_all_over() -> None:
