@@ -50,7 +50,8 @@ def drawn(seed: int, noise: Noise, *, rows: int = 900, dt: float = 0.01) -> tupl
     nothing = np.full(rows, np.nan)
     inputs = RotorInput(time, np.zeros((rows, 4)), nothing, time, True)
     flight = Flight("drawn", time, starts, starts, y, np.full((rows, 3), np.nan), nothing, time, 0.0,
-                    (time // 1.0).astype(np.int64), inputs, frozenset({"position", "velocity", "attitude", "body_rate"}))  # fmt: skip
+                    (time // 1.0).astype(np.int64), inputs,
+                    frozenset({"position", "velocity", "attitude", "body_rate"}))  # fmt: skip
     return flight, acceleration, np.zeros((rows, 12))
 
 
