@@ -101,8 +101,8 @@ def _clear(recording: Recording, flight: Airtime) -> float:
 def _upright(recording: Recording, time: NDArray) -> NDArray:
     """(m,) cosine of the tilt; 1 where no attitude is recorded."""
     for name in ("attitude", "euler"):
-        if name in recording.signals:
-            when, value = ordered(recording.signals[name])
+        when, value = ordered(recording.signals[name]) if name in recording.signals else (np.empty(0), np.empty(0))
+        if when.size:
             q = quaternion_of_euler(value) if name == "euler" else value
             tilt = 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2) / np.maximum((q**2).sum(axis=1), 1e-12)
             return np.interp(time, when, tilt)

@@ -69,6 +69,12 @@ def test_where_a_flight_does_not_show_it_a_nominal_one_stays():
     assert inputs(made_flight(MOTION, noise=0.0)).level is None  # it was measured
 
 
+def test_an_attitude_without_a_number_is_none():
+    recording = unmeasured(replace(MOTION, size=0.1))
+    nothing = changed(recording, "attitude", value=np.full_like(recording.signals["attitude"].value, np.nan))
+    assert inputs(nothing).level.voltage == pytest.approx(inputs(recording).level.voltage, rel=0.01)
+
+
 def test_a_prediction_knows_it_only_as_far_as_it_was_seen():
     shown = recorded(unmeasured(), DRONE)
     found = predict(shown, horizon=10, every=7)
