@@ -37,7 +37,7 @@ def repeated(recording: Recording, seconds: float) -> Recording:
     """The flight over and over, `seconds` of it in the air."""
     air = airtime(recording)
     assert air is not None
-    begin, end = air.airborne[0]
+    begin, end = air.flown[0]
     times = max(1, int(np.ceil(seconds / (end - begin))))
     last = begin + seconds - (times - 1) * (end - begin)
 

@@ -75,7 +75,7 @@ def align(recording: Recording, thrust_time: NDArray, thrust: NDArray, flight: A
         thrust: (m, 4) N.
         flight: when the drone flew.
     """
-    if flight is None or not flight.airborne or "body_rate" not in recording.signals or thrust_time.size < 100:
+    if flight is None or not flight.flown or "body_rate" not in recording.signals or thrust_time.size < 100:
         return None
     when, rate = _fresh(*ordered(recording.signals["body_rate"]))
     thrust_time, thrust = _fresh(thrust_time, thrust)
@@ -96,7 +96,7 @@ def align(recording: Recording, thrust_time: NDArray, thrust: NDArray, flight: A
     acceleration = _filtered(np.gradient(rates, GRID, axis=0), kernel)
     shaken = _filtered(torque, kernel)
     margin = round((REACH + SUPPORT) / GRID)
-    good = inside(time, flight.airborne)
+    good = inside(time, flight.flown)
     good &= (_age(time, when) < 0.04) & (_age(time, thrust_time) < 0.04)
     good[:margin], good[len(good) - margin :] = False, False
     index = np.flatnonzero(good)

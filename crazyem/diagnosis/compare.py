@@ -21,10 +21,10 @@ def compare(recording: Recording, simulated: Recording) -> dict[str, Any]:
     begins, lasts = [], []
     for one in (recording, simulated):
         air = airtime(one)
-        if air is None or not air.airborne:
+        if air is None or not air.flown:
             raise DataError(f"{one.path}: nothing was flown in this recording, so there is nothing to compare")
-        begins.append(air.airborne[0][0])
-        lasts.append(air.airborne[-1][1] - air.airborne[0][0])
+        begins.append(air.flown[0][0])
+        lasts.append(air.flown[-1][1] - air.flown[0][0])
     seconds = min(lasts)
     found: dict[str, Any] = {"simulated": simulated.path, "seconds": seconds, "signals": {}}
     for name in COMPARED:

@@ -118,7 +118,7 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
     air = airtime(recording)
     found = inputs_of(recording, vehicle, flight=air)
     inputs = found.rotor
-    if air is None or not air.airborne:
+    if air is None or not air.flown:
         raise DataError(f"{recording.path}: nothing was flown in this recording, so there is nothing to diagnose")
     measured = {name: ordered(recording.signals[name]) for name in COLUMNS if name in recording.signals}
     if "attitude" not in measured and "body_rate" not in measured and "acceleration" in recording.signals:
@@ -129,7 +129,7 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
         raise DataError(f"{recording.path}: no position, velocity, attitude or body rate to compare a simulation with")
     if "body_rate" not in measured and "attitude" not in measured and "velocity" not in measured:
         raise DataError(f"{recording.path}: positions alone do not show which physics is missing")
-    time = _nodes([t for t, _ in measured.values()], air.airborne)
+    time = _nodes([t for t, _ in measured.values()], air.flown)
     if time.size < 50:
         raise DataError(f"{recording.path}: only {time.size} samples in the air; at least 50 are needed")
     y = np.full((time.size, 13), np.nan)
@@ -143,7 +143,7 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
     fresh = np.concatenate([[True], np.any((y[1:] != y[:-1]) & np.isfinite(y[1:]), axis=1)])  # a repeated row is none
     time, y, force = time[fresh], y[fresh], force[fresh]
     y[:, 6:10] /= np.linalg.norm(y[:, 6:10], axis=1, keepdims=True)
-    gaps = _gaps(time, inputs.time, air.airborne)
+    gaps = _gaps(time, inputs.time, air.flown)
     voltage = np.full(time.size, np.nan)
     if "voltage" in recording.signals:
         when, value = ordered(recording.signals["voltage"])
@@ -151,7 +151,7 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
     ground = air.ground if np.isfinite(air.ground) else 0.0
     flight = Flight(
         name=recording.path, time=time, starts=_starts(time, gaps), gaps=gaps, y=y, force=force, voltage=voltage,
-        flown=time - air.airborne[0][0], ground=ground, block=_blocks(time), inputs=inputs,
+        flown=time - air.flown[0][0], ground=ground, block=_blocks(time), inputs=inputs,
         signals=frozenset(n for n in (*measured, "specific_force", "voltage", "rotor_speed", *COMMANDS)
                           if n in recording.signals or (n == "body_rate" and n in measured)),
         attitude=y[:, 6:10].copy() if onboard_attitude(recording) else None, levelled=found.level is not None,

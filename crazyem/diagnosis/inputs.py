@@ -92,7 +92,7 @@ def inputs_of(
             f"'{vehicle.name}' can turn into forces."
         )
     flight = airtime(recording) if flight is None else flight
-    took_off = flight.airborne[0][0] if flight is not None and flight.airborne else float(found.time[0])
+    took_off = flight.flown[0][0] if flight is not None and flight.flown else float(found.time[0])
     ground = flight.ground if flight is not None and np.isfinite(flight.ground) else 0.0
     level = None
     if found.sent is not None:

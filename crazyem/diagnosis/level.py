@@ -59,12 +59,12 @@ def level_of(
     Returns:
         None where the recording has no velocity, no flight that is long enough, or no voltage does it.
     """
-    if flight is None or not flight.airborne or "velocity" not in recording.signals or not vehicle.thrust_curve:
+    if flight is None or not flight.flown or "velocity" not in recording.signals or not vehicle.thrust_curve:
         return None
     begin, short = _clear(recording, flight), SHORT
     if begin + SHORT > until:
-        begin, short = flight.airborne[0][0], 0.5 * LOOKS[0]
-    end = min(begin + LONG, max(e for b, e in flight.airborne if b <= begin), until)
+        begin, short = flight.flown[0][0], 0.5 * LOOKS[0]
+    end = min(begin + LONG, max(e for b, e in flight.flown if b <= begin), until)
     when, velocity = ordered(recording.signals["velocity"])
     seen = (when >= begin) & (when <= end) & np.isfinite(velocity[:, 2])
     inside = (time >= begin) & (time <= end)
@@ -90,7 +90,7 @@ def level_of(
 
 def _clear(recording: Recording, flight: Airtime) -> float:
     """When the drone was first clear of the floor [s]."""
-    took_off = flight.airborne[0][0]
+    took_off = flight.flown[0][0]
     if "position" not in recording.signals or not np.isfinite(flight.ground):
         return took_off
     when, place = ordered(recording.signals["position"])

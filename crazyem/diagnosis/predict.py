@@ -134,7 +134,7 @@ def recorded(recording: Recording, vehicle: Vehicle) -> Recorded:
         known = since <= OLDEST
         state[known, columns] = value[at[known]]
         age = np.maximum(age, np.maximum(since, 0.0))
-    flights = () if flight is None else flight.airborne
+    flights = () if flight is None else flight.flown
     looks = () if inputs.level is None or flight is None else (0.0, *LOOKS)
     before = tuple(inputs_of(recording, vehicle, flight=flight, until=inputs.took_off + s) for s in looks)
     return Recorded(recording.path, time, state, age, row, inside(time, flights), inputs, parts, flights, before)

@@ -70,7 +70,7 @@ def response(recordings: Sequence[Recording], vehicle: Vehicle) -> Response | No
 def _of_one(recording: Recording, vehicle: Vehicle) -> tuple[NDArray, NDArray] | None:
     """(lag, delay) [s] and their covariance by the scatter of one recording."""
     air = airtime(recording)
-    if vehicle.rotor_constant is None or air is None or not air.airborne:
+    if vehicle.rotor_constant is None or air is None or not air.flown:
         return None
     if any(n not in recording.signals for n in ("motor_command", "rotor_speed")):
         return None
@@ -78,8 +78,8 @@ def _of_one(recording: Recording, vehicle: Vehicle) -> tuple[NDArray, NDArray] |
     when, speed = samples(recording, "rotor_speed")
     if when.size < FEWEST or time.size < FEWEST or float(np.median(np.diff(when))) > FASTEST:
         return None
-    begin = max(air.airborne[0][0] + EDGE, when[0] + LATEST)
-    end = min(air.airborne[-1][1] - EDGE, when[-1] - LATEST)
+    begin = max(air.flown[0][0] + EDGE, when[0] + LATEST)
+    end = min(air.flown[-1][1] - EDGE, when[-1] - LATEST)
     inside = (time > begin) & (time < end)
     if inside.sum() < FEWEST:
         return None

@@ -61,7 +61,7 @@ def _beyond(recording: Recording, rotor: int, lag: float) -> NDArray | None:
     time, command = ordered(recording.signals["motor_command"])
     when, speed = ordered(recording.signals["rotor_speed"])
     flying = np.zeros(time.size, bool)
-    for begin, end in air.airborne:
+    for begin, end in air.flown:
         flying |= (time > begin + 0.5) & (time < end - 0.5)
     if time.size < 2 or when.size < 2:
         return None

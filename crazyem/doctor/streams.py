@@ -258,6 +258,7 @@ class Airtime:
         peak: greatest thrust as a share of what the signal can say (duty squared, ...), for "never left the ground".
         climbed: m, range of height; NaN without a position.
         begin, end: s, of what the rotors said.
+        flown: as `airborne`, without bounces before the climb and after the descent: no force of the floor in it.
     """
 
     lifting: Intervals
@@ -267,6 +268,7 @@ class Airtime:
     climbed: float
     begin: float
     end: float
+    flown: Intervals
 
 
 def airtime(recording: Recording) -> Airtime | None:
@@ -290,7 +292,7 @@ def airtime(recording: Recording) -> Airtime | None:
     ground = float(np.percentile(z, 2))
     flags = z > ground + 0.1
     found = _closed(time, flags) if np.ptp(z) > 0.15 else ()
-    return Airtime(found, found, ground, math.nan, float(np.ptp(z)), float(time[0]), float(time[-1]))
+    return Airtime(found, found, ground, math.nan, float(np.ptp(z)), float(time[0]), float(time[-1]), found)
 
 
 def _height(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
@@ -323,23 +325,26 @@ def _from_rotors(
         level = float(np.median(high)) if high.size else peak  # near hover: most of a flight is
         lifting = _closed(time, thrust > 0.3 * level)
     if height is None:
-        return Airtime(lifting, lifting, math.nan, peak, math.nan, float(time[0]), float(time[-1]))
+        return Airtime(lifting, lifting, math.nan, peak, math.nan, float(time[0]), float(time[-1]), lifting)
     when, z = height
     known = (when >= time[0]) & (when <= time[-1] + 0.5)
     resting = known & ~inside(when, tuple((a - 0.1, b + 0.5) for a, b in lifting))
     climbed = float(np.ptp(z))
     if resting.sum() < 5:  # the rotors never rest: the recording does not show the ground
-        return Airtime(lifting, lifting, math.nan, peak, climbed, float(time[0]), float(time[-1]))
+        return Airtime(lifting, lifting, math.nan, peak, climbed, float(time[0]), float(time[-1]), lifting)
     ground = float(np.median(z[resting]))
-    airborne = []
+    airborne: list[tuple[float, float]] = []
+    flown: list[tuple[float, float]] = []
     for start, end in lifting:
         within = np.flatnonzero((when >= start) & (when <= end))
-        rows = within[_off_the_ground(z[within] - ground)]
-        if rows.size:
-            airborne.append((float(when[rows[0]]), float(when[rows[-1]])))
-        elif not ((when >= start) & (when <= end)).any():
+        if not within.size:
             airborne.append((start, end))
-    return Airtime(lifting, tuple(airborne), ground, peak, climbed, float(time[0]), float(time[-1]))
+            flown.append((start, end))
+        for found, up in ((airborne, z[within] - ground > LIFTED), (flown, _off_the_ground(z[within] - ground))):
+            if up.any():
+                found.append((float(when[within[up][0]]), float(when[within[up][-1]])))
+    begin, end = float(time[0]), float(time[-1])
+    return Airtime(lifting, tuple(airborne), ground, peak, climbed, begin, end, tuple(flown))
 
 
 def _off_the_ground(height: NDArray[np.float64]) -> NDArray[np.bool_]:
