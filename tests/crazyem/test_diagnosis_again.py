@@ -1,0 +1,119 @@
+"""Where a diagnosis begins again, goes on, or is less sure.
+
+Torques that turn nothing, names that were exchanged, effects that their own uncertainty would allow to be none, a load
+beside two weak rotors, a day's differences; on flights of `closed_loop.py`.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from closed_loop import DRONE, Hidden, fly
+
+from crazyem.diagnosis import always
+from crazyem.diagnosis import diagnose as diagnosing
+from crazyem.diagnosis.always import COARSE_REASON, TRIM, refine_base
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.diagnose import diagnose
+from crazyem.diagnosis.fit import Data, nominal
+from crazyem.diagnosis.flight import flight_of
+from crazyem.diagnosis.locate import Finding
+from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.named import DOUBTFUL
+from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.select import select
+from crazyem.diagnosis.trials import Selection, Step, Trial
+from crazyem.diagnosis.unexplained import notable
+
+DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
+THRUST = Candidate("thrust_scale", (), ("scale",))
+TRIMMED = replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}})
+
+
+@pytest.fixture(scope="module")
+def slow_to_turn():
+    """Looks as if it were heavier to turn by 1/0.6, and is dragged."""
+    return fly(Hidden(torque=0.6, drag=(0.02, 0.02, 0.02)), seconds=20.0, seed=5)
+
+
+def test_an_inertia_that_no_body_has_leaves_open_what_turns_the_drone(slow_to_turn, monkeypatch):
+    wanted = ("inertia", "linear_drag")
+    found = diagnose([slow_to_turn], DRONE, wanted=wanted)
+    assert {e.name for e in found.effects} == {"inertia", "linear_drag"}
+    assert not found.left_out
+    monkeypatch.setattr(always, "FAR_OUT", 0.1)  # as if the drone were that much smaller than what it needs
+    said = []
+    again = diagnose([slow_to_turn], DRONE, wanted=wanted, say=said.append)
+    assert [e.name for e in again.effects] == ["linear_drag"]
+    assert again.left_out == {"inertia": COARSE_REASON}
+    assert sum("once more without what is fast" in text for text in said) == 1
+    for axis in "xyz":
+        assert again.effects[0].parameters[axis].value == pytest.approx(0.02, abs=0.006)
+
+
+def test_a_selection_goes_on_from_where_another_began():
+    data = Data([flight_of(fly(Hidden(thrust=(0.9,) * 4, drag=(0.02, 0.02, 0.02)), seconds=20.0), DRONE)])
+    point = nominal(data, Point(DRONE, {}, first_guess()))
+    base = refine_base(data, point, ())
+    first = refine_base(data, base.point.with_effects({"thrust_scale": {"scale": 0.95}}), [THRUST])
+    taken = Trial(THRUST, first.loglik - base.loglik, 0.0, 1.0, 1e-9, 100.0, fitted=first)
+    begun = Selection(base.point, first.point, (Step((taken,), taken), Step((), None)), (THRUST,), first, 2)
+    found = select(data, base.point, [THRUST, DRAG], begun=begun)
+    assert [c.effect for c in found.accepted] == ["thrust_scale", "linear_drag"]
+    assert [s.taken.candidate.effect for s in found.steps if s.taken] == ["thrust_scale", "linear_drag"]
+    assert found.nominal is begun.nominal
+    assert found.final.effects["thrust_scale"]["scale"] == pytest.approx(0.9, abs=0.01)
+    assert found.final.effects["linear_drag"]["x"] == pytest.approx(0.02, abs=0.004)
+
+
+def test_after_an_exchange_the_selection_goes_on(slow_to_turn, monkeypatch):
+    """Made to exchange what it found for nothing, it finds it again; where nothing is exchanged, it is not asked."""
+    calls = []
+    real = diagnosing.select
+
+    def counted(*arguments, begun=None, **more):
+        calls.append(begun)
+        return real(*arguments, begun=begun, **more)
+
+    def emptied(data, apart, selection, say):
+        return Selection(selection.nominal, selection.nominal, (), (), refine_base(data, selection.nominal, ()), 1)
+
+    monkeypatch.setattr(diagnosing, "select", counted)
+    assert [e.name for e in diagnose([slow_to_turn], DRONE, wanted=["linear_drag"]).effects] == ["linear_drag"]
+    assert calls == [None]
+    monkeypatch.setattr(diagnosing, "named_again", emptied)
+    assert [e.name for e in diagnose([slow_to_turn], DRONE, wanted=["linear_drag"]).effects] == ["linear_drag"]
+    assert len(calls) == 3
+    assert calls[2].accepted == ()
+
+
+def test_what_may_as_well_be_none_is_not_sure(slow_to_turn, monkeypatch):
+    sure = diagnose([slow_to_turn], DRONE, wanted=["linear_drag", "inertia"])
+    assert min(e.confidence for e in sure.effects) > DOUBTFUL
+    asked = []
+    monkeypatch.setattr(diagnosing, "wald", lambda away, *rest: asked.append(away) or 0.06)
+    unsure = diagnose([slow_to_turn], DRONE, wanted=["linear_drag", "inertia"])
+    assert {e.name for e in unsure.effects} == {e.name for e in sure.effects}
+    assert all(e.confidence <= DOUBTFUL for e in unsure.effects)
+    own = {e.name: np.array([v.value for v in e.parameters.values()]) for e in sure.effects}
+    away = {"linear_drag": own["linear_drag"], "inertia": own["inertia"] - np.array(DRONE.inertia)}
+    for e in sure.effects:  # what is asked is how far it is from neutral
+        assert any(np.allclose(away[e.name], a) for a in asked)
+
+
+@pytest.mark.parametrize(("vehicle", "alike"), [(DRONE, False), (TRIMMED, True)])
+def test_with_a_trim_a_load_is_told_with_two_weak_rotors(vehicle, alike):
+    """A tenth less thrust of the left rotors; a load there explains it, where nothing else is asked."""
+    flown = fly(Hidden(thrust=(1.0, 1.0, 0.85, 0.85)), seconds=10.0)
+    found = diagnose([flown], vehicle, wanted=["payload"])
+    assert [e.name for e in found.effects] == ["payload"]
+    assert found.effects[0].parameters["y"].value > 0.003
+    assert any({"payload", "rotor_fault"} <= set(group) for group in found.indistinguishable) == alike
+
+
+def test_from_day_to_day_forces_differ_by_more():
+    point = Point(DRONE, {}, first_guess())
+    weight = 9.81 * DRONE.mass
+    for share, vehicle, counts in ((0.015, DRONE, True), (0.015, TRIMMED, False), (0.025, TRIMMED, True)):
+        force = Finding("force", "x", "always", "", (0.0, 9.0), share * weight, 1e-4, "N", 60.0, 1e-9)
+        assert notable(force, replace(point, vehicle=vehicle)) == counts
