@@ -1,17 +1,19 @@
-"""What an open-loop prediction learns from the flight before its start: how much of the model's turning to believe, and
-the mean force that the model lacks.
+"""What an open-loop prediction learns from the flight before its start: how much of the model's turning to believe,
+what the loop does besides, and the mean force that the model lacked.
 
 A drone in stabilised flight hardly accelerates: a controller that answers to the air makes the recorded torque cancel
 a torque that no model knows. Over some tenths of a second the model's net torque is therefore mostly error, and a body
 rate that stays as it is the better prediction; in hard manoeuvres the model is. Which of them is a matter of record:
 for every time ahead h and each axis, the change of the rate that came is regressed on the change that the model gave,
-and on h itself (a steady torque that the model lacks),
+on h itself (a steady torque that the model lacks), and on what is known at the start, since torques that no model
+knows come and go with what the drone does, and the loop takes rates, tilts and velocities back to what it wants,
 
-    change that came = weight(h) * change by the model + offset(h) * h,
+    change that came = weight(h) * change by the model + offset(h) * h + feedback(h) . start,
+    start = (angular acceleration that the model lacked in the last step, rate, tilt and velocity across the axis),
 
 over the flight so far, never what comes after a start; what is older than `MEMORY` counts less. While little has been
-seen, weight and offset are drawn towards 1 and 0, the model itself. The force, in body axes, is a battery or a day's
-thrust, which no file knows.
+seen, everything is drawn towards the model itself: weight 1, the rest 0. The force, in body axes, is a battery or a
+day's thrust, which no file knows.
 """
 
 from dataclasses import dataclass
@@ -23,6 +25,7 @@ from scipy.signal import lfilter
 LAGS = 10  # of them up to the horizon
 MEMORY = 10.0  # s
 WEIGHT_SD, OFFSET_SD = 1.0, 2.0  # 1, rad/s^2: before anything was seen
+FEEDBACK_SD = (1.0, 2.0, 10.0, 2.0)  # 1/s, 1/s, rad/s^2 per rad and per m/s: times h, of what is known at the start
 FORCE_SD, CORRELATED = 0.5, 0.1  # m/s^2 before anything was seen; s within which one moment is as wrong as the next
 MOST = 2.0  # weight; of a model that is right it is 1
 LEAST_TIME = 2.0  # s of flight before anything is said
@@ -67,6 +70,7 @@ class Turned:
         time: (r,) s, increasing.
         rate: (r, 3) rad/s, recorded.
         gained: (r, 3) rad/s, what the model adds from a row to the next one, beginning with the recorded row.
+        start: (r, 3, f) what is known at a row for each axis, see above; f as `FEEDBACK_SD`.
         flying: (r,) bool: the step from a row to the next one counts.
         lacking: (r,) m/s^2, specific force that the model lacked in that step, body axes (r, 3).
     """
@@ -74,6 +78,7 @@ class Turned:
     time: NDArray
     rate: NDArray
     gained: NDArray
+    start: NDArray
     flying: NDArray
     lacking: NDArray
 
@@ -82,10 +87,11 @@ class Turned:
         """Median time between rows [s]."""
         return float(np.median(np.diff(self.time)))
 
-    def changes(self, lag: float) -> tuple[NDArray, NDArray, NDArray]:
-        """End times (k,) s, changes that the model gave and that came (k, 3) rad/s, over `lag` s, in order."""
+    def changes(self, lag: float) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """End times (k,) s, changes that the model gave and that came (k, 3) rad/s, over `lag` s, in order; and the
+        rows (k,) that they begin at."""
         seen = np.isfinite(self.rate).all(1)
-        sound = self.flying & seen & np.isfinite(self.gained).all(1)
+        sound = self.flying & seen & np.isfinite(self.gained).all(1) & np.isfinite(self.start).all((1, 2))
         steps = np.where(sound[:, None], self.gained, 0.0)
         model = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)[:-1]])
         broken = np.concatenate([[0], np.cumsum(~sound)[:-1]])
@@ -93,43 +99,50 @@ class Turned:
         rows = np.flatnonzero(end < self.time.size)
         rows = rows[(broken[end[rows]] == broken[rows]) & sound[rows] & seen[end[rows]]]
         last = end[rows]
-        return self.time[last], model[last] - model[rows], self.rate[last] - self.rate[rows]
+        return self.time[last], model[last] - model[rows], self.rate[last] - self.rate[rows], rows
 
 
 def earned(turned: Turned, starts: NDArray, *, horizon: float) -> Weights:
     """The weights of starts (n,) s by the flight before them, for times ahead up to `horizon` s."""
     lags = np.linspace(0.0, horizon, LAGS + 1)
     weight, added = np.ones((starts.size, lags.size, 3)), np.zeros((starts.size, lags.size, 3))
-    for k, lag in enumerate(lags[1:], 1):
-        ends, x, y = turned.changes(float(lag))
+    here = turned.start[np.maximum(np.searchsorted(turned.time, starts + 1e-9, "right") - 1, 0)]
+    for k, lag in enumerate(map(float, lags[1:]), 1):
+        ends, x, y, rows = turned.changes(lag)
         at = np.searchsorted(ends, starts, "right") - 1
         known = (at + 1) * turned.period > LEAST_TIME
         if not known.any():
             continue
+        sd = np.array([WEIGHT_SD, OFFSET_SD * lag, *(s * lag for s in FEEDBACK_SD)])
         for axis in range(3):
-            found = regressed(x[:, axis], y[:, axis], float(lag), turned.period)[at[known]]
+            explaining = np.column_stack([x[:, axis], np.ones(rows.size), turned.start[rows, axis]])
+            found = regressed(explaining, y[:, axis], sd, max(1.0, lag / turned.period), turned.period)[at[known]]
             weight[known, k, axis] = np.clip(found[:, 0], 0.0, MOST)
-            added[known, k, axis] = found[:, 1] * lag
+            added[known, k, axis] = found[:, 1] + np.einsum("nf,nf->n", found[:, 2:], here[known, axis])
     weight[:, 0] = weight[:, 1]
     return Weights(lags, weight, added, lacked(turned, starts))
 
 
-def regressed(x: NDArray, y: NDArray, lag: float, period: float) -> NDArray:
-    """(k, 2) weight and offset [rad/s^2] by the changes x, y (k,) up to each of them, with the priors above."""
-    forget = np.exp(-period / MEMORY)
-    rows = np.stack([x, np.full(x.size, lag)], 1)
-    products = [rows[:, i] * rows[:, j] for i, j in ((0, 0), (0, 1), (1, 1))]
-    wanted = [rows[:, 0] * y, rows[:, 1] * y, y * y, np.ones(x.size)]
-    sums = lfilter([1.0], [1.0, -forget], np.stack(products + wanted, 1), axis=0)
-    a = sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-    b, yy, count = sums[:, 3:5], sums[:, 5], sums[:, 6]
-    small = 1e-9 * np.eye(2) * np.maximum(np.trace(a, axis1=1, axis2=2), 1e-12)[:, None, None]
-    free = np.linalg.solve(a + small, b[:, :, None])[:, :, 0]
+def regressed(x: NDArray, y: NDArray, sd: NDArray, alike: float, period: float) -> NDArray:
+    """(k, c) coefficients of y (k,) on the columns of x (k, c) up to each row, drawn towards 1, 0, 0 ... by priors of
+    these standard deviations (c,). Each `alike` rows, one every `period` s, say the same."""
+    forget, c = np.exp(-period / MEMORY), x.shape[1]
+    i, j = np.triu_indices(c)
+    sums = lfilter(
+        [1.0], [1.0, -forget], np.column_stack([x[:, i] * x[:, j], x * y[:, None], y * y, np.ones_like(y)]), axis=0
+    )
+    a = np.empty((y.size, c, c))
+    a[:, i, j] = a[:, j, i] = sums[:, : i.size]
+    b, yy, count = sums[:, i.size : i.size + c], sums[:, -2], sums[:, -1]
+    size = np.sqrt(np.maximum(np.einsum("kii->ki", a), 1e-12))
+    a, b = a / (size[:, :, None] * size[:, None, :]), b / size
+    free = np.linalg.solve(a + 1e-9 * np.eye(c), b[:, :, None])[:, :, 0]
     missed = np.maximum(yy - np.einsum("ki,ki->k", free, b), 1e-12) / count  # variance
-    noise = missed * max(1.0, lag / period)  # windows that overlap say the same
-    prior = np.diag([WEIGHT_SD**-2, OFFSET_SD**-2])
-    information = a / noise[:, None, None] + prior
-    solved: NDArray = np.linalg.solve(information, (b / noise[:, None] + prior @ [1.0, 0.0])[:, :, None])[:, :, 0]
+    noise = (missed * alike)[:, None]  # windows that overlap say the same
+    prior = (size * sd) ** -2.0
+    middle = np.concatenate([prior[:, :1] * size[:, :1], np.zeros((y.size, c - 1))], axis=1)
+    information = a / noise[:, :, None] + prior[:, :, None] * np.eye(c)
+    solved: NDArray = np.linalg.solve(information, (b / noise + middle)[:, :, None])[:, :, 0] / size
     return solved
 
 

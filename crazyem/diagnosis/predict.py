@@ -243,7 +243,20 @@ def turned_by(shown: Recorded) -> Turned:
         missed = (shown.state[part + 1, 3:6] - ahead[:, 0, 3:6]) / np.diff(grid)
         lacking[part] = np.einsum("nji,nj->ni", rotation_matrix(shown.state[part, 6:10]), missed)
     flying[rows] = True
-    return Turned(shown.time, shown.state[:, 10:13], gained, flying, lacking)
+    return Turned(shown.time, shown.state[:, 10:13], gained, _at_start(shown, gained, flying), flying, lacking)
+
+
+def _at_start(shown: Recorded, gained: NDArray, flying: NDArray) -> NDArray:
+    """(r, 3, 4) what is known at every row, by axis: the angular acceleration that the model lacked in the step that
+    ends there, the rate, and how far the body leans and how fast it moves across the axis (about z: 0)."""
+    rotation = rotation_matrix(shown.state[:, 6:10])
+    rate, velocity = shown.state[:, 10:13], np.einsum("nji,nj->ni", rotation, shown.state[:, 3:6])
+    up = rotation[:, 2]
+    across = [np.column_stack([v[:, 1], -v[:, 0], np.zeros(len(v))]) for v in (up, velocity)]
+    lacked = np.zeros_like(rate)
+    step = np.diff(shown.time)[:, None]
+    lacked[1:] = np.where(flying[:-1, None], (np.diff(rate, axis=0) - gained[:-1]) / step, 0.0)
+    return np.stack([lacked, rate, *across], axis=2)
 
 
 def start_rows(shown: Recorded, rows: NDArray, *, horizon: int, step: float | None) -> NDArray:

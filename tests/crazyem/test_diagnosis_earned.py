@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from crazyem.cli import main
 from crazyem.diagnosis.earned import (
+    FEEDBACK_SD,
     LEAST_TIME,
     MEMORY,
-    OFFSET_SD,
-    WEIGHT_SD,
     Turned,
     Weights,
     earned,
@@ -32,7 +31,8 @@ def flight(seed: int, *, seconds: float, weight: float, offset: float, error: fl
     gained = acceleration * STEP
     rate = np.concatenate([np.zeros((1, 3)), np.cumsum(weight * gained + offset * STEP, axis=0)[:-1]])
     shown = rate + error * draw.standard_normal(rate.shape)
-    return Turned(time, shown, gained, np.ones(time.size, bool), np.zeros((time.size, 3)))
+    start = np.zeros((time.size, 3, len(FEEDBACK_SD)))  # nothing else is known
+    return Turned(time, shown, gained, start, np.ones(time.size, bool), np.zeros((time.size, 3)))
 
 
 def test_weight_and_offset_are_found_by_the_past() -> None:
@@ -54,11 +54,13 @@ def test_a_model_that_is_right_is_believed() -> None:
 @given(st.integers(0, 1000), st.floats(3.0, 9.0))
 def test_nothing_after_a_start_counts(seed: int, start: float) -> None:
     turned = flight(seed, seconds=10.0, weight=0.5, offset=0.0, error=0.1)
+    turned = replace(turned, start=np.random.default_rng(seed).standard_normal(turned.start.shape))
     after = turned.time > start + 1e-9
     changed = Turned(
         turned.time,
         np.where(after[:, None], 7.0 * turned.rate + 3.0, turned.rate),
         np.where(after[:, None], -turned.gained, turned.gained),
+        np.where(after[:, None, None], 2.0 - turned.start, turned.start),
         turned.flying & ~(turned.time > start + 0.3),
         np.where((turned.time > start - STEP / 2)[:, None], 5.0, turned.lacking),
     )
@@ -70,18 +72,37 @@ def test_nothing_after_a_start_counts(seed: int, start: float) -> None:
 
 def test_the_running_sums_are_those_of_a_plain_loop() -> None:
     draw = np.random.default_rng(5)
-    x, lag = draw.standard_normal(400), 0.2
-    y = 0.3 * x + 0.1 + 0.2 * draw.standard_normal(400)
-    found = regressed(x, y, lag, STEP)
+    x, alike = draw.standard_normal((400, 3)) * [1.0, 30.0, 1e-3], 20.0
+    y = 0.3 * x[:, 0] + 0.1 * x[:, 1] + 0.2 * draw.standard_normal(400)
+    sd = np.array([1.0, 0.3, 5.0])
+    found = regressed(x, y, sd, alike, STEP)
     for k in (250, 399):
-        age = np.exp(-(k - np.arange(k + 1)) * STEP / MEMORY)
-        rows = np.stack([x[: k + 1], np.full(k + 1, lag)], 1)
+        age, rows = np.exp(-(k - np.arange(k + 1)) * STEP / MEMORY), x[: k + 1]
         a, b = (rows * age[:, None]).T @ rows, (rows * age[:, None]).T @ y[: k + 1]
         rest = y[: k + 1] - rows @ np.linalg.solve(a, b)
-        noise = (age * rest**2).sum() / age.sum() * (lag / STEP)
-        prior = np.diag([WEIGHT_SD**-2, OFFSET_SD**-2])
-        wanted = np.linalg.solve(a / noise + prior, b / noise + prior @ np.array([1.0, 0.0]))
+        noise = (age * rest**2).sum() / age.sum() * alike
+        prior = np.diag(sd**-2.0)
+        wanted = np.linalg.solve(a / noise + prior, b / noise + prior @ np.array([1.0, 0.0, 0.0]))
         assert found[k] == pytest.approx(wanted, rel=1e-6)
+
+
+def test_a_loop_that_takes_rates_back_is_learned() -> None:
+    """Rates fall back by themselves with 0.2 s, shaken by a noise, and the model knows of no torque at all."""
+    draw = np.random.default_rng(6)
+    time, rate = np.arange(0.0, 40.0, STEP), np.zeros((4000, 3))
+    for k in range(1, time.size):
+        rate[k] = rate[k - 1] * np.exp(-STEP / 0.2) + 0.1 * draw.standard_normal(3)
+    start = np.zeros((time.size, 3, len(FEEDBACK_SD)))
+    start[:, :, 1] = rate
+    nothing, flying = np.zeros((time.size, 3)), np.ones(time.size, bool)
+    turned = Turned(time, rate, nothing, start, flying, nothing)
+    rows = np.arange(2000, 3900)
+    found = earned(turned, time[rows], horizon=0.5)
+    for lag, k in ((0.1, 2), (0.5, 10)):
+        came = rate[rows + round(lag / STEP)] - rate[rows]
+        best = (np.exp(-lag / 0.2) - 1.0) * rate[rows]  # what can be known
+        left, least = (np.mean((came - guess) ** 2) for guess in (found.added[:, k], best))
+        assert left < least + 0.15 * (np.mean(came**2) - least)
 
 
 def test_gaps_and_missing_rates_are_left_out() -> None:
