@@ -19,6 +19,7 @@ from crazyem.vehicle import GRAVITY
 # disturbing specific force. Torques with memory alone are what most flights need, so they come first.
 STATES = 18
 MEASURED = 12
+TOGETHER = 6  # measurements whose products are added at once: the sums are read and written once for all of them
 
 
 @compiled
@@ -67,6 +68,16 @@ def _transition(dt, decay, turned, rate_turn, middle, specific, jr, x, out):
 
 
 @compiled
+def _add_products(z, total):
+    """total += z' z for z (TOGETHER, m); the upper triangle."""
+    for j in range(z.shape[1]):
+        a, b, c, d, e, f = z[0, j], z[1, j], z[2, j], z[3, j], z[4, j], z[5, j]
+        if a != 0.0 or b != 0.0 or c != 0.0 or d != 0.0 or e != 0.0 or f != 0.0:
+            for i in range(j, z.shape[1]):
+                total[j, i] += a * z[0, i] + b * z[1, i] + c * z[2, i] + d * z[3, i] + e * z[4, i] + f * z[5, i]
+
+
+@compiled
 def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, disturbance, memory, p0, block,
           xp, xf, e, s, loglik, score, information):  # fmt: skip
     """One pass; returns the log-likelihood.
@@ -106,6 +117,7 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
     sens = np.zeros((size, m))
     new = np.empty((size, m))
     z = np.empty(m)
+    shown = np.empty((TOGETHER, m))
     quat = np.empty(4)
     turn = np.empty((3, 3))
     start = np.empty((3, 3))
@@ -251,6 +263,7 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
         for i in range(18):
             correction[i] = 0.0
         ll = 0.0
+        seen = 0
         bl = block[k]
         for i in range(12):
             if np.isnan(innov[i]):
@@ -280,14 +293,18 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
                     if g != 0.0:
                         for j in range(m):
                             sens[i2, j] -= g * z[j]
-                weight = err * inv
+                weight, root = err * inv, np.sqrt(inv)
                 for j in range(m):
                     score[bl, j] += weight * z[j]
-                    zj = z[j] * inv
-                    if zj != 0.0:
-                        for j2 in range(j, m):
-                            information[bl, j, j2] += zj * z[j2]
+                    shown[seen, j] = root * z[j]
+                seen += 1
+                if seen == TOGETHER:
+                    _add_products(shown, information[bl])
+                    seen = 0
             ll -= 0.5 * (np.log(2 * np.pi * var) + err * err * inv)
+        if seen:
+            shown[seen:] = 0.0
+            _add_products(shown, information[bl])
         loglik[k] = ll
         total += ll
         for i in range(6):

@@ -15,6 +15,7 @@ from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.flight import Flight
 from crazyem.diagnosis.gram import bounded
 from crazyem.diagnosis.model import Column, Model, Point
+from crazyem.diagnosis.workers import Workers
 from crazyem.physics.rotations import rotation_matrix
 
 AXES = ("x", "y", "z")
@@ -129,7 +130,7 @@ def locate(data: Data, point: Point) -> Located:
     disturbances = []
     whiteness: dict[str, list[float]] = {}
     for model in data.models:
-        found, disturbance, white = _one(model, point)
+        found, disturbance, white = _one(model, point, data.workers)
         findings += found
         disturbances.append(disturbance)
         for name, p in white.items():
@@ -141,7 +142,7 @@ def locate(data: Data, point: Point) -> Located:
     )
 
 
-def _one(model: Model, point: Point) -> tuple[list[Finding], Disturbance, dict[str, float]]:
+def _one(model: Model, point: Point, workers: Workers) -> tuple[list[Finding], Disturbance, dict[str, float]]:
     flight = model.flight
     unit = np.concatenate([units_of(point), np.ones(9)])
     constant = [*axis_columns(flight), *shown_columns(flight)[:6]]
@@ -160,8 +161,11 @@ def _one(model: Model, point: Point) -> tuple[list[Finding], Disturbance, dict[s
         findings += _constant_and_change(i, b[:, i], a[:, i], dispersion[i], flight, times, unit[i])
     path = model.shown if model.shown is not None else swept.filtered
     thrust = model.thrusts(point.vehicle, point.effects)[0]
-    for name, (values, regime_unit) in regimes(flight, path, thrust).items():
-        findings += _by_regime(model, point, name, values, regime_unit, unit)
+    for found in workers.map(
+        lambda regime: _by_regime(model.twin(), point, regime[0], *regime[1], unit),
+        regimes(flight, path, thrust).items(),
+    ):
+        findings += found
     return findings, disturbance, _whiteness(swept.innovation, swept.variance)
 
 

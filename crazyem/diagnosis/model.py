@@ -171,7 +171,8 @@ class Model:
     shown: NDArray | None = None  # (n, 19) filtered, at the rows
     moved: NDArray | None = None  # (n, 6) accelerations of that path, with what the model lacks
     _thrusts: dict[str, tuple[NDArray, NDArray]] = field(default_factory=dict)
-    _rotation: NDArray | None = None
+    _rotation: NDArray | None = None  # of the path
+    _rotation_shown: NDArray | None = None
     _felt_alone: bool | None = None
     _vibration: NDArray | None = None
 
@@ -211,8 +212,11 @@ class Model:
         if not any(_shows(name) for name in effects):
             return np.zeros((self.flight.time.size, 12))
         path = initial_path(self.flight) if self.shown is None else self.shown
+        if self._rotation_shown is None:
+            self._rotation_shown = rotation_matrix(path[:, 6:10])
+        thrusts = self.thrusts(point.vehicle, {})
         situation = replace(
-            situation_of(self.flight, path, point.vehicle, self.thrusts(point.vehicle, {})),
+            situation_of(self.flight, path, point.vehicle, thrusts, self._rotation_shown),
             specific_force=accelerations[:, :3], angular_acceleration=accelerations[:, 3:],
         )  # fmt: skip
         return measured(situation, vehicle=point.vehicle, effects=effects).state
@@ -237,7 +241,7 @@ class Model:
             swept = self._felt(swept, acceleration, acting)
         if order is not None:
             swept = replace(swept, score=swept.score[:, order], information=swept.information[:, order][:, :, order])
-        self._rotation = None
+        self._rotation = self._rotation_shown = None
         if not np.isfinite(swept.filtered).all():  # a model that left the range of numbers must not spoil the next one
             self.path = self.shown = self.moved = None
             return swept

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Body, Effect, Effects, Offset, Situation
 from crazyem.physics.lag import CAUSAL, HOLD, LINEAR, fit_predictor, hold_predictor, lagged_means
+from crazyem.physics.rotations import cross
 from crazyem.physics.rotors import wrench
 from crazyem.vehicle import GRAVITY, Vehicle
 
@@ -171,11 +172,11 @@ def accelerated(force: NDArray, torque: NDArray, *, body: Body, body_rate: NDArr
     centre = body.centre
     shifted = bool(centre.any())
     if shifted:
-        torque = torque - np.cross(centre, force)
-    angular = (torque - np.cross(body_rate, body_rate @ body.inertia)) @ np.linalg.inv(body.inertia)
+        torque = torque - cross(centre, force)
+    angular = (torque - cross(body_rate, body_rate @ body.inertia)) @ np.linalg.inv(body.inertia)
     specific = force / body.mass
     if shifted:
-        specific = specific - np.cross(angular, centre) - np.cross(body_rate, np.cross(body_rate, centre))
+        specific = specific - cross(angular, centre) - cross(body_rate, cross(body_rate, centre))
     return Motion(specific, angular)
 
 
