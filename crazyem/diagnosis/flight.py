@@ -16,7 +16,9 @@ from crazyem.vehicle import GRAVITY, Vehicle
 
 SAME_NODE = 1.5e-3  # s: measurements closer than this belong to one node
 MAX_GAP = 0.1  # s between nodes, or between inputs, beyond which a step cannot be trusted
-BLOCK = 1.0  # s: unit of resampling and held-out blocks
+# s: unit of resampling and held-out blocks; shorter in a short flight, so that there are `BLOCKS` of them: scatter of
+# ten tells too little of itself where some ten things are always free. Scores hang together for tenths of a second.
+BLOCK, SHORT, BLOCKS = 1.0, 0.5, 20
 NEAR = 0.03  # s between samples of the accelerometer, at most, for a value between them
 SHORTEST = 4.0  # s of flight below which nothing is said
 PIECE = 60.0  # s after which the filter starts anew, so that long flights are swept in pieces
@@ -47,7 +49,7 @@ class Flight:
         voltage: (n,) V; NaN where unknown.
         flown: (n,) s since the feet left the floor.
         ground: height of the floor [m] in the frame of the position.
-        block: (n,) int: consecutive stretches of about a second.
+        block: (n,) int: consecutive stretches of about a second, of half a second in short flights.
         inputs: what the rotors were told.
         signals: names of what is measured.
         attitude: (n, 4) all that was logged, where an onboard filter made it, of which `y` has one in `APART` seconds
@@ -266,5 +268,6 @@ def _starts(time: NDArray, gaps: NDArray) -> NDArray:
 
 
 def _blocks(time: NDArray) -> NDArray:
-    index = np.floor((time - time[0]) / BLOCK).astype(np.int64)
+    since = time - time[0]
+    index = np.floor(since / min(BLOCK, max(SHORT, float(since[-1]) / BLOCKS))).astype(np.int64)
     return np.unique(index, return_inverse=True)[1].astype(np.int64)

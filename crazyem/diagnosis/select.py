@@ -45,7 +45,7 @@ from crazyem.diagnosis.trials import (
 
 SHORTLIST = 6
 WORTH, ANYWAY = 0.15, 3  # share of the largest linear gain from which a candidate is fitted, and how many are anyway
-MOST = 4  # effects
+MOST = 6  # effects: real drones differ from a file in more than one thing
 NEARLY, MOST_COMPARED = 0.8, 3  # share of the best's gain from which, and how many, explanations get noise of their own
 BESIDE = 0.5  # share of its gain that an effect keeps beside another which it is no other name for
 # Angular acceleration is torque over inertia: where the one is fitted, so is the other, to be told apart or not; both

@@ -131,6 +131,14 @@ def test_nothing_hidden_is_nothing_found(seed: int) -> None:
     assert document["where"] == []
 
 
+@pytest.mark.parametrize("seed", [0, 2])
+def test_ten_seconds_are_enough_for_what_is_plain(seed: int) -> None:
+    """Ten blocks of a second told too little of their own scatter, and everything was left out again."""
+    found = diagnose([fly(Hidden(thrust=(0.9,) * 4, drag=(0.02, 0.02, 0.02)), seed=seed, seconds=10.0)], DRONE)
+    assert {"thrust_scale", "linear_drag"} <= {*first(found), *(e.name for e in found.effects)}
+    assert not diagnose([fly(seed=seed, seconds=10.0)], DRONE).mismatch
+
+
 @pytest.mark.slow
 def test_weak_thrust_is_named_or_declared_alike() -> None:
     """A payload of the right place and size is nearly the same thing."""
