@@ -247,6 +247,8 @@ def _named(
             group = tuple(dict.fromkeys([candidate.effect, *(t.candidate.effect for t in alike), *equal]))
             groups.append(group)
             separate += [CATALOGUE[n].separates for n in group if CATALOGUE[n].separates]
+        elif candidate.effect == "thrust_scale":
+            separate.append(HEAVIER.format(1.0 / values["scale"]))
     order = sorted(range(len(named)), key=lambda i: -_evidence(selection, i))
     return tuple(named[i] for i in order), tuple(groups), tuple(dict.fromkeys(separate))
 
@@ -259,6 +261,8 @@ def _evidence(selection: Selection, i: int) -> float:
 
 WITHIN = 0.05  # p-value from which an effect's own uncertainty holds that there is none of it
 SHAKES = "hold the drone with its rotors turning: what shakes then is not the loop that swings with a wrong model"
+# Exactly the same to every signal, but two things at once: more mass, and inertias to match.
+HEAVIER = "weigh the drone: with {:.3g} times its mass and its inertias it would fly the same"
 TELLING = 3.0  # nats by which a witness tells two effects apart
 MEASURED_LATE = "measurement_delay"
 WEAK_OR_MISREAD = ("rotor_fault", "rotor_sensor")

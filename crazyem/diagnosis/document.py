@@ -200,7 +200,8 @@ def text_of(document: Mapping[str, Any]) -> str:
                 lines.append(f"    {name:16s} {p['value']}")
     for group in document["indistinguishable"]:
         lines.append(f"  cannot be told apart: {', '.join(group)}")
-    lines += [f"    would separate them: {text}" for text in document["would_separate"]]
+    words = "would separate them" if document["indistinguishable"] else "would tell more"
+    lines += [f"    {words}: {text}" for text in document["would_separate"]]
     if document["unexplained"]["found"]:
         for f in document["unexplained"]["where"][:4]:
             size = f"{_short(f['effect_size'], '+.3g')} {f['unit']}"

@@ -116,22 +116,21 @@ def earned(turned: Turned, starts: NDArray, *, horizon: float) -> Weights:
         sd = np.array([WEIGHT_SD, OFFSET_SD * lag, *(s * lag for s in FEEDBACK_SD)])
         for axis in range(3):
             explaining = np.column_stack([x[:, axis], np.ones(rows.size), turned.start[rows, axis]])
-            found = regressed(explaining, y[:, axis], sd, max(1.0, lag / turned.period), turned.period)[at[known]]
+            found = regressed(explaining, y[:, axis], sd, max(1.0, lag / turned.period), turned.period, at[known])
             weight[known, k, axis] = np.clip(found[:, 0], 0.0, MOST)
             added[known, k, axis] = found[:, 1] + np.einsum("nf,nf->n", found[:, 2:], here[known, axis])
     weight[:, 0] = weight[:, 1]
     return Weights(lags, weight, added, lacked(turned, starts))
 
 
-def regressed(x: NDArray, y: NDArray, sd: NDArray, alike: float, period: float) -> NDArray:
-    """(k, c) coefficients of y (k,) on the columns of x (k, c) up to each row, drawn towards 1, 0, 0 ... by priors of
-    these standard deviations (c,). Each `alike` rows, one every `period` s, say the same."""
+def regressed(x: NDArray, y: NDArray, sd: NDArray, alike: float, period: float, at: NDArray) -> NDArray:
+    """(n, c) coefficients of y (k,) on the columns of x (k, c) up to each of the rows `at` (n,), drawn towards
+    1, 0, 0 ... by priors of these standard deviations (c,). Each `alike` rows, one every `period` s, say the same."""
     forget, c = np.exp(-period / MEMORY), x.shape[1]
     i, j = np.triu_indices(c)
-    sums = lfilter(
-        [1.0], [1.0, -forget], np.column_stack([x[:, i] * x[:, j], x * y[:, None], y * y, np.ones_like(y)]), axis=0
-    )
-    a = np.empty((y.size, c, c))
+    products = np.column_stack([x[:, i] * x[:, j], x * y[:, None], y * y, np.ones_like(y)])
+    sums = lfilter([1.0], [1.0, -forget], products, axis=0)[at]
+    a = np.empty((at.size, c, c))
     a[:, i, j] = a[:, j, i] = sums[:, : i.size]
     b, yy, count = sums[:, i.size : i.size + c], sums[:, -2], sums[:, -1]
     size = np.sqrt(np.maximum(np.einsum("kii->ki", a), 1e-12))
@@ -140,7 +139,7 @@ def regressed(x: NDArray, y: NDArray, sd: NDArray, alike: float, period: float) 
     missed = np.maximum(yy - np.einsum("ki,ki->k", free, b), 1e-12) / count  # variance
     noise = (missed * alike)[:, None]  # windows that overlap say the same
     prior = (size * sd) ** -2.0
-    middle = np.concatenate([prior[:, :1] * size[:, :1], np.zeros((y.size, c - 1))], axis=1)
+    middle = np.concatenate([prior[:, :1] * size[:, :1], np.zeros((at.size, c - 1))], axis=1)
     information = a / noise[:, :, None] + prior[:, :, None] * np.eye(c)
     solved: NDArray = np.linalg.solve(information, (b / noise + middle)[:, :, None])[:, :, 0] / size
     return solved

@@ -75,15 +75,16 @@ def test_the_running_sums_are_those_of_a_plain_loop() -> None:
     x, alike = draw.standard_normal((400, 3)) * [1.0, 30.0, 1e-3], 20.0
     y = 0.3 * x[:, 0] + 0.1 * x[:, 1] + 0.2 * draw.standard_normal(400)
     sd = np.array([1.0, 0.3, 5.0])
-    found = regressed(x, y, sd, alike, STEP)
-    for k in (250, 399):
+    last = (250, 399)
+    found = regressed(x, y, sd, alike, STEP, np.array(last))
+    for row, k in zip(found, last, strict=True):
         age, rows = np.exp(-(k - np.arange(k + 1)) * STEP / MEMORY), x[: k + 1]
         a, b = (rows * age[:, None]).T @ rows, (rows * age[:, None]).T @ y[: k + 1]
         rest = y[: k + 1] - rows @ np.linalg.solve(a, b)
         noise = (age * rest**2).sum() / age.sum() * alike
         prior = np.diag(sd**-2.0)
         wanted = np.linalg.solve(a / noise + prior, b / noise + prior @ np.array([1.0, 0.0, 0.0]))
-        assert found[k] == pytest.approx(wanted, rel=1e-6)
+        assert row == pytest.approx(wanted, rel=1e-6)
 
 
 def test_a_loop_that_takes_rates_back_is_learned() -> None:

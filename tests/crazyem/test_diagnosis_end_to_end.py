@@ -136,6 +136,7 @@ def test_ten_seconds_are_enough_for_what_is_plain(seed: int) -> None:
     """Ten blocks of a second told too little of their own scatter, and everything was left out again."""
     found = diagnose([fly(Hidden(thrust=(0.9,) * 4, drag=(0.02, 0.02, 0.02)), seed=seed, seconds=10.0)], DRONE)
     assert {"thrust_scale", "linear_drag"} <= {*first(found), *(e.name for e in found.effects)}
+    assert any("weigh the drone" in text for text in found.would_separate)
     assert not diagnose([fly(seed=seed, seconds=10.0)], DRONE).mismatch
 
 

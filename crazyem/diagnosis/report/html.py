@@ -226,7 +226,7 @@ def _groups(document: Document) -> str:
     separate = document.get("would_separate")
     out = _list(items, kind="warn")
     if separate:
-        out += "<h3>What would tell them apart</h3>" + _list(separate)
+        out += f"<h3>What would tell {'them apart' if items else 'more'}</h3>" + _list(separate)
     return out
 
 
