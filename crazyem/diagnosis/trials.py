@@ -25,6 +25,7 @@ LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "motor_lag": 7.5e-3, "v
          "attitude_misalignment": 2e-3, "gyro_bias": 3e-3, "torque_scale": 0.08, "thrust_curve": 0.06,
          "velocity_moment": 3e-6}  # fmt: skip
 VELOCITY_LEAST = 2.0  # times what the jitter of an onboard estimate looks like
+STEEP = 3.0  # vertical over horizontal wind
 LEAST_INERTIA = 0.08  # relative, the same
 LEAST_LOAD = 0.005  # of the drone's mass, the same
 LEAST_DRAG = {"x": 1e-3, "y": 1e-3, "z": 3e-3}  # N s/m or N s^2/m^2; along z thrust is a little wrong (see SYSTEMATIC)
@@ -216,8 +217,11 @@ def matters(point: Point, candidate: Candidate, data: Data | None = None) -> boo
     by_axis = {"center_of_mass": LEAST_CENTRE, "linear_drag": LEAST_DRAG, "quadratic_drag": LEAST_DRAG}
     if candidate.effect in by_axis:
         return any(abs(here[n] - neutral[n]) > by_axis[candidate.effect][n] for n in candidate.free)
-    if candidate.effect == "wind":  # what only rises or sinks is thrust that is a little wrong
-        return float(np.hypot(here["x"], here["y"])) > usual_wind(point.vehicle)
+    if (
+        candidate.effect == "wind"
+    ):  # what rises or sinks is thrust that is a little wrong: no air blows through the floor
+        along = float(np.hypot(here["x"], here["y"]))
+        return along > usual_wind(point.vehicle) and abs(here["z"]) < STEEP * along
     if candidate.effect in ("payload", "suspended_load"):
         return bool(here["mass"] > LEAST_LOAD * point.vehicle.mass)
     if candidate.effect == "inertia":

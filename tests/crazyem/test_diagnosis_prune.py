@@ -156,7 +156,8 @@ def test_wind_that_only_sinks_is_thrust_that_is_a_little_wrong():
     wind = Candidate("wind", (), ("x", "y", "z"))
     trimmed = replace(DRONE, effects={"trim": dict.fromkeys("xyz", 0.0)})
     for vehicle, values, counts in (
-        (DRONE, (0.05, 0.05, 3.0), False), (DRONE, (0.2, 0.0, 0.0), True), (trimmed, (0.2, 0.0, 0.0), False),
+        (DRONE, (0.05, 0.05, 3.0), False), (DRONE, (0.2, 0.0, 0.0), True),
+        (DRONE, (-0.11, 0.03, 1.7), False), (DRONE, (1.0, 1.0, 1.7), True), (trimmed, (0.2, 0.0, 0.0), False),
         (trimmed, (0.9, 0.9, 0.0), True),
     ):  # fmt: skip
         point = Point(vehicle, {"wind": dict(zip("xyz", values, strict=True))}, first_guess())

@@ -28,6 +28,7 @@ WIND = Effect(
     order=64,
     air=blowing,
     external=pushing,
+    needs=("velocity", "position"),  # a force that goes on moves the drone; an accelerometer alone is only tilted by it
     separates="hover for 5 s at each of four headings: wind stays in the world, a tilted frame turns with the drone",
 )
 
