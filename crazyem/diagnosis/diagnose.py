@@ -219,7 +219,9 @@ def _named(
         taken = step.taken
         assert taken is not None
         others = {candidate.effect, *step.beside}
-        rivals = [t for t in step.trials if t.p_value < SURE and t.candidate.effect not in others]
+        # what is not told apart from it is a rival, however unsure alone: its own size was fitted as small as it may be
+        rivals = [t for t in step.trials if t.p_value < SURE or any(t is a for a in step.alike)]
+        rivals = [t for t in rivals if t.candidate.effect not in others]
         if candidate.effect in told:
             rivals = [t for t in rivals if t.candidate.effect not in told]
         alike = [t for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}]
