@@ -26,6 +26,7 @@ LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "motor_lag": 7.5e-3, "v
          "velocity_moment": 3e-6}  # fmt: skip
 VELOCITY_LEAST = 2.0  # times what the jitter of an onboard estimate looks like
 STEEP = 3.0  # vertical over horizontal wind
+HIGHEST = 1.0  # m: a floor is felt by some rotor radii, Crazyflies have 23 to 28 mm
 LEAST_INERTIA = 0.08  # relative, the same
 LEAST_LOAD = 0.005  # of the drone's mass, the same
 LEAST_DRAG = {"x": 1e-3, "y": 1e-3, "z": 3e-3}  # N s/m or N s^2/m^2; along z thrust is a little wrong (see SYSTEMATIC)
@@ -222,6 +223,8 @@ def matters(point: Point, candidate: Candidate, data: Data | None = None) -> boo
     ):  # what rises or sinks is thrust that is a little wrong: no air blows through the floor
         along = float(np.hypot(here["x"], here["y"]))
         return along > usual_wind(point.vehicle) and abs(here["z"]) < STEEP * along
+    if candidate.effect == "ground_effect":  # what does not fade with height is thrust that is a little wrong
+        return here["height"] < HIGHEST
     if candidate.effect in ("payload", "suspended_load"):
         return bool(here["mass"] > LEAST_LOAD * point.vehicle.mass)
     if candidate.effect == "inertia":

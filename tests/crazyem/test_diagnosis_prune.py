@@ -164,6 +164,13 @@ def test_wind_that_only_sinks_is_thrust_that_is_a_little_wrong():
         assert matters(point, wind) == counts
 
 
+def test_a_ground_effect_that_does_not_fade_is_thrust_that_is_a_little_wrong():
+    lifting = Candidate("ground_effect", (), ("strength", "height"))
+    for height, counts in ((0.1, True), (0.5, True), (10.0, False)):
+        point = POINT.with_effects({"ground_effect": {"strength": 0.09, "height": height}})
+        assert matters(point, lifting) == counts
+
+
 def test_a_scale_of_velocities_must_be_more_than_the_jitter_of_the_estimate():
     """20 % of the 7 mm/s of a hover are 1 mm/s, and any onboard estimate is as wrong; 20 % of 0.7 m/s are more."""
     scale = Candidate("velocity_scale", (), ("x", "y", "z"))
