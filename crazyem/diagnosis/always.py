@@ -13,7 +13,7 @@ from crazyem.diagnosis.flight import Flight
 from crazyem.diagnosis.gram import Solution, used
 from crazyem.diagnosis.model import Point
 from crazyem.physics.rotors import wrench
-from crazyem.vehicle import Vehicle
+from crazyem.vehicle import GRAVITY, Vehicle
 
 # What is never exactly as a vehicle file says, and is therefore always free, within these standard deviations: the
 # delay between a stamp and its effect, what sampling the commands at 100 Hz does to inertia and lag, and what an
@@ -63,6 +63,9 @@ COARSE_INERTIA_SD, COARSE_DAMPING_SD = 1.0, 3e-4  # relative; N m s
 # of the turning that the drone would have to be as heavy to turn as if all its mass were this many times as far out as
 # its rotors: no body of that size is, and what it stands for says nothing of the drone.
 FAR_OUT = 2.0
+# m/s. Nor does a body turn as in honey: a rotor loses thrust with the speed at which its air comes, all of it at twice
+# the speed that it gives to the air (4 m/s in a Crazyflie's hover; half of that is less than any small drone's).
+INDUCED = 2.0
 COARSE_REASON = "the recorded commands are mostly faster than their sampling: what acted in between is not known"
 TRIM_REASON = "a shifted centre of mass is a trim, and that changes from day to day"
 LEVEL_REASON = "no battery voltage is recorded, so how heavy or strong the drone is cannot be told"
@@ -143,10 +146,13 @@ def coarsely_sampled(data: Data, point: Point) -> bool:
 
 
 def unlike_a_body(point: Point, accepted: Sequence[Candidate]) -> bool:
-    """Whether the inertia that was found is more than a drone of this mass and size can have (see `FAR_OUT`)."""
-    moments = [v for c in accepted if c.effect == "inertia" for v in c.values(point).values()]
-    most = point.vehicle.mass * (FAR_OUT * float(np.hypot(*point.vehicle.arm))) ** 2
-    return most > 0 and any(float(v) > most for v in moments)
+    """Whether the inertia or the damping that was found is more than a drone of this mass and size can have (see
+    `FAR_OUT`, `INDUCED`)."""
+    mass, arm = point.vehicle.mass, float(np.hypot(*point.vehicle.arm))
+    most = {"inertia": mass * (FAR_OUT * arm) ** 2, "rate_damping": mass * GRAVITY * arm**2 / (2.0 * INDUCED)}
+    return arm > 0 and any(
+        float(v) > most[c.effect] for c in accepted if c.effect in most for v in c.values(point).values()
+    )
 
 
 def fast_share(flight: Flight, vehicle: Vehicle) -> float:

@@ -96,6 +96,15 @@ def test_no_drone_is_as_heavy_to_turn_as_if_its_mass_were_far_out():
         assert not unlike_a_body(POINT.with_effects({"inertia": found}), [])  # free, and no finding
 
 
+def test_no_drone_turns_as_in_honey():
+    """5.6e-4 N m s was said of real flights of a drone of 27 g, whose rates would fall by 1/e within 30 ms."""
+    damping = Candidate("rate_damping", (), ("x", "y", "z"))
+    for most, unlike in ((5e-5, False), (5.6e-4, True)):
+        point = POINT.with_effects({"rate_damping": {"x": 0.0, "y": most, "z": 0.0}})
+        assert unlike_a_body(point, [damping]) == unlike
+        assert not unlike_a_body(point, [])
+
+
 def test_of_flights_whose_commands_do_not_turn_the_drone_nothing_fast_is_asked():
     flights = [SimpleNamespace(coarse=c, levelled=False) for c in (True, True)]
     candidates = [Candidate(n, (), ()) for n in (*FAST, "linear_drag", "wind", "thrust_scale")]
