@@ -182,7 +182,9 @@ def abstained(
     if all(f.levelled for f in data.flights):
         gone |= {c.effect: LEVEL_REASON for c in candidates if c.effect in HEAVY_OR_STRONG}
     if coarsely_sampled(data, point):
-        gone |= {c.effect: COARSE_REASON for c in candidates if c.effect in FAST}
+        # torques on another clock say nothing; how thrust goes with the command shows in forces, which are slow
+        slow = ("thrust_curve",) if all(f.coarse for f in data.flights) else ()
+        gone |= {c.effect: COARSE_REASON for c in candidates if c.effect in FAST and c.effect not in slow}
     return [c for c in candidates if c.effect not in gone], {**left_out, **gone}
 
 
