@@ -23,7 +23,7 @@ from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.place import depends_on_place
 from crazyem.diagnosis.select import select
 from crazyem.diagnosis.split import LOAD, WEAKER, as_load, as_two, instead_of_a_load
-from crazyem.diagnosis.trials import SURE, Selection, Trial, margin, told_apart, wald
+from crazyem.diagnosis.trials import Selection, Trial, margin, told_apart, wald
 from crazyem.diagnosis.unexplained import Unexplained, unexplained
 from crazyem.diagnosis.witness import false_speed, late_measurements
 from crazyem.diagnosis.workers import Workers
@@ -219,9 +219,7 @@ def _named(
         taken = step.taken
         assert taken is not None
         others = {candidate.effect, *step.beside}
-        # what is not told apart from it is a rival, however unsure alone: its own size was fitted as small as it may be
-        rivals = [t for t in step.trials if t.p_value < SURE or any(t is a for a in step.alike)]
-        rivals = [t for t in rivals if t.candidate.effect not in others]
+        rivals = [t for t in step.explanations() if t.candidate.effect not in others]
         if candidate.effect in told:
             rivals = [t for t in rivals if t.candidate.effect not in told]
         alike = [t for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}]
@@ -263,7 +261,7 @@ def _evidence(selection: Selection, i: int) -> float:
 
 WITHIN = 0.05  # p-value from which an effect's own uncertainty holds that there is none of it
 SHAKES = "hold the drone with its rotors turning: what shakes then is not the loop that swings with a wrong model"
-# Exactly the same to every signal, but two things at once: more mass, and inertias to match.
+# Exactly the same to every signal, but for forces of the air: two things at once, more mass and inertias to match.
 HEAVIER = "weigh the drone: with {:.3g} times its mass and its inertias it would fly the same"
 TELLING = 3.0  # nats by which a witness tells two effects apart
 MEASURED_LATE = "measurement_delay"

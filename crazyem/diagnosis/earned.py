@@ -72,7 +72,7 @@ class Turned:
         gained: (r, 3) rad/s, what the model adds from a row to the next one, beginning with the recorded row.
         start: (r, 3, f) what is known at a row for each axis, see above; f as `FEEDBACK_SD`.
         flying: (r,) bool: the step from a row to the next one counts.
-        lacking: (r,) m/s^2, specific force that the model lacked in that step, body axes (r, 3).
+        lacking: (r, 3) m/s^2, specific force that the model lacked in that step, body axes.
     """
 
     time: NDArray

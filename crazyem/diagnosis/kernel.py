@@ -19,7 +19,7 @@ from crazyem.vehicle import GRAVITY
 # disturbing specific force. Torques with memory alone are what most flights need, so they come first.
 STATES = 18
 MEASURED = 12
-TOGETHER = 6  # measurements whose products are added at once: the sums are read and written once for all of them
+TOGETHER = 6  # measurements whose products are added at once (`_add_products` is written out for as many)
 
 
 @compiled

@@ -72,6 +72,11 @@ class Step:
     alike: tuple[Trial, ...] = ()
     beside: frozenset[str] = frozenset()
 
+    def explanations(self) -> list[Trial]:
+        """The trials that explain what this turn is about: significant alone, or, however unsure alone, not told apart
+        from the one that was taken."""
+        return [t for t in self.trials if t.p_value < SURE or any(t is a for a in self.alike)]
+
 
 @dataclass(frozen=True)
 class Selection:

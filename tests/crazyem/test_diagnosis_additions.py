@@ -44,6 +44,22 @@ def test_what_was_not_asked_again_stays_a_rival() -> None:
     assert additions(Step((trial("inertia", 50.0),), None), []) == frozenset()
 
 
+def test_what_is_not_told_apart_is_a_rival_however_unsure_alone() -> None:
+    taken, sure, unsure = (
+        trial("motor_lag", 40.0),
+        trial("inertia", 30.0),
+        replace(trial("torque_scale", 33.0), p_value=0.3),
+    )
+    far = replace(trial("wind", 9.0), p_value=0.3)
+    trials = (taken, unsure, sure, far)
+    assert [t.candidate.effect for t in Step(trials, taken, (unsure,)).explanations()] == [
+        "motor_lag",
+        "torque_scale",
+        "inertia",
+    ]
+    assert [t.candidate.effect for t in Step(trials, taken).explanations()] == ["motor_lag", "inertia"]
+
+
 def test_what_explains_nearly_as_much_is_compared_with_noise_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Told apart under noise that still is the effect; with noise of its own the second is the better."""
     gained = {"torque_scale": 2000.0, "inertia": 2100.0, "wind": 5000.0}

@@ -24,7 +24,8 @@ from crazyem.diagnosis.always import (
     unsure,
     usual_wind,
 )
-from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.candidates import Candidate, candidates_for
+from crazyem.diagnosis.flight import _blocks
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
 
@@ -117,3 +118,18 @@ def test_of_flights_whose_commands_do_not_turn_the_drone_nothing_fast_is_asked()
 
 def test_a_draft_of_a_room_is_a_finding_only_of_a_drone_whose_trim_does_not_change():
     assert usual_wind(DRONE) < 0.5 < usual_wind(replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}}))
+
+
+def test_short_flights_have_shorter_blocks_so_that_there_are_twenty():
+    for seconds, blocks in ((5.0, 10), (10.0, 20), (19.0, 20), (60.0, 60)):
+        block = _blocks(np.arange(0.0, seconds - 1e-6, 0.01) + 3.0)
+        assert block[0] == 0
+        assert abs(int(block[-1]) + 1 - blocks) <= 1
+        assert set(np.diff(block)) == {0, 1}
+
+
+def test_without_position_and_velocity_no_wind_can_be_seen():
+    asked = (frozenset({"attitude", "body_rate", "specific_force"}), frozenset({"attitude", "body_rate", "velocity"}))
+    found = [candidates_for(POINT, signals, measured_speeds=False) for signals in asked]
+    assert [any(c.effect == "wind" for c in kept) for kept, _ in found] == [False, True]
+    assert "velocity" in found[0][1]["wind"]

@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_flight import changed
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from crazyem.cli import main
 from crazyem.diagnosis.earned import (
@@ -19,6 +22,9 @@ from crazyem.diagnosis.earned import (
     earned,
     regressed,
 )
+from crazyem.diagnosis.predict import _at_start, predict, recorded
+from crazyem.recordings import open_recording
+from crazyem.vehicle import load_vehicle
 
 STEP = 0.01  # s
 
@@ -106,6 +112,43 @@ def test_a_loop_that_takes_rates_back_is_learned() -> None:
         assert left < least + 0.15 * (np.mean(came**2) - least)
 
 
+def test_what_is_known_at_a_start() -> None:
+    """A body that rolls right flies to its right; pitch turns what is forward, and yaw has neither tilt nor way."""
+    turned = Rotation.from_euler("ZYX", [[0.0, 0.0, 0.0], [1.0, 0.0, 0.2], [2.0, 0.3, 0.0], [0.5, 0.0, 0.0]])
+    along = np.array([[1.0, 2.0, 3.0]] * 4)  # m/s, body
+    rate = np.array([[0.0, 0.0, 0.0], [0.1, 0.2, 0.3], [0.1, 0.5, 0.3], [0.4, 0.5, 0.3]])
+    state = np.concatenate([np.zeros((4, 3)), turned.apply(along), turned.as_quat(), rate], axis=1)
+    gained = np.array([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [9.0, 9.0, 9.0], [0.0, 0.0, 0.0]])
+    shown = SimpleNamespace(state=state, time=np.array([0.0, 0.01, 0.03, 0.04]))
+    start = _at_start(shown, gained, np.array([True, True, False, False]))  # type: ignore[arg-type]
+    assert start[:, :, 0] == pytest.approx(  # in the step that ends there, of those that count
+        np.array([[0, 0, 0], [0, 20, 30], [0, 10, 0], [0, 0, 0]], float), abs=1e-9
+    )
+    assert np.array_equal(start[:, :, 1], rate)
+    leaning = [[0, 0, 0], [np.sin(0.2), 0, 0], [0, np.sin(0.3), 0], [0, 0, 0]]
+    assert start[:, :, 2] == pytest.approx(np.array(leaning), abs=1e-9)
+    assert start[:, :, 3] == pytest.approx(np.array([[2.0, -1.0, 0.0]] * 4), abs=1e-9)
+
+
+def test_what_is_flown_after_a_start_changes_no_prediction_from_it() -> None:
+    """The whole shipped recording, with all that is learned before a start 10 s into it."""
+    recording = open_recording(str(Path(__file__).parents[2] / "logs" / "payload_excite.mcap"))
+    vehicle, when = load_vehicle("cf2"), float(recording.signals["position"].time[0]) + 14.0
+    broken = recording
+    for name in ("velocity", "attitude", "body_rate"):
+        array = recording.signals[name]
+        value = array.value.copy()
+        value[array.time > when] = np.roll(value[array.time > when], 1, axis=1)
+        broken = changed(broken, name, value=value)
+    found = [predict(recorded(r, vehicle), horizon=50) for r in (recording, broken)]
+    row = [int(np.searchsorted(f.start_time, when, "right")) - 1 for f in found]
+    one, other = (f.prediction[: k + 1] for f, k in zip(found, row, strict=True))
+    assert found[0].airborne[row[0]]
+    assert np.array_equal(one, other)
+    plain = predict(recorded(recording, vehicle), horizon=50, plain=True)
+    assert np.abs(plain.prediction[row[0], -1, 10:] - one[-1, -1, 10:]).max() > 1e-3  # something was learned
+
+
 def test_gaps_and_missing_rates_are_left_out() -> None:
     turned = flight(2, seconds=20.0, weight=0.6, offset=0.0, error=0.01)
     rate = turned.rate.copy()
@@ -153,8 +196,6 @@ def test_the_command_predicts_better_than_the_model_alone(tmp_path: Path) -> Non
         with np.load(out) as found:
             flying = found["airborne"]
             last, at = found["prediction"][flying, -1], found["start_index"][flying] + 50
-        from crazyem.recordings import open_recording
-
         truth = open_recording(str(log)).signals["body_rate"]
         when = open_recording(str(log)).signals["position"].time[at]
         shown = np.stack([np.interp(when, truth.time, v) for v in np.asarray(truth.value).T], 1)
