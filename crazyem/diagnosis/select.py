@@ -52,6 +52,7 @@ BESIDE = 0.5  # share of its gain that an effect keeps beside another which it i
 # at once would be any size. A longer lag with more torque is nearly the same as neither.
 PARTNERS = (("torque_scale", "inertia"), ("inertia", "torque_scale"), ("torque_scale", "motor_lag"),
             ("motor_lag", "torque_scale"))  # fmt: skip
+TURNING = {name for pair in PARTNERS for name in pair}
 
 
 def linear_trials(
@@ -282,7 +283,13 @@ def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], No
     """
     counted = basis.held_out is not None
     equals = alike_with(trials[0], trials, counted=counted)
-    nearly = [t for t in trials if t.value > NEARLY * trials[0].value and rivals(t, counted=counted)]
+    turns = trials[0].candidate.effect in TURNING
+    nearly = [
+        t
+        for t in trials
+        if rivals(t, counted=counted)
+        and (t.value > NEARLY * trials[0].value or (turns and t.candidate.effect in TURNING))
+    ]
     equals += [t for t in nearly[:MOST_COMPARED] if all(t is not e for e in equals)]
     if len(equals) == 1:
         return trials, equals
