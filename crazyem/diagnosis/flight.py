@@ -26,7 +26,8 @@ PIECE = 60.0  # s after which the filter starts anew, so that long flights are s
 # over 0.04 s, so its error hangs together that long. Taken for white at 100 Hz it is drone that turns: gyros then look
 # four to ten times as noisy as by one attitude in 80 ms, and torques of drones with nothing hidden 6 % too strong.
 APART = 0.08
-ONBOARD = "stateEstimate"  # what the firmware's logs of its own estimate begin with
+# What names of attitudes that a filter on board made begin with: the Crazyflie's, those of MAVLink and of ULog.
+ONBOARD = ("stateEstimate", "kalman.", "ATTITUDE.", "ATTITUDE_QUATERNION.", "vehicle_attitude.")
 COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 COMMANDS = ("motor_command", "motor_request", "mixer_command")
 YAW = "stateEstimate.yaw"  # deg, right-handed
@@ -168,9 +169,13 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
 
 
 def onboard_attitude(recording: Recording) -> bool:
-    """Whether the attitude is that of a filter on board, and not of motion capture."""
+    """Whether the attitude is that of a filter on board, and not of motion capture: by its name, or by a CSV mapping
+    that claims it (`attitude = "onboard"`)."""
     attitude = recording.signals.get("attitude")
-    return attitude is not None and any(s.startswith(ONBOARD) for s in attitude.source)
+    if attitude is None:
+        return False
+    claimed = recording.metadata.get("claims", {}).get("attitude") == "onboard" or "mavlink" in recording.metadata
+    return claimed or any(s.rsplit("/", 1)[-1].startswith(ONBOARD) for s in attitude.source)
 
 
 def leaning(recording: Recording) -> tuple[NDArray, NDArray]:

@@ -9,7 +9,7 @@ from made_flight import array_of
 
 from crazyem.diagnosis.always import refine_base
 from crazyem.diagnosis.fit import Data, nominal, starting_point
-from crazyem.diagnosis.flight import APART, Flight, flight_of
+from crazyem.diagnosis.flight import APART, Flight, flight_of, onboard_attitude
 from crazyem.diagnosis.model import Point
 from crazyem.recordings.recording import Recording
 
@@ -44,6 +44,25 @@ def test_attitudes_of_motion_capture_are_all_used() -> None:
     flight = flight_of(onboard(recording, source="qx"), DRONE)
     assert flight.attitude is None
     assert seen(flight).size == flight.time.size
+
+
+@pytest.mark.parametrize(
+    ("source", "metadata", "expected"),
+    [
+        ("stateEstimateZ.quat", {}, True),
+        ("kalman.q0", {}, True),
+        ("vehicle_attitude.q[0]", {}, True),
+        ("158/ATTITUDE_QUATERNION.q1", {}, True),
+        ("quaternion", {"mavlink": {"system": "1"}}, True),
+        ("qx", {"claims": {"attitude": "onboard"}}, True),
+        ("qx", {"claims": {"mass_kg": "0.045"}}, False),
+        ("ATT_POS_MOCAP.q1", {}, False),
+    ],
+)
+def test_attitudes_that_a_filter_on_board_made(
+    source: str, metadata: dict[str, dict[str, str]], expected: bool
+) -> None:
+    assert onboard_attitude(replace(onboard(fly(seconds=2.0), source=source), metadata=metadata)) is expected
 
 
 def test_of_onboard_attitudes_one_in_so_many_is_used_and_none_is_lost() -> None:
