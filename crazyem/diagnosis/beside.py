@@ -28,12 +28,13 @@ def beside_the_regression(
     remains: Unexplained,
     wanted: Sequence[str],
     left_out: dict[str, str],
-    by_place: bool,
+    pulled: bool,
     say: Callable[[str], None],
 ) -> list[Named]:
-    """What is no column of the regression: gusts, unless a force depends on place, and a tilted accelerometer."""
+    """What is no column of the regression: gusts, unless something pulls the drone to a place (`pulled`), and a tilted
+    accelerometer."""
     found = []
-    if (not wanted or "gusts" in wanted) and "gusts" not in left_out and not by_place:
+    if (not wanted or "gusts" in wanted) and "gusts" not in left_out and not pulled:
         say("gusts")
         gusts = find_gusts(data, point)
         known = gusts is not None and gusts.speed < usual_gusts(point.vehicle)

@@ -99,22 +99,19 @@ def diagnose(
         after = locate(data, selection.final)
     place = depends_on_place(data, apart, selection.final)
     remains = unexplained(data, selection, after, apart)
-    pulls = [*([pull] if pull else []), *([place.finding] if place else [])]
-    for finding in pulls:
-        remains = remains.beside(finding)
-    turned = heading_by_place(data, apart)
-    if turned is not None:
-        remains = remains.beside(turned)
+    for finding in (pull, place and place.finding, heading_by_place(data, apart)):
+        remains = remains.beside(finding) if finding else remains
+    pulled = pull is not None or (place is not None and not place.pushed)
+    beside = beside_the_regression(data, apart, selection.final, remains, wanted, left_out, pulled, say)
+    if any(e.name == "gusts" for e in beside):
+        remains = remains.without_force()
     in_place = {LOAD: as_two(data, apart, selection), WEAKER.effect: as_load(data, apart, selection)}
     effects, groups, separate = _named(data, selection, remains, told, in_place)
-    beside = beside_the_regression(data, apart, selection.final, remains, wanted, left_out, bool(pulls), say)
     if flights[0].inputs.measured and not any(e.name == "input_delay" for e in effects):
         late, alike = late_rotors(recordings, held_out, vehicle, wanted, left_out)
         beside += late
         groups = (*groups, *alike)
         separate = tuple(dict.fromkeys((*separate, *(CATALOGUE[n].separates for g in alike for n in g))))
-    if any(e.name == "gusts" for e in beside):
-        remains = remains.without_force()
     effects = (*effects, *beside)
     fitted_vehicle = _with_effects(vehicle, selection, beside)
     mismatch = bool(effects) or remains.found

@@ -30,6 +30,12 @@ class Place:
     held_out: float
     finding: Finding
 
+    @property
+    def pushed(self) -> bool:
+        """Whether the drone is pushed away from where it is: a loop that gives way to gusts flies like that, on every
+        flight; what is tied to a place pulls back."""
+        return self.finding.axis == self.finding.variable and self.finding.effect_size > 0.0
+
 
 def depends_on_place(data: Data, apart: Data | None, point: Point) -> Place | None:
     """Whether a force that depends on place is left beside a model; None if not, or where positions are unknown."""

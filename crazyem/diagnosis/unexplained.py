@@ -29,16 +29,27 @@ class Unexplained:
     """What remains.
 
     Attributes:
-        found: whether there is structure that no effect explains.
-        findings: where, strongest first.
-        nats: of the strongest.
-        explained: share of the structure that the effects explain, 0 to 1.
+        findings: where structure is left that no effect explains, strongest first.
+        gained: nats that the effects explain.
     """
 
-    found: bool
     findings: tuple[Finding, ...]
-    nats: float
-    explained: float
+    gained: float
+
+    @property
+    def found(self) -> bool:
+        """Whether there is structure that no effect explains."""
+        return bool(self.findings)
+
+    @property
+    def nats(self) -> float:
+        """Of the strongest finding."""
+        return self.findings[0].nats if self.findings else 0.0
+
+    @property
+    def explained(self) -> float:
+        """Share of the structure that the effects explain, 0 to 1."""
+        return self.gained / (self.gained + self.nats) if self.gained + self.nats > 0 else 1.0
 
     @property
     def force_nats(self) -> float:
@@ -49,13 +60,11 @@ class Unexplained:
 
     def beside(self, finding: Finding) -> "Unexplained":
         """The same with one more finding."""
-        findings = tuple(sorted((*self.findings, finding), key=lambda f: -f.nats))
-        return Unexplained(True, findings, findings[0].nats, self.explained)
+        return Unexplained(tuple(sorted((*self.findings, finding), key=lambda f: -f.nats)), self.gained)
 
     def without_force(self) -> "Unexplained":
         """What remains once a random force explains the forces."""
-        rest = tuple(f for f in self.findings if f.signal != "force")
-        return Unexplained(bool(rest), rest, rest[0].nats if rest else 0.0, self.explained)
+        return Unexplained(tuple(f for f in self.findings if f.signal != "force"), self.gained)
 
 
 def unexplained(data: Data, selection: Selection, after: Located, apart: Data | None = None) -> Unexplained:
@@ -72,9 +81,7 @@ def unexplained(data: Data, selection: Selection, after: Located, apart: Data | 
     left += [erratic] if erratic else []
     left.sort(key=lambda f: -f.nats)
     gained = sum(s.taken.evidence for s in selection.steps if s.taken)
-    nats = left[0].nats if left else 0.0
-    explained = gained / (gained + nats) if gained + nats > 0 else 1.0
-    return Unexplained(bool(left), tuple(left[:12]), nats, explained)
+    return Unexplained(tuple(left[:12]), gained)
 
 
 def notable(finding: Finding, point: Point) -> bool:

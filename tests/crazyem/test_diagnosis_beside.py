@@ -16,7 +16,9 @@ from crazyem.diagnosis.document import document_of, text_of
 from crazyem.diagnosis.fit import Data, nominal, starting_point
 from crazyem.diagnosis.flight import flight_of, without
 from crazyem.diagnosis.gusts import Gusts, find_gusts
+from crazyem.diagnosis.locate import Finding
 from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.place import Place
 from crazyem.diagnosis.unexplained import Unexplained
 from crazyem.errors import DataError
 from crazyem.recordings import open_recording
@@ -65,11 +67,34 @@ def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(m
     """As in a recording whose forces last for one sample each: the logarithm's error was 30 000."""
     found = Gusts(5000.0, np.ones(3), 0.25, 3e4, True, 1.6, 0.05)
     monkeypatch.setattr("crazyem.diagnosis.beside.find_gusts", lambda data, point: found)
-    vehicle, remains = load_vehicle("cf2"), Unexplained(False, (), 0.0, 1.0)
+    vehicle, remains = load_vehicle("cf2"), Unexplained((), 0.0)
     data, point = Data(()), starting_point(Point(vehicle, {}, None))
     (named,) = beside_the_regression(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
     assert named.parameters["correlation_time"].ci95 == (0.01, 100.0)
     assert named.parameters["standard_deviation"].ci95 == pytest.approx((1.502, 1.698))
+
+
+def test_what_pushes_the_drone_away_is_no_place_that_it_is_tied_to():
+    """Gusts move a drone that its loop holds: their force goes with its place, on every flight alike."""
+    said = {
+        (axis, by, size): Place(
+            30.0, 300.0, Finding("force", axis, f"{by} position", by, (0.0, 20.0), size, 1e-3, "N", 30.0, 0.0)
+        ).pushed
+        for axis, by, size in (("x", "x", 0.009), ("x", "x", -0.009), ("y", "x", 0.009))
+    }
+    assert list(said.values()) == [True, False, False]
+
+
+def test_gusts_explain_every_force_and_nothing_else():
+    force, torque = (
+        Finding(signal, "x", "always", "", (0.0, 20.0), 0.01, 1e-3, unit, 30.0, 0.0)
+        for signal, unit in (("force", "N"), ("torque", "N m"))
+    )
+    remains = Unexplained((), 0.0).beside(force)
+    assert (remains.explained, remains.without_force()) == (0.0, Unexplained((), 0.0))
+    assert remains.without_force().explained == 1.0
+    assert remains.beside(torque).without_force().findings == (torque,)
+    assert Unexplained((force,), 90.0).explained == pytest.approx(0.75)
 
 
 def test_what_is_not_finite_is_said_as_a_dash(recording):
