@@ -120,7 +120,7 @@ def test_causal_means_are_blind_to_the_future(seed, k, delay, behind):
 @given(seeds, st.floats(-0.012, 0.012), st.floats(-0.003, 0.003))
 @settings(max_examples=60, deadline=None)
 def test_causal_means_do_not_jump_with_the_delay(seed, delay, behind):
-    """A delay that is fitted may pass where a shifted step begins at a stamp (it did: 300 nats within a microsecond)."""
+    """A delay that is fitted may pass where a shifted step begins at a stamp (it did: by 300 nats)."""
     rng, times, commands, nodes = after_a_while(seed, behind)
     predictor = np.concatenate([rng.normal(size=(4, ORDER)) * 0.4, np.zeros((4, 1))], 1)
     for at in (delay, -behind):  # the second: every step begins at a stamp
