@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, Fitted, refine, remembering
+from crazyem.diagnosis.fit import Data, Fitted, refine, remembering, remembering_anew
 from crazyem.diagnosis.flight import Flight
 from crazyem.diagnosis.gram import Solution, used
 from crazyem.diagnosis.model import Point
@@ -294,3 +294,17 @@ def refine_base(
     noise = noise and TRIM not in point.vehicle.effects
     free = nuisances(data, point, accepted)
     return refine(data, with_nuisances(point, free), accepted, nuisances=free, rounds=rounds, noise=noise)
+
+
+def refine_anew(data: Data, point: Point, accepted: Sequence[Candidate], *, rounds: int = 5) -> Fitted:
+    """`refine_base`, then once more with the memory of the disturbing torques chosen again; the better of both.
+
+    Whether torques have a memory was told by a model that lacked what is found, and what is always free: of one flight
+    the nominal model gained 58 nats by a second look, which a torque scale got for itself before.
+    """
+    once = refine_base(data, point, accepted, rounds=rounds)
+    again = refine_base(data, remembering_anew(data, once.point), accepted, rounds=rounds)
+    if again.loglik > once.loglik:
+        return again
+    data.settle(once.point)
+    return once

@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from crazyem.diagnosis.always import TRIM, refine_base, without
+from crazyem.diagnosis.always import TRIM, refine_anew, refine_base, without
 from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, DivergedError, remembering_anew
+from crazyem.diagnosis.fit import Data, DivergedError
 from crazyem.diagnosis.split import judged
 from crazyem.diagnosis.trials import SURE, Selection, Step, Trial, at_the_end, margin, matters, told_apart
 
@@ -79,8 +79,7 @@ def _asked_again(
     accepted = _in_place(selection.accepted, mine, chosen.candidate)
     assert chosen.fitted is not None
     values = {chosen.candidate.effect: chosen.candidate.values(chosen.fitted.point)}
-    point = refine_base(data, without(selection.final, name).with_effects(values), accepted).point
-    fitted = refine_base(data, remembering_anew(data, point), accepted)
+    fitted = refine_anew(data, without(selection.final, name).with_effects(values), accepted)
     if not matters(fitted.point, chosen.candidate, data):
         return selection
     say(f"  beside the others it is {chosen.candidate.label}")

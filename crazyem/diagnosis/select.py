@@ -18,13 +18,14 @@ from crazyem.diagnosis.always import (
     by_gain,
     nuisances,
     on_held_out,
+    refine_anew,
     refine_base,
     unlike_a_body,
     with_nuisances,
 )
 from crazyem.diagnosis.beginnings import best_begun
 from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, DivergedError, Fitted, held_near, remembering_anew
+from crazyem.diagnosis.fit import Data, DivergedError, Fitted, held_near
 from crazyem.diagnosis.gram import Solution
 from crazyem.diagnosis.model import Column, Point
 from crazyem.diagnosis.onset import date, onset_of
@@ -153,7 +154,7 @@ def sharpened(basis: Basis, trial: Trial) -> Trial:
     assert trial.fitted is not None
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
     try:
-        fit = refine_base(data, remembering_anew(data, trial.fitted.point), mine, rounds=2)
+        fit = refine_anew(data, trial.fitted.point, mine, rounds=2)
     except DivergedError:
         return trial
     return compared(basis, trial, data, fit)
@@ -187,7 +188,7 @@ def select(
     say: Callable[[str], None] = lambda text: None,
 ) -> Selection:
     """The effects that the flights ask for; beyond those `begun` with, where there are some."""
-    fitted = refine_base(data, nominal_point, ()) if begun is None else begun.fitted
+    fitted = refine_anew(data, nominal_point, ()) if begun is None else begun.fitted
     nominal = fitted.point if begun is None else begun.nominal
     point, value = fitted.point, fitted.loglik
     accepted: list[Candidate] = [] if begun is None else list(begun.accepted)
@@ -229,7 +230,7 @@ def select(
         dated, candidate = date(data, best.fitted, best.candidate)
         accepted.append(candidate)
         say(f"  found {candidate.label}: {best.evidence:.1f} nats")
-        fitted = refine_base(data, remembering_anew(data, dated.point), accepted)
+        fitted = refine_anew(data, dated.point, accepted)
         point, value = fitted.point, fitted.loglik
         if unlike_a_body(point, accepted):  # told by other means, or not at all: see `diagnose`
             return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))
