@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from closed_loop import DRONE
+from closed_loop import DRONE, fly
 
 from crazyem.diagnosis.always import (
     AT_ONCE_SD,
@@ -20,12 +20,15 @@ from crazyem.diagnosis.always import (
     abstained,
     jittery,
     nuisances,
+    refine_anew,
+    refine_base,
     unlike_a_body,
     unsure,
     usual_wind,
 )
 from crazyem.diagnosis.candidates import Candidate, candidates_for
-from crazyem.diagnosis.flight import _blocks
+from crazyem.diagnosis.fit import Data, starting_point
+from crazyem.diagnosis.flight import _blocks, flight_of
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
 
@@ -133,3 +136,15 @@ def test_without_position_and_velocity_no_wind_can_be_seen():
     found = [candidates_for(POINT, signals, measured_speeds=False) for signals in asked]
     assert [any(c.effect == "wind" for c in kept) for kept, _ in found] == [False, True]
     assert "velocity" in found[0][1]["wind"]
+
+
+def test_a_second_look_at_the_memory_of_torques_never_makes_a_fit_worse():
+    """Begun with white torques where they sway for half a second, and once more where that is known."""
+    data = Data([flight_of(fly(seconds=8.0, sway=3.0, seed=2), DRONE)])
+    begun = data.fit_noise(starting_point(Point(DRONE, {}, first_guess())))
+    once, anew = (refine(data.twin(), begun, ()) for refine in (refine_base, refine_anew))
+    assert not once.point.noise.disturbance.any()
+    assert anew.point.noise.disturbance[3:].any()
+    assert anew.loglik > once.loglik + 10.0
+    again = refine_anew(data.twin(), anew.point, ())
+    assert again.loglik > anew.loglik - 0.1
