@@ -44,8 +44,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, *, load: float, weaker: float, was: f
         return weaker, BLOCKS + weaker / 20
 
     monkeypatch.setattr(exchange, "judged", judged)
-    monkeypatch.setattr(exchange, "remembering_anew", lambda data, point: point)
-    monkeypatch.setattr(exchange, "refine_base", lambda data, point, accepted: SimpleNamespace(point=point))
+    monkeypatch.setattr(exchange, "refine_anew", lambda data, point, accepted: SimpleNamespace(point=point))
     return exchange.named_again(SimpleNamespace(workers=Workers(1)), None, selection)  # type: ignore[arg-type]
 
 
@@ -102,8 +101,7 @@ def test_what_ended_where_its_range_ends_gives_way_to_whatever_is_next(monkeypat
         selection = Selection(BARE, point, steps, (slope, FLAPPING), SimpleNamespace(), 34)  # type: ignore[arg-type]
         monkeypatch.setattr(exchange, "judged", lambda data, held_out, start, candidates: (
             (1000.0 if candidates[0] is slope else 100.0), BLOCKS))  # fmt: skip
-        monkeypatch.setattr(exchange, "remembering_anew", lambda data, point: point)
-        monkeypatch.setattr(exchange, "refine_base", lambda data, point, accepted: SimpleNamespace(point=point))
+        monkeypatch.setattr(exchange, "refine_anew", lambda data, point, accepted: SimpleNamespace(point=point))
         found = exchange.named_again(SimpleNamespace(workers=Workers(1)), None, selection)  # type: ignore[arg-type]
         assert names(found) == [name, "velocity_moment"]
         assert (slope in [t.candidate for t in found.steps[0].trials]) == (name == "thrust_curve")
