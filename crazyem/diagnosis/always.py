@@ -284,7 +284,7 @@ def on_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate]) -> 
     free = nuisances(held_out, point, ())
     found = {c.effect for c in accepted}
     bare = point.with_effects({c.effect: c.neutral(point) for c, _ in free if c.effect not in found})
-    return refine(held_out, bare, (), nuisances=free, about=bare, rounds=2, noise=TRIM not in point.vehicle.effects)
+    return refine(held_out, bare, (), nuisances=free, about=bare, rounds=2, noise=False)
 
 
 def refine_base(

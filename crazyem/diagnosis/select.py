@@ -188,7 +188,9 @@ def select(
     say: Callable[[str], None] = lambda text: None,
 ) -> Selection:
     """The effects that the flights ask for; beyond those `begun` with, where there are some."""
-    fitted = refine_anew(data, nominal_point, ()) if begun is None else begun.fitted
+    # with a trim in the file noise stays (see `steadied`), or what is steady would pass for a torque with memory
+    begin = refine_base if TRIM in nominal_point.vehicle.effects else refine_anew
+    fitted = begin(data, nominal_point, ()) if begun is None else begun.fitted
     nominal = fitted.point if begun is None else begun.nominal
     point, value = fitted.point, fitted.loglik
     accepted: list[Candidate] = [] if begun is None else list(begun.accepted)

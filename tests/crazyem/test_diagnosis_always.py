@@ -20,7 +20,6 @@ from crazyem.diagnosis.always import (
     abstained,
     jittery,
     nuisances,
-    on_held_out,
     refine_anew,
     refine_base,
     unlike_a_body,
@@ -149,13 +148,3 @@ def test_a_second_look_at_the_memory_of_torques_never_makes_a_fit_worse():
     assert anew.loglik > once.loglik + 10.0
     again = refine_anew(data.twin(), anew.point, ())
     assert again.loglik > anew.loglik - 0.1
-
-
-def test_flights_held_out_have_noise_scales_of_their_own():
-    """Those of a hover made every model fail in a quick flight."""
-    calm, rough = (Data([flight_of(fly(seconds=6.0, shake=s, seed=3), DRONE)]) for s in (0.1, 0.8))
-    point = refine_base(calm, calm.fit_noise(starting_point(Point(DRONE, {}, first_guess()))), ()).point
-    there = on_held_out(rough.twin(), point, ())
-    assert there.point.noise.impulse[3] > 3.0 * point.noise.impulse[3]
-    assert there.loglik > rough.twin().loglik(point) + 100.0
-    assert there.point.effects.keys() == point.effects.keys()
