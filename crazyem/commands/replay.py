@@ -11,10 +11,9 @@ from crazyem.live.pipeline import Pipeline
 from crazyem.live.summary import check_writable, live_line
 from crazyem.physics import folding
 from crazyem.recordings import Recording, open_recording
-from crazyem.signals.mavlink import ATTITUDE_PERIOD
+from crazyem.signals.mavlink import ATTITUDE_PERIOD, carries_attitude
 from crazyem.vehicle import Vehicle
 
-MAVLINK_ATTITUDES = {"ATTITUDE", "ATTITUDE_QUATERNION"}
 SCALE_NOTICE = (
     "mass and thrust scale are one parameter in this data: the value is as right as the thrust law of the vehicle "
     "file (a thrust law x % too strong reads as a mass x % too high), and the interval does not include that."
@@ -54,7 +53,7 @@ def attitude_period_of(recording: Recording) -> float:
     """As the live estimator had it: longer than nothing for what an autopilot sent over MAVLink [s]."""
     attitude = recording.signals.get("attitude")
     names = attitude.source if attitude is not None else ()
-    theirs = "mavlink" in recording.metadata or any(n.split(".")[0] in MAVLINK_ATTITUDES for n in names)
+    theirs = "mavlink" in recording.metadata or any(carries_attitude(n) for n in names)
     return ATTITUDE_PERIOD if theirs else 0.0
 
 

@@ -12,6 +12,7 @@ from crazyem.doctor.streams import airtime, ordered
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
 from crazyem.recordings.recording import Recording
+from crazyem.signals.mavlink import carries_attitude
 from crazyem.vehicle import GRAVITY, Vehicle
 
 SAME_NODE = 1.5e-3  # s: measurements closer than this belong to one node
@@ -26,8 +27,8 @@ PIECE = 60.0  # s after which the filter starts anew, so that long flights are s
 # over 0.04 s, so its error hangs together that long. Taken for white at 100 Hz it is drone that turns: gyros then look
 # four to ten times as noisy as by one attitude in 80 ms, and torques of drones with nothing hidden 6 % too strong.
 APART = 0.08
-# What names of attitudes that a filter on board made begin with: the Crazyflie's, those of MAVLink and of ULog.
-ONBOARD = ("stateEstimate", "kalman.", "ATTITUDE.", "ATTITUDE_QUATERNION.", "vehicle_attitude.")
+# What names of attitudes that a filter on board made begin with, beside those of MAVLink: the Crazyflie's, ULog's.
+ONBOARD = ("stateEstimate", "kalman.", "vehicle_attitude.")
 COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 COMMANDS = ("motor_command", "motor_request", "mixer_command")
 YAW = "stateEstimate.yaw"  # deg, right-handed
@@ -175,7 +176,7 @@ def onboard_attitude(recording: Recording) -> bool:
     if attitude is None:
         return False
     claimed = recording.metadata.get("claims", {}).get("attitude") == "onboard" or "mavlink" in recording.metadata
-    return claimed or any(s.rsplit("/", 1)[-1].startswith(ONBOARD) for s in attitude.source)
+    return claimed or any(s.rsplit("/", 1)[-1].startswith(ONBOARD) or carries_attitude(s) for s in attitude.source)
 
 
 def leaning(recording: Recording) -> tuple[NDArray, NDArray]:

@@ -71,6 +71,13 @@ MAPPINGS: tuple[Mapping, ...] = (
     Mapping("setpoint_position", "POSITION_TARGET_LOCAL_NED", _XYZ),
 )
 
+_ATTITUDES = frozenset(row.message for row in MAPPINGS if row.signal == "attitude")
+
+
+def carries_attitude(variable: str) -> bool:
+    """Whether a variable of a log is of a message with an attitude; a sender before it ("158/") is passed over."""
+    return variable.rsplit("/", 1)[-1].split(".")[0] in _ATTITUDES
+
 
 def mapping(signal: str, message: str) -> Mapping:
     """The row of a signal and a message; KeyError if there is none."""

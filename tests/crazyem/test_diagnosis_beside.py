@@ -85,6 +85,18 @@ def test_what_pushes_the_drone_away_is_no_place_that_it_is_tied_to():
     assert list(said.values()) == [True, False, False]
 
 
+@pytest.mark.parametrize(("size", "gusts"), [(0.009, True), (-0.009, False)])
+def test_a_diagnosis_leaves_to_gusts_what_pushes_away_and_keeps_what_pulls_back(monkeypatch, recording, size, gusts):
+    where = Finding("force", "x", "x position", "x", (0.0, 20.0), size, 1e-3, "N", 30.0, 0.0)
+    air = Gusts(5000.0, np.ones(3), 1.0, 0.1, True, 1.6, 0.05)
+    monkeypatch.setattr("crazyem.diagnosis.diagnose.depends_on_place", lambda *_: Place(30.0, 300.0, where))
+    monkeypatch.setattr("crazyem.diagnosis.beside.find_gusts", lambda data, point: air)
+    found = diagnose([recording], load_vehicle("cf2"), wanted=["gusts"])
+    assert ("gusts" in [e.name for e in found.effects]) == gusts
+    assert (where in found.unexplained.findings) == (not gusts)
+    assert gusts or found.unexplained.found
+
+
 def test_gusts_explain_every_force_and_nothing_else():
     force, torque = (
         Finding(signal, "x", "always", "", (0.0, 20.0), 0.01, 1e-3, unit, 30.0, 0.0)

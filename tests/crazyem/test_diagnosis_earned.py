@@ -131,7 +131,7 @@ def test_what_is_known_at_a_start() -> None:
 
 
 def test_what_is_flown_after_a_start_changes_no_prediction_from_it() -> None:
-    """The whole shipped recording, with all that is learned before a start 10 s into it."""
+    """The whole shipped recording, with all that is learned before a start 14 s into it."""
     recording = open_recording(str(Path(__file__).parents[2] / "logs" / "payload_excite.mcap"))
     vehicle, when = load_vehicle("cf2"), float(recording.signals["position"].time[0]) + 14.0
     broken = recording
