@@ -76,7 +76,7 @@ _ATTITUDES = frozenset(row.message for row in MAPPINGS if row.signal == "attitud
 
 def carries_attitude(variable: str) -> bool:
     """Whether a variable of a log is of a message with an attitude; a sender before it ("158/") is passed over."""
-    return variable.rsplit("/", 1)[-1].split(".")[0] in _ATTITUDES
+    return variable.rsplit("/", 1)[-1].split(".", maxsplit=1)[0] in _ATTITUDES
 
 
 def mapping(signal: str, message: str) -> Mapping:
