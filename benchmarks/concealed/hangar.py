@@ -122,7 +122,7 @@ class Hangar:
         self._answer()
 
     def _answer(self) -> int | str:
-        if not self._pipe.poll(180.0):  # the first one on a machine compiles
+        if not self._pipe.poll(900.0):  # the first one on a busy machine compiles for minutes
             raise RuntimeError("the simulator does not answer")
         answer: int | str = self._pipe.recv()
         return answer
