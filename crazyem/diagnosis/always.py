@@ -72,6 +72,7 @@ LEVEL_REASON = "no battery voltage is recorded, so how heavy or strong the drone
 HEAVY_OR_STRONG = ("payload", "thrust_scale")
 FAST = ("inertia", "inertia_products", "torque_scale", "rate_damping", "rotor_inertia", "motor_lag", "input_delay",
         "measurement_delay", "gyro_bias", "thrust_curve")  # fmt: skip
+SHOWN_BY_FORCES = ("thrust_curve", "motor_lag", "input_delay")
 # m/s, where trims differ from day to day, and on any drone; times what the file has. Hovering in a real room looks like
 # 0 to 0.6 m/s, and a drone with nothing hidden once like 0.3.
 CALM, ROOM, GUSTIER = 1.0, 0.4, 2.0
@@ -182,8 +183,8 @@ def abstained(
     if all(f.levelled for f in data.flights):
         gone |= {c.effect: LEVEL_REASON for c in candidates if c.effect in HEAVY_OR_STRONG}
     if coarsely_sampled(data, point):
-        # torques on another clock say nothing; how thrust goes with the command shows in forces, which are slow
-        slow = ("thrust_curve",) if all(f.coarse for f in data.flights) else ()
+        # torques on another clock say nothing; how thrust goes with the command, and how late, shows in forces
+        slow = SHOWN_BY_FORCES if all(f.coarse for f in data.flights) else ()
         gone |= {c.effect: COARSE_REASON for c in candidates if c.effect in FAST and c.effect not in slow}
     return [c for c in candidates if c.effect not in gone], {**left_out, **gone}
 

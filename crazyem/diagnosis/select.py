@@ -35,6 +35,7 @@ from crazyem.diagnosis.trials import (
     Selection,
     Step,
     Trial,
+    at_the_end,
     both,
     gain_of_both,
     matters,
@@ -205,7 +206,7 @@ def select(
         ]
         say(f"looking for effect {turn + 1} among {len(rest)} candidates")
         linear = linear_trials(data, point, accepted, best_begun(data, point, accepted, rest))
-        if turn > first:
+        if len(accepted) > first:
             steps[-1] = replace(steps[-1], beside=additions(steps[-1], [t for t, _ in linear]))
         promising = shortlist(linear) if turn < MOST else []  # after the last, only what stands beside it is asked
         basis = Basis(data, held_out, point, tuple(accepted), value, held_value)
@@ -232,7 +233,16 @@ def select(
         dated, candidate = date(data, best.fitted, best.candidate)
         accepted.append(candidate)
         say(f"  found {candidate.label}: {best.evidence:.1f} nats")
-        fitted = refine_anew(data, dated.point, accepted)
+        before, fitted = fitted, refine_anew(data, dated.point, accepted)
+        if at_the_end(fitted.point, candidate):
+            # together with all that is free it went on to where nothing more is admitted: it stands for something else
+            say(f"  left out again, nothing more of it is admitted: {candidate.label}")
+            accepted.pop()
+            steps.pop()
+            candidates = [c for c in candidates if c.effect != candidate.effect]
+            fitted = before
+            data.settle(fitted.point)
+            continue
         point, value = fitted.point, fitted.loglik
         if unlike_a_body(point, accepted):  # told by other means, or not at all: see `diagnose`
             return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))

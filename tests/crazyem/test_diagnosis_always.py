@@ -113,8 +113,9 @@ def test_of_flights_whose_commands_do_not_turn_the_drone_nothing_fast_is_asked()
     flights = [SimpleNamespace(coarse=c, levelled=False) for c in (True, True)]
     candidates = [Candidate(n, (), ()) for n in (*FAST, "linear_drag", "wind", "thrust_scale")]
     kept, reasons = abstained(SimpleNamespace(flights=flights), POINT, candidates, {})  # type: ignore[arg-type]
-    assert [c.effect for c in kept] == ["thrust_curve", "linear_drag", "wind", "thrust_scale"]  # forces are slow
-    assert reasons == dict.fromkeys((n for n in FAST if n != "thrust_curve"), COARSE_REASON)
+    slow = ["motor_lag", "input_delay", "thrust_curve"]  # shown by forces
+    assert [c.effect for c in kept] == [*slow, "linear_drag", "wind", "thrust_scale"]
+    assert reasons == dict.fromkeys((n for n in FAST if n not in slow), COARSE_REASON)
     flights[1].coarse = False
     assert abstained(SimpleNamespace(flights=flights), POINT, candidates, {})[0] == candidates  # type: ignore[arg-type]
 
