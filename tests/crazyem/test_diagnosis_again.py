@@ -12,6 +12,7 @@ from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis import always
 from crazyem.diagnosis import diagnose as diagnosing
+from crazyem.diagnosis import select as selecting
 from crazyem.diagnosis.always import COARSE_REASON, TRIM, refine_base
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.diagnose import diagnose
@@ -64,6 +65,27 @@ def test_a_selection_goes_on_from_where_another_began():
     assert found.nominal is begun.nominal
     assert found.final.effects["thrust_scale"]["scale"] == pytest.approx(0.9, abs=0.01)
     assert found.final.effects["linear_drag"]["x"] == pytest.approx(0.02, abs=0.004)
+
+
+def test_what_went_on_to_its_end_is_taken_back_and_the_selection_goes_on(monkeypatch):
+    """As a slope of the thrust curve did, in the fit with all that is free: a thrust that does not heed its command."""
+    data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02), thrust=(0.9,) * 4), seconds=20.0), DRONE)])
+    point = nominal(data, Point(DRONE, {}, first_guess()))
+    real, said = selecting.refine_anew, []
+    end = THRUST.range_of("scale")[0]
+
+    def too_far(data, point, accepted, **more):
+        fit = real(data, point, accepted, **more)
+        if said and "found thrust_scale" in said[-1]:
+            return replace(fit, point=fit.point.with_effects({"thrust_scale": {"scale": end}}))
+        return fit
+
+    monkeypatch.setattr(selecting, "refine_anew", too_far)
+    found = select(data, point, [THRUST, DRAG], say=lambda text: said.append(text))
+    assert sum("nothing more of it is admitted: thrust_scale" in text for text in said) == 1
+    assert "thrust_scale" not in {c.effect for c in found.accepted}
+    assert "thrust_scale" not in found.final.effects
+    assert all(s.taken.candidate.effect != "thrust_scale" for s in found.steps if s.taken)
 
 
 def test_after_an_exchange_the_selection_goes_on(slow_to_turn, monkeypatch):
