@@ -81,7 +81,7 @@ def test_what_went_on_to_its_end_is_taken_back_and_the_selection_goes_on(monkeyp
         return fit
 
     monkeypatch.setattr(selecting, "refine_anew", too_far)
-    found = select(data, point, [THRUST, DRAG], say=lambda text: said.append(text))
+    found = select(data, point, [THRUST, DRAG], say=said.append)
     assert sum("nothing more of it is admitted: thrust_scale" in text for text in said) == 1
     assert "thrust_scale" not in {c.effect for c in found.accepted}
     assert "thrust_scale" not in found.final.effects
