@@ -132,11 +132,12 @@ def test_short_flights_have_shorter_blocks_so_that_there_are_twenty():
         assert set(np.diff(block)) == {0, 1}
 
 
-def test_without_position_and_velocity_no_wind_can_be_seen():
+@pytest.mark.parametrize("effect", ["wind", "suspended_load"])
+def test_without_position_and_velocity_neither_wind_nor_what_swings_can_be_seen(effect):
     asked = (frozenset({"attitude", "body_rate", "specific_force"}), frozenset({"attitude", "body_rate", "velocity"}))
     found = [candidates_for(POINT, signals, measured_speeds=False) for signals in asked]
-    assert [any(c.effect == "wind" for c in kept) for kept, _ in found] == [False, True]
-    assert "velocity" in found[0][1]["wind"]
+    assert [any(c.effect == effect for c in kept) for kept, _ in found] == [False, True]
+    assert "velocity" in found[0][1][effect]
 
 
 def test_a_second_look_at_the_memory_of_torques_never_makes_a_fit_worse():
