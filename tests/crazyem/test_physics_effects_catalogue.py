@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from effects_cases import CF2, ROTORS, still, wild
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from crazyem.errors import FileFormatError
 from crazyem.physics.effects.catalogue import CATALOGUE, check_effects, discover
 from crazyem.physics.effects.effect import Effect, Effects, Parameter, Wrench
-from crazyem.physics.motion import RotorInput, measured, motion, own_values, rotor_thrust
+from crazyem.physics.motion import RotorInput, body_of, measured, motion, own_values, rotor_thrust
 from crazyem.vehicle import parse_vehicle
 
 AGREED = {  # issue 5: names are an interface
@@ -165,6 +165,7 @@ anything = st.sampled_from(sorted(CATALOGUE)).flatmap(admitted)
 def test_whatever_is_admitted_is_finite(one: Effects, other: Effects, seed: int, voltage: bool) -> None:
     effects = {**one, **other}
     check_effects(effects, where="test")
+    assume(np.linalg.eigvalsh(body_of(CF2, effects).inertia)[0] > 0)  # others are refused with their file (folding.py)
     situation = wild(30, seed=seed, speed=5.0, vehicle=CF2 if seed % 2 else ROTORS)
     moved = motion(situation, vehicle=CF2, effects=effects)
     shown = measured(situation, vehicle=CF2, effects=effects)
