@@ -73,6 +73,7 @@ HEAVY_OR_STRONG = ("payload", "thrust_scale")
 FAST = ("inertia", "inertia_products", "torque_scale", "rate_damping", "rotor_inertia", "motor_lag", "input_delay",
         "measurement_delay", "gyro_bias", "thrust_curve")  # fmt: skip
 SHOWN_BY_FORCES = ("thrust_curve", "motor_lag", "input_delay")
+OFF_THE_MIDDLE = ("payload", "center_of_mass", "rotor_fault")  # told from a thrust scale by their torque alone
 # m/s, where trims differ from day to day, and on any drone; times what the file has. Hovering in a real room looks like
 # 0 to 0.6 m/s, and a drone with nothing hidden once like 0.3.
 CALM, ROOM, GUSTIER = 1.0, 0.4, 2.0
@@ -184,8 +185,9 @@ def abstained(
         gone |= {c.effect: LEVEL_REASON for c in candidates if c.effect in HEAVY_OR_STRONG}
     if coarsely_sampled(data, point):
         # torques on another clock say nothing; how thrust goes with the command, and how late, shows in forces
-        slow = SHOWN_BY_FORCES if all(f.coarse for f in data.flights) else ()
-        gone |= {c.effect: COARSE_REASON for c in candidates if c.effect in FAST and c.effect not in slow}
+        slow, aside = (SHOWN_BY_FORCES, OFF_THE_MIDDLE) if all(f.coarse for f in data.flights) else ((), ())
+        fast = {*FAST, *aside} - {*slow}
+        gone |= {c.effect: COARSE_REASON for c in candidates if c.effect in fast}
     return [c for c in candidates if c.effect not in gone], {**left_out, **gone}
 
 

@@ -240,6 +240,8 @@ def _named(
             confidence *= _better(*pair)
         if candidate.effect == LOAD and TRIM in selection.final.vehicle.effects:
             equal = (*equal, TWO_WEAK)
+        if candidate.effect == WEAKER.effect and all(f.coarse for f in data.flights):
+            equal = (*equal, LOAD)  # nothing but torques tells them apart
         if alike or equal:
             group = tuple(dict.fromkeys([candidate.effect, *(t.candidate.effect for t in alike), *equal]))
             groups.append(group)

@@ -247,13 +247,19 @@ def select(
         if unlike_a_body(point, accepted):  # told by other means, or not at all: see `diagnose`
             return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))
         held_value = on_held_out(held_out, point, accepted).loglik if held_out else 0.0
+    found = [c.effect for c in accepted]
     fitted, accepted, steps = drop(data, fitted, accepted, steps, held_out, say)
     doubted: frozenset[str] = frozenset()
     if TRIM not in point.vehicle.effects:  # both judge by the scatter of blocks (see `by_gain`)
         fitted, accepted, steps = survive(data, fitted, accepted, steps, held_out, say)
         doubted = shaken(data, nominal_point, fitted, accepted, say)
-    point = fitted.point
-    return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates), doubted)
+    chosen = Selection(nominal, fitted.point, tuple(steps), tuple(accepted), fitted, len(candidates), doubted)
+    gone = {name for name in found if all(name != c.effect for c in accepted)}
+    if len(found) < MOST or not gone:
+        return chosen
+    # there was room for no more, and now there is
+    rest = [c for c in candidates if c.effect not in gone]
+    return select(data, nominal_point, rest, held_out=held_out, begun=chosen, say=say)
 
 
 def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Solution]]:

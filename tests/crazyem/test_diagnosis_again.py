@@ -22,6 +22,7 @@ from crazyem.diagnosis.locate import Finding
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.named import DOUBTFUL
 from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.prune import left_out
 from crazyem.diagnosis.select import select
 from crazyem.diagnosis.trials import Selection, Step, Trial
 from crazyem.diagnosis.unexplained import notable
@@ -86,6 +87,22 @@ def test_what_went_on_to_its_end_is_taken_back_and_the_selection_goes_on(monkeyp
     assert "thrust_scale" not in {c.effect for c in found.accepted}
     assert "thrust_scale" not in found.final.effects
     assert all(s.taken.candidate.effect != "thrust_scale" for s in found.steps if s.taken)
+
+
+def test_where_there_was_room_for_no_more_it_goes_on_after_something_is_left_out(monkeypatch):
+    data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02), thrust=(0.9,) * 4), seconds=20.0), DRONE)])
+    point = nominal(data, Point(DRONE, {}, first_guess()))
+    real = selecting.drop
+
+    def without_the_first(data, fitted, accepted, steps, *more):
+        if [c.effect for c in accepted] == ["thrust_scale"]:
+            return left_out(data, fitted, accepted, steps, accepted[0])
+        return real(data, fitted, accepted, steps, *more)
+
+    monkeypatch.setattr(selecting, "drop", without_the_first)
+    for most, names in ((1, ["linear_drag"]), (2, ["thrust_scale", "linear_drag"])):
+        monkeypatch.setattr(selecting, "MOST", most)
+        assert [c.effect for c in select(data, point, [THRUST, DRAG]).accepted] == names
 
 
 def test_after_an_exchange_the_selection_goes_on(slow_to_turn, monkeypatch):

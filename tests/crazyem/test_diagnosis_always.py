@@ -111,11 +111,12 @@ def test_no_drone_turns_as_in_honey():
 
 def test_of_flights_whose_commands_do_not_turn_the_drone_nothing_fast_is_asked():
     flights = [SimpleNamespace(coarse=c, levelled=False) for c in (True, True)]
-    candidates = [Candidate(n, (), ()) for n in (*FAST, "linear_drag", "wind", "thrust_scale")]
+    sideways = ("payload", "center_of_mass", "rotor_fault")  # told from a thrust scale by their torque alone
+    candidates = [Candidate(n, (), ()) for n in (*FAST, *sideways, "linear_drag", "wind", "thrust_scale")]
     kept, reasons = abstained(SimpleNamespace(flights=flights), POINT, candidates, {})  # type: ignore[arg-type]
     slow = ["motor_lag", "input_delay", "thrust_curve"]  # shown by forces
     assert [c.effect for c in kept] == [*slow, "linear_drag", "wind", "thrust_scale"]
-    assert reasons == dict.fromkeys((n for n in FAST if n not in slow), COARSE_REASON)
+    assert reasons == dict.fromkeys((*(n for n in FAST if n not in slow), *sideways), COARSE_REASON)
     flights[1].coarse = False
     assert abstained(SimpleNamespace(flights=flights), POINT, candidates, {})[0] == candidates  # type: ignore[arg-type]
 
