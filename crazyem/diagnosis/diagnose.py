@@ -105,7 +105,11 @@ def diagnose(
     beside = beside_the_regression(data, apart, selection.final, remains, wanted, left_out, pulled, say)
     if any(e.name == "gusts" for e in beside):
         remains = remains.without_force()
-    in_place = {LOAD: as_two(data, apart, selection), WEAKER.effect: as_load(data, apart, selection)}
+    coarse = all(f.coarse for f in data.flights)  # only torques would tell weaker rotors from a load
+    in_place = {
+        LOAD: as_two(data, apart, selection),
+        WEAKER.effect: None if coarse else as_load(data, apart, selection),
+    }
     effects, groups, separate = _named(data, selection, remains, told, in_place)
     if flights[0].inputs.measured and not any(e.name == "input_delay" for e in effects):
         late, alike = late_rotors(recordings, held_out, vehicle, wanted, left_out)
@@ -113,6 +117,7 @@ def diagnose(
         groups = (*groups, *alike)
         separate = tuple(dict.fromkeys((*separate, *(CATALOGUE[n].separates for g in alike for n in g))))
     effects = (*effects, *beside)
+    left_out = {n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)}
     fitted_vehicle = _with_effects(vehicle, selection, beside)
     mismatch = bool(effects) or remains.found
     return Diagnosis(

@@ -64,8 +64,6 @@ def as_load(data: Data, held_out: Data | None, selection: Selection) -> tuple[Tr
     step = next((s for s in selection.steps if s.taken and s.taken.candidate is weaker), None)
     if weaker is None or step is None or step.taken is None or any(c.effect == LOAD for c in selection.accepted):
         return None
-    if all(f.coarse for f in data.flights):  # only torques would tell, and theirs are not known
-        return None
     share = weaker.values(selection.final)["scale"]
     if share >= 1.0 or any(t.candidate.effect == LOAD and t.fitted is not None for t in step.trials):
         return None
