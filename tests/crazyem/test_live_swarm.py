@@ -3,8 +3,8 @@
 import argparse
 import io
 import json
-import re
 import math
+import re
 import subprocess
 import sys
 import threading
