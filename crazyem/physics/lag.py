@@ -7,10 +7,10 @@ command (for estimating both). A millisecond of delay that nobody models reads a
 A logged command is known only at its stamps, and in closed loop the next one already answers to the disturbance
 of the present step. To interpolate towards it is to let the step's own noise into its input: on hover data
 logged at 100 Hz that reads as 5 ms of delay and 16 % of inertia. So the mean of a step uses only commands
-stamped before the step began (or less than `REACTION` after that), continued by the prediction that the past
-allows (a linear one, fitted to the same commands: an innovation must be orthogonal to what predicts it); the lag
-itself is carried on along the commands as they then came (CAUSAL). Which commands those are is a matter of stamps
-alone, whatever the delay: what is known must not change with a parameter that is fitted."""
+stamped before the step began, continued by the prediction that the past allows (a linear one, fitted to the same
+commands: an innovation must be orthogonal to what predicts it); the lag itself is carried on along the commands as
+they then came (CAUSAL). Which commands those are is a matter of stamps alone, whatever the delay: what is known must
+not change with a parameter that is fitted. One stamped even 1 ms later answers already (`docs/estimator.md`)."""
 
 import numpy as np
 
@@ -24,9 +24,6 @@ HOLD = 1  # the earlier value: a controller that acts once per stamp, without la
 CAUSAL = 2  # a straight line, but a step's mean knows no later stamp than its start: commands with rotor lag
 
 ORDER = 3  # of the linear prediction
-# s: a command answers to a gyro that is low-passed at 80 Hz (2 ms) before the loop sees it, so one that is stamped so
-# little after a step began knows nothing of the step's own noise yet. Log blocks are often 1 or 2 ms apart.
-REACTION = 2e-3
 _AHEAD = 64  # most commands known or predicted inside one step
 
 
@@ -200,9 +197,9 @@ def lagged_means(
         acc[:] = 0.0
         if mode == CAUSAL:
             known = i + 1
-            while known < last and times[known] <= begin + delay + REACTION + 1e-6:
+            while known < last and times[known] <= begin + delay + 1e-6:
                 known += 1
-            while known > 1 and times[known - 1] > begin + delay + REACTION + 1e-6:
+            while known > 1 and times[known - 1] > begin + delay + 1e-6:
                 known -= 1
             guess[:] = state
             size = _predict(times, commands, i, known, end, predictor, path_times, path)

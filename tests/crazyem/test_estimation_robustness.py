@@ -65,10 +65,10 @@ def test_commands_stamped_between_the_measurements_under_noisy_control():
 
 
 def test_causal_state_is_blind_too():
-    t, node, out = np.arange(6) * 0.01, np.array([0.027, 0.037]), []
+    t, node, out = np.arange(6) * 0.01, np.array([0.028, 0.038]), []
     for future in (0.0, 1.0):
         u = np.zeros((6, 4))
-        u[3, 0] = future  # stamped 30 ms, after the step that begins at 27 ms and the loop's reaction
+        u[3, 0] = future  # stamped 30 ms, after the step that begins at 28 ms
         mean, state = np.zeros((2, 4)), np.zeros(13)
         lagged_means(
             t,
