@@ -127,24 +127,18 @@ def raise_after(error: BaseException | None) -> None:
         raise error
 
 
-def new_estimator(vehicle: Vehicle, arguments: argparse.Namespace, *, attitude_period: float = 0.0) -> Any:
+def new_estimator(vehicle: Vehicle, arguments: argparse.Namespace, *, onboard: bool = True) -> Any:
     """The estimator with the window of the command line; it begins its window anew when the mass steps.
 
-    `attitude_period` [s] as in `OnlineEstimator`.
+    `onboard`: attitudes come from a filter on board, as those of every link do.
     """
-    from crazyem.estimation.online import OnlineEstimator
+    from crazyem.estimation.online import ATTITUDE_PERIOD, OnlineEstimator
     from crazyem.estimation.steps import StepAwareEstimator
 
+    period = ATTITUDE_PERIOD if onboard else 0.0
     return StepAwareEstimator(
-        OnlineEstimator(vehicle, window=arguments.window, every=arguments.every, attitude_period=attitude_period)
+        OnlineEstimator(vehicle, window=arguments.window, every=arguments.every, attitude_period=period)
     )
-
-
-def attitude_period(uri: str) -> float:
-    """For `new_estimator`, of what comes from this link [s]."""
-    from crazyem.signals.mavlink import ATTITUDE_PERIOD
-
-    return ATTITUDE_PERIOD if uri.startswith("mavlink:") else 0.0
 
 
 def compile_kernels(vehicle: Vehicle) -> None:

@@ -11,7 +11,7 @@ from crazyem.live.pipeline import Pipeline
 from crazyem.live.summary import check_writable, live_line
 from crazyem.physics import folding
 from crazyem.recordings import Recording, open_recording
-from crazyem.signals.mavlink import ATTITUDE_PERIOD, carries_attitude
+from crazyem.recordings.attitudes import onboard_attitude
 from crazyem.vehicle import Vehicle
 
 SCALE_NOTICE = (
@@ -49,14 +49,6 @@ def required_signals(recording: Recording, vehicle: Vehicle) -> list[str]:
     return ["position", "attitude", *inputs, *(n for n in ("velocity", "body_rate") if n in names)]
 
 
-def attitude_period_of(recording: Recording) -> float:
-    """As the live estimator had it: longer than nothing for what an autopilot sent over MAVLink [s]."""
-    attitude = recording.signals.get("attitude")
-    names = attitude.source if attitude is not None else ()
-    theirs = "mavlink" in recording.metadata or any(carries_attitude(n) for n in names)
-    return ATTITUDE_PERIOD if theirs else 0.0
-
-
 def replay(recording: Recording, pipeline: Pipeline, *, progress: bool = True) -> None:
     """Run every sample of a recording through the pipeline."""
     shown = time.monotonic()
@@ -85,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
     recording.check(required_signals(recording, vehicle))
     history = History()
     take_events(recording, history)
-    estimator = new_estimator(vehicle, arguments, attitude_period=attitude_period_of(recording))
+    estimator = new_estimator(vehicle, arguments, onboard=onboard_attitude(recording))
     pipeline = Pipeline(estimator, history=history)
     pipeline.estimate_until = history.marks.get("estimate_end", pipeline.estimate_until)
     replay(recording, pipeline)

@@ -18,7 +18,6 @@ from typing import Any
 
 from crazyem.commands.common import (
     LiveLine,
-    attitude_period,
     close_recorder,
     compile_kernels,
     new_estimator,
@@ -229,7 +228,7 @@ def _begin(
     )
     drone.recorder = streams.beside(recorder, m.name)
     drone.estimator = estimator = Paced(
-        new_estimator(drone.vehicle, arguments, attitude_period=attitude_period(m.uri)),
+        new_estimator(drone.vehicle, arguments),
         number=number,
         of=of,
         late=arguments.every / arguments.rate,

@@ -11,7 +11,6 @@ import time
 
 from crazyem.commands.common import (
     LiveLine,
-    attitude_period,
     close_recorder,
     compile_kernels,
     new_estimator,
@@ -71,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
         session = Session(
             link,
             vehicle=vehicle,
-            estimator=new_estimator(vehicle, arguments, attitude_period=attitude_period(arguments.uri)),
+            estimator=new_estimator(vehicle, arguments),
             recorder=recorder,
             rate=arguments.rate,
             reconnect_within=arguments.reconnect,

@@ -139,7 +139,7 @@ def _bias(point: Point) -> float:
 
 def coarsely_sampled(data: Data, point: Point) -> bool:
     """Whether the commands of most flights are faster than their sampling (see `COARSE`); with a trim in the file."""
-    if all(f.coarse for f in data.flights):
+    if data.coarse:
         return True
     if TRIM not in point.vehicle.effects:
         return False
@@ -185,7 +185,7 @@ def abstained(
         gone |= {c.effect: LEVEL_REASON for c in candidates if c.effect in HEAVY_OR_STRONG}
     if coarsely_sampled(data, point):
         # torques on another clock say nothing; how thrust goes with the command, and how late, shows in forces
-        slow, aside = (SHOWN_BY_FORCES, OFF_THE_MIDDLE) if all(f.coarse for f in data.flights) else ((), ())
+        slow, aside = (SHOWN_BY_FORCES, OFF_THE_MIDDLE) if data.coarse else ((), ())
         fast = {*FAST, *aside} - {*slow}
         gone |= {c.effect: COARSE_REASON for c in candidates if c.effect in fast}
     return [c for c in candidates if c.effect not in gone], {**left_out, **gone}

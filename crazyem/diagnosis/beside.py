@@ -10,7 +10,7 @@ from crazyem.diagnosis.always import usual_gusts
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.gusts import find_gusts
 from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.named import Named, Value, around, share, trust
+from crazyem.diagnosis.named import DOUBTFUL, Named, Value, around, share
 from crazyem.diagnosis.prune import ADMITTED
 from crazyem.diagnosis.trials import SURE
 from crazyem.diagnosis.unexplained import Unexplained
@@ -54,8 +54,9 @@ def beside_the_regression(
                 there = find_gusts(apart, point)
                 held = there.gain if there else 0.0
             if held > 0:
-                found.append(Named("gusts", "gusts", values, {}, held, float(np.exp(-min(held, 700.0))),
-                                   trust(remains.without_force()) * share(min(gusts.gain, held), [])))  # fmt: skip
+                # what the regression explains, nothing where gusts are all there is, says nothing of them
+                sure = (DOUBTFUL if remains.without_force().found else 1.0) * share(min(gusts.gain, held), [])
+                found.append(Named("gusts", "gusts", values, {}, held, float(np.exp(-min(held, 700.0))), sure))
     if not wanted or accelerometer.EFFECT in wanted:
         tilted = accelerometer.tilt(data, point)
         if tilted is not None:

@@ -23,7 +23,7 @@ from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.place import depends_on_place
 from crazyem.diagnosis.select import select
 from crazyem.diagnosis.split import LOAD, WEAKER, as_load, as_two, instead_of_a_load
-from crazyem.diagnosis.trials import Selection, Trial, margin, told_apart, wald
+from crazyem.diagnosis.trials import Selection, Trial, better, told_apart, wald
 from crazyem.diagnosis.unexplained import Unexplained, unexplained
 from crazyem.diagnosis.witness import false_speed, late_measurements
 from crazyem.diagnosis.workers import Workers
@@ -105,10 +105,10 @@ def diagnose(
     beside = beside_the_regression(data, apart, selection.final, remains, wanted, left_out, pulled, say)
     if any(e.name == "gusts" for e in beside):
         remains = remains.without_force()
-    coarse = all(f.coarse for f in data.flights)  # only torques would tell weaker rotors from a load
     in_place = {
         LOAD: as_two(data, apart, selection),
-        WEAKER.effect: None if coarse else as_load(data, apart, selection),
+        # only torques would tell weaker rotors from a load
+        WEAKER.effect: None if data.coarse else as_load(data, apart, selection),
     }
     effects, groups, separate = _named(data, selection, remains, told, in_place)
     if flights[0].inputs.measured and not any(e.name == "input_delay" for e in effects):
@@ -242,10 +242,10 @@ def _named(
         if pair is not None and not told_apart(*pair):
             instead = [c.effect for c in instead_of_a_load(selection.final.vehicle)]
             equal = (*equal, *(instead if candidate.effect == LOAD else [LOAD]))
-            confidence *= _better(*pair)
+            confidence *= better(*pair)
         if candidate.effect == LOAD and TRIM in selection.final.vehicle.effects:
             equal = (*equal, TWO_WEAK)
-        if candidate.effect == WEAKER.effect and all(f.coarse for f in data.flights):
+        if candidate.effect == WEAKER.effect and data.coarse:
             equal = (*equal, LOAD)  # nothing but torques tells them apart
         if alike or equal:
             group = tuple(dict.fromkeys([candidate.effect, *(t.candidate.effect for t in alike), *equal]))
@@ -282,10 +282,5 @@ def _preferred(taken: Trial, rivals: Sequence[Trial]) -> float:
     chance = 1.0
     for rival in rivals:
         if rival.fitted is not None and rival.blocks.size == taken.blocks.size:
-            chance *= _better(taken, rival)
+            chance *= better(taken, rival)
     return chance
-
-
-def _better(one: Trial, other: Trial) -> float:
-    nats, sd = margin(one, other)
-    return float(stats.norm.cdf(nats / sd))

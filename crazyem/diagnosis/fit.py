@@ -82,6 +82,11 @@ class Data:
         """What all of them measure."""
         return frozenset.intersection(*(f.signals for f in self.flights))
 
+    @property
+    def coarse(self) -> bool:
+        """Whether in none of them what turned the drone is in the commands as recorded."""
+        return all(f.coarse for f in self.flights)
+
     def loglik(self, point: Point, passes: int = 1) -> float:
         """Log-likelihood [nats]; a start is not counted."""
         return sum(self.workers.map(lambda m: m.sweep(point, passes=passes).loglik, self.models))

@@ -11,8 +11,8 @@ from crazyem.diagnosis.inputs import inputs_of
 from crazyem.doctor.streams import airtime, ordered
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
+from crazyem.recordings.attitudes import onboard_attitude
 from crazyem.recordings.recording import Recording
-from crazyem.signals.mavlink import carries_attitude
 from crazyem.vehicle import GRAVITY, Vehicle
 
 SAME_NODE = 1.5e-3  # s: measurements closer than this belong to one node
@@ -27,8 +27,6 @@ PIECE = 60.0  # s after which the filter starts anew, so that long flights are s
 # over 0.04 s, so its error hangs together that long. Taken for white at 100 Hz it is drone that turns: gyros then look
 # four to ten times as noisy as by one attitude in 80 ms, and torques of drones with nothing hidden 6 % too strong.
 APART = 0.08
-# What names of attitudes that a filter on board made begin with, beside those of MAVLink: the Crazyflie's, ULog's.
-ONBOARD = ("stateEstimate", "kalman.", "vehicle_attitude.")
 COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 COMMANDS = ("motor_command", "motor_request", "mixer_command")
 YAW = "stateEstimate.yaw"  # deg, right-handed
@@ -167,16 +165,6 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
             f"(at least {SHORTEST:g} s)"
         )
     return flight
-
-
-def onboard_attitude(recording: Recording) -> bool:
-    """Whether the attitude is that of a filter on board, and not of motion capture: by its name, or by a CSV mapping
-    that claims it (`attitude = "onboard"`)."""
-    attitude = recording.signals.get("attitude")
-    if attitude is None:
-        return False
-    claimed = recording.metadata.get("claims", {}).get("attitude") == "onboard" or "mavlink" in recording.metadata
-    return claimed or any(s.rsplit("/", 1)[-1].startswith(ONBOARD) or carries_attitude(s) for s in attitude.source)
 
 
 def leaning(recording: Recording) -> tuple[NDArray, NDArray]:

@@ -103,6 +103,12 @@ def margin(best: Trial, other: Trial) -> tuple[float, float]:
     return nats, scatter(best.blocks - other.blocks)
 
 
+def better(one: Trial, other: Trial) -> float:
+    """Probability that one explains more than the other, by the scatter of the difference."""
+    nats, sd = margin(one, other)
+    return float(stats.norm.cdf(nats / sd))
+
+
 def scatter(differences: NDArray) -> float:
     """Standard deviation of the sum of differences of log-likelihoods (b,) by blocks, neighbours alike by half."""
     centred = differences - differences.mean()

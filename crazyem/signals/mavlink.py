@@ -10,11 +10,6 @@ from dataclasses import dataclass
 MILLI_G = 9.80665e-3  # m/s^2, the standard gravity of autopilots
 RPM = 2.0 * math.pi / 60.0
 
-# s between attitudes that an estimator uses. An autopilot's filter integrates its gyro and takes a fix now and then, so
-# its attitude errs as its rates do and for far longer than a message lasts: as ten independent attitudes in 0.1 s they
-# contradict the rates, and inertia comes out a fifth too high in hover (docs/mavlink.md).
-ATTITUDE_PERIOD = 0.05
-
 # What is put together of several messages and parameters has names of its own, in our units and our order of rotors.
 OUTPUTS, ROTORS, BATTERY, INFO = "outputs", "rotors", "battery", "supervisor"
 

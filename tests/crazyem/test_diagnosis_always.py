@@ -40,7 +40,8 @@ def flown(*, speed: float, measured: bool = False) -> SimpleNamespace:
     y = np.zeros((400, 13))
     y[:, 3:6] = np.sqrt(2) * speed * np.array([1, 2, 4]) * np.sin(np.arange(400) * np.pi / 20)[:, None]
     flight = SimpleNamespace(y=y, inputs=SimpleNamespace(measured=measured), coarse=False)
-    return SimpleNamespace(flights=[flight], signals=frozenset({"position", "velocity", "attitude", "body_rate"}))
+    signals = frozenset({"position", "velocity", "attitude", "body_rate"})
+    return SimpleNamespace(flights=[flight], coarse=False, signals=signals)
 
 
 def sd_of(data: SimpleNamespace, point: Point, effect: str) -> np.ndarray:
@@ -109,16 +110,20 @@ def test_no_drone_turns_as_in_honey():
         assert not unlike_a_body(point, [])
 
 
+def data_of(flights):
+    return SimpleNamespace(flights=flights, coarse=Data.coarse.fget(SimpleNamespace(flights=flights)))
+
+
 def test_of_flights_whose_commands_do_not_turn_the_drone_nothing_fast_is_asked():
     flights = [SimpleNamespace(coarse=c, levelled=False) for c in (True, True)]
     sideways = ("payload", "center_of_mass", "rotor_fault")  # told from a thrust scale by their torque alone
     candidates = [Candidate(n, (), ()) for n in (*FAST, *sideways, "linear_drag", "wind", "thrust_scale")]
-    kept, reasons = abstained(SimpleNamespace(flights=flights), POINT, candidates, {})  # type: ignore[arg-type]
+    kept, reasons = abstained(data_of(flights), POINT, candidates, {})
     slow = ["motor_lag", "input_delay", "thrust_curve"]  # shown by forces
     assert [c.effect for c in kept] == [*slow, "linear_drag", "wind", "thrust_scale"]
     assert reasons == dict.fromkeys((*(n for n in FAST if n not in slow), *sideways), COARSE_REASON)
     flights[1].coarse = False
-    assert abstained(SimpleNamespace(flights=flights), POINT, candidates, {})[0] == candidates  # type: ignore[arg-type]
+    assert abstained(data_of(flights), POINT, candidates, {})[0] == candidates
 
 
 def test_a_draft_of_a_room_is_a_finding_only_of_a_drone_whose_trim_does_not_change():

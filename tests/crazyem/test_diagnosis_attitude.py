@@ -9,8 +9,9 @@ from made_flight import array_of
 
 from crazyem.diagnosis.always import refine_base
 from crazyem.diagnosis.fit import Data, nominal, starting_point
-from crazyem.diagnosis.flight import APART, Flight, flight_of, onboard_attitude
+from crazyem.diagnosis.flight import APART, Flight, flight_of
 from crazyem.diagnosis.model import Point
+from crazyem.recordings.attitudes import onboard_attitude
 from crazyem.recordings.recording import Recording
 
 PULL, TILT = 0.04, 4e-3  # s, rad: how long an error lasts, and its standard deviation

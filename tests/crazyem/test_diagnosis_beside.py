@@ -18,6 +18,7 @@ from crazyem.diagnosis.flight import flight_of, without
 from crazyem.diagnosis.gusts import Gusts, find_gusts
 from crazyem.diagnosis.locate import Finding
 from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.named import DOUBTFUL
 from crazyem.diagnosis.place import Place
 from crazyem.diagnosis.unexplained import Unexplained
 from crazyem.errors import DataError
@@ -72,6 +73,18 @@ def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(m
     (named,) = beside_the_regression(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
     assert named.parameters["correlation_time"].ci95 == (0.01, 100.0)
     assert named.parameters["standard_deviation"].ci95 == pytest.approx((1.502, 1.698))
+
+
+@pytest.mark.parametrize(("other", "confidence"), [(False, 0.95), (True, DOUBTFUL * 0.95)])
+def test_gusts_are_as_sure_as_what_they_leave_allows(monkeypatch, other, confidence):
+    """Where gusts are all there is the regression explains nothing, which says nothing of them (told with 0 once)."""
+    air = Gusts(5000.0, np.ones(3), 0.25, 0.1, True, 1.6, 0.05)
+    monkeypatch.setattr("crazyem.diagnosis.beside.find_gusts", lambda data, point: air)
+    where = Finding("attitude", "y", "changes at 7 s", "time", (7.0, 28.0), 0.04, 0.005, "rad", 34.0, 1e-7)
+    remains = Unexplained((where,) if other else (), 0.0)
+    data, point = Data(()), starting_point(Point(load_vehicle("cf2"), {}, None))
+    (named,) = beside_the_regression(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
+    assert named.confidence == pytest.approx(confidence)
 
 
 def test_what_pushes_the_drone_away_is_no_place_that_it_is_tied_to():

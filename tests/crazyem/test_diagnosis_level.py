@@ -119,11 +119,12 @@ def test_how_heavy_or_strong_the_drone_is_is_left_open():
     assert not flight_of(made_flight(MOTION, noise=0.0), DRONE).levelled
     point = Point(DRONE, {}, first_guess())
     found, left_out = candidates_for(point, flight.signals, measured_speeds=False)
-    data = SimpleNamespace(flights=[flight])
+    data = SimpleNamespace(flights=[flight], coarse=False)
     kept, reasons = abstained(data, point, found, left_out)
     gone = {"payload", "thrust_scale"}
     assert {c.effect for c in found} - {c.effect for c in kept} == gone
     assert all("no battery voltage" in reasons[n] for n in gone)
     assert "gain_per_second" in {n for c in kept if c.effect == "battery_sag" for n in c.free}
-    kept, _ = abstained(SimpleNamespace(flights=[flight, replace(flight, levelled=False)]), point, found, left_out)
+    data.flights += [replace(flight, levelled=False)]
+    kept, _ = abstained(data, point, found, left_out)
     assert gone <= {c.effect for c in kept}  # one that was measured can tell

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from crazyem.commands.common import attitude_period
-from crazyem.estimation.online import OnlineEstimator
+from crazyem.estimation.online import ATTITUDE_PERIOD, OnlineEstimator
 from crazyem.links.mavlink import streams
 from crazyem.links.mavlink.frames import FrameParser
 from crazyem.links.mavlink.stamps import DroneClock
@@ -85,7 +84,7 @@ def test_hovering_inertia_is_within_its_intervals(tmp_path):
     off, off_with_all, held = [], [], 0
     for seed in range(4):
         frames = hover(tmp_path, seed)
-        said, with_all = estimated(frames, attitude_period(URI)), estimated(frames, 0.0)
+        said, with_all = estimated(frames, ATTITUDE_PERIOD), estimated(frames, 0.0)
         off.append([said[n].value / true - 1 for n, true in INERTIA.items()])
         off_with_all.append([with_all[n].value / true - 1 for n, true in INERTIA.items()])
         held += sum(said[n].ci95[0] <= true <= said[n].ci95[1] for n, true in INERTIA.items())

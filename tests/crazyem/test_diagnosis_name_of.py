@@ -1,0 +1,48 @@
+"""Which of several explanations that are not told apart gives the name."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.select import name_of
+from crazyem.diagnosis.trials import Trial, better, told_apart
+
+NOISE = np.random.default_rng(0).normal(size=40)
+
+
+def trial(effect: str, free: str, value: float, *, scatter: float = 0.0, p_value: float = 1e-9) -> Trial:
+    """An explanation by as many numbers as `free` has letters; its likelihood scatters over blocks."""
+    there = SimpleNamespace()
+    blocks = value / 40 + scatter * NOISE
+    return Trial(
+        Candidate(effect, (), tuple(free)), value, 0.0, 1.0, p_value, value - len(free), there, blocks, value,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def test_the_simplest_gives_the_name_where_nothing_beats_it():
+    payload, centre = trial("payload", "mxyz", 101.0), trial("center_of_mass", "xyz", 100.0, scatter=0.3)
+    assert name_of([payload, centre], counted=False) is centre
+
+
+def test_what_is_beaten_for_all_but_certain_does_not_however_simple():
+    """Three inertias better by 3.7 nats than a factor on all torques, steadily from block to block: the factor was told
+    first, with a confidence of 0.02."""
+    inertia, torque = trial("inertia", "xyz", 105.7), trial("torque_scale", "s", 100.0, scatter=0.25)
+    assert not told_apart(inertia, torque)  # by less than 4 nats
+    assert better(torque, inertia) < 0.05
+    assert name_of([inertia, torque], counted=False) is inertia
+    unsteady = trial("torque_scale", "s", 100.0, scatter=1.0)
+    assert better(unsteady, inertia) > 0.05
+    assert name_of([inertia, unsteady], counted=False) is unsteady
+
+
+def test_what_is_not_significant_itself_beats_nothing():
+    centre, payload = trial("center_of_mass", "xyz", 100.0), trial("payload", "mxyz", 130.0, p_value=0.01)
+    assert better(centre, payload) < 1e-3
+    assert name_of([centre, payload], counted=False) is centre
+
+
+def test_without_evidence_enough_the_first_gives_the_name():
+    first, simple = trial("inertia", "xyz", 20.0), trial("torque_scale", "s", 6.0, scatter=3.0)
+    assert name_of([first, simple], counted=False) is first
