@@ -181,6 +181,20 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
     return replace(trial, gain=gain, held_out=held, p_value=sure, fitted=fit, blocks=blocks, value=value)
 
 
+def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Callable[[str], None]) -> Step:
+    """One turn of the selection: the promising are fitted, and the best is taken if it is sure enough."""
+    counted = basis.held_out is not None
+    fitted = basis.data.workers.map(lambda entry: tried(basis, *entry, say=say), shortlist(linear))
+    trials = weighed(fitted, counted=counted)
+    rest = [t for t, _ in linear if all(t.candidate is not p.candidate for p in trials)]
+    if not trials or own_evidence(trials[0], counted=counted) <= ADMITTED or trials[0].p_value >= SURE:
+        return Step((*trials, *rest), None)
+    trials, equals = compared_again(basis, trials, say=say)
+    taken = name_of(equals, counted=counted)
+    alike = tuple(t for t in equals if t.candidate.effect != taken.candidate.effect)
+    return Step((*trials, *rest), taken, alike)
+
+
 def select(
     data: Data,
     nominal_point: Point,
@@ -200,38 +214,27 @@ def select(
     steps: list[Step] = [] if begun is None else [s for s in begun.steps if s.taken]
     held_value = on_held_out(held_out, point, accepted).loglik if held_out else 0.0
     first = len(accepted)
-    for turn in range(first, MOST + 1):
+    while True:
         rest = [
             c
             for c in candidates
             if all(c.effect != a.effect and (c.effect, a.effect) not in PARTNERS for a in accepted)
         ]
-        say(f"looking for effect {turn + 1} among {len(rest)} candidates")
+        say(f"looking for effect {len(accepted) + 1} among {len(rest)} candidates")
         linear = linear_trials(data, point, accepted, best_begun(data, point, accepted, rest))
         if len(accepted) > first:
             steps[-1] = replace(steps[-1], beside=additions(steps[-1], [t for t, _ in linear]))
-        promising = shortlist(linear) if turn < MOST else []  # after the last, only what stands beside it is asked
-        basis = Basis(data, held_out, point, tuple(accepted), value, held_value)
-        trials = data.workers.map(lambda entry: tried(basis, *entry, say=say), promising)  # noqa: B023 - done at once
-        trials = weighed(trials, counted=held_out is not None)
-        rest_trials = [t for t, _ in linear if all(t.candidate is not p.candidate for p in trials)]
-        best = trials[0] if trials else None
-        enough = (
-            best is not None and own_evidence(best, counted=held_out is not None) > ADMITTED and best.p_value < SURE
-        )
-        if not enough or turn == MOST:
-            steps.append(Step((*trials, *rest_trials), None))
+        if len(accepted) >= MOST:  # what stands beside the last is all that is asked
+            steps.append(Step(tuple(t for t, _ in linear), None))
             break
-        assert best is not None
-        assert best.fitted is not None
-        trials, equals = compared_again(basis, trials, say=say)
-        best = name_of(equals, counted=held_out is not None)
-        assert best.fitted is not None
-        alike = tuple(t for t in equals if t.candidate.effect != best.candidate.effect)
-        steps.append(Step((*trials, *rest_trials), best, alike))
-        dated, candidate = date(data, best.fitted, best.candidate)
+        steps.append(step_of(Basis(data, held_out, point, tuple(accepted), value, held_value), linear, say=say))
+        taken = steps[-1].taken
+        if taken is None:
+            break
+        assert taken.fitted is not None
+        dated, candidate = date(data, taken.fitted, taken.candidate)
         accepted.append(candidate)
-        say(f"  found {candidate.label}: {best.evidence:.1f} nats")
+        say(f"  found {candidate.label}: {taken.evidence:.1f} nats")
         before, fitted = fitted, refine_anew(data, dated.point, accepted)
         if at_the_end(fitted.point, candidate):
             # together with all that is free it went on to where nothing more is admitted: it stands for something else
