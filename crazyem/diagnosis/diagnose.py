@@ -18,7 +18,7 @@ from crazyem.diagnosis.heading import heading_by_place
 from crazyem.diagnosis.imitated import by_place
 from crazyem.diagnosis.locate import Located, locate
 from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.named import DOUBTFUL, Named, Value, share, trust
+from crazyem.diagnosis.named import DOUBTFUL, Named, Value, one_factor, share, trust
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.place import depends_on_place
 from crazyem.diagnosis.select import select
@@ -232,21 +232,25 @@ def _named(
         if candidate.effect in selection.doubted:
             confidence = min(confidence, DOUBTFUL)
             separate.append(SHAKES)
-        p_value = min(1.0, taken.p_value * max(1, selection.tried))
-        name, label, chosen = candidate.effect, candidate.label, dict(candidate.fixed)
-        if late:
-            name, label, chosen = MEASURED_LATE, MEASURED_LATE, {"streams": ("state", "gyro")}
-        named.append(Named(name, label, parameters, chosen, taken.held_out, p_value, confidence))
         equal = () if candidate.effect in told else SAME.get(candidate.effect, ())
         pair = in_place.get(candidate.effect)
         if pair is not None and not told_apart(*pair):
             instead = [c.effect for c in instead_of_a_load(selection.final.vehicle)]
             equal = (*equal, *(instead if candidate.effect == LOAD else [LOAD]))
-            confidence *= better(*pair)
+        if candidate.effect == "inertia" and all(t.candidate.effect != "torque_scale" for t in step.trials):
+            # not asked beside what was found before it
+            before = np.array([neutral[n] for n in candidate.free])
+            if one_factor(before + away, before, solution.covariance[own, own]):
+                equal = (*equal, "torque_scale")
         if candidate.effect == LOAD and TRIM in selection.final.vehicle.effects:
             equal = (*equal, TWO_WEAK)
         if candidate.effect == WEAKER.effect and data.coarse:
             equal = (*equal, LOAD)  # nothing but torques tells them apart
+        p_value = min(1.0, taken.p_value * max(1, selection.tried))
+        name, label, chosen = candidate.effect, candidate.label, dict(candidate.fixed)
+        if late:
+            name, label, chosen = MEASURED_LATE, MEASURED_LATE, {"streams": ("state", "gyro")}
+        named.append(Named(name, label, parameters, chosen, taken.held_out, p_value, confidence))
         if alike or equal:
             group = tuple(dict.fromkeys([candidate.effect, *(t.candidate.effect for t in alike), *equal]))
             groups.append(group)

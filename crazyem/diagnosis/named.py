@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
 
 from crazyem.diagnosis.unexplained import Unexplained
 
@@ -58,3 +60,15 @@ def share(best: float, others: Sequence[float]) -> float:
     """Probability of the best against its rivals and against nothing (evidence 0)."""
     weights = np.exp(np.clip(TEMPER * (np.array([*others, 0.0]) - best), -700, 0))
     return CALIBRATED / float(1.0 + weights.sum())
+
+
+def one_factor(values: NDArray, neutral: NDArray, covariance: NDArray) -> bool:
+    """Whether values (k,) with a covariance (k, k) are their neutral ones times one factor, by chi-squared at 5 %.
+
+    Inertias that are, about all three axes, are what a factor on the torques is, to every signal.
+    """
+    ratio = np.log(values / neutral)
+    precision = np.linalg.pinv(covariance / np.outer(values, values))
+    mean = (precision @ ratio).sum() / precision.sum()
+    distance = float((ratio - mean) @ precision @ (ratio - mean))
+    return bool(stats.chi2.sf(distance, len(values) - 1) > 0.05)

@@ -1,0 +1,35 @@
+"""What a name is said with: inertias that are one factor on the torques, and a group that says so."""
+
+import numpy as np
+import pytest
+from closed_loop import DRONE, Hidden, fly
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crazyem.diagnosis.diagnose import diagnose
+from crazyem.diagnosis.named import one_factor
+
+OWN = np.array([1.66e-5, 1.67e-5, 2.93e-5])
+
+
+@given(st.floats(0.5, 2.0), st.floats(0.001, 0.1), st.floats(0.0, 0.9))
+@settings(max_examples=50, deadline=None)
+def test_one_factor_is_told_as_one_whatever_its_size_and_what_the_axes_share(factor, relative, shared):
+    covariance = relative**2 * np.outer(OWN, OWN) * (np.eye(3) * (1 - shared) + shared)
+    assert one_factor(factor * OWN, OWN, covariance)
+    apart = factor * OWN * np.exp(np.array([6.0, -6.0, 0.0]) * relative)
+    assert not one_factor(apart, OWN, covariance)
+
+
+def test_chance_tells_one_factor_as_several_in_one_of_twenty():
+    rng = np.random.default_rng(0)
+    covariance = np.diag((0.02 * OWN) ** 2)
+    told = [one_factor(1.2 * OWN * (1 + 0.02 / 1.2 * rng.normal(size=3)), OWN, covariance) for _ in range(2000)]
+    assert np.mean(told) == pytest.approx(0.95, abs=0.02)
+
+
+def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_asked():
+    flown = fly(Hidden(torque=0.7), seconds=12.0)
+    found = diagnose([flown], DRONE, wanted=["inertia"])
+    assert [e.name for e in found.effects] == ["inertia"]
+    assert found.indistinguishable == (("inertia", "torque_scale"),)
