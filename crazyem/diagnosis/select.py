@@ -57,6 +57,8 @@ BESIDE = 0.5  # share of its gain that an effect keeps beside another which it i
 PARTNERS = (("torque_scale", "inertia"), ("inertia", "torque_scale"), ("torque_scale", "motor_lag"),
             ("motor_lag", "torque_scale"))  # fmt: skip
 TURNING = {name for pair in PARTNERS for name in pair}
+# A heavier drone with as much more thrust has more torque and nothing else: beside a lag that is the same again.
+TORQUE_AND_LAG = {"payload", "thrust_scale", "motor_lag"}
 
 
 def linear_trials(
@@ -181,6 +183,15 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
     return replace(trial, gain=gain, held_out=held, p_value=sure, fitted=fit, blocks=blocks, value=value)
 
 
+def may_join(effect: str, found: set[str]) -> bool:
+    """Whether an effect can be known beside those found: not twice, and not where it is what they are, differently."""
+    return (
+        effect not in found
+        and all((effect, f) not in PARTNERS for f in found)
+        and not (effect in TORQUE_AND_LAG and {effect, *found} >= TORQUE_AND_LAG)
+    )
+
+
 def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Callable[[str], None]) -> Step:
     """One turn of the selection: the promising are fitted, and the best is taken if it is sure enough."""
     counted = basis.held_out is not None
@@ -215,11 +226,7 @@ def select(
     held_value = on_held_out(held_out, point, accepted).loglik if held_out else 0.0
     first = len(accepted)
     while True:
-        rest = [
-            c
-            for c in candidates
-            if all(c.effect != a.effect and (c.effect, a.effect) not in PARTNERS for a in accepted)
-        ]
+        rest = [c for c in candidates if may_join(c.effect, {a.effect for a in accepted})]
         say(f"looking for effect {len(accepted) + 1} among {len(rest)} candidates")
         linear = linear_trials(data, point, accepted, best_begun(data, point, accepted, rest))
         if len(accepted) > first:

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.select import name_of
+from crazyem.diagnosis.select import may_join, name_of
 from crazyem.diagnosis.trials import Trial, better, told_apart
 
 NOISE = np.random.default_rng(0).normal(size=40)
@@ -46,3 +46,13 @@ def test_what_is_not_significant_itself_beats_nothing():
 def test_without_evidence_enough_the_first_gives_the_name():
     first, simple = trial("inertia", "xyz", 20.0), trial("torque_scale", "s", 6.0, scatter=3.0)
     assert name_of([first, simple], counted=False) is first
+
+
+def test_what_is_already_there_in_another_form_is_not_asked():
+    assert may_join("motor_lag", {"thrust_scale"})
+    assert may_join("payload", {"thrust_scale"})
+    assert not may_join("payload", {"thrust_scale", "motor_lag"})  # both heavier and stronger: more torque
+    assert not may_join("motor_lag", {"thrust_scale", "payload", "wind"})
+    assert not may_join("inertia", {"torque_scale"})
+    assert not may_join("wind", {"wind"})
+    assert may_join("wind", {"thrust_scale", "motor_lag"})
