@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.select import may_join, name_of
+from crazyem.diagnosis.select import BEATEN, may_join, name_of
 from crazyem.diagnosis.trials import Trial, better, told_apart
 
 NOISE = np.random.default_rng(0).normal(size=40)
@@ -25,15 +25,15 @@ def test_the_simplest_gives_the_name_where_nothing_beats_it():
     assert name_of([payload, centre], counted=False) is centre
 
 
-def test_what_is_beaten_for_all_but_certain_does_not_however_simple():
+def test_what_is_beaten_does_not_however_simple():
     """Three inertias better by 3.7 nats than a factor on all torques, steadily from block to block: the factor was told
     first, with a confidence of 0.02."""
     inertia, torque = trial("inertia", "xyz", 105.7), trial("torque_scale", "s", 100.0, scatter=0.25)
     assert not told_apart(inertia, torque)  # by less than 4 nats
-    assert better(torque, inertia) < 0.05
+    assert better(torque, inertia) < BEATEN
     assert name_of([inertia, torque], counted=False) is inertia
     unsteady = trial("torque_scale", "s", 100.0, scatter=1.0)
-    assert better(unsteady, inertia) > 0.05
+    assert better(unsteady, inertia) > BEATEN
     assert name_of([inertia, unsteady], counted=False) is unsteady
 
 
