@@ -108,9 +108,8 @@ def initial_path(flight: Flight) -> NDArray:
 def thrust_of(flight: Flight, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, NDArray]:
     """Mean thrust of each rotor over the steps, and its rate: (n, 4) N, (n, 4) N/s."""
     return rotor_thrust(
-        flight.inputs, flight.time, vehicle=vehicle, effects=effects, breaks=np.flatnonzero(flight.gaps).tolist(),
-        rates=flight.y[:, 10:13],
-    )  # fmt: skip
+        flight.inputs, flight.time, vehicle=vehicle, effects=effects, breaks=np.flatnonzero(flight.gaps).tolist()
+    )
 
 
 def situation_of(

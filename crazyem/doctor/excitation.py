@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from crazyem.doctor.envelope import Airborne, held, sound_samples
 from crazyem.doctor.whitening import ORDER, Fit, autoregression, filtered, long_run
-from crazyem.physics.lag import CAUSAL, LINEAR, lagged_means
-from crazyem.physics.predictor import fit_predictor, hold_predictor
+from crazyem.physics.lag import CAUSAL, LINEAR, fit_predictor, hold_predictor, lagged_means
 from crazyem.physics.rotations import quaternion_conjugate, quaternion_product, rotation_vector_from_quaternion
 from crazyem.physics.rotors import wrench_from_command, wrench_from_speed
 from crazyem.recordings.recording import Recording
@@ -141,8 +140,8 @@ def lagged(
         if times.size >= 2:
             state = np.append(np.tile(commands[0], 3), times[0])
             lagged_means(
-                times, commands, 0, times.size, predictor, np.zeros((0, 3)), nodes, 0, nodes.size, mode, tau, delay,
-                state, mean, by_tau, by_delay,
+                times, commands, 0, times.size, predictor, nodes, 0, nodes.size, mode, tau, delay, state, mean, by_tau,
+                by_delay,
             )  # fmt: skip
         late = np.searchsorted(times, nodes, "right")
         far = nodes - times[np.maximum(late - 1, 0)] > 0.1 if times.size else np.ones(nodes.size, bool)

@@ -12,8 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.physics.lag import CAUSAL, lagged_means
-from crazyem.physics.predictor import hold_predictor
+from crazyem.physics.lag import CAUSAL, hold_predictor, lagged_means
 
 _DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])  # third difference: blind to what is smooth, 20 times white variance
 _STEPS = 1000
@@ -63,9 +62,8 @@ def _lagged_noise(period: float, tau: float) -> tuple[float, float, float]:
     mean, by_tau, by_delay = np.zeros((_STEPS, 4)), np.zeros((_STEPS, 4)), np.zeros((_STEPS, 4))
     state = np.zeros(13)
     lagged_means(
-        times, noise, 0, _STEPS, hold_predictor(), np.zeros((0, 3)), times, 1, _STEPS, CAUSAL, tau, 0.0, state, mean,
-        by_tau, by_delay,
-    )  # fmt: skip
+        times, noise, 0, _STEPS, hold_predictor(), times, 1, _STEPS, CAUSAL, tau, 0.0, state, mean, by_tau, by_delay
+    )
     settled = slice(_STEPS // 10, None)
     m = mean[settled]
     return float(np.mean(m * m)), float(np.mean(m * by_tau[settled])), float(np.mean(m * by_delay[settled]))

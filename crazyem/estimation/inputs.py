@@ -4,12 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.estimation.tape import Tape
-from crazyem.physics.lag import CAUSAL, lagged_means
-from crazyem.physics.predictor import fit_predictor, hold_predictor
+from crazyem.physics.lag import CAUSAL, fit_predictor, hold_predictor, lagged_means
 
 MAX_GAP = 0.1  # s without an input beyond which a step cannot be trusted
 _RECENT = 8  # inputs looked at one by one, newest first, before the rest is searched
-NOT_MEASURED = np.zeros((0, 3))
 SETTLE = 5.0  # time constants after which a lag has forgotten where it started
 
 
@@ -85,8 +83,8 @@ class InputHistory:
     def advance(self, tape: Tape, first: int, last: int, theta: NDArray) -> None:
         """Fill the means of rows first..last-1 for parameters theta (9,), going on from the newest node."""
         self._at = lagged_means(
-            self.times, self.wrenches, self._at, self.size, self.predictor, tape.rates(), tape.time, first, last,
-            self.mode, theta[4], theta[5], self.lag, tape.mean, tape.mean_tau, tape.mean_delay,
+            self.times, self.wrenches, self._at, self.size, self.predictor, tape.time, first, last, self.mode, theta[4],
+            theta[5], self.lag, tape.mean, tape.mean_tau, tape.mean_delay,
         )  # fmt: skip
         tape.spread_inputs(first, last, theta[6:9])
 
@@ -95,8 +93,9 @@ class InputHistory:
         node = np.array([time])
         scratch = np.zeros((1, 4))
         self._at = lagged_means(
-            self.times, self.wrenches, self._at, self.size, self.predictor, NOT_MEASURED, node, 0, 1, self.mode, tau,
-            delay, self.lag, scratch, scratch.copy(), scratch.copy(),
+            self.times, self.wrenches, self._at, self.size, self.predictor, node, 0, 1, self.mode, tau, delay,
+            self.lag, scratch, scratch.copy(),
+            scratch.copy(),
         )  # fmt: skip
 
     def refill(self, tape: Tape, first: int, last: int, theta: NDArray) -> None:
@@ -104,8 +103,7 @@ class InputHistory:
         start = tape.time[first] - theta[5] - 2 * SETTLE * max(theta[4], 0.02)
         at = max(0, int(np.searchsorted(self.times[: self.size], start, "right")) - 1)
         if self.mode == CAUSAL:
-            times, wrenches = self.between(tape.time[first], tape.time[last - 1])
-            self.predictor = fit_predictor(wrenches, times, tape.time[first:last], tape.rates()[first:last])
+            self.predictor = fit_predictor(self.between(tape.time[first], tape.time[last - 1])[1])
         self.lag[:12] = np.tile(self.wrenches[at], 3)
         self.lag[12] = self.times[at]
         self._at = at

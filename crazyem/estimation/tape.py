@@ -97,10 +97,6 @@ class Tape:
         self.size += 1
         return dropped
 
-    def rates(self) -> np.ndarray:
-        """Body rates as measured (capacity, 3) rad/s, NaN where not."""
-        return np.ascontiguousarray(self.y[:, 10:13])
-
     def spread_inputs(self, first: int, last: int, offset: np.ndarray) -> None:
         """Mean inputs, with the torque offset (3,) added, into the contiguous columns that the kernels read."""
         self.thrust[first:last] = self.mean[first:last, 0]

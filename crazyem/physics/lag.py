@@ -7,15 +7,14 @@ command (for estimating both). A millisecond of delay that nobody models reads a
 A logged command is known only at its stamps, and in closed loop the next one already answers to the disturbance
 of the present step. To interpolate towards it is to let the step's own noise into its input: on hover data
 logged at 100 Hz that reads as 5 ms of delay and 16 % of inertia. So the mean of a step uses only commands
-stamped before the step began, continued by the prediction that they and the body rates at its beginning allow
-(`predictor.py`); the lag itself is carried on along the commands as they then came (CAUSAL). Which commands those
-are is a matter of stamps alone, whatever the delay: what is known must not change with a parameter that is fitted.
-One stamped even 1 ms later answers already (docs/estimator.md)."""
+stamped before the step began, continued by the prediction that the past allows (a linear one, fitted to the same
+commands: an innovation must be orthogonal to what predicts it); the lag itself is carried on along the commands as
+they then came (CAUSAL). Which commands those are is a matter of stamps alone, whatever the delay: what is known must
+not change with a parameter that is fitted. One stamped even 1 ms later answers already (`docs/estimator.md`)."""
 
 import numpy as np
 
 from crazyem.compiled import compiled
-from crazyem.physics.predictor import NEAR, ORDER, OWN, RATES
 
 STEP = 1e-3  # relative change of tau for the central difference
 
@@ -24,6 +23,7 @@ LINEAR = 0  # a straight line: measured rotor speeds
 HOLD = 1  # the earlier value: a controller that acts once per stamp, without lag
 CAUSAL = 2  # a straight line, but a step's mean knows no later stamp than its start: commands with rotor lag
 
+ORDER = 3  # of the linear prediction
 _AHEAD = 64  # most commands known or predicted inside one step
 
 
@@ -54,34 +54,59 @@ def _at(times, commands, i, last, t, mode, out):
 
 
 @compiled
-def _predict(times, commands, i, known, end, predictor, path_times, path, rates):
-    """Commands i..known-1 (and a few before) and their prediction up to `end`, into path; returns how many.
-
-    rates: (RATES,) body rates when the step begins and at the node before, NaN where they are not known.
-    """
+def _predict(times, commands, i, known, end, predictor, path_times, path):
+    """Commands i..known-1 (and a few before) and their prediction up to `end`, into path; returns how many."""
     begin = max(0, min(i, known - ORDER), known - _AHEAD // 2)
     size = known - begin
     for k in range(size):
         path_times[k] = times[begin + k]
         path[k] = commands[begin + k]
     period = path_times[size - 1] - path_times[size - 2] if size >= 2 else 0.0
-    if size < ORDER or not 0.0 < period < NEAR:
+    if size < ORDER or not 0.0 < period < 0.05:
         return size  # held
-    answers = np.isfinite(rates[0])  # the first to come answers to these rates
     while path_times[size - 1] < end and size < _AHEAD:
         for c in range(4):
-            at = OWN if answers else 0
-            value = predictor[c, at + ORDER]
+            value = predictor[c, ORDER]
             for j in range(ORDER):
-                value += predictor[c, at + j] * path[size - 1 - j, c]
-            if answers:
-                for j in range(RATES):
-                    value += predictor[c, 2 * OWN + j] * rates[j]
+                value += predictor[c, j] * path[size - 1 - j, c]
             path[size, c] = value
-        answers = False
         path_times[size] = path_times[size - 1] + period
         size += 1
     return size
+
+
+def hold_predictor() -> np.ndarray:
+    """Prediction that the latest command stays. (4, ORDER + 1)."""
+    weights = np.zeros((4, ORDER + 1))
+    weights[:, 0] = 1.0
+    return weights
+
+
+def fit_predictor(commands: np.ndarray) -> np.ndarray:
+    """Least-squares weights with which the latest commands predict the next.
+
+    Args:
+        commands: (n, 4), evenly spaced.
+
+    Returns:
+        (4, ORDER + 1): weights of the latest, the one before ..., and a constant. With too few commands, or none that
+        vary, the prediction is to hold the latest.
+    """
+    weights = hold_predictor()
+    n = len(commands) - ORDER
+    if n < 10 * (ORDER + 1):
+        return weights
+    for c in range(4):
+        past = np.stack([commands[ORDER - 1 - j : ORDER - 1 - j + n, c] for j in range(ORDER)], 1)
+        centre, spread = past.mean(), past.std()
+        if not spread > 0.0:
+            continue
+        a = (past - centre) / spread
+        target = (commands[ORDER:, c] - commands[ORDER - 1 : -1, c]) / spread
+        step = np.linalg.solve(a.T @ a + 1e-6 * n * np.eye(ORDER), a.T @ target)
+        weights[c, :ORDER] += step
+        weights[c, ORDER] = -step.sum() * centre
+    return weights
 
 
 @compiled
@@ -123,21 +148,9 @@ def _back(t0, t1, u0, u1, t, tau, state):
 
 
 @compiled
-def _known_rates(nodes, rates, k, known):
-    """Body rates where step k begins and at the node before into known (RATES,); NaN if either is not there."""
-    known[:] = np.nan
-    if k >= 2 and k <= len(rates) and nodes[k - 1] - nodes[k - 2] < NEAR:
-        known[:3] = rates[k - 1]
-        known[3:] = rates[k - 2]
-        for j in range(RATES):
-            if not np.isfinite(known[j]):
-                known[0] = np.nan
-
-
-@compiled
 def lagged_means(
-    times, commands, first, last, predictor, rates, nodes, node_first, node_last, mode, tau, delay, state, mean,
-    mean_tau, mean_delay,
+    times, commands, first, last, predictor, nodes, node_first, node_last, mode, tau, delay, state, mean, mean_tau,
+    mean_delay,
 ):  # fmt: skip
     """Means of the lagged command over the steps between nodes.
 
@@ -145,8 +158,7 @@ def lagged_means(
         times: (n,) s, stamps of the commands, increasing.
         commands: (n, 4) F [N] and M [N m] commanded at those stamps.
         first, last: range of commands to use; times[first] must not be after the start time in `state`.
-        predictor: (4, WIDTH) weights in the prediction of the next command; see `fit_predictor`.
-        rates: (m, 3) rad/s, body rates measured at the nodes, NaN where not; (0, 3) for a prediction by commands alone.
+        predictor: (4, ORDER + 1) weights of the latest commands in the prediction of the next; see `fit_predictor`.
         nodes: (m,) s, increasing.
         node_first, node_last: fill rows node_first..node_last-1, row k being the step that ends at nodes[k].
         mode: LINEAR, HOLD or CAUSAL.
@@ -168,7 +180,6 @@ def lagged_means(
     path_times = np.empty(_AHEAD)
     path = np.empty((_AHEAD, 4))
     start = np.empty(4)
-    known_rates = np.empty(RATES)
     begin = state[12]
     while i + 1 < last and times[i + 1] <= begin:
         i += 1
@@ -191,8 +202,7 @@ def lagged_means(
             while known > 1 and times[known - 1] > begin + delay + 1e-6:
                 known -= 1
             guess[:] = state
-            _known_rates(nodes, rates, k, known_rates)
-            size = _predict(times, commands, i, known, end, predictor, path_times, path, known_rates)
+            size = _predict(times, commands, i, known, end, predictor, path_times, path)
             if known <= i + 1 and i + 1 < last and begin > times[known - 1]:
                 # the state at `begin` has been carried towards commands that are not known yet: go back to the last
                 # stamp that is, and come here again along what is known and predicted

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Body, Effect, Effects, Offset, Situation
-from crazyem.physics.lag import CAUSAL, HOLD, LINEAR, lagged_means
-from crazyem.physics.predictor import fit_predictor, hold_predictor
+from crazyem.physics.lag import CAUSAL, HOLD, LINEAR, fit_predictor, hold_predictor, lagged_means
 from crazyem.physics.rotations import cross
 from crazyem.physics.rotors import wrench
 from crazyem.vehicle import GRAVITY, Vehicle
@@ -95,26 +94,17 @@ def settled(inputs: RotorInput, *, vehicle: Vehicle, effects: Effects) -> tuple[
 
 
 def rotor_thrust(
-    inputs: RotorInput,
-    nodes: NDArray,
-    *,
-    vehicle: Vehicle,
-    effects: Effects,
-    breaks: Sequence[int] = (),
-    rates: NDArray | None = None,
+    inputs: RotorInput, nodes: NDArray, *, vehicle: Vehicle, effects: Effects, breaks: Sequence[int] = ()
 ) -> tuple[NDArray, NDArray]:
     """Mean thrust of each rotor, and its mean derivative, over the steps that end at nodes (n,) [s].
 
-    `breaks`: rows at which a new stretch begins (their step means nothing). `rates`: (n, 3) rad/s as measured at the
-    nodes, NaN where not, to which the commands after them answer. Returns (n, 4) N and (n, 4) N/s.
+    `breaks`: rows at which a new stretch begins (their step means nothing). Returns (n, 4) N and (n, 4) N/s.
     """
     thrust, lag, delay = settled(inputs, vehicle=vehicle, effects=effects)
     mode = LINEAR if inputs.measured else (CAUSAL if lag > 0 and inputs.aged else HOLD)
     mean, rate = np.zeros((len(nodes), 4)), np.zeros((len(nodes), 4))
     scratch = np.zeros((len(nodes), 4))
-    rates = np.zeros((0, 3)) if rates is None else np.ascontiguousarray(rates, float)
-    answered = (inputs.time, nodes, rates) if len(rates) else ()
-    predictor = fit_predictor(thrust, *answered) if mode == CAUSAL else hold_predictor()
+    predictor = fit_predictor(thrust) if mode == CAUSAL else hold_predictor()
     state = np.zeros(13)
     starts = sorted({0, *breaks, len(nodes)})
     for first, last in pairwise(starts):
@@ -122,8 +112,8 @@ def rotor_thrust(
         at = max(0, int(np.searchsorted(inputs.time, begin, "right")) - 1)
         state[:12] = np.tile(thrust[at], 3)
         state[12] = inputs.time[at]
-        lagged_means(inputs.time, thrust, at, len(inputs.time), predictor, rates, nodes, first, last, mode, lag, delay,
-                     state, mean, scratch, rate)  # fmt: skip
+        lagged_means(inputs.time, thrust, at, len(inputs.time), predictor, nodes, first, last, mode, lag, delay, state,
+                     mean, scratch, rate)  # fmt: skip
     return mean, -rate
 
 

@@ -9,8 +9,7 @@ import synthetic
 
 from crazyem.errors import FileFormatError
 from crazyem.estimation.online import OnlineEstimator
-from crazyem.physics.lag import CAUSAL, lagged_means
-from crazyem.physics.predictor import hold_predictor
+from crazyem.physics.lag import CAUSAL, hold_predictor, lagged_means
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle, parse_vehicle
 
@@ -77,7 +76,6 @@ def test_causal_state_is_blind_too():
             0,
             6,
             hold_predictor(),
-            np.zeros((0, 3)),
             node,
             0,
             2,

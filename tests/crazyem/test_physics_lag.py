@@ -1,4 +1,4 @@
-"""The rotor lag: means over steps against brute-force integration, what a step may know, derivatives."""
+"""The rotor lag: means over steps against brute-force integration, what a step may know, derivatives, the predictor."""
 
 from itertools import pairwise
 
@@ -7,25 +7,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crazyem.physics.lag import CAUSAL, HOLD, LINEAR, lagged_means
-from crazyem.physics.predictor import ORDER, OWN, WIDTH, hold_predictor
+from crazyem.physics.lag import CAUSAL, HOLD, LINEAR, ORDER, fit_predictor, hold_predictor, lagged_means
 
 seeds = st.integers(0, 2**32 - 1)
 
 
-def run(times, commands, nodes, *, mode, tau, delay=0.0, predictor=None, rates=None, start=None, splits=()):
+def run(times, commands, nodes, *, mode, tau, delay=0.0, predictor=None, start=None, splits=()):
     """Means, d/dtau, d/ddelay of the steps between nodes; in several calls if splits are given."""
     state = np.zeros(13)
     state[:12] = np.tile(commands[0] if start is None else start, 3)
     state[12] = nodes[0] - delay
     outputs = tuple(np.zeros((len(nodes), 4)) for _ in range(3))
     predictor = hold_predictor() if predictor is None else predictor
-    rates = np.zeros((0, 3)) if rates is None else rates
     edges = [1, *splits, len(nodes)]
     at = 0
     for first, last in pairwise(edges):
         at = lagged_means(
-            times, commands, at, len(times), predictor, rates, nodes, first, last, mode, tau, delay, state, *outputs
+            times, commands, at, len(times), predictor, nodes, first, last, mode, tau, delay, state, *outputs
         )
     return *outputs, state
 
@@ -91,14 +89,6 @@ def test_without_lag_a_linear_command_gives_the_mean_of_the_line(seed):
         np.testing.assert_allclose(ours[k], area / (nodes[k] - nodes[k - 1]), rtol=1e-9, atol=1e-15)
 
 
-def some_predictor(rng):
-    """Weights of any size, of commands alone and with rates, in units of commands and rad/s."""
-    weights = rng.normal(size=(4, WIDTH)) * 0.4
-    weights[:, [ORDER, OWN + ORDER]] = 0.0
-    weights[:, 2 * OWN :] *= np.array([[0.3], [1e-4], [1e-4], [1e-5]]) * 0.1
-    return weights
-
-
 def after_a_while(seed, behind):
     """As `irregular`, with one long step at first, so that what is gone back over had been carried; nodes `behind` [s]
     stamps, or before them."""
@@ -115,14 +105,12 @@ def test_causal_means_are_blind_to_the_future(seed, k, delay, behind):
     known is a matter of stamps, whatever the delay.
     """
     rng, times, commands, nodes = after_a_while(seed, behind)
-    predictor, rates = some_predictor(rng), rng.normal(size=(len(nodes), 3))
-    before = run(times, commands, nodes, mode=CAUSAL, tau=0.05, delay=delay, predictor=predictor, rates=rates)
+    predictor = np.concatenate([rng.normal(size=(4, ORDER)) * 0.4, np.zeros((4, 1))], 1)
+    before = run(times, commands, nodes, mode=CAUSAL, tau=0.05, delay=delay, predictor=predictor)
     other = commands.copy()
     later = times > nodes[k - 1] + 1e-6
     other[later] += rng.normal(size=(later.sum(), 4))
-    measured_later = rates.copy()
-    measured_later[k:] += rng.normal(size=measured_later[k:].shape)
-    after = run(times, other, nodes, mode=CAUSAL, tau=0.05, delay=delay, predictor=predictor, rates=measured_later)
+    after = run(times, other, nodes, mode=CAUSAL, tau=0.05, delay=delay, predictor=predictor)
     for a, b in zip(before[:3], after[:3]):
         np.testing.assert_allclose(a[2 : k + 1], b[2 : k + 1], rtol=0, atol=1e-9)  # going back is exact to rounding
     if later[:-1].any() and times[later][0] < nodes[-1] - 0.02:
@@ -134,10 +122,10 @@ def test_causal_means_are_blind_to_the_future(seed, k, delay, behind):
 def test_causal_means_do_not_jump_with_the_delay(seed, delay, behind):
     """A delay that is fitted may pass where a shifted step begins at a stamp (it did: by 300 nats)."""
     rng, times, commands, nodes = after_a_while(seed, behind)
-    predictor, rates = some_predictor(rng), rng.normal(size=(len(nodes), 3))
+    predictor = np.concatenate([rng.normal(size=(4, ORDER)) * 0.4, np.zeros((4, 1))], 1)
     for at in (delay, -behind):  # the second: every step begins at a stamp
         means = [
-            run(times, commands, nodes, mode=CAUSAL, tau=0.05, delay=at + d, predictor=predictor, rates=rates)[0][2:]
+            run(times, commands, nodes, mode=CAUSAL, tau=0.05, delay=at + d, predictor=predictor)[0][2:]
             for d in (-1e-8, 1e-8)
         ]
         np.testing.assert_allclose(means[0] / [0.3, 1e-4, 1e-4, 1e-5], means[1] / [0.3, 1e-4, 1e-4, 1e-5], atol=1e-4)
@@ -147,7 +135,7 @@ def test_causal_means_carry_the_lag_along_what_came():
     """With a prediction that comes true, CAUSAL and LINEAR agree; the lag's state agrees whatever was predicted."""
     t = np.arange(60) * 0.01
     ramp = np.outer(1 + 3 * t, [0.3, 1e-4, -1e-4, 2e-5])
-    line = np.zeros((4, WIDTH))
+    line = np.zeros((4, ORDER + 1))
     line[:, :2] = [2.0, -1.0]  # next = 2 latest - the one before
     nodes = t[5:] + 0.002
     causal = run(t, ramp, nodes, mode=CAUSAL, tau=0.06, delay=0.003, predictor=line)
@@ -187,14 +175,12 @@ def test_derivatives_are_those_of_finite_differences(seed, mode, tau):
 @settings(max_examples=30, deadline=None)
 def test_incremental_calls_equal_one_call(seed, mode, split, tau):
     rng, times, commands, nodes = irregular(seed)
-    predictor, rates = some_predictor(rng), rng.normal(size=(len(nodes), 3))
+    predictor = np.concatenate([rng.normal(size=(4, ORDER)) * 0.4, np.zeros((4, 1))], 1)
     split = min(split, len(nodes) - 1)
-    one = run(times, commands, nodes, mode=mode, tau=tau, delay=0.003, predictor=predictor, rates=rates)
+    one = run(times, commands, nodes, mode=mode, tau=tau, delay=0.003, predictor=predictor)
     if split < 2:
         return
-    two = run(
-        times, commands, nodes, mode=mode, tau=tau, delay=0.003, predictor=predictor, rates=rates, splits=(split,)
-    )
+    two = run(times, commands, nodes, mode=mode, tau=tau, delay=0.003, predictor=predictor, splits=(split,))
     for a, b in zip(one, two):
         np.testing.assert_array_equal(a, b)
 
@@ -216,3 +202,36 @@ def test_a_node_that_does_not_advance_gives_the_present_value():
     mean = run(t, commands, nodes, mode=LINEAR, tau=0.05)[0]
     assert np.all(np.isfinite(mean))
     np.testing.assert_allclose(mean[1:], commands[:2])
+
+
+def test_predictor_recovers_an_autoregressive_process():
+    rng = np.random.default_rng(2)
+    weights = np.array([1.2, -0.5, 0.1])
+    scale, centre = np.array([0.05, 1e-5, 2e-5, 1e-6]), np.array([0.35, 0.0, 1e-5, 0.0])
+    x = np.zeros((4000, 4))
+    for k in range(3, len(x)):
+        x[k] = weights @ x[k - 3 : k][::-1] + rng.normal(size=4)
+    fitted = fit_predictor(centre + scale * x)
+    # standard error of a weight is about 1 / sqrt(n) = 0.016
+    np.testing.assert_allclose(fitted[:, :ORDER], np.tile(weights, (4, 1)), atol=0.06)
+    np.testing.assert_allclose(fitted[:, ORDER], (1 - weights.sum()) * centre, atol=0.06 * centre.max())
+
+
+def test_predictor_holds_where_there_is_nothing_to_fit():
+    hold = hold_predictor()
+    np.testing.assert_array_equal(hold[:, 0], 1.0)
+    constant = np.tile([0.3, 1e-4, 0.0, 1e-5], (500, 1))
+    predicted = fit_predictor(constant)
+    np.testing.assert_allclose(predicted[:, :ORDER] @ np.ones(ORDER) * constant[0] + predicted[:, ORDER], constant[0])
+    few = np.random.default_rng(0).normal(size=(20, 4))
+    np.testing.assert_array_equal(fit_predictor(few), hold)
+    np.testing.assert_array_equal(fit_predictor(np.zeros((0, 4))), hold)
+
+
+@given(seeds, st.floats(1e-9, 1e9))
+@settings(max_examples=20, deadline=None)
+def test_predictor_does_not_depend_on_units(seed, scale):
+    x = np.random.default_rng(seed).normal(size=(300, 4)).cumsum(0)
+    a, b = fit_predictor(x), fit_predictor(scale * x)
+    np.testing.assert_allclose(a[:, :ORDER], b[:, :ORDER], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(a[:, ORDER] * scale, b[:, ORDER], rtol=1e-5, atol=1e-9 * scale)
