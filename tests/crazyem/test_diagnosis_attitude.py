@@ -13,6 +13,7 @@ from crazyem.diagnosis.flight import APART, Flight, flight_of
 from crazyem.diagnosis.model import Point
 from crazyem.recordings.attitudes import onboard_attitude
 from crazyem.recordings.recording import Recording
+from crazyem.signals.vocabulary import MAVLINK_SOURCES, SOURCES
 
 PULL, TILT = 0.04, 4e-3  # s, rad: how long an error lasts, and its standard deviation
 
@@ -64,6 +65,16 @@ def test_attitudes_that_a_filter_on_board_made(
     source: str, metadata: dict[str, dict[str, str]], expected: bool
 ) -> None:
     assert onboard_attitude(replace(onboard(fly(seconds=2.0), source=source), metadata=metadata)) is expected
+
+
+def test_every_attitude_that_a_link_gives_is_of_a_filter_on_board() -> None:
+    """So that a replay thins them as the flight did (`new_estimator`)."""
+    given = [s.variables for s in (*SOURCES, *MAVLINK_SOURCES) if s.signal == "attitude"]
+    assert len(given) >= 5
+    flown = onboard(fly(seconds=2.0))
+    for variables in given:
+        signal = replace(flown.signals["attitude"], source=variables)
+        assert onboard_attitude(replace(flown, signals={**flown.signals, "attitude": signal})), variables
 
 
 def test_of_onboard_attitudes_one_in_so_many_is_used_and_none_is_lost() -> None:
