@@ -50,7 +50,7 @@ SHORTLIST = 6
 WORTH, ANYWAY = 0.15, 3  # share of the largest linear gain from which a candidate is fitted, and how many are anyway
 MOST = 6  # effects: real drones differ from a file in more than one thing
 NEARLY, MOST_COMPARED = 0.8, 3  # share of the best's gain from which, and how many, explanations get noise of their own
-BEATEN = 0.2  # probability of being the better explanation below which a simpler one does not give the name
+BEATEN = 0.1  # probability of being the better explanation below which a simpler one does not give the name
 BESIDE = 0.5  # share of its gain that an effect keeps beside another which it is no other name for
 # Angular acceleration is torque over inertia: where the one is fitted, so is the other, to be told apart or not; both
 # at once would be any size. A longer lag with more torque is nearly the same as neither.
@@ -336,7 +336,7 @@ def alike_with(best: Trial, trials: Sequence[Trial], *, counted: bool) -> list[T
 
 
 def name_of(equals: Sequence[Trial], *, counted: bool) -> Trial:
-    """Which of those that are not told apart gives the name: the simplest that none of the others beats (four to
+    """Which of those that are not told apart gives the name: the simplest that none of the others beats (nine to
     one), or its confidence would say that it is another."""
     sure = [t for t in equals if t.p_value < SURE]
     unbeaten = [t for t in equals if all(t is o or better(t, o) > BEATEN for o in sure)]
