@@ -53,7 +53,7 @@ def test_an_inertia_that_no_body_has_leaves_open_what_turns_the_drone(slow_to_tu
         assert again.effects[0].parameters[axis].value == pytest.approx(0.02, abs=0.006)
 
 
-def test_a_selection_goes_on_from_where_another_began():
+def test_a_selection_goes_on_from_where_another_began(monkeypatch):
     data = Data([flight_of(fly(Hidden(thrust=(0.9,) * 4, drag=(0.02, 0.02, 0.02)), seconds=20.0), DRONE)])
     point = nominal(data, Point(DRONE, {}, first_guess()))
     base = refine_base(data, point, ())
@@ -63,6 +63,9 @@ def test_a_selection_goes_on_from_where_another_began():
     found = select(data, base.point, [THRUST, DRAG], begun=begun)
     assert [c.effect for c in found.accepted] == ["thrust_scale", "linear_drag"]
     assert [s.taken.candidate.effect for s in found.steps if s.taken] == ["thrust_scale", "linear_drag"]
+    monkeypatch.setattr(selecting, "may_join", lambda effect, present: present != {"thrust_scale"})
+    alone = select(data, base.point, [THRUST, DRAG], begun=begun)
+    assert [c.effect for c in alone.accepted] == ["thrust_scale"]
     assert found.nominal is begun.nominal
     assert found.final.effects["thrust_scale"]["scale"] == pytest.approx(0.9, abs=0.01)
     assert found.final.effects["linear_drag"]["x"] == pytest.approx(0.02, abs=0.004)

@@ -1,16 +1,19 @@
 """Attitudes that an onboard filter made: one in 80 ms is used, because their errors hang together."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from closed_loop import DRONE, fly
 from made_flight import array_of
 
+from crazyem.commands.common import new_estimator
 from crazyem.diagnosis.always import refine_base
 from crazyem.diagnosis.fit import Data, nominal, starting_point
 from crazyem.diagnosis.flight import APART, Flight, flight_of
 from crazyem.diagnosis.model import Point
+from crazyem.estimation import online, steps
 from crazyem.recordings.attitudes import onboard_attitude
 from crazyem.recordings.recording import Recording
 from crazyem.signals.vocabulary import MAVLINK_SOURCES, SOURCES
@@ -75,6 +78,17 @@ def test_every_attitude_that_a_link_gives_is_of_a_filter_on_board() -> None:
     for variables in given:
         signal = replace(flown.signals["attitude"], source=variables)
         assert onboard_attitude(replace(flown, signals={**flown.signals, "attitude": signal})), variables
+
+
+@pytest.mark.parametrize(("onboard", "period"), [(True, 0.05), (False, 0.0)])
+def test_the_estimator_of_the_commands_thins_attitudes_of_filters_on_board_and_no_others(
+    monkeypatch: pytest.MonkeyPatch, onboard: bool, period: float
+) -> None:
+    made = []
+    monkeypatch.setattr(online, "OnlineEstimator", lambda vehicle, **given: made.append(given) or SimpleNamespace())
+    monkeypatch.setattr(steps, "StepAwareEstimator", lambda estimator: estimator)
+    new_estimator(DRONE, SimpleNamespace(window=800, every=4), onboard=onboard)  # type: ignore[arg-type]
+    assert made == [{"window": 800, "every": 4, "attitude_period": period}]
 
 
 def test_of_onboard_attitudes_one_in_so_many_is_used_and_none_is_lost() -> None:
