@@ -23,7 +23,7 @@ from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.place import depends_on_place
 from crazyem.diagnosis.select import select
 from crazyem.diagnosis.split import LOAD, WEAKER, as_load, as_two, instead_of_a_load
-from crazyem.diagnosis.trials import Selection, Trial, better, told_apart, wald
+from crazyem.diagnosis.trials import Selection, Trial, preferred, told_apart, wald
 from crazyem.diagnosis.unexplained import Unexplained, unexplained
 from crazyem.diagnosis.witness import false_speed, late_measurements
 from crazyem.diagnosis.workers import Workers
@@ -225,7 +225,7 @@ def _named(
         if candidate.effect in told:
             rivals = [t for t in rivals if t.candidate.effect not in told]
         alike = [t for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}]
-        confidence = trust(remains) * share(taken.evidence, []) * _preferred(taken, rivals)
+        confidence = trust(remains) * share(taken.evidence, []) * preferred(taken, rivals)
         away = np.array([values[n] - neutral[n] for n in candidate.free])
         if wald(away, solution.covariance[own, own], fitted.gram, used) > WITHIN:
             confidence = min(confidence, DOUBTFUL)
@@ -279,12 +279,3 @@ WEAK_OR_MISREAD = ("rotor_fault", "rotor_sensor")
 TWO_WEAK = "rotor_fault"
 # Exactly the same to every signal: inputs that act late, and measurements that are all late together.
 SAME = {"input_delay": ("measurement_delay",)}
-
-
-def _preferred(taken: Trial, rivals: Sequence[Trial]) -> float:
-    """Probability that none of the rivals is the better explanation, by the scatter of the likelihoods' differences."""
-    chance = 1.0
-    for rival in rivals:
-        if rival.fitted is not None and rival.blocks.size == taken.blocks.size:
-            chance *= better(taken, rival)
-    return chance

@@ -18,6 +18,7 @@ SURE = 1e-3  # p-value of the score test, before counting candidates,
 LIKELY = 5e-2  # which flights held out may lower where it is below this
 CLOSE = 4.0  # nats within which two explanations cannot be told apart,
 FAR = 20.0  # nats that one step is believed to bring without looking
+EVEN = 0.5  # what a name is worth, at least, beside a rival that is not significant itself
 TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks
 # Smaller than this, these are not told from what filters, sampling and the air of a room do: s, s, s, 1, rad, rad/s, 1,
 # 1, N m s/m.
@@ -107,6 +108,19 @@ def better(one: Trial, other: Trial) -> float:
     """Probability that one explains more than the other, by the scatter of the difference."""
     nats, sd = margin(one, other)
     return float(stats.norm.cdf(nats / sd))
+
+
+def preferred(taken: Trial, rivals: Sequence[Trial]) -> float:
+    """Probability that none of the rivals is the better explanation, by the scatter of the likelihoods' differences.
+
+    A rival that is not significant itself is at most as probable: its likelihood may be better because it frees a
+    direction that no flight tells (the mass of a load beside a thrust scale) and that differs from flight to flight.
+    """
+    chance = 1.0
+    for rival in rivals:
+        if rival.fitted is not None and rival.blocks.size == taken.blocks.size:
+            chance *= max(better(taken, rival), EVEN if rival.p_value >= SURE else 0.0)
+    return chance
 
 
 def scatter(differences: NDArray) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.select import BEATEN, may_join, name_of
-from crazyem.diagnosis.trials import Trial, better, told_apart
+from crazyem.diagnosis.trials import Trial, better, preferred, told_apart
 
 NOISE = np.random.default_rng(0).normal(size=40)
 
@@ -41,6 +41,14 @@ def test_what_is_not_significant_itself_beats_nothing():
     centre, payload = trial("center_of_mass", "xyz", 100.0), trial("payload", "mxyz", 130.0, p_value=0.01)
     assert better(centre, payload) < 1e-3
     assert name_of([centre, payload], counted=False) is centre
+    assert preferred(centre, [payload]) == 0.5  # was 0.0: a name that nobody believes in, not even who says it
+
+
+def test_what_is_better_and_significant_takes_a_name_its_worth():
+    centre, payload = trial("center_of_mass", "xyz", 100.0), trial("payload", "mxyz", 130.0)
+    assert preferred(centre, [payload]) < 1e-3
+    assert preferred(payload, [centre]) > 0.999
+    assert preferred(payload, []) == 1.0
 
 
 def test_without_evidence_enough_the_first_gives_the_name():
