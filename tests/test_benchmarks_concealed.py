@@ -266,3 +266,19 @@ def test_the_diagnosing_process_sees_two_recordings_and_a_name(tmp_path: Path) -
     assert result["files"] == ["held_out.mcap", "recording.mcap"]
     assert not any(str(tmp_path) in word or "/" in word for word in result["words"])
     assert "0.0 % of 1" in report(study)
+
+
+def test_the_ideal_observer_is_asked_for_what_went_wrong_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from benchmarks.concealed import report
+    from benchmarks.concealed.paths import Study, write
+
+    study, asked = Study(tmp_path), []
+    for case, said in (("0001", "wind"), ("0002", "gusts")):
+        write(study.truth(case), {**truth("single", wind={"x": 1.0}), "case": case})
+        write(study.answer(case), {"result": answer(effect(said)), "seconds": 1.0})
+    monkeypatch.setattr(report, "ideal_nats", lambda recording, *_: asked.append(recording.parent.name) or 3.0)
+    monkeypatch.setattr(report, "held_out_error", lambda *_: pytest.fail("predictions are not asked for"))
+    assert [o.nats for o in report.outcomes(study, ideal="kept")] == [None, None]
+    assert [o.nats for o in report.outcomes(study, ideal="failures")] == [None, 3.0]
+    assert [o.nats for o in report.outcomes(study, ideal="failures")] == [None, 3.0]  # kept
+    assert asked == ["0002"]

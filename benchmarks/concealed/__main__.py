@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from .paths import Study
+from .report import IDEAL, report
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -23,7 +24,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--command", nargs="+", help="diagnose: instead of `crazyem diagnose`")
     parser.add_argument("--write-docs", action="store_true", help="score: docs/concealed.md and docs/concealed.json")
-    parser.add_argument("--no-ideal", action="store_true", help="score: without what takes half a minute a case")
+    parser.add_argument(
+        "--ideal", choices=IDEAL, default="all",
+        help="score: of which cases to ask what an ideal observer sees, half a minute each (default %(default)s)",
+    )  # fmt: skip
     return parser
 
 
@@ -44,9 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         diagnose_all(study, command=arguments.command, minutes=arguments.minutes, part=part)
     else:
-        from .report import report
-
-        print(report(study, write_docs=arguments.write_docs, ideal=not arguments.no_ideal))
+        print(report(study, write_docs=arguments.write_docs, ideal=arguments.ideal))
     return 0
 
 

@@ -1,6 +1,7 @@
 """Collects a study from its files, scores it, writes the table that is published."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,45 +9,57 @@ from crazyem.vehicle import load_vehicle
 
 from .ideal import held_out_error, ideal_nats, ideal_nats_of_each
 from .paths import Study, read, write
-from .score import Outcome, figures
+from .score import Outcome, failures, figures
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 MARKS = ("<!-- concealed: table -->", "<!-- /concealed -->")
 
 
-def outcomes(study: Study, *, ideal: bool = True) -> list[Outcome]:
-    """Every flown case that was asked about. What needs the truth on top is computed once and kept in OUT/ideal;
-    `ideal` False takes only what is there."""
-    out = []
-    for case in study.cases():
-        answer, truth = read(study.answer(case)), read(study.truth(case))
-        if answer is None:
-            continue
-        known = _ideal(study, case, truth) if ideal else read(study.folder / "ideal" / f"{case}.json") or {}
-        out.append(Outcome(truth, answer["result"], answer["seconds"], known.get("nats"), known.get("held_out", {}),
-                           known.get("of_each", {})))  # fmt: skip
-    return out
+IDEAL = ("all", "failures", "kept")
 
 
-def _ideal(study: Study, case: str, truth: dict[str, Any]) -> dict[str, Any]:
-    """Nats of the truth on the flight; held-out errors of nominal, fitted and true model."""
-    file = study.folder / "ideal" / f"{case}.json"
-    known: dict[str, Any] = read(file) or {"held_out": {}}
+def outcomes(study: Study, *, ideal: str = "all") -> list[Outcome]:
+    """Every flown case that was asked about.
+
+    What needs the truth on top is computed once and kept in OUT/ideal: of `all` with held-out predictions, of
+    `failures` the nats alone (what was named counts as detectable without), of nothing beyond what is `kept`.
+    """
+    kept = [_outcome(study, case) for case in study.cases() if study.answer(case).is_file()]
+    wanted = {row["case"] for row in failures(kept)} if ideal == "failures" else set()
+    for outcome in kept:
+        case = outcome.truth["case"]
+        if ideal == "all" or case in wanted:
+            _know(study, case, outcome.truth, held_out=ideal == "all")
+    return [_outcome(study, outcome.truth["case"]) for outcome in kept]
+
+
+def _outcome(study: Study, case: str) -> Outcome:
+    answer, truth, known = read(study.answer(case)), read(study.truth(case)), read(_known(study, case)) or {}
+    return Outcome(truth, answer["result"], answer["seconds"], known.get("nats"), known.get("held_out", {}),
+                   known.get("of_each") or {})  # fmt: skip
+
+
+def _known(study: Study, case: str) -> Path:
+    return study.folder / "ideal" / f"{case}.json"
+
+
+def _know(study: Study, case: str, truth: Mapping[str, Any], *, held_out: bool) -> None:
+    """Keep nats of the truth on the flight and, if asked, held-out errors of nominal, fitted and true model."""
+    known: dict[str, Any] = read(_known(study, case)) or {"held_out": {}}
     vehicle = load_vehicle(truth["platform"])
     if known.get("nats") is None and truth["kind"] in ("single", "pair"):
         known["nats"] = ideal_nats(study.recording(case, "recording"), vehicle, truth["effects"])
     if known.get("of_each") is None and truth["kind"] == "pair":
         known["of_each"] = ideal_nats_of_each(study.recording(case, "recording"), vehicle, truth["effects"])
     folder = study.folder / "vehicles"
-    models = {"nominal": folder / f"{truth['platform']}.toml", "fitted": study.fitted(case)}
-    if truth["effects"] and not truth["hidden"]:
+    models = {"nominal": folder / f"{truth['platform']}.toml", "fitted": study.fitted(case)} if held_out else {}
+    if held_out and truth["effects"] and not truth["hidden"]:
         models["true"] = study.truth(case).with_name(f"{case}_vehicle.toml")
         models["true"].write_text(_with_effects(vehicle.to_toml(), truth["effects"]))
     for name, model in models.items():
         if known["held_out"].get(name) is None and model.is_file():
             known["held_out"][name] = held_out_error(study.recording(case, "held_out"), str(model))
-    write(file, known)
-    return known
+    write(_known(study, case), known)
 
 
 def _with_effects(vehicle: str, effects: dict[str, dict[str, Any]]) -> str:
@@ -128,7 +141,7 @@ def _said(effect: dict[str, Any]) -> str:
     return f"{effect['name']} ({confidence:.2f})" if isinstance(confidence, float) else str(effect["name"])
 
 
-def report(study: Study, *, write_docs: bool = False, ideal: bool = True) -> str:
+def report(study: Study, *, write_docs: bool = False, ideal: str = "all") -> str:
     """Score a study: figures into OUT/score.json, and the table; `write_docs` publishes both."""
     found = figures(outcomes(study, ideal=ideal))
     truths = [read(study.truth(c)) for c in study.cases()]
