@@ -145,15 +145,7 @@ def _mark(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
 
 
 def _sort(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
-    place = np.argsort(array.time, kind="stable")
-    return replace(
-        array,
-        time=array.time[place],
-        value=array.value[place],
-        order=array.order[place],
-        host_time=array.host_time[place],
-        marked=array.marked[place],
-    )
+    return array.rows(np.argsort(array.time, kind="stable"))
 
 
 def _world_to_body(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:

@@ -3,7 +3,7 @@
 import math
 import zlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -205,15 +205,7 @@ def thinned(array: SignalArray) -> SignalArray:
     step = int(0.005 / period) if 0.0 < period < 0.0025 else 1
     if step < 2:
         return array
-    rows = slice(None, None, step)
-    return replace(
-        array,
-        time=array.time[rows],
-        value=array.value[rows],
-        order=array.order[rows],
-        host_time=array.host_time[rows],
-        marked=array.marked[rows],
-    )
+    return array.rows(slice(None, None, step))
 
 
 def ordered(array: SignalArray, *, finite: bool = True) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

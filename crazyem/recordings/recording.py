@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,17 @@ class SignalArray:
             return components(self.quantity)
         count = self.value.shape[1]
         return tuple(str(i) for i in range(count)) if count > 1 else ()
+
+    def rows(self, chosen: slice | NDArray[np.int64]) -> "SignalArray":
+        """These samples alone, in this order."""
+        return replace(
+            self,
+            time=self.time[chosen],
+            value=self.value[chosen],
+            order=self.order[chosen],
+            host_time=self.host_time[chosen],
+            marked=self.marked[chosen],
+        )
 
 
 @dataclass(frozen=True, slots=True)
