@@ -9,8 +9,8 @@ from scipy import stats
 
 from crazyem.diagnosis.always import jittery, nuisances, solved, usual_wind
 from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, Fitted, moved
-from crazyem.diagnosis.gram import Gram
+from crazyem.diagnosis.fit import Data, Fitted, bounds_of, held_near, moved
+from crazyem.diagnosis.gram import Gram, bounded
 from crazyem.diagnosis.model import Point
 from crazyem.physics.effects.catalogue import CATALOGUE
 
@@ -158,30 +158,33 @@ def both(p_value: float, held: float) -> float:
 def gain_of_both(fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequence[Candidate]) -> float:
     """What an effect fitted to the one set of flights would gain on both [nats] if it were fitted to both.
 
-    By one step from `there`, the flights held out with the effect as it was fitted, with the covariance of `fitted` as
-    the prior of its parameters. To be admitted an effect must hold as it is; to be compared with another it must not
-    suffer from being less well known: a poor flight to fit would always prefer fewer parameters.
+    By one step from `there`, the flights held out with the effect as it was fitted. The covariance of `fitted` is the
+    prior of its parameters, and what is always free may differ from flight to flight as it does without the effect; of
+    those kinds `there` has moved away from what was fitted already, and paid for it as for what is always free, which
+    is given back. To be admitted an effect must hold as it is; to be compared with another it must not suffer from
+    being less well known: a poor flight to fit would always prefer fewer parameters.
     """
     free = nuisances(held_out, there.point, accepted)
-    own = sum(len(c.free) for c in accepted)
-    columns = [x for c in [*accepted, *(c for c, _ in free)] for x in c.columns(there.point)]
-    score, information = held_out.gram(there.point, columns).total(range(len(columns)))
-    known = np.zeros((len(columns), len(columns)))
-    covariance = solved(fitted)[0].covariance[:own, :own]
-    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    known[:own, :own] = np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-9) / np.outer(scale, scale)
-    known[own:, own:] = np.diag([w for _, precision in free for w in precision])
-    rest = score.copy()
-    rest[own:] = 0.0  # those of `there` are at their maximum
-    step = np.linalg.lstsq(information + known, rest, rcond=1e-12)[0]
-    told = 0.5 * float(rest @ step)
+    own, parts = sum(len(c.free) for c in accepted), [*accepted, *(c for c, _ in free)]
+    score, information = _total(held_out, there.point, parts)
+    apart = {(c.effect, n): w for c, p in nuisances(held_out, there.point, ()) for n, w in zip(c.free, p, strict=True)}
+    paid = np.array([apart.get((c.effect, n), 0.0) for c in accepted for n in c.free])
+    away = np.array([
+        *(c.values(there.point)[n] - c.values(fitted.point)[n] for c in accepted for n in c.free),
+        *(c.values(there.point)[n] - c.neutral(there.point)[n] for c, _ in free for n in c.free),
+    ])  # fmt: skip
+    known = np.diag([*np.zeros(own), *(w for _, precision in free for w in precision)])
+    differing = np.divide(1.0, paid, out=np.zeros(own), where=paid > 0.0)
+    known[:own, :own] = _inverse(solved(fitted)[0].covariance[:own, :own] + np.diag(differing))
+    back = 0.5 * float(paid @ np.square(away[:own]) - away[:own] @ known[:own, :own] @ away[:own])
+    rest = score - known @ away
+    low, high = held_near(*bounds_of(parts, there.point), away, np.diag(known) * (np.arange(len(away)) >= own))
+    step = bounded(information + known, rest, low, high)
+    told = float(rest @ step - 0.5 * step @ (information + known) @ step)
     if told < FAR:
-        return told
+        return back + told
     # So much is told by slopes where an effect is far from what these flights want; what the step brings is to be seen
-    looked, parts = held_out.twin(), [*accepted, *(c for c, _ in free)]
-    away = np.array(
-        [0.0] * own + [c.values(there.point)[n] - c.neutral(there.point)[n] for c, _ in free for n in c.free]
-    )
+    looked = held_out.twin()
     begin, best = looked.loglik(there.point) - 0.5 * float(away @ known @ away), 0.0
     for part in (1.0, 0.5, 0.25):
         moves = part * step
@@ -189,7 +192,20 @@ def gain_of_both(fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequen
             brought = looked.loglik(moved(there.point, parts, moves), passes=2) - begin
         brought -= 0.5 * float((away + moves) @ known @ (away + moves))
         best = max(best, brought if np.isfinite(brought) else 0.0)
-    return min(best, told)
+    return back + min(best, told)
+
+
+def _total(data: Data, point: Point, parts: Sequence[Candidate]) -> tuple[NDArray, NDArray]:
+    """Score (k,) and information (k, k) of all free parameters."""
+    columns = [x for c in parts for x in c.columns(point)]
+    return data.gram(point, columns).total(range(len(columns)))
+
+
+def _inverse(covariance: NDArray) -> NDArray:
+    """Of a covariance (k, k) whose parameters are of very different sizes."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    inverse: NDArray = np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-9) / np.outer(scale, scale)
+    return inverse
 
 
 def own_evidence(trial: Trial, *, counted: bool) -> float:
