@@ -20,7 +20,7 @@ from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.place import depends_on_place
 from crazyem.diagnosis.select import select
 from crazyem.diagnosis.split import LOAD, WEAKER, as_load, as_two
-from crazyem.diagnosis.told import MEASURED_LATE, tell
+from crazyem.diagnosis.told import MEASURED_LATE, strongest_first, tell
 from crazyem.diagnosis.trials import Selection
 from crazyem.diagnosis.unexplained import Unexplained, unexplained
 from crazyem.diagnosis.witness import false_speed, late_measurements
@@ -117,7 +117,7 @@ def diagnose(
         beside += late
         groups = (*groups, *alike)
         separate = tuple(dict.fromkeys((*separate, *(CATALOGUE[n].separates for g in alike for n in g))))
-    effects = (*told.effects, *beside)
+    effects = strongest_first(told.effects, beside)
     left_out = {n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)}
     fitted_vehicle = _with_effects(vehicle, selection, beside)
     mismatch = bool(effects) or remains.found

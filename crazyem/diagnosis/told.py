@@ -102,6 +102,16 @@ def tell(
     return Told(tuple(n for _, n in found), tuple(groups), tuple(dict.fromkeys(separate)))
 
 
+def strongest_first(effects: Sequence[Named], beside: Sequence[Named]) -> tuple[Named, ...]:
+    """The effects in their order, and among them, before the first that brings less on flight held out, those that the
+    selection cannot ask for (gusts, an accelerometer, what acts before measured rotors)."""
+    told = list(effects)
+    for one in beside:
+        at = next((i for i, e in enumerate(told) if e.held_out_nats < one.held_out_nats), len(told))
+        told.insert(at, one)
+    return tuple(told)
+
+
 def _away(candidate: Candidate, point: Point) -> NDArray:
     values, neutral = candidate.values(point), candidate.neutral(point)
     return np.array([values[n] - neutral[n] for n in candidate.free])

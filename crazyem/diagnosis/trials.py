@@ -158,11 +158,11 @@ def both(p_value: float, held: float) -> float:
 def gain_of_both(fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequence[Candidate]) -> float:
     """What an effect fitted to the one set of flights would gain on both [nats] if it were fitted to both.
 
-    By one step from `there`, the flights held out with the effect as it was fitted. The covariance of `fitted` is the
-    prior of its parameters, and what is always free may differ from flight to flight as it does without the effect; of
-    those kinds `there` has moved away from what was fitted already, and paid for it as for what is always free, which
-    is given back. To be admitted an effect must hold as it is; to be compared with another it must not suffer from
-    being less well known: a poor flight to fit would always prefer fewer parameters.
+    By one step from `there`, the flights held out with the effect as it was fitted. The curvature at `fitted` is the
+    prior of its parameters; what is of a kind that is always free may differ from what was fitted by its scatter in
+    either set of flights. Of these kinds `there` has moved already, and paid for it as for the scatter of its own
+    flights, which is given back. To be admitted an effect must hold as it is; to be compared with another it must not
+    suffer from being less well known: a poor flight to fit would always prefer fewer parameters.
     """
     free = nuisances(held_out, there.point, accepted)
     own, parts = sum(len(c.free) for c in accepted), [*accepted, *(c for c, _ in free)]
@@ -175,7 +175,8 @@ def gain_of_both(fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequen
     ])  # fmt: skip
     known = np.diag([*np.zeros(own), *(w for _, precision in free for w in precision)])
     differing = np.divide(1.0, paid, out=np.zeros(own), where=paid > 0.0)
-    known[:own, :own] = _inverse(solved(fitted)[0].covariance[:own, :own] + np.diag(differing))
+    curvature = fitted.gram.total(range(fitted.gram.size))[1] + np.diag(fitted.precision)
+    known[:own, :own] = _inverse(_inverse(curvature)[:own, :own] + np.diag(2.0 * differing))
     back = 0.5 * float(paid @ np.square(away[:own]) - away[:own] @ known[:own, :own] @ away[:own])
     rest = score - known @ away
     low, high = held_near(*bounds_of(parts, there.point), away, np.diag(known) * (np.arange(len(away)) >= own))

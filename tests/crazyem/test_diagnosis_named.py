@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.named import one_factor
+from crazyem.diagnosis.named import Named, one_factor
+from crazyem.diagnosis.told import strongest_first
 
 OWN = np.array([1.66e-5, 1.67e-5, 2.93e-5])
 
@@ -33,3 +34,15 @@ def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_as
     found = diagnose([flown], DRONE, wanted=["inertia"])
     assert [e.name for e in found.effects] == ["inertia"]
     assert found.indistinguishable == (("inertia", "torque_scale"),)
+
+
+def test_what_is_found_beside_the_selection_stands_where_its_evidence_puts_it():
+    """A late input of 72 nats was told after a doubtful drag of 9."""
+
+    def named(name: str, held_out: float) -> Named:
+        return Named(name, name, {}, {}, held_out, 0.0, 0.95)
+
+    told = [named("thrust_scale", 500.0), named("linear_drag", 9.0), named("wind", 20.0)]  # by evidence on all flights
+    found = strongest_first(told, [named("input_delay", 72.0), named("gusts", 3.0)])
+    assert [e.name for e in found] == ["thrust_scale", "input_delay", "linear_drag", "wind", "gusts"]
+    assert strongest_first((), [named("gusts", 3.0)])[0].name == "gusts"
