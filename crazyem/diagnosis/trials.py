@@ -74,9 +74,10 @@ class Step:
     beside: frozenset[str] = frozenset()
 
     def explanations(self) -> list[Trial]:
-        """The trials that explain what this turn is about: significant alone, or, however unsure alone, not told apart
-        from the one that was taken."""
-        return [t for t in self.trials if t.p_value < SURE or any(t is a for a in self.alike)]
+        """The trials that explain what this turn is about: significant alone and of some use on all flights together
+        (one that ruins those held out scatters so much there that nothing could be told from it), or, however unsure
+        alone, not told apart from the one that was taken."""
+        return [t for t in self.trials if (t.p_value < SURE and t.evidence > 0) or any(t is a for a in self.alike)]
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,13 @@
 """Which of several explanations that are not told apart gives the name."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.select import BEATEN, may_join, name_of
-from crazyem.diagnosis.trials import Trial, better, preferred, told_apart
+from crazyem.diagnosis.trials import Step, Trial, better, preferred, told_apart
 
 NOISE = np.random.default_rng(0).normal(size=40)
 
@@ -49,6 +50,13 @@ def test_what_is_better_and_significant_takes_a_name_its_worth():
     assert preferred(centre, [payload]) < 1e-3
     assert preferred(payload, [centre]) > 0.999
     assert preferred(payload, []) == 1.0
+
+
+def test_what_ruins_the_flights_held_out_explains_nothing_however_significant():
+    """A damping fitted in a hover, which took 22000 nats from a quick flight and half the trust in a rotor inertia."""
+    taken, ruin = trial("rotor_inertia", "i", 219.0), replace(trial("rate_damping", "xyz", 25.0), evidence=-21964.0)
+    assert Step((taken, ruin), taken).explanations() == [taken]
+    assert Step((taken, ruin), taken, alike=(ruin,)).explanations() == [taken, ruin]
 
 
 def test_without_evidence_enough_the_first_gives_the_name():
