@@ -13,6 +13,7 @@ from closed_loop import DRONE, Hidden, fly
 from crazyem.diagnosis import always
 from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis import select as selecting
+from crazyem.diagnosis import told
 from crazyem.diagnosis.always import COARSE_REASON, TRIM, refine_base
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.diagnose import diagnose
@@ -133,7 +134,7 @@ def test_what_may_as_well_be_none_is_not_sure(slow_to_turn, monkeypatch):
     sure = diagnose([slow_to_turn], DRONE, wanted=["linear_drag", "inertia"])
     assert min(e.confidence for e in sure.effects) > DOUBTFUL
     asked = []
-    monkeypatch.setattr(diagnosing, "wald", lambda away, *rest: asked.append(away) or 0.06)
+    monkeypatch.setattr(told, "wald", lambda away, *rest: asked.append(away) or 0.06)
     unsure = diagnose([slow_to_turn], DRONE, wanted=["linear_drag", "inertia"])
     assert {e.name for e in unsure.effects} == {e.name for e in sure.effects}
     assert all(e.confidence <= DOUBTFUL for e in unsure.effects)
