@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
-from crazyem.diagnosis import always
+from crazyem.diagnosis import always, told
 from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis import select as selecting
-from crazyem.diagnosis import told
 from crazyem.diagnosis.always import COARSE_REASON, TRIM, refine_base
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.diagnose import diagnose
