@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from .paths import Study
-from .report import IDEAL, report
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -25,7 +24,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--command", nargs="+", help="diagnose: instead of `crazyem diagnose`")
     parser.add_argument("--write-docs", action="store_true", help="score: docs/concealed.md and docs/concealed.json")
     parser.add_argument(
-        "--ideal", choices=IDEAL, default="all",
+        "--ideal", choices=("all", "failures", "kept"), default="all",
         help="score: of which cases to ask what an ideal observer sees, half a minute each (default %(default)s)",
     )  # fmt: skip
     return parser
@@ -48,6 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         diagnose_all(study, command=arguments.command, minutes=arguments.minutes, part=part)
     else:
+        from .report import report
+
         print(report(study, write_docs=arguments.write_docs, ideal=arguments.ideal))
     return 0
 

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from crazyem.vehicle import load_vehicle
 
@@ -13,12 +13,10 @@ from .score import Outcome, failures, figures
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 MARKS = ("<!-- concealed: table -->", "<!-- /concealed -->")
+Ideal = Literal["all", "failures", "kept"]
 
 
-IDEAL = ("all", "failures", "kept")
-
-
-def outcomes(study: Study, *, ideal: str = "all") -> list[Outcome]:
+def outcomes(study: Study, *, ideal: Ideal = "all") -> list[Outcome]:
     """Every flown case that was asked about.
 
     What needs the truth on top is computed once and kept in OUT/ideal: of `all` with held-out predictions, of
@@ -141,7 +139,7 @@ def _said(effect: dict[str, Any]) -> str:
     return f"{effect['name']} ({confidence:.2f})" if isinstance(confidence, float) else str(effect["name"])
 
 
-def report(study: Study, *, write_docs: bool = False, ideal: str = "all") -> str:
+def report(study: Study, *, write_docs: bool = False, ideal: Ideal = "all") -> str:
     """Score a study: figures into OUT/score.json, and the table; `write_docs` publishes both."""
     found = figures(outcomes(study, ideal=ideal))
     truths = [read(study.truth(c)) for c in study.cases()]

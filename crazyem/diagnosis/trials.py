@@ -203,10 +203,10 @@ def _total(data: Data, point: Point, parts: Sequence[Candidate]) -> tuple[NDArra
     return data.gram(point, columns).total(range(len(columns)))
 
 
-def _inverse(covariance: NDArray) -> NDArray:
-    """Of a covariance (k, k) whose parameters are of very different sizes."""
-    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    inverse: NDArray = np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-9) / np.outer(scale, scale)
+def _inverse(matrix: NDArray) -> NDArray:
+    """Of a covariance or a curvature (k, k) whose parameters are of very different sizes."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    inverse: NDArray = np.linalg.pinv(matrix / np.outer(scale, scale), rcond=1e-9) / np.outer(scale, scale)
     return inverse
 
 
