@@ -88,7 +88,7 @@ def diagnose(
         # beside the new name there may be room for others
         selection = select(data, selection.nominal, candidates, held_out=apart, begun=selection, say=say)
     selection, pull = by_place(data, apart, selection, say)
-    selection, witnessed = _heard(data, selection, recordings)
+    selection, witnessed = _heard(data, apart, selection, recordings)
     say("where the nominal model fails")
     data.settle(selection.nominal)
     before = locate(data, selection.nominal)
@@ -151,13 +151,18 @@ def _selected(
     return data, apart, select(data, nominal, candidates, held_out=apart, say=say), candidates, left_out
 
 
-def _heard(data: Data, selection: Selection, recordings: Sequence[Recording]) -> tuple[Selection, frozenset[str]]:
-    """The selection after the witnesses were heard, and the names of effects that they told from their look-alikes."""
+def _heard(
+    data: Data, apart: Data | None, selection: Selection, recordings: Sequence[Recording]
+) -> tuple[Selection, frozenset[str]]:
+    """The selection after the witnesses were heard, and the names of effects that they told from their look-alikes.
+
+    An accelerometer says most where thrust sets in, which not every flight shows: it is heard on those kept apart, too.
+    """
     witnessed: set[str] = set()
     punctual = replace(selection.nominal, effects={n: dict(v) for n, v in selection.nominal.vehicle.effects.items()})
     for candidate in selection.accepted:
         if candidate.effect == "input_delay":
-            nats = late_measurements(data, punctual, candidate.values(selection.final)["delay"])
+            nats = late_measurements(data.together_with(apart), punctual, candidate.values(selection.final)["delay"])
             if nats is not None and abs(nats) > TELLING:
                 witnessed |= {MEASURED_LATE if nats > 0 else "input_delay", "input_delay"}
         elif candidate.effect in WEAK_OR_MISREAD and dict(candidate.fixed).get("onset_time") is None:

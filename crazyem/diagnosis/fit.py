@@ -72,6 +72,13 @@ class Data:
         both.models += other.twin().models if other is not None else []
         return both
 
+    def each(self) -> list["Data"]:
+        """Twins of the flights one by one."""
+        parts = [self.twin() for _ in self.models]
+        for part, model in zip(parts, self.models, strict=True):
+            part.models = [model.twin()]
+        return parts
+
     @property
     def flights(self) -> list[Flight]:
         """The flights."""

@@ -100,7 +100,18 @@ class Gram:
             held += float(b_out @ t - 0.5 * t @ a_out @ t)
         covariance, dispersion, meat = self._sandwich(scores, infos, theta, a + np.diag(weight), effective)
         which = np.arange(k) if tested is None else np.asarray(tested, int)
-        p_value = self._p_value(b + weight * centre, infos, a + np.diag(weight), meat, which, len(scores))
+        total, curvature, free = b + weight * centre, a + np.diag(weight), np.zeros(k, bool)
+        p_value = self._p_value(total, infos, curvature, meat, which, free, len(scores))
+        if low is not None and high is not None:
+            # Whatever speaks against an effect's absence while the others are free speaks against it within bounds,
+            # too; beside others that a bound holds fast there may be more
+            absent = np.isin(np.arange(k), which)
+            low, high = np.where(absent, 0.0, low), np.where(absent, 0.0, high)
+            without = bounded(curvature, total, low, high)
+            fast = ~absent & ((without <= low) | (without >= high))
+            if fast.any():
+                beside = self._p_value(total - curvature @ without, infos, curvature, meat, which, fast, len(scores))
+                p_value = min(p_value, beside)
         return Solution(theta, gain, held, p_value, covariance, dispersion)
 
     @staticmethod
@@ -127,16 +138,20 @@ class Gram:
         return sandwich * np.outer(larger, larger), ratio, meat
 
     @staticmethod
-    def _p_value(total: NDArray, infos: NDArray, a: NDArray, meat: NDArray, which: NDArray, blocks: int) -> float:
+    def _p_value(
+        total: NDArray, infos: NDArray, a: NDArray, meat: NDArray, which: NDArray, held_fast: NDArray, blocks: int
+    ) -> float:
         """Score test of the tested columns, the others profiled out, by the scatter of the blocks.
 
-        `total` counts what priors pull: where they hold the others at the maximum, theirs is zero. Without it, what
-        an effect has already bent of them would speak against it.
+        `total` is taken where the others are without the tested, and counts what priors pull: where they hold the
+        others at the maximum, theirs is zero. Without it, what an effect has already bent of them would speak against
+        it. What bounds hold fast (k,) is not profiled out: it cannot give way, and a late input would be no more than
+        a lag that nobody admits.
         """
         k = which.size
         if k == 0:
             return 1.0
-        others = np.setdiff1d(np.arange(a.shape[0]), which)
+        others = np.setdiff1d(np.flatnonzero(~held_fast), which)
         project = np.zeros((k, a.shape[0]))
         project[np.arange(k), which] = 1.0
         if others.size:

@@ -75,9 +75,14 @@ class Step:
 
     def explanations(self) -> list[Trial]:
         """The trials that explain what this turn is about: significant alone and of some use on all flights together
-        (one that ruins those held out scatters so much there that nothing could be told from it), or, however unsure
-        alone, not told apart from the one that was taken."""
-        return [t for t in self.trials if (t.p_value < SURE and t.evidence > 0) or any(t is a for a in self.alike)]
+        (one that ruins those held out scatters so much there that nothing could be told from it) or, as fitted to all
+        of them, better than the one that was taken (a quadratic drag fitted to slow flight ruins a quick one, and is
+        still what both show); or, however unsure alone, not told apart from it."""
+        return [t for t in self.trials if self._explains(t) or any(t is a for a in self.alike)]
+
+    def _explains(self, trial: Trial) -> bool:
+        better_on_all = self.taken is not None and trial.value > self.taken.value
+        return trial.p_value < SURE and (trial.evidence > 0 or better_on_all)
 
 
 @dataclass(frozen=True)

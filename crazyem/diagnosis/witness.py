@@ -26,15 +26,18 @@ FEWEST = 8  # blocks
 def late_measurements(data: Data, nominal: Point, delay: float) -> float | None:
     """Nats for late measurements and against late inputs, of `delay` [s]; None without an accelerometer.
 
-    `nominal` has no delay. For measured rotor speeds nothing is said: their own lag is not known.
+    `nominal` has no delay. The flight that tells the lag best is heard, most often one where thrust sets in at once:
+    errors have one sign (in 11 simulated flights with nothing hidden that tell it to 2 to 4 ms it was one sd too long
+    on average, too short in none), so the mean of several would pass for better than it is. For measured rotor speeds
+    nothing is said: their own lag is not known.
     """
     if data.flights[0].inputs.measured:
         return None
-    found = tilt(data, nominal)
-    if found is None:
+    solutions = [found[0] for found in (tilt(one, nominal) for one in data.each()) if found is not None]
+    if not solutions:
         return None
-    solution = found[0]
-    lag, variance = float(solution.theta[LAG]), float(solution.covariance[LAG, LAG]) + PUNCTUAL_SD**2
+    best = min(solutions, key=lambda s: float(s.covariance[LAG, LAG]))
+    lag, variance = float(best.theta[LAG]), float(best.covariance[LAG, LAG]) + PUNCTUAL_SD**2
     return ((lag - PUNCTUAL - delay) ** 2 - (lag - PUNCTUAL) ** 2) / (2.0 * variance)
 
 

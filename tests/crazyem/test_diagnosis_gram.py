@@ -76,6 +76,24 @@ def test_what_a_prior_has_taken_up_does_not_speak_against_an_effect(weight: floa
     assert neutral.p_value < 1e-3
 
 
+def test_what_a_bound_holds_fast_does_not_take_an_effects_place() -> None:
+    """As if the bound were the value of the other column, which the tested one then is beside alone; free, the other
+    would explain nearly everything, and nothing would speak for the tested one."""
+    gram = simulated(5, columns=2, truth=np.array([0.5, 0.0]))
+    both = np.array([[1.0, 0.9], [0.0, 0.45]])  # the tested column is mostly the other one
+    alike = Gram(gram.score @ both, np.einsum("ji,bjk,kl->bil", both, gram.information, both), gram.flight)
+    bound = 0.1
+    low, high = np.full(2, -np.inf), np.array([bound, np.inf])
+    found = alike.solve([0, 1], low=low, high=high, tested=[1])
+    assert found.theta[0] == bound
+    shifted = alike.score[:, 1:] - bound * alike.information[:, 1:, 0]
+    alone = Gram(shifted, alike.information[:, 1:, 1:], alike.flight).solve([0], tested=[0])
+    assert found.theta[1] == pytest.approx(alone.theta[0])
+    assert found.p_value == pytest.approx(alone.p_value, rel=1e-9)
+    assert found.p_value < 1e-6
+    assert alike.solve([0, 1], tested=[1]).p_value > 0.05  # free, the other takes its place
+
+
 def by_enumeration(a: Array, b: Array, low: Array, high: Array) -> float:
     """The best of all solutions in which each column is free, at its lower or at its upper bound [nats]."""
     best = -np.inf

@@ -57,6 +57,8 @@ def test_what_ruins_the_flights_held_out_explains_nothing_however_significant():
     taken, ruin = trial("rotor_inertia", "i", 219.0), replace(trial("rate_damping", "xyz", 25.0), evidence=-21964.0)
     assert Step((taken, ruin), taken).explanations() == [taken]
     assert Step((taken, ruin), taken, alike=(ruin,)).explanations() == [taken, ruin]
+    both = replace(ruin, value=taken.value + 1.0)  # as fitted to all flights it explains more than the one taken
+    assert Step((taken, both), taken).explanations() == [taken, both]
 
 
 def test_without_evidence_enough_the_first_gives_the_name():
