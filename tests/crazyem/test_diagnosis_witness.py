@@ -61,9 +61,9 @@ def test_an_accelerometer_tells_late_forces_from_late_measurements(recording: Re
         thrust[k] = f[k - 1] + (thrust[k - 1] - f[k - 1]) * np.exp(-0.01 / lag)
     noise = np.random.default_rng(1).normal(size=(len(f), 3)) * 0.02
 
-    def seen(late: float) -> Recording:
+    def seen(late: float, shaken: float = 1.0) -> Recording:
         z = np.interp(command.time - 4.5e-3 - late, command.time, thrust) / DRONE.mass
-        shown = array_of("specific_force", command.time, np.column_stack([0 * z, 0 * z, z]) + noise, place=91)
+        shown = array_of("specific_force", command.time, np.column_stack([0 * z, 0 * z, z]) + shaken * noise, place=91)
         return replace(recording, signals={**recording.signals, "specific_force": shown})
 
     said = []
@@ -73,6 +73,9 @@ def test_an_accelerometer_tells_late_forces_from_late_measurements(recording: Re
         assert found is not None
         said.append(found)
     assert said[0] > said[1] + 3.0  # punctual forces speak for late measurements, late ones for late inputs
+    for order in (1, -1):  # of two flights the one that tells more is heard, and it alone
+        both = Data([flight_of(r, DRONE) for r in (seen(0.010), seen(0.0, shaken=40.0))[::order]])
+        assert late_measurements(both, point_of(data), 0.010) == pytest.approx(said[1], abs=0.5)
     data = Data([flight_of(recording, DRONE)])
     assert late_measurements(data, point_of(data), 0.010) is None  # no accelerometer
 
