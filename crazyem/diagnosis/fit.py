@@ -74,7 +74,7 @@ class Data:
 
     def each(self) -> list["Data"]:
         """Twins of the flights one by one."""
-        parts = [self.twin() for _ in self.models]
+        parts = [Data((), self.workers) for _ in self.models]
         for part, model in zip(parts, self.models, strict=True):
             part.models = [model.twin()]
         return parts

@@ -102,16 +102,12 @@ class Gram:
         which = np.arange(k) if tested is None else np.asarray(tested, int)
         total, curvature, free = b + weight * centre, a + np.diag(weight), np.zeros(k, bool)
         p_value = self._p_value(total, infos, curvature, meat, which, free, len(scores))
-        if low is not None and high is not None:
+        if low is not None and high is not None and which.size < k:
             # Whatever speaks against an effect's absence while the others are free speaks against it within bounds,
             # too; beside others that a bound holds fast there may be more
-            absent = np.isin(np.arange(k), which)
-            low, high = np.where(absent, 0.0, low), np.where(absent, 0.0, high)
-            without = bounded(curvature, total, low, high)
-            fast = ~absent & ((without <= low) | (without >= high))
+            rest, fast = _beside(curvature, total, low, high, which)
             if fast.any():
-                beside = self._p_value(total - curvature @ without, infos, curvature, meat, which, fast, len(scores))
-                p_value = min(p_value, beside)
+                p_value = min(p_value, self._p_value(rest, infos, curvature, meat, which, fast, len(scores)))
         return Solution(theta, gain, held, p_value, covariance, dispersion)
 
     @staticmethod
@@ -170,6 +166,14 @@ class Gram:
         t2 = float(np.sum((vectors.T @ b) ** 2 / np.maximum(floor, 1e-9)))
         freedom = max(blocks - k, 1)
         return float(stats.f.sf(t2 * freedom / (k * max(blocks - 1, 1)), k, freedom))
+
+
+def _beside(a: NDArray, b: NDArray, low: NDArray, high: NDArray, which: NDArray) -> tuple[NDArray, NDArray]:
+    """The score (k,) at the maximum within bounds without the columns `which`, and what bounds hold fast there (k,)."""
+    absent = np.isin(np.arange(b.size), which)
+    low, high = np.where(absent, 0.0, low), np.where(absent, 0.0, high)
+    without = bounded(a, b, low, high)
+    return b - a @ without, ~absent & ((without <= low) | (without >= high))
 
 
 def used(information: NDArray, posterior: NDArray) -> float:

@@ -11,11 +11,12 @@ from closed_loop import DRONE, Hidden, fly
 from made_flight import array_of
 
 from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, nominal, remembering, starting_point
+from crazyem.diagnosis.diagnose import _heard
+from crazyem.diagnosis.fit import Data, Fitted, nominal, remembering, starting_point
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.place import depends_on_place
-from crazyem.diagnosis.trials import Trial, both, margin, told_apart
+from crazyem.diagnosis.trials import Selection, Trial, both, margin, told_apart
 from crazyem.diagnosis.witness import false_speed, late_measurements
 from crazyem.recordings.recording import Recording
 
@@ -50,8 +51,9 @@ def test_commands_tell_a_sensor_that_counts_wrong_from_a_weak_rotor(recording: R
     assert false_speed([recording], 2, 1.06, lag) is None  # no speeds
 
 
-def test_an_accelerometer_tells_late_forces_from_late_measurements(recording: Recording) -> None:
-    """The thrust of the made drone itself, low-passed as its rotors are, as the accelerometer; then 10 ms late."""
+def felt(recording: Recording, late: float, shaken: float = 1.0) -> Recording:
+    """With the thrust of the made drone itself, low-passed as its rotors are, `late` by so many s, as accelerometer;
+    `shaken` times its noise."""
     command = recording.signals["motor_command"]
     volts = recording.signals["voltage"].value
     lag = DRONE.motor_time_constant
@@ -60,24 +62,41 @@ def test_an_accelerometer_tells_late_forces_from_late_measurements(recording: Re
     for k in range(1, len(f)):
         thrust[k] = f[k - 1] + (thrust[k - 1] - f[k - 1]) * np.exp(-0.01 / lag)
     noise = np.random.default_rng(1).normal(size=(len(f), 3)) * 0.02
+    z = np.interp(command.time - 4.5e-3 - late, command.time, thrust) / DRONE.mass
+    shown = array_of("specific_force", command.time, np.column_stack([0 * z, 0 * z, z]) + shaken * noise, place=91)
+    return replace(recording, signals={**recording.signals, "specific_force": shown})
 
-    def seen(late: float, shaken: float = 1.0) -> Recording:
-        z = np.interp(command.time - 4.5e-3 - late, command.time, thrust) / DRONE.mass
-        shown = array_of("specific_force", command.time, np.column_stack([0 * z, 0 * z, z]) + shaken * noise, place=91)
-        return replace(recording, signals={**recording.signals, "specific_force": shown})
 
+def test_an_accelerometer_tells_late_forces_from_late_measurements(recording: Recording) -> None:
     said = []
     for late in (0.0, 0.010):
-        data = Data([flight_of(seen(late), DRONE)])
+        data = Data([flight_of(felt(recording, late), DRONE)])
         found = late_measurements(data, point_of(data), 0.010)
         assert found is not None
         said.append(found)
     assert said[0] > said[1] + 3.0  # punctual forces speak for late measurements, late ones for late inputs
     for order in (1, -1):  # of two flights the one that tells more is heard, and it alone
-        both = Data([flight_of(r, DRONE) for r in (seen(0.010), seen(0.0, shaken=40.0))[::order]])
+        two = (felt(recording, 0.010), felt(recording, 0.0, shaken=40.0))
+        both = Data([flight_of(r, DRONE) for r in two[::order]])
         assert late_measurements(both, point_of(data), 0.010) == pytest.approx(said[1], abs=0.5)
     data = Data([flight_of(recording, DRONE)])
     assert late_measurements(data, point_of(data), 0.010) is None  # no accelerometer
+
+
+def test_a_witness_is_heard_on_the_flights_held_out_too(recording: Recording) -> None:
+    """The accelerometer of the flight that was fitted says nothing, that of the one kept apart tells late from punctual
+    (7 ms less than made: in a flight as lively as this one the sensor's own 4.5 ms and the sampling show as 8)."""
+    silent = felt(recording, 0.0, shaken=1e4)
+    data = Data([flight_of(silent, DRONE)])
+    nominal = point_of(data)
+    late = Candidate("input_delay", (), ("delay",))
+    final = nominal.with_effects({"input_delay": {"delay": 0.010}})
+    fitted = Fitted(final, (late,), 0.0, data.gram(final, late.columns(final)), np.zeros(1))
+    selection = Selection(nominal, final, (), (late,), fitted, 1)
+    assert _heard(data, None, selection, [silent])[1] == frozenset()
+    for seconds, told in ((-0.007, {"measurement_delay", "input_delay"}), (0.010, {"input_delay"})):
+        apart = Data([flight_of(felt(recording, seconds), DRONE)])
+        assert _heard(data, apart, selection, [silent])[1] == told
 
 
 def test_sampled_commands_are_torques_with_the_memory_of_the_lag() -> None:
