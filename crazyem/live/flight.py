@@ -20,6 +20,7 @@ CONFIRMED_WITHIN = 0.25  # s; without setpoints the drone levels out after 0.5 s
 OVERTAKEN = 0.15  # s of host time by which packets may overtake one another
 HAND_OVERS, HAND_OVER_EVERY = 3, 0.04  # times that the drone is handed back to land, s between them
 SILENCE = 3.0  # s of host time without a packet after which the drone counts as lost
+REPORT_EVERY = 1.0  # s of host time between reports of progress
 
 
 class FlightInterruptedError(Exception):
@@ -344,7 +345,7 @@ class Flight:
             raise CrazyemError(f"the drone fell while the link was gone: {self.telemetry.grounded_reason()}.")
         if self._stream is not None and self._stream.failure is not None:
             raise LinkError(f"setpoints could not be sent: {self._stream.failure}.")
-        if now - self._report >= 1.0:
+        if now - self._report >= REPORT_EVERY:
             self._report = now
             self.progress(self.phase, clock_seconds(self.session.clock.newest, self._phase_start))
 
