@@ -290,12 +290,20 @@ def on_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate]) -> 
     return refine(held_out, bare, (), nuisances=free, about=bare, rounds=2, noise=False)
 
 
+def _let_go(point: Point, accepted: Sequence[Candidate], free: Nuisances) -> Point:
+    """The point with what is free no longer (see `nuisances`) as the vehicle file has it, instead of where it was left:
+    nobody is told of it, and a torque scale of 0.925 that stayed made a centre of mass 8 % too small."""
+    kept = {c.effect for c in (*accepted, *(c for c, _ in free))}
+    return point if "torque_scale" in kept else without(point, "torque_scale")
+
+
 def refine_base(
     data: Data, point: Point, accepted: Sequence[Candidate], *, rounds: int = 5, noise: bool = True
 ) -> Fitted:
     """`refine` with what is always free; with a trim, noise scales stay as they are (see `steadied`)."""
     noise = noise and TRIM not in point.vehicle.effects
     free = nuisances(data, point, accepted)
+    point = _let_go(point, accepted, free)
     return refine(data, with_nuisances(point, free), accepted, nuisances=free, rounds=rounds, noise=noise)
 
 

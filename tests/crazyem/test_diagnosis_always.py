@@ -156,3 +156,23 @@ def test_a_second_look_at_the_memory_of_torques_never_makes_a_fit_worse():
     assert anew.loglik > once.loglik + 10.0
     again = refine_anew(data.twin(), anew.point, ())
     assert again.loglik > anew.loglik - 0.1
+
+
+def test_what_is_free_no_longer_does_not_stay_where_it_was_left():
+    """Beside a lag that was found the torque scale is held at what the file says, for a free one goes along with it;
+    held where it stood before, it would make all that is balanced by torques wrong by as much, and nobody be told."""
+    data = Data([flight_of(fly(seconds=8.0, seed=3), DRONE)])
+    lag = Candidate("motor_lag", (), ("time_constant",))
+    neutral = starting_point(Point(DRONE, {}, first_guess())).with_effects({"motor_lag": lag.neutral(POINT)})
+    data.settle(neutral)
+    begun = data.fit_noise(neutral)
+    left = begun.with_effects({"torque_scale": {"scale": 0.925}})
+    fits = [refine_base(data.twin(), point, [lag], noise=False) for point in (begun, left)]
+    assert fits[1].point.effects == fits[0].point.effects
+    assert fits[1].loglik == pytest.approx(fits[0].loglik, abs=1e-6)
+    free = refine_base(data.twin(), left, (), noise=False).point.effects  # without a lag that was found it is free
+    assert free["torque_scale"]["scale"] not in (1.0, 0.925)
+    filed = replace(DRONE, effects={"torque_scale": {"scale": 1.1}})
+    assert refine_base(data.twin(), replace(left, vehicle=filed), [lag], rounds=1).point.effects["torque_scale"] == {
+        "scale": 1.1
+    }
