@@ -197,9 +197,11 @@ def lagged_means(
         acc[:] = 0.0
         if mode == CAUSAL:
             known = i + 1
-            while known < last and times[known] <= begin + delay + 1e-6:
+            # by the node itself: with begin + delay, rounding would decide for a stamp at the end of the microsecond
+            now = (nodes[k - 1] if k > node_first else begin + delay) + 1e-6
+            while known < last and times[known] <= now:
                 known += 1
-            while known > 1 and times[known - 1] > begin + delay + 1e-6:
+            while known > 1 and times[known - 1] > now:
                 known -= 1
             guess[:] = state
             size = _predict(times, commands, i, known, end, predictor, path_times, path)

@@ -60,7 +60,8 @@ URIS = ["--uri", "fake://0", "--uri", "fake://1", "--uri", "fake://2"]
 
 def test_drones_fly_side_by_side_with_a_recording_and_a_row_each(fake, capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(flight, "REPORT_EVERY", 0.05)  # made-up drones fly for a second or less
-    code, said = flown(*URIS, "--push", "--record", "f.mcap")
+    # long enough for the ramp of pushes to arrive at the end of it, also on a busy machine
+    code, said = flown(*URIS, "--push", "--record", "f.mcap", "--duration", "12")
     assert code == 0
     assert [d["name"] for d in said["drones"]] == ["drone0", "drone1", "drone2"]
     for i, drone in enumerate(said["drones"]):
