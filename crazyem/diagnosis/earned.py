@@ -28,7 +28,8 @@ WEIGHT_SD, OFFSET_SD = 1.0, 2.0  # 1, rad/s^2: before anything was seen
 FEEDBACK_SD = (1.0, 2.0, 10.0, 2.0)  # 1/s, 1/s, rad/s^2 per rad and per m/s: times h, of what is known at the start
 FORCE_SD, CORRELATED = 0.5, 0.1  # m/s^2 before anything was seen; s within which one moment is as wrong as the next
 MOST = 2.0  # weight; of a model that is right it is 1
-LEAST_TIME = 2.0  # s of flight before anything is said
+LEAST_TIME = 2.0  # s of flight before anything is said of the turning,
+FORCE_TIME = 0.3  # of the force, whose prior holds it while little was seen: a frame 3 degrees off is 0.5 m/s^2 at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +160,6 @@ def lacked(turned: Turned, starts: NDArray) -> NDArray:
     spread = np.maximum(squares / count - (total / count) ** 2, 1e-12) * max(1.0, CORRELATED / turned.period)
     mean = total / (count + spread / FORCE_SD**2)
     at = np.searchsorted(turned.time[rows] + turned.period, starts + 1e-9, "right") - 1
-    known = (at + 1) * turned.period > LEAST_TIME
+    known = (at + 1) * turned.period > FORCE_TIME
     found[known] = mean[at[known]]
     return found

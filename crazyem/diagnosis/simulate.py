@@ -155,13 +155,14 @@ class Simulator:
         if self._length is not None:
             start.swing = np.tile([0.0, 0.0, -1.0, 0.0, 0.0, 0.0], (len(state), 1)) if swing is None else swing
         path: list[_Row] = []
+        self._weights = weights
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             body, before = self._true(start, times[:, 0], known)
             turn = quaternion_product(quaternion_conjugate(start.attitude), body.attitude)
             bias = body.rate - start.rate
             if weights is not None:
                 body = replace(body, since=np.zeros(len(state)), gained=np.zeros((len(state), 3)))
-                self._weights, self._begun = weights, body.rate
+                self._begun = body.rate
             for k in range(times.shape[1] - 1):
                 begin, span = times[:, k], times[:, k + 1] - times[:, k]
                 pieces = max(1, int(np.ceil(float(span.max(initial=0.0)) / substep - 1e-6)))
@@ -189,7 +190,7 @@ class Simulator:
         """The state one step later with constant accelerations; the force is turned by `rotation` (n, 3, 3)."""
         h = step[:, None]
         force = moved.specific_force
-        if body.since is not None and self._weights is not None:
+        if self._weights is not None:  # on the way to the start, too: what sensors show late begins there
             force = force + self._weights.force
         acceleration = np.einsum("nij,nj->ni", rotation, force) - np.array([0.0, 0.0, GRAVITY])
         velocity = body.velocity + h * acceleration

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from crazyem.cli import main
 from crazyem.diagnosis.earned import (
     FEEDBACK_SD,
+    FORCE_SD,
     LEAST_TIME,
     MEMORY,
     Turned,
@@ -164,9 +165,29 @@ def test_a_force_that_the_model_lacks_is_the_mean_of_what_it_lacked() -> None:
     draw = np.random.default_rng(4)
     lacking = np.array([0.1, -0.2, 0.6]) + 0.3 * draw.standard_normal((turned.time.size, 3))
     lacking[turned.time < 15.0] += 1.0  # long forgotten
-    found = earned(replace(turned, lacking=lacking), np.array([0.5, 39.9]), horizon=0.5)
+    found = earned(replace(turned, lacking=lacking), np.array([0.2, 0.6, 39.9]), horizon=0.5)
     assert np.array_equal(found.force[0], np.zeros(3))
-    assert found.force[1] == pytest.approx([0.1, -0.2, 0.6], abs=0.12)
+    early = lacking[:60].mean(0) / (1.0 + lacking[:60].var(0) * 10.0 / (60.0 * FORCE_SD**2))  # ten rows say the same
+    assert found.force[1] == pytest.approx(early, rel=0.02)
+    assert found.force[2] == pytest.approx([0.1, -0.2, 0.6], abs=0.12)
+
+
+def test_a_learned_force_acts_before_a_start_that_is_shown_late() -> None:
+    """Where states are shown 30 ms late, 10 ms of prediction lie wholly before the moment at which it begins."""
+    recording, bare = (
+        open_recording(str(Path(__file__).parents[2] / "logs" / "payload_excite.mcap")),
+        load_vehicle("cf2"),
+    )
+    vehicle = replace(bare, effects={"measurement_delay": {"delay": 0.03, "streams": ("state", "gyro")}})
+    shown = recorded(recording, vehicle)
+    errors = {}
+    for plain in (False, True):
+        found = predict(shown, horizon=1, every=10, plain=plain)
+        keep = found.airborne & (found.start_time > found.start_time[found.airborne][0] + 3.0)
+        came = shown.state[np.searchsorted(shown.time, found.time[keep, 0]), 5]
+        errors[plain] = abs(float(np.mean(found.prediction[keep, 0, 5] - came)))
+    assert errors[True] > 1e-2  # m/s: thrust is 29 g's, the drone weighs 36 g
+    assert errors[False] < 0.2 * errors[True]
 
 
 def test_between_lags_weights_are_interpolated() -> None:
