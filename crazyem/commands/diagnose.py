@@ -5,7 +5,6 @@ import json
 import os
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ from crazyem.commands.replay import vehicle_of
 from crazyem.errors import UsageError
 from crazyem.live.summary import check_writable
 from crazyem.recordings import open_recording
-from crazyem.recordings.recording import Recording
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -44,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     say("open-loop errors before and after")
     document, pictures = document_of(found, recordings, held_out, withhold=arguments.withhold)
-    document["notices"] = _notices(recordings)
+    document["notices"] = [*(n for r in recordings for n in r.notices), *document["notices"]]
     document["seconds"] = time.monotonic() - begin
     if arguments.against:
         document["against"] = compare(recordings[0], open_recording(arguments.against, options))
@@ -63,10 +61,6 @@ def run(arguments: argparse.Namespace) -> int:
         text += "\n" + "\n".join(_against(document["against"]))
     put(text)
     return 0
-
-
-def _notices(recordings: Sequence[Recording]) -> list[str]:
-    return [n for r in recordings for n in r.notices]
 
 
 def _against(compared: Any) -> list[str]:

@@ -11,12 +11,14 @@ from crazyem.diagnosis.exchange import exchanged, named_again
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.fit import nominal as nominal_of
 from crazyem.diagnosis.flight import Flight, flight_of
+from crazyem.diagnosis.frame import alike as in_one_frame
 from crazyem.diagnosis.heading import heading_by_place
 from crazyem.diagnosis.imitated import by_place
 from crazyem.diagnosis.locate import Located, locate
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.named import Named
 from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.own import Own, owned
 from crazyem.diagnosis.place import depends_on_place
 from crazyem.diagnosis.select import select
 from crazyem.diagnosis.split import LOAD, WEAKER, as_load, as_two
@@ -52,6 +54,7 @@ class Diagnosis:
     selection: Selection
     left_out: dict[str, str]
     explained: float
+    own: tuple[Own, ...]
 
 
 def diagnose(
@@ -75,6 +78,7 @@ def diagnose(
     """
     flights = [flight_of(r, vehicle, withhold=withhold) for r in recordings]
     kept_apart = [flight_of(r, vehicle, withhold=withhold) for r in held_out]
+    flights, kept_apart = in_one_frame(flights, kept_apart)
     workers = Workers(jobs)
     say(f"nominal model of {vehicle.name}: {sum(f.duration for f in flights):.0f} s of flight")
     data, apart, selection, candidates, left_out = _selected(flights, kept_apart, vehicle, wanted, workers, say)
@@ -124,6 +128,7 @@ def diagnose(
     return Diagnosis(
         vehicle, fitted_vehicle, tuple(r.path for r in recordings), tuple(r.path for r in held_out), mismatch,
         before, after, effects, groups, separate, remains, selection, left_out, remains.explained,
+        owned(flights, kept_apart),
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from crazyem.diagnosis.flight import without
 from crazyem.diagnosis.horizon import HorizonErrors, Windows, errors, open_loop, windows
 from crazyem.diagnosis.locate import Finding, strongest
 from crazyem.diagnosis.named import Named
+from crazyem.diagnosis.own import Own
 from crazyem.diagnosis.predict import NAMES, Recorded, recorded
 from crazyem.diagnosis.report import Series
 from crazyem.errors import DataError
@@ -58,8 +60,15 @@ def document_of(
         },
         "not_identifiable": [{"name": n, "reason": r} for n, r in diagnosis.left_out.items()],
         "ranking": _ranking(diagnosis),
+        "of_recordings": [own.to_json() for own in diagnosis.own],
+        "notices": notices_of(diagnosis.own),
     }
     return document, {**disturbance_pictures(diagnosis), **pictures}
+
+
+def notices_of(own: Sequence[Own]) -> list[str]:
+    """What is told of each recording, with its name where there are several."""
+    return [f"{Path(o.recording).name}: {text}" if len(own) > 1 else text for o in own for text in o.notices]
 
 
 def _effect(effect: Named) -> dict[str, Any]:
@@ -206,6 +215,7 @@ def text_of(document: Mapping[str, Any]) -> str:
         for f in document["unexplained"]["where"][:4]:
             size = f"{_short(f['effect_size'], '+.3g')} {f['unit']}"
             lines.append(f"  unexplained: {f['signal']} {f['axis']}, {f['regime']}: {size}")
+    lines += [f"  note: {text}" for text in document["notices"]]
     for part, title in (("train", "fitted flight"), ("held_out", "held-out flight")):
         both = document["fit"][part]
         if both:

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from crazyem.diagnosis.alignment import Alignment
+from crazyem.diagnosis.frame import Frame
 from crazyem.diagnosis.inputs import inputs_of
 from crazyem.doctor.streams import airtime, ordered
 from crazyem.errors import DataError
@@ -56,6 +58,9 @@ class Flight:
             and those at starts; None: `y` has all.
         levelled: the voltage is not recorded, and the thrust of its beginning is the weight by assumption.
         coarse: what turned the drone is not in the commands as recorded (see `always.FAR_OUT`).
+        alignment: how late measured rotor speeds are; they are moved already. None where unknown.
+        frame: how the pose lies against that of other recordings; it is turned back already. None where alike.
+        notices: what had to be assumed of the inputs, a sentence each.
     """
 
     name: str
@@ -73,6 +78,9 @@ class Flight:
     attitude: NDArray | None = None
     levelled: bool = False
     coarse: bool = False
+    alignment: Alignment | None = None
+    frame: Frame | None = None
+    notices: tuple[str, ...] = ()
 
     @property
     def blocks(self) -> int:
@@ -157,6 +165,7 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
         signals=frozenset(n for n in (*measured, "specific_force", "voltage", "rotor_speed", *COMMANDS)
                           if n in recording.signals or (n == "body_rate" and n in measured)),
         attitude=y[:, 6:10].copy() if onboard_attitude(recording) else None, levelled=found.level is not None,
+        alignment=found.alignment, notices=found.notices,
     )  # fmt: skip
     flight = flight.started(flight.starts)
     if flight.duration < SHORTEST:

@@ -1,0 +1,80 @@
+"""Pose frames that lie differently on the drone: made flights, each with its frame turned by a known angle."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from closed_loop import DRONE, Hidden, fly
+from made_flight import changed
+from scipy.spatial.transform import Rotation
+
+from crazyem.diagnosis.diagnose import diagnose
+from crazyem.diagnosis.document import document_of
+from crazyem.diagnosis.flight import Flight, flight_of
+from crazyem.diagnosis.frame import alike, tilt_of
+from crazyem.recordings.recording import Recording
+
+DRAG = Hidden(drag=(0.02, 0.015, 0.0))
+
+
+def turned(recording: Recording, roll: float, pitch: float) -> Recording:
+    """What a pose shows whose frame the body is turned further than by (roll, pitch) [rad]."""
+    pose = Rotation.from_quat(recording.signals["attitude"].value)
+    return changed(recording, "attitude", value=(pose * Rotation.from_rotvec([roll, pitch, 0.0]).inv()).as_quat())
+
+
+def flight(seed: int, roll: float = 0.0, pitch: float = 0.0, hidden: Hidden = DRAG) -> Flight:
+    return flight_of(turned(fly(hidden, seed=seed), roll, pitch), DRONE)
+
+
+def test_a_tilt_is_found_with_an_error_as_told() -> None:
+    """Twelve flights with drag, which no file knows of: both angles of each, over what is said of their errors."""
+    away = []
+    for seed in range(12):
+        truth = np.random.default_rng(seed).normal(scale=0.02, size=2)
+        found = tilt_of(flight(seed, *truth))
+        assert found is not None
+        assert (found[1] < 4e-3).all()
+        away.append((found[0] - truth) / found[1])
+    assert 0.5 < float(np.sqrt(np.mean(np.square(away)))) < 1.6
+    assert np.abs(away).max() < 4.0
+
+
+def test_frames_that_lie_alike_are_left_alone() -> None:
+    flights = [flight(seed, 0.02, -0.01) for seed in range(4)]
+    fitted, apart = alike(flights[:3], flights[3:])
+    assert all(a is b for a, b in zip([*fitted, *apart], flights, strict=True))
+
+
+def test_frames_are_turned_to_the_mean_of_those_fitted() -> None:
+    truth = [(0.01, -0.01), (0.03, 0.01), (-0.01, 0.0), (0.06, 0.05)]
+    flights = [flight(seed, *t) for seed, t in enumerate(truth)]
+    fitted, apart = alike(flights[:3], flights[3:])
+    after = [found[0] for f in [*fitted, *apart] if (found := tilt_of(f)) is not None]
+    assert np.ptp(after, axis=0) == pytest.approx(0.0, abs=2e-3)
+    assert np.mean(after, axis=0) == pytest.approx([0.01, 0.0], abs=3e-3)  # of the first three: stays, to be named
+    frame = apart[0].frame
+    assert frame is not None
+    assert (frame.roll, frame.pitch) == pytest.approx((0.05, 0.05), abs=4e-3)
+    assert np.array_equal(apart[0].y[:, :6], flights[3].y[:, :6])
+
+
+def test_one_flight_or_a_filter_on_board_tells_nothing() -> None:
+    alone = flight(0, 0.05, 0.0)
+    assert alike([alone], []) == ([alone], [])
+    onboard = replace(alone, attitude=alone.y[:, 6:10].copy())
+    assert tilt_of(onboard) is None
+    still = replace(flight(1), signals=frozenset({"attitude", "velocity"}))
+    assert tilt_of(still) is None
+
+
+def test_a_diagnosis_tells_whose_frame_it_turned_and_names_no_tilt() -> None:
+    """Flights of one healthy drone whose frames lie 30 mrad apart, about a mean of nothing."""
+    recordings = [replace(turned(fly(seed=s), r, 0.0), path=f"{s}.csv") for s, r in enumerate((0.015, -0.015, 0.03))]
+    found = diagnose(recordings[:2], DRONE, held_out=recordings[2:], wanted=["attitude_misalignment", "wind"])
+    assert not found.mismatch
+    document, _ = document_of(found, recordings[:2], recordings[2:])
+    for own, roll in zip(document["of_recordings"], (0.015, -0.015, 0.03), strict=True):
+        assert own["pose_frame"]["roll"] == pytest.approx(roll, abs=3e-3)
+    assert [own["held_out"] for own in document["of_recordings"]] == [False, False, True]
+    assert any("2.csv" in text and "tilted" in text for text in document["notices"])
