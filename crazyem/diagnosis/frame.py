@@ -34,7 +34,7 @@ class Frame:
     """How a recording's pose frame is turned against those of the others.
 
     Attributes:
-        roll, pitch: rad, by which the body is turned further than the pose says; taken off already.
+        roll, pitch: rad, of the frame in the body, as `attitude_misalignment` has them; taken off already.
         sd: rad, (roll, pitch).
     """
 
@@ -72,7 +72,7 @@ def alike(flights: "Sequence[Flight]", kept_apart: "Sequence[Flight]") -> "tuple
 
 
 def tilt_of(flight: "Flight") -> tuple[NDArray, NDArray] | None:
-    """Roll and pitch (2,) rad of the body against its pose frame, and their standard deviations; None if not told."""
+    """Roll and pitch (2,) rad of the pose frame in the body, and their standard deviations; None if not told."""
     if flight.attitude is not None or not {"position", "attitude"} <= flight.signals:
         return None
     rows = [_across(flight, part) for part in _stretches(flight)]
@@ -87,7 +87,7 @@ def tilt_of(flight: "Flight") -> tuple[NDArray, NDArray] | None:
     lean, error = np.zeros(2), np.zeros(2)
     for axis in range(2):
         lean[axis], error[axis] = _constant(whole[:, [axis, 3]], whole[:, 4 + axis], block)
-    return np.array([-lean[1], lean[0]]), error[::-1]
+    return np.array([lean[1], -lean[0]]), error[::-1]
 
 
 def _stretches(flight: "Flight") -> list[NDArray]:
@@ -141,7 +141,7 @@ def _deviation(tilt: NDArray, sd: NDArray, fitted: int) -> NDArray:
 
 def _turned_back(flight: "Flight", away: NDArray, error: NDArray) -> "Flight":
     y, seen = flight.y.copy(), np.isfinite(flight.y[:, 6])
-    by = Rotation.from_rotvec([away[0], away[1], 0.0])
+    by = Rotation.from_rotvec([-away[0], -away[1], 0.0])
     y[seen, 6:10] = (Rotation.from_quat(y[seen, 6:10]) * by).as_quat()
     frame = Frame(float(away[0]), float(away[1]), (float(error[0]), float(error[1])))
     return replace(flight, y=y, frame=frame)

@@ -18,9 +18,9 @@ DRAG = Hidden(drag=(0.02, 0.015, 0.0))
 
 
 def turned(recording: Recording, roll: float, pitch: float) -> Recording:
-    """What a pose shows whose frame the body is turned further than by (roll, pitch) [rad]."""
+    """What a pose shows whose frame is turned in the body by (roll, pitch) [rad]: rolled by +a it shows roll + a."""
     pose = Rotation.from_quat(recording.signals["attitude"].value)
-    return changed(recording, "attitude", value=(pose * Rotation.from_rotvec([roll, pitch, 0.0]).inv()).as_quat())
+    return changed(recording, "attitude", value=(pose * Rotation.from_rotvec([roll, pitch, 0.0])).as_quat())
 
 
 def flight(seed: int, roll: float = 0.0, pitch: float = 0.0, hidden: Hidden = DRAG) -> Flight:

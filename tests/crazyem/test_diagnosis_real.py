@@ -13,6 +13,7 @@ from crazyem.diagnosis import felt
 from crazyem.diagnosis.alignment import Alignment
 from crazyem.diagnosis.flight import Flight, controlled_rates, flight_of, without
 from crazyem.diagnosis.inputs import inputs_of
+from crazyem.diagnosis.own import owned
 from crazyem.diagnosis.predict import predict, recorded
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
@@ -80,6 +81,15 @@ def test_it_is_used_and_said() -> None:
     inputs = inputs_of(shaken(delay=-0.02), VEHICLE)
     assert inputs.rotor.delay == pytest.approx(-0.02, abs=1e-3)
     assert any("after their stamps" in notice for notice in inputs.notices)
+
+
+def test_a_diagnosis_tells_it_of_each_recording() -> None:
+    late, unknown = (flight_of(shaken(delay=0.02, related=r), VEHICLE) for r in (True, False))
+    one, other = owned([late], [unknown])
+    assert one.to_json()["rotor_clock"]["delay"] == pytest.approx(0.02, abs=1e-3)
+    assert any("after their stamps" in text for text in one.notices)
+    assert (one.held_out, other.held_out) == (False, True)
+    assert other.to_json()["rotor_clock"] is None
 
 
 def test_a_prediction_knows_of_the_delay_what_came_before_its_start() -> None:
