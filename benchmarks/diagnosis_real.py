@@ -140,23 +140,30 @@ TRAIN = tuple(
         ("B3_figure8_fast", 1), ("B3_figure8_fast", 2), ("B3_figure8_medium", 1), ("B3_figure8_slow", 1),
     )
 )  # fmt: skip
-LEFT_OUT = ("B9_trefoil_medium_rep1", "B9_trefoil_slow_rep1", "B9_trefoil_fast_rep1", "B6_linear_ramp_rep2")
+LEFT_OUT = (
+    "B9_trefoil_medium_rep1", "B9_trefoil_slow_rep1", "B9_trefoil_slow_rep14", "B9_trefoil_fast_rep1",
+    "B6_linear_ramp_rep2",
+)  # fmt: skip
+Judged = tuple[NDArray, float, int]  # see `forces`
 WINDOW = 21  # samples of the Savitzky-Golay filter that accelerations come from
 
 
-def forces(path: Path, vehicle: str, withhold: Sequence[str], *, learned: bool = False) -> tuple[NDArray, float, int]:
+def forces(path: Path, vehicle: str, withhold: Sequence[str], *, learned: bool = False) -> Judged:
     """Residual of the specific force (n, 3) m/s^2 in body axes at recorded states, and the rms of the position error
     after 0.5 s with the attitude as measured [m], of how many starts. `learned`: as `crazyem predict` has it, with
-    the force that was missing before each start; else the model alone."""
+    the force that was missing before each start; else the model alone. (A voltage that is withheld is that of the
+    first 3 s for the position, at earlier starts too.)"""
+    from crazyem.diagnosis.earned import earned
     from crazyem.diagnosis.flight import without
     from crazyem.diagnosis.horizon import errors, open_loop, windows
-    from crazyem.diagnosis.predict import predict, recorded
+    from crazyem.diagnosis.predict import predict, recorded, turned_by
     from crazyem.recordings import open_recording
     from crazyem.vehicle import load_vehicle
 
     shown = recorded(without(open_recording(path), withhold), load_vehicle(vehicle))
     at = windows(shown)
-    position = errors(open_loop(shown, at, measured_attitude=True), at)
+    weights = earned(turned_by(shown), at.times[:, 0], horizon=at.horizons[-1]) if learned else None
+    position = errors(open_loop(shown, at, measured_attitude=True, weights=weights), at)
     step = 0.01  # one step from every sample: the model's acceleration
     if learned:
         found = predict(shown, horizon=1)
@@ -188,18 +195,26 @@ def judged(folder: Path, vehicle: str, withhold: Sequence[str] = ()) -> dict[str
     """Pooled over the flights of types that were not fitted, and each of them."""
     paths = [folder / f"{n}.csv.gz" for n in LEFT_OUT]
     parts = [forces(p, vehicle, withhold) for p in paths]
-    learned = [forces(p, vehicle, withhold, learned=True)[0] for p in paths]
-    starts = np.array([p[2] for p in parts], float)
-    position = float(np.sqrt(np.sum(starts * np.square([p[1] for p in parts])) / starts.sum()))
+    learned = [forces(p, vehicle, withhold, learned=True) for p in paths]
+    return {
+        **_scores(parts, learned),
+        "flights": {n: _scores([p], [by]) for n, p, by in zip(LEFT_OUT, parts, learned, strict=True)},
+    }
+
+
+def _scores(parts: Sequence[Judged], learned: Sequence[Judged]) -> dict[str, Any]:
+    """By the model alone, and as `predict` has it."""
     return {
         "force_rms": rms_of(np.concatenate([p[0] for p in parts])),
-        "predicted_force_rms": rms_of(np.concatenate(learned)),
-        "position_rms": round(position, 4),
-        "flights": {
-            n: {"force_rms": rms_of(p[0]), "predicted_force_rms": rms_of(by), "position_rms": round(float(p[1]), 4)}
-            for n, p, by in zip(LEFT_OUT, parts, learned, strict=True)
-        },
+        "predicted_force_rms": rms_of(np.concatenate([p[0] for p in learned])),
+        "position_rms": _pooled_position(parts),
+        "predicted_position_rms": _pooled_position(learned),
     }
+
+
+def _pooled_position(parts: Sequence[Judged]) -> float:
+    starts = np.array([p[2] for p in parts], float)
+    return round(float(np.sqrt(np.sum(starts * np.square([p[1] for p in parts])) / starts.sum())), 4)
 
 
 def rms_of(rest: NDArray) -> list[float]:
@@ -304,14 +319,15 @@ def tables(done: dict[str, Any]) -> str:
             out.append(f"| {name} | {_delay(delays[f'raw/{name}'])} | {_delay(delays.get(f'processed/{name}'))} |")
         out.append("")
     if "nanobench" in done:
-        out += ["| nanobench, types left out | force residual x, y, z m/s² | by `predict` | position after 0.5 s m |",
-                "| --- | --- | --- | --- |"]  # fmt: skip
+        out += ["| nanobench, types left out | force residual x, y, z m/s² | by `predict` | position after 0.5 s m | "
+                "by `predict` |", "| --- | --- | --- | --- | --- |"]  # fmt: skip
         for name in ("before", "after", "withheld_before", "withheld_after"):
             s = done["nanobench"][name]
             for flight, scores in ((name.replace("_", ", "), s), *s.get("flights", {}).items()):
                 x, y, z = scores["force_rms"]
                 by = ", ".join(map(str, scores.get("predicted_force_rms", ["-"])))
-                out.append(f"| {flight} | {x}, {y}, {z} | {by} | {scores['position_rms']} |")
+                late = scores.get("predicted_position_rms", "-")
+                out.append(f"| {flight} | {x}, {y}, {z} | {by} | {scores['position_rms']} | {late} |")
         out.append("")
     if "crazypad" in done:
         out += ["| crazypad: flight, by the file fitted to | what was said first |", "| --- | --- |"]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.diagnosis.earned import Weights
 from crazyem.diagnosis.predict import SAME, Recorded, start_rows
 from crazyem.diagnosis.simulate import Simulator
 from crazyem.errors import DataError
@@ -114,6 +115,7 @@ def open_loop(
     vehicle: Vehicle | None = None,
     effects: Effects | None = None,
     measured_attitude: bool = False,
+    weights: Weights | None = None,
 ) -> NDArray:
     """(n, h, 13) predictions for windows.
 
@@ -123,6 +125,7 @@ def open_loop(
         vehicle: other constants than the recording was read with (mass, inertia, arm, lag; not the law of thrust).
         effects: None takes those of the vehicle.
         measured_attitude: follow the recorded attitude and rate, so that forces are judged alone.
+        weights: what was learned before each start (see `earned`); None: the model alone.
     """
     simulator = Simulator(shown.inputs, effects, vehicle=vehicle)
     swings = simulator.swings(shown.time, shown.state[:, 3:6])
@@ -132,6 +135,7 @@ def open_loop(
         swing=None if swings is None else swings[at.rows],
         given=at.times[:, -1] - shown.period,  # as in `predict`, where steps are the recording's
         attitude=(lambda time: recorded_attitude(shown, time)) if measured_attitude else None,
+        weights=weights,
     )
 
 
