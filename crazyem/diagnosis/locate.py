@@ -5,7 +5,7 @@ disturbance of each block with its error; by bins of a regime (speed, height, ti
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,8 @@ class Finding:
 
     Attributes:
         signal: "force", "torque", "attitude", "velocity" or "body_rate".
-        axis: x, y or z of the body (velocity: of the world).
+        axis: x, y or z of the body (velocity: of the world); "world x" or "world y" of a force that belongs to the
+            room more than to the body.
         regime: in words, "always" for a constant.
         variable: what the regime is told by; "" for a constant.
         interval: s, where it is seen.
@@ -98,6 +99,12 @@ def shown_columns(flight: Flight, weights: NDArray | None = None) -> list[Column
     return columns
 
 
+def world_columns(rotation: NDArray) -> list[Column]:
+    """A unit acceleration along world x and y, by the attitudes (n, 3, 3)."""
+    none = np.zeros((len(rotation), 3))
+    return [Column(f"world {AXES[k]}", acting=np.concatenate([rotation[:, k], none], axis=1)) for k in range(2)]
+
+
 def regimes(flight: Flight, path: NDArray, thrust: NDArray) -> dict[str, tuple[NDArray, str]]:
     """Variables that a mismatch may depend on: name -> ((n,) values, unit)."""
     up = rotation_matrix(path[:, 6:10])[:, 2, 2]
@@ -160,6 +167,7 @@ def _one(model: Model, point: Point, workers: Workers) -> tuple[list[Finding], D
             continue
         findings += _constant_and_change(i, b[:, i], a[:, i], dispersion[i], flight, times, unit[i])
     path = model.shown if model.shown is not None else swept.filtered
+    findings += _of_the_world(model, point, path, times, findings)
     thrust = model.thrusts(point.vehicle, point.effects)[0]
     for found in workers.map(
         lambda regime: _by_regime(model.twin(), point, regime[0], *regime[1], unit),
@@ -167,6 +175,23 @@ def _one(model: Model, point: Point, workers: Workers) -> tuple[list[Finding], D
     ):
         findings += found
     return findings, disturbance, _whiteness(swept.innovation, swept.variance)
+
+
+def _of_the_world(
+    model: Model, point: Point, path: NDArray, times: NDArray, of_the_body: Sequence[Finding]
+) -> list[Finding]:
+    """Forces along horizontal axes of the world, always there or from a moment on, that say more than the same along
+    axes of the body: a wind on a drone that turns."""
+    flight = model.flight
+    swept = model.sweep(point, world_columns(rotation_matrix(path[:, 6:10])))
+    b, a = swept.score, np.einsum("bii->bi", swept.information)
+    dispersion = _dispersion(b, a)
+    found = []
+    for k in range(2):
+        found += _constant_and_change(k, b[:, k], a[:, k], dispersion[k], flight, times, point.vehicle.mass)
+    body = [f for f in of_the_body if f.signal == "force" and f.axis in AXES[:2]]
+    better = [f for f in found if all(f.nats > g.nats for g in body if g.variable == f.variable)]
+    return [replace(f, axis=f"world {f.axis}") for f in better]
 
 
 def _dispersion(b: NDArray, a: NDArray) -> NDArray:

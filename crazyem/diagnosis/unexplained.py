@@ -73,7 +73,9 @@ def unexplained(data: Data, selection: Selection, after: Located, apart: Data | 
     # what is always free gives way to a vibration, so that is looked for with it where the vehicle file has it
     named = {c.effect: point.effects[c.effect] for c in selection.accepted if c.effect not in selection.doubted}
     filed = replace(point, effects={**point.vehicle.effects, **named})
-    left = [f for f in strongest(after.findings, most=40) if f.nats > STRUCTURE and notable(f, point)]
+    # along axes of the body: a force of the room is asked for by `place.py`, and `wind` is of the catalogue
+    of_the_body = [f for f in after.findings if f.axis in AXES]
+    left = [f for f in strongest(of_the_body, most=40) if f.nats > STRUCTURE and notable(f, point)]
     for model in data.models:
         left += lines(model.sweep(point), model.flight.time) + humps(model, filed)
         model.settle(point)
