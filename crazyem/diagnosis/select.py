@@ -48,7 +48,7 @@ from crazyem.diagnosis.trials import (
 
 SHORTLIST = 6
 WORTH, ANYWAY = 0.15, 3  # share of the largest linear gain from which a candidate is fitted, and how many are anyway
-MOST = 6  # effects: real drones differ from a file in more than one thing
+MOST = 9  # effects: real drones differ from a file in more than one thing
 NEARLY, MOST_COMPARED = 0.8, 3  # share of the best's gain from which, and how many, explanations get noise of their own
 BEATEN = 0.1  # probability of being the better explanation below which a simpler one does not give the name
 BESIDE = 0.5  # share of its gain that an effect keeps beside another which it is no other name for
