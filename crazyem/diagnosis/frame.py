@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 STEP, WIDTH = 0.01, 21  # s, samples: of the polynomials (Savitzky and Golay) whose curvature is the acceleration
 BLOCK, LEAST = 1.0, 8  # s that scatter together, and how many of them are needed
+SMALLEST = 1e-5  # rad: of a drone that stands on its feet all along even scatter says nothing
 LIKELY = 1e-3  # p-value that the frames lie alike
 
 
@@ -79,8 +80,9 @@ def tilt_of(flight: "Flight") -> tuple[NDArray, NDArray] | None:
     rows = [r for r in rows if r.size]
     if not rows:
         return None
-    block = np.concatenate([(1000 * k + np.arange(len(r)) * STEP // BLOCK) for k, r in enumerate(rows)])
-    block = np.unique(block, return_inverse=True)[1]
+    own = [np.floor(np.arange(len(r)) * STEP / BLOCK).astype(int) for r in rows]
+    first = np.cumsum([0, *(b[-1] + 1 for b in own[:-1])])
+    block = np.concatenate([b + f for b, f in zip(own, first, strict=True)])
     if block.max() + 1 < LEAST:
         return None
     whole = np.concatenate(rows)
@@ -118,11 +120,11 @@ def _constant(explaining: NDArray, across: NDArray, block: NDArray) -> tuple[flo
     a, b = np.zeros((count, 2, 2)), np.zeros((count, 2))
     np.add.at(a, block, explaining[:, :, None] * explaining[:, None, :])
     np.add.at(b, block, explaining * across[:, None])
-    inverse = np.linalg.inv(a.sum(0))
+    inverse = np.linalg.pinv(a.sum(0), hermitian=True)  # a drone that never moves shows no drag
     theta = inverse @ b.sum(0)
     rest = b - a @ theta
     covariance = inverse @ (rest.T @ rest) @ inverse * count / (count - 2)
-    return float(theta[1]), float(np.sqrt(covariance[1, 1]))
+    return float(theta[1]), max(SMALLEST, float(np.sqrt(covariance[1, 1])))
 
 
 def _deviation(tilt: NDArray, sd: NDArray, fitted: int) -> NDArray:

@@ -68,6 +68,14 @@ def test_one_flight_or_a_filter_on_board_tells_nothing() -> None:
     assert tilt_of(still) is None
 
 
+def test_a_drone_that_never_moves_is_upright() -> None:
+    still = [flight(seed) for seed in range(2)]
+    for f in still:
+        f.y[:, :3], f.y[:, 6:10] = (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0)
+    assert tilt_of(still[0]) == (pytest.approx([0.0, 0.0], abs=1e-9), pytest.approx([1e-5, 1e-5]))
+    assert alike(still, []) == (still, [])
+
+
 def test_a_diagnosis_tells_whose_frame_it_turned_and_names_no_tilt() -> None:
     """Flights of one healthy drone whose frames lie 30 mrad apart, about a mean of nothing."""
     recordings = [replace(turned(fly(seed=s), r, 0.0), path=f"{s}.csv") for s, r in enumerate((0.015, -0.015, 0.03))]
