@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.candidates import Candidate, strengths_of
 from crazyem.diagnosis.fit import Data, Fitted, refine, remembering, remembering_anew
 from crazyem.diagnosis.flight import Flight
 from crazyem.diagnosis.gram import Solution, used
@@ -36,7 +36,8 @@ TORQUE_SD = 0.03
 # flights of 11 drones with nothing hidden (and of 8e-5 to 2.4e-4 in hovers, which hardly show it).
 DAMPING_SD = 6e-6
 # From one day to the next, of a drone whose file has a trim: batteries are put in again, propellers and feet bent.
-# Healthy and damaged flights of two drones on several days scatter like this (docs/diagnosis_real.md).
+# Healthy and damaged flights of two drones on several days scatter like this (docs/diagnosis_real.md). The thrust is
+# free for each of several recordings of any drone (`SEVERAL`): one number for all would make it heed commands less.
 TRIM_SD = (5e-4, 5e-4, 1.6e-4)  # m: torque per thrust
 THRUST_SD = 0.02  # relative
 FLAPPING_SD, DRAG_SD = 3e-4, 0.02  # N m s/m, N s/m: real rotors have both, bare rigid bodies of files neither
@@ -44,6 +45,7 @@ LEANING_SD = (0.02, 0.02, 2e-3)  # rad: an attitude made from the acceleration i
 # s: a filter on board that integrates a biased gyro and is drawn back by the fixes stays off by the bias times the time
 # that takes: 0.041, 0.043, 0.041 and 0.038 s in roll and pitch of two simulated flights.
 PULL = 0.05
+SEVERAL = 3  # recordings whose commands are known, from which on each has a thrust of its own
 TRIM = "trim"
 # Standard deviations that no scatter shows. An attitude 1 ms late is a force that goes with the velocity, 3e-4 N s/m of
 # drag along the quicker axis of a figure 8 (mass * (3.1 rad/s)^2 * 1 ms); along z thrust is a little wrong; a gyro's
@@ -105,6 +107,9 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
         found.append((Candidate("velocity_scale", (), ("x", "y", "z")), tuple((VELOCITY_SD + jittery(data)) ** -2.0)))
         if "attitude" in data.signals and "body_rate" in data.signals:
             found.append((Candidate("onboard_filter", FILTER, tuple(n for n, _ in FILTER)), (FILTER_SD**-2,) * 2))
+    if data.differ:
+        own = strengths_of(data.flights)
+        found.append((own, (THRUST_SD**-2,) * len(own.free)))
     if TRIM in point.vehicle.effects:
         found.append((Candidate(TRIM, (), ("x", "y", "z")), tuple(sd**-2 for sd in TRIM_SD)))
         found.append((Candidate("thrust_scale", (), ("scale",)), (THRUST_SD**-2,)))
@@ -118,6 +123,12 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
     if "motor_lag" in taken:  # both free, with a lag that has no prior, go along their ridge: a lag 8 ms too long
         taken.add("torque_scale")
     return [(c, p) for c, p in found if c.effect not in taken]
+
+
+def differing(flights: Sequence[Flight], kept_apart: Sequence[Flight], vehicle: Vehicle) -> list[list[Flight]]:
+    """The flights, each with a thrust of its own where there are several: see `SEVERAL`. A trim has one already."""
+    own = len(flights) >= SEVERAL and not flights[0].inputs.measured and TRIM not in vehicle.effects
+    return [[replace(f, differs=own) for f in part] for part in (flights, kept_apart)]
 
 
 def jittery(data: Data) -> NDArray:

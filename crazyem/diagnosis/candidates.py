@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from crazyem.diagnosis.model import Column, Point
+from crazyem.diagnosis.flight import Flight
+from crazyem.diagnosis.model import STRENGTH, Column, Point
 from crazyem.errors import UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effect, Parameter
@@ -120,6 +121,28 @@ class Candidate:
             low, high = self.range_of(name)
             found[name] = min(max(found[name], low), high)
         return found
+
+
+class Strengths(Candidate):
+    """The thrust of each recording over what the vehicle says of it (`model.STRENGTH`): always free, never named."""
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return "strength of each recording"
+
+    def parameter(self, name: str) -> Parameter:
+        """Of the recording of that name."""
+        return Parameter(name, "", 1.0, 0.5, 1.5, 0.01)
+
+    def neutral(self, point: Point) -> dict[str, Any]:
+        """As the vehicle says."""
+        return dict.fromkeys(self.free, 1.0)
+
+
+def strengths_of(flights: Sequence[Flight]) -> Strengths:
+    """Those of some recordings; two of one name are one."""
+    return Strengths(STRENGTH, (), tuple(dict.fromkeys(f.name for f in flights)))
 
 
 def candidates_for(

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from crazyem.diagnosis.always import abstained, steadied, unlike_a_body
+from crazyem.diagnosis.always import abstained, differing, steadied, unlike_a_body
 from crazyem.diagnosis.beside import beside_the_regression, late_rotors
 from crazyem.diagnosis.candidates import Candidate, candidates_for
 from crazyem.diagnosis.exchange import exchanged, named_again
@@ -15,7 +15,7 @@ from crazyem.diagnosis.frame import alike as in_one_frame
 from crazyem.diagnosis.heading import heading_by_place
 from crazyem.diagnosis.imitated import by_place
 from crazyem.diagnosis.locate import Located, locate
-from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.model import STRENGTH, Point
 from crazyem.diagnosis.named import Named
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.own import Own, owned
@@ -78,7 +78,7 @@ def diagnose(
     """
     flights = [flight_of(r, vehicle, withhold=withhold) for r in recordings]
     kept_apart = [flight_of(r, vehicle, withhold=withhold) for r in held_out]
-    flights, kept_apart = in_one_frame(flights, kept_apart)
+    flights, kept_apart = differing(*in_one_frame(flights, kept_apart), vehicle)
     workers = Workers(jobs)
     say(f"nominal model of {vehicle.name}: {sum(f.duration for f in flights):.0f} s of flight")
     data, apart, selection, candidates, left_out = _selected(flights, kept_apart, vehicle, wanted, workers, say)
@@ -128,7 +128,7 @@ def diagnose(
     return Diagnosis(
         vehicle, fitted_vehicle, tuple(r.path for r in recordings), tuple(r.path for r in held_out), mismatch,
         before, after, effects, groups, separate, remains, selection, left_out, remains.explained,
-        owned(flights, kept_apart),
+        owned(flights, kept_apart, selection.final.effects.get(STRENGTH)),
     )  # fmt: skip
 
 

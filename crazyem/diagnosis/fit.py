@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.flight import Flight
 from crazyem.diagnosis.gram import Gram
-from crazyem.diagnosis.model import Column, Model, Point, Swept
+from crazyem.diagnosis.model import STRENGTH, Column, Model, Point, Swept
 from crazyem.diagnosis.noise import first_guess, fit_noise
 from crazyem.diagnosis.workers import Workers
 from crazyem.errors import DataError
@@ -90,6 +90,11 @@ class Data:
         return frozenset.intersection(*(f.signals for f in self.flights))
 
     @property
+    def differ(self) -> bool:
+        """Whether each of them may have a thrust of its own."""
+        return bool(self.models) and all(f.differs for f in self.flights)
+
+    @property
     def coarse(self) -> bool:
         """Whether in none of them what turned the drone is in the commands as recorded."""
         return all(f.coarse for f in self.flights)
@@ -164,7 +169,7 @@ class Data:
 
 def strongly_shown(name: str, values: Mapping[str, Any]) -> bool:
     """Whether an effect moves what sensors show so far from the state that one pass does not find it."""
-    if CATALOGUE[name].measured is None:
+    if name == STRENGTH or CATALOGUE[name].measured is None:
         return False
     return name != "velocity_scale" or any(abs(values.get(a, 1.0) - 1.0) > SLIGHT for a in "xyz")
 

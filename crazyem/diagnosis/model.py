@@ -18,6 +18,9 @@ from crazyem.physics.rotations import rotation_matrix
 from crazyem.vehicle import Vehicle
 
 RECENT = 0.5  # s, over which what a model lacks is averaged: long enough that the noise of one sample is nothing
+# The thrust of one recording over what the vehicle file and its effects say: batteries and propellers of another day.
+# No effect of the catalogue, since it belongs to no drone: name of the flight -> factor.
+STRENGTH = "strength"
 WIDE = np.array([1.0] * 3 + [2.0] * 3 + [0.5] * 3 + [3.0] * 3) ** 2  # variances at a start of what is not measured
 
 
@@ -162,6 +165,17 @@ def lacking(swept: Swept, flight: Flight) -> NDArray:
     return mean
 
 
+def of_recording(effects: Effects, name: str) -> Effects:
+    """The effects as they act in the recording of that name: with its own strength, where there is one."""
+    if STRENGTH not in effects:
+        return effects
+    own: dict[str, Mapping[str, Any]] = {n: v for n, v in effects.items() if n != STRENGTH}
+    factor = effects[STRENGTH].get(name, 1.0)
+    if factor != 1.0:
+        own["thrust_scale"] = {"scale": factor * own.get("thrust_scale", {}).get("scale", 1.0)}
+    return own
+
+
 @dataclass
 class Model:
     """A flight under models near one another: remembers the path of the last pass, at which physics is evaluated."""
@@ -182,6 +196,7 @@ class Model:
 
     def thrusts(self, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, NDArray]:
         """Thrusts after the lag; remembered, since most columns change nothing before the rotors."""
+        effects = of_recording(effects, self.flight.name)
         before = {n: effects[n] for n in effects if _before_rotors(n)}
         key = f"{vehicle!r} {before!r}"
         if key not in self._thrusts:
@@ -192,7 +207,7 @@ class Model:
 
     def accelerations(self, point: Point, effects: Effects | None = None) -> tuple[NDArray, Situation]:
         """(n, 6) specific force and angular acceleration over each step, and the situation."""
-        effects = point.effects if effects is None else effects
+        effects = of_recording(point.effects if effects is None else effects, self.flight.name)
         path = initial_path(self.flight) if self.path is None else self.path
         if self._rotation is None:
             self._rotation = rotation_matrix(path[:, 6:10])
@@ -207,7 +222,7 @@ class Model:
         A lag shows by the accelerations that the drone has, not by those that a wrong model gives: a shifted centre of
         mass of 0.7 mm is 10 rad/s^2, and 1 ms of that would be a gyro's bias of 10 mrad/s.
         """
-        effects = point.effects if effects is None else effects
+        effects = of_recording(point.effects if effects is None else effects, self.flight.name)
         accelerations = accelerations if self.moved is None else self.moved
         if not any(_shows(name) for name in effects):
             return np.zeros((self.flight.time.size, 12))
@@ -279,16 +294,18 @@ class Model:
         acting: list[NDArray] = []
         showing: list[NDArray] = []
         where: list[tuple[bool, int]] = []
+        here = of_recording(point.effects, self.flight.name)
         for column in columns:
             d_acting, d_showing = column.acting, column.showing
-            if column.plus is not None:
-                shows = any(_shows(name) for name in column.plus)
-                moves = any(not _shows(name) for name in column.plus)
-                up = self.accelerations(point, column.plus)[0] if moves else acceleration
+            plus = None if column.plus is None else of_recording(column.plus, self.flight.name)
+            if plus is not None and not (STRENGTH in point.effects and column.minus is None and plus == here):
+                shows = any(_shows(name) for name in plus)
+                moves = any(not _shows(name) for name in plus)
+                up = self.accelerations(point, plus)[0] if moves else acceleration
                 down = acceleration if column.minus is None or not moves else self.accelerations(point, column.minus)[0]
                 d_acting = (up - down) / column.width
                 if shows:
-                    up = self.offsets(point, acceleration, column.plus)
+                    up = self.offsets(point, acceleration, plus)
                     down = offset if column.minus is None else self.offsets(point, acceleration, column.minus)
                     d_showing = (up - down) / column.width
                     if not d_showing.any():

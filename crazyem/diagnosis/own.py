@@ -1,12 +1,14 @@
 """What belongs to one recording and to no drone: the clock of its rotors, the frame of its pose, what was assumed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from crazyem.diagnosis.alignment import Alignment
 from crazyem.diagnosis.flight import Flight
 from crazyem.diagnosis.frame import Frame
+
+WORTH_TELLING = 0.005  # of the thrust
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,6 +20,7 @@ class Own:
         held_out: whether it is one that is only judged by.
         alignment: how late measured rotor speeds are behind the body rates; None where unknown.
         frame: how the pose lies against that of the other recordings; None where alike or unknown.
+        strength: thrust over what the fitted vehicle says of it; None where it is not asked (see `always.SEVERAL`).
         notices: a sentence each.
     """
 
@@ -25,6 +28,7 @@ class Own:
     held_out: bool
     alignment: Alignment | None
     frame: Frame | None
+    strength: float | None
     notices: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
@@ -38,13 +42,25 @@ class Own:
                 "explained_share": clock.explained, "unit": "s",
             },
             "pose_frame": frame and {"roll": frame.roll, "pitch": frame.pitch, "sd": list(frame.sd), "unit": "rad"},
+            "thrust": self.strength and {"scale": self.strength, "unit": ""},
         }  # fmt: skip
 
 
-def owned(flights: Sequence[Flight], kept_apart: Sequence[Flight]) -> tuple[Own, ...]:
-    """Of all flights, those kept apart last."""
+def owned(
+    flights: Sequence[Flight], kept_apart: Sequence[Flight], strengths: Mapping[str, float] | None = None
+) -> tuple[Own, ...]:
+    """Of all flights, those kept apart last; `strengths` by name."""
     return tuple(
-        Own(f.name, apart, f.alignment, f.frame, (*f.notices, *([f.frame.said()] if f.frame else [])))
+        _own(f, apart, None if strengths is None else strengths.get(f.name))
         for part, apart in ((flights, False), (kept_apart, True))
         for f in part
     )
+
+
+def _own(flight: Flight, held_out: bool, strength: float | None) -> Own:
+    notices = [*flight.notices]
+    if flight.frame:
+        notices.append(flight.frame.said())
+    if strength is not None and abs(strength - 1.0) > WORTH_TELLING:
+        notices.append(f"the thrust of this recording differs by {100.0 * (strength - 1.0):+.1f} % from the vehicle's")
+    return Own(flight.name, held_out, flight.alignment, flight.frame, strength, tuple(notices))

@@ -11,7 +11,7 @@ from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import TORQUES, Data, Fitted
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.restless import beside_peaks, peaks
-from crazyem.diagnosis.trials import LIKELY, SURE, Step, both, significance, wald
+from crazyem.diagnosis.trials import LIKELY, SURE, Step, at_the_end, both, significance, wald
 
 ADMITTED = 8.0  # nats of evidence that an effect must bring
 HELD = 1.0  # nats it must bring on flight held out,
@@ -31,8 +31,13 @@ def drop(
     held_out: Data | None,
     say: Callable[[str], None],
 ) -> tuple[Fitted, list[Candidate], list[Step]]:
-    """Leave out again what the final model does not need, on the flights fitted or on those held out."""
+    """Leave out again what the final model does not need, on the flights fitted or on those held out.
+
+    But not what holds another within its range: without a thrust scale a thrust curve went on to where the thrust does
+    not heed its command, which needs no scale.
+    """
     accepted, steps = list(accepted), list(steps)
+    kept: list[Candidate] = []
     while accepted:
         here = data.loglik(fitted.point, passes=2)
         held_here = on_held_out(held_out, fitted.point, accepted).loglik if held_out else 0.0
@@ -49,13 +54,19 @@ def drop(
             judged.append((min(gain - len(c.free) + held, held + ADMITTED - need if held_out else np.inf), c, less))
             now = replace(step.taken, gain=gain * step.taken.dispersion, held_out=held * step.taken.dispersion)
             steps = [replace(s, taken=now) if s is step and held_out else s for s in steps]
-        worst = min(judged, key=lambda j: j[0])
-        if worst[0] > ADMITTED:
+        worst = min((j for j in judged if j[1] not in kept), key=lambda j: j[0], default=None)
+        if worst is None or worst[0] > ADMITTED:
             break
+        rest = [c for c in accepted if c is not worst[1]]
+        bare_of_it = refine_base(data, worst[2].point, rest)
+        if any(at_the_end(bare_of_it.point, c) and not at_the_end(fitted.point, c) for c in rest):
+            say(f"  stays, because another would go on to the end of its range: {worst[1].label}")
+            kept.append(worst[1])
+            data.settle(fitted.point)
+            continue
         say(f"  left out again: {worst[1].label}")
-        accepted.remove(worst[1])
+        accepted, fitted = rest, bare_of_it
         steps = [s for s in steps if s.taken is None or s.taken.candidate.effect != worst[1].effect]
-        fitted = refine_base(data, worst[2].point, accepted)
     return fitted, accepted, steps
 
 

@@ -93,6 +93,25 @@ def test_what_is_expected_on_flights_held_out_is_what_their_likelihood_would_los
     assert found > prune.TELLING
 
 
+@pytest.mark.parametrize(("slope", "kept"), [(-0.9, True), (-0.5, False)])
+def test_what_holds_another_within_its_range_stays(monkeypatch, slope, kept):
+    """A thrust scale brings too little, but without it a thrust curve goes on to where commands are not heeded."""
+    scale, curve = (Candidate(n, (), (p,)) for n, p in (("thrust_scale", "scale"), ("thrust_curve", "slope_error")))
+    with_both = POINT.with_effects({"thrust_scale": {"scale": 0.8}, "thrust_curve": {"slope_error": -0.4}})
+    alone = POINT.with_effects({"thrust_curve": {"slope_error": slope}})
+    fitted, bare = SimpleNamespace(point=with_both), SimpleNamespace(point=alone)
+    steps = [replace(TAKEN, taken=replace(TAKEN.taken, candidate=c, dispersion=1.0)) for c in (scale, curve)]
+    lost = {scale: 5.0, curve: 300.0}
+    fits = {c: SimpleNamespace(point=alone, loglik=-nats) for c, nats in lost.items()}
+    monkeypatch.setattr(prune, "bare_fit", lambda data, held_out, fitted, accepted, c: (fits[c], 0.0))
+    monkeypatch.setattr(prune, "refine_base", lambda *a, **k: bare)
+    data = SimpleNamespace(loglik=lambda point, passes: 0.0, settle=lambda point: None, workers=Workers(1))
+    found, accepted, left = prune.drop(data, fitted, [scale, curve], steps, None, lambda text: None)
+    assert accepted == ([scale, curve] if kept else [curve])
+    assert [s.taken.candidate for s in left] == accepted
+    assert found is (fitted if kept else bare)
+
+
 @pytest.mark.parametrize(("expected", "held", "kept"), [(1.0, -25.0, True), (1.0, -31.0, False), (50.0, -5.0, False),
                                                         (50.0, 5.0, True)])  # fmt: skip
 def test_flights_held_out_are_asked_where_they_can_answer(monkeypatch, expected, held, kept):

@@ -1,0 +1,90 @@
+"""The thrust of each of several recordings: flights made elsewhere, every one with rotors of another strength."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from closed_loop import DRONE, Hidden, fly
+
+from crazyem.diagnosis.always import SEVERAL, THRUST_SD, differing, nuisances, refine_base
+from crazyem.diagnosis.candidates import Candidate, Strengths, strengths_of
+from crazyem.diagnosis.diagnose import diagnose
+from crazyem.diagnosis.fit import Data, nominal
+from crazyem.diagnosis.flight import Flight, flight_of
+from crazyem.diagnosis.model import STRENGTH, Point, of_recording
+from crazyem.diagnosis.noise import first_guess
+
+STRONG = (0.97, 1.0, 1.03, 1.02)
+
+
+def flights() -> list[Flight]:
+    made = [
+        replace(flight_of(fly(Hidden(thrust=(s,) * 4), seed=k, seconds=12.0), DRONE), name=f"{k}.csv")
+        for k, s in enumerate(STRONG)
+    ]
+    return differing(made, [], DRONE)[0]
+
+
+def test_each_is_found_and_the_mean_is_left_to_the_thrust_scale() -> None:
+    data = Data(flights())
+    point = nominal(data, Point(DRONE, {}, first_guess()))
+    scale = Candidate("thrust_scale", (), ("scale",))
+    found = refine_base(data, point.with_effects({"thrust_scale": {"scale": 1.0}}), [scale]).point
+    own = np.array([found.effects[STRENGTH][f"{k}.csv"] for k in range(4)])
+    assert own * found.effects["thrust_scale"]["scale"] == pytest.approx(STRONG, abs=4e-3)
+    assert own.mean() == pytest.approx(1.0, abs=2e-3)  # priors
+
+
+def test_a_recording_hears_of_its_own_strength_only() -> None:
+    """Derivatives by the strength of one recording, against differences of the log-likelihood of each."""
+    data = Data(flights()[:3])
+    own = strengths_of(data.flights)
+    point = nominal(data, Point(DRONE, {STRENGTH: own.neutral(Point(DRONE, {}, first_guess()))}, first_guess()))
+    gram = data.gram(point, own.columns(point))
+    score = np.stack([gram.score[gram.flight == k].sum(0) for k in range(3)])
+    assert np.count_nonzero(score) == 3
+    assert (np.diag(score) != 0).all()
+    for k, name in enumerate(own.free):
+        up, down = (point.with_effects({STRENGTH: {name: 1.0 + d}}) for d in (1e-4, -1e-4))
+        slope = [(a.sweep(up).loglik - b.sweep(down).loglik) / 2e-4
+                 for a, b in zip(data.twin().models, data.twin().models, strict=True)]  # fmt: skip
+        assert slope[k] == pytest.approx(score[k, k], rel=0.02)
+        assert np.delete(slope, k) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_it_is_a_factor_on_the_thrust_scale_and_nothing_of_the_vehicle() -> None:
+    effects = {"thrust_scale": {"scale": 0.9}, STRENGTH: {"a": 1.1}}
+    assert of_recording(effects, "a") == {"thrust_scale": {"scale": pytest.approx(0.99)}}
+    assert of_recording(effects, "b") == {"thrust_scale": {"scale": 0.9}}
+    assert of_recording({}, "a") == {}
+
+
+def test_it_is_free_only_among_several_recordings_of_commands() -> None:
+    some = flights()
+    assert SEVERAL == 3
+    two = differing(some[:2], some[2:], DRONE)
+    assert not any(f.differs for part in two for f in part)
+    speeds = [replace(f, inputs=replace(f.inputs, measured=True)) for f in some]
+    assert not differing(speeds, [], DRONE)[0][0].differs
+    trimmed = replace(DRONE, effects={"trim": {"x": 0.0}})
+    assert not differing(some, [], trimmed)[0][0].differs
+    data = Data(some)
+    free = {c.effect: (c, p) for c, p in nuisances(data, Point(DRONE, {}, first_guess()), ())}
+    strengths, precisions = free[STRENGTH]
+    assert isinstance(strengths, Strengths)
+    assert strengths.free == ("0.csv", "1.csv", "2.csv", "3.csv")
+    assert precisions == (THRUST_SD**-2,) * 4
+
+
+@pytest.mark.slow
+def test_days_of_other_strengths_are_told_and_not_named() -> None:
+    """About a mean of one, thrust curve and sag asked as well: nothing is missing, each day's strength is a note."""
+    made = [
+        replace(fly(Hidden(thrust=(s,) * 4), seed=k, seconds=15.0), path=f"{k}.csv")
+        for k, s in enumerate((0.97, 1.0, 1.03))
+    ]
+    found = diagnose(made, DRONE, wanted=["thrust_scale", "thrust_curve", "battery_sag"])
+    assert not found.mismatch
+    for own, truth in zip(found.own, (0.97, 1.0, 1.03), strict=True):
+        assert own.strength == pytest.approx(truth, abs=6e-3)
+        assert any("thrust" in text for text in own.notices) == (truth != 1.0)
