@@ -68,7 +68,11 @@ def document_of(
 
 def notices_of(own: Sequence[Own]) -> list[str]:
     """What is told of each recording, with its name where there are several."""
-    return [f"{Path(o.recording).name}: {text}" if len(own) > 1 else text for o in own for text in o.notices]
+    return [_named(o.recording, text, len(own) > 1) for o in own for text in o.notices]
+
+
+def _named(recording: str, text: str, several: bool) -> str:
+    return f"{Path(recording).name}: {text}" if several else text
 
 
 def _effect(effect: Named) -> dict[str, Any]:
@@ -215,7 +219,9 @@ def text_of(document: Mapping[str, Any]) -> str:
         for f in document["unexplained"]["where"][:4]:
             size = f"{_short(f['effect_size'], '+.3g')} {f['unit']}"
             lines.append(f"  unexplained: {f['signal']} {f['axis']}, {f['regime']}: {size}")
-    lines += [f"  note: {text}" for text in document["notices"]]
+    several = len(document["of_recordings"]) > 1
+    for own in document["of_recordings"]:
+        lines += [f"  note: {_named(own['recording'], text, several)}" for text in own["notices"]]
     for part, title in (("train", "fitted flight"), ("held_out", "held-out flight")):
         both = document["fit"][part]
         if both:

@@ -42,6 +42,7 @@ class Own:
                 "explained_share": clock.explained, "unit": "s",
             },
             "pose_frame": frame and {"roll": frame.roll, "pitch": frame.pitch, "sd": list(frame.sd), "unit": "rad"},
+            "notices": list(self.notices),
             "thrust": self.strength and {"scale": self.strength, "unit": ""},
         }  # fmt: skip
 
