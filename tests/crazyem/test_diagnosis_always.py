@@ -101,6 +101,15 @@ def test_no_drone_is_as_heavy_to_turn_as_if_its_mass_were_far_out():
         assert not unlike_a_body(POINT.with_effects({"inertia": found}), [])  # free, and no finding
 
 
+def test_torques_too_weak_for_a_body_are_inertias_too_large_for_one():
+    weakest = max(DRONE.inertia) / (DRONE.mass * (2 * np.hypot(*DRONE.arm)) ** 2)
+    weak = Candidate("torque_scale", (), ("scale",))
+    for scale, unlike in ((1.1 * weakest, False), (0.9 * weakest, True)):
+        point = POINT.with_effects({"torque_scale": {"scale": scale}})
+        assert unlike_a_body(point, [weak]) == unlike
+        assert not unlike_a_body(point, [])
+
+
 def test_no_drone_turns_as_in_honey():
     """5.6e-4 N m s was said of real flights of a drone of 27 g, whose rates would fall by 1/e within 30 ms."""
     damping = Candidate("rate_damping", (), ("x", "y", "z"))
