@@ -159,8 +159,8 @@ def coarsely_sampled(data: Data, point: Point) -> bool:
 
 
 def unlike_a_body(point: Point, accepted: Sequence[Candidate]) -> bool:
-    """Whether the inertia (or the lack of torque) or the damping that was found is more than a drone of this mass and size can have (see
-    `FAR_OUT`, `INDUCED`)."""
+    """Whether the inertia, the lack of torque or the damping that was found is more than a drone of this mass and size
+    can have (see `FAR_OUT`, `INDUCED`)."""
     mass, arm = point.vehicle.mass, float(np.hypot(*point.vehicle.arm))
     most = {"inertia": mass * (FAR_OUT * arm) ** 2, "rate_damping": mass * GRAVITY * arm**2 / (2.0 * INDUCED)}
     if arm > 0 and any(c.effect == "torque_scale" for c in accepted):  # torques too weak are inertias too large

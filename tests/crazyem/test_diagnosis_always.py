@@ -41,7 +41,7 @@ def flown(*, speed: float, measured: bool = False) -> SimpleNamespace:
     y[:, 3:6] = np.sqrt(2) * speed * np.array([1, 2, 4]) * np.sin(np.arange(400) * np.pi / 20)[:, None]
     flight = SimpleNamespace(y=y, inputs=SimpleNamespace(measured=measured), coarse=False)
     signals = frozenset({"position", "velocity", "attitude", "body_rate"})
-    return SimpleNamespace(flights=[flight], coarse=False, signals=signals)
+    return SimpleNamespace(flights=[flight], coarse=False, differ=False, signals=signals)
 
 
 def sd_of(data: SimpleNamespace, point: Point, effect: str) -> np.ndarray:
