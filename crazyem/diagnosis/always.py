@@ -126,8 +126,12 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
 
 
 def differing(flights: Sequence[Flight], kept_apart: Sequence[Flight], vehicle: Vehicle) -> list[list[Flight]]:
-    """The flights, each with a thrust of its own where there are several: see `SEVERAL`. A trim has one already."""
-    own = len(flights) >= SEVERAL and not flights[0].inputs.measured and TRIM not in vehicle.effects
+    """The flights, each with a thrust of its own where there are several: see `SEVERAL`.
+
+    A trim has one already, and so has a voltage that was taken from the flight's own beginning (`level.py`).
+    """
+    commanded = not any(f.inputs.measured or f.levelled for f in (*flights, *kept_apart))
+    own = len(flights) >= SEVERAL and commanded and TRIM not in vehicle.effects
     return [[replace(f, differs=own) for f in part] for part in (flights, kept_apart)]
 
 

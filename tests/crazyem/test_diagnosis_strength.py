@@ -66,6 +66,7 @@ def test_it_is_free_only_among_several_recordings_of_commands() -> None:
     assert not any(f.differs for part in two for f in part)
     speeds = [replace(f, inputs=replace(f.inputs, measured=True)) for f in some]
     assert not differing(speeds, [], DRONE)[0][0].differs
+    assert not differing([replace(f, levelled=True) for f in some], [], DRONE)[0][0].differs
     trimmed = replace(DRONE, effects={"trim": {"x": 0.0}})
     assert not differing(some, [], trimmed)[0][0].differs
     data = Data(some)
