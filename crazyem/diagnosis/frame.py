@@ -58,15 +58,14 @@ def alike(flights: "Sequence[Flight]", kept_apart: "Sequence[Flight]") -> "tuple
     where there is none, and where attitudes come from a filter on board, nothing is done.
     """
     everyone = [*flights, *kept_apart]
-    found = [tilt_of(f) for f in everyone]
-    fitted = [i for i in range(len(flights)) if found[i] is not None]
-    known = [i for i in range(len(everyone)) if found[i] is not None]
-    if not fitted or len(known) < 2:
+    told = {i: tilt for i, f in enumerate(everyone) if (tilt := tilt_of(f)) is not None}
+    fitted = sum(i < len(flights) for i in told)
+    if not fitted or len(told) < 2:
         return list(flights), list(kept_apart)
-    tilt, sd = (np.array([found[i][k] for i in known]) for k in (0, 1))  # type: ignore[index]
-    deviation = np.stack([_deviation(tilt[:, a], sd[:, a], len(fitted)) for a in range(2)], 1)
+    tilts, sds = (np.array([found[k] for found in told.values()]) for k in (0, 1))
+    deviation = np.stack([_deviation(tilts[:, a], sds[:, a], fitted) for a in range(2)], 1)
     turned = list(everyone)
-    for i, away, error in zip(known, deviation, sd, strict=True):
+    for i, away, error in zip(told, deviation, sds, strict=True):
         if away.any():
             turned[i] = _turned_back(everyone[i], away, error)
     return turned[: len(flights)], turned[len(flights) :]
