@@ -13,7 +13,7 @@ WORTH_TELLING = 0.005  # of the thrust
 
 @dataclass(frozen=True, eq=False)
 class Own:
-    """Found in a recording and taken off before anything is fitted; never written into a vehicle file.
+    """Found in a recording, taken off or fitted beside what all share; never written into a vehicle file.
 
     Attributes:
         recording: its path.
