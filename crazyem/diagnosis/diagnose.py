@@ -11,6 +11,7 @@ from crazyem.diagnosis.exchange import exchanged, named_again
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.fit import nominal as nominal_of
 from crazyem.diagnosis.flight import Flight, flight_of
+from crazyem.diagnosis.floor import on_one_floor
 from crazyem.diagnosis.frame import alike as in_one_frame
 from crazyem.diagnosis.heading import heading_by_place
 from crazyem.diagnosis.imitated import by_place
@@ -78,7 +79,7 @@ def diagnose(
     """
     flights = [flight_of(r, vehicle, withhold=withhold) for r in recordings]
     kept_apart = [flight_of(r, vehicle, withhold=withhold) for r in held_out]
-    flights, kept_apart = differing(*in_one_frame(flights, kept_apart), vehicle)
+    flights, kept_apart = differing(*in_one_frame(*on_one_floor(flights, kept_apart)), vehicle)
     workers = Workers(jobs)
     say(f"nominal model of {vehicle.name}: {sum(f.duration for f in flights):.0f} s of flight")
     data, apart, selection, candidates, left_out = _selected(flights, kept_apart, vehicle, wanted, workers, say)

@@ -107,6 +107,10 @@ class Data:
         """(b,) log-likelihood by blocks of all flights [nats]."""
         return np.concatenate([np.bincount(m.flight.block, m.sweep(point).rows) for m in self.models])
 
+    def recordings_of_blocks(self) -> NDArray:
+        """(b,) int: which flight each of those blocks is of."""
+        return np.repeat(np.arange(len(self.models)), [m.flight.blocks for m in self.models])
+
     def settle(self, point: Point) -> list[Swept]:
         """Physics evaluated at the filter's own states."""
         return self.workers.map(lambda m: m.settle(point), self.models)

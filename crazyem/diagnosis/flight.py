@@ -50,7 +50,8 @@ class Flight:
         force: (n, 3) accelerometer [m/s^2, body]; NaN where not measured.
         voltage: (n,) V; NaN where unknown.
         flown: (n,) s since the feet left the floor.
-        ground: height of the floor [m] in the frame of the position.
+        ground: height of the floor [m] in the frame of the position; 0 where nothing shows it.
+        grounded: whether the recording shows the floor, by where the drone rests.
         block: (n,) int: consecutive stretches of about a second, of half a second in short flights.
         inputs: what the rotors were told.
         signals: names of what is measured.
@@ -77,6 +78,7 @@ class Flight:
     inputs: RotorInput
     signals: frozenset[str]
     attitude: NDArray | None = None
+    grounded: bool = True
     levelled: bool = False
     coarse: bool = False
     differs: bool = False
@@ -166,8 +168,8 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
         flown=time - air.flown[0][0], ground=ground, block=_blocks(time), inputs=inputs,
         signals=frozenset(n for n in (*measured, "specific_force", "voltage", "rotor_speed", *COMMANDS)
                           if n in recording.signals or (n == "body_rate" and n in measured)),
-        attitude=y[:, 6:10].copy() if onboard_attitude(recording) else None, levelled=found.level is not None,
-        alignment=found.alignment, notices=found.notices,
+        attitude=y[:, 6:10].copy() if onboard_attitude(recording) else None, grounded=bool(np.isfinite(air.ground)),
+        levelled=found.level is not None, alignment=found.alignment, notices=found.notices,
     )  # fmt: skip
     flight = flight.started(flight.starts)
     if flight.duration < SHORTEST:

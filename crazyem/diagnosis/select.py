@@ -168,19 +168,22 @@ def sharpened(basis: Basis, trial: Trial) -> Trial:
 def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
     """The trial with what its fit gains, on the flights fitted (`data`, where the fit is) and on those held out."""
     gain = fit.loglik - basis.value
-    blocks = data.block_loglik(fit.point)
+    blocks, recording = data.block_loglik(fit.point), data.recordings_of_blocks()
     held, value, mine = trial.held_out, gain, [*basis.accepted, trial.candidate]
     if basis.held_out:
         apart = basis.held_out.twin()
         there = on_held_out(apart, fit.point, mine)
         held, blocks = there.loglik - basis.held_value, np.append(blocks, apart.block_loglik(there.point))
+        recording = np.append(recording, len(data.models) + apart.recordings_of_blocks())
         value += held + gain_of_both(fit, apart, there, mine)
     k = len(trial.candidate.free)
     wald_p = significance(fit, k, offset=sum(len(c.free) for c in basis.accepted))
     wald_p = by_gain(fit.point, gain / trial.dispersion, k, len(fit.gram.score), wald_p)
     sure = both(max(trial.p_value, wald_p), held / trial.dispersion if basis.held_out else 0.0)
     sure = sure if matters(fit.point, trial.candidate, data) else 1.0
-    return replace(trial, gain=gain, held_out=held, p_value=sure, fitted=fit, blocks=blocks, value=value)
+    return replace(
+        trial, gain=gain, held_out=held, p_value=sure, fitted=fit, blocks=blocks, value=value, recording=recording
+    )
 
 
 def may_join(effect: str, found: set[str]) -> bool:

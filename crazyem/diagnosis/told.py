@@ -94,7 +94,7 @@ def tell(
             *_by_turning_alone(candidate, data, selection),
         ]
         if equal:
-            groups.append(tuple(dict.fromkeys([candidate.effect, *equal])))
+            groups.append(tuple(dict.fromkeys([name, *equal])))
             separate += [CATALOGUE[n].separates for n in groups[-1] if CATALOGUE[n].separates]
         elif candidate.effect == "thrust_scale":
             separate.append(HEAVIER.format(1.0 / candidate.values(point)["scale"]))

@@ -19,7 +19,8 @@ LIKELY = 5e-2  # which flights held out may lower where it is below this
 CLOSE = 4.0  # nats within which two explanations cannot be told apart,
 FAR = 20.0  # nats that one step is believed to bring without looking
 EVEN = 0.5  # what a name is worth, at least, beside a rival that is not significant itself
-TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks
+TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks or recordings
+MANY = 5  # recordings, from which on it is seen by how much they differ
 # Smaller than this, these are not told from what filters, sampling and the air of a room do: s, s, s, 1, rad, rad/s, 1,
 # 1, N m s/m.
 LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "motor_lag": 7.5e-3, "velocity_scale": 0.035,
@@ -50,6 +51,7 @@ class Trial:
         blocks: (b,) its log-likelihood by blocks of the flights fitted and of those held out.
         value: the gain on all of these blocks [nats] once fitted to all of them, less what the priors of the always
             free parameters cost.
+        recording: (b,) int, which recording each block is of.
     """
 
     candidate: Candidate
@@ -61,6 +63,7 @@ class Trial:
     fitted: Fitted | None = None
     blocks: NDArray = field(default_factory=lambda: np.zeros(0))
     value: float = 0.0
+    recording: NDArray = field(default_factory=lambda: np.zeros(0, int))
 
 
 @dataclass(frozen=True)
@@ -104,10 +107,12 @@ def margin(best: Trial, other: Trial) -> tuple[float, float]:
 
     What the priors of the always free parameters cost counts too: a factor on all torques that needs three inertias to
     be bent is the worse for it. The scatter of the difference over blocks counts, in which all that both miss cancels
-    (Vuong 1989), with half of the covariance of neighbours on each side.
+    (Vuong 1989), with half of the covariance of neighbours on each side; and where there are many recordings that over
+    them, since what belongs to a recording (its clock, its battery) is the same in all of its blocks.
     """
     nats = best.value - other.value - len(best.candidate.free) + len(other.candidate.free)
-    return nats, scatter(best.blocks - other.blocks)
+    apart = best.blocks - other.blocks
+    return nats, max(scatter(apart), between(apart, best.recording))
 
 
 def better(one: Trial, other: Trial) -> float:
@@ -133,6 +138,15 @@ def scatter(differences: NDArray) -> float:
     """Standard deviation of the sum of differences of log-likelihoods (b,) by blocks, neighbours alike by half."""
     centred = differences - differences.mean()
     return float(np.sqrt(centred @ centred + max(0.0, float(centred[1:] @ centred[:-1])))) + 1e-9
+
+
+def between(differences: NDArray, recording: NDArray) -> float:
+    """Standard deviation of the sum of differences (b,) by how they differ between recordings (b,); 0 for few."""
+    if recording.size != differences.size or len(np.unique(recording)) < MANY:
+        return 0.0
+    total, length = np.bincount(recording, differences), np.bincount(recording)
+    away = total - length * total.sum() / length.sum()
+    return float(np.sqrt(away @ away * length.size / (length.size - 1)))
 
 
 def told_apart(best: Trial, other: Trial) -> bool:

@@ -233,7 +233,8 @@ def graded(share: float, *, degrades: float, unusable: float = math.inf) -> Grad
 
 SHORTEST_FLIGHT = 0.4  # s of lift; less is a hop or a test of the rotors
 LONGEST_FALL = 0.6  # s without lift that a manoeuvre may have
-LIFTED, CLEAR = 0.03, 0.1  # m above the ground: in the air; and surely so
+LIFTED, CLEAR = 0.03, 0.1  # m above the ground: in the air; and surely so,
+BOUNCE = 0.25  # or this share of the greatest height: a hard landing throws a drone up by 0.12 m, from 1 m
 _POSSIBLE = {"rotor_speed": 8000.0, "motor_command": 1.5, "motor_request": 1.5}
 _RAW_MOTORS = ("motor.m1", "motor.m2", "motor.m3", "motor.m4")
 _LIFT_SIGNALS = ("motor_command", "motor_request", "rotor_speed", "wrench_command", "mixer_command")
@@ -342,7 +343,7 @@ def _from_rotors(
 def _off_the_ground(height: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Rows (n,) in the air, of heights above the ground [m]: without bounces before the climb and after the descent."""
     lifted = height > LIFTED
-    high = np.flatnonzero(height > CLEAR)
+    high = np.flatnonzero(height > max(CLEAR, BOUNCE * float(height.max(initial=0.0))))
     if high.size:
         down = np.flatnonzero(~lifted)
         first, last = np.searchsorted(down, high[0]) - 1, np.searchsorted(down, high[-1])

@@ -16,7 +16,7 @@ from crazyem.diagnosis.fit import Data, Fitted, nominal, remembering, starting_p
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.place import depends_on_place
-from crazyem.diagnosis.trials import Selection, Trial, both, margin, told_apart
+from crazyem.diagnosis.trials import Selection, Trial, between, both, margin, scatter, told_apart
 from crazyem.diagnosis.witness import false_speed, late_measurements
 from crazyem.recordings.recording import Recording
 
@@ -143,6 +143,34 @@ def test_what_two_explanations_share_does_not_blur_their_difference() -> None:
     assert not told_apart(trial(shared), trial(shared))
     assert not told_apart(trial(shared + 2.0 * rng.normal(size=50) + 0.1), trial(shared))
     assert margin(trial(shared, 3), trial(shared, 1))[0] == pytest.approx(-2.0)  # a parameter costs a nat
+
+
+@pytest.mark.parametrize("recordings", [5, 9, 20])
+def test_what_is_a_recordings_own_is_seen_between_recordings(recordings: int) -> None:
+    """Each recording is off as a whole: by the blocks alone the error of the sum looks several times too small."""
+    rng = np.random.default_rng(1)
+    length = rng.integers(10, 40, recordings)
+    of = np.repeat(np.arange(recordings), length)
+    sums, told, blocks = [], [], []
+    for _ in range(400):
+        apart = rng.normal(size=recordings)[of] + rng.normal(size=of.size)
+        sums.append(apart.sum())
+        told.append(between(apart, of))
+        blocks.append(scatter(apart))
+    truth = float(np.sqrt(np.sum(length**2) + of.size))
+    assert np.std(sums) == pytest.approx(truth, rel=0.1)
+    assert np.sqrt(np.mean(np.square(told))) == pytest.approx(truth, rel=0.15)
+    assert np.mean(blocks) < 0.6 * truth
+
+
+def test_few_recordings_do_not_tell_how_they_differ() -> None:
+    apart = np.repeat([5.0, -5.0, 0.0, 1.0], 10)
+    assert between(apart, np.repeat(np.arange(4), 10)) == 0.0
+    assert between(apart, np.zeros(0, int)) == 0.0
+    of = np.repeat(np.arange(5), 8)
+    one, other = trial(np.repeat([5.0, -2.0, 5.0, -2.0, 4.0], 8)), trial(np.zeros(40))
+    assert told_apart(one, other)
+    assert not told_apart(replace(one, recording=of), replace(other, recording=of))
 
 
 def test_flights_held_out_lower_a_p_value_that_is_small_already() -> None:

@@ -322,3 +322,12 @@ def test_bounces_before_the_climb_and_after_the_landing_are_no_flight():
     assert found.tolist() == [*[False] * len(hop), *lifted.tolist(), *[False] * len(down)]
     assert _off_the_ground(np.array([0.0, 0.04, 0.05, 0.0])).tolist() == [False, True, True, False]  # a hop alone
     assert _off_the_ground(np.array([0.04, 0.2, 0.3])).all()  # begins and ends in the air
+
+
+def test_a_hard_landing_is_the_end_even_if_it_throws_the_drone_high():
+    """Recorded: a landing at 0.9 m/s from 1 m (nanobench, a figure 8) and up again by 0.12 m, at 25 m/s^2."""
+    flight, bounce = [0.04, 0.3, 1.0, 0.6, 0.1, 0.04], [0.01, 0.04, 0.08, 0.12, 0.12, 0.06, 0.02]
+    found = _off_the_ground(np.array([0.0, *flight, *bounce]))
+    assert found.tolist() == [False, *[True] * len(flight), *[False] * len(bounce)]
+    low = np.array([0.0, 0.04, 0.12, 0.16, 0.01, 0.12, 0.0])  # of a low flight it is the flight itself
+    assert _off_the_ground(low).tolist() == [False, True, True, True, False, True, False]
