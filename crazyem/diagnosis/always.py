@@ -61,6 +61,9 @@ ANGLES = ("roll", "pitch", "yaw")
 # heavy and damped. Share of the power of roll and pitch torques above half of the Nyquist frequency (white: a half):
 COARSE = 0.2  # simulated flights have up to 0.12
 COARSE_INERTIA_SD, COARSE_DAMPING_SD = 1.0, 3e-4  # relative; N m s
+# Nor is a shifted centre of mass asked of them, but their commands trim the drone all the same: one rotor weaker by a
+# tenth is a torque per thrust of a twentieth of the arm. Taken for none, it was a wind (by the moment of its flow).
+COARSE_TRIM = 0.05
 # Streams that were put onto another clock by straight lines do not look white any more. Their torques explain so little
 # of the turning that the drone would have to be as heavy to turn as if all its mass were this many times as far out as
 # its rotors: no body of that size is, and what it stands for says nothing of the drone.
@@ -100,7 +103,10 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
             damping = COARSE_DAMPING_SD if coarse else DAMPING_SD
             found.append((Candidate("rate_damping", (), ("x", "y", "z")), (damping**-2,) * 3))
         if "velocity" in data.signals:
-            found.append((Candidate("center_of_mass", (), ("x", "y", "z")), tuple(sd**-2 for sd in CENTRE_SD)))
+            trimmed = data.coarse and TRIM not in point.vehicle.effects
+            level = tuple(max(COARSE_TRIM * a, CENTRE_SD[0]) for a in point.vehicle.arm) if trimmed else CENTRE_SD[:2]
+            precision = tuple(sd**-2 for sd in (*level, CENTRE_SD[2]))
+            found.append((Candidate("center_of_mass", (), ("x", "y", "z")), precision))
         if not measured and point.vehicle.motor_time_constant > 0:
             found.append((Candidate("motor_lag", (), ("time_constant",)), (LAG_SD**-2,)))
     if "velocity" in data.signals and "position" in data.signals:

@@ -15,6 +15,7 @@ from crazyem.diagnosis.always import (
     coarsely_sampled,
     fast_share,
     nuisances,
+    refine_base,
     usual_gusts,
     without,
 )
@@ -60,6 +61,25 @@ def test_a_day_is_free_only_where_the_file_has_a_trim() -> None:
         assert usual_gusts(vehicle) == (1.0 if there else 0.4)  # m/s: weather of a drone that flew, air of a room
     stormy = replace(TRIMMED, effects={**TRIMMED.effects, "gusts": {"standard_deviation": 2.0}})
     assert usual_gusts(stormy) == pytest.approx(4.0)
+
+
+def test_a_trim_is_free_where_no_centre_of_mass_is_asked_for() -> None:
+    """Rotors on the left weaker by 3 %, on the right stronger: thrust acts 3 % of the arm right of the middle."""
+    lopsided = Hidden(thrust=(1.03, 1.03, 0.97, 0.97), drag=(0.02, 0.02, 0.0))
+    flights = [replace(flight_of(fly(lopsided, seed=s, seconds=12.0), DRONE), coarse=True) for s in range(2)]
+    drag = Candidate("linear_drag", (), ("x", "y", "z"))
+    for vehicle, there in ((DRONE, True), (replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}}), False)):
+        free = {c.effect: p for c, p in nuisances(Data(flights), point_of(vehicle), ())}
+        sd = np.array(free["center_of_mass"]) ** -0.5
+        assert sd[:2] == pytest.approx(0.05 * DRONE.arm[0] if there else 2e-5)
+    data = Data(flights)
+    start = nominal(data, Point(DRONE, {}, first_guess())).with_effects(
+        {"linear_drag": {"x": 0.01, "y": 0.01, "z": 0.0}}
+    )
+    found = refine_base(data, start, [drag]).point.effects
+    assert found["center_of_mass"]["y"] == pytest.approx(0.03 * DRONE.arm[1], rel=0.05)
+    assert found["center_of_mass"]["x"] == pytest.approx(0.0, abs=1e-4)
+    assert found["linear_drag"]["x"] == pytest.approx(0.02, abs=1e-3)
 
 
 def test_a_trim_is_looked_for_only_if_asked_for() -> None:
