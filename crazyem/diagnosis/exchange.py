@@ -66,13 +66,14 @@ def _asked_again(
     tried = [replace(t, value=value, blocks=blocks) for t, (value, blocks) in zip(others, found[1:], strict=True)]
     asked = tried if ended else [now, *tried]
     best = max(asked, key=lambda t: t.value - len(t.candidate.free))
-    equals = [t for t in asked if t is best or not told_apart(best, t)]
+    equals = [t for t in asked if t is best or not told_apart(best, t, recordings=False)]
+    group = [t for t in asked if t is best or not told_apart(best, t)]
     chosen = min(equals, key=lambda t: (len(t.candidate.free), -t.value))
     rest = [t for t in step.trials if t is not step.taken and all(t.candidate is not r.candidate for r in tried)]
     trials = (*asked, *rest)  # what ended is no rival of what takes its place
     if any(t is now for t in equals) and len(chosen.candidate.free) == len(mine.free):
         chosen = now
-    alike = tuple(t for t in equals if t is not chosen and t.candidate.effect != chosen.candidate.effect)
+    alike = tuple(t for t in group if t is not chosen and t.candidate.effect != chosen.candidate.effect)
     steps = tuple(replace(step, taken=chosen, trials=trials, alike=alike) if s is step else s for s in selection.steps)
     if chosen is now:
         return replace(selection, steps=steps)

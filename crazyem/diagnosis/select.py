@@ -340,9 +340,14 @@ def alike_with(best: Trial, trials: Sequence[Trial], *, counted: bool) -> list[T
 
 def name_of(equals: Sequence[Trial], *, counted: bool) -> Trial:
     """Which of those that are not told apart gives the name: the simplest that none of the others beats (nine to
-    one), or its confidence would say that it is another."""
-    sure = [t for t in equals if t.p_value < SURE]
-    unbeaten = [t for t in equals if all(t is o or better(t, o) > BEATEN for o in sure)]
+    one), or its confidence would say that it is another.
+
+    By the scatter over blocks alone: how recordings differ widens a group, but is known from few of them, and a name
+    that loses by hundreds of nats is none because of that.
+    """
+    near = [t for t in equals if t is equals[0] or not told_apart(equals[0], t, recordings=False)]
+    sure = [t for t in near if t.p_value < SURE]
+    unbeaten = [t for t in near if all(t is o or better(t, o, recordings=False) > BEATEN for o in sure)]
     simplest = min(unbeaten, key=lambda t: (len(t.candidate.free), -t.evidence), default=equals[0])
     return simplest if own_evidence(simplest, counted=counted) > ADMITTED else equals[0]
 

@@ -102,22 +102,22 @@ class Selection:
     doubted: frozenset[str] = frozenset()
 
 
-def margin(best: Trial, other: Trial) -> tuple[float, float]:
+def margin(best: Trial, other: Trial, *, recordings: bool = True) -> tuple[float, float]:
     """Log-likelihood of one less that of the other, each less its number of parameters, with its standard deviation.
 
     What the priors of the always free parameters cost counts too: a factor on all torques that needs three inertias to
     be bent is the worse for it. The scatter of the difference over blocks counts, in which all that both miss cancels
     (Vuong 1989), with half of the covariance of neighbours on each side; and where there are many recordings that over
-    them, since what belongs to a recording (its clock, its battery) is the same in all of its blocks.
+    `recordings`, since what belongs to one (its clock, its battery) is the same in all of its blocks.
     """
     nats = best.value - other.value - len(best.candidate.free) + len(other.candidate.free)
     apart = best.blocks - other.blocks
-    return nats, max(scatter(apart), between(apart, best.recording))
+    return nats, max(scatter(apart), between(apart, best.recording) if recordings else 0.0)
 
 
-def better(one: Trial, other: Trial) -> float:
+def better(one: Trial, other: Trial, *, recordings: bool = True) -> float:
     """Probability that one explains more than the other, by the scatter of the difference."""
-    nats, sd = margin(one, other)
+    nats, sd = margin(one, other, recordings=recordings)
     return float(stats.norm.cdf(nats / sd))
 
 
@@ -149,9 +149,9 @@ def between(differences: NDArray, recording: NDArray) -> float:
     return float(np.sqrt(away @ away * length.size / (length.size - 1)))
 
 
-def told_apart(best: Trial, other: Trial) -> bool:
+def told_apart(best: Trial, other: Trial, *, recordings: bool = True) -> bool:
     """Whether the flights prefer the one by more than chance."""
-    nats, sd = margin(best, other)
+    nats, sd = margin(best, other, recordings=recordings)
     return nats > CLOSE and nats > TOLD * sd
 
 

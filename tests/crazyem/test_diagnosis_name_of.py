@@ -38,6 +38,19 @@ def test_what_is_beaten_does_not_however_simple():
     assert name_of([inertia, unsteady], counted=False) is unsteady
 
 
+def test_recordings_that_differ_widen_the_group_but_do_not_give_the_name():
+    """Better by 20 nats in most of eight recordings, worse by 13 in three: one group, the better is named."""
+    of = np.repeat(np.arange(8), 5)
+    apart = np.repeat([20.0, 20.0, 20.0, -13.0, -13.0, -13.0, 20.0, 20.0], 5) / 5
+    lags, late = trial("motor_lag", "xyz", 100.0), trial("input_delay", "d", 100.0)
+    best = replace(lags, blocks=lags.blocks + apart, value=100.0 + apart.sum() + 2.0, recording=of)
+    other = replace(late, recording=of)
+    assert not told_apart(best, other)
+    assert told_apart(best, other, recordings=False)
+    assert name_of([best, other], counted=False) is best
+    assert 0.8 < preferred(best, [other]) < 0.95
+
+
 def test_what_is_not_significant_itself_beats_nothing():
     centre, payload = trial("center_of_mass", "xyz", 100.0), trial("payload", "mxyz", 130.0, p_value=0.01)
     assert better(centre, payload) < 1e-3
