@@ -205,8 +205,7 @@ def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Call
         return Step((*trials, *rest), None)
     trials, equals = compared_again(basis, trials, say=say)
     taken = name_of(equals, counted=counted)
-    alike = tuple(t for t in equals if t.candidate.effect != taken.candidate.effect)
-    return Step((*trials, *rest), taken, alike)
+    return Step((*trials, *rest), taken, group_of(taken, equals, trials, counted=counted))
 
 
 def select(
@@ -336,6 +335,13 @@ def alike_with(best: Trial, trials: Sequence[Trial], *, counted: bool) -> list[T
     """The best, and what is not told apart from it."""
     others = [t for t in trials if t is not best and rivals(t, counted=counted)]
     return [best, *(t for t in others if not told_apart(best, t))]
+
+
+def group_of(taken: Trial, equals: Sequence[Trial], trials: Sequence[Trial], *, counted: bool) -> tuple[Trial, ...]:
+    """What is not told apart from the best, nor from the one that gives the name, which may be another: a lag loses to
+    a ground effect, but not to the delay that is named before it."""
+    more = [t for t in alike_with(taken, trials, counted=counted) if all(t is not e for e in equals)]
+    return tuple(t for t in (*equals, *more) if t.candidate.effect != taken.candidate.effect)
 
 
 def name_of(equals: Sequence[Trial], *, counted: bool) -> Trial:

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.select import BEATEN, may_join, name_of
+from crazyem.diagnosis.select import BEATEN, group_of, may_join, name_of
 from crazyem.diagnosis.trials import Step, Trial, better, preferred, told_apart
 
 NOISE = np.random.default_rng(0).normal(size=40)
@@ -49,6 +49,20 @@ def test_recordings_that_differ_widen_the_group_but_do_not_give_the_name():
     assert told_apart(best, other, recordings=False)
     assert name_of([best, other], counted=False) is best
     assert 0.8 < preferred(best, [other]) < 0.95
+
+
+def test_the_group_is_that_of_the_name():
+    """A delay gives the name, though a ground effect is better; a lag loses to that, but not to the delay."""
+    ground = trial("ground_effect", "sh", 130.0)
+    late = trial("input_delay", "d", 100.0, scatter=8.0)
+    lag = replace(trial("motor_lag", "t", 90.0), blocks=late.blocks - 0.25 - 2.0 * NOISE)
+    assert not told_apart(ground, late)
+    assert told_apart(ground, replace(lag, blocks=ground.blocks - 1.0))
+    assert not told_apart(late, lag)
+    equals = [ground, late]
+    assert name_of(equals, counted=False) is late
+    assert group_of(late, equals, [*equals, lag], counted=False) == (ground, lag)
+    assert group_of(ground, [ground], [ground, replace(lag, blocks=ground.blocks - 1.0)], counted=False) == ()
 
 
 def test_what_is_not_significant_itself_beats_nothing():
