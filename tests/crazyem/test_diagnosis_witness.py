@@ -10,13 +10,16 @@ import pytest
 from closed_loop import DRONE, Hidden, fly
 from made_flight import array_of
 
+from crazyem.diagnosis.always import refine_base
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.diagnose import _heard
 from crazyem.diagnosis.fit import Data, Fitted, nominal, remembering, starting_point
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.place import depends_on_place
-from crazyem.diagnosis.trials import Selection, Trial, between, both, margin, scatter, told_apart
+from crazyem.diagnosis.told import tell
+from crazyem.diagnosis.trials import Selection, Step, Trial, between, both, margin, scatter, told_apart
+from crazyem.diagnosis.unexplained import Unexplained
 from crazyem.diagnosis.witness import false_speed, late_measurements
 from crazyem.recordings.recording import Recording
 
@@ -98,6 +101,33 @@ def test_a_witness_is_heard_on_the_flights_held_out_too(recording: Recording) ->
     for seconds, told in ((-0.007, {"measurement_delay", "input_delay"}), (0.010, {"input_delay"})):
         apart = Data([flight_of(felt(recording, seconds), DRONE)])
         assert _heard(data, apart, selection, [silent])[1] == told
+
+
+def test_a_group_holds_the_name_that_is_told(recording: Recording) -> None:
+    """Late inputs and late measurements are one model, fitted as the first; told as the second, so is its group."""
+    data = Data([flight_of(recording, DRONE)])
+    start = point_of(data)
+    late = Candidate("input_delay", (), ("delay",))
+    fitted = refine_base(data, start.with_effects({"input_delay": {"delay": 0.01}}), [late], rounds=1, noise=False)
+    own = data.block_loglik(fitted.point)
+    taken = Trial(late, 50.0, 0.0, 1.0, 1e-9, 50.0, fitted, own, 50.0)
+    lag = replace(taken, candidate=Candidate("motor_lag", (), ("time_constant",)))
+    selection = Selection(start, fitted.point, (Step((taken, lag), taken, (lag,)),), (late,), fitted, 1)
+    for witnessed, name, group in (
+        ({"measurement_delay", "input_delay"}, "measurement_delay", ("measurement_delay", "motor_lag")),
+        ({"input_delay"}, "input_delay", ("input_delay", "motor_lag")),
+        (set(), "input_delay", ("input_delay", "motor_lag", "measurement_delay")),
+    ):
+        told = tell(data, selection, Unexplained((), 50.0), witnessed=frozenset(witnessed), in_place={})
+        assert [e.name for e in told.effects] == [name]
+        assert told.groups == (group,)
+
+
+def test_blocks_know_their_recording() -> None:
+    data = Data([flight_of(fly(seed=s, seconds=t), DRONE) for s, t in ((1, 6.0), (2, 12.0))])
+    point = point_of(data)
+    blocks, of = data.block_loglik(point), data.recordings_of_blocks()
+    assert np.bincount(of, blocks) == pytest.approx([m.sweep(point).loglik for m in data.models], rel=1e-6)
 
 
 def test_sampled_commands_are_torques_with_the_memory_of_the_lag() -> None:
