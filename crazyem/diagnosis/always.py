@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.diagnosis.candidates import Candidate, strengths_of
+from crazyem.diagnosis.candidates import TRIM, Candidate, strengths_of
 from crazyem.diagnosis.fit import Data, Fitted, refine, remembering, remembering_anew
 from crazyem.diagnosis.flight import Flight
 from crazyem.diagnosis.gram import Solution, used
 from crazyem.diagnosis.model import Point
-from crazyem.physics.rotors import wrench
+from crazyem.diagnosis.sampling import coarsely_sampled
 from crazyem.vehicle import GRAVITY, Vehicle
 
 # What is never exactly as a vehicle file says, and is therefore always free, within these standard deviations: the
@@ -40,13 +40,15 @@ DAMPING_SD = 6e-6
 # free for each of several recordings of any drone (`SEVERAL`): one number for all would make it heed commands less.
 TRIM_SD = (5e-4, 5e-4, 1.6e-4)  # m: torque per thrust
 THRUST_SD = 0.02  # relative
+# s: of the lag of rotors in the calm flights of real drones, 24 to 105 ms in 26 flights for a file's 50, whether
+# anything was wrong with them or not, so a file to which one of them was fitted does not know it.
+DAILY_LAG_SD = 0.025
 FLAPPING_SD, DRAG_SD = 3e-4, 0.02  # N m s/m, N s/m: real rotors have both, bare rigid bodies of files neither
 LEANING_SD = (0.02, 0.02, 2e-3)  # rad: an attitude made from the acceleration is tilted as the accelerometer is
 # s: a filter on board that integrates a biased gyro and is drawn back by the fixes stays off by the bias times the time
 # that takes: 0.041, 0.043, 0.041 and 0.038 s in roll and pitch of two simulated flights.
 PULL = 0.05
 SEVERAL = 3  # recordings whose commands are known, from which on each has a thrust of its own
-TRIM = "trim"
 # Standard deviations that no scatter shows. An attitude 1 ms late is a force that goes with the velocity, 3e-4 N s/m of
 # drag along the quicker axis of a figure 8 (mass * (3.1 rad/s)^2 * 1 ms); along z thrust is a little wrong; a gyro's
 # bias walks. Found at these sizes in drones with known ones.
@@ -54,13 +56,9 @@ SYSTEMATIC = {
     **{(name, axis): sd for name in ("linear_drag", "quadratic_drag") for axis, sd in zip("xyz", (3e-4, 3e-4, 1e-3))},
     **{("gyro_bias", axis): 4e-4 for axis in "xyz"},
 }
-EDGE, SLOW = 0.5, 1.0  # s left out at either end; Hz below which torques say nothing of sampling
 ANGLES = ("roll", "pitch", "yaw")
-# Commands of a loop at 500 Hz that answer to vibration, logged at 100 Hz, are nearly white: most of what is logged acts
-# for 2 ms only, and what acts was not logged. That is an error in the input, under which every fit makes the drone look
-# heavy and damped. Share of the power of roll and pitch torques above half of the Nyquist frequency (white: a half):
-COARSE = 0.2  # simulated flights have up to 0.12
-COARSE_INERTIA_SD, COARSE_DAMPING_SD = 1.0, 3e-4  # relative; N m s
+# What commands that are mostly faster than their sampling (`sampling.py`) say nothing of: relative; N m s.
+COARSE_INERTIA_SD, COARSE_DAMPING_SD = 1.0, 3e-4
 # Nor is a shifted centre of mass asked of them, but their commands trim the drone all the same: one rotor weaker by a
 # tenth is a torque per thrust of a twentieth of the arm. Taken for none, it was a wind (by the moment of its flow).
 COARSE_TRIM = 0.05
@@ -79,6 +77,7 @@ FAST = ("inertia", "inertia_products", "torque_scale", "rate_damping", "rotor_in
         "measurement_delay", "gyro_bias", "thrust_curve")  # fmt: skip
 SHOWN_BY_FORCES = ("thrust_curve", "motor_lag", "input_delay")
 OFF_THE_MIDDLE = ("payload", "center_of_mass", "rotor_fault")  # told from a thrust scale by their torque alone
+HIGH_OR_LOW = ("payload", "center_of_mass")
 # m/s, where trims differ from day to day, and on any drone; times what the file has. Hovering in a real room looks like
 # 0 to 0.6 m/s, and a drone with nothing hidden once like 0.3.
 CALM, ROOM, GUSTIER = 1.0, 0.4, 2.0
@@ -88,7 +87,8 @@ Nuisances = list[tuple[Candidate, tuple[float, ...]]]  # with the precision of e
 
 def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisances:
     """What is always free, with the precisions of its priors about neutral."""
-    measured = data.flights[0].inputs.measured
+    measured, daily = data.flights[0].inputs.measured, TRIM in point.vehicle.effects
+    lags = not measured and point.vehicle.motor_time_constant > 0
     found: Nuisances = [(Candidate("input_delay", (), ("delay",), both_ways=True), (DELAY_SD[measured] ** -2,))]
     if "body_rate" in data.signals or "attitude" in data.signals:
         coarse = coarsely_sampled(data, point)
@@ -103,11 +103,11 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
             damping = COARSE_DAMPING_SD if coarse else DAMPING_SD
             found.append((Candidate("rate_damping", (), ("x", "y", "z")), (damping**-2,) * 3))
         if "velocity" in data.signals:
-            trimmed = data.coarse and TRIM not in point.vehicle.effects
+            trimmed = data.coarse and not daily
             level = tuple(max(COARSE_TRIM * a, CENTRE_SD[0]) for a in point.vehicle.arm) if trimmed else CENTRE_SD[:2]
             precision = tuple(sd**-2 for sd in (*level, CENTRE_SD[2]))
             found.append((Candidate("center_of_mass", (), ("x", "y", "z")), precision))
-        if not measured and point.vehicle.motor_time_constant > 0:
+        if lags and not daily:
             found.append((Candidate("motor_lag", (), ("time_constant",)), (LAG_SD**-2,)))
     if "velocity" in data.signals and "position" in data.signals:
         found.append((Candidate("velocity_scale", (), ("x", "y", "z")), tuple((VELOCITY_SD + jittery(data)) ** -2.0)))
@@ -116,11 +116,13 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
     if data.differ:
         own = strengths_of(data.flights)
         found.append((own, (THRUST_SD**-2,) * len(own.free)))
-    if TRIM in point.vehicle.effects:
+    if daily:
         found.append((Candidate(TRIM, (), ("x", "y", "z")), tuple(sd**-2 for sd in TRIM_SD)))
         found.append((Candidate("thrust_scale", (), ("scale",)), (THRUST_SD**-2,)))
         found.append((Candidate("velocity_moment", (), ("roll_per_vy", "pitch_per_vx")), (FLAPPING_SD**-2,) * 2))
         found.append((Candidate("linear_drag", (), ("x", "y", "z")), (DRAG_SD**-2,) * 3))
+        if lags:
+            found.append((Candidate("motor_lag", (), ("time_constant",)), (DAILY_LAG_SD**-2,)))
     if "attitude" not in data.signals and any(np.isfinite(f.y[:, 6]).any() for f in data.flights):
         found.append((Candidate("attitude_misalignment", (), ANGLES), tuple(sd**-2 for sd in LEANING_SD)))
     elif "attitude" in data.signals and _bias(point) > 0:
@@ -158,16 +160,6 @@ def _bias(point: Point) -> float:
     return float(np.linalg.norm([float(v) for v in point.effects.get("gyro_bias", {}).values()]))
 
 
-def coarsely_sampled(data: Data, point: Point) -> bool:
-    """Whether the commands of most flights are faster than their sampling (see `COARSE`); with a trim in the file."""
-    if data.coarse:
-        return True
-    if TRIM not in point.vehicle.effects:
-        return False
-    shares = [fast_share(f, point.vehicle) for f in data.flights if not f.inputs.measured]
-    return bool(shares) and float(np.median(shares)) > COARSE
-
-
 def unlike_a_body(point: Point, accepted: Sequence[Candidate]) -> bool:
     """Whether the inertia, the lack of torque or the damping that was found is more than a drone of this mass and size
     can have (see `FAR_OUT`, `INDUCED`)."""
@@ -180,23 +172,6 @@ def unlike_a_body(point: Point, accepted: Sequence[Candidate]) -> bool:
     return arm > 0 and any(
         float(v) > most[c.effect] for c in accepted if c.effect in most for v in c.values(point).values()
     )
-
-
-def fast_share(flight: Flight, vehicle: Vehicle) -> float:
-    """Share of the power of the commanded roll and pitch torques above half of the Nyquist frequency, the larger."""
-    time = flight.inputs.time
-    inside = (time > flight.time[0] + EDGE) & (time < flight.time[-1] - EDGE)
-    if inside.sum() < 100:
-        return 0.0
-    period = float(np.median(np.diff(time[inside])))
-    torque = wrench(flight.inputs.thrust[inside], arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust)[:, 1:3]
-    grid = np.arange(time[inside][0], time[inside][-1], period)
-    even = np.stack([np.interp(grid, time[inside], c) for c in torque.T])
-    window = np.hanning(grid.size)
-    power = np.abs(np.fft.rfft((even - even.mean(axis=1, keepdims=True)) * window)) ** 2
-    frequency = np.fft.rfftfreq(grid.size, period)
-    fast, all_of_it = power[:, frequency > 0.25 / period].sum(1), power[:, frequency > SLOW].sum(1)
-    return float(np.divide(fast, all_of_it, out=np.zeros(2), where=all_of_it > 0).max())
 
 
 def abstained(
@@ -213,7 +188,14 @@ def abstained(
         slow, aside = (SHOWN_BY_FORCES, OFF_THE_MIDDLE) if data.coarse else ((), ())
         fast = {*FAST, *aside} - {*slow}
         gone |= {c.effect: COARSE_REASON for c in candidates if c.effect in fast}
+        candidates = [replace(c, free=_without_height(c)) for c in candidates]
     return [c for c in candidates if c.effect not in gone], {**left_out, **gone}
+
+
+def _without_height(candidate: Candidate) -> tuple[str, ...]:
+    """What is fitted of a candidate whose height shows in torques that go with lateral acceleration, not in its
+    weight."""
+    return tuple(n for n in candidate.free if candidate.effect not in HIGH_OR_LOW or n != "z")
 
 
 def steadied(data: Data, point: Point) -> Point:

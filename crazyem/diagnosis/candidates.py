@@ -18,7 +18,8 @@ STRONGEST = 1.1  # a worn, cut or bent propeller pulls less than the others; a n
 NO_STRONGER = 1.0  # and none gets stronger in flight
 # judged by themselves: gusts.py, accelerometer.py, imitated.py; of every log: always.py
 ASIDE = ("gusts", "accelerometer_misalignment", "onboard_filter", "force_by_place")
-ASKED = ("trim",)  # looked for only if asked for: near every effect that brings a steady torque
+TRIM = "trim"
+ASKED = (TRIM,)  # looked for only if asked for: near every effect that brings a steady torque
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import Any
 
 from crazyem.diagnosis.always import abstained, differing, steadied, unlike_a_body
 from crazyem.diagnosis.beside import beside_the_regression, late_rotors
-from crazyem.diagnosis.candidates import Candidate, candidates_for
+from crazyem.diagnosis.candidates import TRIM, Candidate, candidates_for
 from crazyem.diagnosis.exchange import exchanged, named_again
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.fit import nominal as nominal_of
@@ -21,8 +21,10 @@ from crazyem.diagnosis.named import Named
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.own import Own, owned
 from crazyem.diagnosis.place import depends_on_place
+from crazyem.diagnosis.sampling import of_a_real_drone
 from crazyem.diagnosis.select import select
 from crazyem.diagnosis.split import LOAD, WEAKER, as_load, as_two
+from crazyem.diagnosis.steady import left_as_trim
 from crazyem.diagnosis.told import MEASURED_LATE, strongest_first, tell
 from crazyem.diagnosis.trials import Selection
 from crazyem.diagnosis.unexplained import Unexplained, unexplained
@@ -79,14 +81,19 @@ def diagnose(
     """
     flights = [flight_of(r, vehicle, withhold=withhold) for r in recordings]
     kept_apart = [flight_of(r, vehicle, withhold=withhold) for r in held_out]
-    flights, kept_apart = differing(*in_one_frame(*on_one_floor(flights, kept_apart)), vehicle)
+    assumed = of_a_real_drone(flights, vehicle)
+    untrimmed = assumed is not vehicle and not wanted  # its trim is looked for, too
+    flights, kept_apart = differing(*in_one_frame(*on_one_floor(flights, kept_apart)), assumed)
     workers = Workers(jobs)
     say(f"nominal model of {vehicle.name}: {sum(f.duration for f in flights):.0f} s of flight")
-    data, apart, selection, candidates, left_out = _selected(flights, kept_apart, vehicle, wanted, workers, say)
+    asked = [Candidate(TRIM, (), ("x", "y", "z"))] if untrimmed else []
+    data, apart, selection, candidates, left_out = _selected(flights, kept_apart, assumed, wanted, asked, workers, say)
     if unlike_a_body(selection.final, selection.accepted) and not any(f.coarse for f in flights):
         say("the turning does not follow the commands as they were recorded: once more without what is fast")
         flights, kept_apart = ([replace(f, coarse=True) for f in part] for part in (flights, kept_apart))
-        data, apart, selection, candidates, left_out = _selected(flights, kept_apart, vehicle, wanted, workers, say)
+        data, apart, selection, candidates, left_out = _selected(
+            flights, kept_apart, assumed, wanted, asked, workers, say
+        )
     named = selection.accepted
     selection = named_again(data, apart, selection, say)
     if {c.effect for c in selection.accepted} != {c.effect for c in named}:
@@ -124,7 +131,7 @@ def diagnose(
         separate = tuple(dict.fromkeys((*separate, *(CATALOGUE[n].separates for g in alike for n in g))))
     effects = strongest_first(told.effects, beside)
     left_out = {n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)}
-    fitted_vehicle = _with_effects(vehicle, selection, beside)
+    fitted_vehicle = left_as_trim(flights, _with_effects(assumed, selection, beside), remains, workers)
     mismatch = bool(effects) or remains.found
     return Diagnosis(
         vehicle, fitted_vehicle, tuple(r.path for r in recordings), tuple(r.path for r in held_out), mismatch,
@@ -138,10 +145,12 @@ def _selected(
     kept_apart: Sequence[Flight],
     vehicle: Vehicle,
     wanted: Sequence[str],
+    asked: Sequence[Candidate],
     workers: Workers,
     say: Say,
 ) -> tuple[Data, Data | None, Selection, list[Candidate], dict[str, str]]:
-    """The flights, those kept apart, what they ask for, what was asked, and what they cannot speak of and why."""
+    """The flights, those kept apart, what they ask for, what was asked (all candidates, and those `asked` besides), and
+    what they cannot speak of and why."""
     data, apart = Data(flights, workers), Data(kept_apart, workers) if kept_apart else None
     bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, first_guess())
     nominal = nominal_of(data, bare)
@@ -152,7 +161,7 @@ def _selected(
     candidates, left_out = candidates_for(
         nominal, data.signals, measured_speeds=flights[0].inputs.measured, wanted=wanted
     )
-    candidates, left_out = abstained(data, nominal, candidates, left_out)
+    candidates, left_out = abstained(data, nominal, [*candidates, *asked], left_out)
     nominal = steadied(data, nominal)
     return data, apart, select(data, nominal, candidates, held_out=apart, say=say), candidates, left_out
 

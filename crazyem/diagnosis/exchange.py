@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from crazyem.diagnosis.always import TRIM, refine_anew, refine_base, without
-from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.always import refine_anew, refine_base, without
+from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.fit import Data, DivergedError
 from crazyem.diagnosis.split import judged
 from crazyem.diagnosis.trials import SURE, Selection, Step, Trial, at_the_end, margin, matters, told_apart

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from crazyem.diagnosis.always import TRIM, refine_base, solved, without
-from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.always import refine_base, solved, without
+from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.fit import Data, DivergedError, Fitted, remembering_anew
 from crazyem.diagnosis.locate import AXES, Finding
 from crazyem.diagnosis.model import Point

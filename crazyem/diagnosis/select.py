@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.always import (
-    TRIM,
     by_gain,
     nuisances,
     on_held_out,
@@ -24,12 +23,13 @@ from crazyem.diagnosis.always import (
     with_nuisances,
 )
 from crazyem.diagnosis.beginnings import best_begun
-from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.fit import Data, DivergedError, Fitted, held_near
 from crazyem.diagnosis.gram import Solution
 from crazyem.diagnosis.model import Column, Point
 from crazyem.diagnosis.onset import date, onset_of
 from crazyem.diagnosis.prune import ADMITTED, drop, shaken, survive
+from crazyem.diagnosis.steady import as_steady, beside_a_trim, by_onsets
 from crazyem.diagnosis.trials import (
     SURE,
     Selection,
@@ -42,6 +42,7 @@ from crazyem.diagnosis.trials import (
     matters,
     own_evidence,
     significance,
+    sure_enough,
     told_apart,
     weighed,
 )
@@ -100,7 +101,10 @@ def linear_trials(
     for c, mine in zip(tested, index[len(base) :], strict=True):
         later = onset_of(data, c, gram, mine)
         if later is not None:
-            found += linear_trials(data, point, accepted, [later])
+            found += [
+                (replace(t, p_value=by_onsets(point, t.p_value, len(gram.score))), s)
+                for t, s in linear_trials(data, point, accepted, [later])
+            ]
         lo, hi = (np.array(b) for b in c.bounds(point))
         judge(c, always + mine, np.append(weights, np.zeros(len(mine))), np.append(low, lo), np.append(high, hi),
               np.append(centre, np.zeros(len(mine))))  # fmt: skip
@@ -201,11 +205,19 @@ def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Call
     fitted = basis.data.workers.map(lambda entry: tried(basis, *entry, say=say), shortlist(linear))
     trials = weighed(fitted, counted=counted)
     rest = [t for t, _ in linear if all(t.candidate is not p.candidate for p in trials)]
-    if not trials or own_evidence(trials[0], counted=counted) <= ADMITTED or trials[0].p_value >= SURE:
+    if trim := next((t for t in trials if t.candidate.effect == TRIM and admitted(basis, t)), None):
+        return Step((*trials, *rest), trim, as_steady(trim, [t for t in trials if rivals(t, counted=counted)]))
+    if not trials or not admitted(basis, trials[0]):
         return Step((*trials, *rest), None)
     trials, equals = compared_again(basis, trials, say=say)
     taken = name_of(equals, counted=counted)
     return Step((*trials, *rest), taken, group_of(taken, equals, trials, counted=counted))
+
+
+def admitted(basis: Basis, trial: Trial) -> bool:
+    """Whether a trial is sure enough to be taken."""
+    enough = own_evidence(trial, counted=basis.held_out is not None) > ADMITTED
+    return enough and sure_enough(basis.point, trial.p_value)
 
 
 def select(
@@ -229,6 +241,7 @@ def select(
     first = len(accepted)
     while True:
         rest = [c for c in candidates if may_join(c.effect, {a.effect for a in accepted})]
+        rest = beside_a_trim(rest, accepted)
         say(f"looking for effect {len(accepted) + 1} among {len(rest)} candidates")
         linear = linear_trials(data, point, accepted, best_begun(data, point, accepted, rest))
         if len(accepted) > first:
@@ -292,7 +305,8 @@ def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Sol
         names = {t.candidate.effect for t, _ in chosen}
         if one in names and other not in names:
             chosen += [e for e in linear if e[0].candidate.effect == other][:1]
-    return chosen
+    trims = [e for e in linear if e[0].candidate.effect == TRIM][:1]
+    return chosen + [e for e in trims if all(e is not c for c in chosen)]
 
 
 def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:

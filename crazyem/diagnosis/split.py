@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.always import TRIM, on_held_out, refine_base, without
-from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.always import on_held_out, refine_base, without
+from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.fit import Data, DivergedError
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.trials import Selection, Trial, gain_of_both

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.diagnosis.always import TRIM, solved, unsure
-from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.always import solved, unsure
+from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.named import DOUBTFUL, Named, Value, one_factor, share, trust

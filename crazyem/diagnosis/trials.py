@@ -1,20 +1,22 @@
 """Effects that were tried, and how two of them are compared: evidence, significance, what cannot be told apart."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.diagnosis.always import jittery, nuisances, solved, usual_wind
-from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.always import THRUST_SD, TRIM_SD, jittery, nuisances, solved, usual_wind
+from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.fit import Data, Fitted, bounds_of, held_near, moved
 from crazyem.diagnosis.gram import Gram, bounded
 from crazyem.diagnosis.model import Point
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 SURE = 1e-3  # p-value of the score test, before counting candidates,
+# with a trim in the file, where no test by the scatter of blocks follows (see `select`); some 70 are asked,
+SURE_DAILY = 1e-4
 LIKELY = 5e-2  # which flights held out may lower where it is below this
 CLOSE = 4.0  # nats within which two explanations cannot be told apart,
 FAR = 20.0  # nats that one step is believed to bring without looking
@@ -31,6 +33,7 @@ STEEP = 3.0  # vertical over horizontal wind
 HIGHEST = 1.0  # m: a floor is felt by some rotor radii, Crazyflies have 23 to 28 mm
 LEAST_INERTIA = 0.08  # relative, the same
 LEAST_LOAD = 0.005  # of the drone's mass, the same
+DRAWN = 2.0  # standard deviations of the day's trim
 LEAST_DRAG = {"x": 1e-3, "y": 1e-3, "z": 3e-3}  # N s/m or N s^2/m^2; along z thrust is a little wrong (see SYSTEMATIC)
 DRAG_MOST = {"linear_drag": 5.0, "quadratic_drag": 3.0}  # 1/s, 1/m, times the mass: more than air has
 LEAST_CENTRE = {"x": 1e-4, "y": 1e-4, "z": 1e-3}  # m; z shows in lateral accelerations of O alone
@@ -126,11 +129,13 @@ def preferred(taken: Trial, rivals: Sequence[Trial]) -> float:
 
     A rival that is not significant itself is at most as probable: its likelihood may be better because it frees a
     direction that no flight tells (the mass of a load beside a thrust scale) and that differs from flight to flight.
+    Nor is it more against a trim, which every real drone has.
     """
     chance = 1.0
+    known = taken.candidate.effect == TRIM
     for rival in rivals:
         if rival.fitted is not None and rival.blocks.size == taken.blocks.size:
-            chance *= max(better(taken, rival), EVEN if rival.p_value >= SURE else 0.0)
+            chance *= max(better(taken, rival), EVEN if known or rival.p_value >= SURE else 0.0)
     return chance
 
 
@@ -267,6 +272,27 @@ def at_the_end(point: Point, candidate: Candidate) -> bool:
     return here[name] in candidate.range_of(name) and here[name] != candidate.neutral(point)[name]
 
 
+def sure_enough(point: Point, p_value: float) -> bool:
+    """Whether an effect may be taken by its p-value."""
+    return p_value < (SURE_DAILY if TRIM in point.vehicle.effects else SURE)
+
+
+def _other_load(point: Point, here: Mapping[str, float], filed: Mapping[str, float]) -> bool:
+    """Whether a load is another than the file's by more than is told: in weight, or in where it draws the centre.
+
+    With a trim in the file by more than differs from day to day; that of no load is told by its weight alone.
+    """
+    daily = TRIM in point.vehicle.effects
+    heavier = abs(here["mass"] - filed["mass"])
+    if heavier > (THRUST_SD if daily else LEAST_LOAD) * point.vehicle.mass:
+        return True
+    if "x" not in here or not (daily or filed["mass"] > 0.0):
+        return False
+    along_x, along_y = (here["mass"] * here[n] - filed["mass"] * filed[n] for n in "xy")
+    drawn = float(np.hypot(along_x, along_y)) / point.vehicle.mass
+    return drawn > (DRAWN * TRIM_SD[0] if daily else LEAST_CENTRE["x"])
+
+
 def matters(point: Point, candidate: Candidate, data: Data | None = None) -> bool:
     """Whether the effect is larger than what onboard filters or the sampling of a log look like, and within its range.
 
@@ -288,7 +314,7 @@ def matters(point: Point, candidate: Candidate, data: Data | None = None) -> boo
     if candidate.effect == "ground_effect":  # what does not fade with height is thrust that is a little wrong
         return here["height"] < HIGHEST
     if candidate.effect in ("payload", "suspended_load"):
-        return bool(here["mass"] > LEAST_LOAD * point.vehicle.mass)
+        return _other_load(point, here, neutral)
     if candidate.effect == "inertia":
         return any(abs(here[n] / neutral[n] - 1.0) > LEAST_INERTIA for n in candidate.free)
     if candidate.effect == "velocity_scale" and data is not None:

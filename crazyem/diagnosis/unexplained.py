@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.always import TRIM
+from crazyem.diagnosis.candidates import TRIM
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.locate import AXES, Finding, Located, strongest
 from crazyem.diagnosis.model import Point, Swept

@@ -13,8 +13,8 @@ from closed_loop import DRONE, Hidden, fly
 from crazyem.diagnosis import always, told
 from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis import select as selecting
-from crazyem.diagnosis.always import COARSE_REASON, TRIM, refine_base
-from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.always import COARSE_REASON, refine_base
+from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fit import Data, nominal
 from crazyem.diagnosis.flight import flight_of

@@ -15,7 +15,6 @@ from crazyem.diagnosis.always import (
     INERTIA_SD,
     JITTER,
     PULL,
-    TRIM,
     VELOCITY_SD,
     abstained,
     jittery,
@@ -26,7 +25,7 @@ from crazyem.diagnosis.always import (
     unsure,
     usual_wind,
 )
-from crazyem.diagnosis.candidates import Candidate, candidates_for
+from crazyem.diagnosis.candidates import TRIM, Candidate, candidates_for
 from crazyem.diagnosis.fit import Data, starting_point
 from crazyem.diagnosis.flight import _blocks, flight_of
 from crazyem.diagnosis.model import Point

@@ -9,8 +9,8 @@ import pytest
 from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis import split
-from crazyem.diagnosis.always import TRIM, refine_base
-from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.always import refine_base
+from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.fit import Data, nominal
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Point

@@ -10,21 +10,19 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.always import (
     FAST,
-    TRIM,
     abstained,
-    coarsely_sampled,
-    fast_share,
     nuisances,
     refine_base,
     usual_gusts,
     without,
 )
-from crazyem.diagnosis.candidates import Candidate, candidates_for
+from crazyem.diagnosis.candidates import TRIM, Candidate, candidates_for
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fit import Data, nominal
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Noise, Point
 from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.sampling import coarsely_sampled, fast_share, of_a_real_drone
 from crazyem.diagnosis.select import linear_trials
 from crazyem.recordings import open_recording
 from crazyem.recordings.recording import Recording
@@ -101,6 +99,9 @@ def test_commands_that_are_faster_than_their_sampling_say_nothing_of_inertia(whi
     assert share == pytest.approx(0.5, abs=0.1) if white else share < 0.15
     assert coarsely_sampled(data, point) is coarse
     assert not coarsely_sampled(data, point_of(DRONE))
+    assumed = of_a_real_drone(data.flights, DRONE)
+    assert (assumed.effects.get(TRIM) == {"x": 0.0, "y": 0.0, "z": 0.0}) is coarse
+    assert of_a_real_drone(data.flights, TRIMMED) is TRIMMED
     candidates, _ = candidates_for(point, flight.signals, measured_speeds=False)
     left, reasons = abstained(data, point, candidates, {"gusts": "why not"})
     assert ({c.effect for c in left} & set(FAST) == set()) is coarse

@@ -21,5 +21,5 @@ TRIM = Effect(
     tuple(Parameter(axis, "m", 0.0, -0.02, 0.02, 1e-4) for axis in "xyz"),
     order=41,
     external=trimmed,
-    separates="fly the same drone on several days: a trim comes back with every battery, a little different",
+    separates="fly the drone while it is well and judge by the vehicle file written from that: its trim is in there",
 )

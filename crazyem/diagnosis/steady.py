@@ -1,0 +1,60 @@
+"""Steady torques: a trim among its look-alikes, and what is left of one in the vehicle that was fitted.
+
+A torque that acts all the time and that no effect explains is what a real drone needs to hover: rotors that are not
+equal, nor upright. It stays unexplained, but the file that is written has it, so that a simulator flies as the drone
+does, and the next diagnosis by that file takes it for the file of a real drone, whose trim, thrust and flapping differ
+from day to day.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from crazyem.diagnosis.always import refine_base, steadied
+from crazyem.diagnosis.candidates import TRIM, Candidate
+from crazyem.diagnosis.fit import Data, nominal
+from crazyem.diagnosis.flight import Flight
+from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.trials import Trial, told_apart
+from crazyem.diagnosis.unexplained import Unexplained
+from crazyem.diagnosis.workers import Workers
+from crazyem.vehicle import Vehicle
+
+STEADY = ("rotor_fault", "payload")  # what brings a steady torque as a trim does
+
+
+def left_as_trim(flights: Sequence[Flight], vehicle: Vehicle, remains: Unexplained, workers: Workers) -> Vehicle:
+    """The fitted vehicle with the trim that these flights ask for, if a steady torque is left and it has none."""
+    steady = any(f.signal == "torque" and not f.variable for f in remains.findings)
+    if not steady or TRIM in vehicle.effects:
+        return vehicle
+    trim = Candidate(TRIM, (), ("x", "y", "z"))
+    untrimmed = replace(vehicle, effects={**vehicle.effects, TRIM: dict.fromkeys(trim.free, 0.0)})
+    data = Data(flights, workers)
+    point = nominal(data, Point(untrimmed, {n: dict(v) for n, v in untrimmed.effects.items()}, first_guess()))
+    fitted = refine_base(data, steadied(data, point), [trim])
+    return replace(vehicle, effects={**vehicle.effects, TRIM: {n: float(fitted.point.effects[TRIM][n]) for n in "xyz"}})
+
+
+def as_steady(trim: Trial, rivals: Sequence[Trial]) -> tuple[Trial, ...]:
+    """What explains a steady torque as well as a trim or better: with a trim that nobody knows it is not told from it.
+
+    So a trim is taken first where it is asked for: every real drone has one, and a weak rotor or a load beside the
+    middle is told by a file that knows it, which a flight of the healthy drone gives.
+    """
+    others = (t for t in rivals if t.candidate.effect in STEADY)
+    return tuple(t for t in others if not told_apart(trim, t))
+
+
+def beside_a_trim(candidates: Sequence[Candidate], accepted: Sequence[Candidate]) -> list[Candidate]:
+    """The candidates without what a fitted trim is, too: a rotor that is weak all the time, and where a load is."""
+    if all(c.effect != TRIM for c in accepted):
+        return list(candidates)
+    weak = [c for c in candidates if c.effect == "rotor_fault" and dict(c.fixed).get("onset_time") is None]
+    rest = [c for c in candidates if all(c is not w for w in weak)]
+    return [replace(c, free=("mass",)) if c.effect == "payload" else c for c in rest]
+
+
+def by_onsets(point: Point, p_value: float, blocks: int) -> float:
+    """The p-value of an onset that was looked for among the blocks: with a trim in the file nothing asks again."""
+    return min(1.0, p_value * blocks) if TRIM in point.vehicle.effects else p_value
