@@ -258,33 +258,35 @@ def _with(text: str, *, name: str, mass: float) -> str:
 # -- crazypad and sysid ------------------------------------------------------------------------------------------------
 
 
-def crazypad(shared: Path, work: Path) -> dict[str, Any]:
-    """A healthy flight of each drone makes its vehicle file; all others of that drone are judged by it.
+HEALTHY = {  # the first of each drone judges all of its flights, the others the healthy and taped ones
+    "E8": (
+        "motor__normal_flight__E8_log00", "motor__normal_flight__E8_log03", "controller__normal_flight__E8_log00",
+        "motor__tape_on_propeller_M3__E8_log00",
+    ),
+    "E9": ("motor__normal_flight__E9_log00", "controller__normal_flight__E9_log00"),
+}  # fmt: skip
 
-    Healthy flights of another day or table are judged by each other, for the rate of false alarms.
+
+def crazypad(shared: Path, work: Path) -> dict[str, Any]:
+    """As a user would: a preset and a healthy flight make the vehicle file, and other flights are judged by it.
+
+    Every healthy flight judges every other of its drone, for the rate of false alarms.
     """
     folder = shared / "recordings/crazypad"
-    bare = work / "cf2-31g.toml"
-    bare.write_text(_with(_preset("cf2-legacy"), name="cf2-31g", mass=0.031) + "\n[effects.trim]\nx = 0.0\n")
     result: dict[str, Any] = {}
-    for drone, healthy, judged_by_it in (
-        ("E8", "motor__normal_flight__E8_log00", "*__E8_*"),
-        ("E8", "motor__normal_flight__E8_log03", "*__normal_flight__E8_*"),
-        ("E9", "motor__normal_flight__E9_log00", "*__E9_*"),
-    ):
-        base = diagnose(
-            work, healthy, [folder / healthy], [], bare, "--candidates", "trim,thrust_scale,velocity_moment"
-        )
-        result[f"{drone}, {healthy}"] = base
-        for path in sorted(folder.glob(judged_by_it)):
-            if path.name == healthy:
-                continue
-            name = f"{path.name} by {healthy}"
-            try:
-                found = diagnose(work, name, [path], [], base["fitted"])
-            except RuntimeError as error:
-                found = {"failed": str(error)}
-            result[name] = found
+    for drone, healthy in HEALTHY.items():
+        for name in healthy:
+            base = diagnose(work, name, [folder / name], [], "cf2-legacy")
+            result[f"{drone}, {name}"] = base
+            judged = sorted(folder.glob(f"*__{drone}_*")) if name == healthy[0] else [folder / n for n in healthy]
+            for path in judged:
+                if path.name == name:
+                    continue
+                title = f"{path.name} by {name}"
+                try:
+                    result[title] = diagnose(work, title, [path], [], base["fitted"])
+                except RuntimeError as error:
+                    result[title] = {"failed": str(error)}
     return result
 
 

@@ -40,6 +40,7 @@ class Hidden:
         rope: N, along world x where x is beyond 0.1 m: nothing of the catalogue does that.
         load: kg and m of a weight on a string that swings little: a plane pendulum, its weight, and no more.
         breeze: (3,) N, world, constant.
+        twist: m, torque about body z over the thrust of all rotors, which are not upright.
         cable: N/m and m: stiffness and length of a slack cable to a point of the floor, (0.5, -0.7, 0).
     """
 
@@ -50,6 +51,7 @@ class Hidden:
     rope: float = 0.0
     load: tuple[float, float] = (0.0, 1.0)
     breeze: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    twist: float = 0.0
     cable: tuple[float, float] = (0.0, 0.4)
 
 
@@ -80,8 +82,8 @@ def turned(r, by):
 
 
 @compiled
-def loop(goal, goal_v, goal_a, yaw, noise, kicks, sway, weak, onset, scale, drag, rope, load, breeze, cable, mass,
-         inertia, levers, signs, unmix, lag, most, h, rows):  # fmt: skip
+def loop(goal, goal_v, goal_a, yaw, noise, kicks, sway, weak, onset, scale, drag, rope, load, breeze, twist, cable,
+         mass, inertia, levers, signs, unmix, lag, most, h, rows):  # fmt: skip
     p, v, r, w = goal[0].copy(), goal_v[0].copy(), np.eye(3), np.zeros(3)
     f, integral = np.full(4, mass * G / 4), np.zeros(3)
     sa, sb = np.zeros((4, 3)), np.zeros((4, 3))
@@ -128,7 +130,9 @@ def loop(goal, goal_v, goal_a, yaw, noise, kicks, sway, weak, onset, scale, drag
             world[2] -= load[0] * G
             sa[i] = world / mass
             sa[i, 2] -= G
-            sb[i] = (scale * levers * (signs @ real) - cross(w_at, inertia * w_at)) / inertia + sway[k]
+            torque = scale * levers * (signs @ real)
+            torque[2] += twist * real.sum()
+            sb[i] = (torque - cross(w_at, inertia * w_at)) / inertia + sway[k]
         moved = -stiff * aside - sa[0] - 0.1 * (v + slide)  # the same drag over mass as the catalogue's
         moved[2] = 0.0
         slide = slide + h * moved
@@ -176,8 +180,8 @@ def fly(
     rows = np.zeros((steps, 22))
     loop(
         *wanted(seed, time), noise, kicks, wander, np.array(hidden.thrust), hidden.onset, hidden.torque,
-        np.array(hidden.drag), hidden.rope, np.array(hidden.load), np.array(hidden.breeze), np.array(hidden.cable),
-        vehicle.mass, np.array(vehicle.inertia), levers, SIGNS, np.ascontiguousarray(unmix),
+        np.array(hidden.drag), hidden.rope, np.array(hidden.load), np.array(hidden.breeze), hidden.twist,
+        np.array(hidden.cable), vehicle.mass, np.array(vehicle.inertia), levers, SIGNS, np.ascontiguousarray(unmix),
         vehicle.motor_time_constant, vehicle.thrust_max, CONTROL, rows,
     )  # fmt: skip
     every = round(LOG / CONTROL)

@@ -1,0 +1,126 @@
+"""What is steady: a trim among its look-alikes, the file that is written with one, and another day of the drone."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from closed_loop import DRONE, Hidden, fly
+
+from crazyem.diagnosis.candidates import TRIM, Candidate
+from crazyem.diagnosis.diagnose import diagnose
+from crazyem.diagnosis.model import Noise, Point
+from crazyem.diagnosis.steady import as_steady, beside_a_trim, by_onsets
+from crazyem.diagnosis.trials import SURE, SURE_DAILY, Trial, matters, preferred, sure_enough
+from crazyem.recordings.recording import Recording
+from crazyem.vehicle import Vehicle
+
+NOISE = Noise(np.full(6, 0.3), np.full(4, 1e-2))
+ASKED = Candidate(TRIM, (), ("x", "y", "z"))
+WEAK = Candidate("rotor_fault", (("rotor", 3), ("onset_time", None)), ("scale",))
+LATE = replace(WEAK, fixed=(("rotor", 3), ("onset_time", 7.5)))
+LOAD = Candidate("payload", (), ("mass", "x", "y", "z"))
+TWIST = 9e-4  # m: torque about z over thrust, as two real drones need it
+
+
+def point_of(vehicle: Vehicle, **effects: dict[str, Any]) -> Point:
+    return Point(vehicle, {**{n: dict(v) for n, v in vehicle.effects.items()}, **effects}, NOISE)
+
+
+def shaking(recording: Recording, *, seed: int) -> Recording:
+    """With commands that were logged between others that acted: white, a tenth of the command, with no effect."""
+    logged = recording.signals["motor_command"]
+    noise = 0.1 * np.nanmean(logged.value) * np.random.default_rng(seed).standard_normal(logged.value.shape)
+    return replace(
+        recording, signals={**recording.signals, "motor_command": replace(logged, value=logged.value + noise)}
+    )
+
+
+def trial(candidate: Candidate, value: float, scatter: float = 0.1) -> Trial:
+    blocks = np.full(20, value / 20) + scatter * np.random.default_rng(len(candidate.free)).standard_normal(20)
+    fitted: Any = SimpleNamespace()
+    return Trial(candidate, value, value, 1.0, 1e-9, value, fitted=fitted, blocks=blocks, value=value)
+
+
+def test_a_steady_torque_that_nothing_explains_is_written_as_a_trim() -> None:
+    found = diagnose([fly(Hidden(twist=TWIST), seconds=14.0, seed=5)], DRONE)
+    assert [(f.signal, f.axis, f.variable) for f in found.unexplained.findings][:1] == [("torque", "z", "")]
+    trim = found.fitted_vehicle.effects[TRIM]
+    assert trim["z"] == pytest.approx(TWIST, rel=0.1)  # a day is worth twice as much
+    assert abs(trim["x"]) < 2e-5
+    assert abs(trim["y"]) < 2e-5
+    assert TRIM not in DRONE.effects
+    # on another day thrust is 1 % less, the rotors on the left a little weaker, and the twist another
+    other = fly(Hidden(twist=TWIST + 1e-4, thrust=(0.995, 0.995, 0.985, 0.985)), seconds=14.0, seed=6)
+    assert not diagnose([other], found.fitted_vehicle).mismatch
+
+
+def test_what_a_file_explains_leaves_no_trim() -> None:
+    assert (
+        TRIM not in diagnose([fly(Hidden(drag=(0.02, 0.02, 0.0)), seconds=12.0, seed=7)], DRONE).fitted_vehicle.effects
+    )
+
+
+def test_a_drone_whose_commands_shake_has_a_trim_first() -> None:
+    """As those of real drones with a deck, logged at 100 Hz; judged by a file that knows no trim, then by its own."""
+    healthy = shaking(fly(Hidden(twist=TWIST), seconds=14.0, seed=8), seed=1)
+    found = diagnose([healthy], DRONE)
+    assert found.effects[0].name == TRIM
+    assert found.effects[0].parameters["z"].value == pytest.approx(TWIST, rel=0.1)
+    assert {"inertia", "motor_lag", "center_of_mass"} <= set(found.left_out)
+    again = shaking(fly(Hidden(twist=TWIST), seconds=14.0, seed=9), seed=2)
+    assert not diagnose([again], found.fitted_vehicle).mismatch
+    weak = Hidden(twist=TWIST, thrust=(1.0, 1.0, 0.72, 1.0))
+    cut = diagnose([shaking(fly(weak, seconds=14.0, seed=10), seed=3)], found.fitted_vehicle)
+    assert (cut.effects[0].name, cut.effects[0].chosen["rotor"]) == ("rotor_fault", 3)
+    assert cut.effects[0].parameters["scale"].value == pytest.approx(0.72, abs=0.05)
+
+
+def test_with_a_trim_that_nobody_knew_what_is_steady_is_not_told_from_it() -> None:
+    trim, weak, load = trial(ASKED, 100.0), trial(WEAK, 120.0), trial(LOAD, 60.0)
+    assert as_steady(trim, [weak, load, trial(replace(ASKED, effect="wind"), 110.0)]) == (weak,)
+    assert as_steady(trim, [load]) == ()
+    # a trim is there in any case: what explains more makes it a toss, and no worse
+    assert preferred(trim, [weak]) == pytest.approx(0.5)
+    assert preferred(trial(Candidate("wind", (), ("x", "y", "z")), 100.0), [weak]) < 0.01
+
+
+def test_beside_a_trim_neither_a_weak_rotor_nor_the_place_of_a_load_is_asked_for() -> None:
+    assert beside_a_trim([WEAK, LATE, LOAD], []) == [WEAK, LATE, LOAD]
+    assert beside_a_trim([WEAK, LATE, LOAD], [ASKED]) == [LATE, replace(LOAD, free=("mass",))]
+
+
+def test_with_a_trim_in_the_file_an_effect_must_be_surer_and_a_date_pays_for_the_search() -> None:
+    filed = point_of(replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}}))
+    assert SURE_DAILY < SURE
+    between = (SURE_DAILY * SURE) ** 0.5
+    assert sure_enough(point_of(DRONE), between)
+    assert not sure_enough(filed, between)
+    assert by_onsets(filed, 1e-5, 20) == pytest.approx(2e-4)
+    assert by_onsets(filed, 0.3, 20) == 1.0
+    assert by_onsets(point_of(DRONE), 1e-5, 20) == 1e-5
+
+
+@pytest.mark.parametrize(
+    ("filed", "load", "trim", "another"),
+    [
+        (None, (1e-4, 0.03, 0.0), False, False),  # 0.3 % of the mass, as before: told by its weight alone
+        (None, (3e-4, 0.0, 0.0), False, True),
+        ((2e-3, 0.01, 0.0), (2.0e-3, 0.01, 0.0), False, False),  # the one of the file
+        ((2e-3, 0.01, 0.0), (2.0e-3, 0.02, 0.0), False, True),  # moved
+        ((2e-3, 0.01, 0.0), (2.0e-3, 0.02, 0.0), True, False),  # moved: 0.6 mm of the centre is a day
+        ((2e-3, 0.01, 0.0), (2.0e-3, 0.03, 0.02), True, True),
+        (None, (5e-4, 0.01, 0.0), True, False),  # 1.4 % of the thrust is a day
+        (None, (9e-4, 0.01, 0.0), True, True),
+    ],
+)
+def test_a_load_counts_by_what_it_differs_from_the_file(
+    filed: tuple[float, ...] | None, load: tuple[float, ...], trim: bool, another: bool
+) -> None:
+    def effect(values: tuple[float, ...]) -> dict[str, float]:
+        return dict(zip(("mass", "x", "y"), values, strict=True))
+
+    effects: dict[str, Any] = {TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}} if trim else {}
+    vehicle = replace(DRONE, effects={**effects, **({"payload": effect(filed)} if filed else {})})
+    assert matters(point_of(vehicle, payload={**effect(load), "z": 0.0}), LOAD) is another
