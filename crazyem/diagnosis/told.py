@@ -23,6 +23,7 @@ SHAKES = "hold the drone with its rotors turning: what shakes then is not the lo
 # Exactly the same to every signal, but for forces of the air: two things at once, more mass and inertias to match.
 HEAVIER = "weigh the drone: with {:.3g} times its mass and its inertias it would fly the same"
 MEASURED_LATE = "measurement_delay"
+BY_TORQUE = ("velocity_moment",)  # of what is asked of flights whose torques say little, what they alone can tell
 # Two weak rotors beside each other lack thrust and tilt the drone as a weight on their side does, with no torque about
 # z; only what turns tells, which a drone whose trim changes from day to day does not show.
 TWO_WEAK = "rotor_fault"
@@ -71,7 +72,9 @@ def tell(
         at = own.stop
         away, covariance = _away(candidate, point), solution.covariance[own, own]
         rivals = _rivals(candidate, step, witnessed)
-        confidence = trust(remains) * share(step.taken.evidence, []) * preferred(step.taken, rivals)
+        # where torques say nothing, what they leave says nothing against what forces tell
+        heard = remains.of_forces() if data.coarse and candidate.effect not in BY_TORQUE else remains
+        confidence = trust(heard) * share(step.taken.evidence, []) * preferred(step.taken, rivals)
         doubted = candidate.effect in selection.doubted
         if doubted or wald(away, covariance, gram, used) > WITHIN:
             confidence = min(confidence, DOUBTFUL)

@@ -17,10 +17,11 @@ STRUCTURE = 25.0  # nats of structure left over that count as unexplained
 # Smaller than this is what onboard filters and sampled commands leave in every flight: share of weight, share of the
 # weight times the arm, rad, m/s.
 TOLERANCE = {"force": 0.01, "torque": 0.0004, "attitude": 5e-3, "velocity": 0.05}
-DAILY = 2.0  # times that, where trims, thrust and leaning differ by 2 % from day to day (see always.py)
+DAILY = 2.0  # times that, where trims, thrust and leaning differ by 2 % from day to day or flight to flight (always.py)
 SLOWEST = 1.5  # Hz: below, onboard filters wander
 LINE = 25.0  # nats: peak of the spectrum over its surroundings (power), the number of frequencies allowed for
 SHAKEN = 0.3  # of what an unknown torque would leave of a swing
+TURNING = ("torque", "body_rate")
 NEAR = 0.15  # share of the frequency range that is "surroundings"
 
 
@@ -62,6 +63,11 @@ class Unexplained:
         """The same with one more finding."""
         return Unexplained(tuple(sorted((*self.findings, finding), key=lambda f: -f.nats)), self.gained)
 
+    def of_forces(self) -> "Unexplained":
+        """What remains of forces, attitudes and velocities: all that speaks of effects that forces tell, where the
+        turning does not follow the commands as they were recorded."""
+        return Unexplained(tuple(f for f in self.findings if f.signal not in TURNING), self.gained)
+
     def without_force(self) -> "Unexplained":
         """What remains once a random force explains the forces."""
         return Unexplained(tuple(f for f in self.findings if f.signal != "force"), self.gained)
@@ -75,7 +81,7 @@ def unexplained(data: Data, selection: Selection, after: Located, apart: Data | 
     filed = replace(point, effects={**point.vehicle.effects, **named})
     # along axes of the body: a force of the room is asked for by `place.py`, and `wind` is of the catalogue
     of_the_body = [f for f in after.findings if f.axis in AXES]
-    left = [f for f in strongest(of_the_body, most=40) if f.nats > STRUCTURE and notable(f, point)]
+    left = [f for f in strongest(of_the_body, most=40) if f.nats > STRUCTURE and notable(f, point, differ=data.differ)]
     for model in data.models:
         left += lines(model.sweep(point), model.flight.time) + humps(model, filed)
         model.settle(point)
@@ -86,12 +92,12 @@ def unexplained(data: Data, selection: Selection, after: Located, apart: Data | 
     return Unexplained(tuple(left[:12]), gained)
 
 
-def notable(finding: Finding, point: Point) -> bool:
-    """Whether a finding is larger than what every flight shows."""
+def notable(finding: Finding, point: Point, *, differ: bool = False) -> bool:
+    """Whether a finding is larger than what every flight shows; of flights that `differ` in their thrusts as well."""
     weight = point.vehicle.mass * GRAVITY
     arm = max(point.vehicle.arm) or 0.03
     size = {"force": weight, "torque": weight * arm}.get(finding.signal, 1.0)
-    daily = DAILY if TRIM in point.vehicle.effects else 1.0
+    daily = DAILY if differ or TRIM in point.vehicle.effects else 1.0
     return abs(finding.effect_size) > TOLERANCE.get(finding.signal, 0.0) * daily * size
 
 

@@ -20,12 +20,12 @@ from crazyem.diagnosis.fit import Data, nominal
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.locate import Finding
 from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.named import DOUBTFUL
+from crazyem.diagnosis.named import DOUBTFUL, trust
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.prune import left_out
 from crazyem.diagnosis.select import select
 from crazyem.diagnosis.trials import Selection, Step, Trial
-from crazyem.diagnosis.unexplained import notable
+from crazyem.diagnosis.unexplained import Unexplained, notable
 
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
 THRUST = Candidate("thrust_scale", (), ("scale",))
@@ -159,3 +159,14 @@ def test_from_day_to_day_forces_differ_by_more():
     for share, vehicle, counts in ((0.015, DRONE, True), (0.015, TRIMMED, False), (0.025, TRIMMED, True)):
         force = Finding("force", "x", "always", "", (0.0, 9.0), share * weight, 1e-4, "N", 60.0, 1e-9)
         assert notable(force, replace(point, vehicle=vehicle)) == counts
+        assert notable(force, replace(point, vehicle=vehicle), differ=True) == (share > 0.02)
+
+
+def test_where_torques_say_nothing_they_say_nothing_against_what_forces_tell():
+    def left(signal: str, nats: float) -> Finding:
+        return Finding(signal, "x", "always", "", (0.0, 9.0), 1.0, 0.1, "", nats, 1e-9)
+
+    remains = Unexplained((left("torque", 300.0), left("body_rate", 90.0)), 900.0)
+    assert trust(remains) == DOUBTFUL
+    assert trust(remains.of_forces()) == 1.0
+    assert trust(remains.beside(left("force", 100.0)).of_forces()) == DOUBTFUL

@@ -170,10 +170,8 @@ def test_rotors_relabelled_by_symmetry_give_the_relabelled_gains(name: str) -> N
 
 
 def trimmed_by(folder, name: str) -> Vehicle:
-    """The file of drone E8 by a flight with whole propellers."""
-    bare = replace(load_vehicle("cf2-legacy"), name="e8", mass=0.031, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}})
-    wanted = (TRIM, "thrust_scale", "velocity_moment")
-    return diagnose([open_recording(folder / name)], bare, wanted=wanted).fitted_vehicle
+    """The file of drone E8 by a flight with whole propellers, as a user would make it: a preset and nothing named."""
+    return diagnose([open_recording(folder / name)], load_vehicle("cf2-legacy")).fitted_vehicle
 
 
 @pytest.fixture(scope="module")
