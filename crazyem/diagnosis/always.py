@@ -12,7 +12,7 @@ from crazyem.diagnosis.fit import Data, Fitted, refine, remembering, remembering
 from crazyem.diagnosis.flight import Flight
 from crazyem.diagnosis.gram import Solution, used
 from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.sampling import coarsely_sampled
+from crazyem.diagnosis.sampling import TRIM_SD, coarsely_sampled
 from crazyem.vehicle import GRAVITY, Vehicle
 
 # What is never exactly as a vehicle file says, and is therefore always free, within these standard deviations: the
@@ -38,7 +38,6 @@ DAMPING_SD = 6e-6
 # From one day to the next, of a drone whose file has a trim: batteries are put in again, propellers and feet bent.
 # Healthy and damaged flights of two drones on several days scatter like this (docs/diagnosis_real.md). The thrust is
 # free for each of several recordings of any drone (`SEVERAL`): one number for all would make it heed commands less.
-TRIM_SD = (5e-4, 5e-4, 1.6e-4)  # m: torque per thrust
 THRUST_SD = 0.02  # relative
 # s: of the lag of rotors in the calm flights of real drones, 24 to 105 ms in 26 flights for a file's 50, whether
 # anything was wrong with them or not, so a file to which one of them was fitted does not know it.

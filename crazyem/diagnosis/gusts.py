@@ -19,6 +19,7 @@ SHARE_SD = 0.2  # relative: of the spread, for the memory that goes with it and 
 FAR = 25  # iterations of the first fit
 SMALLEST = 0.08  # m/s^2: less is what onboard filters leave
 ALIKE = 3.0  # largest ratio between the axes' spreads for moving air; a force on one axis alone is none
+KNOWN = 1e-3  # N s/m: a drag below it is none that was found, but one that is free near nothing
 PUSH = 0.007  # N s/m: of moving air on a drone whose drag is not known (docs/effects.md)
 
 
@@ -78,14 +79,14 @@ def find_gusts(data: Data, point: Point) -> Gusts | None:
     independent = max(3.0 * seconds / (2.0 * memory), 2.0)
     memory_sd = max(1.0 / np.sqrt(max(-2 * curve[0], 1e-9)), np.sqrt(2.0 / independent))
     size = float(np.median(spread))  # along z thrust is a little wrong as well
-    push = drag_of(point) or PUSH
-    speed = size * point.vehicle.mass / push
+    speed = size * point.vehicle.mass / push_of(point)
     alike = bool(spread.max() < ALIKE * spread.min())
     speed_sd = speed * float(np.hypot(1.0 / np.sqrt(2 * independent), SHARE_SD))
     return Gusts(gain, spread, memory, float(memory_sd), alike, speed, speed_sd)
 
 
-def drag_of(point: Point) -> float:
-    """Mean linear drag [N s/m] if the model has one."""
+def push_of(point: Point) -> float:
+    """N s/m with which the air takes the drone along: its mean linear drag, if the model has one that was found."""
     drag = point.effects.get("linear_drag")
-    return float(np.mean([drag[a] for a in "xyz"])) if drag else 0.0
+    mean = float(np.mean([drag[a] for a in "xyz"])) if drag else 0.0
+    return mean if mean > KNOWN else PUSH

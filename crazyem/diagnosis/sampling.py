@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crazyem.diagnosis.candidates import TRIM
 from crazyem.diagnosis.fit import Data
@@ -17,6 +18,9 @@ from crazyem.vehicle import Vehicle
 # heavy and damped. Share of the power of roll and pitch torques above half of the Nyquist frequency (white: a half):
 COARSE = 0.2  # simulated flights have up to 0.12, whatever is wrong with the drone
 EDGE, SLOW = 0.5, 1.0  # s left out at either end; Hz below which torques say nothing of sampling
+# m, torque per thrust: by how much the trim of a drone whose file has one differs from one day to the next. Healthy and
+# damaged flights of two drones on several days scatter like this (docs/diagnosis_real.md).
+TRIM_SD = (5e-4, 5e-4, 1.6e-4)
 
 
 def coarsely_sampled(data: Data, point: Point) -> bool:
@@ -34,14 +38,24 @@ def shaken_commands(flights: Sequence[Flight], vehicle: Vehicle) -> bool:
 
 
 def of_a_real_drone(flights: Sequence[Flight], vehicle: Vehicle) -> Vehicle:
-    """The vehicle with a trim of nothing, if its file has none and its commands shake as only a real drone's do.
+    """The vehicle with a trim of nothing, if its file has none, its commands shake as a real drone's do, and they hold
+    a steady torque.
 
     Such commands tell little but what is steady. Where that was not free within what differs from drone to drone and
     from day to day, it was called a weak rotor, a load or a wind.
     """
     if TRIM in vehicle.effects or not shaken_commands(flights, vehicle):
         return vehicle
+    if not any(np.any(np.abs(held(f, vehicle)) > TRIM_SD) for f in flights):
+        return vehicle
     return replace(vehicle, effects={**vehicle.effects, TRIM: dict.fromkeys("xyz", 0.0)})
+
+
+def held(flight: Flight, vehicle: Vehicle) -> NDArray:
+    """(3,) torque of the commands over their thrust in the air [m], body axes, on average: less a drone's trim."""
+    inside = (flight.inputs.time > flight.time[0]) & (flight.inputs.time < flight.time[-1])
+    mean = wrench(flight.inputs.thrust[inside], arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust).mean(0)
+    return mean[1:] / mean[0] if mean[0] > 0 else np.zeros(3)
 
 
 def fast_share(flight: Flight, vehicle: Vehicle) -> float:

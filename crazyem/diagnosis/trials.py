@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.diagnosis.always import THRUST_SD, TRIM_SD, jittery, nuisances, solved, usual_wind
+from crazyem.diagnosis.always import THRUST_SD, jittery, nuisances, solved, usual_wind
 from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.fit import Data, Fitted, bounds_of, held_near, moved
 from crazyem.diagnosis.gram import Gram, bounded
 from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.sampling import TRIM_SD
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 SURE = 1e-3  # p-value of the score test, before counting candidates,

@@ -10,6 +10,7 @@ from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.diagnose import diagnose
+from crazyem.diagnosis.gusts import PUSH, push_of
 from crazyem.diagnosis.model import Noise, Point
 from crazyem.diagnosis.steady import as_steady, beside_a_trim, by_onsets
 from crazyem.diagnosis.trials import SURE, SURE_DAILY, Trial, matters, preferred, sure_enough
@@ -124,3 +125,9 @@ def test_a_load_counts_by_what_it_differs_from_the_file(
     effects: dict[str, Any] = {TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}} if trim else {}
     vehicle = replace(DRONE, effects={**effects, **({"payload": effect(filed)} if filed else {})})
     assert matters(point_of(vehicle, payload={**effect(load), "z": 0.0}), LOAD) is another
+
+
+def test_a_drag_that_is_free_near_nothing_does_not_make_a_storm_of_a_force() -> None:
+    for drag, push in ((None, PUSH), (2e-5, PUSH), (0.012, 0.012)):
+        effects = {"linear_drag": dict.fromkeys("xyz", drag)} if drag else {}
+        assert push_of(point_of(DRONE, **effects)) == pytest.approx(push)

@@ -22,7 +22,7 @@ from crazyem.diagnosis.fit import Data, nominal
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Noise, Point
 from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.sampling import coarsely_sampled, fast_share, of_a_real_drone
+from crazyem.diagnosis.sampling import coarsely_sampled, fast_share, held, of_a_real_drone
 from crazyem.diagnosis.select import linear_trials
 from crazyem.recordings import open_recording
 from crazyem.recordings.recording import Recording
@@ -99,7 +99,11 @@ def test_commands_that_are_faster_than_their_sampling_say_nothing_of_inertia(whi
     assert share == pytest.approx(0.5, abs=0.1) if white else share < 0.15
     assert coarsely_sampled(data, point) is coarse
     assert not coarsely_sampled(data, point_of(DRONE))
-    assumed = of_a_real_drone(data.flights, DRONE)
+    assert of_a_real_drone(data.flights, DRONE) is DRONE  # whatever shakes: nothing steady is held against
+    twisted = rotor.thrust * np.array([1.1, 0.9, 1.1, 0.9])
+    held_against = [replace(flight, inputs=replace(rotor, thrust=twisted))]
+    assert held(held_against[0], DRONE)[2] == pytest.approx(-0.1 * DRONE.torque_per_thrust, rel=0.1)
+    assumed = of_a_real_drone(held_against, DRONE)
     assert (assumed.effects.get(TRIM) == {"x": 0.0, "y": 0.0, "z": 0.0}) is coarse
     assert of_a_real_drone(data.flights, TRIMMED) is TRIMMED
     candidates, _ = candidates_for(point, flight.signals, measured_speeds=False)
