@@ -165,3 +165,19 @@ def test_no_document_breaks_it(found: dict[str, Any]) -> None:
     text = report(found, {})
     checked(text)
     assert re.search(r"<h1>.+</h1>", text)
+
+
+@pytest.mark.parametrize(
+    ("onset", "said"),
+    [
+        (None, "lacks rotor fault of rotor 3 (48 % sure)."),
+        (7.5, "lacks rotor fault of rotor 3 since 7.50 s (48 % sure)."),
+    ],
+)
+def test_which_rotor_and_since_when_is_in_the_sentence(onset: float | None, said: str) -> None:
+    chosen = {"rotor": {"value": 3, "chosen": True}, "onset_time": {"value": onset, "chosen": True}}
+    fault = {"name": "rotor_fault", "confidence": 0.48, "parameters": {"scale": {"value": 0.9}, **chosen}}
+    assert said in verdict({"mismatch": True, "effects": [fault]})
+    grouped = verdict({"mismatch": True, "effects": [fault], "indistinguishable": [["rotor_fault", "payload"]]})
+    assert "of rotor 3" in grouped
+    assert "(or payload, which this flight cannot tell from it)" in grouped

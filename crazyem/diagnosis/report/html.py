@@ -91,8 +91,16 @@ def _named(effect: Mapping[str, Any], groups: Iterable[Sequence[Any]]) -> str:
     how = "" if sure is None else f" ({100 * sure:.0f} % sure)"
     if group:
         others = _joined([_words(str(g)) for g in group if g != name], "or")
-        return f"{_words(name)} (or {others}, which this flight cannot tell from it){how}"
-    return _words(name) + how
+        return f"{_words(name)}{_which(effect)} (or {others}, which this flight cannot tell from it){how}"
+    return _words(name) + _which(effect) + how
+
+
+def _which(effect: Mapping[str, Any]) -> str:
+    """Of which rotor, and since when, where that belongs to the effect."""
+    found = _dict(effect.get("parameters"))
+    rotor, onset = (_number(_dict(found.get(n)).get("value")) for n in ("rotor", "onset_time"))
+    of = "" if rotor is None else f" of rotor {rotor:.0f}"
+    return of if onset is None else f"{of} since {onset:.2f} s"
 
 
 def _gain(document: Document) -> str:
