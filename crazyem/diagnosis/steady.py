@@ -26,7 +26,7 @@ STEADY = ("rotor_fault", "payload")  # what brings a steady torque as a trim doe
 def left_as_trim(flights: Sequence[Flight], vehicle: Vehicle, remains: Unexplained, workers: Workers) -> Vehicle:
     """The fitted vehicle with the trim that these flights ask for, if a steady torque is left and it has none."""
     steady = any(f.signal == "torque" and not f.variable for f in remains.findings)
-    if not steady or TRIM in vehicle.effects:
+    if not steady or TRIM in vehicle.effects or all(f.coarse for f in flights):  # such torques are not to be written
         return vehicle
     trim = Candidate(TRIM, (), ("x", "y", "z"))
     untrimmed = replace(vehicle, effects={**vehicle.effects, TRIM: dict.fromkeys(trim.free, 0.0)})
