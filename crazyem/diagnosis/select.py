@@ -153,9 +153,9 @@ def tried(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str]
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
     try:
         fit = refine_base(data, with_started(point, trial.candidate, solution), mine, rounds=3, noise=False)
+        return compared(basis, trial, data, fit)
     except DivergedError:  # the linear approximation went too far
         return replace(trial, p_value=1.0)
-    return compared(basis, trial, data, fit)
 
 
 def sharpened(basis: Basis, trial: Trial) -> Trial:
@@ -164,9 +164,9 @@ def sharpened(basis: Basis, trial: Trial) -> Trial:
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
     try:
         fit = refine_anew(data, trial.fitted.point, mine, rounds=2)
+        return compared(basis, trial, data, fit)
     except DivergedError:
         return trial
-    return compared(basis, trial, data, fit)
 
 
 def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:

@@ -9,7 +9,7 @@ from scipy import stats
 
 from crazyem.diagnosis.always import THRUST_SD, jittery, nuisances, solved, usual_wind
 from crazyem.diagnosis.candidates import TRIM, Candidate
-from crazyem.diagnosis.fit import Data, Fitted, bounds_of, held_near, moved
+from crazyem.diagnosis.fit import Data, DivergedError, Fitted, bounds_of, held_near, moved
 from crazyem.diagnosis.gram import Gram, bounded
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.sampling import TRIM_SD
@@ -229,8 +229,15 @@ def _total(data: Data, point: Point, parts: Sequence[Candidate]) -> tuple[NDArra
 
 
 def _inverse(matrix: NDArray) -> NDArray:
-    """Of a covariance or a curvature (k, k) whose parameters are of very different sizes."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    """Of a covariance or a curvature (k, k) whose parameters are of very different sizes; of one that says nothing, 0.
+
+    Raises:
+        DivergedError: a number of it is not finite.
+    """
+    if not np.isfinite(matrix).all():
+        raise DivergedError("the curvature of a fit is not finite")
+    told = np.diag(matrix) > 0.0
+    scale = np.sqrt(np.where(told, np.diag(matrix), 1.0))
     inverse: NDArray = np.linalg.pinv(matrix / np.outer(scale, scale), rcond=1e-9) / np.outer(scale, scale)
     return inverse
 

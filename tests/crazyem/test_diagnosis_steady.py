@@ -10,10 +10,11 @@ from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.diagnose import diagnose
+from crazyem.diagnosis.fit import DivergedError
 from crazyem.diagnosis.gusts import PUSH, push_of
 from crazyem.diagnosis.model import Noise, Point
 from crazyem.diagnosis.steady import as_steady, beside_a_trim, by_onsets
-from crazyem.diagnosis.trials import SURE, SURE_DAILY, Trial, matters, preferred, sure_enough
+from crazyem.diagnosis.trials import SURE, SURE_DAILY, Trial, _inverse, matters, preferred, sure_enough
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
@@ -131,3 +132,10 @@ def test_a_drag_that_is_free_near_nothing_does_not_make_a_storm_of_a_force() -> 
     for drag, push in ((None, PUSH), (2e-5, PUSH), (0.012, 0.012)):
         effects = {"linear_drag": dict.fromkeys("xyz", drag)} if drag else {}
         assert push_of(point_of(DRONE, **effects)) == pytest.approx(push)
+
+
+def test_a_curvature_that_says_nothing_of_a_parameter_has_an_inverse_and_one_that_is_not_finite_has_diverged() -> None:
+    """The first was divided by 1e-300, and one flight of 320 ended with 'SVD did not converge'."""
+    np.testing.assert_allclose(_inverse(np.diag([4.0, 0.0, 1e-12])), np.diag([0.25, 0.0, 1e12]))
+    with pytest.raises(DivergedError, match="not finite"):
+        _inverse(np.diag([1.0, np.inf]))
