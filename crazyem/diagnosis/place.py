@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.gram import Gram
 from crazyem.diagnosis.locate import AXES, Finding
-from crazyem.diagnosis.model import Column, Model, Point
+from crazyem.diagnosis.model import Column, Model, Point, initial_path
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.vehicle import GRAVITY, Vehicle
 
@@ -81,8 +81,8 @@ def slope_finding(data: Data, slopes: NDArray, errors: NDArray, nats: float, veh
 
 
 def _path(model: Model) -> NDArray:
-    assert model.shown is not None
-    return model.shown
+    """Filtered, or as measured where the model left the range of numbers."""
+    return initial_path(model.flight) if model.shown is None else model.shown
 
 
 def _gram(data: Data, point: Point, centre: NDArray) -> Gram:
