@@ -130,7 +130,7 @@ def preferred(taken: Trial, rivals: Sequence[Trial]) -> float:
 
     A rival that is not significant itself is at most as probable: its likelihood may be better because it frees a
     direction that no flight tells (the mass of a load beside a thrust scale) and that differs from flight to flight.
-    Nor is it more against a trim, which every real drone has.
+    Against a trim, which every real drone has, no rival is more probable either.
     """
     chance = 1.0
     known = taken.candidate.effect == TRIM

@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
+from crazyem.diagnosis import select as selecting
 from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fit import DivergedError
 from crazyem.diagnosis.gusts import PUSH, push_of
 from crazyem.diagnosis.model import Noise, Point
+from crazyem.diagnosis.select import Basis, shortlist, step_of
 from crazyem.diagnosis.steady import as_steady, beside_a_trim, by_onsets
 from crazyem.diagnosis.trials import SURE, SURE_DAILY, Trial, _inverse, matters, preferred, sure_enough
+from crazyem.diagnosis.workers import Workers
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
@@ -86,6 +89,25 @@ def test_with_a_trim_that_nobody_knew_what_is_steady_is_not_told_from_it() -> No
     # a trim is there in any case: what explains more makes it a toss, and no worse
     assert preferred(trim, [weak]) == pytest.approx(0.5)
     assert preferred(trial(Candidate("wind", (), ("x", "y", "z")), 100.0), [weak]) < 0.01
+
+
+def test_a_trim_that_is_asked_for_is_fitted_and_taken_before_a_better_weak_rotor(monkeypatch) -> None:
+    filed = point_of(replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}}))
+    better = [trial(replace(WEAK, fixed=(("rotor", r), ("onset_time", None))), 200.0 + r) for r in (1, 2, 3, 4)]
+    others = [trial(Candidate(n, (), ("x",)), 150.0) for n in ("linear_drag", "wind", "gyro_bias", "velocity_scale")]
+    linear: Any = [(t, None) for t in (*better, *others, trial(ASKED, 60.0))]
+    assert sum(t.candidate.effect == TRIM for t, _ in shortlist(linear)) == 1
+    monkeypatch.setattr(selecting, "tried", lambda basis, entry, solution, *, say: entry)
+    data: Any = SimpleNamespace(workers=Workers(1))
+    step = step_of(Basis(data, None, filed, (), 0.0, 0.0), linear, say=lambda text: None)
+    assert step.taken is not None
+    assert step.taken.candidate is ASKED
+    assert {t.candidate.effect for t in step.alike} == {"rotor_fault"}
+    unsure: Any = [(replace(t, p_value=1e-3) if t.candidate is ASKED else t, None) for t, _ in linear]
+    monkeypatch.setattr(selecting, "compared_again", lambda basis, trials, *, say: (trials, trials[:1]))
+    step = step_of(Basis(data, None, filed, (), 0.0, 0.0), unsure, say=lambda text: None)
+    assert step.taken is not None
+    assert step.taken.candidate.effect == "rotor_fault"
 
 
 def test_beside_a_trim_neither_a_weak_rotor_nor_the_place_of_a_load_is_asked_for() -> None:

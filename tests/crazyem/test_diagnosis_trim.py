@@ -110,7 +110,18 @@ def test_commands_that_are_faster_than_their_sampling_say_nothing_of_inertia(whi
     left, reasons = abstained(data, point, candidates, {"gusts": "why not"})
     assert ({c.effect for c in left} & set(FAST) == set()) is coarse
     assert ("inertia" in reasons) is coarse
+    load = next(c for c in left if c.effect == "payload")
+    assert load.free == (("mass", "x", "y") if coarse else ("mass", "x", "y", "z"))  # no torque tells its height
     assert reasons["gusts"] == "why not"
+
+
+def test_the_firmware_on_a_pc_shakes_and_is_no_real_drone(shared_recordings) -> None:
+    """Its motors are equal and upright, so its commands hold no steady torque."""
+    name = "real_firmware/lee_34g_mass_pushed_midflight.csv.gz"
+    vehicle = load_vehicle("cf2")
+    flight = flight_of(open_recording(shared_recordings / name), vehicle)
+    assert fast_share(flight, vehicle) > 0.3
+    assert of_a_real_drone([flight], vehicle) is vehicle
 
 
 # -- symmetry ----------------------------------------------------------------------------------------------------------
