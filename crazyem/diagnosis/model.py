@@ -336,7 +336,10 @@ def _shows(name: str) -> bool:
 def run_sweep(
     flight: Flight, acceleration: NDArray, offset: NDArray, acting: NDArray, showing: NDArray, noise: Noise
 ) -> Swept:
-    """The kernel with its arrays made."""
+    """The kernel with its arrays made; a log-likelihood of -inf where a variance is not one.
+
+    Noise scales so far apart that the covariance lost its sign seem likely without end, and fits ran away to them.
+    """
     n, m = flight.time.size, acting.shape[2] + showing.shape[2]
     predicted, filtered = np.zeros((n, 19)), np.zeros((n, 19))
     innovation, variance, rows = np.zeros((n, 12)), np.zeros((n, 12)), np.zeros(n)
@@ -350,6 +353,8 @@ def run_sweep(
         flight.block if m else np.zeros(n, np.int64), predicted, filtered, innovation, variance, rows, score,
         information,
     )  # fmt: skip
+    if not np.all(variance >= 0.0):
+        loglik = -np.inf
     upper = np.triu(information)
     information = upper + np.transpose(np.triu(information, 1), (0, 2, 1))
     return Swept(loglik, rows, predicted, filtered, innovation, variance, score, information)

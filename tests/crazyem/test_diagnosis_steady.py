@@ -8,12 +8,17 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
+from crazyem.diagnosis import model as modelling
+from crazyem.diagnosis import prune as pruning
 from crazyem.diagnosis import select as selecting
+from crazyem.diagnosis.always import refine_base
 from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fit import DivergedError
+from crazyem.diagnosis.fit import Data, DivergedError, nominal
+from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.gusts import PUSH, push_of
 from crazyem.diagnosis.model import Noise, Point
+from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.select import Basis, shortlist, step_of
 from crazyem.diagnosis.steady import as_steady, beside_a_trim, by_onsets
 from crazyem.diagnosis.trials import SURE, SURE_DAILY, Trial, _inverse, matters, preferred, sure_enough
@@ -161,3 +166,43 @@ def test_a_curvature_that_says_nothing_of_a_parameter_has_an_inverse_and_one_tha
     np.testing.assert_allclose(_inverse(np.diag([4.0, 0.0, 1e-12])), np.diag([0.25, 0.0, 1e12]))
     with pytest.raises(DivergedError, match="not finite"):
         _inverse(np.diag([1.0, np.inf]))
+
+
+def test_noise_under_which_a_variance_is_none_is_not_likely(monkeypatch) -> None:
+    flight = flight_of(fly(seconds=6.0), DRONE)
+    data = Data([flight])
+    point = point_of(DRONE)
+    assert np.isfinite(data.loglik(point))
+    kernel = modelling.sweep
+
+    def lost(*arrays: Any) -> float:
+        value = kernel(*arrays)
+        arrays[17][3, 0] = -1e299  # a variance
+        return float(value) + 1e6  # as likely as it then seems
+
+    monkeypatch.setattr(modelling, "sweep", lost)
+    assert data.loglik(point) == -np.inf
+    with pytest.raises(DivergedError):
+        refine_base(data, point, ())
+    fitted = data.fit_noise(point)
+    assert np.allclose(fitted.noise.impulse, point.noise.impulse)  # nothing is gained by going anywhere
+
+
+def test_what_wanders_is_fitted_beside_the_flights(monkeypatch) -> None:
+    """Fits that went on from where it led did not come back."""
+    drag = Candidate("linear_drag", (), ("x", "y", "z"))
+    data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.0)), seconds=8.0, seed=3), DRONE)])
+    fitted = refine_base(data, nominal(data, Point(DRONE, {}, first_guess())).with_effects({"linear_drag": {}}), [drag])
+    seen: list[Data] = []
+
+    def recorded(apart: Data, *arguments: Any, **options: Any) -> Any:
+        seen.append(apart)
+        return refine_base(apart, *arguments, **options)
+
+    monkeypatch.setattr(pruning, "refine_base", recorded)
+    monkeypatch.setattr(pruning, "WANDERING", -np.inf)
+    step: Any = SimpleNamespace(taken=SimpleNamespace(candidate=drag, dispersion=1.0))
+    kept = pruning.survive(data, fitted, [drag], [step], None, lambda text: None)
+    assert [c.effect for c in kept[1]] == ["linear_drag"]
+    assert len(seen) == 1
+    assert seen[0] is not data
