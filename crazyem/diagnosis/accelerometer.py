@@ -5,6 +5,7 @@ residual is regressed on the tilt, with a bias and a lag of the sensor as nuisan
 blocks, as everywhere.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -37,20 +38,29 @@ def tilt(data: Data, point: Point) -> tuple[Solution, Gram] | None:
     return gram.solve(range(7), precision=precision, tested=range(2)), gram
 
 
-def held_out_gain(data: Data, point: Point, angles: NDArray) -> float:
-    """Log-likelihood that the angles bring on other flights [nats], bias and lag fitted there."""
-    total = 0.0
+def held_out_gain(data: Data, point: Point, angles: NDArray, *, yaw_sd: float) -> float:
+    """Log-likelihood that the angles bring on other flights [nats], bias and lag fitted there.
+
+    So is the yaw about what was found, by `yaw_sd` [rad]: a hover says nothing of it, and a quick flight does.
+    """
+    total, dispersion = 0.0, gram_dispersion(data, point)
+    bare = [3, 4, 5, 6]
+    known = {2: yaw_sd**-2, **dict.fromkeys((3, 4, 5), BIAS_SD**-2), 6: LAG_SD**-2}
     for model in data.models:
-        gram = _of(model, point)
-        precision = np.array([BIAS_SD**-2] * 3 + [LAG_SD**-2])
-        b, a = gram.total(range(7))
-        rest = [3, 4, 5, 6]
-        inner = np.linalg.inv(a[np.ix_(rest, rest)] + np.diag(precision))
+        b, a = (
+            v / dispersion for v in _of(model, point).total(range(7))
+        )  # not what priors say, which does not scatter
         shift = np.array([*angles])
-        left = b[rest] - a[np.ix_(rest, [0, 1, 2])] @ shift
         total += float(b[:3] @ shift - 0.5 * shift @ a[:3, :3] @ shift)
-        total += float(0.5 * left @ inner @ left - 0.5 * b[rest] @ inner @ b[rest])
-    return total / max(1.0, gram_dispersion(data, point))
+        total += _fitted(b - a[:, :3] @ shift, a, known) - _fitted(b, a, {i: known[i] for i in bare})
+    return total
+
+
+def _fitted(score: NDArray, information: NDArray, known: Mapping[int, float]) -> float:
+    """What parameters bring [nats], by index with the precisions of their priors; the rest as it is."""
+    at = list(known)
+    inner = information[np.ix_(at, at)] + np.diag([known[i] for i in at])
+    return 0.5 * float(score[at] @ np.linalg.solve(inner, score[at]))
 
 
 def gram_dispersion(data: Data, point: Point) -> float:

@@ -64,7 +64,7 @@ def beside_the_regression(
             sd = np.sqrt(np.diag(solution.covariance)[:3])
             angles = solution.theta[:3]
             wald = float(stats.f.sf(np.sum((angles / sd)[:2] ** 2) / 2, 2, max(len(gram.score) - 7, 3)))
-            held = accelerometer.held_out_gain(apart or data, point, angles)
+            held = accelerometer.held_out_gain(apart or data, point, angles, yaw_sd=float(sd[2]))
             sure = max(solution.p_value, wald) < SURE and held > ADMITTED
             if sure and np.abs(angles).max() > accelerometer.LEAST:
                 values = {n: Value(float(a), "rad", float(e), around(float(a), float(e)))

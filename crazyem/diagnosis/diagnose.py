@@ -12,6 +12,7 @@ from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.fit import nominal as nominal_of
 from crazyem.diagnosis.flight import Flight, flight_of
 from crazyem.diagnosis.floor import on_one_floor
+from crazyem.diagnosis.foretold import with_found, without_what_misleads
 from crazyem.diagnosis.frame import alike as in_one_frame
 from crazyem.diagnosis.heading import heading_by_place
 from crazyem.diagnosis.imitated import by_place
@@ -101,6 +102,8 @@ def diagnose(
         selection = select(data, selection.nominal, candidates, held_out=apart, begun=selection, say=say)
     selection, pull = by_place(data, apart, selection, say)
     selection, witnessed = _heard(data, apart, selection, recordings)
+    judges = held_out or recordings
+    selection = without_what_misleads(data, selection, assumed, judges, withhold=withhold, say=say)
     say("where the nominal model fails")
     data.settle(selection.nominal)
     before = locate(data, selection.nominal)
@@ -206,11 +209,8 @@ def _misread_or_weak(
 
 def _with_effects(vehicle: Vehicle, selection: Selection, beside: Sequence[Named]) -> Vehicle:
     """The vehicle with what was found; delays within what is normal are left out."""
-    kept = {n: dict(v) for n, v in vehicle.effects.items()}
-    accepted = {c.effect for c in selection.accepted}
-    for name, values in selection.final.effects.items():
-        if name in accepted:
-            kept[name] = {k: v for k, v in values.items() if v is not None}
-    for named in beside:
-        kept[named.name] = {n: v.value for n, v in named.parameters.items()}
-    return replace(vehicle, effects=kept)
+    fitted = with_found(vehicle, selection, selection.accepted)
+    return replace(
+        fitted,
+        effects={**fitted.effects, **{e.name: {n: v.value for n, v in e.parameters.items()} for e in beside}},
+    )

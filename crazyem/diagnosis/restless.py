@@ -6,6 +6,7 @@ spectrum of the rates' innovations. No effect of the catalogue does either, so b
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.gram import Gram
 from crazyem.diagnosis.locate import AXES, Finding, units_of
 from crazyem.diagnosis.model import Column, Model, Point
+from crazyem.physics.motion import body_of
 from crazyem.physics.rotors import wrench
 from crazyem.vehicle import GRAVITY
 
@@ -33,24 +35,39 @@ SHAKEN = 0.15  # of the angular acceleration in that band: less is a loop that s
 SMALLEST = 0.0004  # of weight times arm
 
 
-def standardised(model: Model, point: Point) -> tuple[NDArray, NDArray]:
-    """(n, 3) innovations of the body rates in standard deviations, and (n,) which rows have all three."""
+def standardised(model: Model, point: Point, turned: NDArray | None = None) -> tuple[NDArray, NDArray]:
+    """(n, 3) innovations of the body rates in standard deviations, and (n,) which rows have all three.
+
+    Args:
+        turned: (3, 3) with which they are multiplied before; None leaves each axis its own.
+    """
     swept = model.sweep(point)
-    seen: NDArray = np.all(swept.variance[:, 9:12] > 0, axis=1)
-    z = np.divide(swept.innovation[:, 9:12], np.sqrt(swept.variance[:, 9:12]), where=seen[:, None],
-                  out=np.zeros((seen.size, 3)))  # fmt: skip
+    innovation, variance = swept.innovation[:, 9:12], swept.variance[:, 9:12]
+    seen: NDArray = np.all(variance > 0, axis=1)
+    if turned is not None:
+        innovation, variance = innovation @ turned.T, variance @ np.square(turned).T
+    z = np.divide(innovation, np.sqrt(variance), where=seen[:, None], out=np.zeros((seen.size, 3)))
     return np.clip(z, -OUTLYING, OUTLYING), seen
+
+
+def memoryless(data: Data, point: Point) -> Point:
+    """The point with torques that have no memory, and noise scales that fit then: what a filter remembers it follows,
+    and what it follows is no innovation any more."""
+    white = np.concatenate([point.noise.disturbance[:3], np.zeros(3)])
+    return data.fit_noise(replace(point, noise=replace(point.noise, disturbance=white)))
 
 
 def erratic_rotor(models: Sequence[Model], point: Point) -> Finding | None:
     """The rotor whose random thrust the correlations between the axes' innovations point to, if they do.
 
-    Of flights fitted and held out alike: nothing is fitted here.
+    Of flights fitted and held out alike: nothing is fitted here. Shows most where torques are `memoryless`. Of the
+    torques, not of what turns: products of inertia turn the torques of all rotors into rates that go together.
     """
+    inertia = body_of(point.vehicle, point.effects).inertia
     pairs = ((0, 1), (0, 2), (1, 2))
     sums, count = [], 0
     for model in models:
-        z, seen = standardised(model, point)
+        z, seen = standardised(model, point, inertia / np.max(inertia))
         block = model.flight.block
         sums.append(np.stack([np.bincount(block, z[:, i] * z[:, j], model.flight.blocks) for i, j in pairs], 1))
         count += int(seen.sum())

@@ -90,6 +90,6 @@ def judged(data: Data, held_out: Data | None, start: Point, candidates: Sequence
     if held_out is not None:
         apart = held_out.twin()
         there = on_held_out(apart, fitted.point, candidates)
-        value += there.loglik + gain_of_both(fitted, apart, there, candidates)
-        blocks = np.append(blocks, apart.block_loglik(there.point))
+        more, beyond = gain_of_both(fitted, apart, there, candidates)
+        value, blocks = value + there.loglik + more, np.append(blocks, beyond)
     return value, blocks

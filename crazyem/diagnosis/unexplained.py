@@ -9,7 +9,7 @@ from crazyem.diagnosis.candidates import TRIM
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.locate import AXES, Finding, Located, strongest
 from crazyem.diagnosis.model import Point, Swept
-from crazyem.diagnosis.restless import erratic_rotor, humps
+from crazyem.diagnosis.restless import erratic_rotor, humps, memoryless
 from crazyem.diagnosis.trials import Selection
 from crazyem.vehicle import GRAVITY
 
@@ -85,7 +85,9 @@ def unexplained(data: Data, selection: Selection, after: Located, apart: Data | 
     for model in data.models:
         left += lines(model.sweep(point), model.flight.time) + humps(model, filed)
         model.settle(point)
-    erratic = erratic_rotor([*data.models, *(apart.models if apart else ())], point)
+    everything, quiet = data.together_with(apart), memoryless(data.twin(), point)
+    everything.settle(quiet)
+    erratic = erratic_rotor(everything.models, quiet)
     left += [erratic] if erratic else []
     left.sort(key=lambda f: -f.nats)
     gained = sum(s.taken.evidence for s in selection.steps if s.taken)

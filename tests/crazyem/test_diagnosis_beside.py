@@ -56,6 +56,30 @@ def test_a_tilted_accelerometer_is_measured_and_an_upright_one_is_not_accused(re
         assert (solution.p_value < 1e-6) == (flown is turned)
 
 
+def test_a_yaw_that_was_not_seen_does_not_cost_what_the_tilt_brings(recording):
+    """0.3 rad by a hover, which hardly shows it, spoils what a quick flight with drag says of roll and pitch, unless it
+    is known to be unsure."""
+    axes = Rotation.from_euler("ZYX", [0.0, -0.02, 0.03]).as_matrix()
+    data, point = fitted(with_values(recording, "specific_force", lambda value: value @ axes))
+    point = point.with_effects({"linear_drag": {"x": 0.03, "y": 0.03, "z": 0.03}})
+    sure, unsure = (
+        accelerometer.held_out_gain(data, point, np.array([0.03, -0.02, 0.3]), yaw_sd=sd) for sd in (1e-4, 0.3)
+    )
+    assert unsure > sure + 1.0
+
+
+def test_what_a_prior_says_is_no_weaker_because_residuals_scatter(recording):
+    """A bias that stands for the tilt costs what its prior says, 0.5 (g angle / sd)^2, however the rest scatters."""
+    axes = Rotation.from_euler("ZYX", [0.0, -0.02, 0.03]).as_matrix()
+    data, point = fitted(with_values(recording, "specific_force", lambda value: value @ axes))
+    instead = 0.5 * (0.03**2 + 0.02**2) * (9.81 / accelerometer.BIAS_SD) ** 2
+    assert instead > 60
+    for model in data.models:  # from block to block, on the whole nothing
+        model.flight.force[:] += 0.2 * (-1.0) ** model.flight.block[:, None]
+    assert accelerometer.gram_dispersion(data, point) > 3
+    assert accelerometer.held_out_gain(data, point, np.array([0.03, -0.02, 0.0]), yaw_sd=0.3) > 0.5 * instead
+
+
 def test_without_an_accelerometer_nothing_is_said(recording):
     assert accelerometer.tilt(*fitted(without(recording, ["specific_force"]))) is None
 

@@ -5,9 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from crazyem.diagnosis import select
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.select import BEATEN, group_of, may_join, name_of
 from crazyem.diagnosis.trials import Step, Trial, better, preferred, told_apart
+from crazyem.diagnosis.workers import Workers
 
 NOISE = np.random.default_rng(0).normal(size=40)
 
@@ -101,3 +103,16 @@ def test_what_is_already_there_in_another_form_is_not_asked():
     assert not may_join("inertia", {"torque_scale"})
     assert not may_join("wind", {"wind"})
     assert may_join("wind", {"thrust_scale", "motor_lag"})
+
+
+def test_the_better_explanation_of_all_flights_leads_whichever_ruins_those_held_out_least(monkeypatch):
+    """Fitted to a hover, a linear drag happens to cost a quick flight less than the quadratic one that is right, which
+    fitted to both explains it by thousands of nats more."""
+    linear, quadratic = trial("linear_drag", "xyz", 2000.0), trial("quadratic_drag", "xyz", 9000.0)
+    linear, quadratic = replace(linear, evidence=26000.0), replace(quadratic, evidence=12000.0)
+    basis = SimpleNamespace(held_out=object(), data=SimpleNamespace(workers=Workers(1)))
+    monkeypatch.setattr(select, "sharpened", lambda basis, trial: trial)
+    monkeypatch.setattr(select, "weighed", lambda trials, counted: sorted(trials, key=lambda t: -t.evidence))
+    trials, equals = select.compared_again(basis, [linear, quadratic], say=lambda text: None)
+    assert trials[0] is linear
+    assert equals == [quadratic]

@@ -20,6 +20,7 @@ from crazyem.diagnosis.restless import (
     erratic_rotor,
     hump,
     humps,
+    memoryless,
     peaks,
     reach_of,
     spectrum,
@@ -117,3 +118,31 @@ def test_a_healthy_made_flight_has_neither() -> None:
     point = nominal(data, Point(DRONE, {}, first_guess()))
     assert not humps(data.models[0], point)
     assert erratic_rotor(data.models, point) is None
+
+
+@pytest.mark.parametrize("share", [0.15, 0.27])
+def test_torques_that_products_of_inertia_turn_into_rates_are_no_rotor(share: float) -> None:
+    """All axes are mixed with the signs of a rotor, and the model knows it: of the torques nothing goes together."""
+    inertia = np.diag(DRONE.inertia)
+    products = {"xy": -share, "xz": -share / 2, "yz": -share / 2}  # as rotor 1, whose signs are alike
+    for (i, j), value in zip(((0, 1), (0, 2), (1, 2)), products.values(), strict=True):
+        inertia[i, j] = inertia[j, i] = value * DRONE.inertia[0]
+    knowing = Point(DRONE, {"inertia_products": {n: v * DRONE.inertia[0] for n, v in products.items()}}, POINT.noise)
+    rng, said = np.random.default_rng(0), 0
+    for _ in range(5):
+        torque = rng.normal(size=(ROWS, 3)) * np.array(DRONE.inertia)  # rates of unit variance without products
+        rates = torque @ np.linalg.inv(inertia)
+        assert erratic_rotor([model_of(rates)], knowing) is None
+        said += erratic_rotor([model_of(rates)], POINT) is not None
+    assert said == 5
+
+
+def test_what_a_filter_remembers_is_an_innovation_again() -> None:
+    """Torques with a memory hide how the axes go together: most of it is foreseen. Without, noise takes their place."""
+    data = Data([flight_of(fly(seconds=7.0, sway=6.0), DRONE)])
+    point = nominal(data, Point(DRONE, {}, first_guess()))
+    assert point.noise.disturbance[3:].max() > 1.0
+    quiet = memoryless(data.twin(), point)
+    assert not quiet.noise.disturbance[3:].any()
+    assert np.all(quiet.noise.impulse[3:5] > point.noise.impulse[3:5])
+    assert quiet.effects == point.effects

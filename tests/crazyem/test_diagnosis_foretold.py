@@ -1,0 +1,97 @@
+"""What makes predictions worse is left out again: on made flights, with inertias that are right and that are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from closed_loop import DRONE, fly
+
+from crazyem.diagnosis.always import refine_base
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.fit import Data, nominal
+from crazyem.diagnosis.flight import flight_of
+from crazyem.diagnosis.foretold import WORSE, ratio, with_found, without_what_misleads
+from crazyem.diagnosis.horizon import UNITS, HorizonErrors
+from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.trials import Selection, Step, Trial
+
+INERTIA = Candidate("inertia", (), ("xx", "yy", "zz"))
+DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
+
+
+def selected(data: Data, found: dict[str, tuple[Candidate, dict[str, float]]]) -> Selection:
+    """A selection with effects of these sizes, whatever the flights say."""
+    point = nominal(data, Point(DRONE, {}, first_guess()))
+    begun = point.with_effects({name: values for name, (_, values) in found.items()})
+    candidates = [c for c, _ in found.values()]
+    fitted = refine_base(data, begun, candidates, rounds=1, noise=False)
+    final = fitted.point.with_effects({name: values for name, (_, values) in found.items()})
+    steps = tuple(Step((), Trial(c, 100.0, 100.0, 1.0, 1e-9, 100.0)) for c in candidates)
+    return Selection(point, final, steps, tuple(candidates), replace(fitted, point=final), 2)
+
+
+@pytest.fixture(scope="module")
+def heavy():
+    """A drone a quarter heavier to turn than its file says, and the data of its flight."""
+    recording = fly(vehicle=replace(DRONE, inertia=tuple(1.25 * i for i in DRONE.inertia)), seconds=8.0)
+    return recording, Data([flight_of(recording, DRONE)])
+
+
+def inertias(factor: float) -> dict[str, float]:
+    return dict(zip(INERTIA.free, (factor * i for i in DRONE.inertia), strict=True))
+
+
+def test_what_is_right_stays(heavy):
+    recording, data = heavy
+    selection = selected(data, {"inertia": (INERTIA, inertias(1.25))})
+    assert without_what_misleads(data, selection, DRONE, [recording]) is selection
+
+
+def test_what_leads_astray_goes_and_what_does_not_stays(heavy):
+    """Inertias of 0.4 of the real ones, as a vibration had them, beside a drag of nothing."""
+    recording, data = heavy
+    harmless = dict.fromkeys(DRAG.free, 1e-6)
+    selection = selected(data, {"linear_drag": (DRAG, harmless), "inertia": (INERTIA, inertias(0.4))})
+    said: list[str] = []
+    left = without_what_misleads(data, selection, DRONE, [recording], say=said.append)
+    assert [c.effect for c in left.accepted] == ["linear_drag"]
+    assert [s.taken.candidate.effect for s in left.steps if s.taken] == ["linear_drag"]
+    assert len(said) == 1
+    assert "inertia" in said[0]
+
+
+def test_nothing_is_asked_where_the_turning_does_not_follow_the_commands(heavy):
+    recording, data = heavy
+    selection = selected(data, {"inertia": (INERTIA, inertias(0.4))})
+    coarse = Data([replace(m.flight, coarse=True) for m in data.models])
+    assert without_what_misleads(coarse, selection, DRONE, [recording]) is selection
+
+
+def test_a_recording_without_whole_states_judges_nothing(heavy):
+    recording, data = heavy
+    selection = selected(data, {"inertia": (INERTIA, inertias(0.4))})
+    blind = replace(recording, signals={n: s for n, s in recording.signals.items() if n != "attitude"})
+    assert without_what_misleads(data, selection, DRONE, [blind]) is selection
+
+
+def test_the_vehicle_has_what_was_accepted_and_what_it_had(heavy):
+    _, data = heavy
+    selection = selected(data, {"inertia": (INERTIA, inertias(0.4))})
+    filed = replace(DRONE, effects={"linear_drag": {"x": 0.01}})
+    assert with_found(filed, selection, ()).effects == filed.effects
+    assert with_found(filed, selection, selection.accepted).effects["inertia"] == inertias(0.4)
+
+
+def errors(factor: float) -> HorizonErrors:
+    rms = dict.fromkeys(UNITS, (1.0, 2.0 * factor, 3.0 * factor))
+    return HorizonErrors((0.01, 0.1, 0.5), 10, rms, rms)
+
+
+def test_the_ratio_is_a_geometric_mean_without_the_shortest_horizon():
+    assert ratio([errors(1.0)], [errors(1.5)]) == pytest.approx(1.5)
+    assert ratio([errors(1.0), errors(1.0)], [errors(2.0), errors(0.5)]) == pytest.approx(1.0)
+    assert ratio([errors(1.0), None], [errors(2.0), errors(9.0)]) == pytest.approx(2.0)
+    assert ratio([None], [None]) == 1.0
+    assert ratio([errors(1.0)], [errors(np.inf)]) == np.inf > WORSE
+    assert ratio([errors(1.0)], [errors(np.nan)]) == 1.0
