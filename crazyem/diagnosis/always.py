@@ -24,6 +24,8 @@ LAG_SD = 2e-3  # s: with nothing hidden and torques as free, 51 to 55 ms instead
 # Relative, about z: rotors that are heavy answer with torque at once, without the lag that hides what sampled commands
 # miss, and then yaw looks too heavy by 20 to 40 %.
 AT_ONCE_SD = 0.25
+# N m s: and as if it were damped, by 1e-5 to 1.9e-4 in 12 flights that shake of drones with such rotors and no damping.
+AT_ONCE_DAMPING_SD = 1e-4
 CENTRE_SD = (2e-5, 2e-5, 7e-4)  # m; a height of -0.4 to -0.8 mm is what velocities of onboard filters look like
 VELOCITY_SD, JITTER = 2e-3, 3e-3  # relative: no onboard filter is better; m/s, see `jittery`
 # s: rates behind the attitude, velocities behind the position, by the filters of the firmware; in 80 flights with
@@ -81,6 +83,7 @@ HIGH_OR_LOW = ("payload", "center_of_mass")
 # 0 to 0.6 m/s, and a drone with nothing hidden once like 0.3.
 CALM, ROOM, GUSTIER = 1.0, 0.4, 2.0
 STILL = 0.1  # m/s of steady wind
+SOMETIMES_FREE = ("torque_scale", "rate_damping")  # by what was found: until a lag is, and beside a rotor inertia
 Nuisances = list[tuple[Candidate, tuple[float, ...]]]  # with the precision of each free parameter
 
 
@@ -92,15 +95,18 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
     if "body_rate" in data.signals or "attitude" in data.signals:
         coarse = coarsely_sampled(data, point)
         share = COARSE_INERTIA_SD if coarse else INERTIA_SD
-        if not coarse and not measured and point.effects.get("rotor_inertia", {}).get("inertia", 0.0) > 0.0:
+        heavy = not coarse and not measured and point.effects.get("rotor_inertia", {}).get("inertia", 0.0) > 0.0
+        if heavy:
             share = np.array([*INERTIA_SD[:2], AT_ONCE_SD])
         moments = tuple((share * np.array(point.vehicle.inertia)) ** -2.0)
         found.append((Candidate("inertia", (), ("xx", "yy", "zz")), moments))
         if not coarse:
             found.append((Candidate("torque_scale", (), ("scale",)), (TORQUE_SD**-2,)))
-        if coarse or measured:
-            damping = COARSE_DAMPING_SD if coarse else DAMPING_SD
-            found.append((Candidate("rate_damping", (), ("x", "y", "z")), (damping**-2,) * 3))
+        if coarse or measured or heavy:
+            tilting = COARSE_DAMPING_SD if coarse else DAMPING_SD
+            turning = AT_ONCE_DAMPING_SD if heavy else tilting
+            damped = Candidate("rate_damping", (), ("x", "y", "z"))
+            found.append((damped, (tilting**-2, tilting**-2, turning**-2)))
         if "velocity" in data.signals:
             trimmed = data.coarse and not daily
             level = tuple(max(COARSE_TRIM * a, CENTRE_SD[0]) for a in point.vehicle.arm) if trimmed else CENTRE_SD[:2]
@@ -300,7 +306,9 @@ def _let_go(point: Point, accepted: Sequence[Candidate], free: Nuisances) -> Poi
     """The point with what is free no longer (see `nuisances`) as the vehicle file has it, instead of where it was left:
     nobody is told of it, and a torque scale of 0.925 that stayed made a centre of mass 8 % too small."""
     kept = {c.effect for c in (*accepted, *(c for c, _ in free))}
-    return point if "torque_scale" in kept else without(point, "torque_scale")
+    for name in SOMETIMES_FREE:
+        point = point if name in kept else without(point, name)
+    return point
 
 
 def refine_base(

@@ -8,6 +8,7 @@ import pytest
 from closed_loop import DRONE, fly
 
 from crazyem.diagnosis.always import (
+    AT_ONCE_DAMPING_SD,
     AT_ONCE_SD,
     COARSE_REASON,
     DAMPING_SD,
@@ -16,6 +17,7 @@ from crazyem.diagnosis.always import (
     JITTER,
     PULL,
     VELOCITY_SD,
+    _let_go,
     abstained,
     jittery,
     nuisances,
@@ -78,6 +80,17 @@ def test_beside_heavy_rotors_the_yaw_inertia_is_hardly_known():
     assert sd_of(flown(speed=0.1, measured=True), heavy, "inertia")[2] == pytest.approx(
         INERTIA_SD[2] * DRONE.inertia[2]
     )
+
+
+def test_beside_heavy_rotors_a_damping_of_yaw_is_free_as_well_and_goes_with_them():
+    """What sampled commands leave of their torque is a damping about z, of drones that have none."""
+    heavy = POINT.with_effects({"rotor_inertia": {"inertia": 2e-8}})
+    wanted = [DAMPING_SD, DAMPING_SD, AT_ONCE_DAMPING_SD]
+    assert sd_of(flown(speed=0.1), heavy, "rate_damping") == pytest.approx(wanted)
+    assert sd_of(flown(speed=0.1, measured=True), heavy, "rate_damping") == pytest.approx(np.full(3, DAMPING_SD))
+    left = POINT.with_effects({"rate_damping": {"x": 0.0, "y": 0.0, "z": 1e-4}})  # by a rotor inertia that is gone
+    assert "rate_damping" not in _let_go(left, (), []).effects
+    assert _let_go(left, [Candidate("rate_damping", (), ("x", "y", "z"))], []).effects == left.effects
 
 
 def test_intervals_hold_what_no_scatter_shows():

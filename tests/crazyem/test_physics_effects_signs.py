@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.physics.effects.effect import Effects, Situation
 from crazyem.physics.effects.rotation import axes, rotation_between
+from crazyem.physics.effects.rotor_inertia import TYPICAL_ROTOR_CONSTANT
 from crazyem.physics.motion import RotorInput, measured, motion, rotor_thrust
 
 M = CF2.mass
@@ -124,11 +125,18 @@ def test_rotor_inertia_goes_with_the_speed_and_not_with_a_lost_blade() -> None:
     assert gained == pytest.approx(2.0 * 2e-8 * math.sqrt(0.1 / 2.5e-8))
 
 
+@pytest.mark.parametrize(("gram", "rpm"), [(17.3, 13522), (28.6, 17174)])
+def test_the_typical_rotor_is_that_of_the_stand(gram: float, rpm: float) -> None:
+    """What four propellers of a brushed Crazyflie lift at a speed (Bitcraze, Measuring propeller RPM, part 3, 2015)."""
+    speed = rpm * 2 * math.pi / 60
+    assert pytest.approx(gram * 1e-3 * 9.81 / 4 / speed**2, rel=0.04) == TYPICAL_ROTOR_CONSTANT
+
+
 def test_rotor_inertia_of_a_vehicle_without_rotor_constant_takes_a_typical_one() -> None:
     rolling = still(thrust=[0.1, 0, 0, 0], body_rate=[2.0, 0, 0], vehicle=CF2)
     gained = motion(rolling, vehicle=CF2, effects={"rotor_inertia": {"inertia": 2e-8}}).angular_acceleration[0, 1] * IYY
     plain = motion(rolling, vehicle=CF2, effects={}).angular_acceleration[0, 1] * IYY
-    assert gained - plain == pytest.approx(2.0 * 2e-8 * math.sqrt(0.1 / 3.7e-8))
+    assert gained - plain == pytest.approx(2.0 * 2e-8 * math.sqrt(0.1 / 2.1e-8))
 
 
 # --- before the lag --------------------------------------------------------------------------------------------------
