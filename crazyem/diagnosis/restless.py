@@ -21,6 +21,7 @@ from crazyem.physics.motion import body_of
 from crazyem.physics.rotors import wrench
 from crazyem.vehicle import GRAVITY
 
+AT_RANDOM = "at random"  # what such a finding depends on; a thrust of the rotor is the variable `rotor`
 CHANCE = 1e-5  # that no rotor stands out, the number of rotors allowed for
 EACH = 2.33  # standard deviations for tilting alone and with yawing alone: a product of inertia mixes two axes only
 LEAST = 0.03  # correlation
@@ -92,7 +93,7 @@ def erratic_rotor(models: Sequence[Model], point: Point) -> Finding | None:
     level = np.hypot(noise.disturbance[3:5], noise.impulse[3:5] / np.sqrt(step)) * vehicle.inertia[:2]
     size = float(np.sqrt(correlation) * level.mean())
     time = models[0].flight.time
-    return Finding("torque", "x", f"rotor {rotor + 1} at random", "rotor", (float(time[0]), float(time[-1])), size,
+    return Finding("torque", "x", f"rotor {rotor + 1} at random", AT_RANDOM, (float(time[0]), float(time[-1])), size,
                    size / (2 * t), "N m", float(-np.log(max(chance, 1e-300))), chance)  # fmt: skip
 
 

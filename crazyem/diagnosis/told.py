@@ -24,9 +24,12 @@ SHAKES = "hold the drone with its rotors turning: what shakes then is not the lo
 HEAVIER = "weigh the drone: with {:.3g} times its mass and its inertias it would fly the same"
 MEASURED_LATE = "measurement_delay"
 BY_TORQUE = ("velocity_moment",)  # of what is asked of flights whose torques say little, what they alone can tell
+# Told by forces that last, which no rotor feigns that pushes at random.
+BY_FORCE = ("thrust_scale", "thrust_curve", "battery_sag", "linear_drag", "quadratic_drag", "wind", "ground_effect",
+            "attitude_misalignment", "velocity_scale")  # fmt: skip
 # Two weak rotors beside each other lack thrust and tilt the drone as a weight on their side does, with no torque about
 # z; only what turns tells, which a drone whose trim changes from day to day does not show.
-TWO_WEAK = "rotor_fault"
+WEAK_ROTOR = "rotor_fault"
 # Exactly the same to every signal: inputs that act late, and measurements that are all late together.
 SAME = {"input_delay": (MEASURED_LATE,)}
 
@@ -72,8 +75,7 @@ def tell(
         at = own.stop
         away, covariance = _away(candidate, point), solution.covariance[own, own]
         rivals = _rivals(candidate, step, witnessed)
-        # where torques say nothing, what they leave says nothing against what forces tell
-        heard = remains.of_forces() if data.coarse and candidate.effect not in BY_TORQUE else remains
+        heard = _heard(remains, candidate, data)
         confidence = trust(heard) * share(step.taken.evidence, []) * preferred(step.taken, rivals)
         doubted = candidate.effect in selection.doubted
         if doubted or wald(away, covariance, gram, used) > WITHIN:
@@ -113,6 +115,17 @@ def strongest_first(effects: Sequence[Named], beside: Sequence[Named]) -> tuple[
         at = next((i for i, e in enumerate(told) if e.held_out_nats < one.held_out_nats), len(told))
         told.insert(at, one)
     return tuple(told)
+
+
+def _heard(remains: Unexplained, candidate: Candidate, data: Data) -> Unexplained:
+    """What speaks against a name of all that remains."""
+    if data.coarse and candidate.effect not in BY_TORQUE:
+        remains = remains.of_forces()  # where torques say nothing, what they leave says nothing against forces
+    if candidate.effect in BY_FORCE:
+        return remains.without_random_rotor()
+    if candidate.effect == WEAK_ROTOR:  # a propeller that is cut is out of balance as well
+        return remains.without_random_rotor(int(dict(candidate.fixed)["rotor"]))
+    return remains
 
 
 def _away(candidate: Candidate, point: Point) -> NDArray:
@@ -162,5 +175,5 @@ def _as_a_factor(candidate: Candidate, step: Step, point: Point, covariance: NDA
 def _by_turning_alone(candidate: Candidate, data: Data, selection: Selection) -> Sequence[str]:
     """A load for weak rotors, and the other way round, where nothing but torques would tell, which say nothing here."""
     if candidate.effect == LOAD and TRIM in selection.final.vehicle.effects:
-        return [TWO_WEAK]
+        return [WEAK_ROTOR]
     return [LOAD] if candidate.effect == WEAKER.effect and data.coarse else ()

@@ -9,7 +9,7 @@ from crazyem.diagnosis.candidates import TRIM
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.locate import AXES, Finding, Located, strongest
 from crazyem.diagnosis.model import Point, Swept
-from crazyem.diagnosis.restless import erratic_rotor, humps, memoryless
+from crazyem.diagnosis.restless import AT_RANDOM, erratic_rotor, humps, memoryless
 from crazyem.diagnosis.trials import Selection
 from crazyem.vehicle import GRAVITY
 
@@ -67,6 +67,12 @@ class Unexplained:
         """What remains of forces, attitudes and velocities: all that speaks of effects that forces tell, where the
         turning does not follow the commands as they were recorded."""
         return Unexplained(tuple(f for f in self.findings if f.signal not in TURNING), self.gained)
+
+    def without_random_rotor(self, rotor: int | None = None) -> "Unexplained":
+        """What remains but a rotor (1 to 4; None: any) that pushes at random, which is no force that lasts."""
+        which = "" if rotor is None else f"rotor {rotor} "
+        left = (f for f in self.findings if f.variable != AT_RANDOM or not f.regime.startswith(which))
+        return Unexplained(tuple(left), self.gained)
 
     def without_force(self) -> "Unexplained":
         """What remains once a random force explains the forces."""

@@ -13,7 +13,7 @@ from closed_loop import DRONE, Hidden, fly
 from crazyem.diagnosis import always, told
 from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis import select as selecting
-from crazyem.diagnosis.always import COARSE_REASON, refine_base
+from crazyem.diagnosis.always import COARSE_REASON, FAST, refine_base
 from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fit import Data, nominal
@@ -23,9 +23,12 @@ from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.named import DOUBTFUL, trust
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.prune import left_out
+from crazyem.diagnosis.restless import AT_RANDOM
 from crazyem.diagnosis.select import select
+from crazyem.diagnosis.told import BY_FORCE
 from crazyem.diagnosis.trials import Selection, Step, Trial
 from crazyem.diagnosis.unexplained import Unexplained, notable
+from crazyem.physics.effects.catalogue import CATALOGUE
 
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
 THRUST = Candidate("thrust_scale", (), ("scale",))
@@ -170,3 +173,17 @@ def test_where_torques_say_nothing_they_say_nothing_against_what_forces_tell():
     assert trust(remains) == DOUBTFUL
     assert trust(remains.of_forces()) == 1.0
     assert trust(remains.beside(left("force", 100.0)).of_forces()) == DOUBTFUL
+
+
+def test_a_rotor_that_pushes_at_random_says_nothing_against_forces_that_last():
+    """One real drone's fourth rotor does, beside a thrust that is a quarter too weak by 80 000 nats."""
+    rotor = Finding("torque", "x", "rotor 4 at random", AT_RANDOM, (0.0, 9.0), 1e-4, 1e-5, "N m", 60.0, 1e-9)
+    shaken = Finding("torque", "x", "frequency 5.2 Hz", "frequency", (0.0, 9.0), 1e-4, 1e-5, "N m", 60.0, 1e-9)
+    remains = Unexplained((rotor,), 900.0)
+    assert trust(remains) == DOUBTFUL
+    assert trust(remains.without_random_rotor()) == 1.0
+    assert trust(remains.without_random_rotor(4)) == 1.0  # nor against its being weak
+    assert trust(remains.without_random_rotor(1)) == DOUBTFUL
+    assert trust(remains.beside(shaken).without_random_rotor()) == DOUBTFUL  # a loop that swings feigns a drag
+    assert set(BY_FORCE) <= set(CATALOGUE)
+    assert not set(BY_FORCE) & set(FAST) - {"thrust_curve"}

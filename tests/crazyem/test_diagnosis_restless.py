@@ -48,7 +48,7 @@ def test_a_rotor_that_disturbs_is_told_by_the_signs_of_its_place(rotor: int) -> 
     rates = rng.normal(size=(ROWS, 3)) + 0.35 * rng.normal(size=(ROWS, 1)) * SIGNS[:, rotor]
     found = erratic_rotor([model_of(rates)], POINT)
     assert found is not None
-    assert (found.signal, found.regime, found.variable) == ("torque", f"rotor {rotor + 1} at random", "rotor")
+    assert (found.signal, found.regime, found.variable) == ("torque", f"rotor {rotor + 1} at random", "at random")
     assert found.effect_size > 0
 
 
