@@ -47,9 +47,8 @@ def held_out_gain(data: Data, point: Point, angles: NDArray, *, yaw_sd: float) -
     bare = [3, 4, 5, 6]
     known = {2: yaw_sd**-2, **dict.fromkeys((3, 4, 5), BIAS_SD**-2), 6: LAG_SD**-2}
     for model in data.models:
-        b, a = (
-            v / dispersion for v in _of(model, point).total(range(7))
-        )  # not what priors say, which does not scatter
+        # what residuals say, that is, and not what priors do, which does not scatter
+        b, a = (v / dispersion for v in _of(model, point).total(range(7)))
         shift = np.array([*angles])
         total += float(b[:3] @ shift - 0.5 * shift @ a[:3, :3] @ shift)
         total += _fitted(b - a[:, :3] @ shift, a, known) - _fitted(b, a, {i: known[i] for i in bare})

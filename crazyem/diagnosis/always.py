@@ -24,7 +24,7 @@ LAG_SD = 2e-3  # s: with nothing hidden and torques as free, 51 to 55 ms instead
 # Relative, about z: rotors that are heavy answer with torque at once, without the lag that hides what sampled commands
 # miss, and then yaw looks too heavy by 20 to 40 %.
 AT_ONCE_SD = 0.25
-# N m s: and as if it were damped, by 1e-5 to 1.9e-4 in 12 flights that shake of drones with such rotors and no damping.
+# N m s: and as if it were damped, by 1e-5 to 1.9e-4 in 11 flights that shake of drones with such rotors and no damping.
 AT_ONCE_DAMPING_SD = 1e-4
 CENTRE_SD = (2e-5, 2e-5, 7e-4)  # m; a height of -0.4 to -0.8 mm is what velocities of onboard filters look like
 VELOCITY_SD, JITTER = 2e-3, 3e-3  # relative: no onboard filter is better; m/s, see `jittery`

@@ -22,7 +22,7 @@ from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
 # Of the errors at 100 and 500 ms, geometric mean over position, velocity, attitude and rate. What was hidden and found
-# in 240 simulated drones has at most 1.10 (late inputs, torque scales: a loop's answer to air is no torque that turns).
+# in 210 simulated drones has at most 1.10 (late inputs, torque scales: a loop's answer to air is no torque that turns).
 WORSE = 1.2
 
 

@@ -177,11 +177,10 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
     if basis.held_out:
         apart = basis.held_out.twin()
         there = on_held_out(apart, fit.point, mine)
-        held, (more, beyond) = there.loglik - basis.held_value, gain_of_both(fit, apart, there, mine)
-        blocks, recording = (
-            np.append(blocks, beyond),
-            np.append(recording, len(data.models) + apart.recordings_of_blocks()),
-        )
+        held = there.loglik - basis.held_value
+        more, beyond = gain_of_both(fit, apart, there, mine)
+        blocks = np.append(blocks, beyond)
+        recording = np.append(recording, len(data.models) + apart.recordings_of_blocks())
         value += held + more
     k = len(trial.candidate.free)
     wald_p = significance(fit, k, offset=sum(len(c.free) for c in basis.accepted))
@@ -345,7 +344,7 @@ def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], No
     rest = [t for t in trials if all(t is not e for e in equals)]
     trials = weighed([*again, *rest], counted=counted)
     close = [t for t in trials if any(t.candidate is a.candidate for a in again)]
-    explain = [t for t in close if t is close[0] or rivals(t, counted=counted)]
+    explain = [t for t in close if t is close[0] or admitted(basis, t)]
     # as fitted to all flights: a drag fitted to slow flight is by chance what ruins a quick one least
     best = max(explain, key=lambda t: t.value - len(t.candidate.free))
     return trials, alike_with(best, close, counted=counted)

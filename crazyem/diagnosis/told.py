@@ -75,7 +75,7 @@ def tell(
         at = own.stop
         away, covariance = _away(candidate, point), solution.covariance[own, own]
         rivals = _rivals(candidate, step, witnessed)
-        heard = _heard(remains, candidate, data)
+        heard = _against(remains, candidate, data)
         confidence = trust(heard) * share(step.taken.evidence, []) * preferred(step.taken, rivals)
         doubted = candidate.effect in selection.doubted
         if doubted or wald(away, covariance, gram, used) > WITHIN:
@@ -117,7 +117,7 @@ def strongest_first(effects: Sequence[Named], beside: Sequence[Named]) -> tuple[
     return tuple(told)
 
 
-def _heard(remains: Unexplained, candidate: Candidate, data: Data) -> Unexplained:
+def _against(remains: Unexplained, candidate: Candidate, data: Data) -> Unexplained:
     """What speaks against a name of all that remains."""
     if data.coarse and candidate.effect not in BY_TORQUE:
         remains = remains.of_forces()  # where torques say nothing, what they leave says nothing against forces

@@ -25,7 +25,7 @@ EVEN = 0.5  # what a name is worth, at least, beside a rival that is not signifi
 TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks or recordings
 MANY = 5  # recordings, from which on it is seen by how much they differ
 # Smaller than this, these are not told from what filters, sampling and the air of a room do: s, s, s, 1, rad, rad/s, 1,
-# 1, N m s/m. And no rotor is lighter, kg m^2: 0.2 g of propeller, 46 mm from tip to tip, have 3e-8; a tenth of it.
+# 1, N m s/m. And no rotor is lighter, kg m^2: a rod of 0.1 g and 46 mm has 1.8e-8, and this is a sixth of it.
 LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "motor_lag": 7.5e-3, "velocity_scale": 0.035,
          "attitude_misalignment": 2e-3, "gyro_bias": 3e-3, "torque_scale": 0.08, "thrust_curve": 0.06,
          "velocity_moment": 3e-6, "rotor_inertia": 3e-9}  # fmt: skip

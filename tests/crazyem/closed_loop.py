@@ -153,6 +153,7 @@ def fly(
     shake: float = 0.3,
     sway: float = 0.0,
     vibration: float = 0.0,
+    sticking: float = 0.0,
     vehicle: Vehicle = DRONE,
 ) -> Recording:
     """A recording at 100 Hz of a controller that runs at 500 Hz.
@@ -162,6 +163,7 @@ def fly(
         shake: rad/s^2 sqrt(s), intensity of random angular impulses.
         sway: rad/s^2, standard deviation of random angular accelerations with a memory of 0.5 s.
         vibration: rad/s^2, amplitude of an angular acceleration about roll and pitch at 6 Hz, a little unsteady.
+        sticking: N, standard deviation of random thrusts of rotor 4 with a memory of 0.05 s.
     """
     hidden = hidden or Hidden()
     rng = np.random.default_rng(seed)
@@ -177,6 +179,10 @@ def fly(
     if vibration > 0:
         phase = 2 * np.pi * 6.0 * time + 3.0 * np.sin(0.7 * time)
         wander[:, :2] += vibration * np.stack([np.cos(phase), np.sin(phase)], 1)
+    if sticking > 0:
+        keep = np.exp(-CONTROL / 0.05)
+        thrust = lfilter([sticking * np.sqrt(1 - keep**2)], [1, -keep], rng.normal(size=steps))
+        wander = wander + thrust[:, None] * levers * SIGNS[:, 3] / np.array(vehicle.inertia)
     rows = np.zeros((steps, 22))
     loop(
         *wanted(seed, time), noise, kicks, wander, np.array(hidden.thrust), hidden.onset, hidden.torque,

@@ -5,6 +5,7 @@ beside two weak rotors, a day's differences; on flights of `closed_loop.py`.
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -187,3 +188,9 @@ def test_a_rotor_that_pushes_at_random_says_nothing_against_forces_that_last():
     assert trust(remains.beside(shaken).without_random_rotor()) == DOUBTFUL  # a loop that swings feigns a drag
     assert set(BY_FORCE) <= set(CATALOGUE)
     assert not set(BY_FORCE) & set(FAST) - {"thrust_curve"}
+    data = SimpleNamespace(coarse=False)
+    for name, rotor, against in (
+        ("linear_drag", 0, False), ("inertia_products", 0, True), ("rotor_fault", 4, False), ("rotor_fault", 1, True),
+    ):  # fmt: skip
+        candidate = Candidate(name, (("rotor", rotor),) if rotor else (), ("x",))
+        assert told._against(remains, candidate, data).found == against  # type: ignore[arg-type]

@@ -4,9 +4,12 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+from closed_loop import DRONE
 
 from crazyem.diagnosis import select
 from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.select import BEATEN, group_of, may_join, name_of
 from crazyem.diagnosis.trials import Step, Trial, better, preferred, told_apart
 from crazyem.diagnosis.workers import Workers
@@ -110,9 +113,12 @@ def test_the_better_explanation_of_all_flights_leads_whichever_ruins_those_held_
     fitted to both explains it by thousands of nats more."""
     linear, quadratic = trial("linear_drag", "xyz", 2000.0), trial("quadratic_drag", "xyz", 9000.0)
     linear, quadratic = replace(linear, evidence=26000.0), replace(quadratic, evidence=12000.0)
-    basis = SimpleNamespace(held_out=object(), data=SimpleNamespace(workers=Workers(1)))
+    point = Point(DRONE, {}, first_guess())
+    basis = SimpleNamespace(held_out=object(), point=point, data=SimpleNamespace(workers=Workers(1)))
     monkeypatch.setattr(select, "sharpened", lambda basis, trial: trial)
     monkeypatch.setattr(select, "weighed", lambda trials, counted: sorted(trials, key=lambda t: -t.evidence))
     trials, equals = select.compared_again(basis, [linear, quadratic], say=lambda text: None)
     assert trials[0] is linear
     assert equals == [quadratic]
+    unsure = replace(quadratic, p_value=0.5)  # what may not be taken does not lead, however well it would fit
+    assert select.compared_again(basis, [linear, unsure], say=lambda text: None)[1][0] is linear

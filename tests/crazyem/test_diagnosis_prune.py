@@ -135,6 +135,9 @@ def test_one_number_at_the_end_of_its_range_is_no_finding():
     assert not matters(POINT.with_effects({"thrust_curve": {"slope_error": low}}), slope)
     assert matters(POINT.with_effects({"thrust_curve": {"slope_error": low + 1e-6}}), slope)
     assert not matters(POINT.with_effects({"thrust_curve": {"slope_error": 0.02}}), slope)
+    spun = Candidate("rotor_inertia", (), ("inertia",))  # no propeller is as light
+    assert not matters(POINT.with_effects({"rotor_inertia": {"inertia": 1.9e-9}}), spun)
+    assert matters(POINT.with_effects({"rotor_inertia": {"inertia": 5e-9}}), spun)
     assert matters(POINT.with_effects({"linear_drag": {"x": 0.0, "y": 0.01, "z": 0.0}}), DRAG)  # one of three
     for axis, size, counts in (("y", 1.2e-3, True), ("y", 0.8e-3, False), ("z", 2e-3, False), ("z", 4e-3, True)):
         point = POINT.with_effects({"linear_drag": {"x": 0.0, "y": 0.0, "z": 0.0, axis: size}})

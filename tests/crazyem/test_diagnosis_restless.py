@@ -146,3 +146,14 @@ def test_what_a_filter_remembers_is_an_innovation_again() -> None:
     assert not quiet.noise.disturbance[3:].any()
     assert np.all(quiet.noise.impulse[3:5] > point.noise.impulse[3:5])
     assert quiet.effects == point.effects
+
+
+def test_a_made_rotor_that_pushes_at_random_is_told() -> None:
+    """By 4 mN with a memory of 0.05 s, for a roll of 4 mN times the arm: which rotor, and about how much."""
+    data = Data([flight_of(fly(sticking=4e-3), DRONE)])
+    quiet = memoryless(data, nominal(data, Point(DRONE, {}, first_guess())))
+    data.settle(quiet)
+    found = erratic_rotor(data.models, quiet)
+    assert found is not None
+    assert found.regime == "rotor 4 at random"
+    assert 0.5 < found.effect_size / (4e-3 * DRONE.arm[0]) < 1.5
