@@ -6,12 +6,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from closed_loop import DRONE
 
 from crazyem.diagnosis import select
 from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.select import additions
 from crazyem.diagnosis.trials import Step, Trial
 from crazyem.diagnosis.workers import Workers
+
+POINT = Point(DRONE, {}, first_guess())
 
 
 def trial(effect: str, gain: float, *, fitted: bool = True, fixed: tuple[tuple[str, object], ...] = ()) -> Trial:
@@ -68,7 +73,7 @@ def test_what_explains_nearly_as_much_is_compared_with_noise_of_its_own(monkeypa
         return replace(t, gain=gained[t.candidate.effect], value=gained[t.candidate.effect])
 
     monkeypatch.setattr(select, "sharpened", sharpened)
-    basis: Any = SimpleNamespace(held_out=None, data=SimpleNamespace(workers=Workers(1)))
+    basis: Any = SimpleNamespace(held_out=None, point=POINT, data=SimpleNamespace(workers=Workers(1)))
     first = [
         replace(trial(effect, gain), value=gain, blocks=np.full(20, gain / 20))
         for effect, gain in (("torque_scale", 1200.0), ("inertia", 1100.0), ("wind", 900.0))  # wind: 0.75 of the best
@@ -90,7 +95,7 @@ def test_what_turns_the_drone_as_well_is_compared_with_noise_of_its_own_however_
         return t
 
     monkeypatch.setattr(select, "sharpened", sharpened)
-    basis: Any = SimpleNamespace(held_out=None, data=SimpleNamespace(workers=Workers(1)))
+    basis: Any = SimpleNamespace(held_out=None, point=POINT, data=SimpleNamespace(workers=Workers(1)))
     first = [
         replace(trial(effect, gain), value=gain, blocks=np.full(20, gain / 20))
         for effect, gain in (("motor_lag", 40.0), (other, 15.0))
