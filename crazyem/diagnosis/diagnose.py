@@ -25,7 +25,7 @@ from crazyem.diagnosis.place import depends_on_place
 from crazyem.diagnosis.sampling import of_a_real_drone
 from crazyem.diagnosis.select import select
 from crazyem.diagnosis.split import LOAD, WEAKER, as_load, as_two
-from crazyem.diagnosis.steady import left_as_trim
+from crazyem.diagnosis.steady import left_as_trim, with_its_thrust
 from crazyem.diagnosis.told import MEASURED_LATE, strongest_first, tell
 from crazyem.diagnosis.trials import Selection
 from crazyem.diagnosis.unexplained import Unexplained, unexplained
@@ -134,7 +134,9 @@ def diagnose(
         separate = tuple(dict.fromkeys((*separate, *(CATALOGUE[n].separates for g in alike for n in g))))
     effects = strongest_first(told.effects, beside)
     left_out = {n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)}
-    fitted_vehicle = left_as_trim(flights, _with_effects(assumed, selection, beside), remains, workers)
+    fitted_vehicle = _with_effects(assumed, selection, beside)
+    fitted_vehicle = with_its_thrust(fitted_vehicle, data, selection.final, selection.accepted)
+    fitted_vehicle = left_as_trim(flights, fitted_vehicle, remains, workers)
     mismatch = bool(effects) or remains.found
     return Diagnosis(
         vehicle, fitted_vehicle, tuple(r.path for r in recordings), tuple(r.path for r in held_out), mismatch,

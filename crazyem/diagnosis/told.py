@@ -12,7 +12,7 @@ from crazyem.diagnosis.always import solved, unsure
 from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.named import DOUBTFUL, Named, Value, one_factor, share, trust
+from crazyem.diagnosis.named import DOUBTFUL, Named, Value, at_most, one_factor, share, trust
 from crazyem.diagnosis.split import LOAD, WEAKER, instead_of_a_load
 from crazyem.diagnosis.trials import Selection, Step, Trial, preferred, told_apart, wald
 from crazyem.diagnosis.unexplained import Unexplained
@@ -81,6 +81,7 @@ def tell(
         if doubted or wald(away, covariance, gram, used) > WITHIN:
             confidence = min(confidence, DOUBTFUL)
         p_value = min(1.0, step.taken.p_value * max(1, selection.tried))
+        confidence = min(confidence, at_most(step.taken.held_out, p_value))
         # late inputs and late measurements are one model, so it is fitted as the first, whatever it is called
         late = candidate.effect == "input_delay" and MEASURED_LATE in witnessed
         name, label = (MEASURED_LATE, MEASURED_LATE) if late else (candidate.effect, candidate.label)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.named import Named, one_factor
+from crazyem.diagnosis.named import CALIBRATED, DOUBTFUL, SELDOM, Named, at_most, one_factor
 from crazyem.diagnosis.told import strongest_first
 
 OWN = np.array([1.66e-5, 1.67e-5, 2.93e-5])
@@ -46,3 +46,18 @@ def test_what_is_found_beside_the_selection_stands_where_its_evidence_puts_it():
     found = strongest_first(told, [named("input_delay", 72.0), named("gusts", 3.0)])
     assert [e.name for e in found] == ["thrust_scale", "input_delay", "linear_drag", "wind", "gusts"]
     assert strongest_first((), [named("gusts", 3.0)])[0].name == "gusts"
+
+
+@given(st.floats(-100.0, 1e4), st.floats(-100.0, 1e4), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_more_evidence_never_makes_a_name_less_sure(held, more, p_value, other) -> None:
+    least, most = sorted((held, more))
+    sure, unsure = sorted((p_value, other))
+    assert DOUBTFUL <= at_most(least, unsure) <= at_most(most, unsure) <= CALIBRATED
+    assert at_most(least, unsure) <= at_most(least, sure)
+
+
+def test_a_name_that_brings_little_elsewhere_is_not_sure() -> None:
+    """Products of inertia with 8 nats and p = 0.003 were 95 % sure; what was hidden was a rotor that sticks."""
+    assert at_most(8.0, 0.003) == DOUBTFUL
+    assert at_most(8.0, 1e-6) == SELDOM
+    assert at_most(30.0, 0.003) == CALIBRATED

@@ -60,6 +60,7 @@ def test_a_steady_torque_that_nothing_explains_is_written_as_a_trim() -> None:
     assert trim["z"] == pytest.approx(TWIST, rel=0.1)  # a day is worth twice as much
     assert abs(trim["x"]) < 2e-5
     assert abs(trim["y"]) < 2e-5
+    assert found.fitted_vehicle.effects["thrust_scale"]["scale"] == pytest.approx(1.0, abs=0.005)
     assert TRIM not in DRONE.effects
     # on another day thrust is 1 % less, the rotors on the left a little weaker, and the twist another
     other = fly(Hidden(twist=TWIST + 1e-4, thrust=(0.995, 0.995, 0.985, 0.985)), seconds=14.0, seed=6)
@@ -74,14 +75,17 @@ def test_what_a_file_explains_leaves_no_trim() -> None:
 
 def test_a_drone_whose_commands_shake_has_a_trim_first() -> None:
     """As those of real drones with a deck, logged at 100 Hz; judged by a file that knows no trim, then by its own."""
-    healthy = shaking(fly(Hidden(twist=TWIST), seconds=14.0, seed=8), seed=1)
+    strong = 1.04  # within what any drone may have, and part of its file all the same
+    healthy = shaking(fly(Hidden(twist=TWIST, thrust=(strong,) * 4), seconds=14.0, seed=8), seed=1)
     found = diagnose([healthy], DRONE)
+    assert [e.name for e in found.effects] == [TRIM]
+    assert found.fitted_vehicle.effects["thrust_scale"]["scale"] == pytest.approx(strong, abs=0.005)
     assert found.effects[0].name == TRIM
     assert found.effects[0].parameters["z"].value == pytest.approx(TWIST, rel=0.1)
     assert {"inertia", "motor_lag", "center_of_mass"} <= set(found.left_out)
-    again = shaking(fly(Hidden(twist=TWIST), seconds=14.0, seed=9), seed=2)
+    again = shaking(fly(Hidden(twist=TWIST, thrust=(strong,) * 4), seconds=14.0, seed=9), seed=2)
     assert not diagnose([again], found.fitted_vehicle).mismatch
-    weak = Hidden(twist=TWIST, thrust=(1.0, 1.0, 0.72, 1.0))
+    weak = Hidden(twist=TWIST, thrust=(strong, strong, 0.72 * strong, strong))
     cut = diagnose([shaking(fly(weak, seconds=14.0, seed=10), seed=3)], found.fitted_vehicle)
     assert (cut.effects[0].name, cut.effects[0].chosen["rotor"]) == ("rotor_fault", 3)
     assert cut.effects[0].parameters["scale"].value == pytest.approx(0.72, abs=0.05)
