@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from crazyem.diagnosis.always import abstained, differing, steadied, unlike_a_body
+from crazyem.diagnosis.balance import by_balance
 from crazyem.diagnosis.beside import beside_the_regression, late_rotors
 from crazyem.diagnosis.candidates import TRIM, Candidate, candidates_for
 from crazyem.diagnosis.exchange import exchanged, named_again
@@ -29,14 +30,13 @@ from crazyem.diagnosis.steady import left_as_trim, with_its_thrust
 from crazyem.diagnosis.told import MEASURED_LATE, strongest_first, tell
 from crazyem.diagnosis.trials import Selection
 from crazyem.diagnosis.unexplained import Unexplained, unexplained
-from crazyem.diagnosis.witness import false_speed, late_measurements
+from crazyem.diagnosis.witness import TELLING, false_speed, late_measurements
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
 Say = Callable[[str], None]
-TELLING = 3.0  # nats by which a witness tells two effects apart
 WEAK_OR_MISREAD = ("rotor_fault", "rotor_sensor")
 
 
@@ -102,6 +102,7 @@ def diagnose(
         selection = select(data, selection.nominal, candidates, held_out=apart, begun=selection, say=say)
     selection, pull = by_place(data, apart, selection, say)
     selection, witnessed = _heard(data, apart, selection, recordings)
+    selection, balance = by_balance(data, selection)
     judges = held_out or recordings
     selection = without_what_misleads(data, selection, assumed, judges, withhold=withhold, say=say)
     say("where the nominal model fails")
@@ -125,7 +126,7 @@ def diagnose(
         # only torques would tell weaker rotors from a load
         WEAKER.effect: None if data.coarse else as_load(data, apart, selection),
     }
-    told = tell(data, selection, remains, witnessed=witnessed, in_place=in_place)
+    told = tell(data, selection, remains, witnessed=witnessed, in_place=in_place, balance=balance)
     groups, separate = told.groups, told.separate
     if flights[0].inputs.measured and not any(e.name == "input_delay" for e in told.effects):
         late, alike = late_rotors(recordings, held_out, vehicle, wanted, left_out)

@@ -7,8 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.special import expit
 
 from crazyem.diagnosis.always import solved, unsure
+from crazyem.diagnosis.balance import DAYS, Balance, how_weak, prefers
+from crazyem.diagnosis.balance import steady as steadily
 from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.fit import Data
 from crazyem.diagnosis.model import Point
@@ -16,6 +19,7 @@ from crazyem.diagnosis.named import DOUBTFUL, Named, Value, at_most, one_factor,
 from crazyem.diagnosis.split import LOAD, WEAKER, instead_of_a_load
 from crazyem.diagnosis.trials import Selection, Step, Trial, preferred, told_apart, wald
 from crazyem.diagnosis.unexplained import Unexplained
+from crazyem.diagnosis.witness import TELLING
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 WITHIN = 0.05  # p-value from which an effect's own uncertainty holds that there is none of it
@@ -50,6 +54,7 @@ def tell(
     *,
     witnessed: frozenset[str],
     in_place: Mapping[str, tuple[Trial, Trial] | None],
+    balance: Balance | None = None,
 ) -> Told:
     """The selected effects as they are told.
 
@@ -57,6 +62,7 @@ def tell(
         remains: the structure that they leave, beside which no name is sure.
         witnessed: names that a witness told from their look-alikes.
         in_place: for an effect the two trials, of it and of what else could stand in its place.
+        balance: what is steady, by which names are told apart where a file has a trim.
     """
     if not selection.accepted:
         return Told()
@@ -74,11 +80,14 @@ def tell(
         own = slice(at, at + len(candidate.free))
         at = own.stop
         away, covariance = _away(candidate, point), solution.covariance[own, own]
-        rivals = _rivals(candidate, step, witnessed)
+        rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, witnessed), balance)
         heard = _against(remains, candidate, data)
         confidence = trust(heard) * share(step.taken.evidence, []) * preferred(step.taken, rivals)
+        confidence *= float(np.prod(expit(list(steady.values()))))
         doubted = candidate.effect in selection.doubted
-        if doubted or wald(away, covariance, gram, used) > WITHIN:
+        by_day = _by_the_day(candidate, point, balance)
+        none_of_it = wald(away, covariance, gram, used) if by_day is None else by_day[1]
+        if doubted or none_of_it > WITHIN:
             confidence = min(confidence, DOUBTFUL)
         p_value = min(1.0, step.taken.p_value * max(1, selection.tried))
         confidence = min(confidence, at_most(step.taken.held_out, p_value))
@@ -86,7 +95,7 @@ def tell(
         late = candidate.effect == "input_delay" and MEASURED_LATE in witnessed
         name, label = (MEASURED_LATE, MEASURED_LATE) if late else (candidate.effect, candidate.label)
         chosen: dict[str, object] = {"streams": ("state", "gyro")} if late else dict(candidate.fixed)
-        numbers = _numbers(candidate, point, sd[own], width, never)
+        numbers = by_day[0] if by_day else _numbers(candidate, point, sd[own], width, never)
         named = Named(name, label, numbers, chosen, step.taken.held_out, p_value, confidence)
         found.append((step.taken.evidence, named))
 
@@ -94,6 +103,7 @@ def tell(
             separate.append(SHAKES)
         equal = [
             *(t.candidate.effect for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}),
+            *(name for name, nats in steady.items() if nats < TELLING),
             *(() if candidate.effect in witnessed else SAME.get(candidate.effect, ())),
             *_in_place(candidate, in_place, selection),
             *_as_a_factor(candidate, step, point, covariance),
@@ -146,6 +156,32 @@ def _numbers(
         low, high = values[name] - width * error, values[name] + width * error
         out[name] = Value(values[name], p.unit, error, (max(low, p.low), min(high, p.high)))
     return out
+
+
+def _by_the_day(candidate: Candidate, point: Point, balance: Balance | None) -> tuple[dict[str, Value], float] | None:
+    """How weak a rotor is by the balance, of which the day is most of what is uncertain, and the p-value that it is not
+    weak at all; None for other effects, and where there is no balance."""
+    if balance is None or candidate.effect != WEAK_ROTOR or not steadily(candidate):
+        return None
+    scale = float(candidate.values(point)["scale"])
+    sd = how_weak(balance, int(dict(candidate.fixed)["rotor"]))[1]
+    reach = sd * float(stats.t.ppf(0.975, DAYS))
+    value = Value(scale, candidate.parameter("scale").unit, sd, (max(scale - reach, 0.0), scale + reach))
+    return {"scale": value}, 2.0 * float(stats.t.sf((1.0 - scale) / sd, DAYS))
+
+
+def _steady_rivals(
+    candidate: Candidate, rivals: Sequence[Trial], balance: Balance | None
+) -> tuple[list[Trial], dict[str, float]]:
+    """The rivals of which the balance says nothing, and of the others the nats by which it prefers the candidate."""
+    if balance is None:
+        return list(rivals), {}
+    said = [(t, prefers(balance, candidate, t.candidate)) for t in rivals]
+    nats: dict[str, float] = {}
+    for trial, margin in said:
+        if margin is not None:
+            nats[trial.candidate.effect] = min(margin, nats.get(trial.candidate.effect, np.inf))
+    return [t for t, margin in said if margin is None], nats
 
 
 def _rivals(candidate: Candidate, step: Step, witnessed: frozenset[str]) -> list[Trial]:

@@ -16,6 +16,7 @@ from crazyem.diagnosis.model import Point
 from crazyem.doctor.streams import airtime, ordered
 from crazyem.recordings.recording import Recording
 
+TELLING = 3.0  # nats by which a witness tells two effects apart
 PUNCTUAL, PUNCTUAL_SD = 1e-3, 1.5e-3  # s: lag of the accelerometer behind the forces of commands where nothing is late
 TWINS_SD = 0.01  # relative: speeds of two healthy rotors at one command
 LAG = 6  # which of the parameters of `accelerometer.tilt` is the lag [s]
