@@ -135,8 +135,9 @@ def how_weak(balance: Balance, rotor: int) -> tuple[float, float]:
 def by_balance(data: Data, selection: Selection) -> tuple[Selection, Balance | None]:
     """The selection with a steady effect named and sized by the balance, and that balance.
 
-    Of what the balance does not tell apart the simplest gives the name. None where there is nothing to be weighed: no
-    trim in the vehicle's file, or not just one effect that brings a steady force or torque.
+    Of what the balance does not tell apart the simplest gives the name; what it prefers to the name takes its place.
+    None where there is nothing to be weighed: no trim in the vehicle's file, or not just one effect that brings a
+    steady force or torque.
     """
     names = {c.effect for c in selection.accepted}
     mine = next((c for c in selection.accepted if c.effect in FREE), None)
@@ -145,7 +146,7 @@ def by_balance(data: Data, selection: Selection) -> tuple[Selection, Balance | N
         return selection, None
     try:
         balance = balance_of(data, selection.nominal)
-        selection, mine = _simplest(data, selection, mine, balance)
+        selection, mine = _named(data, selection, mine, balance)
         if mine.effect == "rotor_fault":
             lack = how_weak(balance, int(dict(mine.fixed)["rotor"]))[0]
             if 0.0 < lack < 1.0:
@@ -155,19 +156,20 @@ def by_balance(data: Data, selection: Selection) -> tuple[Selection, Balance | N
     return selection, balance
 
 
-def _simplest(data: Data, selection: Selection, mine: Candidate, balance: Balance) -> tuple[Selection, Candidate]:
-    """The selection with the simplest of what the balance does not tell apart, and which that is."""
+def _named(data: Data, selection: Selection, mine: Candidate, balance: Balance) -> tuple[Selection, Candidate]:
+    """The selection with what the balance prefers to all others, else with the simplest of what it does not tell from
+    the name; and which that is."""
     step = next(s for s in selection.steps if s.taken and s.taken.candidate.effect == mine.effect)
-    simpler: list[tuple[float, Trial]] = []
+    rivals: list[tuple[float, Trial]] = []
     for trial in step.explanations():
         nats = prefers(balance, mine, trial.candidate)
-        if trial.fitted is None or nats is None or FREE[trial.candidate.effect] >= FREE[mine.effect]:
-            continue
-        if nats < TELLING:
-            simpler.append((nats, trial))
-    if not simpler:
+        if nats is not None and trial.fitted is not None:
+            rivals.append((nats, trial))
+    beaten = [r for r in rivals if r[0] < -TELLING]
+    simpler = [r for r in rivals if r[0] < TELLING and FREE[r[1].candidate.effect] < FREE[mine.effect]]
+    if not beaten and not simpler:
         return selection, mine
-    best = min(simpler, key=lambda entry: entry[0])[1]
+    best = min(beaten or simpler, key=lambda entry: entry[0])[1]
     return _instead(data, selection, step, mine, best), best.candidate
 
 

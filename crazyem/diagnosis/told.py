@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.special import expit
 
 from crazyem.diagnosis.always import solved, unsure
 from crazyem.diagnosis.balance import DAYS, Balance, how_weak, prefers
@@ -83,7 +82,7 @@ def tell(
         rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, witnessed), balance)
         heard = _against(remains, candidate, data)
         confidence = trust(heard) * share(step.taken.evidence, []) * preferred(step.taken, rivals)
-        confidence *= float(np.prod(expit(list(steady.values()))))
+        confidence /= 1.0 + sum(float(np.exp(-nats)) for nats in steady.values())
         doubted = candidate.effect in selection.doubted
         by_day = _by_the_day(candidate, point, balance)
         none_of_it = wald(away, covariance, gram, used) if by_day is None else by_day[1]

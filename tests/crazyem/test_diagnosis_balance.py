@@ -160,29 +160,40 @@ def test_the_balance_of_a_flight_is_what_was_hidden_in_it() -> None:
     assert found.rotors[:, 0] == pytest.approx(0.25 + 0.25 * 1.1e-3 / TURN * np.array([1, -1, 1, -1]), abs=5e-3)
 
 
-def test_a_name_stands_unless_a_simpler_one_is_no_worse(monkeypatch) -> None:
-    """A load of three numbers gives way to a rotor of one, where its drag is there; and stays where it is not."""
-    instead, sized = [], []
+def test_a_name_stands_unless_another_is_better_or_a_simpler_one_no_worse(monkeypatch) -> None:
+    """A load of three numbers gives way to a rotor of one, where its drag is there; a rotor to a load, where two rotors
+    are weak."""
+    instead: list[Trial] = []
+    sized: list[float] = []
     monkeypatch.setattr(balancing, "_instead", lambda data, s, step, old, trial: instead.append(trial) or s)
-    monkeypatch.setattr(balancing, "_sized", lambda data, s, mine, values: sized.append((mine.label, values)) or s)
+    monkeypatch.setattr(balancing, "_sized", lambda data, s, mine, values: sized.append(values["scale"]) or s)
     fitted: Any = SimpleNamespace()
 
     def trial(candidate: Candidate) -> Trial:
         return Trial(candidate, 100.0, 100.0, 1.0, 1e-9, 100.0, fitted=fitted)
 
-    trials = (trial(LOAD), trial(rotor(3)), trial(DRAG), replace(trial(STRONG), fitted=None))
-    step: Any = SimpleNamespace(taken=trials[0], explanations=lambda: list(trials[1:]))
+    unfitted = replace(trial(STRONG), fitted=None)
     point = Point(TRIMMED, {}, first_guess())
-    selection: Any = SimpleNamespace(accepted=(LOAD, DRAG), steps=(step,), nominal=point)
     data: Any = None
-    for lack, name in ((0.25 * EACH[2], "rotor_fault"), (loaded(0.08, 0.0, 0.03), "payload")):
+    left = loaded(0.08, 0.0, 0.03)
+    for lack, name, rival, taken in (
+        (0.25 * EACH[2], LOAD, rotor(3), "rotor_fault"),  # as good, and simpler
+        (left, LOAD, rotor(3), ""),
+        (left, rotor(3), LOAD, "payload"),
+        (0.25 * EACH[2], rotor(3), LOAD, ""),
+        (0.1 * EACH[2], rotor(3), LOAD, ""),  # too little to tell
+    ):
         shown = balance(lack)
+        trials = (trial(name), trial(rival), trial(DRAG), unfitted)
+        step: Any = SimpleNamespace(taken=trials[0], explanations=lambda trials=trials: list(trials[1:]))
+        selection: Any = SimpleNamespace(accepted=(name, DRAG), steps=(step,), nominal=point)
         monkeypatch.setattr(balancing, "balance_of", lambda data, point, shown=shown: shown)
         instead.clear()
         sized.clear()
         assert by_balance(data, selection)[1] is shown
-        assert [t.candidate.effect for t in instead] == ([name] if name == "rotor_fault" else [])
-        assert [v["scale"] for _, v in sized] == pytest.approx([0.75] if name == "rotor_fault" else [])
+        assert [t.candidate.effect for t in instead] == ([taken] if taken else [])
+        lacks = {"rotor_fault": True, "payload": False, "": name is not LOAD}[taken]
+        assert sized == pytest.approx([1.0 - how_weak(shown, 3)[0]] if lacks else [])
     # two steady effects, one that sets in, a trim that was found, no trim in the file: nothing is weighed
     trimmed = (LOAD, Candidate(TRIM, (), ("x",)))
     asked = [((LOAD, STRONG), TRIMMED), ((rotor(2, onset=3.0),), TRIMMED), (trimmed, TRIMMED), ((LOAD,), DRONE)]
