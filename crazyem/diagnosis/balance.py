@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear, minimize_scalar
 
 from crazyem.diagnosis.always import THRUST_SD, nuisances, solved, with_nuisances
-from crazyem.diagnosis.candidates import TRIM, Candidate
+from crazyem.diagnosis.candidates import ON_BOARD, TRIM, Candidate
 from crazyem.diagnosis.exchange import exchanged
 from crazyem.diagnosis.fit import Data, DivergedError, refine
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.sampling import TRIM_SD
 from crazyem.diagnosis.trials import Selection, Step, Trial
 from crazyem.diagnosis.witness import TELLING
-from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.rotors import wrench
 
 # Degrees of freedom of the day's covariance: known from some twelve days of two drones, four numbers each. Normal tails
@@ -101,11 +100,10 @@ def _likely(distance: float) -> float:
 
 def _loaded(root: NDArray, lack: NDArray) -> float:
     """Squared distance of the balance from that of the load which comes nearest."""
-    reach = {p.name: p.high for p in CATALOGUE["payload"].parameters}
 
     def distance(share: float) -> float:
         """With a load of a share of the whole weight: it is missing thrust, and draws the centre to where it is."""
-        most = share * np.array([reach["y"], reach["x"]])
+        most = np.full(2, share * ON_BOARD)
         rest = lack - root[:, 0] * share
         if share <= 0.0:
             return float(rest @ rest)

@@ -152,8 +152,11 @@ def _numbers(
     for name, own in zip(candidate.free, sd, strict=True):
         p = candidate.parameter(name)
         error = float(np.hypot(own, never.get((candidate.effect, name), 0.0)))
+        least, most = candidate.range_of(name)
+        if values[name] in (least, most) and values[name] != p.neutral:  # it may be anywhere, for all that is known
+            error = max(error, (most - least) / 12**0.5)
         low, high = values[name] - width * error, values[name] + width * error
-        out[name] = Value(values[name], p.unit, error, (max(low, p.low), min(high, p.high)))
+        out[name] = Value(values[name], p.unit, error, (max(low, least), min(high, most)))
     return out
 
 

@@ -85,6 +85,15 @@ def test_a_load_by_two_rotors_is_none_of_them() -> None:
     assert weighed(shown, "payload", {}) == pytest.approx(-3.0, abs=1e-3)
 
 
+def test_no_load_is_further_out_than_the_drone() -> None:
+    """2.3 mm of torque over thrust with no thrust missing: 40 mm from the middle it would be 6 % of the weight."""
+    distance = 0.0023 / 0.04
+    nearest = min(((m / SD[0]) ** 2 + (0.0023 - 0.04 * m) ** 2 / SD[1] ** 2) for m in np.linspace(0.0, distance, 2000))
+    found = weighed(balance(np.array([0.0, -0.0023, 0.0, 0.0])), "payload", {})
+    assert found == pytest.approx(-0.5 * (DAYS + 4) * np.log1p(nearest / DAYS) - 3.0, abs=1e-3)
+    assert found < -4.0
+
+
 def test_a_healthy_drone_is_best_explained_by_nothing_and_two_weak_rotors_by_a_load() -> None:
     assert all(
         weighed(balance(np.zeros(4)), name, {"rotor": 1}) == pytest.approx(-n, abs=1e-6) for name, n in FREE.items()

@@ -1,14 +1,22 @@
 """What a name is said with: inertias that are one factor on the torques, and a group that says so."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from crazyem.diagnosis.always import unsure
+from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.diagnose import diagnose
+from crazyem.diagnosis.fit import Data
+from crazyem.diagnosis.flight import flight_of
+from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.named import CALIBRATED, DOUBTFUL, SELDOM, Named, at_most, one_factor
-from crazyem.diagnosis.told import strongest_first
+from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.told import _numbers, strongest_first
 
 OWN = np.array([1.66e-5, 1.67e-5, 2.93e-5])
 
@@ -61,3 +69,28 @@ def test_a_name_that_brings_little_elsewhere_is_not_sure() -> None:
     assert at_most(8.0, 0.003) == DOUBTFUL
     assert at_most(8.0, 1e-6) == SELDOM
     assert at_most(30.0, 0.003) == CALIBRATED
+
+
+def point_of(**effects: dict[str, Any]) -> Point:
+    return Point(DRONE, effects, first_guess())
+
+
+def test_a_number_at_the_end_of_what_is_admitted_may_be_anywhere() -> None:
+    load = Candidate("payload", (), ("mass", "x", "y"))
+    point = point_of(payload={"mass": 0.002, "x": -0.04, "y": 0.01, "z": 0.0})
+    told = _numbers(load, point, np.array([1e-4, 1e-3, 1e-3]), 2.0, {})
+    assert told["y"].ci95 == pytest.approx((0.008, 0.012))
+    assert told["x"].sd == pytest.approx(0.08 / 12**0.5)
+    assert told["x"].ci95[0] == pytest.approx(-0.04)  # never beyond
+    drag = Candidate("linear_drag", (), ("x", "z"))
+    told = _numbers(drag, point_of(linear_drag={"x": 0.02, "z": 0.0}), np.array([1e-3, 1e-3]), 2.0, {})
+    assert told["z"].ci95 == pytest.approx((0.0, 2e-3))  # none of it is no end
+
+
+def test_what_no_scatter_shows_is_part_of_an_interval() -> None:
+    data = Data([flight_of(fly(seconds=6.0), DRONE)])
+    never = unsure(data, point_of(suspended_load={"mass": 0.002, "length": 0.4}))
+    assert never["suspended_load", "length"] == pytest.approx(0.002)
+    assert never["suspended_load", "mass"] == pytest.approx(3e-3 * DRONE.mass)
+    assert never["thrust_curve", "slope_error"] == pytest.approx(0.02)
+    assert unsure(data, point_of())["suspended_load", "length"] == 0.0
