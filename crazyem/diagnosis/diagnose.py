@@ -26,7 +26,7 @@ from crazyem.diagnosis.place import depends_on_place
 from crazyem.diagnosis.sampling import of_a_real_drone
 from crazyem.diagnosis.select import select
 from crazyem.diagnosis.split import LOAD, WEAKER, as_load, as_two
-from crazyem.diagnosis.steady import left_as_trim, with_its_thrust
+from crazyem.diagnosis.steady import left_as_trim, with_its_thrust, with_whole_torques
 from crazyem.diagnosis.told import MEASURED_LATE, strongest_first, tell
 from crazyem.diagnosis.trials import Selection
 from crazyem.diagnosis.unexplained import Unexplained, unexplained
@@ -102,7 +102,7 @@ def diagnose(
         selection = select(data, selection.nominal, candidates, held_out=apart, begun=selection, say=say)
     selection, pull = by_place(data, apart, selection, say)
     selection, witnessed = _heard(data, apart, selection, recordings)
-    selection, balance = by_balance(data, selection)
+    selection, balance = by_balance(data, with_whole_torques(data, selection))
     judges = held_out or recordings
     selection = without_what_misleads(data, selection, assumed, judges, withhold=withhold, say=say)
     say("where the nominal model fails")

@@ -19,9 +19,10 @@ from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.gusts import PUSH, push_of
 from crazyem.diagnosis.model import Noise, Point
 from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.sampling import held
 from crazyem.diagnosis.select import Basis, shortlist, step_of
-from crazyem.diagnosis.steady import as_steady, beside_a_trim, by_onsets
-from crazyem.diagnosis.trials import SURE, SURE_DAILY, Trial, _inverse, matters, preferred, sure_enough
+from crazyem.diagnosis.steady import as_steady, beside_a_trim, by_onsets, with_whole_torques
+from crazyem.diagnosis.trials import SURE, SURE_DAILY, Selection, Trial, _inverse, matters, preferred, sure_enough
 from crazyem.diagnosis.workers import Workers
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
@@ -89,6 +90,30 @@ def test_a_drone_whose_commands_shake_has_a_trim_first() -> None:
     cut = diagnose([shaking(fly(weak, seconds=14.0, seed=10), seed=3)], found.fitted_vehicle)
     assert (cut.effects[0].name, cut.effects[0].chosen["rotor"]) == ("rotor_fault", 3)
     assert cut.effects[0].parameters["scale"].value == pytest.approx(0.72, abs=0.05)
+
+
+@pytest.mark.parametrize("torque", [0.97, 1.03])
+def test_a_centre_of_mass_is_where_the_mean_commands_are_balanced(torque: float) -> None:
+    """Rotors on the left weaker, on the right stronger by 4 %, and quick torques off by 3 %, as sampled commands make
+    them look. A drone that flies for a while and does not turn over has no torque on average: no fit needed."""
+    flown = fly(Hidden(thrust=(1.04, 1.04, 0.96, 0.96)), seconds=14.0, seed=11)
+    flight = flight_of(flown, DRONE)
+    swung = flight.inputs.thrust - flight.inputs.thrust.mean(0)
+    seen = replace(flight, inputs=replace(flight.inputs, thrust=flight.inputs.thrust.mean(0) + torque * swung))
+    along_x, along_y, _ = held(seen, DRONE)
+    data = Data([seen])
+    shifted = Candidate("center_of_mass", (), ("x", "y", "z"))
+    fitted = refine_base(data, nominal(data, Point(DRONE, {"center_of_mass": {"y": 1e-3}}, first_guess())), [shifted])
+    selection: Any = Selection(fitted.point, fitted.point, (), (shifted,), fitted, 1)
+    loose = fitted.point.effects["center_of_mass"]
+    whole = with_whole_torques(data, selection).final.effects["center_of_mass"]
+    assert whole["y"] == pytest.approx(along_x, rel=0.015)
+    assert whole["x"] == pytest.approx(-along_y, abs=2e-5)
+    assert abs(loose["y"] - along_x) > 2 * abs(whole["y"] - along_x)
+    # what speaks of all torques, or a file of a real drone, keeps what it has
+    named = replace(selection, accepted=(shifted, Candidate("torque_scale", (), ("scale",))))
+    assert with_whole_torques(data, named) is named
+    assert with_whole_torques(data, replace(selection, accepted=(LOAD, WEAK))) is not selection
 
 
 def test_with_a_trim_that_nobody_knew_what_is_steady_is_not_told_from_it() -> None:
