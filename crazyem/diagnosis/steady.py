@@ -1,4 +1,5 @@
-"""Steady torques: a trim among its look-alikes, and what is left of one in the vehicle that was fitted.
+"""Steady torques: a trim among its look-alikes, what is left of one in the vehicle that was fitted, and the centre of
+mass that whole torques balance.
 
 A torque that acts all the time and that no effect explains is what a real drone needs to hover: rotors that are not
 equal, nor upright. It stays unexplained, but the file that is written has it, so that a simulator flies as the drone

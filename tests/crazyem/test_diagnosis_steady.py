@@ -11,6 +11,7 @@ from closed_loop import DRONE, Hidden, fly
 from crazyem.diagnosis import model as modelling
 from crazyem.diagnosis import prune as pruning
 from crazyem.diagnosis import select as selecting
+from crazyem.diagnosis import steady as steadying
 from crazyem.diagnosis.always import refine_base
 from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.diagnose import diagnose
@@ -110,10 +111,29 @@ def test_a_centre_of_mass_is_where_the_mean_commands_are_balanced(torque: float)
     assert whole["y"] == pytest.approx(along_x, rel=0.015)
     assert whole["x"] == pytest.approx(-along_y, abs=2e-5)
     assert abs(loose["y"] - along_x) > 2 * abs(whole["y"] - along_x)
-    # what speaks of all torques, or a file of a real drone, keeps what it has
-    named = replace(selection, accepted=(shifted, Candidate("torque_scale", (), ("scale",))))
-    assert with_whole_torques(data, named) is named
-    assert with_whole_torques(data, replace(selection, accepted=(LOAD, WEAK))) is not selection
+
+
+def test_what_keeps_the_freedom_of_all_torques(monkeypatch) -> None:
+    """Where torques were named, no centre is to be known, the day's trim is free, or the fit goes astray."""
+    data: Any = SimpleNamespace()
+    shifted, torques = (Candidate(n, (), ("y",)) for n in ("center_of_mass", "torque_scale"))
+    filed = replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}})
+    asked: list[Any] = []
+
+    def lost(*arguments: Any, **options: Any) -> Any:
+        asked.append(arguments)
+        raise DivergedError("lost")
+
+    monkeypatch.setattr(steadying, "refine", lost)
+    monkeypatch.setattr(steadying, "nuisances", lambda data, point, accepted: [])
+    for accepted, vehicle in (((shifted, torques), DRONE), ((WEAK,), DRONE), ((), DRONE), ((shifted,), filed)):
+        kept: Any = SimpleNamespace(accepted=accepted, final=point_of(vehicle))
+        assert with_whole_torques(data, kept) is kept
+    assert not asked
+    for name in ("center_of_mass", "payload"):
+        tried: Any = SimpleNamespace(accepted=(replace(shifted, effect=name),), final=point_of(DRONE))
+        assert with_whole_torques(data, tried) is tried
+    assert len(asked) == 2
 
 
 def test_with_a_trim_that_nobody_knew_what_is_steady_is_not_told_from_it() -> None:

@@ -216,7 +216,7 @@ def test_a_cut_propeller_is_named_and_relabelled(shared_recordings, healthy) -> 
 
 @pytest.mark.slow
 def test_how_much_a_cut_propeller_lacks_is_known(shared_recordings, healthy) -> None:
-    """By two tables of the same flights, which share only what the drone did; the more was cut the more it lacks."""
+    """By two flights with each propeller, logged in different tables; the more was cut the more it lacks."""
     told = []
     for cut in ("1.5mm_1.5mm_44mm", "2.5mm_2.5mm_42mm", "3.5mm_3.5mm_40mm"):
         values = []
