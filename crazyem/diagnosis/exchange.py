@@ -13,7 +13,7 @@ import numpy as np
 from crazyem.diagnosis.always import refine_anew, refine_base, without
 from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.fit import Data, DivergedError
-from crazyem.diagnosis.split import judged
+from crazyem.diagnosis.split import judged, tuned_of
 from crazyem.diagnosis.trials import SURE, Selection, Step, Trial, at_the_end, margin, matters, told_apart
 
 NEAR = 100.0  # nats by which a rival may have been worse when it was tried
@@ -62,10 +62,15 @@ def _asked_again(
         point = bare.with_effects({rival.candidate.effect: rival.candidate.values(rival.fitted.point)})
         starts.append((point, _in_place(selection.accepted, mine, rival.candidate)))
     found = data.workers.map(lambda start: judged(data, held_out, *start), starts)
-    now = replace(step.taken, candidate=mine, value=found[0][0], blocks=found[0][1])
-    tried = [replace(t, value=value, blocks=blocks) for t, (value, blocks) in zip(others, found[1:], strict=True)]
+    tried = [
+        replace(trial, candidate=c, value=value, blocks=blocks, tuned=tuned_of(c, accepted, known))
+        for trial, c, (_, accepted), (value, blocks, known) in zip(
+            [step.taken, *others], [mine, *(t.candidate for t in others)], starts, found, strict=True
+        )
+    ]
+    now, tried = tried[0], tried[1:]
     asked = tried if ended else [now, *tried]
-    best = max(asked, key=lambda t: t.value - len(t.candidate.free))
+    best = max(asked, key=lambda t: t.worth)
     equals = [t for t in asked if t is best or not told_apart(best, t, recordings=False)]
     group = [t for t in asked if t is best or not told_apart(best, t)]
     chosen = min(equals, key=lambda t: (len(t.candidate.free), -t.value))

@@ -39,11 +39,13 @@ from crazyem.diagnosis.trials import (
     better,
     both,
     gain_of_both,
+    known_by,
     matters,
     own_evidence,
     significance,
     sure_enough,
     told_apart,
+    tuning,
     weighed,
 )
 
@@ -178,18 +180,20 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
         apart = basis.held_out.twin()
         there = on_held_out(apart, fit.point, mine)
         held = there.loglik - basis.held_value
-        more, beyond = gain_of_both(fit, apart, there, mine)
+        more, beyond, covariance = gain_of_both(fit, apart, there, mine)
         blocks = np.append(blocks, beyond)
         recording = np.append(recording, len(data.models) + apart.recordings_of_blocks())
         value += held + more
+    else:
+        covariance = known_by(fit, mine)
     k = len(trial.candidate.free)
+    tuned = tuning([trial.candidate], covariance[-k:, -k:])
     wald_p = significance(fit, k, offset=sum(len(c.free) for c in basis.accepted))
     wald_p = by_gain(fit.point, gain / trial.dispersion, k, len(fit.gram.score), wald_p)
     sure = both(max(trial.p_value, wald_p), held / trial.dispersion if basis.held_out else 0.0)
     sure = sure if matters(fit.point, trial.candidate, data) else 1.0
-    return replace(
-        trial, gain=gain, held_out=held, p_value=sure, fitted=fit, blocks=blocks, value=value, recording=recording
-    )
+    judged = replace(trial, gain=gain, held_out=held, p_value=sure, fitted=fit)
+    return replace(judged, blocks=blocks, value=value, recording=recording, tuned=tuned)
 
 
 def may_join(effect: str, found: set[str]) -> bool:
@@ -346,7 +350,7 @@ def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], No
     close = [t for t in trials if any(t.candidate is a.candidate for a in again)]
     explain = [t for t in close if t is close[0] or admitted(basis, t)]
     # as fitted to all flights: a drag fitted to slow flight is by chance what ruins a quick one least
-    best = max(explain, key=lambda t: t.value - len(t.candidate.free))
+    best = max(explain, key=lambda t: t.worth)
     return trials, alike_with(best, close, counted=counted)
 
 

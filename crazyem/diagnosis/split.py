@@ -16,7 +16,7 @@ from crazyem.diagnosis.always import on_held_out, refine_base, without
 from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.fit import Data, DivergedError
 from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.trials import Selection, Trial, gain_of_both
+from crazyem.diagnosis.trials import Selection, Trial, gain_of_both, known_by, tuning
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.vehicle import Vehicle
 
@@ -44,15 +44,25 @@ def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Tri
     bare = without(selection.final, LOAD)
     bare = bare.with_effects({c.effect: c.neutral(bare) for c in two})
     try:
-        value, blocks = judged(data, held_out, selection.final, selection.accepted)
-        other, others = judged(data, held_out, bare, [*rest, *two])
+        value, blocks, known = judged(data, held_out, selection.final, selection.accepted)
+        other, others, known_two = judged(data, held_out, bare, [*rest, *two])
     except DivergedError:
         return None
     other -= np.log(len(CATALOGUE)) * (len(two) - 1)  # that a second effect is there as well is no matter of course
     free = tuple(f"{c.effect}.{n}" for c in two for n in c.free)  # counted, and no more
     return (
-        replace(step.taken, value=value, blocks=blocks),
-        Trial(Candidate(WEAKER.effect, (), free), 0.0, 0.0, 1.0, 0.0, 0.0, blocks=others, value=other),
+        replace(step.taken, value=value, blocks=blocks, tuned=tuned_of(load, selection.accepted, known)),
+        Trial(
+            Candidate(WEAKER.effect, (), free),
+            0.0,
+            0.0,
+            1.0,
+            0.0,
+            0.0,
+            blocks=others,
+            value=other,
+            tuned=tuning(two, known_two[-len(free) :, -len(free) :]),
+        ),
     )
 
 
@@ -72,24 +82,43 @@ def as_load(data: Data, held_out: Data | None, selection: Selection) -> tuple[Tr
     mass = selection.final.vehicle.mass * (1.0 / share - 1.0)
     loaded = bare.with_effects({LOAD: {**HEAVIER.neutral(bare), "mass": mass}})
     try:
-        value, blocks = judged(data, held_out, selection.final, selection.accepted)
-        other, others = judged(data, held_out, loaded, [*rest, HEAVIER])
+        value, blocks, known = judged(data, held_out, selection.final, selection.accepted)
+        other, others, known_load = judged(data, held_out, loaded, [*rest, HEAVIER])
     except DivergedError:
         return None
     return (
-        replace(step.taken, value=value, blocks=blocks),
-        Trial(HEAVIER, 0.0, 0.0, 1.0, 0.0, 0.0, blocks=others, value=other),
+        replace(step.taken, value=value, blocks=blocks, tuned=tuned_of(weaker, selection.accepted, known)),
+        Trial(
+            HEAVIER,
+            0.0,
+            0.0,
+            1.0,
+            0.0,
+            0.0,
+            blocks=others,
+            value=other,
+            tuned=tuned_of(HEAVIER, [*rest, HEAVIER], known_load),
+        ),
     )
 
 
-def judged(data: Data, held_out: Data | None, start: Point, candidates: Sequence[Candidate]) -> tuple[float, NDArray]:
-    """Log-likelihood as fitted to all flights, and by blocks."""
+def judged(
+    data: Data, held_out: Data | None, start: Point, candidates: Sequence[Candidate]
+) -> tuple[float, NDArray, NDArray]:
+    """Log-likelihood as fitted to all flights, also by blocks; what is known of the candidates' parameters (k, k)."""
     here = data.twin()
     fitted = refine_base(here, start, candidates, noise=False)
     value, blocks = fitted.loglik, here.block_loglik(fitted.point)
-    if held_out is not None:
-        apart = held_out.twin()
-        there = on_held_out(apart, fitted.point, candidates)
-        more, beyond = gain_of_both(fitted, apart, there, candidates)
-        value, blocks = value + there.loglik + more, np.append(blocks, beyond)
-    return value, blocks
+    if held_out is None:
+        return value, blocks, known_by(fitted, candidates)
+    apart = held_out.twin()
+    there = on_held_out(apart, fitted.point, candidates)
+    more, beyond, known = gain_of_both(fitted, apart, there, candidates)
+    return value + there.loglik + more, np.append(blocks, beyond), known
+
+
+def tuned_of(one: Candidate, candidates: Sequence[Candidate], known: NDArray) -> float:
+    """What the parameters of one of the candidates cost it, by what is known of all of them (k, k)."""
+    begin = sum(len(c.free) for c in candidates[: [c is one for c in candidates].index(True)])
+    own = slice(begin, begin + len(one.free))
+    return tuning([one], known[own, own])

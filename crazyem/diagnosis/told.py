@@ -111,6 +111,8 @@ def tell(
         if equal:
             groups.append(tuple(dict.fromkeys([name, *equal])))
             separate += [CATALOGUE[n].separates for n in groups[-1] if CATALOGUE[n].separates]
+        elif candidate.effect == LOAD:  # told from weak rotors by where it sits, which is no proof
+            separate.append(CATALOGUE[LOAD].separates)
         elif candidate.effect == "thrust_scale":
             separate.append(HEAVIER.format(1.0 / candidate.values(point)["scale"]))
     found.sort(key=lambda entry: -entry[0])

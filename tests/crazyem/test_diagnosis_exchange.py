@@ -1,11 +1,13 @@
 """Names asked again beside the rest: exchanged where a rival is better, or as good with fewer parameters."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from closed_loop import DRONE
+from numpy.typing import NDArray
 
 from crazyem.diagnosis import exchange
 from crazyem.diagnosis.candidates import Candidate
@@ -28,6 +30,11 @@ def trial(candidate: Candidate, value: float, point: Point) -> Trial:
     return Trial(candidate, value, 0.0, 1.0, 1e-9, value, SimpleNamespace(point=point), BLOCKS, value)  # type: ignore[arg-type]
 
 
+def unknown(candidates: Sequence[Candidate]) -> NDArray:
+    """A covariance that says no more than what is usual, so that each parameter costs a nat."""
+    return np.diag([c.parameter(n).width ** 2 for c in candidates for n in c.free])
+
+
 def asked(monkeypatch: pytest.MonkeyPatch, *, load: float, weaker: float, was: float = 30.0) -> Selection:
     """The selection after the load (`load` nats beside the flapping) was held against weaker rotors (`weaker`), which
     were worse by `was` nats when it was taken."""
@@ -38,10 +45,10 @@ def asked(monkeypatch: pytest.MonkeyPatch, *, load: float, weaker: float, was: f
     def judged(data, held_out, start, candidates):
         assert [c.effect for c in candidates][1] == "velocity_moment"
         if candidates[0] is LOAD:
-            return load, BLOCKS + load / 20
+            return load, BLOCKS + load / 20, unknown(candidates)
         assert "payload" not in start.effects
         assert start.effects["thrust_scale"]["scale"] == 0.9
-        return weaker, BLOCKS + weaker / 20
+        return weaker, BLOCKS + weaker / 20, unknown(candidates)
 
     monkeypatch.setattr(exchange, "judged", judged)
     monkeypatch.setattr(exchange, "refine_anew", lambda data, point, accepted: SimpleNamespace(point=point))
@@ -100,7 +107,7 @@ def test_what_ended_where_its_range_ends_gives_way_to_whatever_is_next(monkeypat
         steps = (Step((taken, other), taken), Step((), trial(FLAPPING, 20.0, point)))
         selection = Selection(BARE, point, steps, (slope, FLAPPING), SimpleNamespace(), 34)  # type: ignore[arg-type]
         monkeypatch.setattr(exchange, "judged", lambda data, held_out, start, candidates: (
-            (1000.0 if candidates[0] is slope else 100.0), BLOCKS))  # fmt: skip
+            (1000.0 if candidates[0] is slope else 100.0), BLOCKS, unknown(candidates)))  # fmt: skip
         monkeypatch.setattr(exchange, "refine_anew", lambda data, point, accepted: SimpleNamespace(point=point))
         found = exchange.named_again(SimpleNamespace(workers=Workers(1)), None, selection)  # type: ignore[arg-type]
         assert names(found) == [name, "velocity_moment"]

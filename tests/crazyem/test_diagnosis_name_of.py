@@ -4,14 +4,17 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from closed_loop import DRONE
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from crazyem.diagnosis import select
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.select import BEATEN, group_of, may_join, name_of
-from crazyem.diagnosis.trials import Step, Trial, better, preferred, told_apart
+from crazyem.diagnosis.trials import Step, Trial, better, known_of, preferred, told_apart, tuning
 from crazyem.diagnosis.workers import Workers
 
 NOISE = np.random.default_rng(0).normal(size=40)
@@ -122,3 +125,37 @@ def test_the_better_explanation_of_all_flights_leads_whichever_ruins_those_held_
     assert equals == [quadratic]
     unsure = replace(quadratic, p_value=0.5)  # what may not be taken does not lead, however well it would fit
     assert select.compared_again(basis, [linear, unsure], say=lambda text: None)[1][0] is linear
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(1e-3, 1.0), min_size=4, max_size=4), st.integers(0, 1000))
+def test_what_tuning_costs_is_the_evidence_of_a_linear_model(known: list[float], seed: int) -> None:
+    """Laplace's evidence is exact where the likelihood is Gaussian: log of the integral of likelihood times prior is
+    that of the maximum less what tuning costs, but for what the prior says of where the maximum is."""
+    load = Candidate("payload", (), ("mass", "x", "y", "z"))
+    usual = np.array([load.parameter(n).width for n in load.free])
+    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(4, 4)))[0]
+    information = turn @ np.diag(np.array(known) ** -2.0) @ turn.T / np.outer(usual, usual)
+    # integral of exp(-x'Ax/2) N(x; 0, U) = det(I + UA)^(-1/2), the maximum being at neutral
+    wanted = 0.5 * np.linalg.slogdet(np.eye(4) + information * np.square(usual)[:, None])[1]
+    assert tuning([load], known_of([load], information)) == pytest.approx(max(4.0, wanted), rel=1e-5)
+
+
+def test_what_no_flight_tells_costs_a_nat_and_no_more() -> None:
+    load = Candidate("payload", (), ("mass", "x", "y", "z"))
+    told = np.zeros((6, 6))
+    told[0, 0], told[4:, 4:] = 1e12, np.eye(2)
+    assert tuning([load], known_of([load], told)) == pytest.approx(0.5 * np.log1p(1e12 * 2.5e-3**2), rel=1e-6)
+    assert tuning([load], known_of([load], np.zeros((4, 4)))) == 4.0
+
+
+def test_a_load_that_must_sit_in_the_middle_is_told_from_weak_rotors() -> None:
+    """As likely with four numbers as with one, but two of them must be 0 within 0.1 mm of some 10: that it happens to
+    sit there costs more than another nat for each."""
+    weak, load = replace(trial("thrust_scale", "s", 100.0), tuned=5.0), trial("payload", "mxyz", 100.5, scatter=0.1)
+    assert not told_apart(weak, replace(load, tuned=None, value=103.5))
+    scaled = np.diag(np.square([1e-5, 1e-4, 1e-4, 1.0]))
+    at = Candidate("payload", (), ("mass", "x", "y", "z"))
+    cost = tuning([at], known_of([at], np.linalg.inv(scaled)))
+    assert cost == pytest.approx(np.log(2.5e-3 / 1e-5) + 2 * np.log(1e-2 / 1e-4), abs=0.01)
+    assert told_apart(weak, replace(load, tuned=cost))

@@ -27,6 +27,11 @@ def selection_of(point: Point, accepted: tuple[Candidate, ...], fitted: Any = No
     return Selection(point, point, steps, accepted, fitted, 34)
 
 
+def unknown(candidates: Any) -> Any:
+    """A covariance that says no more than what is usual, so that each parameter costs a nat."""
+    return np.diag([c.parameter(n).width ** 2 for c in candidates for n in c.free])
+
+
 @pytest.mark.parametrize("trim", [False, True])
 def test_the_two_pay_for_their_parameters_and_for_being_two(monkeypatch: pytest.MonkeyPatch, trim: bool) -> None:
     vehicle = DRONE if not trim else SimpleNamespace(**{**vars(DRONE), "effects": {TRIM: {"x": 0.0}}})
@@ -34,9 +39,9 @@ def test_the_two_pay_for_their_parameters_and_for_being_two(monkeypatch: pytest.
     point = Point(vehicle, effects, first_guess())  # type: ignore[arg-type]
     asked = []
 
-    def judged(data: Any, held_out: Any, start: Point, candidates: Any) -> tuple[float, Any]:
+    def judged(data: Any, held_out: Any, start: Point, candidates: Any) -> tuple[float, Any, Any]:
         asked.append(([c.effect for c in candidates], sorted(start.effects)))
-        return (110.0 if len(asked) == 1 else 104.0), np.zeros(5)
+        return (110.0 if len(asked) == 1 else 104.0), np.zeros(5), unknown(candidates)
 
     monkeypatch.setattr(split, "judged", judged)
     found = split.as_two(SimpleNamespace(), None, selection_of(point, (LOAD, DRAG)))  # type: ignore[arg-type]
@@ -61,9 +66,9 @@ def test_a_load_in_the_place_of_weaker_rotors_weighs_what_they_lack(
     point = Point(DRONE, {"thrust_scale": {"scale": scale}, "linear_drag": dict.fromkeys("xyz", 0.01)}, first_guess())
     asked = []
 
-    def judged(data: Any, held_out: Any, start: Point, candidates: Any) -> tuple[float, Any]:
+    def judged(data: Any, held_out: Any, start: Point, candidates: Any) -> tuple[float, Any, Any]:
         asked.append(([c.effect for c in candidates], start.effects))
-        return (110.0 if len(asked) == 1 else 104.0), np.zeros(5)
+        return (110.0 if len(asked) == 1 else 104.0), np.zeros(5), unknown(candidates)
 
     monkeypatch.setattr(split, "judged", judged)
     chosen = selection_of(point, (split.WEAKER, DRAG))

@@ -29,6 +29,7 @@ class Parameter:
         chosen: a discrete choice (a rotor, a stream, a length from a list), searched and not differentiated.
         among: the value is a list of some of these; `chosen` are the lists that are searched.
         needs, without: as in `Effect`, for this parameter alone.
+        usual: how far from neutral it usually is where the effect is there (0: five times `scale`).
     """
 
     name: str
@@ -41,6 +42,12 @@ class Parameter:
     among: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
+    usual: float = 0.0
+
+    @property
+    def width(self) -> float:
+        """How far from neutral it usually is, for what it costs a model that this can be anything (see `trials`)."""
+        return self.usual or 5.0 * self.scale
 
 
 @dataclass(frozen=True)
@@ -78,6 +85,8 @@ class Situation:
         shaken: whether some effect couples the air to the body (a drag); without, wind is a constant force.
         lagged: (n, 4) N after the lag, before what changes thrust at the same rotor speed; None: as `thrust`.
         swing: (n, 6) direction of a load's string (unit, world) and its derivative [1/s]; None: found along the rows.
+        turned: (n, 3) rad/s, body: the rate but for a constant, as motion alone changes it from row to row; None: as
+            `body_rate`, which a filter has mixed with the noise of what was measured.
     """
 
     time: NDArray
@@ -98,6 +107,7 @@ class Situation:
     shaken: bool = False
     lagged: NDArray | None = None
     swing: NDArray | None = None
+    turned: NDArray | None = None
 
     @property
     def size(self) -> int:

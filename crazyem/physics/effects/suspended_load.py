@@ -49,7 +49,7 @@ LENGTHS = tuple(round(9.81 / (2.48 + 0.14 * k) ** 2, 4) for k in range(54))
 
 SUSPENDED_LOAD = Effect(
     "suspended_load",
-    (Parameter("mass", "kg", 0.0, 0.0, 0.5, 5e-4), Parameter("length", "m", 0.3, 0.02, 10.0, 2e-4)),
+    (Parameter("mass", "kg", 0.0, 0.0, 0.5, 5e-4), Parameter("length", "m", 0.3, 0.02, 10.0, 2e-4, usual=0.3)),
     order=70,
     tied=pulled,
     needs=("position", "velocity"),  # it swings by the drone's path, which no accelerometer alone shows
