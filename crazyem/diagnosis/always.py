@@ -52,9 +52,11 @@ PULL = 0.05
 SEVERAL = 3  # recordings whose commands are known, from which on each has a thrust of its own
 # Standard deviations that no scatter shows. An attitude 1 ms late is a force that goes with the velocity, 3e-4 N s/m of
 # drag along the quicker axis of a figure 8 (mass * (3.1 rad/s)^2 * 1 ms); along z thrust is a little wrong; a gyro's
-# bias walks; a slope of thrust came out 0.02 too large. Found at these sizes in drones with known ones.
+# bias walks; a slope of thrust came out 0.02 too large; a late gyro makes the attitude that is made from it late, too,
+# where it turns fast. Found at these sizes in drones with known ones.
 SYSTEMATIC = {
     ("thrust_curve", "slope_error"): 0.02,
+    ("measurement_delay", "delay"): 1e-3,
     **{(name, axis): sd for name in ("linear_drag", "quadratic_drag") for axis, sd in zip("xyz", (3e-4, 3e-4, 1e-3))},
     **{("gyro_bias", axis): 4e-4 for axis in "xyz"},
 }

@@ -234,6 +234,8 @@ class Model:
             situation_of(self.flight, path, point.vehicle, thrusts, self._rotation_shown),
             specific_force=accelerations[:, :3], angular_acceleration=accelerations[:, 3:],
         )  # fmt: skip
+        turned = np.cumsum(accelerations[:, 3:] * situation.step[:, None], axis=0)
+        situation = replace(situation, turned=turned)
         return measured(situation, vehicle=point.vehicle, effects=effects).state
 
     def sweep(self, point: Point, columns: Sequence[Column] = (), *, passes: int = 1) -> Swept:

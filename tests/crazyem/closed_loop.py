@@ -154,6 +154,7 @@ def fly(
     sway: float = 0.0,
     vibration: float = 0.0,
     sticking: float = 0.0,
+    hop: float = 0.0,
     vehicle: Vehicle = DRONE,
 ) -> Recording:
     """A recording at 100 Hz of a controller that runs at 500 Hz.
@@ -164,6 +165,7 @@ def fly(
         sway: rad/s^2, standard deviation of random angular accelerations with a memory of 0.5 s.
         vibration: rad/s^2, amplitude of an angular acceleration about roll and pitch at 6 Hz, a little unsteady.
         sticking: N, standard deviation of random thrusts of rotor 4 with a memory of 0.05 s.
+        hop: m, by which the height asked for is higher in every second span of 2 s: thrust sets in at once.
     """
     hidden = hidden or Hidden()
     rng = np.random.default_rng(seed)
@@ -184,8 +186,10 @@ def fly(
         thrust = lfilter([sticking * np.sqrt(1 - keep**2)], [1, -keep], rng.normal(size=steps))
         wander = wander + thrust[:, None] * levers * SIGNS[:, 3] / np.array(vehicle.inertia)
     rows = np.zeros((steps, 22))
+    position, *motion = wanted(seed, time)
+    position[:, 2] += hop * (np.floor(time / 2.0) % 2)
     loop(
-        *wanted(seed, time), noise, kicks, wander, np.array(hidden.thrust), hidden.onset, hidden.torque,
+        position, *motion, noise, kicks, wander, np.array(hidden.thrust), hidden.onset, hidden.torque,
         np.array(hidden.drag), hidden.rope, np.array(hidden.load), np.array(hidden.breeze), hidden.twist,
         np.array(hidden.cable), vehicle.mass, np.array(vehicle.inertia), levers, SIGNS, np.ascontiguousarray(unmix),
         vehicle.motor_time_constant, vehicle.thrust_max, CONTROL, rows,

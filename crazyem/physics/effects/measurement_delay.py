@@ -21,7 +21,8 @@ def late(situation: Situation, *, delay: float, streams: str | Sequence[str]) ->
     """What was `delay` [s] ago, less what is now, for the streams "state", "pose", "gyro", "accelerometer".
 
     Interpolates between rows, which are one path broken where a step is 0 or longer than 0.1 s. Before the first row of
-    a stretch the drone moved and turned as in that row.
+    a stretch the drone moved and turned as in that row. Of a filter's rates differences over some ms are half the noise
+    of the gyro, that of the very sample which is to be explained; `Situation.turned` has none.
     """
     offset = Offset(np.zeros((situation.size, 12)), np.zeros((situation.size, 3)))
     if delay == 0.0 or not situation.size:
@@ -37,7 +38,8 @@ def late(situation: Situation, *, delay: float, streams: str | Sequence[str]) ->
     if "attitude" in shown:
         offset.state[:, 6:9] = _turned(situation, row, part, before)
     if "body_rate" in shown:
-        offset.state[:, 9:12] = _past(situation.body_rate, row, part) - situation.body_rate
+        rate = situation.body_rate if situation.turned is None else situation.turned
+        offset.state[:, 9:12] = _past(rate, row, part) - rate
     if "specific_force" in shown:
         offset.specific_force[:] = _past(situation.specific_force, row, part) - situation.specific_force
     return offset

@@ -1,0 +1,64 @@
+"""A gyro that is late: found by how rates are behind the motion, not by differences of what a filter made of them.
+
+The recording is flown by `closed_loop.py`, which shares no line with the diagnosis, and its rates are shifted by a
+spline.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from closed_loop import DRONE, fly
+from made_flight import array_of
+from scipy.interpolate import CubicSpline
+
+from crazyem.diagnosis.always import refine_base
+from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.fit import Data, nominal
+from crazyem.diagnosis.flight import flight_of
+from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.trials import matters
+
+GYRO = Candidate("measurement_delay", (("streams", ("gyro",)),), ("delay",))
+
+
+@pytest.mark.parametrize("late", [0.0, 0.003, 0.006])
+def test_a_late_gyro_is_late_by_what_it_was_shifted(late: float) -> None:
+    """With what is always free of onboard filters, which starts at 1.2 ms and is 0 here. By differences of the filtered
+    rates, which hold the noise of the sample that they are to explain, it was 0 for all three."""
+    recording = fly(seconds=12.0, seed=3)
+    rate = recording.signals["body_rate"]
+    shown = array_of("body_rate", rate.time, CubicSpline(rate.time, rate.value)(rate.time - late), place=95)
+    data = Data([flight_of(replace(recording, signals={**recording.signals, "body_rate": shown}), DRONE)])
+    begun = nominal(data, Point(DRONE, {}, first_guess())).with_effects(
+        {"measurement_delay": {"delay": 0.002, "streams": ("gyro",)}}
+    )
+    found = refine_base(data, begun, [GYRO]).point.effects
+    total = found["measurement_delay"]["delay"] + found["onboard_filter"]["rate_lag"]
+    assert total == pytest.approx(late, abs=0.6e-3)
+
+
+@pytest.mark.parametrize(("streams", "told"), [(("gyro",), True), (("state",), False)])
+def test_less_of_a_gyro_matters_than_of_a_state(streams: tuple[str, ...], told: bool) -> None:
+    point = Point(DRONE, {"measurement_delay": {"delay": 0.0025, "streams": streams}}, first_guess())
+    candidate = Candidate("measurement_delay", (("streams", streams),), ("delay",))
+    assert matters(point, candidate) is told
+    assert not matters(point.with_effects({"measurement_delay": {"delay": 0.0019}}), candidate)
+
+
+def test_rates_of_motion_alone_are_turned_by_what_acts() -> None:
+    """The rate but for a constant: the sum of angular accelerations over the steps, none across a gap."""
+    recording = fly(seconds=8.0)
+    data = Data([flight_of(recording, DRONE)])
+    point = nominal(data, Point(DRONE, {}, first_guess()))
+    model = data.models[0]
+    model.settle(point)
+    with_delay = point.with_effects({"measurement_delay": {"delay": 0.01, "streams": ("gyro",)}})
+    acceleration, situation = model.accelerations(with_delay)
+    offset = model.offsets(with_delay, acceleration)
+    assert model.moved is not None
+    rows = np.flatnonzero(~model.flight.starts & (np.diff(model.flight.time, prepend=-1.0) > 0))[5:]
+    assert np.allclose(situation.step[rows], 0.01, atol=1e-4)
+    # a delay of one step of 10 ms takes back what acted over that step
+    assert np.allclose(offset[rows, 9:12], -0.01 * model.moved[rows, 3:], atol=2e-4)
