@@ -56,7 +56,7 @@ SEVERAL = 3  # recordings whose commands are known, from which on each has a thr
 # where it turns fast. Found at these sizes in drones with known ones.
 SYSTEMATIC = {
     ("thrust_curve", "slope_error"): 0.02,
-    ("measurement_delay", "delay"): 1e-3,
+    ("measurement_delay", "delay"): 1.5e-3,
     **{(name, axis): sd for name in ("linear_drag", "quadratic_drag") for axis, sd in zip("xyz", (3e-4, 3e-4, 1e-3))},
     **{("gyro_bias", axis): 4e-4 for axis in "xyz"},
 }
