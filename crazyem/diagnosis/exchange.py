@@ -14,7 +14,7 @@ from crazyem.diagnosis.always import refine_anew, refine_base, without
 from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.fit import Data, DivergedError
 from crazyem.diagnosis.split import judged, tuned_of
-from crazyem.diagnosis.trials import SURE, Selection, Step, Trial, at_the_end, margin, matters, told_apart
+from crazyem.diagnosis.trials import SURE, Selection, Step, Trial, at_the_end, margin, matters, not_beaten, told_apart
 
 NEAR = 100.0  # nats by which a rival may have been worse when it was tried
 
@@ -73,10 +73,11 @@ def _asked_again(
     best = max(asked, key=lambda t: t.worth)
     equals = [t for t in asked if t is best or not told_apart(best, t, recordings=False)]
     group = [t for t in asked if t is best or not told_apart(best, t)]
-    chosen = min(equals, key=lambda t: (len(t.candidate.free), -t.value))
+    unbeaten = not_beaten(equals)
+    chosen = min(unbeaten, key=lambda t: (len(t.candidate.free), -t.value), default=best)
     rest = [t for t in step.trials if t is not step.taken and all(t.candidate is not r.candidate for r in tried)]
     trials = (*asked, *rest)  # what ended is no rival of what takes its place
-    if any(t is now for t in equals) and len(chosen.candidate.free) == len(mine.free):
+    if any(t is now for t in unbeaten) and len(chosen.candidate.free) == len(mine.free):
         chosen = now
     alike = tuple(t for t in group if t is not chosen and t.candidate.effect != chosen.candidate.effect)
     steps = tuple(replace(step, taken=chosen, trials=trials, alike=alike) if s is step else s for s in selection.steps)

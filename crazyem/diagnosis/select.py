@@ -36,11 +36,11 @@ from crazyem.diagnosis.trials import (
     Step,
     Trial,
     at_the_end,
-    better,
     both,
     gain_of_both,
     known_by,
     matters,
+    not_beaten,
     own_evidence,
     significance,
     sure_enough,
@@ -53,7 +53,6 @@ SHORTLIST = 6
 WORTH, ANYWAY = 0.15, 3  # share of the largest linear gain from which a candidate is fitted, and how many are anyway
 MOST = 9  # effects: real drones differ from a file in more than one thing
 NEARLY, MOST_COMPARED = 0.8, 3  # share of the best's gain from which, and how many, explanations get noise of their own
-BEATEN = 0.1  # probability of being the better explanation below which a simpler one does not give the name
 BESIDE = 0.5  # share of its gain that an effect keeps beside another which it is no other name for
 # Angular acceleration is torque over inertia: where the one is fitted, so is the other, to be told apart or not; both
 # at once would be any size. A longer lag with more torque is nearly the same as neither.
@@ -375,9 +374,7 @@ def name_of(equals: Sequence[Trial], *, counted: bool) -> Trial:
     that loses by hundreds of nats is none because of that.
     """
     near = [t for t in equals if t is equals[0] or not told_apart(equals[0], t, recordings=False)]
-    sure = [t for t in near if t.p_value < SURE]
-    unbeaten = [t for t in near if all(t is o or better(t, o, recordings=False) > BEATEN for o in sure)]
-    simplest = min(unbeaten, key=lambda t: (len(t.candidate.free), -t.evidence), default=equals[0])
+    simplest = min(not_beaten(near), key=lambda t: (len(t.candidate.free), -t.evidence), default=equals[0])
     return simplest if own_evidence(simplest, counted=counted) > ADMITTED else equals[0]
 
 

@@ -23,6 +23,7 @@ CLOSE = 4.0  # nats within which two explanations cannot be told apart,
 FAR = 20.0  # nats that one step is believed to bring without looking
 EVEN = 0.5  # what a name is worth, at least, beside a rival that is not significant itself
 TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks or recordings
+BEATEN = 0.1  # probability of being the better explanation below which a simpler one does not give the name
 MANY = 5  # recordings, from which on it is seen by how much they differ
 # Smaller than this, these are not told from what filters, sampling and the air of a room do: s, s, s, 1, rad, rad/s, 1,
 # 1, N m s/m. And no rotor is lighter, kg m^2: a rod of 0.1 g and 46 mm has 1.8e-8, and this is a sixth of it.
@@ -161,6 +162,12 @@ def better(one: Trial, other: Trial, *, recordings: bool = True) -> float:
     """Probability that one explains more than the other, by the scatter of the difference."""
     nats, sd = margin(one, other, recordings=recordings)
     return float(stats.norm.cdf(nats / sd))
+
+
+def not_beaten(near: Sequence[Trial]) -> list[Trial]:
+    """Those of which none of the others that is significant is better nine to one."""
+    sure = [t for t in near if t.p_value < SURE]
+    return [t for t in near if all(t is o or better(t, o, recordings=False) > BEATEN for o in sure)]
 
 
 def preferred(taken: Trial, rivals: Sequence[Trial]) -> float:
