@@ -13,8 +13,9 @@ import numpy as np
 from crazyem.diagnosis.always import refine_anew, refine_base, without
 from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.fit import Data, DivergedError
+from crazyem.diagnosis.least import at_the_end, matters
 from crazyem.diagnosis.split import judged, tuned_of
-from crazyem.diagnosis.trials import SURE, Selection, Step, Trial, at_the_end, margin, matters, not_beaten, told_apart
+from crazyem.diagnosis.trials import SURE, Selection, Step, Trial, margin, not_beaten, told_apart
 
 NEAR = 100.0  # nats by which a rival may have been worse when it was tried
 

@@ -9,9 +9,10 @@ import numpy as np
 from crazyem.diagnosis.always import nuisances, on_held_out, refine_base, without
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import TORQUES, Data, Fitted
+from crazyem.diagnosis.least import at_the_end
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.restless import beside_peaks, peaks
-from crazyem.diagnosis.trials import LIKELY, SURE, Step, at_the_end, both, significance, wald
+from crazyem.diagnosis.trials import LIKELY, SURE, Step, both, significance, wald
 
 ADMITTED = 8.0  # nats of evidence that an effect must bring
 HELD = 1.0  # nats it must bring on flight held out,

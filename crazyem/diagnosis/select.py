@@ -24,8 +24,10 @@ from crazyem.diagnosis.always import (
 )
 from crazyem.diagnosis.beginnings import best_begun
 from crazyem.diagnosis.candidates import TRIM, Candidate
+from crazyem.diagnosis.evidence import gain_of_both, known_by, tuning
 from crazyem.diagnosis.fit import Data, DivergedError, Fitted, held_near
 from crazyem.diagnosis.gram import Solution
+from crazyem.diagnosis.least import at_the_end, matters
 from crazyem.diagnosis.model import Column, Point
 from crazyem.diagnosis.onset import date, onset_of
 from crazyem.diagnosis.prune import ADMITTED, drop, shaken, survive
@@ -35,17 +37,12 @@ from crazyem.diagnosis.trials import (
     Selection,
     Step,
     Trial,
-    at_the_end,
     both,
-    gain_of_both,
-    known_by,
-    matters,
     not_beaten,
     own_evidence,
     significance,
     sure_enough,
     told_apart,
-    tuning,
     weighed,
 )
 

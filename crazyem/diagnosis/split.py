@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.always import on_held_out, refine_base, without
 from crazyem.diagnosis.candidates import TRIM, Candidate
+from crazyem.diagnosis.evidence import gain_of_both, known_by, tuning
 from crazyem.diagnosis.fit import Data, DivergedError
 from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.trials import Selection, Trial, gain_of_both, known_by, tuning
+from crazyem.diagnosis.trials import Selection, Trial
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.vehicle import Vehicle
 

@@ -1,18 +1,17 @@
 """Effects that were tried, and how two of them are compared: evidence, significance, what cannot be told apart."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.diagnosis.always import THRUST_SD, jittery, nuisances, solved, usual_wind
+from crazyem.diagnosis.always import solved
 from crazyem.diagnosis.candidates import TRIM, Candidate
-from crazyem.diagnosis.fit import Data, DivergedError, Fitted, bounds_of, held_near, moved
-from crazyem.diagnosis.gram import Gram, bounded
+from crazyem.diagnosis.fit import Fitted
+from crazyem.diagnosis.gram import Gram
 from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.sampling import TRIM_SD
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 SURE = 1e-3  # p-value of the score test, before counting candidates,
@@ -20,27 +19,10 @@ SURE = 1e-3  # p-value of the score test, before counting candidates,
 SURE_DAILY = 1e-4
 LIKELY = 5e-2  # which flights held out may lower where it is below this
 CLOSE = 4.0  # nats within which two explanations cannot be told apart,
-FAR = 20.0  # nats that one step is believed to bring without looking
 EVEN = 0.5  # what a name is worth, at least, beside a rival that is not significant itself
 TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks or recordings
 BEATEN = 0.1  # probability of being the better explanation below which a simpler one does not give the name
 MANY = 5  # recordings, from which on it is seen by how much they differ
-# Smaller than this, these are not told from what filters, sampling and the air of a room do: s, s, s, 1, rad, rad/s, 1,
-# 1, N m s/m. And no rotor is lighter, kg m^2: a rod of 0.1 g and 46 mm has 1.8e-8, and this is a sixth of it.
-LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "motor_lag": 7.5e-3, "velocity_scale": 0.035,
-         "attitude_misalignment": 2e-3, "gyro_bias": 3e-3, "torque_scale": 0.08, "thrust_curve": 0.06,
-         "velocity_moment": 3e-6, "rotor_inertia": 3e-9}  # fmt: skip
-# s: with nothing late rates were 1.1 ms later than usual at most in 28 simulated flights, those of hovers earlier.
-GYRO_LEAST = 2e-3
-VELOCITY_LEAST = 2.0  # times what the jitter of an onboard estimate looks like
-STEEP = 3.0  # vertical over horizontal wind
-HIGHEST = 1.0  # m: a floor is felt by some rotor radii, Crazyflies have 23 to 28 mm
-LEAST_INERTIA = 0.08  # relative, the same
-LEAST_LOAD = 0.005  # of the drone's mass, the same
-DRAWN = 2.0  # standard deviations of the day's trim
-LEAST_DRAG = {"x": 1e-3, "y": 1e-3, "z": 3e-3}  # N s/m or N s^2/m^2; along z thrust is a little wrong (see SYSTEMATIC)
-DRAG_MOST = {"linear_drag": 5.0, "quadratic_drag": 3.0}  # 1/s, 1/m, times the mass: more than air has
-LEAST_CENTRE = {"x": 1e-4, "y": 1e-4, "z": 1e-3}  # m; z shows in lateral accelerations of O alone
 
 
 @dataclass(frozen=True)
@@ -59,7 +41,7 @@ class Trial:
         value: the gain on all of these blocks [nats] once fitted to all of them, less what the priors of the always
             free parameters cost.
         recording: (b,) int, which recording each block is of.
-        tuned: nats that it costs that its parameters might have been anything (`tuning`); None: one for each.
+        tuned: nats that it costs that its parameters might have been anything (`evidence.tuning`); None: one for each.
     """
 
     candidate: Candidate
@@ -127,35 +109,6 @@ def margin(best: Trial, other: Trial, *, recordings: bool = True) -> tuple[float
     nats = best.worth - other.worth
     apart = best.blocks - other.blocks
     return nats, max(scatter(apart), between(apart, best.recording) if recordings else 0.0)
-
-
-def tuning(candidates: Sequence[Candidate], covariance: NDArray) -> float:
-    """Nats that it costs effects that their parameters (k, in order) might have been anything.
-
-    What is left of what is usual once they are known, as in Laplace's approximation of the evidence (MacKay 1992): a
-    load that explains weak rotors must sit in the middle of the drone, and one that could be anywhere hardly ever does,
-    within what a flight tells of it. What no flight tells costs nothing by this, and at least a nat for each parameter,
-    as chance brings that much.
-
-    Args:
-        covariance: (k, k), with what is usual as prior (`known_of`).
-    """
-    usual = _usual(candidates)
-    left = np.linalg.eigvalsh(covariance / np.outer(usual, usual))
-    return max(float(usual.size), -0.5 * float(np.sum(np.log(np.clip(left, 1e-12, 1.0)))))
-
-
-def known_of(candidates: Sequence[Candidate], curvature: NDArray) -> NDArray:
-    """(k, k) covariance of the parameters of the candidates, which come first in a curvature (n, n), all else free,
-    with what is usual as prior."""
-    own = np.zeros(len(curvature))
-    usual = _usual(candidates)
-    own[: usual.size] = usual**-2.0
-    return _inverse(curvature + np.diag(own))[: usual.size, : usual.size]
-
-
-def _usual(candidates: Sequence[Candidate]) -> NDArray:
-    return np.array([c.parameter(n).width for c in candidates for n in c.free])
 
 
 def better(one: Trial, other: Trial, *, recordings: bool = True) -> float:
@@ -226,81 +179,6 @@ def both(p_value: float, held: float) -> float:
     return p_value * float(np.exp(-max(held, 0.0))) if p_value < LIKELY else p_value
 
 
-def gain_of_both(
-    fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequence[Candidate]
-) -> tuple[float, NDArray, NDArray]:
-    """What an effect fitted to the one set of flights would gain on both [nats] if it were fitted to both, the
-    log-likelihood of those held out then, by blocks (b,), and the covariance (k, k) of what is accepted by both
-    (`known_of`).
-
-    By one step from `there`, the flights held out with the effect as it was fitted. The curvature at `fitted` is the
-    prior of its parameters; what is of a kind that is always free may differ from what was fitted by its scatter in
-    either set of flights. Of these kinds `there` has moved already, and paid for it as for the scatter of its own
-    flights, which is given back. To be admitted an effect must hold as it is; to be compared with another it must not
-    suffer from being less well known: a poor flight to fit would always prefer fewer parameters.
-    """
-    free = nuisances(held_out, there.point, accepted)
-    own, parts = sum(len(c.free) for c in accepted), [*accepted, *(c for c, _ in free)]
-    score, information = _total(held_out, there.point, parts)
-    apart = {(c.effect, n): w for c, p in nuisances(held_out, there.point, ()) for n, w in zip(c.free, p, strict=True)}
-    paid = np.array([apart.get((c.effect, n), 0.0) for c in accepted for n in c.free])
-    away = np.array([
-        *(c.values(there.point)[n] - c.values(fitted.point)[n] for c in accepted for n in c.free),
-        *(c.values(there.point)[n] - c.neutral(there.point)[n] for c, _ in free for n in c.free),
-    ])  # fmt: skip
-    known = np.diag([*np.zeros(own), *(w for _, precision in free for w in precision)])
-    differing = np.divide(1.0, paid, out=np.zeros(own), where=paid > 0.0)
-    curvature = fitted.gram.total(range(fitted.gram.size))[1] + np.diag(fitted.precision)
-    known[:own, :own] = _inverse(_inverse(curvature)[:own, :own] + np.diag(2.0 * differing))
-    back = 0.5 * float(paid @ np.square(away[:own]) - away[:own] @ known[:own, :own] @ away[:own])
-    rest = score - known @ away
-    low, high = held_near(*bounds_of(parts, there.point), away, np.diag(known) * (np.arange(len(away)) >= own))
-    step = bounded(information + known, rest, low, high)
-    told = float(rest @ step - 0.5 * step @ (information + known) @ step)
-    blocks, covariance = held_out.block_loglik(there.point), known_of(accepted, information + known)
-    if told < FAR:
-        return back + told, blocks, covariance
-    # So much is told by slopes where an effect is far from what these flights want; what the step brings is to be seen
-    looked = held_out.twin()
-    begin, best = looked.loglik(there.point) - 0.5 * float(away @ known @ away), 0.0
-    for part in (1.0, 0.5, 0.25):
-        moves = part * step
-        point = moved(there.point, parts, moves)
-        with np.errstate(over="ignore", invalid="ignore"):
-            brought = looked.loglik(point, passes=2) - begin
-        brought -= 0.5 * float((away + moves) @ known @ (away + moves))
-        if np.isfinite(brought) and brought > best:
-            # by which explanations scatter: a drag that is right and was fitted to a hover ruins what it was not fitted
-            # to, so badly that none could be told from it
-            best, blocks = brought, looked.block_loglik(point)
-    return back + min(best, told), blocks, covariance
-
-
-def known_by(fitted: Fitted, accepted: Sequence[Candidate]) -> NDArray:
-    """(k, k) covariance of what is accepted at the maximum (`known_of`)."""
-    return known_of(accepted, fitted.gram.total(range(fitted.gram.size))[1] + np.diag(fitted.precision))
-
-
-def _total(data: Data, point: Point, parts: Sequence[Candidate]) -> tuple[NDArray, NDArray]:
-    """Score (k,) and information (k, k) of all free parameters."""
-    columns = [x for c in parts for x in c.columns(point)]
-    return data.gram(point, columns).total(range(len(columns)))
-
-
-def _inverse(matrix: NDArray) -> NDArray:
-    """Of a covariance or a curvature (k, k) whose parameters are of very different sizes; of one that says nothing, 0.
-
-    Raises:
-        DivergedError: a number of it is not finite.
-    """
-    if not np.isfinite(matrix).all():
-        raise DivergedError("the curvature of a fit is not finite")
-    told = np.diag(matrix) > 0.0
-    scale = np.sqrt(np.where(told, np.diag(matrix), 1.0))
-    inverse: NDArray = np.linalg.pinv(matrix / np.outer(scale, scale), rcond=1e-9) / np.outer(scale, scale)
-    return inverse
-
-
 def own_evidence(trial: Trial, *, counted: bool) -> float:
     """Evidence by the candidate's own scatter: what it must bring to be admitted."""
     return (trial.gain + (trial.held_out if counted else 0.0)) / trial.dispersion - len(trial.candidate.free)
@@ -327,66 +205,6 @@ def wald(away: NDArray, covariance: NDArray, gram: Gram, columns: float) -> floa
     return float(stats.f.sf(distance / len(z), len(z), max(len(gram.score) - columns, 3)))
 
 
-def at_the_end(point: Point, candidate: Candidate) -> bool:
-    """Whether an effect of one number is where nothing more of it is admitted, or a drag is none that air has."""
-    here = candidate.values(point)
-    if candidate.effect in DRAG_MOST:
-        most = DRAG_MOST[candidate.effect] * point.vehicle.mass
-        return any(here[n] > most for n in candidate.free)
-    if len(candidate.free) != 1:
-        return False
-    name = candidate.free[0]
-    return here[name] in candidate.range_of(name) and here[name] != candidate.neutral(point)[name]
-
-
 def sure_enough(point: Point, p_value: float) -> bool:
     """Whether an effect may be taken by its p-value."""
     return p_value < (SURE_DAILY if TRIM in point.vehicle.effects else SURE)
-
-
-def _other_load(point: Point, here: Mapping[str, float], filed: Mapping[str, float]) -> bool:
-    """Whether a load is another than the file's by more than is told: in weight, or in where it draws the centre.
-
-    With a trim in the file by more than differs from day to day; that of no load is told by its weight alone.
-    """
-    daily = TRIM in point.vehicle.effects
-    heavier = abs(here["mass"] - filed["mass"])
-    if heavier > (THRUST_SD if daily else LEAST_LOAD) * point.vehicle.mass:
-        return True
-    if "x" not in here or not (daily or filed["mass"] > 0.0):
-        return False
-    along_x, along_y = (here["mass"] * here[n] - filed["mass"] * filed[n] for n in "xy")
-    drawn = float(np.hypot(along_x, along_y)) / point.vehicle.mass
-    return drawn > (DRAWN * TRIM_SD[0] if daily else LEAST_CENTRE["x"])
-
-
-def matters(point: Point, candidate: Candidate, data: Data | None = None) -> bool:
-    """Whether the effect is larger than what onboard filters or the sampling of a log look like, and within its range.
-
-    One number that ends where nothing more is admitted would be more: it stands for something else. With the flights it
-    was fitted to, a scale of velocities must be more than the jitter of the estimate in them, too.
-    """
-    least = GYRO_LEAST if dict(candidate.fixed).get("streams") == ("gyro",) else LEAST.get(candidate.effect)
-    here, neutral = candidate.values(point), candidate.neutral(point)
-    if at_the_end(point, candidate):
-        return False
-    by_axis = {"center_of_mass": LEAST_CENTRE, "linear_drag": LEAST_DRAG, "quadratic_drag": LEAST_DRAG}
-    if candidate.effect in by_axis:
-        return any(abs(here[n] - neutral[n]) > by_axis[candidate.effect][n] for n in candidate.free)
-    if (
-        candidate.effect == "wind"
-    ):  # what rises or sinks is thrust that is a little wrong: no air blows through the floor
-        along = float(np.hypot(here["x"], here["y"]))
-        return along > usual_wind(point.vehicle) and abs(here["z"]) < STEEP * along
-    if candidate.effect == "ground_effect":  # what does not fade with height is thrust that is a little wrong
-        return here["height"] < HIGHEST
-    if candidate.effect in ("payload", "suspended_load"):
-        return _other_load(point, here, neutral)
-    if candidate.effect == "inertia":
-        return any(abs(here[n] / neutral[n] - 1.0) > LEAST_INERTIA for n in candidate.free)
-    if candidate.effect == "velocity_scale" and data is not None:
-        jitter = np.maximum(VELOCITY_LEAST * jittery(data), least or 0.0)
-        return any(abs(here[n] - neutral[n]) > j for n, j in zip("xyz", jitter, strict=True) if n in candidate.free)
-    if least is None:
-        return True
-    return any(abs(here[n] - neutral[n]) > least for n in candidate.free)

@@ -16,9 +16,9 @@ from crazyem.diagnosis.always import refine_base
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import Data, nominal
 from crazyem.diagnosis.flight import flight_of
+from crazyem.diagnosis.least import matters
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.trials import matters
 
 GYRO = Candidate("measurement_delay", (("streams", ("gyro",)),), ("delay",))
 

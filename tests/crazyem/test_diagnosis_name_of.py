@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from crazyem.diagnosis import select
 from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.evidence import known_of, tuning
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.select import group_of, may_join, name_of
-from crazyem.diagnosis.trials import BEATEN, Step, Trial, better, known_of, preferred, told_apart, tuning
+from crazyem.diagnosis.trials import BEATEN, Step, Trial, better, preferred, told_apart
 from crazyem.diagnosis.workers import Workers
 
 NOISE = np.random.default_rng(0).normal(size=40)

@@ -13,10 +13,11 @@ from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import Data, Fitted, nominal
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.gram import Gram
+from crazyem.diagnosis.least import at_the_end, matters
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.select import shortlist
-from crazyem.diagnosis.trials import LIKELY, SURE, Step, Trial, at_the_end, matters, significance
+from crazyem.diagnosis.trials import LIKELY, SURE, Step, Trial, significance
 from crazyem.diagnosis.workers import Workers
 
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))

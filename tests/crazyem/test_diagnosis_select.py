@@ -9,6 +9,7 @@ from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis.always import on_held_out, refine_base
 from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.evidence import gain_of_both
 from crazyem.diagnosis.fit import Data, Fitted, nominal, remembering, remembering_anew
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Point
@@ -16,7 +17,6 @@ from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.onset import ONSET, date
 from crazyem.diagnosis.prune import shaken
 from crazyem.diagnosis.restless import peaks
-from crazyem.diagnosis.trials import gain_of_both
 
 ONSET_TIME = 4.37  # s
 

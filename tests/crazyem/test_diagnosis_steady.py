@@ -15,15 +15,17 @@ from crazyem.diagnosis import steady as steadying
 from crazyem.diagnosis.always import refine_base
 from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.diagnose import diagnose
+from crazyem.diagnosis.evidence import _inverse
 from crazyem.diagnosis.fit import Data, DivergedError, nominal
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.gusts import PUSH, push_of
+from crazyem.diagnosis.least import matters
 from crazyem.diagnosis.model import Noise, Point
 from crazyem.diagnosis.noise import first_guess
 from crazyem.diagnosis.sampling import held
 from crazyem.diagnosis.select import Basis, shortlist, step_of
 from crazyem.diagnosis.steady import as_steady, beside_a_trim, by_onsets, with_whole_torques
-from crazyem.diagnosis.trials import SURE, SURE_DAILY, Selection, Trial, _inverse, matters, preferred, sure_enough
+from crazyem.diagnosis.trials import SURE, SURE_DAILY, Selection, Trial, preferred, sure_enough
 from crazyem.diagnosis.workers import Workers
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle

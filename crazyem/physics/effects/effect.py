@@ -46,7 +46,7 @@ class Parameter:
 
     @property
     def width(self) -> float:
-        """How far from neutral it usually is, for what it costs a model that this can be anything (see `trials`)."""
+        """How far from neutral it usually is, by which it costs a model that it can be anything (`evidence.tuning`)."""
         return self.usual or 5.0 * self.scale
 
 
