@@ -11,6 +11,7 @@ from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.fit import Data, DivergedError, Fitted, bounds_of, held_near, moved
 from crazyem.diagnosis.gram import bounded
 from crazyem.diagnosis.model import Point
+from crazyem.physics.effects.catalogue import CATALOGUE
 
 FAR = 20.0  # nats that one step is believed to bring without looking
 
@@ -26,22 +27,29 @@ def tuning(candidates: Sequence[Candidate], covariance: NDArray) -> float:
     Args:
         covariance: (k, k), with what is usual as prior (`known_of`).
     """
-    usual = _usual(candidates)
-    left = np.linalg.eigvalsh(covariance / np.outer(usual, usual))
-    return max(float(usual.size), -0.5 * float(np.sum(np.log(np.clip(left, 1e-12, 1.0)))))
+    root = np.linalg.inv(np.linalg.cholesky(_usual(candidates)))
+    left = np.linalg.eigvalsh(root @ covariance @ root.T)
+    return max(float(len(root)), -0.5 * float(np.sum(np.log(np.clip(left, 1e-12, 1.0)))))
 
 
 def known_of(candidates: Sequence[Candidate], curvature: NDArray) -> NDArray:
     """(k, k) covariance of the parameters of the candidates, which come first in a curvature (n, n), all else free,
     with what is usual as prior."""
-    own = np.zeros(len(curvature))
     usual = _usual(candidates)
-    own[: usual.size] = usual**-2.0
-    return _inverse(curvature + np.diag(own))[: usual.size, : usual.size]
+    with_prior = curvature.copy()
+    with_prior[: len(usual), : len(usual)] += np.linalg.inv(usual)
+    return _inverse(with_prior)[: len(usual), : len(usual)]
 
 
 def _usual(candidates: Sequence[Candidate]) -> NDArray:
-    return np.array([c.parameter(n).width for c in candidates for n in c.free])
+    """(k, k) covariance of how far the parameters usually are from neutral."""
+    width = np.array([c.parameter(n).width for c in candidates for n in c.free])
+    which = np.repeat(np.arange(len(candidates)), [len(c.free) for c in candidates])
+    alike = np.array([CATALOGUE[c.effect].alike for c in candidates])[which]
+    together = np.where(which[:, None] == which, alike, 0.0)
+    np.fill_diagonal(together, 1.0)
+    covariance: NDArray = together * np.outer(width, width)
+    return covariance
 
 
 def gain_of_both(

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.special import expit
 
 from crazyem.diagnosis.always import solved
 from crazyem.diagnosis.candidates import TRIM, Candidate
@@ -112,9 +113,11 @@ def margin(best: Trial, other: Trial, *, recordings: bool = True) -> tuple[float
 
 
 def better(one: Trial, other: Trial, *, recordings: bool = True) -> float:
-    """Probability that one explains more than the other, by the scatter of the difference."""
+    """Probability that one explains more than the other, by the scatter of the difference; no surer than the odds that
+    so many nats are, however steadily they come."""
     nats, sd = margin(one, other, recordings=recordings)
-    return float(stats.norm.cdf(nats / sd))
+    by_scatter, by_odds = float(stats.norm.cdf(nats / sd)), float(expit(nats))
+    return min(by_scatter, by_odds) if nats > 0.0 else max(by_scatter, by_odds)
 
 
 def not_beaten(near: Sequence[Trial]) -> list[Trial]:

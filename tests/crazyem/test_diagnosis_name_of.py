@@ -142,6 +142,29 @@ def test_what_tuning_costs_is_the_evidence_of_a_linear_model(known: list[float],
     assert tuning([load], known_of([load], information)) == pytest.approx(max(4.0, wanted), rel=1e-5)
 
 
+@pytest.mark.parametrize("nats", [-2.0, 0.5, 2.0])
+def test_few_nats_are_no_surer_for_coming_steadily(nats: float) -> None:
+    """A factor on all torques was told with 0.95 for three inertias, ahead by 2 nats of what parameters cost."""
+    one, other = trial("torque_scale", "s", 100.0 + nats), trial("inertia", "x", 100.0)
+    assert better(one, other) == pytest.approx(1.0 / (1.0 + np.exp(-nats)))
+    assert better(one, other) + better(other, one) == pytest.approx(1.0)
+    unsteady = replace(other, blocks=other.blocks + NOISE)
+    assert abs(better(one, unsteady) - 0.5) < abs(better(one, other) - 0.5)
+
+
+def test_inertias_that_are_one_factor_are_no_coincidence() -> None:
+    """More mass around a drone makes it heavier to turn about every axis: three inertias known within 3e-7 kg m^2 of
+    some 1.5e-6, of which what they have in common is known, cost hardly more than a nat each, and not 4.9."""
+    inertia = Candidate("inertia", (), ("xx", "yy", "zz"))
+    width = inertia.parameter("xx").width
+    usual = width**2 * (0.1 * np.eye(3) + 0.9)
+    information = np.eye(3) / (width / 5) ** 2
+    wanted = 0.5 * np.linalg.slogdet(np.eye(3) + usual @ information)[1]
+    assert tuning([inertia], known_of([inertia], information)) == pytest.approx(wanted, rel=1e-9)
+    assert wanted == pytest.approx(3.4, abs=0.1)
+    assert 1.5 * np.log(1.0 + 25.0) == pytest.approx(4.9, abs=0.1)  # were they independent of each other
+
+
 def test_what_no_flight_tells_costs_a_nat_and_no_more() -> None:
     load = Candidate("payload", (), ("mass", "x", "y", "z"))
     told = np.zeros((6, 6))

@@ -173,6 +173,7 @@ class Effect:
             "motor_command", "specific_force", "position", "attitude", "body_rate", "velocity".
         without: signals with which it cannot be (sag in time only matters where no voltage is known).
         separates: what would tell it from its look-alikes, in words.
+        alike: correlation of how far its parameters usually are from neutral (`Parameter.usual`).
         nudge: small values at which every parameter matters (a ground effect's height says nothing at strength 0);
             the fit begins with derivatives there. Empty: neutral will do.
         amplitude: the parameter without which the others say nothing ("strength"); "" if there is none.
@@ -197,6 +198,7 @@ class Effect:
     needs: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     separates: str = ""
+    alike: float = 0.0
     nudge: Values = field(default_factory=dict)
     amplitude: str = ""
     alternatives: tuple[tuple[str, ...], ...] = ()

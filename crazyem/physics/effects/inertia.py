@@ -29,6 +29,7 @@ INERTIA = Effect(
     body=diagonal,
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum), or measure the rotors' torque on a stand",
+    alike=0.9,  # what is heavier about one axis is so about the others: they differ by a third of what they are more
 )
 
 INERTIA_PRODUCTS = Effect(
