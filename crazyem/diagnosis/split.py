@@ -33,38 +33,33 @@ def instead_of_a_load(vehicle: Vehicle) -> list[Candidate]:
 
 
 def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
-    """The load as a trial and what may stand in its place as another, to be compared; None where no load was found, or
-    where nothing can be fitted in its place.
+    """The load as a trial and the best of what may stand in its place as another, weaker rotors with a shifted centre
+    and without, to be compared; None where no load was found, or where nothing can be fitted in its place.
     """
     load = next((c for c in selection.accepted if c.effect == LOAD), None)
     step = next((s for s in selection.steps if s.taken and s.taken.candidate is load), None)
     if load is None or step is None or step.taken is None:
         return None
-    two = instead_of_a_load(selection.final.vehicle)
-    rest = [c for c in selection.accepted if c.effect not in {LOAD, *(t.effect for t in two)}]
-    bare = without(selection.final, LOAD)
-    bare = bare.with_effects({c.effect: c.neutral(bare) for c in two})
+    most = instead_of_a_load(selection.final.vehicle)
     try:
         value, blocks, known = judged(data, held_out, selection.final, selection.accepted)
-        other, others, known_two = judged(data, held_out, bare, [*rest, *two])
+        others = [_in_place_of_a_load(data, held_out, selection, most[:n]) for n in range(1, len(most) + 1)]
     except DivergedError:
         return None
-    other -= np.log(len(CATALOGUE)) * (len(two) - 1)  # that a second effect is there as well is no matter of course
-    free = tuple(f"{c.effect}.{n}" for c in two for n in c.free)  # counted, and no more
-    return (
-        replace(step.taken, value=value, blocks=blocks, tuned=tuned_of(load, selection.accepted, known)),
-        Trial(
-            Candidate(WEAKER.effect, (), free),
-            0.0,
-            0.0,
-            1.0,
-            0.0,
-            0.0,
-            blocks=others,
-            value=other,
-            tuned=tuning(two, known_two[-len(free) :, -len(free) :]),
-        ),
-    )
+    taken = replace(step.taken, value=value, blocks=blocks, tuned=tuned_of(load, selection.accepted, known))
+    return taken, max(others, key=lambda t: t.worth)
+
+
+def _in_place_of_a_load(data: Data, held_out: Data | None, selection: Selection, instead: Sequence[Candidate]) -> Trial:
+    """Some effects in the place of a load, as one trial; that there is a second one as well is no matter of course."""
+    rest = [c for c in selection.accepted if c.effect not in {LOAD, *(t.effect for t in instead)}]
+    bare = without(selection.final, LOAD)
+    bare = bare.with_effects({c.effect: c.neutral(bare) for c in instead})
+    value, blocks, known = judged(data, held_out, bare, [*rest, *instead])
+    free = tuple(f"{c.effect}.{n}" for c in instead for n in c.free)  # counted, and no more
+    cost = tuning(instead, known[-len(free) :, -len(free) :]) + np.log(len(CATALOGUE)) * (len(instead) - 1)
+    named = Candidate(WEAKER.effect, (), free)
+    return Trial(named, 0.0, 0.0, 1.0, 0.0, 0.0, blocks=blocks, value=value, tuned=float(cost))
 
 
 def as_load(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
