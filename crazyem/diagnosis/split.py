@@ -58,8 +58,12 @@ def _in_place_of_a_load(data: Data, held_out: Data | None, selection: Selection,
     value, blocks, known = judged(data, held_out, bare, [*rest, *instead])
     free = tuple(f"{c.effect}.{n}" for c in instead for n in c.free)  # counted, and no more
     cost = tuning(instead, known[-len(free) :, -len(free) :]) + np.log(len(CATALOGUE)) * (len(instead) - 1)
-    named = Candidate(WEAKER.effect, (), free)
-    return Trial(named, 0.0, 0.0, 1.0, 0.0, 0.0, blocks=blocks, value=value, tuned=float(cost))
+    return _stands(Candidate(WEAKER.effect, (), free), value, blocks, float(cost))
+
+
+def _stands(candidate: Candidate, value: float, blocks: NDArray, tuned: float) -> Trial:
+    """A trial of what was fitted in the place of another, of which nothing but the comparison with it is asked."""
+    return Trial(candidate, 0.0, 0.0, 1.0, 0.0, 0.0, blocks=blocks, value=value, tuned=tuned)
 
 
 def as_load(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
@@ -82,20 +86,8 @@ def as_load(data: Data, held_out: Data | None, selection: Selection) -> tuple[Tr
         other, others, known_load = judged(data, held_out, loaded, [*rest, HEAVIER])
     except DivergedError:
         return None
-    return (
-        replace(step.taken, value=value, blocks=blocks, tuned=tuned_of(weaker, selection.accepted, known)),
-        Trial(
-            HEAVIER,
-            0.0,
-            0.0,
-            1.0,
-            0.0,
-            0.0,
-            blocks=others,
-            value=other,
-            tuned=tuned_of(HEAVIER, [*rest, HEAVIER], known_load),
-        ),
-    )
+    taken = replace(step.taken, value=value, blocks=blocks, tuned=tuned_of(weaker, selection.accepted, known))
+    return taken, _stands(HEAVIER, other, others, tuned_of(HEAVIER, [*rest, HEAVIER], known_load))
 
 
 def judged(

@@ -19,8 +19,8 @@ from crazyem.recordings.recording import Recording
 TELLING = 3.0  # nats by which a witness tells two effects apart
 PUNCTUAL, PUNCTUAL_SD = 1e-3, 1.5e-3  # s: lag of the accelerometer behind the forces of commands where nothing is late
 # Where thrust never sets in at once, what the model lacks of slow forces passes for lag: with 0.3 s of thrust over its
-# rate (standard deviations) by -18 to 28 ms in 17 simulated flights, most by 8 to 20, with 0.16 s by -3 to 8 in 9; with
-# 0.05 s, as sudden take-offs have, by no more than above.
+# rate (standard deviations) by -18 to 28 ms in 17 simulated flights, most by 8 to 20, with 0.16 to 0.19 s by -3 to 8 in
+# 9; with 0.05 s, as sudden take-offs have, by no more than above.
 SUDDEN, SLOW = 0.06, 0.06  # s; s of lag for each second beyond it
 TWINS_SD = 0.01  # relative: speeds of two healthy rotors at one command
 LAG = 6  # which of the parameters of `accelerometer.tilt` is the lag [s]

@@ -1,13 +1,12 @@
 """Names asked again beside the rest: exchanged where a rival is better, or as good with fewer parameters."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from closed_loop import DRONE
-from numpy.typing import NDArray
+from unknown_effects import unknown
 
 from crazyem.diagnosis import exchange
 from crazyem.diagnosis.candidates import Candidate
@@ -28,11 +27,6 @@ BLOCKS = np.linspace(-1.0, 1.0, 20)
 
 def trial(candidate: Candidate, value: float, point: Point) -> Trial:
     return Trial(candidate, value, 0.0, 1.0, 1e-9, value, SimpleNamespace(point=point), BLOCKS, value)  # type: ignore[arg-type]
-
-
-def unknown(candidates: Sequence[Candidate]) -> NDArray:
-    """A covariance that says no more than what is usual, so that each parameter costs a nat."""
-    return np.diag([c.parameter(n).width ** 2 for c in candidates for n in c.free])
 
 
 def asked(monkeypatch: pytest.MonkeyPatch, *, load: float, weaker: float, was: float = 30.0) -> Selection:

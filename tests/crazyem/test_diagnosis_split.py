@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
+from unknown_effects import unknown
 
 from crazyem.diagnosis import split
 from crazyem.diagnosis.always import refine_base
@@ -15,7 +16,9 @@ from crazyem.diagnosis.fit import Data, nominal
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.told import tell
 from crazyem.diagnosis.trials import Selection, Step, Trial, margin, told_apart
+from crazyem.diagnosis.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 LOAD = Candidate("payload", (), ("mass", "x", "y", "z"))
@@ -25,11 +28,6 @@ DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
 def selection_of(point: Point, accepted: tuple[Candidate, ...], fitted: Any = None) -> Selection:
     steps = tuple(Step((), Trial(c, 50.0, 0.0, 1.0, 1e-9, 46.0)) for c in accepted)
     return Selection(point, point, steps, accepted, fitted, 34)
-
-
-def unknown(candidates: Any) -> Any:
-    """A covariance that says no more than what is usual, so that each parameter costs a nat."""
-    return np.diag([c.parameter(n).width ** 2 for c in candidates for n in c.free])
 
 
 @pytest.mark.parametrize(("trim", "alone"), [(False, 60.0), (True, 104.0), (False, 103.0)])
@@ -89,6 +87,21 @@ def test_a_load_in_the_place_of_weaker_rotors_weighs_what_they_lack(
         assert asked[1][1]["payload"]["mass"] == pytest.approx(DRONE.mass * (1 / scale - 1))
         assert "thrust_scale" not in asked[1][1]
         assert margin(*found)[0] == pytest.approx(6.0 - 1 + 4)
+
+
+def test_weighing_is_asked_for_whether_a_load_is_told_apart_or_not() -> None:
+    data = Data([flight_of(fly(Hidden(thrust=(0.9, 0.9, 0.9, 0.9)), seconds=8.0), DRONE)])
+    point = nominal(data, Point(DRONE, {}, first_guess()))
+    begun = point.with_effects({"payload": {**LOAD.neutral(point), "mass": 0.0039}})
+    fitted = refine_base(data, begun, [LOAD], rounds=1, noise=False)
+    trial = Trial(LOAD, 50.0, 0.0, 1.0, 1e-9, 46.0, fitted, np.zeros(8), 50.0)
+    weaker = replace(trial, candidate=split.WEAKER, tuned=4.0)
+    selection = Selection(point, fitted.point, (Step((trial,), trial),), (LOAD,), fitted, 1)
+    for value, group in ((30.0, ()), (49.0, (("payload", "thrust_scale", "center_of_mass"),))):
+        pair = (trial, replace(weaker, value=value))
+        told = tell(data, selection, Unexplained((), 50.0), witnessed=frozenset(), in_place={"payload": pair})
+        assert told.groups == group
+        assert CATALOGUE["payload"].separates in told.separate
 
 
 @pytest.mark.slow
