@@ -2,10 +2,13 @@
 
 A pendulum of a wrong period falls out of step within the time it is damped in, so the likelihood over lengths has a
 peak some per cent wide, and a fit that begins beside it stays there. One pass gives what the amplitude alone explains
-at every beginning; the best few are tried in full.
+at every beginning; the best few are tried in full. Where a load is driven into chaos, what a small one would do says
+nothing of a larger one, which is followed by how it pulls: there, beginnings are compared by likelihood.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +22,7 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 
 FEW = 5  # beginnings that are all tried in full; of more,
 KEPT = 2  # the best peaks are
+SEEN = 50.0  # nats, from which an effect that has sizes is tried with them
 
 
 def best_begun(
@@ -39,12 +43,40 @@ def best_begun(
     for family in many:
         columns += [_amplitude(c, point) for c in family]
     gram = data.gram(point, columns)
-    dropped, at = set[Candidate](), len(weights)
+    dropped, added, at = set[Candidate](), list[Candidate](), len(weights)
     for family in many:
         gains = [_gain(gram, weights, at + i) for i in range(len(family))]
         at += len(family)
-        dropped |= set(family) - {family[i] for i in peaks(gains)}
-    return [c for c in candidates if c not in dropped]
+        best = peaks(gains)
+        found = larger(data, point, family, best) if max(gains) > SEEN else None
+        if found is None:
+            dropped |= set(family) - {family[i] for i in best}
+        else:
+            dropped |= set(family)
+            added.append(found)
+    return [*(c for c in candidates if c not in dropped), *added]
+
+
+def larger(data: Data, point: Point, family: Sequence[Candidate], peaks: Sequence[int]) -> Candidate | None:
+    """The beginning and the size that are likeliest, if they are not beside one of these peaks; None: they are, or none
+    is likelier than nothing. What is steady in an effect that weighs is given back by the thrust."""
+    effect = CATALOGUE[family[0].effect]
+    nothing = data.twin().loglik(point)
+
+    def gain(tried: tuple[float, Candidate]) -> float:
+        size, candidate = tried
+        values = {**candidate.neutral(point), **dict(candidate.begin), effect.amplitude: size}
+        scale = point.effects.get("thrust_scale", {}).get("scale", 1.0) * (1.0 + size / point.vehicle.mass)
+        return data.twin().loglik(point.with_effects({effect.name: values, "thrust_scale": {"scale": scale}})) - nothing
+
+    tried = list(product(effect.sizes, family))
+    gains = data.workers.map(gain, tried)
+    if not tried or max(gains) <= 0.0:
+        return None
+    size, best = tried[int(np.argmax(gains))]
+    if any(abs(family.index(best) - i) <= 1 for i in peaks):
+        return None
+    return replace(best, begin=tuple({**dict(best.begin), effect.amplitude: size}.items()))
 
 
 def peaks(gains: Sequence[float]) -> list[int]:

@@ -128,7 +128,7 @@ def open_loop(
         weights: what was learned before each start (see `earned`); None: the model alone.
     """
     simulator = Simulator(shown.inputs, effects, vehicle=vehicle)
-    swings = simulator.swings(shown.time, shown.state[:, 3:6])
+    swings = simulator.swings(shown.time, shown.state, shown.airborne)
     return simulator.run(
         shown.state[at.rows],
         at.times,

@@ -147,20 +147,45 @@ def causal_middle(filtered: NDArray, predicted: NDArray, starts: NDArray) -> NDA
     return middle
 
 
+def corrected(swept: Swept, flight: Flight) -> tuple[NDArray, NDArray, NDArray]:
+    """What a pass of the filter found beyond its model, step by step: changes (n, 6) of velocity m/s and body rate
+    rad/s, body axes; lengths (n,) of the steps [s]; which of them (n,) are known (0 where not)."""
+    step = np.diff(flight.time, prepend=flight.time[0])
+    known = (step > 0) & ~flight.starts
+    change = swept.filtered - swept.predicted
+    force = np.einsum("nji,nj->ni", rotation_matrix(swept.filtered[:, 6:10]), change[:, 3:6])
+    carried = swept.filtered[:, 13:19] * step[:, None]
+    return (
+        np.where(known[:, None], carried + np.concatenate([force, change[:, 10:13]], axis=1), 0.0),
+        np.where(known, step, 0.0),
+        known,
+    )
+
+
+def seen_force(swept: Swept, flight: Flight, acceleration: NDArray) -> NDArray:
+    """(n, 3) m/s^2: specific force over each step by the model and what the filter found beside it; NaN: not known."""
+    impulse, step, known = corrected(swept, flight)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        seen: NDArray = np.where(known[:, None], acceleration[:, :3] + impulse[:, :3] / step[:, None], np.nan)
+    return seen
+
+
+def unrest(noise: Noise) -> NDArray:
+    """(3,) m/s^2 sqrt(s): intensity of the specific force that comes and goes, with a memory or without."""
+    memory = np.broadcast_to(np.asarray(noise.memory, float), (6,))[:3]
+    found: NDArray = np.sqrt(np.square(noise.impulse[:3]) + 2.0 * memory * np.square(noise.disturbance[:3]))
+    return found
+
+
 def lacking(swept: Swept, flight: Flight) -> NDArray:
     """(n, 6) specific force m/s^2 and angular acceleration rad/s^2, body axes, that a model lacks along a flight.
 
     The mean over the last `RECENT` of the disturbances with a memory and of what measurements corrected: what comes
     and goes faster is known to the filter too late, and would look like a gyro that is early.
     """
-    step = np.diff(flight.time, prepend=flight.time[0])
-    known = (step > 0) & ~flight.starts
-    corrected = swept.filtered - swept.predicted
-    force = np.einsum("nji,nj->ni", rotation_matrix(swept.filtered[:, 6:10]), corrected[:, 3:6])
-    carried = swept.filtered[:, 13:19] * step[:, None]
-    impulse = np.where(known[:, None], carried + np.concatenate([force, corrected[:, 10:13]], axis=1), 0.0)
+    impulse, step, known = corrected(swept, flight)
     forget = [1.0, -np.exp(-float(np.median(step[known])) / RECENT)] if known.any() else [1.0, 0.0]
-    total, span = (lfilter([1.0], forget, v, axis=0) for v in (impulse, np.where(known, step, 0.0)[:, None]))
+    total, span = (lfilter([1.0], forget, v, axis=0) for v in (impulse, step[:, None]))
     mean: NDArray = total / np.maximum(span, RECENT)
     return mean
 
@@ -184,6 +209,7 @@ class Model:
     path: NDArray | None = None  # (n, 19) in the middle of each step
     shown: NDArray | None = None  # (n, 19) filtered, at the rows
     moved: NDArray | None = None  # (n, 6) accelerations of that path, with what the model lacks
+    seen: NDArray | None = None  # (n, 3) specific force over each step of that path, as it was found to be
     _thrusts: dict[str, tuple[NDArray, NDArray]] = field(default_factory=dict)
     _rotation: NDArray | None = None  # of the path
     _rotation_shown: NDArray | None = None
@@ -213,6 +239,7 @@ class Model:
             self._rotation = rotation_matrix(path[:, 6:10])
         thrusts = self.thrusts(point.vehicle, effects)
         situation = situation_of(self.flight, path, point.vehicle, thrusts, self._rotation)
+        situation = replace(situation, seen=self.seen, unrest=unrest(point.noise))
         moved = motion(situation, vehicle=point.vehicle, effects=effects)
         return np.concatenate([moved.specific_force, moved.angular_acceleration], axis=1), situation
 
@@ -260,11 +287,12 @@ class Model:
             swept = replace(swept, score=swept.score[:, order], information=swept.information[:, order][:, :, order])
         self._rotation = self._rotation_shown = None
         if not np.isfinite(swept.filtered).all():  # a model that left the range of numbers must not spoil the next one
-            self.path = self.shown = self.moved = None
+            self.path = self.shown = self.moved = self.seen = None
             return swept
         self.path = causal_middle(swept.filtered, swept.predicted, flight.starts)
         self.shown = swept.filtered
         self.moved = acceleration + lacking(swept, flight)
+        self.seen = seen_force(swept, flight, acceleration)
         return swept
 
     def _is_felt(self) -> bool:

@@ -200,7 +200,7 @@ def predict(
     for known, those in _by_knowledge(shown, rows):
         weights = None if plain else earned(turned_by(known), known.time[those], horizon=span)
         simulator = Simulator(known.inputs)
-        swings = simulator.swings(known.time, known.state[:, 3:6])
+        swings = simulator.swings(known.time, known.state, known.airborne)
         at = 0
         for part in _parts(those, max(1, min(CHUNK, 2_000_000 // horizon))):
             grid = _times(known, part, horizon=horizon, step=step)
@@ -230,7 +230,7 @@ def _by_knowledge(shown: Recorded, rows: NDArray) -> list[tuple[Recorded, NDArra
 def turned_by(shown: Recorded) -> Turned:
     """What the model says of the turning of a recorded flight, one step ahead of every row."""
     simulator = Simulator(shown.inputs)
-    swings = simulator.swings(shown.time, shown.state[:, 3:6])
+    swings = simulator.swings(shown.time, shown.state, shown.airborne)
     gained, lacking = np.zeros((shown.time.size, 3)), np.zeros((shown.time.size, 3))
     flying = np.zeros(shown.time.size, bool)
     rows = np.arange(shown.time.size - 1)

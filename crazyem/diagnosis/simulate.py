@@ -16,8 +16,8 @@ from crazyem.diagnosis.earned import Weights
 from crazyem.diagnosis.inputs import Inputs
 from crazyem.physics.effects.effect import Effects, Situation
 from crazyem.physics.effects.measurement_delay import LONGEST_STEP
-from crazyem.physics.effects.pendulum import swing_along, swing_on
-from crazyem.physics.motion import Motion, active, measured, motion
+from crazyem.physics.effects.pendulum import swing_along, swing_on, watched_along
+from crazyem.physics.motion import Motion, active, body_of, measured, motion
 from crazyem.physics.rotations import (
     quaternion_conjugate,
     quaternion_from_rotation_vector,
@@ -28,6 +28,7 @@ from crazyem.vehicle import GRAVITY, Vehicle
 
 SUBSTEP = 5e-3  # s
 BACK = 5e-3  # s between the rows of a path before a start
+LEAST_UNREST = 2e-3  # m/s^2 sqrt(s): a force that is seen is seen no better, whatever a recording shows
 
 
 @dataclass
@@ -102,24 +103,56 @@ class Simulator:
         self._late: NDArray | float = 0.0  # s: what was not known of the delay at each start
         self._looks_back = max((float(values.get("delay", 0.0)) for values in sensors), default=0.0)  # s
         values = {effect.name: found for effect, found in active(self.effects, self.vehicle)}
-        self._length: float | None = values["suspended_load"]["length"] if "suspended_load" in values else None
+        load = values.get("suspended_load", {"mass": 0.0, "length": None})
+        self._load: float = load["mass"]
+        self._length: float | None = load["length"]
         self._air = np.array([values.get("wind", {}).get(axis, 0.0) for axis in "xyz"])
         constant = self.vehicle.rotor_constant
         self._rotor_constant = float("nan") if constant is None else constant
 
-    def swings(self, time: NDArray, velocity: NDArray) -> NDArray | None:
+    def swings(self, time: NDArray, state: NDArray, airborne: NDArray) -> NDArray | None:
         """(r, 6) of a suspended load along a recorded path, each row from those up to it; None without a load.
 
-        time: (r,) s, increasing; velocity: (r, 3) m/s, world. At the first row, and after gaps, it hangs at rest.
+        time: (r,) s, increasing; state: (r, 13), NaN where not known; airborne: (r,) bool, where the load is seen to
+        pull. At the first row, and after gaps, it hangs at rest.
         """
         if self._length is None:
             return None
         gap = np.diff(time, prepend=time[:1])
-        known = np.isfinite(velocity).all(axis=1)
+        known = np.isfinite(state).all(axis=1)
         broken = (gap <= 0.0) | (gap > LONGEST_STEP) | ~known
         broken[1:] |= ~known[:-1]
+        velocity = state[:, 3:6]
         air = np.broadcast_to(self._air, velocity.shape)
-        return swing_along(gap=gap, broken=broken, velocity=velocity, air=air, length=self._length)
+        hanging = {"gap": gap, "broken": broken, "velocity": velocity, "air": air, "length": self._length}
+        rows = 1 + np.flatnonzero(~broken[1:] & airborne[1:] & airborne[:-1])
+        share = self._load / (body_of(self.vehicle, self.effects).mass + self._load)
+        if rows.size < 3 or share <= 0.0:
+            return swing_along(**hanging)
+        free, seen = np.zeros_like(velocity), np.full_like(velocity, np.nan)
+        rotation = np.broadcast_to(np.eye(3), (time.size, 3, 3)).copy()
+        free[rows], seen[rows], rotation[rows] = self._forces(time, state, rows)
+        bend = np.diff((seen - free)[rows], n=2, axis=0)  # what a load does bends little within a step
+        noise = np.sqrt(np.median(gap[rows])) * np.median(np.abs(bend), axis=0) / (0.6745 * np.sqrt(6.0))
+        return watched_along(
+            **hanging, share=share, rotation=rotation, free=free, shown=seen, noise=np.maximum(noise, LEAST_UNREST)
+        )
+
+    def _forces(self, time: NDArray, state: NDArray, rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Over the steps that end at rows (m,) of a recorded path: specific force without a load, and as seen, (m, 3)
+        m/s^2, body; and attitudes (m, 3, 3) in the middle of the steps."""
+        effects = {name: values for name, values in self.effects.items() if name != "suspended_load"}
+        begin, end = time[rows - 1], time[rows]
+        last = self.course.newest(begin)
+        step = end - begin
+        thrust, rate = self.course.over(begin, end, last=last)
+        before, after = state[rows - 1], state[rows]
+        middle = _Body.of(0.5 * (before + after))
+        middle.attitude = turned(before[:, 6:10], 0.5 * step[:, None] * middle.rate)
+        situation = self._situation(middle, end, step, thrust, rate, last)
+        free = motion(situation, vehicle=self.vehicle, effects=effects).specific_force
+        world = (after[:, 3:6] - before[:, 3:6]) / step[:, None] + np.array([0.0, 0.0, GRAVITY])
+        return free, situation.to_body(world), situation.rotation
 
     def run(
         self,

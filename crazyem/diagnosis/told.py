@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.diagnosis.always import solved, unsure
+from crazyem.diagnosis.always import by_a_wrong_lag, solved, unsure
 from crazyem.diagnosis.balance import DAYS, Balance, how_weak, prefers
 from crazyem.diagnosis.balance import steady as steadily
 from crazyem.diagnosis.candidates import TRIM, Candidate
@@ -70,6 +70,9 @@ def tell(
     sd = np.sqrt(np.maximum(np.diag(solution.covariance), 0.0))
     width = float(stats.t.ppf(0.975, max(len(gram.score) - used, 3)))
     never = unsure(data, point)
+    never |= {
+        name: float(np.hypot(never.get(name, 0.0), off)) for name, off in by_a_wrong_lag(data, selection.fitted).items()
+    }
     found: list[tuple[float, Named]] = []
     groups: list[tuple[str, ...]] = []
     separate: list[str] = []

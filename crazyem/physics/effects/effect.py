@@ -87,6 +87,9 @@ class Situation:
         swing: (n, 6) direction of a load's string (unit, world) and its derivative [1/s]; None: found along the rows.
         turned: (n, 3) rad/s, body: the rate but for a constant, as motion alone changes it from row to row; None: as
             `body_rate`, which a filter has mixed with the noise of what was measured.
+        seen: (n, 3) m/s^2, body: specific force that the drone was seen to have in each step, NaN where it was not;
+            None: not known. An effect may go by rows before its own only.
+        unrest: (3,) m/s^2 sqrt(s): how much of it comes and goes at random.
     """
 
     time: NDArray
@@ -108,6 +111,8 @@ class Situation:
     lagged: NDArray | None = None
     swing: NDArray | None = None
     turned: NDArray | None = None
+    seen: NDArray | None = None
+    unrest: NDArray | None = None
 
     @property
     def size(self) -> int:
@@ -179,6 +184,7 @@ class Effect:
         amplitude: the parameter without which the others say nothing ("strength"); "" if there is none.
         alternatives: sets of parameters that are fitted together, one of which is enough; empty: all of them.
         beginnings: parameter -> values to begin from, where the likelihood may have several maxima.
+        sizes: values of the amplitude with which beginnings are compared in full, where a small one says little.
     """
 
     name: str
@@ -203,6 +209,7 @@ class Effect:
     amplitude: str = ""
     alternatives: tuple[tuple[str, ...], ...] = ()
     beginnings: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    sizes: tuple[float, ...] = ()
 
     def complete(self, values: Values, own: Values) -> dict[str, Any]:
         """All parameters: those given, else neutral; `own` are the vehicle's values for those whose neutral is NaN."""

@@ -4,6 +4,11 @@ The load hangs at r_O + L n, |n| = 1. With a the acceleration of the pivot and d
 drag,
 
     L d2n/dt2 = (1 - n n')(g - a + d) - L |dn/dt|^2 n.
+
+In flights that shake, two loads that began almost alike are out of step after some seconds: a driven pendulum is
+chaotic there, and no path is known well enough. So the load is a state that is estimated, by an extended Kalman filter
+of its own (`watched_along`), from the force with which it is seen to pull: in steps up to the last one, so that what it
+says of a step is still a prediction of it.
 """
 
 import numpy as np
@@ -14,6 +19,9 @@ from crazyem.compiled import compiled
 GRAVITY = 9.81  # m/s^2
 DAMPING = 0.1  # 1/s: drag of the load over its mass
 FASTEST = 200.0  # 1/s: only absurd paths swing faster
+# What a load may do that its path does not say: a filtered path is wrong by some 1 cm/s from one 10 ms to the next.
+ASTRAY = 1e-3  # m/sqrt(s)
+HANGING = 0.1  # rad, and rad per radian of its swing: how far it may be from hanging at rest where a stretch begins
 
 
 @compiled
@@ -28,6 +36,23 @@ def _slope(state, pull, velocity, air, length, out):
     for i in range(3):
         out[i] = state[3 + i]
         out[3 + i] = (out[3 + i] - along * state[i]) / length - speed * state[i]
+
+
+@compiled
+def _straighten(state):
+    """Take out what integration adds: direction to unit length, its derivative across it and not absurd."""
+    size = np.sqrt(state[0] * state[0] + state[1] * state[1] + state[2] * state[2])
+    along = 0.0
+    for i in range(3):
+        state[i] /= size
+        along += state[i] * state[3 + i]
+    speed = 0.0
+    for i in range(3):
+        state[3 + i] -= along * state[i]
+        speed += state[3 + i] * state[3 + i]
+    if speed > FASTEST * FASTEST:
+        for i in range(3):
+            state[3 + i] *= FASTEST / np.sqrt(speed)
 
 
 @compiled
@@ -52,18 +77,7 @@ def _swing(state, acceleration, velocity, air, step, length, work):
             _slope(work[4], pull, now, air, length, work[stage])
         for i in range(6):
             state[i] += h / 6.0 * (work[0, i] + 2.0 * work[1, i] + 2.0 * work[2, i] + work[3, i])
-        size = np.sqrt(state[0] * state[0] + state[1] * state[1] + state[2] * state[2])
-        along = 0.0
-        for i in range(3):
-            state[i] /= size
-            along += state[i] * state[3 + i]
-        speed = 0.0
-        for i in range(3):
-            state[3 + i] -= along * state[i]
-            speed += state[3 + i] * state[3 + i]
-        if speed > FASTEST * FASTEST:
-            for i in range(3):
-                state[3 + i] *= FASTEST / np.sqrt(speed)
+        _straighten(state)
 
 
 @compiled
@@ -81,6 +95,106 @@ def _along(gap, broken, velocity, air, length, out):
                 acceleration[i] = (velocity[k, i] - velocity[k - 1, i]) / gap[k]
             _swing(state, acceleration, velocity[k - 1], air[k], gap[k], length, work)
         out[k] = state
+
+
+@compiled
+def _slopes(state, pull, velocity, air, length, out):
+    """Derivative of d(state)/dt by the state, (6, 6); arguments as `_slope`."""
+    along = speed = 0.0
+    for i in range(3):
+        along += state[i] * (pull[i] - DAMPING * (velocity[i] + length * state[3 + i] - air[i]))
+        speed += state[3 + i] * state[3 + i]
+    for i in range(3):
+        for j in range(3):
+            same = 1.0 if i == j else 0.0
+            across = same - state[i] * state[j]
+            drawn_j = pull[j] - DAMPING * (velocity[j] + length * state[3 + j] - air[j])
+            out[i, j] = 0.0
+            out[i, 3 + j] = same
+            out[3 + i, j] = -(along * same + state[i] * drawn_j) / length - speed * same
+            out[3 + i, 3 + j] = -DAMPING * across - 2.0 * state[i] * state[3 + j]
+
+
+@compiled
+def _watched(gap, broken, velocity, air, length, share, rotation, free, shown, noise, out):
+    """As `_along`, corrected by what is seen of the pull; see `watched_along`."""
+    work = np.zeros((6, 6))
+    state, before = np.zeros(6), np.zeros(6)
+    acceleration, pull, drag = np.zeros(3), np.zeros(3), np.zeros(3)
+    cov, slopes, phi, flat = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), np.eye(6)
+    row, gain, pulls = np.zeros(6), np.zeros(6), np.zeros((3, 6))
+    swinging = np.sqrt(GRAVITY / length)
+    for k in range(len(gap)):
+        if broken[k]:
+            state[:] = 0.0
+            state[2] = -1.0
+            cov[:] = 0.0
+            for i in range(2):
+                cov[i, i] = HANGING**2
+                cov[3 + i, 3 + i] = (HANGING * swinging) ** 2
+            out[k] = state
+            continue
+        for i in range(3):
+            acceleration[i] = (velocity[k, i] - velocity[k - 1, i]) / gap[k]
+            pull[i] = -acceleration[i]
+        pull[2] -= GRAVITY
+        before[:] = state
+        _swing(state, acceleration, velocity[k - 1], air[k], gap[k], length, work)
+        out[k] = state
+        _slopes(before, pull, velocity[k - 1], air[k], length, slopes)
+        for i in range(6):
+            for j in range(6):
+                square = 0.0
+                for m in range(6):
+                    square += slopes[i, m] * slopes[m, j]
+                phi[i, j] = (1.0 if i == j else 0.0) + gap[k] * slopes[i, j] + 0.5 * gap[k] ** 2 * square
+        cov[:] = phi @ cov @ phi.T
+        for i in range(3):
+            cov[i, i] += gap[k] * (ASTRAY / length) ** 2
+        for i in range(3):
+            for j in range(3):
+                flat[i, j] = flat[3 + i, 3 + j] = (1.0 if i == j else 0.0) - state[i] * state[j]
+        cov[:] = flat @ cov @ flat
+        # the pull by the state: share (n.(d - f) + L |dn/dt|^2) n, world, and turned into body axes
+        taut = 0.0
+        for i in range(3):
+            force = 0.0
+            for j in range(3):
+                force += rotation[k, i, j] * free[k, j]
+            drag[i] = -DAMPING * (velocity[k, i] + length * state[3 + i] - air[k, i]) - force
+            taut += state[i] * drag[i] + length * state[3 + i] * state[3 + i]
+        for axis in range(3):
+            along = 0.0
+            for i in range(3):
+                along += rotation[k, i, axis] * state[i]
+            for i in range(3):
+                pulls[axis, i] = share * (taut * rotation[k, i, axis] + along * drag[i])
+                pulls[axis, 3 + i] = share * along * 2.0 * length * state[3 + i]
+        before[:] = 0.0  # what is corrected
+        for axis in range(3):
+            if not np.isfinite(shown[k, axis]):
+                continue
+            expected = 0.0
+            for i in range(3):
+                expected += rotation[k, i, axis] * state[i]
+            missed = shown[k, axis] - free[k, axis] - share * taut * expected
+            variance = noise[axis] ** 2 / gap[k]
+            for i in range(6):
+                row[i] = 0.0
+                missed -= pulls[axis, i] * before[i]
+                for j in range(6):
+                    row[i] += cov[i, j] * pulls[axis, j]
+                variance += pulls[axis, i] * row[i]
+            for i in range(6):
+                gain[i] = row[i] / variance
+                before[i] += gain[i] * missed
+                for j in range(6):
+                    cov[i, j] -= gain[i] * row[j]
+        for i in range(6):
+            state[i] += before[i]
+            for j in range(i):
+                cov[i, j] = cov[j, i] = 0.5 * (cov[i, j] + cov[j, i])
+        _straighten(state)
 
 
 @compiled
@@ -106,6 +220,28 @@ def swing_along(*, gap: NDArray, broken: NDArray, velocity: NDArray, air: NDArra
     """
     out = np.empty((len(gap), 6))
     _along(_plain(gap), np.ascontiguousarray(broken), _plain(velocity), _plain(air), float(length), out)
+    return out
+
+
+def watched_along(
+    *, gap: NDArray, broken: NDArray, velocity: NDArray, air: NDArray, length: float, share: float,
+    rotation: NDArray, free: NDArray, shown: NDArray, noise: NDArray,
+) -> NDArray:  # fmt: skip
+    """As `swing_along`, corrected row by row by the force with which the load is seen to pull, in rows before.
+
+    Args:
+        gap, broken, velocity, air, length: as there.
+        share: mass of the load over that of drone and load.
+        rotation: (n, 3, 3) body to world.
+        free: (n, 3) m/s^2, body: specific force over the steps, without the load.
+        shown: (n, 3) m/s^2, body: that which was seen; NaN where it was not.
+        noise: (3,) m/s^2 sqrt(s): what of it no model knows.
+    """
+    out = np.empty((len(gap), 6))
+    _watched(
+        _plain(gap), np.ascontiguousarray(broken), _plain(velocity), _plain(air), float(length), float(share),
+        _plain(rotation), _plain(free), _plain(shown), _plain(noise), out,
+    )  # fmt: skip
     return out
 
 

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
 from crazyem.physics.effects.measurement_delay import stretches
-from crazyem.physics.effects.pendulum import DAMPING, swing_along
+from crazyem.physics.effects.pendulum import DAMPING, swing_along, watched_along
 from crazyem.physics.rotations import skew
 
 
@@ -18,9 +18,11 @@ def pulled(situation: Situation, body: Body, *, mass: float, length: float) -> W
         T (1 + m n'A n) = m (n'd + L |dn/dt|^2 - n'f)
 
     with f the specific force at O without the string and d the drag of the load over its mass. The swing comes from
-    the drone's path (or `situation.swing`).
+    the drone's path and from how it was seen to pull before (or `situation.swing`).
     """
-    swing = situation.swing if situation.swing is not None else swing_of(situation, length=length)
+    swing = situation.swing
+    if swing is None:
+        swing = swing_of(situation, length=length, share=mass / (body.mass + mass))
     direction, turning = swing[:, :3], swing[:, 3:]
     drag = -DAMPING * (situation.velocity + length * turning - situation.air)
     along = situation.to_body(direction)
@@ -35,10 +37,19 @@ def _dot(a: NDArray, b: NDArray) -> NDArray:
     return np.einsum("ni,ni->n", a, b)
 
 
-def swing_of(situation: Situation, *, length: float) -> NDArray:
-    """(n, 6) direction of the string (unit, world) and its derivative [1/s] along the rows of a situation."""
+def swing_of(situation: Situation, *, length: float, share: float = 0.0) -> NDArray:
+    """(n, 6) direction of the string (unit, world) and its derivative [1/s] along the rows of a situation.
+
+    share: mass of the load over that of drone and load, by which it is seen to pull where `situation.seen` is known.
+    """
     gap, broken = stretches(situation)
-    return swing_along(gap=gap, broken=broken, velocity=situation.velocity, air=situation.air, length=length)
+    velocity, air = situation.velocity, situation.air
+    if situation.seen is None or situation.unrest is None or share <= 0.0:
+        return swing_along(gap=gap, broken=broken, velocity=velocity, air=air, length=length)
+    return watched_along(
+        gap=gap, broken=broken, velocity=velocity, air=air, length=length, share=share, rotation=situation.rotation,
+        free=situation.specific_force, shown=situation.seen, noise=situation.unrest,
+    )  # fmt: skip
 
 
 # A pendulum of the wrong period fits no better than none: in the 10 s that DAMPING leaves it, 0.1 rad/s put it a
@@ -57,4 +68,5 @@ SUSPENDED_LOAD = Effect(
     nudge={"mass": 5e-4},
     amplitude="mass",
     beginnings={"length": LENGTHS},
+    sizes=(1e-3, 2e-3, 4e-3),  # where it shakes, a load is followed only by one that pulls about as much
 )
