@@ -12,11 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.diagnosis.always import refine_base
-from crazyem.diagnosis.beginnings import KEPT, best_begun, peaks
+from crazyem.diagnosis.beginnings import KEPT, best_begun, larger, peaks
 from crazyem.diagnosis.candidates import Candidate, variants
 from crazyem.diagnosis.fit import Data, nominal, starting_point
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Model, Point
+from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 LOAD = CATALOGUE["suspended_load"]
@@ -53,6 +54,50 @@ def test_a_load_is_begun_at_the_length_whose_swing_the_flight_shows(length):
     assert len(right) == 1
     assert right[0].loglik > max(f.loglik for f in fits) - 1.0  # 0.5 m: half of that fits as well, within 0.1 nats
     assert right[0].point.effects["suspended_load"]["mass"] == pytest.approx(0.0015, rel=0.1)
+
+
+class Likely:
+    """Flights whose log-likelihood has one peak, at a mass and a length, and asks for the thrust that carries it."""
+
+    workers = Workers(1)
+
+    def __init__(self, mass, length, height):
+        self.mass, self.length, self.height = mass, length, height
+
+    def twin(self):
+        return self
+
+    def loglik(self, point):
+        load = point.effects.get("suspended_load")
+        if load is None:
+            return 0.0
+        lifted = point.effects["thrust_scale"]["scale"] / (0.9 * (1 + load["mass"] / DRONE.mass))
+        assert lifted == pytest.approx(1.0)  # beside what thrust the model had already
+        off = np.log(load["mass"] / self.mass) ** 2 + (20 * np.log(load["length"] / self.length)) ** 2
+        return self.height - 100.0 * off
+
+
+@pytest.mark.parametrize(
+    ("linear", "height", "found"),
+    [
+        (0.5, 100.0, True),  # another length is the likeliest
+        (0.252, 100.0, False),  # the same, or one beside it: derivatives of a small load said it as well
+        (0.5, -50.0, False),  # none is likelier than nothing
+    ],
+)
+def test_a_load_that_is_followed_only_by_one_as_heavy_is_begun_with_its_mass(linear, height, found):
+    point = POINT.with_effects({"thrust_scale": {"scale": 0.9}})
+    family = variants(LOAD, point, frozenset({"position", "velocity"}))
+    lengths = np.array([dict(c.begin)["length"] for c in family])
+    near = int(np.argmin(np.abs(lengths - linear)))
+    begun = larger(Likely(0.0022, 0.25, height), point, family, [near])
+    assert (begun is not None) == found
+    if begun is not None:
+        assert dict(begun.begin)["length"] == pytest.approx(0.25, rel=0.05)
+        assert dict(begun.begin)["mass"] == 0.002
+        started = begun.started(point, [0.002, 0.0])
+        assert started["mass"] == 0.002
+        assert started["length"] == dict(begun.begin)["length"]
 
 
 def test_what_swings_goes_on_through_steps_that_are_left_out():

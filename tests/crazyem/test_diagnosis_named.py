@@ -8,10 +8,10 @@ from closed_loop import DRONE, Hidden, fly
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crazyem.diagnosis.always import unsure
+from crazyem.diagnosis.always import LAG_OFF, by_a_wrong_lag, nuisances, refine_base, unsure
 from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fit import Data
+from crazyem.diagnosis.fit import Data, nominal
 from crazyem.diagnosis.flight import flight_of
 from crazyem.diagnosis.model import Point
 from crazyem.diagnosis.named import CALIBRATED, DOUBTFUL, SELDOM, Named, at_most, one_factor
@@ -94,3 +94,26 @@ def test_what_no_scatter_shows_is_part_of_an_interval() -> None:
     assert never["suspended_load", "mass"] == pytest.approx(3e-3 * DRONE.mass)
     assert never["thrust_curve", "slope_error"] == pytest.approx(0.02)
     assert unsure(data, point_of())["suspended_load", "length"] == 0.0
+
+
+def test_inertias_are_as_unsure_as_a_lag_that_is_a_little_wrong_makes_them() -> None:
+    """Held to a lag 3 ms longer, they are elsewhere by as much."""
+    data = Data([flight_of(fly(seconds=12.0), DRONE)])
+    inertia = Candidate("inertia", (), ("xx", "yy", "zz"))
+    start = nominal(data, point_of()).with_effects({"inertia": dict(zip(inertia.free, DRONE.inertia, strict=True))})
+    fitted = refine_base(data, start, [inertia], rounds=3, noise=False)
+    off = by_a_wrong_lag(data, fitted)
+    names = [*inertia.free, *((c.effect, n) for c, _ in nuisances(data, fitted.point, [inertia]) for n in c.free)]
+    lag, size = names.index(("motor_lag", "time_constant")), fitted.gram.size
+    low, high = np.full(size, -np.inf), np.full(size, np.inf)
+    theta = []
+    for change in (0.0, LAG_OFF):
+        low[lag] = high[lag] = change
+        theta.append(fitted.gram.solve(range(size), precision=fitted.precision, low=low, high=high).theta)
+    for k, name in enumerate(inertia.free):
+        assert off["inertia", name] == pytest.approx(abs(theta[1][k] - theta[0][k]), rel=1e-3)
+        assert off["inertia", name] > 0.003 * DRONE.inertia[k]
+    assert len(off) == 3
+    assert (
+        by_a_wrong_lag(data, refine_base(data, start, [Candidate("motor_lag", (), ("time_constant",))], rounds=1)) == {}
+    )

@@ -210,6 +210,20 @@ def test_a_load_counts_from_a_share_of_the_drone_s_mass_on_whatever_its_length()
     assert matters(some, load)
 
 
+def test_beside_a_load_less_thrust_than_its_swing_leaves_open_of_its_weight_is_none():
+    data = Data([flight_of(fly(seconds=6.0), DRONE)])
+    load = {"suspended_load": {"mass": 0.001, "length": 0.3}}
+    scale, more = Candidate("thrust_scale", (), ("scale",)), Candidate("payload", (), ("mass", "x", "y"))
+    for candidate, values, counts in (
+        (scale, {"thrust_scale": {"scale": 0.993}}, False),
+        (scale, {"thrust_scale": {"scale": 0.98}}, True),
+        (more, {"payload": {"mass": 0.006 * DRONE.mass}}, False),
+        (more, {"payload": {"mass": 0.02 * DRONE.mass}}, True),
+    ):
+        assert matters(POINT.with_effects(values), candidate, data)  # without a load
+        assert matters(POINT.with_effects({**load, **values}), candidate, data) == counts
+
+
 def test_a_load_is_as_significant_as_its_mass():
     """A length far from the one where fits begin, and exactly known, says nothing where the mass may be 0."""
     load = Candidate("suspended_load", (), ("mass", "length"))
