@@ -116,7 +116,7 @@ def nanodrone(shared: Path, work: Path) -> dict[str, Any]:
 
 def alignment(shared: Path, work: Path) -> dict[str, Any]:
     """Delays between rotor speeds and body rates of every run, raw and processed."""
-    from crazyem.diagnosis.inputs import inputs_of
+    from crazyem.diagnosis.flights.inputs import inputs_of
     from crazyem.recordings import open_recording
     from crazyem.vehicle import load_vehicle
 
@@ -153,10 +153,10 @@ def forces(path: Path, vehicle: str, withhold: Sequence[str], *, learned: bool =
     after 0.5 s with the attitude as measured [m], of how many starts. `learned`: as `crazyem predict` has it, with
     the force that was missing before each start; else the model alone. (A voltage that is withheld is that of the
     first 3 s for the position, at earlier starts too.)"""
-    from crazyem.diagnosis.earned import earned
-    from crazyem.diagnosis.flight import without
-    from crazyem.diagnosis.horizon import errors, open_loop, windows
-    from crazyem.diagnosis.predict import predict, recorded, turned_by
+    from crazyem.diagnosis.flights.flight import without
+    from crazyem.diagnosis.prediction.earned import earned
+    from crazyem.diagnosis.prediction.horizon import errors, open_loop, windows
+    from crazyem.diagnosis.prediction.predict import predict, recorded, turned_by
     from crazyem.recordings import open_recording
     from crazyem.vehicle import load_vehicle
 

@@ -39,6 +39,16 @@ ALLOWED: dict[str, set[str]] = {
     "__init__": {"live", "recordings", "vehicle"},  # the library's front door: lazily, on first use
 }
 
+# The same for the folders of the diagnosis, in the order in which data pass through them; `workers` serves all.
+DIAGNOSIS: dict[str, set[str]] = {
+    "workers": set(),
+    "flights": set(),
+    "prediction": {"flights"},
+    "fitting": {"flights", "workers"},
+    "locating": {"flights", "fitting", "workers"},
+    "naming": {"flights", "prediction", "fitting", "locating", "workers"},
+}
+
 # Finer than folders: the only modules that a part may import from another. Each says what the exception is for.
 ONLY: dict[tuple[str, str], set[str]] = {
     ("recordings", "links"): {"crazyem.links.base", "crazyem.links.clock"},  # a type, and 24-bit stamps
@@ -126,6 +136,21 @@ def test_the_allowed_arrows_have_no_circle() -> None:
             break
         placed |= ready
     assert placed == set(ALLOWED)
+
+
+def test_data_pass_through_the_diagnosis_one_way() -> None:
+    """What stands above its folders (`diagnose.py`, `document.py`, `compare.py`, `report/`) is used by none of them."""
+    guilty = []
+    for path in of_package("crazyem"):
+        parts = path.relative_to(ROOT / "crazyem").with_suffix("").parts
+        if parts[0] != "diagnosis" or parts[1] not in DIAGNOSIS:
+            continue
+        for module in imports(path):
+            pieces = module.split(".")
+            inside = pieces[:2] == ["crazyem", "diagnosis"] and len(pieces) > 2
+            if inside and pieces[2] not in {parts[1], *DIAGNOSIS[parts[1]]}:
+                guilty.append((name_of(path), module))
+    assert guilty == []
 
 
 def test_commands_are_only_used_from_above() -> None:

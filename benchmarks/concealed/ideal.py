@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from crazyem.diagnosis.always import refine_base
-from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, Fitted, nominal, remembering_anew
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.fitting.always import refine_base
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, remembering_anew
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording
 from crazyem.vehicle import Vehicle

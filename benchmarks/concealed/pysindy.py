@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.model import Model, Point
-from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.fitting.model import Model, Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.registry import open_recording
 from crazyem.vehicle import Vehicle, load_vehicle

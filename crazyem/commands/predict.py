@@ -18,7 +18,7 @@ LARGEST = 4e9  # bytes of the arrays
 
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
-    from crazyem.diagnosis.predict import predict, recorded
+    from crazyem.diagnosis.prediction.predict import predict, recorded
 
     recording_path = Path(arguments.file)
     output = targets([Found(recording_path)], arguments.output, ".npz", force=arguments.force)[0]

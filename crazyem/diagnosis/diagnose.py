@@ -4,33 +4,33 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from crazyem.diagnosis.always import abstained, differing, steadied, unlike_a_body
-from crazyem.diagnosis.balance import by_balance
-from crazyem.diagnosis.beside import beside_the_regression, late_rotors
-from crazyem.diagnosis.candidates import TRIM, Candidate, candidates_for
-from crazyem.diagnosis.exchange import exchanged, named_again
-from crazyem.diagnosis.fit import Data
-from crazyem.diagnosis.fit import nominal as nominal_of
-from crazyem.diagnosis.flight import Flight, flight_of
-from crazyem.diagnosis.floor import on_one_floor
-from crazyem.diagnosis.foretold import with_found, without_what_misleads
-from crazyem.diagnosis.frame import alike as in_one_frame
-from crazyem.diagnosis.heading import heading_by_place
-from crazyem.diagnosis.imitated import by_place
-from crazyem.diagnosis.locate import Located, locate
-from crazyem.diagnosis.model import STRENGTH, Point
-from crazyem.diagnosis.named import Named
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.own import Own, owned
-from crazyem.diagnosis.place import depends_on_place
-from crazyem.diagnosis.sampling import of_a_real_drone
-from crazyem.diagnosis.select import select
-from crazyem.diagnosis.split import LOAD, WEAKER, as_load, as_two
-from crazyem.diagnosis.steady import left_as_trim, with_its_thrust, with_whole_torques
-from crazyem.diagnosis.told import MEASURED_LATE, strongest_first, tell
-from crazyem.diagnosis.trials import Selection
-from crazyem.diagnosis.unexplained import Unexplained, unexplained
-from crazyem.diagnosis.witness import TELLING, false_speed, late_measurements
+from crazyem.diagnosis.fitting.always import abstained, differing, steadied, unlike_a_body
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
+from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.fitting.fit import nominal as nominal_of
+from crazyem.diagnosis.fitting.model import STRENGTH, Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.sampling import of_a_real_drone
+from crazyem.diagnosis.flights.flight import Flight, flight_of
+from crazyem.diagnosis.flights.floor import on_one_floor
+from crazyem.diagnosis.flights.frame import alike as in_one_frame
+from crazyem.diagnosis.flights.own import Own, owned
+from crazyem.diagnosis.locating.heading import heading_by_place
+from crazyem.diagnosis.locating.locate import Located, locate
+from crazyem.diagnosis.locating.place import depends_on_place
+from crazyem.diagnosis.naming.balance import by_balance
+from crazyem.diagnosis.naming.beside import beside_the_regression, late_rotors
+from crazyem.diagnosis.naming.exchange import exchanged, named_again
+from crazyem.diagnosis.naming.foretold import with_found, without_what_misleads
+from crazyem.diagnosis.naming.imitated import by_place
+from crazyem.diagnosis.naming.named import Named
+from crazyem.diagnosis.naming.select import select
+from crazyem.diagnosis.naming.split import LOAD, WEAKER, as_load, as_two
+from crazyem.diagnosis.naming.steady import left_as_trim, with_its_thrust, with_whole_torques
+from crazyem.diagnosis.naming.told import MEASURED_LATE, strongest_first, tell
+from crazyem.diagnosis.naming.trials import Selection
+from crazyem.diagnosis.naming.unexplained import Unexplained, unexplained
+from crazyem.diagnosis.naming.witness import TELLING, false_speed, late_measurements
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording

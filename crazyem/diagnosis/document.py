@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from crazyem.diagnosis.diagnose import Diagnosis
-from crazyem.diagnosis.flight import without
-from crazyem.diagnosis.horizon import HorizonErrors, Windows, errors, open_loop, windows
-from crazyem.diagnosis.locate import Finding, strongest
-from crazyem.diagnosis.named import Named
-from crazyem.diagnosis.own import Own
-from crazyem.diagnosis.predict import NAMES, Recorded, recorded
+from crazyem.diagnosis.flights.flight import without
+from crazyem.diagnosis.flights.own import Own
+from crazyem.diagnosis.locating.locate import Finding, strongest
+from crazyem.diagnosis.naming.named import Named
+from crazyem.diagnosis.prediction.horizon import HorizonErrors, Windows, errors, open_loop, windows
+from crazyem.diagnosis.prediction.predict import NAMES, Recorded, recorded
 from crazyem.diagnosis.report import Series
 from crazyem.errors import DataError
 from crazyem.recordings.recording import Recording

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from closed_loop import DRONE
 
-from crazyem.diagnosis import select
-from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.select import additions
-from crazyem.diagnosis.trials import Step, Trial
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.naming import select
+from crazyem.diagnosis.naming.select import additions
+from crazyem.diagnosis.naming.trials import Step, Trial
 from crazyem.diagnosis.workers import Workers
 
 POINT = Point(DRONE, {}, first_guess())

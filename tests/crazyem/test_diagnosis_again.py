@@ -11,24 +11,25 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
-from crazyem.diagnosis import always, told
 from crazyem.diagnosis import diagnose as diagnosing
-from crazyem.diagnosis import select as selecting
-from crazyem.diagnosis.always import COARSE_REASON, FAST, refine_base
-from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fit import Data, nominal
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.locate import Finding
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.named import DOUBTFUL, trust
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.prune import left_out
-from crazyem.diagnosis.restless import AT_RANDOM
-from crazyem.diagnosis.select import select
-from crazyem.diagnosis.told import BY_FORCE
-from crazyem.diagnosis.trials import Selection, Step, Trial
-from crazyem.diagnosis.unexplained import Unexplained, notable
+from crazyem.diagnosis.fitting import always
+from crazyem.diagnosis.fitting.always import COARSE_REASON, FAST, refine_base
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.locating.locate import Finding
+from crazyem.diagnosis.locating.restless import AT_RANDOM
+from crazyem.diagnosis.naming import select as selecting
+from crazyem.diagnosis.naming import told
+from crazyem.diagnosis.naming.named import DOUBTFUL, trust
+from crazyem.diagnosis.naming.prune import left_out
+from crazyem.diagnosis.naming.select import select
+from crazyem.diagnosis.naming.told import BY_FORCE
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial
+from crazyem.diagnosis.naming.unexplained import Unexplained, notable
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, fly
 
-from crazyem.diagnosis.always import (
+from crazyem.diagnosis.fitting.always import (
     AT_ONCE_DAMPING_SD,
     AT_ONCE_SD,
     COARSE_REASON,
@@ -27,11 +27,11 @@ from crazyem.diagnosis.always import (
     unsure,
     usual_wind,
 )
-from crazyem.diagnosis.candidates import TRIM, Candidate, candidates_for
-from crazyem.diagnosis.fit import Data, starting_point
-from crazyem.diagnosis.flight import _blocks, flight_of
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
+from crazyem.diagnosis.fitting.fit import Data, starting_point
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import _blocks, flight_of
 
 POINT = Point(DRONE, {}, first_guess())
 

@@ -9,10 +9,10 @@ from closed_loop import DRONE, fly
 from made_flight import array_of
 
 from crazyem.commands.common import new_estimator
-from crazyem.diagnosis.always import refine_base
-from crazyem.diagnosis.fit import Data, nominal, starting_point
-from crazyem.diagnosis.flight import APART, Flight, flight_of
-from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.fitting.always import refine_base
+from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.flights.flight import APART, Flight, flight_of
 from crazyem.estimation import online, steps
 from crazyem.recordings.attitudes import onboard_attitude
 from crazyem.recordings.recording import Recording

@@ -12,8 +12,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.diagnosis import balance as balancing
-from crazyem.diagnosis.balance import (
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, nominal
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.naming import balance as balancing
+from crazyem.diagnosis.naming.balance import (
     DAYS,
     FREE,
     Balance,
@@ -25,13 +30,8 @@ from crazyem.diagnosis.balance import (
     weighed,
     without_each,
 )
-from crazyem.diagnosis.candidates import TRIM, Candidate
-from crazyem.diagnosis.fit import Data, DivergedError, nominal
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.told import _by_the_day, _steady_rivals
-from crazyem.diagnosis.trials import Trial
+from crazyem.diagnosis.naming.told import _by_the_day, _steady_rivals
+from crazyem.diagnosis.naming.trials import Trial
 
 SD = np.array([0.02, 5e-4, 5e-4, 1.6e-4])  # thrust, relative; torque over thrust, m
 ARM, TURN = 0.033, 0.006  # m

@@ -11,12 +11,12 @@ from closed_loop import DRONE, Hidden, fly
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crazyem.diagnosis.always import refine_base
-from crazyem.diagnosis.beginnings import KEPT, best_begun, larger, peaks
-from crazyem.diagnosis.candidates import Candidate, variants
-from crazyem.diagnosis.fit import Data, nominal, starting_point
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.model import Model, Point
+from crazyem.diagnosis.fitting.always import refine_base
+from crazyem.diagnosis.fitting.candidates import Candidate, variants
+from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
+from crazyem.diagnosis.fitting.model import Model, Point
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.naming.beginnings import KEPT, best_begun, larger, peaks
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis import accelerometer
-from crazyem.diagnosis.beside import beside_the_regression
 from crazyem.diagnosis.compare import compare
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.document import document_of, text_of
-from crazyem.diagnosis.fit import Data, nominal, starting_point
-from crazyem.diagnosis.flight import flight_of, without
-from crazyem.diagnosis.gusts import Gusts, find_gusts
-from crazyem.diagnosis.locate import Finding
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.named import DOUBTFUL
-from crazyem.diagnosis.place import Place
-from crazyem.diagnosis.unexplained import Unexplained
+from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.flights.flight import flight_of, without
+from crazyem.diagnosis.locating.locate import Finding
+from crazyem.diagnosis.locating.place import Place
+from crazyem.diagnosis.naming import accelerometer
+from crazyem.diagnosis.naming.beside import beside_the_regression
+from crazyem.diagnosis.naming.gusts import Gusts, find_gusts
+from crazyem.diagnosis.naming.named import DOUBTFUL
+from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.errors import DataError
 from crazyem.recordings import open_recording
 from crazyem.vehicle import load_vehicle
@@ -91,7 +91,7 @@ def test_a_calm_flight_has_no_gusts(recording):
 def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(monkeypatch):
     """As in a recording whose forces last for one sample each: the logarithm's error was 30 000."""
     found = Gusts(5000.0, np.ones(3), 0.25, 3e4, True, 1.6, 0.05)
-    monkeypatch.setattr("crazyem.diagnosis.beside.find_gusts", lambda data, point: found)
+    monkeypatch.setattr("crazyem.diagnosis.naming.beside.find_gusts", lambda data, point: found)
     vehicle, remains = load_vehicle("cf2"), Unexplained((), 0.0)
     data, point = Data(()), starting_point(Point(vehicle, {}, None))
     (named,) = beside_the_regression(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
@@ -103,7 +103,7 @@ def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(m
 def test_gusts_are_as_sure_as_what_they_leave_allows(monkeypatch, other, confidence):
     """Where gusts are all there is the regression explains nothing, which says nothing of them (told with 0 once)."""
     air = Gusts(5000.0, np.ones(3), 0.25, 0.1, True, 1.6, 0.05)
-    monkeypatch.setattr("crazyem.diagnosis.beside.find_gusts", lambda data, point: air)
+    monkeypatch.setattr("crazyem.diagnosis.naming.beside.find_gusts", lambda data, point: air)
     where = Finding("attitude", "y", "changes at 7 s", "time", (7.0, 28.0), 0.04, 0.005, "rad", 34.0, 1e-7)
     remains = Unexplained((where,) if other else (), 0.0)
     data, point = Data(()), starting_point(Point(load_vehicle("cf2"), {}, None))
@@ -127,7 +127,7 @@ def test_a_diagnosis_leaves_to_gusts_what_pushes_away_and_keeps_what_pulls_back(
     where = Finding("force", "x", "x position", "x", (0.0, 20.0), size, 1e-3, "N", 30.0, 0.0)
     air = Gusts(5000.0, np.ones(3), 1.0, 0.1, True, 1.6, 0.05)
     monkeypatch.setattr("crazyem.diagnosis.diagnose.depends_on_place", lambda *_: Place(30.0, 300.0, where))
-    monkeypatch.setattr("crazyem.diagnosis.beside.find_gusts", lambda data, point: air)
+    monkeypatch.setattr("crazyem.diagnosis.naming.beside.find_gusts", lambda data, point: air)
     found = diagnose([recording], load_vehicle("cf2"), wanted=["gusts"])
     assert ("gusts" in [e.name for e in found.effects]) == gusts
     assert (where in found.unexplained.findings) == (not gusts)

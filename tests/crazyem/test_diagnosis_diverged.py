@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, fly
 
-from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, DivergedError, refine
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.select import Basis, tried
-from crazyem.diagnosis.trials import Trial
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, refine
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.naming.select import Basis, tried
+from crazyem.diagnosis.naming.trials import Trial
 from crazyem.errors import DataError
 
 DRAG = Candidate("quadratic_drag", (), ("x", "y", "z"))
@@ -50,7 +50,7 @@ def test_a_candidate_that_diverges_is_no_explanation(wild: tuple[Data, Point], m
     def diverges(*arguments: object, **more: object) -> None:
         raise DivergedError("too far")
 
-    monkeypatch.setattr("crazyem.diagnosis.select.refine_base", diverges)
+    monkeypatch.setattr("crazyem.diagnosis.naming.select.refine_base", diverges)
     basis = Basis(data, None, Point(DRONE, {}, point.noise), (), 0.0, 0.0)
     linear = Trial(DRAG, 50.0, 50.0, 1.0, 1e-9, 49.0)
     solution: Any = SimpleNamespace(theta=np.array([0.1, 0.1, 0.1]))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from crazyem.cli import main
-from crazyem.diagnosis.earned import (
+from crazyem.diagnosis.prediction.earned import (
     FEEDBACK_SD,
     FORCE_SD,
     LEAST_TIME,
@@ -23,7 +23,7 @@ from crazyem.diagnosis.earned import (
     earned,
     regressed,
 )
-from crazyem.diagnosis.predict import _at_start, predict, recorded
+from crazyem.diagnosis.prediction.predict import _at_start, predict, recorded
 from crazyem.recordings import open_recording
 from crazyem.vehicle import load_vehicle
 

@@ -12,13 +12,13 @@ from closed_loop import CONTROL, DRONE, LOG, PER_VOLT, SIGNS, G, Hidden, fly
 from numpy.typing import NDArray
 
 from crazyem.cli import main
-from crazyem.diagnosis.always import refine_base
-from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.diagnose import Diagnosis, diagnose
 from crazyem.diagnosis.document import document_of
-from crazyem.diagnosis.fit import Data, starting_point
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.model import Noise, Point
+from crazyem.diagnosis.fitting.always import refine_base
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.fit import Data, starting_point
+from crazyem.diagnosis.fitting.model import Noise, Point
+from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings import open_recording
 from crazyem.recordings.mcap.signals import write_recording

@@ -8,11 +8,11 @@ import pytest
 from closed_loop import DRONE
 from unknown_effects import unknown
 
-from crazyem.diagnosis import exchange
-from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.trials import Selection, Step, Trial
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.naming import exchange
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.workers import Workers
 
 LOAD = Candidate("payload", (), ("mass", "x", "y", "z"))

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, fly
 
-from crazyem.diagnosis.always import refine_base
-from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, nominal
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.foretold import WORSE, ratio, with_found, without_what_misleads
-from crazyem.diagnosis.horizon import UNITS, HorizonErrors
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.trials import Selection, Step, Trial
+from crazyem.diagnosis.fitting.always import refine_base
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.naming.foretold import WORSE, ratio, with_found, without_what_misleads
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial
+from crazyem.diagnosis.prediction.horizon import UNITS, HorizonErrors
 
 INERTIA = Candidate("inertia", (), ("xx", "yy", "zz"))
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.document import document_of
-from crazyem.diagnosis.flight import Flight, flight_of
-from crazyem.diagnosis.frame import alike, tilt_of
+from crazyem.diagnosis.flights.flight import Flight, flight_of
+from crazyem.diagnosis.flights.frame import alike, tilt_of
 from crazyem.recordings.recording import Recording
 
 DRAG = Hidden(drag=(0.02, 0.015, 0.0))

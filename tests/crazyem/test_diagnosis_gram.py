@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from crazyem.diagnosis.gram import CHUNK, FOLDS, Gram, bounded
+from crazyem.diagnosis.fitting.gram import CHUNK, FOLDS, Gram, bounded
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ from closed_loop import DRONE, fly
 from made_flight import array_of
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.fit import Data
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.heading import heading_by_place
+from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.locating.heading import heading_by_place
 from crazyem.recordings.recording import Recording
 
 

@@ -10,8 +10,8 @@ from flown import DRONE, START, G, fly, recording_of, smooth_thrust, speeds
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.horizon import HORIZONS, errors, horizon_errors, lengths, open_loop, windows
-from crazyem.diagnosis.predict import Recorded, recorded
+from crazyem.diagnosis.prediction.horizon import HORIZONS, errors, horizon_errors, lengths, open_loop, windows
+from crazyem.diagnosis.prediction.predict import Recorded, recorded
 from crazyem.errors import DataError
 from crazyem.recordings import open_recording
 from crazyem.vehicle import load_vehicle

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
-from crazyem.diagnosis import imitated
-from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.diagnose import Diagnosis, diagnose
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.trials import Selection, Step, Trial
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.naming import imitated
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.effect import Body
 from crazyem.physics.effects.force_by_place import FORCE_BY_PLACE, pulling

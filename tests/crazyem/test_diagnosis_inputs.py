@@ -8,7 +8,7 @@ import pytest
 from made_flight import array_of, made_flight, without
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.inputs import NOMINAL_VOLTAGE, inputs_of, rotor_input
+from crazyem.diagnosis.flights.inputs import NOMINAL_VOLTAGE, inputs_of, rotor_input
 from crazyem.errors import DataError, FileFormatError
 from crazyem.physics import folding
 from crazyem.physics.rotors import wrench

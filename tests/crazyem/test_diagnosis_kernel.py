@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.kernel import sweep
+from crazyem.diagnosis.fitting.kernel import sweep
 
 Array = NDArray[np.float64]
 G = 9.81

@@ -12,13 +12,13 @@ from closed_loop import DRONE, fly
 from made_flight import array_of
 from scipy.interpolate import CubicSpline
 
-from crazyem.diagnosis.always import refine_base
-from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, nominal
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.least import matters
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.fitting.always import refine_base
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.naming.least import matters
 
 GYRO = Candidate("measurement_delay", (("streams", ("gyro",)),), ("delay",))
 

@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_flight import Motion, changed, made_flight, without
 
-from crazyem.diagnosis.always import abstained
-from crazyem.diagnosis.candidates import candidates_for
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.inputs import NOMINAL_VOLTAGE, inputs_of
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.predict import predict, recorded
+from crazyem.diagnosis.fitting.always import abstained
+from crazyem.diagnosis.fitting.candidates import candidates_for
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.flights.inputs import NOMINAL_VOLTAGE, inputs_of
+from crazyem.diagnosis.prediction.predict import predict, recorded
 from crazyem.doctor.streams import airtime
 from crazyem.vehicle import GRAVITY, load_vehicle
 

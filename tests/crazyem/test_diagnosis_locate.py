@@ -3,11 +3,11 @@
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
-from crazyem.diagnosis.fit import Data, nominal
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.locate import Located, locate
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.locating.locate import Located, locate
 
 
 def located(hidden: Hidden, seed: int) -> Located:

@@ -9,13 +9,13 @@ from closed_loop import DRONE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crazyem.diagnosis import select
-from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.evidence import known_of, tuning
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.select import group_of, may_join, name_of
-from crazyem.diagnosis.trials import BEATEN, Step, Trial, better, preferred, told_apart
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.naming import select
+from crazyem.diagnosis.naming.evidence import known_of, tuning
+from crazyem.diagnosis.naming.select import group_of, may_join, name_of
+from crazyem.diagnosis.naming.trials import BEATEN, Step, Trial, better, preferred, told_apart
 from crazyem.diagnosis.workers import Workers
 
 NOISE = np.random.default_rng(0).normal(size=40)

@@ -8,15 +8,15 @@ from closed_loop import DRONE, Hidden, fly
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crazyem.diagnosis.always import LAG_OFF, by_a_wrong_lag, nuisances, refine_base, unsure
-from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fit import Data, nominal
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.named import CALIBRATED, DOUBTFUL, SELDOM, Named, at_most, one_factor
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.told import _numbers, strongest_first
+from crazyem.diagnosis.fitting.always import LAG_OFF, by_a_wrong_lag, nuisances, refine_base, unsure
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.naming.named import CALIBRATED, DOUBTFUL, SELDOM, Named, at_most, one_factor
+from crazyem.diagnosis.naming.told import _numbers, strongest_first
 
 OWN = np.array([1.66e-5, 1.67e-5, 2.93e-5])
 

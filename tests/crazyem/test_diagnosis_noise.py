@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.flight import Flight
-from crazyem.diagnosis.model import Noise
-from crazyem.diagnosis.noise import LEANING_FLOOR, ROWS, fit_noise, logs_of, noise_of, sample_rows
+from crazyem.diagnosis.fitting.model import Noise
+from crazyem.diagnosis.fitting.noise import LEANING_FLOOR, ROWS, fit_noise, logs_of, noise_of, sample_rows
+from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.motion import RotorInput
 
 Array = NDArray[np.float64]

@@ -9,11 +9,11 @@ from made_flight import array_of
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.always import refine_base
-from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, nominal, starting_point
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.model import Point
+from crazyem.diagnosis.fitting.always import refine_base
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.physics.effects.effect import Situation
 from crazyem.physics.effects.onboard_filter import filtered
 from crazyem.physics.rotations import rotation_matrix

@@ -18,9 +18,9 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from crazyem.cli import main
-from crazyem.diagnosis.course import ThrustCourse
-from crazyem.diagnosis.predict import predict, recorded
-from crazyem.diagnosis.simulate import Simulator
+from crazyem.diagnosis.prediction.course import ThrustCourse
+from crazyem.diagnosis.prediction.predict import predict, recorded
+from crazyem.diagnosis.prediction.simulate import Simulator
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput, rotor_thrust
 from crazyem.recordings import open_recording
@@ -405,7 +405,7 @@ def tool_of(shared_recordings: Path) -> Any:
 
 def test_the_protocol_of_the_nano_drone_benchmark(shared_recordings: Path, tmp_path: Path) -> None:
     """Shape and rows are those the benchmark's own tool scores, and its scores are those of the library."""
-    from crazyem.diagnosis.horizon import lengths
+    from crazyem.diagnosis.prediction.horizon import lengths
 
     tool = tool_of(shared_recordings)
     name = "square_run4"

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from made_flight import array_of
 from numpy.typing import NDArray
 
-from crazyem.diagnosis import felt
-from crazyem.diagnosis.alignment import Alignment
-from crazyem.diagnosis.flight import Flight, controlled_rates, flight_of, without
-from crazyem.diagnosis.inputs import inputs_of
-from crazyem.diagnosis.own import owned
-from crazyem.diagnosis.predict import predict, recorded
+from crazyem.diagnosis.fitting import felt
+from crazyem.diagnosis.flights.alignment import Alignment
+from crazyem.diagnosis.flights.flight import Flight, controlled_rates, flight_of, without
+from crazyem.diagnosis.flights.inputs import inputs_of
+from crazyem.diagnosis.flights.own import owned
+from crazyem.diagnosis.prediction.predict import predict, recorded
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
 from crazyem.recordings import open_recording

@@ -8,12 +8,12 @@ import pytest
 from closed_loop import DRONE, SIGNS, fly
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.fit import Data, nominal
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.model import Noise, Point
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.restless import (
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.model import Noise, Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.locating.restless import (
     FARTHEST,
     amplitude_of,
     beside_peaks,

@@ -7,7 +7,7 @@ import pytest
 from closed_loop import DRONE, fly
 from made_flight import array_of
 
-from crazyem.diagnosis.rotor_response import DELAY_SD, ENOUGH, LAG_BIAS, PUNCTUAL, Response, judged, response
+from crazyem.diagnosis.naming.rotor_response import DELAY_SD, ENOUGH, LAG_BIAS, PUNCTUAL, Response, judged, response
 from crazyem.recordings.recording import Recording
 
 ROTORS = replace(DRONE, rotor_constant=2e-8, motor_time_constant=0.03)

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
-from crazyem.diagnosis.always import on_held_out, refine_base
-from crazyem.diagnosis.candidates import Candidate
-from crazyem.diagnosis.evidence import gain_of_both
-from crazyem.diagnosis.fit import Data, Fitted, nominal, remembering, remembering_anew
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.onset import ONSET, date
-from crazyem.diagnosis.prune import shaken
-from crazyem.diagnosis.restless import peaks
+from crazyem.diagnosis.fitting.always import on_held_out, refine_base
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, remembering, remembering_anew
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.locating.restless import peaks
+from crazyem.diagnosis.naming.evidence import gain_of_both
+from crazyem.diagnosis.naming.onset import ONSET, date
+from crazyem.diagnosis.naming.prune import shaken
 
 ONSET_TIME = 4.37  # s
 

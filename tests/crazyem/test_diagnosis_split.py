@@ -9,16 +9,16 @@ import pytest
 from closed_loop import DRONE, Hidden, fly
 from unknown_effects import unknown
 
-from crazyem.diagnosis import split
-from crazyem.diagnosis.always import refine_base
-from crazyem.diagnosis.candidates import TRIM, Candidate
-from crazyem.diagnosis.fit import Data, nominal
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.told import tell
-from crazyem.diagnosis.trials import Selection, Step, Trial, margin, told_apart
-from crazyem.diagnosis.unexplained import Unexplained
+from crazyem.diagnosis.fitting.always import refine_base
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.naming import split
+from crazyem.diagnosis.naming.told import tell
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial, margin, told_apart
+from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 LOAD = Candidate("payload", (), ("mass", "x", "y", "z"))

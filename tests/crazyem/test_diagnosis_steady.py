@@ -8,24 +8,24 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
-from crazyem.diagnosis import model as modelling
-from crazyem.diagnosis import prune as pruning
-from crazyem.diagnosis import select as selecting
-from crazyem.diagnosis import steady as steadying
-from crazyem.diagnosis.always import refine_base
-from crazyem.diagnosis.candidates import TRIM, Candidate
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.evidence import _inverse
-from crazyem.diagnosis.fit import Data, DivergedError, nominal
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.gusts import PUSH, push_of
-from crazyem.diagnosis.least import matters
-from crazyem.diagnosis.model import Noise, Point
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.sampling import held
-from crazyem.diagnosis.select import Basis, shortlist, step_of
-from crazyem.diagnosis.steady import as_steady, beside_a_trim, by_onsets, with_whole_torques
-from crazyem.diagnosis.trials import SURE, SURE_DAILY, Selection, Trial, preferred, sure_enough
+from crazyem.diagnosis.fitting import model as modelling
+from crazyem.diagnosis.fitting.always import refine_base
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, nominal
+from crazyem.diagnosis.fitting.model import Noise, Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.sampling import held
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.naming import prune as pruning
+from crazyem.diagnosis.naming import select as selecting
+from crazyem.diagnosis.naming import steady as steadying
+from crazyem.diagnosis.naming.evidence import _inverse
+from crazyem.diagnosis.naming.gusts import PUSH, push_of
+from crazyem.diagnosis.naming.least import matters
+from crazyem.diagnosis.naming.select import Basis, shortlist, step_of
+from crazyem.diagnosis.naming.steady import as_steady, beside_a_trim, by_onsets, with_whole_torques
+from crazyem.diagnosis.naming.trials import SURE, SURE_DAILY, Selection, Trial, preferred, sure_enough
 from crazyem.diagnosis.workers import Workers
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle

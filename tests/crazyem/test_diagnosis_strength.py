@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
-from crazyem.diagnosis.always import SEVERAL, THRUST_SD, differing, nuisances, refine_base
-from crazyem.diagnosis.candidates import Candidate, Strengths, strengths_of
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fit import Data, nominal
-from crazyem.diagnosis.flight import Flight, flight_of
-from crazyem.diagnosis.model import STRENGTH, Point, of_recording
-from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.fitting.always import SEVERAL, THRUST_SD, differing, nuisances, refine_base
+from crazyem.diagnosis.fitting.candidates import Candidate, Strengths, strengths_of
+from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.model import STRENGTH, Point, of_recording
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import Flight, flight_of
 
 STRONG = (0.97, 1.0, 1.03, 1.02)
 

@@ -8,7 +8,8 @@ from closed_loop import DRONE, Hidden, fly
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.always import (
+from crazyem.diagnosis.diagnose import diagnose
+from crazyem.diagnosis.fitting.always import (
     FAST,
     abstained,
     nuisances,
@@ -16,14 +17,13 @@ from crazyem.diagnosis.always import (
     usual_gusts,
     without,
 )
-from crazyem.diagnosis.candidates import TRIM, Candidate, candidates_for
-from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fit import Data, nominal
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.model import Noise, Point
-from crazyem.diagnosis.noise import first_guess
-from crazyem.diagnosis.sampling import coarsely_sampled, fast_share, held, of_a_real_drone
-from crazyem.diagnosis.select import linear_trials
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
+from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.model import Noise, Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.sampling import coarsely_sampled, fast_share, held, of_a_real_drone
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.naming.select import linear_trials
 from crazyem.recordings import open_recording
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle, load_vehicle

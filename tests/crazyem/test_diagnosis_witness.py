@@ -10,17 +10,17 @@ import pytest
 from closed_loop import DRONE, Hidden, fly
 from made_flight import array_of
 
-from crazyem.diagnosis.always import refine_base
-from crazyem.diagnosis.candidates import Candidate
 from crazyem.diagnosis.diagnose import _heard
-from crazyem.diagnosis.fit import Data, Fitted, nominal, remembering, starting_point
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.place import depends_on_place
-from crazyem.diagnosis.told import tell
-from crazyem.diagnosis.trials import Selection, Step, Trial, between, both, margin, scatter, told_apart
-from crazyem.diagnosis.unexplained import Unexplained
-from crazyem.diagnosis.witness import TELLING, false_speed, late_measurements
+from crazyem.diagnosis.fitting.always import refine_base
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, remembering, starting_point
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.locating.place import depends_on_place
+from crazyem.diagnosis.naming.told import tell
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial, between, both, margin, scatter, told_apart
+from crazyem.diagnosis.naming.unexplained import Unexplained
+from crazyem.diagnosis.naming.witness import TELLING, false_speed, late_measurements
 from crazyem.recordings.recording import Recording
 
 

@@ -7,10 +7,10 @@ import pytest
 from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fit import Data, starting_point
-from crazyem.diagnosis.flight import flight_of
-from crazyem.diagnosis.model import Point
-from crazyem.diagnosis.noise import first_guess
+from crazyem.diagnosis.fitting.fit import Data, starting_point
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.workers import MOST, Workers
 from crazyem.errors import UsageError
 

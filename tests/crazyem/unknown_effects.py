@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.candidates import Candidate
+from crazyem.diagnosis.fitting.candidates import Candidate
 
 
 def unknown(candidates: Sequence[Candidate]) -> NDArray:

@@ -4,7 +4,7 @@ A gyro is low-passed before it is logged (crazyflie-firmware, sensors_bmi088_bmp
 and so are the accelerations that carry an onboard estimate of velocity from one fix of the pose to the next; attitude
 and position, which the fixes show, are later by less. So rates are behind the attitude, velocities behind the position.
 It belongs to the log and not to the drone: no vehicle file needs it, and diagnosis leaves it free
-(`crazyem/diagnosis/always.py`).
+(`crazyem/diagnosis/fitting/always.py`).
 """
 
 import numpy as np

@@ -2,7 +2,7 @@
 
 No four rotors are equal or upright, and no battery sits in the middle. It goes with the thrust, so nothing acts on a
 drone with its rotors at rest. For a vehicle file that has it, the day's trim differs a little from the file's; how much
-is in `crazyem/diagnosis/always.py`.
+is in `crazyem/diagnosis/fitting/always.py`.
 """
 
 import numpy as np

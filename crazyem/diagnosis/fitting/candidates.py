@@ -1,0 +1,215 @@
+"""What might be missing: each effect of the catalogue in each of its variants, as columns of the regression."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+from crazyem.diagnosis.fitting.model import STRENGTH, Column, Point
+from crazyem.diagnosis.flights.flight import Flight
+from crazyem.errors import UsageError
+from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.effect import Effect, Parameter
+from crazyem.physics.motion import own_values
+
+ON_BOARD = 0.04  # m from the middle of the rotors: no part of a Crazyflie is further away
+STRONGEST = 1.1  # a worn, cut or bent propeller pulls less than the others; a new one among worn ones a little more,
+NO_STRONGER = 1.0  # and none gets stronger in flight
+# judged by themselves: gusts.py, accelerometer.py, imitated.py; of every log: always.py
+ASIDE = ("gusts", "accelerometer_misalignment", "onboard_filter", "force_by_place")
+TRIM = "trim"
+ASKED = (TRIM,)  # looked for only if asked for: near every effect that brings a steady torque
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect with its discrete choices made.
+
+    Attributes:
+        effect: name in the catalogue.
+        fixed: parameters that are chosen (a rotor, a stream).
+        free: parameters that are fitted.
+        begin: values at which derivatives are taken while the effect is not part of the model.
+        both_ways: it may be less than nothing as well: a delay that is already counted may be counted too long.
+    """
+
+    effect: str
+    fixed: tuple[tuple[str, Any], ...]
+    free: tuple[str, ...]
+    begin: tuple[tuple[str, float], ...] = ()
+    both_ways: bool = False
+
+    @property
+    def label(self) -> str:
+        """Name with its choices, for people: rotor_fault[rotor=3]."""
+        chosen = ", ".join(f"{k}={v}" for k, v in self.fixed if v is not None)
+        if CATALOGUE[self.effect].alternatives:
+            chosen = ", ".join(filter(None, [chosen, *self.free]))
+        return f"{self.effect}[{chosen}]" if chosen else self.effect
+
+    def parameter(self, name: str) -> Parameter:
+        """The parameter of that name."""
+        return next(p for p in CATALOGUE[self.effect].parameters if p.name == name)
+
+    def range_of(self, name: str) -> tuple[float, float]:
+        """What is admitted of a parameter while it is fitted: a payload is on the drone, a faulty rotor no stronger."""
+        p, far = self.parameter(name), math.inf
+        if self.effect in ("payload", "center_of_mass") and name in "xyz":
+            far = ON_BOARD
+        elif self.effect == "rotor_fault" and name == "scale":
+            far = STRONGEST if dict(self.fixed).get("onset_time") is None else NO_STRONGER
+        return max(-p.high if self.both_ways else p.low, -far), min(p.high, far)
+
+    def neutral(self, point: Point) -> dict[str, Any]:
+        """All its parameters as the vehicle file has them, else at neutral; the choices made."""
+        own = own_values(point.vehicle).get(self.effect, {})
+        filed = point.vehicle.effects.get(self.effect, {})
+        if any(filed.get(name, value) != value for name, value in self.fixed):
+            filed = {}  # of another rotor
+        return {**CATALOGUE[self.effect].complete(filed, own), **dict(self.fixed)}
+
+    def values(self, point: Point) -> dict[str, Any]:
+        """Where it is in a model, or neutral."""
+        return {**self.neutral(point), **point.effects.get(self.effect, {})}
+
+    def columns(self, point: Point) -> list[Column]:
+        """Derivatives at the model, or where the effect begins to matter if it is not part of it."""
+        present = self.effect in point.effects
+        base = {**self.neutral(point), **(point.effects[self.effect] if present else dict(self.begin))}
+        before = point.with_effects({self.effect: base}).effects if not present or self.begin else None
+        columns = []
+        for name in self.free:
+            parameter = self.parameter(name)
+            width = parameter.scale if base[name] + parameter.scale <= parameter.high else -parameter.scale
+            plus = point.with_effects({self.effect: {**base, name: base[name] + width}}).effects
+            minus = before if self.begin and not present else None
+            columns.append(Column(f"{self.effect}.{name}", plus, minus, width))
+        return columns
+
+    def bounds(self, point: Point) -> tuple[list[float], list[float]]:
+        """Admitted changes of the free parameters from where they are."""
+        here = self.values(point)
+        ends = [self.range_of(n) for n in self.free]
+        low = [min(end[0] - here[n], 0.0) for end, n in zip(ends, self.free, strict=True)]
+        return low, [max(end[1] - here[n], 0.0) for end, n in zip(ends, self.free, strict=True)]
+
+    def started(self, point: Point, change: Sequence[float]) -> dict[str, Any]:
+        """Values of the effect after a change found while it was not part of the model.
+
+        With an amplitude, the derivatives by the others were taken at its small value, so their changes scale with it.
+        """
+        base = {**self.neutral(point), **dict(self.begin)}
+        found = dict(base)
+        amplitude = CATALOGUE[self.effect].amplitude
+        moved = dict(zip(self.free, change, strict=True))
+        grown = None
+        if amplitude in moved and amplitude in dict(self.begin):
+            neutral = self.neutral(point)[amplitude]
+            small = base[amplitude] - neutral
+            p = self.parameter(amplitude)
+            grown = neutral + moved[amplitude]
+            if abs(moved[amplitude]) < 0.05 * abs(small) or not p.low <= grown <= p.high:
+                grown = base[amplitude]  # of nothing the others have no derivatives: a weight that only tilts
+            found[amplitude] = grown
+            ratio = small / (grown - neutral)
+        for name in self.free:
+            if name == amplitude and grown is not None:
+                continue
+            step = moved[name] * (ratio if grown is not None else 1.0)
+            found[name] = base[name] + step
+        for name in self.free:
+            low, high = self.range_of(name)
+            found[name] = min(max(found[name], low), high)
+        return found
+
+
+class Strengths(Candidate):
+    """The thrust of each recording over what the vehicle says of it (`model.STRENGTH`): always free, never named."""
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return "strength of each recording"
+
+    def parameter(self, name: str) -> Parameter:
+        """Of the recording of that name."""
+        return Parameter(name, "", 1.0, 0.5, 1.5, 0.01)
+
+    def neutral(self, point: Point) -> dict[str, Any]:
+        """As the vehicle says."""
+        return dict.fromkeys(self.free, 1.0)
+
+
+def strengths_of(flights: Sequence[Flight]) -> Strengths:
+    """Those of some recordings; two of one name are one."""
+    return Strengths(STRENGTH, (), tuple(dict.fromkeys(f.name for f in flights)))
+
+
+def candidates_for(
+    point: Point,
+    signals: frozenset[str],
+    *,
+    measured_speeds: bool,
+    wanted: Sequence[str] = (),
+) -> tuple[list[Candidate], dict[str, str]]:
+    """All candidates that the recorded signals can speak of; and those they cannot, with the reason.
+
+    Raises:
+        UsageError: a wanted effect is not in the catalogue.
+    """
+    for name in wanted:
+        if name not in CATALOGUE:
+            raise UsageError(f"unknown effect '{name}' (known: {', '.join(CATALOGUE)})")
+    found: list[Candidate] = []
+    left_out: dict[str, str] = {}
+    for name, effect in CATALOGUE.items():
+        if wanted and name not in wanted:
+            continue
+        reason = _impossible(effect, signals, measured_speeds)
+        if reason:
+            left_out[name] = reason
+        elif name not in ASIDE and (name in wanted or name not in ASKED):
+            found += variants(effect, point, signals)
+    return found, left_out
+
+
+def _impossible(effect: Effect, signals: frozenset[str], measured_speeds: bool) -> str:
+    if effect.needs and not any(s in signals for s in effect.needs):
+        return f"needs {' or '.join(effect.needs)}, which the recording does not have"
+    if effect.speed is not None and not measured_speeds:
+        return "needs measured rotor speeds"
+    if measured_speeds and (effect.commanded is not None or effect.name == "motor_lag"):
+        return "acts before the rotors, whose speeds were measured"
+    return ""
+
+
+def variants(effect: Effect, point: Point, signals: frozenset[str]) -> list[Candidate]:
+    """One candidate for each discrete choice, set of parameters and beginning."""
+    chosen = [p for p in effect.parameters if p.chosen]
+    continuous = [p.name for p in effect.parameters if not p.chosen and _fitted(p, signals)]
+    found = []
+    for picks in product(*(p.chosen for p in chosen)):
+        fixed = tuple(zip((p.name for p in chosen), picks, strict=True))
+        if ("accelerometer",) in picks:
+            continue  # the accelerometer is compared by itself (accelerometer.py)
+        for free in effect.alternatives or (tuple(continuous),):
+            if not all(name in continuous for name in free):
+                continue
+            for begin in _beginnings(effect):
+                found.append(Candidate(effect.name, fixed, tuple(free), begin))
+    return found
+
+
+def _fitted(parameter: Parameter, signals: frozenset[str]) -> bool:
+    if parameter.needs and not any(s in signals for s in parameter.needs):
+        return False
+    return parameter.neutral is not None and parameter.scale > 0 and math.isfinite(parameter.scale)
+
+
+def _beginnings(effect: Effect) -> list[tuple[tuple[str, float], ...]]:
+    names = list(effect.beginnings)
+    grid: list[Mapping[str, float]] = [
+        dict(zip(names, values, strict=True)) for values in product(*(effect.beginnings[n] for n in names))
+    ]
+    return [tuple({**effect.nudge, **values}.items()) for values in grid]

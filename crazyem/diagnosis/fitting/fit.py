@@ -1,0 +1,316 @@
+"""Fitting effects to flights: derivatives of all columns in one pass, Gauss-Newton steps, noise scales in between."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.gram import Gram
+from crazyem.diagnosis.fitting.model import STRENGTH, Column, Model, Point, Swept
+from crazyem.diagnosis.fitting.noise import first_guess, fit_noise
+from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.workers import Workers
+from crazyem.errors import DataError
+from crazyem.physics.effects.catalogue import CATALOGUE
+
+ROUNDS = 6  # of Gauss-Newton
+WILD = 4.0  # mean square of a step's standardised innovations beyond which it is left out
+REACH = 2.5  # standard deviations within which a nuisance stays
+TORQUES = np.full(3, 0.5)  # rad/s^2, where disturbing torques with memory begin
+WANDER = 0.5  # s: memory of torques that moving air brings
+SAMPLED, WANDERING = 3.0, 2.0  # nats; nats a second: that torques with the memory of the lag, of the air must gain
+PASSES, CONVERGED, SLIGHT = 8, 0.2, 0.01  # passes, nats, relative error of velocity that one pass finds
+ENOUGH = 0.05  # nats: a round that gains less ends the fit
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A model fitted to flights.
+
+    Attributes:
+        point: vehicle, effects and noise.
+        candidates: whose parameters are free.
+        loglik: of the flights fitted [nats].
+        gram: of the free columns at the maximum, nuisances last.
+        precision: (columns of `gram`,) of the priors; 0 for the candidates' own.
+    """
+
+    point: Point
+    candidates: tuple[Candidate, ...]
+    loglik: float
+    gram: Gram
+    precision: NDArray
+
+
+class DivergedError(DataError):
+    """A model under which the filter leaves the range of numbers: nothing can be fitted from there."""
+
+
+class Data:
+    """Flights to be explained together.
+
+    Args:
+        workers: who shares the work; without, it is done in the calling thread.
+    """
+
+    def __init__(self, flights: Sequence[Flight], workers: Workers | None = None) -> None:
+        self.models = [Model(f) for f in flights]
+        self.workers = workers or Workers(1)
+
+    def twin(self) -> "Data":
+        """The same flights, with the paths of the last pass: what is done to the twin leaves this one as it is."""
+        twin = Data((), self.workers)
+        twin.models = [m.twin() for m in self.models]
+        return twin
+
+    def together_with(self, other: "Data | None") -> "Data":
+        """A twin of these flights and of others, to be explained alike."""
+        both = self.twin()
+        both.models += other.twin().models if other is not None else []
+        return both
+
+    def each(self) -> list["Data"]:
+        """Twins of the flights one by one."""
+        parts = [Data((), self.workers) for _ in self.models]
+        for part, model in zip(parts, self.models, strict=True):
+            part.models = [model.twin()]
+        return parts
+
+    @property
+    def flights(self) -> list[Flight]:
+        """The flights."""
+        return [m.flight for m in self.models]
+
+    @property
+    def signals(self) -> frozenset[str]:
+        """What all of them measure."""
+        return frozenset.intersection(*(f.signals for f in self.flights))
+
+    @property
+    def differ(self) -> bool:
+        """Whether each of them may have a thrust of its own."""
+        return bool(self.models) and all(f.differs for f in self.flights)
+
+    @property
+    def coarse(self) -> bool:
+        """Whether in none of them what turned the drone is in the commands as recorded."""
+        return all(f.coarse for f in self.flights)
+
+    def loglik(self, point: Point, passes: int = 1) -> float:
+        """Log-likelihood [nats]; a start is not counted."""
+        return sum(self.workers.map(lambda m: m.sweep(point, passes=passes).loglik, self.models))
+
+    def block_loglik(self, point: Point) -> NDArray:
+        """(b,) log-likelihood by blocks of all flights [nats]."""
+        return np.concatenate([np.bincount(m.flight.block, m.sweep(point).rows) for m in self.models])
+
+    def recordings_of_blocks(self) -> NDArray:
+        """(b,) int: which flight each of those blocks is of."""
+        return np.repeat(np.arange(len(self.models)), [m.flight.blocks for m in self.models])
+
+    def settle(self, point: Point) -> list[Swept]:
+        """Physics evaluated at the filter's own states."""
+        return self.workers.map(lambda m: m.settle(point), self.models)
+
+    def converge(self, point: Point) -> None:
+        """Pass until physics is evaluated where the filter is; where sensors show the state itself, one is enough."""
+        if not any(strongly_shown(name, values) for name, values in point.effects.items()):
+            return
+        before = self.loglik(point)
+        for _ in range(PASSES):
+            now = self.loglik(point)
+            if abs(now - before) < CONVERGED:
+                break
+            before = now
+
+    def fit_noise(self, point: Point, *, iterations: int = 8) -> Point:
+        """The same model with noise scales that fit."""
+        parts = []
+        for model in self.models:
+            acceleration, _ = model.accelerations(point)
+            parts.append((model.flight, acceleration, model.offsets(point, acceleration)))
+        return replace(point, noise=fit_noise(parts, point.noise, iterations=iterations, workers=self.workers))
+
+    def leave_out_wild(self, point: Point) -> int:
+        """Begin anew where a step fits nothing (a stalled link, pulses of command between samples); returns how many.
+
+        One such step outweighs seconds of flight, and tells of no effect that acts at other times.
+        """
+        count = 0
+        for i, model in enumerate(self.models):
+            swept = model.sweep(point)
+            seen = swept.variance > 0
+            squares = np.divide(swept.innovation**2, swept.variance, out=np.zeros_like(swept.variance), where=seen)
+            mean = squares.sum(1) / np.maximum(seen.sum(1), 1)
+            limit = max(WILD, WILD * float(np.quantile(mean, 0.95)) / 2)
+            wild = mean > limit
+            if wild.sum() > 0.02 * wild.size:
+                wild &= mean >= np.quantile(mean, 0.98)
+            wild[1:] |= wild[:-1].copy()
+            if wild.any():
+                count += int(wild.sum())
+                flight = model.flight.started(model.flight.starts | wild)
+                self.models[i] = Model(flight)
+        return count
+
+    def gram(self, point: Point, columns: Sequence[Column]) -> Gram:
+        """Score and information of columns."""
+        return self.gram_and_loglik(point, columns)[0]
+
+    def gram_and_loglik(self, point: Point, columns: Sequence[Column]) -> tuple[Gram, float]:
+        """Score and information of columns, and the log-likelihood."""
+        score, information, flight, loglik = [], [], [], 0.0
+        for i, swept in enumerate(self.workers.map(lambda m: m.sweep(point, columns), self.models)):
+            score.append(swept.score)
+            information.append(swept.information)
+            flight.append(np.full(len(swept.score), i))
+            loglik += swept.loglik
+        return Gram(np.concatenate(score), np.concatenate(information), np.concatenate(flight)), loglik
+
+
+def strongly_shown(name: str, values: Mapping[str, Any]) -> bool:
+    """Whether an effect moves what sensors show so far from the state that one pass does not find it."""
+    if name == STRENGTH or CATALOGUE[name].measured is None:
+        return False
+    return name != "velocity_scale" or any(abs(values.get(a, 1.0) - 1.0) > SLIGHT for a in "xyz")
+
+
+def nominal(data: Data, point: Point) -> Point:
+    """The nominal model with noise scales fitted, torques with memory if the flights ask for them."""
+    data.settle(point)
+    fitted = data.fit_noise(point)
+    if data.leave_out_wild(fitted):
+        data.settle(fitted)
+        fitted = data.fit_noise(fitted)
+    fitted = remembering(data, fitted)
+    data.settle(fitted)
+    return fitted
+
+
+def remembering(data: Data, point: Point) -> Point:
+    """The point with disturbing torques that have a memory, where the likelihood gains by them.
+
+    A command sampled at 100 Hz stands for the five or ten that the rotors got. What it misses acts through the rotors'
+    lag: torque noise with the memory of the lag. Taken for white it makes torques look too weak by some 10 % (errors in
+    the variables). Moving air brings torques of about half a second.
+    """
+    seconds = sum(f.duration for f in data.flights)
+    lag = 0.0 if data.flights[0].inputs.measured else point.vehicle.motor_time_constant
+    best, value = point, data.loglik(point)
+    for memory, needed in ((lag, SAMPLED), (WANDER, WANDERING * seconds)):
+        if memory > 0:
+            start = np.concatenate([point.noise.disturbance[:3], TORQUES])
+            noise = replace(point.noise, disturbance=start, memory=memory)
+            there = data.fit_noise(replace(point, noise=noise), iterations=5)
+            data.settle(there)
+            found = data.loglik(there)
+            if found > value + needed:
+                best, value = there, found
+    return best
+
+
+def remembering_anew(data: Data, point: Point) -> Point:
+    """`remembering` for a model that has found an effect: what the effect did was noise until then."""
+    if not point.noise.disturbance[3:].any():
+        return remembering(data, point)
+    forces = np.concatenate([point.noise.disturbance[:3], np.zeros(3)])
+    white = data.fit_noise(replace(point, noise=replace(point.noise, disturbance=forces)), iterations=5)
+    data.settle(white)
+    chosen = remembering(data, white)
+    data.settle(chosen)
+    return chosen
+
+
+def starting_point(point: Point) -> Point:
+    """The point with a first guess of the noise."""
+    return replace(point, noise=first_guess())
+
+
+def bounds_of(candidates: Sequence[Candidate], point: Point) -> tuple[NDArray, NDArray]:
+    """Admitted changes of all free parameters."""
+    low, high = [], []
+    for c in candidates:
+        lo, hi = c.bounds(point)
+        low += lo
+        high += hi
+    return np.array(low), np.array(high)
+
+
+def held_near(low: NDArray, high: NDArray, away: NDArray, precision: NDArray) -> tuple[NDArray, NDArray]:
+    """Bounds of change, with what has a prior held within a few of its standard deviations: beyond, it is an effect."""
+    reach = np.where(precision > 0, REACH / np.sqrt(np.maximum(precision, 1e-300)), np.inf)
+    return np.maximum(low, np.minimum(-reach - away, 0.0)), np.minimum(high, np.maximum(reach - away, 0.0))
+
+
+def moved(point: Point, candidates: Sequence[Candidate], change: NDArray) -> Point:
+    """The point with the free parameters changed."""
+    changes: dict[str, dict[str, Any]] = {}
+    at = 0
+    for c in candidates:
+        here = c.values(point)
+        for name in c.free:
+            here[name] = float(np.clip(here[name] + change[at], *c.range_of(name)))
+            at += 1
+        changes[c.effect] = {**changes.get(c.effect, {}), **here}
+    return point.with_effects(changes)
+
+
+def refine(
+    data: Data,
+    start: Point,
+    candidates: Sequence[Candidate],
+    *,
+    nuisances: Sequence[tuple[Candidate, tuple[float, ...]]] = (),
+    about: Point | None = None,
+    rounds: int = ROUNDS,
+    noise: bool = True,
+) -> Fitted:
+    """Maximum of the posterior near `start`, in which the candidates' effects already stand.
+
+    `nuisances` are free too, with Gaussian priors of these precisions about neutral, or about their values in `about`.
+
+    Raises: DivergedError if the filter leaves the range of numbers at `start`.
+    """
+    point = start
+    free = [*candidates, *(c for c, _ in nuisances)]
+    own = sum(len(c.free) for c in candidates)
+    weight = np.array([0.0] * own + [w for _, precision in nuisances for w in precision])
+
+    def away(at: Point) -> NDArray:
+        middle = [c.neutral(at) if about is None else c.values(about) for c, _ in nuisances]
+        apart = [c.values(at)[n] - m[n] for (c, _), m in zip(nuisances, middle, strict=True) for n in c.free]
+        return np.array([0.0] * own + apart)
+
+    def look(at: Point) -> tuple[float, Gram]:
+        data.converge(at)
+        gram, loglik = data.gram_and_loglik(at, [column for c in free for column in c.columns(at)])
+        return loglik - 0.5 * float(weight @ np.square(away(at))), gram
+
+    data.loglik(point)  # physics is evaluated where the filter is
+    with np.errstate(over="ignore", invalid="ignore"):
+        value, gram = look(point)
+    if not np.isfinite(value) or not np.isfinite(gram.information).all():
+        raise DivergedError("the vehicle's model leaves the range of numbers on this flight: is it this drone's?")
+    for turn in range(rounds if free else 0):
+        low, high = held_near(*bounds_of(free, point), away(point), weight)
+        step = gram.solve(range(gram.size), low=low, high=high, precision=weight, prior=-away(point)).theta
+        before = value
+        for _ in range(6):
+            there = moved(point, free, step)
+            found, slopes = look(there)
+            if found > value - 1e-6:
+                point, value, gram = there, found, slopes
+                break
+            step = step / 3
+        gained = value - before
+        if noise and (turn < 1 or gained > 2.0):
+            better = data.fit_noise(point, iterations=4)
+            found, slopes = look(better)
+            if found > value:
+                point, value, gram = better, found, slopes
+        if gained < ENOUGH:
+            break
+    return Fitted(point, tuple(candidates), value, gram, weight)

@@ -1,0 +1,390 @@
+"""A flight under a model: vehicle, effects, noise -> innovations, and their derivatives by any columns."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from crazyem.diagnosis.fitting import felt
+from crazyem.diagnosis.fitting.kernel import sweep
+from crazyem.diagnosis.flights.flight import Flight
+from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.effect import Effects, Situation
+from crazyem.physics.motion import measured, motion, rotor_thrust
+from crazyem.physics.rotations import rotation_matrix
+from crazyem.vehicle import Vehicle
+
+RECENT = 0.5  # s, over which what a model lacks is averaged: long enough that the noise of one sample is nothing
+# The thrust of one recording over what the vehicle file and its effects say: batteries and propellers of another day.
+# No effect of the catalogue, since it belongs to no drone: name of the flight -> factor.
+STRENGTH = "strength"
+WIDE = np.array([1.0] * 3 + [2.0] * 3 + [0.5] * 3 + [3.0] * 3) ** 2  # variances at a start of what is not measured
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of process and measurement.
+
+    Attributes:
+        impulse: (6,) intensities of specific force [m/s^2 sqrt(s)] and angular acceleration [rad/s^2 sqrt(s)], body.
+        measurement: (4,) standard deviations of position [m], velocity [m/s], attitude [rad], body rate [rad/s].
+        disturbance: (6,) standard deviations of disturbances with memory [m/s^2, rad/s^2], body; 0: none.
+        memory: s, their correlation time; or (6,).
+    """
+
+    impulse: NDArray
+    measurement: NDArray
+    disturbance: NDArray = field(default_factory=lambda: np.zeros(6))
+    memory: float | NDArray = 1.0
+
+
+@dataclass(frozen=True)
+class Point:
+    """A model: vehicle and effects (name -> parameter -> value) and the noise."""
+
+    vehicle: Vehicle
+    effects: Effects
+    noise: Noise
+
+    def with_effects(self, changes: Mapping[str, Mapping[str, Any]]) -> "Point":
+        """The same with some effects' parameters replaced."""
+        merged = {name: dict(values) for name, values in self.effects.items()}
+        for name, values in changes.items():
+            merged[name] = {**merged.get(name, {}), **values}
+        return replace(self, effects=merged)
+
+
+@dataclass(frozen=True)
+class Swept:
+    """What one pass over a flight found.
+
+    Attributes:
+        loglik: of the whole flight [nats].
+        rows: (n,) by row.
+        predicted, filtered: (n, 19) states.
+        innovation, variance: (n, 12), sequential scalars; variance 0 where nothing was measured.
+        score: (b, c) by block; information: (b, c, c) by block. Empty without columns.
+    """
+
+    loglik: float
+    rows: NDArray
+    predicted: NDArray
+    filtered: NDArray
+    innovation: NDArray
+    variance: NDArray
+    score: NDArray
+    information: NDArray
+
+
+@dataclass(frozen=True)
+class Column:
+    """A direction in the space of models: effects displaced, against effects as they are, over the displacement.
+
+    `acting` and `showing` give derivatives that are no effect's: of the accelerations (n, 6), of what is shown (n, 12).
+    """
+
+    name: str
+    plus: Effects | None = None
+    minus: Effects | None = None
+    width: float = 1.0
+    acting: NDArray | None = None
+    showing: NDArray | None = None
+
+
+def initial_path(flight: Flight) -> NDArray:
+    """(n, 19) states to begin with: what was measured, interpolated where it was not."""
+    path = np.zeros((flight.time.size, 19))
+    path[:, 9] = 1.0
+    for c in range(13):
+        known = np.isfinite(flight.y[:, c])
+        if known.any():
+            path[:, c] = np.interp(flight.time, flight.time[known], flight.y[known, c])
+    if not np.isfinite(flight.y[:, 3:6]).any() and np.isfinite(flight.y[:, 0:3]).any():
+        path[:, 3:6] = np.gradient(path[:, 0:3], flight.time, axis=0)
+    path[:, 6:10] /= np.linalg.norm(path[:, 6:10], axis=1, keepdims=True)
+    return path
+
+
+def thrust_of(flight: Flight, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, NDArray]:
+    """Mean thrust of each rotor over the steps, and its rate: (n, 4) N, (n, 4) N/s."""
+    return rotor_thrust(
+        flight.inputs, flight.time, vehicle=vehicle, effects=effects, breaks=np.flatnonzero(flight.gaps).tolist()
+    )
+
+
+def situation_of(
+    flight: Flight, path: NDArray, vehicle: Vehicle, thrusts: tuple[NDArray, NDArray], rotation: NDArray | None = None
+) -> Situation:
+    """The situation at the rows of a path (n, 19)."""
+    thrust, rate = thrusts
+    step = np.concatenate([[0.0], np.diff(flight.time)])
+    step[flight.gaps] = 0.0
+    rotation = rotation_matrix(path[:, 6:10]) if rotation is None else rotation
+    n = flight.time.size
+    return Situation(
+        time=flight.time, flown=flight.flown, step=step, position=path[:, 0:3],
+        height=np.maximum(path[:, 2] - flight.ground, 0.0), velocity=path[:, 3:6], rotation=rotation,
+        body_rate=path[:, 10:13], specific_force=np.zeros((n, 3)), angular_acceleration=np.zeros((n, 3)),
+        thrust=thrust, thrust_rate=rate, voltage=flight.voltage,
+        rotor_constant=float("nan") if vehicle.rotor_constant is None else vehicle.rotor_constant,
+        air=np.zeros((n, 3)),
+    )  # fmt: skip
+
+
+def causal_middle(filtered: NDArray, predicted: NDArray, starts: NDArray) -> NDArray:
+    """(n, 19) states in the middle of each step: filtered at its begin, predicted to its end."""
+    middle = predicted.copy()
+    before = filtered[:-1]
+    inside = ~starts[1:]
+    sign = np.sign(np.sum(before[:, 6:10] * predicted[1:, 6:10], axis=1, keepdims=True))
+    mean = 0.5 * (before + predicted[1:])
+    mean[:, 6:10] = before[:, 6:10] * np.where(sign == 0, 1.0, sign) + predicted[1:, 6:10]
+    mean[:, 6:10] /= np.linalg.norm(mean[:, 6:10], axis=1, keepdims=True)
+    middle[1:][inside] = mean[inside]
+    return middle
+
+
+def corrected(swept: Swept, flight: Flight) -> tuple[NDArray, NDArray, NDArray]:
+    """What a pass of the filter found beyond its model, step by step: changes (n, 6) of velocity m/s and body rate
+    rad/s, body axes; lengths (n,) of the steps [s]; which of them (n,) are known (0 where not)."""
+    step = np.diff(flight.time, prepend=flight.time[0])
+    known = (step > 0) & ~flight.starts
+    change = swept.filtered - swept.predicted
+    force = np.einsum("nji,nj->ni", rotation_matrix(swept.filtered[:, 6:10]), change[:, 3:6])
+    carried = swept.filtered[:, 13:19] * step[:, None]
+    return (
+        np.where(known[:, None], carried + np.concatenate([force, change[:, 10:13]], axis=1), 0.0),
+        np.where(known, step, 0.0),
+        known,
+    )
+
+
+def seen_force(swept: Swept, flight: Flight, acceleration: NDArray) -> NDArray:
+    """(n, 3) m/s^2: specific force over each step by the model and what the filter found beside it; NaN: not known."""
+    impulse, step, known = corrected(swept, flight)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        seen: NDArray = np.where(known[:, None], acceleration[:, :3] + impulse[:, :3] / step[:, None], np.nan)
+    return seen
+
+
+def unrest(noise: Noise) -> NDArray:
+    """(3,) m/s^2 sqrt(s): intensity of the specific force that comes and goes, with a memory or without."""
+    memory = np.broadcast_to(np.asarray(noise.memory, float), (6,))[:3]
+    found: NDArray = np.sqrt(np.square(noise.impulse[:3]) + 2.0 * memory * np.square(noise.disturbance[:3]))
+    return found
+
+
+def lacking(swept: Swept, flight: Flight) -> NDArray:
+    """(n, 6) specific force m/s^2 and angular acceleration rad/s^2, body axes, that a model lacks along a flight.
+
+    The mean over the last `RECENT` of the disturbances with a memory and of what measurements corrected: what comes
+    and goes faster is known to the filter too late, and would look like a gyro that is early.
+    """
+    impulse, step, known = corrected(swept, flight)
+    forget = [1.0, -np.exp(-float(np.median(step[known])) / RECENT)] if known.any() else [1.0, 0.0]
+    total, span = (lfilter([1.0], forget, v, axis=0) for v in (impulse, step[:, None]))
+    mean: NDArray = total / np.maximum(span, RECENT)
+    return mean
+
+
+def of_recording(effects: Effects, name: str) -> Effects:
+    """The effects as they act in the recording of that name: with its own strength, where there is one."""
+    if STRENGTH not in effects:
+        return effects
+    own: dict[str, Mapping[str, Any]] = {n: v for n, v in effects.items() if n != STRENGTH}
+    factor = effects[STRENGTH].get(name, 1.0)
+    if factor != 1.0:
+        own["thrust_scale"] = {"scale": factor * own.get("thrust_scale", {}).get("scale", 1.0)}
+    return own
+
+
+@dataclass
+class Model:
+    """A flight under models near one another: remembers the path of the last pass, at which physics is evaluated."""
+
+    flight: Flight
+    path: NDArray | None = None  # (n, 19) in the middle of each step
+    shown: NDArray | None = None  # (n, 19) filtered, at the rows
+    moved: NDArray | None = None  # (n, 6) accelerations of that path, with what the model lacks
+    seen: NDArray | None = None  # (n, 3) specific force over each step of that path, as it was found to be
+    _thrusts: dict[str, tuple[NDArray, NDArray]] = field(default_factory=dict)
+    _rotation: NDArray | None = None  # of the path
+    _rotation_shown: NDArray | None = None
+    _felt_alone: bool | None = None
+    _vibration: NDArray | None = None
+
+    def twin(self) -> "Model":
+        """A model that remembers the same; arrays are shared, as they are only ever replaced."""
+        return replace(self, _thrusts=dict(self._thrusts))
+
+    def thrusts(self, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, NDArray]:
+        """Thrusts after the lag; remembered, since most columns change nothing before the rotors."""
+        effects = of_recording(effects, self.flight.name)
+        before = {n: effects[n] for n in effects if _before_rotors(n)}
+        key = f"{vehicle!r} {before!r}"
+        if key not in self._thrusts:
+            if len(self._thrusts) > 8:
+                self._thrusts.clear()
+            self._thrusts[key] = thrust_of(self.flight, vehicle, before)
+        return self._thrusts[key]
+
+    def accelerations(self, point: Point, effects: Effects | None = None) -> tuple[NDArray, Situation]:
+        """(n, 6) specific force and angular acceleration over each step, and the situation."""
+        effects = of_recording(point.effects if effects is None else effects, self.flight.name)
+        path = initial_path(self.flight) if self.path is None else self.path
+        if self._rotation is None:
+            self._rotation = rotation_matrix(path[:, 6:10])
+        thrusts = self.thrusts(point.vehicle, effects)
+        situation = situation_of(self.flight, path, point.vehicle, thrusts, self._rotation)
+        situation = replace(situation, seen=self.seen, unrest=unrest(point.noise))
+        moved = motion(situation, vehicle=point.vehicle, effects=effects)
+        return np.concatenate([moved.specific_force, moved.angular_acceleration], axis=1), situation
+
+    def offsets(self, point: Point, accelerations: NDArray, effects: Effects | None = None) -> NDArray:
+        """(n, 12) what the sensors show beyond the truth, evaluated at the filtered states.
+
+        A lag shows by the accelerations that the drone has, not by those that a wrong model gives: a shifted centre of
+        mass of 0.7 mm is 10 rad/s^2, and 1 ms of that would be a gyro's bias of 10 mrad/s.
+        """
+        effects = of_recording(point.effects if effects is None else effects, self.flight.name)
+        accelerations = accelerations if self.moved is None else self.moved
+        if not any(_shows(name) for name in effects):
+            return np.zeros((self.flight.time.size, 12))
+        path = initial_path(self.flight) if self.shown is None else self.shown
+        if self._rotation_shown is None:
+            self._rotation_shown = rotation_matrix(path[:, 6:10])
+        thrusts = self.thrusts(point.vehicle, {})
+        situation = replace(
+            situation_of(self.flight, path, point.vehicle, thrusts, self._rotation_shown),
+            specific_force=accelerations[:, :3], angular_acceleration=accelerations[:, 3:],
+        )  # fmt: skip
+        turned = np.cumsum(accelerations[:, 3:] * situation.step[:, None], axis=0)
+        situation = replace(situation, turned=turned)
+        return measured(situation, vehicle=point.vehicle, effects=effects).state
+
+    def sweep(self, point: Point, columns: Sequence[Column] = (), *, passes: int = 1) -> Swept:
+        """Filter the flight; with columns, score and information by block. Later passes evaluate physics anew."""
+        for _ in range(max(1, passes) - 1):
+            self._once(point, ())
+        return self._once(point, columns)
+
+    def settle(self, point: Point, passes: int = 2) -> Swept:
+        """Passes without columns until physics is evaluated where the filter is."""
+        return self.sweep(point, passes=passes)
+
+    def _once(self, point: Point, columns: Sequence[Column]) -> Swept:
+        flight = self.flight
+        acceleration, _ = self.accelerations(point)
+        offset = self.offsets(point, acceleration)
+        acting, showing, order = self.derivatives(point, columns, acceleration, offset)
+        swept = run_sweep(flight, acceleration, offset, acting, showing, point.noise)
+        if self._is_felt():
+            swept = self._felt(swept, acceleration, acting)
+        if order is not None:
+            swept = replace(swept, score=swept.score[:, order], information=swept.information[:, order][:, :, order])
+        self._rotation = self._rotation_shown = None
+        if not np.isfinite(swept.filtered).all():  # a model that left the range of numbers must not spoil the next one
+            self.path = self.shown = self.moved = self.seen = None
+            return swept
+        self.path = causal_middle(swept.filtered, swept.predicted, flight.starts)
+        self.shown = swept.filtered
+        self.moved = acceleration + lacking(swept, flight)
+        self.seen = seen_force(swept, flight, acceleration)
+        return swept
+
+    def _is_felt(self) -> bool:
+        if self._felt_alone is None:
+            self._felt_alone = felt.is_needed(self.flight)
+        return self._felt_alone
+
+    def _felt(self, swept: Swept, acceleration: NDArray, acting: NDArray) -> Swept:
+        """With the accelerometer's evidence added, where nothing else shows forces."""
+        if self._vibration is None:
+            self._vibration = felt.vibration(self.flight, acceleration[:, :3])
+        bias = np.append(np.nanmedian(self.flight.force[:, :2] - acceleration[:, :2], axis=0), 0.0)
+        loglik, score, information = felt.evidence(
+            self.flight, acceleration[:, :3], acting[:, :3], self._vibration, bias
+        )
+        if acting.shape[2] and swept.score.size:
+            swept.score[:, : acting.shape[2]] += score
+            swept.information[:, : acting.shape[2], : acting.shape[2]] += information
+        return replace(swept, loglik=swept.loglik + loglik)
+
+    def derivatives(
+        self, point: Point, columns: Sequence[Column], acceleration: NDArray, offset: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray | None]:
+        """Derivatives of accelerations (n, 6, c) and offsets (n, 12, d), and where each column went (None: no columns).
+
+        A column changes either accelerations or what is shown.
+        """
+        n = self.flight.time.size
+        acting: list[NDArray] = []
+        showing: list[NDArray] = []
+        where: list[tuple[bool, int]] = []
+        here = of_recording(point.effects, self.flight.name)
+        for column in columns:
+            d_acting, d_showing = column.acting, column.showing
+            plus = None if column.plus is None else of_recording(column.plus, self.flight.name)
+            if plus is not None and not (STRENGTH in point.effects and column.minus is None and plus == here):
+                shows = any(_shows(name) for name in plus)
+                moves = any(not _shows(name) for name in plus)
+                up = self.accelerations(point, plus)[0] if moves else acceleration
+                down = acceleration if column.minus is None or not moves else self.accelerations(point, column.minus)[0]
+                d_acting = (up - down) / column.width
+                if shows:
+                    up = self.offsets(point, acceleration, plus)
+                    down = offset if column.minus is None else self.offsets(point, acceleration, column.minus)
+                    d_showing = (up - down) / column.width
+                    if not d_showing.any():
+                        d_showing = None
+            if d_showing is not None:
+                where.append((True, len(showing)))
+                showing.append(d_showing)
+            else:
+                where.append((False, len(acting)))
+                acting.append(np.zeros((n, 6)) if d_acting is None else d_acting)
+        if not columns:
+            return np.zeros((n, 6, 0)), np.zeros((n, 12, 0)), None
+        order = np.array([len(acting) + at if shown else at for shown, at in where])
+        stack = (np.stack(acting, 2) if acting else np.zeros((n, 6, 0)),
+                 np.stack(showing, 2) if showing else np.zeros((n, 12, 0)))  # fmt: skip
+        return np.ascontiguousarray(stack[0]), np.ascontiguousarray(stack[1]), order
+
+
+def _before_rotors(name: str) -> bool:
+    effect = CATALOGUE[name]
+    return effect.commanded is not None or effect.timing is not None or effect.speed is not None
+
+
+def _shows(name: str) -> bool:
+    return CATALOGUE[name].measured is not None
+
+
+def run_sweep(
+    flight: Flight, acceleration: NDArray, offset: NDArray, acting: NDArray, showing: NDArray, noise: Noise
+) -> Swept:
+    """The kernel with its arrays made; a log-likelihood of -inf where a variance is not one.
+
+    Noise scales so far apart that the covariance lost its sign seem likely without end, and fits ran away to them.
+    """
+    n, m = flight.time.size, acting.shape[2] + showing.shape[2]
+    predicted, filtered = np.zeros((n, 19)), np.zeros((n, 19))
+    innovation, variance, rows = np.zeros((n, 12)), np.zeros((n, 12)), np.zeros(n)
+    blocks = flight.blocks if m else 1
+    score, information = np.zeros((blocks, m)), np.zeros((blocks, m, m))
+    loglik = sweep(
+        flight.time, flight.starts, flight.y, np.ascontiguousarray(acceleration[:, :3]),
+        np.ascontiguousarray(acceleration[:, 3:]), offset, acting, showing, np.square(noise.impulse),
+        np.repeat(np.square(noise.measurement), 3), np.square(noise.disturbance),
+        np.broadcast_to(np.asarray(noise.memory, float), (6,)).copy(), WIDE,
+        flight.block if m else np.zeros(n, np.int64), predicted, filtered, innovation, variance, rows, score,
+        information,
+    )  # fmt: skip
+    if not np.all(variance >= 0.0):
+        loglik = -np.inf
+    upper = np.triu(information)
+    information = upper + np.transpose(np.triu(information, 1), (0, 2, 1))
+    return Swept(loglik, rows, predicted, filtered, innovation, variance, score, information)

@@ -1,0 +1,130 @@
+"""Noise scales of a model: Fisher scoring on the innovations of the flight, derivatives by differences.
+
+The log-likelihood is sum -1/2 (log s + e^2/s). With de, ds by a scale, the score is sum 1/2 (e^2/s - 1) ds/s - e de/s
+and the information sum 1/2 (ds/s)^2 + de^2/s (Cavanaugh and Shumway 1996, for a Gaussian innovations form).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.fitting.model import Noise, Swept, run_sweep
+from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.workers import Workers
+
+ROWS = 1500  # of each flight, in a few stretches, from which the scales are taken
+STRETCH = 750  # rows each: short ones begin too often at what was measured, and velocities seem better than they are
+FEW, SHORT = 900, 150  # the same for the way there
+PRIOR_SD = 2.0  # of the logarithm of a scale about its typical value
+FROM_AFAR = 8  # iterations
+STEP = 0.02  # in the logarithm, for differences
+LARGEST = 1.5  # step of scoring in the logarithm
+TYPICAL = Noise(np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), np.array([1e-3, 1e-2, 3e-3, 1e-2]))
+FLOOR = np.log(np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2, 1e-5, 1e-4, 1e-4, 1e-4, *[1e-4] * 3, *[1e-3] * 3]))
+# rad: no attitude made from an acceleration is better; in quiet flights 4 to 5 mrad. Believed to 0.5 mrad, every tremor
+# of the acceleration is a torque, and a steady one (a weak rotor) is lost among these.
+LEANING_FLOOR = 3e-3
+TYPICAL_DISTURBANCE = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
+
+
+def logs_of(noise: Noise) -> NDArray:
+    """(16,) logarithms: impulses, measurements, disturbances (of 0: -inf)."""
+    with np.errstate(divide="ignore"):
+        return np.log(np.concatenate([noise.impulse, noise.measurement, noise.disturbance]))
+
+
+def noise_of(logs: NDArray, memory: float | NDArray) -> Noise:
+    """Inverse of `logs_of`."""
+    scales = np.exp(logs)
+    return Noise(scales[:6], scales[6:10], scales[10:], memory)
+
+
+def sample_rows(flight: Flight, *, rows: int = ROWS, stretch: int = STRETCH) -> NDArray:
+    """(n,) bool: stretches spread over the flight, that the noise is taken from."""
+    n = flight.time.size
+    if n <= rows:
+        return np.ones(n, bool)
+    keep = np.zeros(n, bool)
+    for begin in np.linspace(0, n - stretch, rows // stretch).astype(int):
+        keep[begin : begin + stretch] = True
+    return keep
+
+
+def first_guess() -> Noise:
+    """Where scoring begins."""
+    return Noise(np.array([0.3, 0.3, 0.5, 5.0, 5.0, 5.0]), np.array([3e-3, 3e-2, 1e-2, 3e-2]))
+
+
+def fit_noise(
+    parts: list[tuple[Flight, NDArray, NDArray]],
+    start: Noise,
+    *,
+    iterations: int = 8,
+    tolerance: float = 0.2,
+    workers: Workers | None = None,
+) -> Noise:
+    """Noise scales of highest posterior density, the accelerations (n, 6) and offsets (n, 12) of each flight given.
+
+    Scales of quantities that nothing measures stay. Disturbances are fitted where they start above 0. From far away,
+    most of the way is gone on few rows.
+    """
+    if iterations >= FROM_AFAR and any(f.time.size > FEW for f, _, _ in parts):
+        few = [(f.rows(k), a[k], o[k]) for f, a, o in parts for k in (sample_rows(f, rows=FEW, stretch=SHORT),)]
+        start = _scored(few, start, iterations, 5 * tolerance, workers or Workers(1))
+    chosen = [(f.rows(keep), a[keep], o[keep]) for f, a, o in parts for keep in (sample_rows(f),)]
+    return _scored(chosen, start, iterations, tolerance, workers or Workers(1))
+
+
+def _scored(
+    chosen: list[tuple[Flight, NDArray, NDArray]], start: Noise, iterations: int, tolerance: float, workers: Workers
+) -> Noise:
+    measured = np.zeros(4, bool)
+    for flight, _, _ in chosen:
+        measured |= np.array([np.isfinite(flight.y[:, c]).any() for c in (0, 3, 6, 10)])
+    free = np.concatenate([np.ones(6, bool), measured, start.disturbance > 0])
+    logs, memory, floor = logs_of(start), start.memory, FLOOR.copy()
+    if any("attitude" not in f.signals and np.isfinite(f.y[:, 6]).any() for f, _, _ in chosen):
+        floor[8] = np.log(LEANING_FLOOR)
+    logs = np.maximum(logs, np.where(free, floor, -np.inf))
+    typical = logs_of(Noise(TYPICAL.impulse, TYPICAL.measurement, TYPICAL_DISTURBANCE))
+    index = np.flatnonzero(free)
+
+    def sweep(at: NDArray) -> list[Swept]:
+        noise = noise_of(at, memory)
+        return [
+            run_sweep(f, a, o, np.zeros((f.time.size, 6, 0)), np.zeros((f.time.size, 12, 0)), noise)
+            for f, a, o in chosen
+        ]
+
+    def posterior(swept: list[Swept], at: NDArray) -> float:
+        return sum(s.loglik for s in swept) - 0.5 * float(np.sum(((at - typical)[free] / PRIOR_SD) ** 2))
+
+    here = sweep(logs)
+    value = posterior(here, logs)
+    for _ in range(iterations):
+        slopes = workers.map(sweep, logs + STEP * np.eye(logs.size)[index])
+        score, information = np.zeros(index.size), np.zeros((index.size, index.size))
+        for part, base in enumerate(here):
+            seen = base.variance > 0
+            s, e = base.variance[seen], base.innovation[seen]
+            ds = np.stack([(m[part].variance[seen] - s) / STEP for m in slopes]) / s
+            de = np.stack([(m[part].innovation[seen] - e) / STEP for m in slopes]) / np.sqrt(s)
+            score += 0.5 * ds @ (e * e / s - 1.0) - de @ (e / np.sqrt(s))
+            information += 0.5 * ds @ ds.T + de @ de.T
+        score -= (logs - typical)[index] / PRIOR_SD**2
+        information += np.eye(index.size) / PRIOR_SD**2
+        step = np.clip(np.linalg.solve(information, score), -LARGEST, LARGEST)
+        for _ in range(5):
+            there = logs.copy()
+            there[index] = np.maximum(logs[index] + step, floor[index])
+            swept = sweep(there)
+            gained = posterior(swept, there)
+            if gained > value - 1e-9:
+                break
+            step = step / 3
+        else:
+            break
+        done = gained - value < tolerance
+        logs, here, value = there, swept, gained
+        if done:
+            break
+    return noise_of(logs, memory)

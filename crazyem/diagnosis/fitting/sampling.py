@@ -1,0 +1,75 @@
+"""Commands that are mostly faster than their sampling, as those of real drones that shake are, and what follows."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.fitting.candidates import TRIM
+from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.flights.flight import Flight
+from crazyem.physics.rotors import wrench
+from crazyem.vehicle import Vehicle
+
+# Commands of a loop at 500 Hz that answer to vibration, logged at 100 Hz, are nearly white: most of what is logged acts
+# for 2 ms only, and what acts was not logged. That is an error in the input, under which every fit makes the drone look
+# heavy and damped. Share of the power of roll and pitch torques above half of the Nyquist frequency (white: a half):
+COARSE = 0.2  # simulated flights have up to 0.12, whatever is wrong with the drone
+EDGE, SLOW = 0.5, 1.0  # s left out at either end; Hz below which torques say nothing of sampling
+# m, torque per thrust: by how much the trim of a drone whose file has one differs from one day to the next. Healthy and
+# damaged flights of two drones on several days scatter like this (docs/diagnosis_real.md).
+TRIM_SD = (5e-4, 5e-4, 1.6e-4)
+
+
+def coarsely_sampled(data: Data, point: Point) -> bool:
+    """Whether the commands of most flights are faster than their sampling, or on another clock.
+
+    The first is asked of vehicles with a trim alone, as all are that fly so (`of_a_real_drone`).
+    """
+    return data.coarse or (TRIM in point.vehicle.effects and shaken_commands(data.flights, point.vehicle))
+
+
+def shaken_commands(flights: Sequence[Flight], vehicle: Vehicle) -> bool:
+    """Whether the commands of most flights are faster than their sampling (see `COARSE`)."""
+    shares = [fast_share(f, vehicle) for f in flights if not f.inputs.measured]
+    return bool(shares) and float(np.median(shares)) > COARSE
+
+
+def of_a_real_drone(flights: Sequence[Flight], vehicle: Vehicle) -> Vehicle:
+    """The vehicle with a trim of nothing, if its file has none, its commands shake as a real drone's do, and they hold
+    a steady torque.
+
+    Such commands tell little but what is steady. Where that was not free within what differs from drone to drone and
+    from day to day, it was called a weak rotor, a load or a wind.
+    """
+    if TRIM in vehicle.effects or not shaken_commands(flights, vehicle):
+        return vehicle
+    if not any(np.any(np.abs(held(f, vehicle)) > TRIM_SD) for f in flights):
+        return vehicle
+    return replace(vehicle, effects={**vehicle.effects, TRIM: dict.fromkeys("xyz", 0.0)})
+
+
+def held(flight: Flight, vehicle: Vehicle) -> NDArray:
+    """(3,) torque of the commands over their thrust in the air [m], body axes, on average: less a drone's trim."""
+    inside = (flight.inputs.time > flight.time[0]) & (flight.inputs.time < flight.time[-1])
+    mean = wrench(flight.inputs.thrust[inside], arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust).mean(0)
+    return mean[1:] / mean[0] if mean[0] > 0 else np.zeros(3)
+
+
+def fast_share(flight: Flight, vehicle: Vehicle) -> float:
+    """Share of the power of the commanded roll and pitch torques above half of the Nyquist frequency, the larger."""
+    time = flight.inputs.time
+    inside = (time > flight.time[0] + EDGE) & (time < flight.time[-1] - EDGE)
+    if inside.sum() < 100:
+        return 0.0
+    period = float(np.median(np.diff(time[inside])))
+    torque = wrench(flight.inputs.thrust[inside], arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust)[:, 1:3]
+    grid = np.arange(time[inside][0], time[inside][-1], period)
+    even = np.stack([np.interp(grid, time[inside], c) for c in torque.T])
+    window = np.hanning(grid.size)
+    power = np.abs(np.fft.rfft((even - even.mean(axis=1, keepdims=True)) * window)) ** 2
+    frequency = np.fft.rfftfreq(grid.size, period)
+    fast, all_of_it = power[:, frequency > 0.25 / period].sum(1), power[:, frequency > SLOW].sum(1)
+    return float(np.divide(fast, all_of_it, out=np.zeros(2), where=all_of_it > 0).max())

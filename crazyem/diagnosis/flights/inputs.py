@@ -1,0 +1,245 @@
+"""What the rotors of a recorded flight were told, or seen to do, as the rotor input of the model with effects.
+
+Which signal serves is decided once, here: measured speeds before commands, commands with voltage before those without,
+what was sent before what was asked for. Nothing is resampled; stamps are those of the recording.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.flights.alignment import Alignment, align
+from crazyem.diagnosis.flights.level import Level, level_of
+from crazyem.doctor.streams import Airtime, airtime, ordered
+from crazyem.errors import DataError
+from crazyem.physics.motion import RotorInput
+from crazyem.physics.rotors import thrust_from_command, thrust_from_speed, wrench
+from crazyem.recordings.recording import Recording
+from crazyem.vehicle import Vehicle
+
+NOMINAL_VOLTAGE = 3.85  # V under load, middle of 3.7 to 4.0 V, where none is recorded
+# s: a command is held for 2 ms at 500 Hz, rates are low-passed at 80 Hz (2.8 ms). Where the attitude is recorded it is
+# the clock, and rates are behind it (physics/effects/onboard_filter.py).
+DELAY_OF_COMMANDS, BEHIND_ATTITUDE = 3.5e-3, 2.1e-3
+_SAMPLED = ("motor_command", "motor_request", "mixer_command")
+FULL = 65535.0  # counts of PWM
+STAND_IN = 0.01  # m, arm and torque per thrust of a vehicle without rotors; cancels
+
+# No signal of a drone is larger (SI): a sample beyond is an error of transmission.
+_SANE = {"motor_command": 1.5, "motor_request": 1.5, "rotor_speed": 1e5, "wrench_command": 1e3, "mixer_command": 1e6}
+
+# Thrust asked for -> motor volts, in the battery compensation of crazyflie-firmware until 2022-11 (motors.c): grams of
+# thrust of all four motors, then a parabola.
+_GRAMS, _VOLTS = 60.0, (0.088, -0.0006239)
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """Rotor input of a recording.
+
+    Attributes:
+        rotor: see `RotorInput`.
+        signal: the signal it was made from.
+        vehicle: to be used with it. The same as given, but for one without rotors, which gets stand-ins for arm and
+            torque per thrust, so that four thrusts can carry the thrust and the torque of its input.
+        notices: what had to be assumed, a sentence each.
+        ground: height of the floor in the frame of the position [m]; 0 where unknown.
+        took_off: when the drone first left the floor [s]; the first input where that is unknown.
+        alignment: how late measured rotor speeds are behind the body rates, in this recording; None where unknown.
+        level: the voltage that was taken, where none is recorded and the flight shows one; else None.
+    """
+
+    rotor: RotorInput
+    signal: str
+    vehicle: Vehicle
+    notices: tuple[str, ...]
+    ground: float
+    took_off: float
+    alignment: Alignment | None = None
+    level: Level | None = None
+
+
+def rotor_input(recording: Recording, vehicle: Vehicle) -> RotorInput:
+    """The rotor input alone; see `inputs_of`."""
+    return inputs_of(recording, vehicle).rotor
+
+
+def inputs_of(
+    recording: Recording, vehicle: Vehicle, *, flight: Airtime | None = None, until: float = np.inf
+) -> Inputs:
+    """What a vehicle's rotors were told or seen to do in a recording.
+
+    Args:
+        recording: of any format.
+        vehicle: decides which signals can become thrust.
+        flight: `crazyem.doctor.streams.airtime(recording)` where it is known already.
+        until: s, a voltage that is not recorded is taken from the flight (see `level`), but from nothing later; before
+            anything shows it, a nominal one.
+
+    Raises:
+        DataError: the recording has no signal that this vehicle can turn into thrust.
+    """
+    for name, read in _CHOICES:
+        time, value = samples(recording, name)
+        found = read(recording, vehicle, time, value) if time.size >= 2 else None
+        if found is not None and found.time.size >= 2:
+            break
+    else:
+        raise DataError(
+            f"{recording.path}: there are no rotor speeds, motor commands or commanded thrust that the vehicle "
+            f"'{vehicle.name}' can turn into forces."
+        )
+    flight = airtime(recording) if flight is None else flight
+    took_off = flight.flown[0][0] if flight is not None and flight.flown else float(found.time[0])
+    ground = flight.ground if flight is not None and np.isfinite(flight.ground) else 0.0
+    level = None
+    if found.sent is not None:
+        level = level_of(recording, vehicle, flight, found.time, found.sent, nominal=NOMINAL_VOLTAGE, until=until)
+        found = found if level is None else _sent(vehicle, found.time, found.sent, level)
+    alignment = align(recording, found.time, found.thrust, flight) if name == "rotor_speed" else None
+    late = DELAY_OF_COMMANDS if name in _SAMPLED else alignment.delay if alignment is not None else 0.0
+    if name in _SAMPLED and "attitude" in recording.signals:
+        late -= BEHIND_ATTITUDE
+    notices = found.notices if alignment is None else (*found.notices, alignment.said())
+    rotor = RotorInput(
+        found.time,
+        np.ascontiguousarray(found.thrust),
+        found.voltage,
+        np.maximum(found.time - took_off, 0.0),
+        measured=name == "rotor_speed",
+        delay=late,
+    )
+    return Inputs(rotor, name, found.vehicle or vehicle, notices, ground, took_off, alignment, level)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    time: NDArray[np.float64]
+    thrust: NDArray[np.float64]  # (m, 4) N
+    voltage: NDArray[np.float64]  # (m,) V
+    notices: tuple[str, ...] = ()
+    vehicle: Vehicle | None = None  # where it is not the one given
+    sent: NDArray[np.float64] | None = None  # (m, 4) duty where no voltage is recorded
+
+
+_Array = NDArray[np.float64]
+
+
+def samples(recording: Recording, name: str) -> tuple[_Array, _Array]:
+    """Whole samples of a signal with increasing stamps; of several with one stamp the first."""
+    array = recording.signals.get(name)
+    if array is None:
+        return np.empty(0), np.empty((0, 1))
+    time, value = ordered(array)
+    sound = np.abs(value).max(axis=1, initial=0.0) < _SANE.get(name, np.inf)
+    time, value = time[sound], value[sound]
+    later = np.ones(time.size, bool)
+    later[1:] = np.diff(time) > 0
+    return time[later], value[later]
+
+
+def _voltage(recording: Recording, time: _Array) -> _Array:
+    """(m,) V: the newest at each stamp; NaN before the first one."""
+    when, volts = samples(recording, "voltage")
+    sound = (volts[:, 0] > 0.5) & (volts[:, 0] < 60.0)
+    when, volts = when[sound], volts[sound, 0]
+    if not when.size:
+        return np.full(time.size, np.nan)
+    at = np.searchsorted(when, time, "right") - 1
+    return np.where(at >= 0, volts[np.maximum(at, 0)], np.nan)
+
+
+def _from_speed(recording: Recording, vehicle: Vehicle, time: _Array, value: _Array) -> _Found | None:
+    if vehicle.rotor_constant is None:
+        return None
+    thrust = thrust_from_speed(value, rotor_constant=vehicle.rotor_constant)
+    return _Found(time, thrust, _voltage(recording, time))
+
+
+def _from_command(recording: Recording, vehicle: Vehicle, time: _Array, value: _Array) -> _Found | None:
+    """With the voltage of each moment."""
+    if not vehicle.thrust_curve:
+        return None
+    voltage = _voltage(recording, time)
+    known = np.isfinite(voltage)  # before the first voltage nobody knows what a command does
+    if not known.any():
+        return None
+    time, value, voltage = time[known], value[known], voltage[known]
+    return _Found(time, thrust_from_command(value, voltage, thrust_curve=vehicle.thrust_curve), voltage)
+
+
+def _from_command_alone(recording: Recording, vehicle: Vehicle, time: _Array, value: _Array) -> _Found | None:
+    """Without any voltage."""
+    if not vehicle.thrust_curve:
+        return None
+    return _sent(vehicle, time, value, None)
+
+
+def _sent(vehicle: Vehicle, time: _Array, value: _Array, level: Level | None) -> _Found:
+    """What was sent, by a voltage that nobody measured."""
+    volts = NOMINAL_VOLTAGE if level is None else level.voltage
+    thrust = thrust_from_command(value, np.full(time.size, volts), thrust_curve=vehicle.thrust_curve)
+    why = (
+        f"{volts:g} V is assumed throughout, the middle of the 3.7 to 4.0 V of a loaded battery"
+        if level is None
+        else f"{volts:.2f} V is taken throughout, by which the thrust of the first seconds in the air carries the "
+        "vehicle; how heavy or strong it is cannot be told from this recording"
+    )
+    notice = f"no battery voltage is recorded: {why}; a drift of thrust with time may be the battery's"
+    return _Found(time, thrust, np.full(time.size, np.nan), (notice,), sent=value)
+
+
+def _from_request(recording: Recording, vehicle: Vehicle, time: _Array, value: _Array) -> _Found | None:
+    """Thrust asked for before the battery compensation, (m, 4) 0..1."""
+    voltage = _voltage(recording, time)
+    if recording.source == "ulog" and np.isfinite(vehicle.thrust_max):
+        notice = f"motor_request is a share of the largest thrust: {vehicle.thrust_max:g} N of each rotor is assumed"
+        return _Found(time, np.clip(value, 0.0, 1.0) * vehicle.thrust_max, voltage, (notice,))
+    if not vehicle.thrust_curve:
+        return None
+    if not vehicle.battery_compensated:
+        sent = np.clip(value, 0.0, 1.0)
+        find = _from_command if np.isfinite(voltage).any() else _from_command_alone
+        return find(recording, vehicle, time, sent)
+    grams = _GRAMS * np.clip(value, 0.0, None)
+    volts = np.clip(_VOLTS[0] * grams + _VOLTS[1] * grams**2, 0.0, np.where(np.isnan(voltage), 5.0, voltage)[:, None])
+    thrust = thrust_from_command(volts, np.ones(time.size), thrust_curve=vehicle.thrust_curve)
+    notice = (
+        "the motor signal is the thrust asked for before battery compensation: motor volts follow from the "
+        "compensation of the firmware of before 2022-11, which is taken to have been exact"
+    )
+    return _Found(time, thrust, voltage, (notice,))
+
+
+def _from_mixer(recording: Recording, vehicle: Vehicle, time: _Array, value: _Array) -> _Found | None:
+    """Thrust, roll, pitch, yaw handed to the mixer, counts (power_distribution_stock.c)."""
+    base, yaw = value[:, 0], value[:, 3]
+    roll, pitch = np.trunc(value[:, 1] / 2.0), np.trunc(value[:, 2] / 2.0)
+    mixed = np.stack(
+        [base - roll + pitch + yaw, base - roll - pitch - yaw, base + roll - pitch + yaw, base + roll + pitch - yaw], 1
+    )
+    asked = np.where(base[:, None] > 0.0, np.clip(mixed, 0.0, FULL), 0.0) / FULL
+    return _from_request(recording, vehicle, time, asked)
+
+
+def _from_wrench(recording: Recording, vehicle: Vehicle, time: _Array, value: _Array) -> _Found | None:
+    """Commanded thrust and torque, spread over four rotors by the inverse of the mixing."""
+    used = vehicle
+    if min(*vehicle.arm, vehicle.torque_per_thrust) <= 0.0:
+        used = replace(vehicle, arm=(STAND_IN, STAND_IN), torque_per_thrust=STAND_IN)
+    columns = wrench(np.eye(4), arm=used.arm, torque_per_thrust=used.torque_per_thrust)  # row: of one rotor
+    thrust = np.linalg.solve(columns.T, value.T).T
+    return _Found(time, thrust, _voltage(recording, time), vehicle=used)
+
+
+# Best first.
+_CHOICES: tuple[tuple[str, Callable[[Recording, Vehicle, _Array, _Array], _Found | None]], ...] = (
+    ("rotor_speed", _from_speed),
+    ("motor_command", _from_command),
+    ("motor_request", _from_request),
+    ("motor_command", _from_command_alone),
+    ("mixer_command", _from_mixer),
+    ("wrench_command", _from_wrench),
+)

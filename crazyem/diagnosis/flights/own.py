@@ -1,0 +1,67 @@
+"""What belongs to one recording and to no drone: the clock of its rotors, the frame of its pose, what was assumed."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from crazyem.diagnosis.flights.alignment import Alignment
+from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.flights.frame import Frame
+
+WORTH_TELLING = 0.005  # of the thrust
+
+
+@dataclass(frozen=True, eq=False)
+class Own:
+    """Found in a recording, taken off or fitted beside what all share; never written into a vehicle file.
+
+    Attributes:
+        recording: its path.
+        held_out: whether it is one that is only judged by.
+        alignment: how late measured rotor speeds are behind the body rates; None where unknown.
+        frame: how the pose lies against that of the other recordings; None where alike or unknown.
+        strength: thrust over what the fitted vehicle says of it; None where it is not asked (see `always.SEVERAL`).
+        notices: a sentence each.
+    """
+
+    recording: str
+    held_out: bool
+    alignment: Alignment | None
+    frame: Frame | None
+    strength: float | None
+    notices: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """As docs/diagnosis.md has it."""
+        clock, frame = self.alignment, self.frame
+        return {
+            "recording": self.recording,
+            "held_out": self.held_out,
+            "rotor_clock": clock and {
+                "delay": clock.delay, "sd": clock.sd, "roll": clock.roll, "pitch": clock.pitch,
+                "explained_share": clock.explained, "unit": "s",
+            },
+            "pose_frame": frame and {"roll": frame.roll, "pitch": frame.pitch, "sd": list(frame.sd), "unit": "rad"},
+            "notices": list(self.notices),
+            "thrust": self.strength and {"scale": self.strength, "unit": ""},
+        }  # fmt: skip
+
+
+def owned(
+    flights: Sequence[Flight], kept_apart: Sequence[Flight], strengths: Mapping[str, float] | None = None
+) -> tuple[Own, ...]:
+    """Of all flights, those kept apart last; `strengths` by name."""
+    return tuple(
+        _own(f, apart, None if strengths is None else strengths.get(f.name))
+        for part, apart in ((flights, False), (kept_apart, True))
+        for f in part
+    )
+
+
+def _own(flight: Flight, held_out: bool, strength: float | None) -> Own:
+    notices = [*flight.notices]
+    if flight.frame:
+        notices.append(flight.frame.said())
+    if strength is not None and abs(strength - 1.0) > WORTH_TELLING:
+        notices.append(f"the thrust of this recording differs by {100.0 * (strength - 1.0):+.1f} % from the vehicle's")
+    return Own(flight.name, held_out, flight.alignment, flight.frame, strength, tuple(notices))

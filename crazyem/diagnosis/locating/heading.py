@@ -1,0 +1,143 @@
+"""A heading that depends on place: a magnet under the floor, a marker set that bends. Attitude against gyro, no model.
+
+Between two samples the attitude turns by what the gyro shows. What it turns beyond that, and beyond what a biased,
+late, scaled or tilted gyro makes, is asked whether it goes with the change of place: with a heading too large by
+psi(x, y, z), a sum of waves along each axis, the turn about the vertical is too large by the difference of psi. A
+filter takes such an attitude for a noisy gyro, and finds nothing.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.locating.locate import AXES, Finding
+from crazyem.physics.rotations import (
+    quaternion_conjugate,
+    quaternion_product,
+    rotation_matrix,
+    rotation_vector_from_quaternion,
+)
+
+WINDOW = 0.05  # s, between the attitudes that are compared
+NATS, HELD = 15.0, 5.0  # that it must gain on the flights fitted, and on those held out; healthy flights: 5 at most
+SMALLEST = 5e-3  # rad, standard deviation along the flight
+FEWEST = 100  # windows
+WAVES = (4.0, 2.0, 1.3, 1.0, 0.8)  # m, wavelengths: bounded where the other flight goes further
+DRAWN = 1e-2  # ridge, relative
+
+
+@dataclass(frozen=True)
+class _Turns:
+    turned: NDArray  # (n,) rad about the vertical, beyond the gyro's
+    usual: NDArray  # (n, 8) what sensors make
+    after: NDArray  # (n, 3) m, place at the end of a window,
+    place: NDArray  # (n, 3) m, at its begin
+
+
+def heading_by_place(data: Data, apart: Data | None) -> Finding | None:
+    """The error of the heading as a finding, where it depends on place on all flights alike; None if not.
+
+    Without flights held out, or where they hardly move, every other second is.
+    """
+    if not {"position", "attitude", "body_rate"} <= data.signals:
+        return None
+    fitted = [t for t in (_turns(f) for f in data.flights) if t is not None]
+    others = None if apart is None else [t for t in (_turns(f) for f in apart.flights) if t is not None]
+    if not fitted or others == []:
+        return None
+    every = _joined(fitted)
+    middle = np.median(every.place, axis=0)
+    shapes = _shapes(every, middle)
+    theta = _least(shapes, every)
+    x = _without(every.usual, shapes)
+    gained = _nats(shapes, every, theta) - _used(x)
+    other = None if others is None else _joined(others)
+    if other is not None and _expected(_shapes(other, middle), other, theta) > 2 * HELD:
+        held = _nats(_shapes(other, middle), other, theta)
+    else:  # none, or one that hardly moves
+        second = (np.arange(len(shapes)) * WINDOW).astype(int) % 2 == 0
+        one, two = (_Turns(*(getattr(every, n)[s] for n in _Turns.__annotations__)) for s in (second, ~second))
+        held = _nats(shapes[~second], two, _least(shapes[second], one))
+    waves = _waves(every.place - middle)
+    error = waves @ theta
+    if gained < NATS or held < HELD or error.std() < SMALLEST:
+        return None
+    axis = int(np.argmax([(waves[:, k::3] @ theta[k::3]).std() for k in range(3)]))
+    time = data.flights[0].time[[0, -1]]
+    return Finding("attitude", "z", f"{AXES[axis]} position", AXES[axis], (float(time[0]), float(time[1])),
+                   float(error.std()), float(error.std() / np.sqrt(2.0 * gained)), "rad", float(gained),
+                   float(np.exp(-min(gained, 700.0))))  # fmt: skip
+
+
+def _turns(flight: Flight) -> _Turns | None:
+    """Turns over windows of a flight; None where too few are whole."""
+    y = flight.y if flight.attitude is None else np.hstack([flight.y[:, :6], flight.attitude, flight.y[:, 10:]])
+    known = np.isfinite(y[:, [0, 6, 10]]).all(axis=1)
+    rows = np.flatnonzero(known)
+    if rows.size < FEWEST:
+        return None
+    time, y = flight.time[rows], y[rows]
+    torn = np.cumsum(flight.gaps)[rows]
+    rate = np.einsum("nij,nj->ni", rotation_matrix(y[:, 6:10]), y[:, 10:13])  # world
+    angle = np.zeros_like(rate)
+    angle[1:] = np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None], axis=0)
+    step = max(1, round(WINDOW / float(np.median(np.diff(time)))))
+    first = np.arange(0, time.size - step, step)
+    last = first + step
+    whole = (torn[first] == torn[last]) & (time[last] - time[first] < 2 * WINDOW)
+    first, last = first[whole], last[whole]
+    if first.size < FEWEST:
+        return None
+    turned = quaternion_product(y[last, 6:10], quaternion_conjugate(y[first, 6:10]))  # about world axes
+    turn = rotation_vector_from_quaternion(turned)
+    shown = angle[last] - angle[first]
+    usual = np.column_stack([time[last] - time[first], shown, rate[last] - rate[first], shown[:, 2] ** 2])
+    return _Turns(turn[:, 2] - shown[:, 2], usual, y[last, :3], y[first, :3])
+
+
+def _joined(turns: list[_Turns]) -> _Turns:
+    return _Turns(*(np.concatenate([getattr(t, n) for t in turns]) for n in _Turns.__annotations__))
+
+
+def _waves(place: NDArray) -> NDArray:
+    """(n, 30): sines and cosines of x, y, z, wave by wave."""
+    angle = [2 * np.pi / wave * place for wave in WAVES]
+    return np.hstack([f(x) for x in angle for f in (np.sin, np.cos)])
+
+
+def _shapes(turns: _Turns, middle: NDArray) -> NDArray:
+    """Change of the waves over each window."""
+    return _waves(turns.after - middle) - _waves(turns.place - middle)
+
+
+def _without(usual: NDArray, columns: NDArray) -> NDArray:
+    return columns - usual @ np.linalg.lstsq(usual, columns, rcond=None)[0]
+
+
+def _ridge(x: NDArray) -> NDArray:
+    return x.T @ x + (DRAWN * np.trace(x.T @ x) / x.shape[1] + 1e-12) * np.eye(x.shape[1])  # where nothing moves, too
+
+
+def _used(x: NDArray) -> float:
+    """How many terms the windows determine."""
+    return float(np.trace(np.linalg.solve(_ridge(x), x.T @ x)))
+
+
+def _least(shapes: NDArray, turns: _Turns) -> NDArray:
+    x, y = _without(turns.usual, shapes), _without(turns.usual, turns.turned[:, None])[:, 0]
+    return np.linalg.solve(_ridge(x), x.T @ y)
+
+
+def _nats(shapes: NDArray, turns: _Turns, theta: NDArray) -> float:
+    """Log-likelihood that the terms gain, for windows whose errors are independent and of one unknown size."""
+    x, y = _without(turns.usual, shapes), _without(turns.usual, turns.turned[:, None])[:, 0]
+    return 0.5 * y.size * float(np.log(np.sum(y**2) / max(np.sum((y - x @ theta) ** 2), 1e-300)))
+
+
+def _expected(shapes: NDArray, turns: _Turns, theta: NDArray) -> float:
+    """What they would gain if they are there."""
+    x, y = _without(turns.usual, shapes), _without(turns.usual, turns.turned[:, None])[:, 0]
+    return 0.5 * float(np.sum((x @ theta) ** 2) / max(np.mean((y - x @ theta) ** 2), 1e-300))

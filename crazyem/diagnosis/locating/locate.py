@@ -1,0 +1,325 @@
+"""Where a flight parts from a model: what force, torque and sensor error is missing, when, and in which regime.
+
+A disturbance that acts on one axis is a column like any other. Its score and information, block by block, give the
+disturbance of each block with its error; by bins of a regime (speed, height, tilt ...) they give how it depends on it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.fitting.gram import bounded
+from crazyem.diagnosis.fitting.model import Column, Model, Point
+from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.workers import Workers
+from crazyem.physics.rotations import rotation_matrix
+
+AXES = ("x", "y", "z")
+BINS = 4
+NOTABLE = 1e-4  # p-value of a finding before it is listed
+SETTLED = 0.3  # s after a start before rows count
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A place where the model fails.
+
+    Attributes:
+        signal: "force", "torque", "attitude", "velocity" or "body_rate".
+        axis: x, y or z of the body (velocity: of the world); "world x" or "world y" of a force that belongs to the
+            room more than to the body.
+        regime: in words, "always" for a constant.
+        variable: what the regime is told by; "" for a constant.
+        interval: s, where it is seen.
+        effect_size: in `unit`, with sd.
+        nats: log-likelihood that a disturbance there would gain, less its number of parameters, dispersion allowed for.
+        p_value: against chance, the number of tests allowed for.
+    """
+
+    signal: str
+    axis: str
+    regime: str
+    variable: str
+    interval: tuple[float, float]
+    effect_size: float
+    sd: float
+    unit: str
+    nats: float
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """Disturbances in time: time (b,) s; value and sd (b, 6): force [N] and torque [N m], body axes."""
+
+    time: NDArray
+    value: NDArray
+    sd: NDArray
+
+
+@dataclass(frozen=True)
+class Located:
+    """All findings, strongest first; disturbances of each flight; whiteness of the innovations (p-value by channel)."""
+
+    findings: tuple[Finding, ...]
+    disturbances: tuple[Disturbance, ...]
+    whiteness: dict[str, float]
+
+
+def units_of(point: Point) -> NDArray:
+    """(6,) N per m/s^2 and N m per rad/s^2."""
+    return np.array([point.vehicle.mass] * 3 + list(point.vehicle.inertia))
+
+
+def axis_columns(flight: Flight, weights: NDArray | None = None) -> list[Column]:
+    """A unit acceleration on each of the six axes, times weights (n,)."""
+    n = flight.time.size
+    w = np.ones(n) if weights is None else weights
+    columns = []
+    for i in range(6):
+        acting = np.zeros((n, 6))
+        acting[:, i] = w
+        columns.append(Column(f"axis{i}", acting=acting))
+    return columns
+
+
+def shown_columns(flight: Flight, weights: NDArray | None = None) -> list[Column]:
+    """A unit error of what is shown of velocity, attitude and rate."""
+    n = flight.time.size
+    w = np.ones(n) if weights is None else weights
+    columns = []
+    for i in range(3, 12):
+        showing = np.zeros((n, 12))
+        showing[:, i] = w
+        columns.append(Column(f"shown{i}", showing=showing))
+    return columns
+
+
+def world_columns(rotation: NDArray) -> list[Column]:
+    """A unit acceleration along world x and y, by the attitudes (n, 3, 3)."""
+    none = np.zeros((len(rotation), 3))
+    return [Column(f"world {AXES[k]}", acting=np.concatenate([rotation[:, k], none], axis=1)) for k in range(2)]
+
+
+def regimes(flight: Flight, path: NDArray, thrust: NDArray) -> dict[str, tuple[NDArray, str]]:
+    """Variables that a mismatch may depend on: name -> ((n,) values, unit)."""
+    up = rotation_matrix(path[:, 6:10])[:, 2, 2]
+    speed = np.linalg.norm(path[:, 3:6], axis=1)
+    found = {
+        "time": (flight.time, "s"),
+        "x": (path[:, 0], "m"),
+        "y": (path[:, 1], "m"),
+        "height": (path[:, 2] - flight.ground, "m"),
+        "speed": (speed, "m/s"),
+        "velocity x": (path[:, 3], "m/s"),
+        "velocity y": (path[:, 4], "m/s"),
+        "velocity z": (path[:, 5], "m/s"),
+        "tilt": (np.degrees(np.arccos(np.clip(up, -1, 1))), "deg"),
+        "rate": (np.linalg.norm(path[:, 10:13], axis=1), "rad/s"),
+        "thrust": (thrust.sum(1), "N"),
+        **{f"rotor {i + 1}": (thrust[:, i], "N") for i in range(4)},
+    }
+    if np.isfinite(flight.voltage).all():
+        found["voltage"] = (flight.voltage, "V")
+    if not np.isfinite(flight.y[:, 0]).any():
+        for name in ("x", "y", "height"):
+            del found[name]
+    return found
+
+
+def locate(data: Data, point: Point) -> Located:
+    """Where the flights part from the model."""
+    findings: list[Finding] = []
+    disturbances = []
+    whiteness: dict[str, list[float]] = {}
+    for model in data.models:
+        found, disturbance, white = _one(model, point, data.workers)
+        findings += found
+        disturbances.append(disturbance)
+        for name, p in white.items():
+            whiteness.setdefault(name, []).append(p)
+    kept = [f for f in findings if f.p_value < NOTABLE]
+    kept.sort(key=lambda f: -f.nats)
+    return Located(
+        tuple(kept), tuple(disturbances), {n: float(min(1.0, min(p) * len(p))) for n, p in whiteness.items()}
+    )
+
+
+def _one(model: Model, point: Point, workers: Workers) -> tuple[list[Finding], Disturbance, dict[str, float]]:
+    flight = model.flight
+    unit = np.concatenate([units_of(point), np.ones(9)])
+    constant = [*axis_columns(flight), *shown_columns(flight)[:6]]
+    swept = model.sweep(point, constant)
+    b, a = swept.score, np.einsum("bii->bi", swept.information)
+    dispersion = _dispersion(b, a)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = np.where(a[:, :6] > 0, b[:, :6] / a[:, :6], 0.0)
+        sd = np.sqrt(dispersion[:6] / np.maximum(a[:, :6], 1e-30))
+    times = np.array([flight.time[flight.block == i].mean() for i in range(flight.blocks)])
+    disturbance = Disturbance(times, value * unit[:6], np.minimum(sd * unit[:6], 1e3))
+    findings = []
+    for i in range(len(constant)):
+        if i >= 6 and i not in (9, 10, 11):
+            continue
+        findings += _constant_and_change(i, b[:, i], a[:, i], dispersion[i], flight, times, unit[i])
+    path = model.shown if model.shown is not None else swept.filtered
+    findings += _of_the_world(model, point, path, times, findings)
+    thrust = model.thrusts(point.vehicle, point.effects)[0]
+    for found in workers.map(
+        lambda regime: _by_regime(model.twin(), point, regime[0], *regime[1], unit),
+        regimes(flight, path, thrust).items(),
+    ):
+        findings += found
+    return findings, disturbance, _whiteness(swept.innovation, swept.variance)
+
+
+def _of_the_world(
+    model: Model, point: Point, path: NDArray, times: NDArray, of_the_body: Sequence[Finding]
+) -> list[Finding]:
+    """Forces along horizontal axes of the world, always there or from a moment on, that say more than the same along
+    axes of the body: a wind on a drone that turns."""
+    flight = model.flight
+    swept = model.sweep(point, world_columns(rotation_matrix(path[:, 6:10])))
+    b, a = swept.score, np.einsum("bii->bi", swept.information)
+    dispersion = _dispersion(b, a)
+    found = []
+    for k in range(2):
+        found += _constant_and_change(k, b[:, k], a[:, k], dispersion[k], flight, times, point.vehicle.mass)
+    body = [f for f in of_the_body if f.signal == "force" and f.axis in AXES[:2]]
+    better = [f for f in found if all(f.nats > g.nats for g in body if g.variable == f.variable)]
+    return [replace(f, axis=f"world {f.axis}") for f in better]
+
+
+def _dispersion(b: NDArray, a: NDArray) -> NDArray:
+    """By how much the scores of blocks scatter more than the information says, about their own mean."""
+    total = np.maximum(a.sum(0), 1e-300)
+    centred = b - a * (b.sum(0) / total)
+    return np.maximum(1.0, (centred**2).sum(0) / total * len(b) / max(len(b) - 1, 1))
+
+
+def _signal(i: int) -> tuple[str, str, str]:
+    if i < 3:
+        return "force", AXES[i], "N"
+    if i < 6:
+        return "torque", AXES[i - 3], "N m"
+    if i < 9:
+        return "velocity", AXES[i - 6], "m/s"
+    return "attitude", AXES[i - 9], "rad"
+
+
+def _constant_and_change(
+    i: int, b: NDArray, a: NDArray, dispersion: float, flight: Flight, times: NDArray, unit: float
+) -> list[Finding]:
+    signal, axis, name = _signal(i)
+    total_b, total_a = b.sum(), a.sum()
+    if total_a <= 0:
+        return []
+    span = (float(flight.time[0]), float(flight.time[-1]))
+    found = []
+    mean, sd = total_b / total_a, np.sqrt(dispersion / total_a)
+    p = float(stats.t.sf(abs(mean / sd), max(len(b) - 1, 1)) * 2)
+    if p < NOTABLE:
+        found.append(Finding(signal, axis, "always", "", span, mean * unit, sd * unit, name,
+                             0.5 * total_b * mean / dispersion - 1, p))  # fmt: skip
+    # one change in mid-flight: the split that gains most, scores about the means of both sides
+    best = (0.0, 0)
+    cb, ca = np.cumsum(b), np.cumsum(a)
+    for k in range(2, len(b) - 2):
+        left, right = ca[k - 1], total_a - ca[k - 1]
+        if left > 0 and right > 0:
+            gain = 0.5 * (cb[k - 1] ** 2 / left + (total_b - cb[k - 1]) ** 2 / right - total_b**2 / total_a)
+            best = max(best, (gain, k))
+    gain, k = best
+    if k:
+        before, after = cb[k - 1] / ca[k - 1], (total_b - cb[k - 1]) / (total_a - ca[k - 1])
+        level = np.where(np.arange(len(b)) < k, before, after)
+        scatter = max(1.0, float(((b - a * level) ** 2).sum() / total_a * len(b) / max(len(b) - 2, 1)))
+        p = float(min(1.0, stats.f.sf(2 * gain / scatter, 1, max(len(b) - 2, 1)) * len(b)))
+        if p < NOTABLE:
+            error = np.sqrt(scatter * (1 / ca[k - 1] + 1 / (total_a - ca[k - 1])))
+            when = float(0.5 * (times[k - 1] + times[k]))
+            found.append(Finding(signal, axis, f"changes at {when:.1f} s", "time", (when, span[1]),
+                                 (after - before) * unit, error * unit, name, gain / scatter - 2, p))  # fmt: skip
+    return found
+
+
+def _by_regime(
+    model: Model, point: Point, name: str, values: NDArray, regime_unit: str, unit: NDArray
+) -> list[Finding]:
+    """How each axis's disturbance differs between the bins of a regime."""
+    flight = model.flight
+    edges = np.quantile(values, np.linspace(0, 1, BINS + 1))
+    if not np.all(np.diff(edges) > 1e-9 * max(1.0, np.abs(edges).max())):
+        return []
+    which = np.clip(np.searchsorted(edges, values, "right") - 1, 0, BINS - 1)
+    columns: list[Column] = []
+    for k in range(BINS):
+        w = (which == k).astype(float)
+        columns += [*axis_columns(flight, w), *shown_columns(flight, w)[3:6]]
+    per = 9
+    swept = model.sweep(point, columns)
+    found = []
+    for i in range(per):
+        index = np.arange(BINS) * per + i
+        b = swept.score[:, index]
+        a = swept.information[:, index][:, :, index]
+        total_b, total_a = b.sum(0), a.sum(0)
+        if np.any(np.diag(total_a) <= 0):
+            continue
+        theta = bounded(total_a, total_b, None, None)
+        one = total_b.sum() / total_a.sum()
+        gain = 0.5 * total_b @ theta - 0.5 * total_b.sum() * one
+        residual = b - a @ theta
+        scatter = max(1.0, float(np.sum(residual**2) / np.trace(total_a) * len(b) / max(len(b) - BINS, 1)))
+        freedom = max(len(b) - BINS, 1)
+        p = float(stats.f.sf(2 * gain / scatter / (BINS - 1), BINS - 1, freedom))
+        if p >= NOTABLE:
+            continue
+        signal, axis, label = _signal(i if i < 6 else i + 3)
+        size = unit[i if i < 6 else 14]
+        spread = theta - one
+        k = int(np.argmax(np.abs(spread)))
+        rows = np.flatnonzero(which == k)
+        error = np.sqrt(scatter * np.linalg.inv(total_a + 1e-12 * np.diag(np.diag(total_a)))[k, k])
+        words = f"{name} {edges[k]:.3g} to {edges[k + 1]:.3g} {regime_unit}"
+        found.append(Finding(signal, axis, words, name, (float(flight.time[rows[0]]), float(flight.time[rows[-1]])),
+                             float(spread[k] * size), float(error * size), label,
+                             float(gain / scatter - (BINS - 1)), p))  # fmt: skip
+    return found
+
+
+CHANNELS = ("position", "velocity", "attitude", "body_rate")
+
+
+def _whiteness(innovation: NDArray, variance: NDArray, lags: int = 10) -> dict[str, float]:
+    """Ljung-Box p-value of the standardised innovations of each channel."""
+    found = {}
+    for c, channel in enumerate(CHANNELS):
+        for i in range(3):
+            seen = variance[:, 3 * c + i] > 0
+            if seen.sum() < 10 * lags:
+                continue
+            z = innovation[seen, 3 * c + i] / np.sqrt(variance[seen, 3 * c + i])
+            z = z - z.mean()
+            n, power = z.size, float(z @ z)
+            if power <= 0:
+                continue
+            q = sum((float(z[k:] @ z[:-k]) / power) ** 2 / (n - k) for k in range(1, lags + 1)) * n * (n + 2)
+            found[f"{channel} {AXES[i]}"] = float(stats.chi2.sf(q, lags))
+    return found
+
+
+def strongest(findings: Sequence[Finding], most: int = 12) -> list[Finding]:
+    """The best finding of each signal, axis and kind of regime, strongest first."""
+    seen: set[tuple[str, str, str]] = set()
+    chosen = []
+    for f in sorted(findings, key=lambda f: -f.nats):
+        key = (f.signal, f.axis, f.variable)
+        if key not in seen:
+            seen.add(key)
+            chosen.append(f)
+    return chosen[:most]

@@ -1,0 +1,248 @@
+"""Random torques that are not mere noise: of one rotor alone, or of one band of frequencies.
+
+Noise of commands and air disturbs all rotors alike, so the torques about two axes are not correlated. A rotor that
+sticks, slips or misfires gives roll, pitch and yaw the signs of its place. Something that shakes leaves a hump in the
+spectrum of the rates' innovations. No effect of the catalogue does either, so both are structure left unexplained.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.fitting.gram import Gram
+from crazyem.diagnosis.fitting.model import Column, Model, Point
+from crazyem.diagnosis.locating.locate import AXES, Finding, units_of
+from crazyem.physics.motion import body_of
+from crazyem.physics.rotors import wrench
+from crazyem.vehicle import GRAVITY
+
+AT_RANDOM = "at random"  # what such a finding depends on; a thrust of the rotor is the variable `rotor`
+CHANCE = 1e-5  # that no rotor stands out, the number of rotors allowed for
+EACH = 2.33  # standard deviations for tilting alone and with yawing alone: a product of inertia mixes two axes only
+LEAST = 0.03  # correlation
+OUTLYING = 4.0  # standard deviations beyond which an innovation counts no more
+SPAN = 5.0  # s of a piece of which the spectrum is taken: a rotor's speed wanders by less than a tenth in it
+FEWEST = 4  # pieces
+SLOWEST, FASTEST = 1.5, 0.4  # Hz: below, onboard filters wander; of the sampling rate
+AROUND, APART = 4.0, 1.0  # Hz: surroundings of a hump, and what belongs to the hump itself
+HUMP = 10.0  # power over that of the surroundings; drones with nothing hidden have up to 3.4
+FOOT, FARTHEST = 3.0, 2.0  # of the surroundings; Hz
+SHAKEN = 0.15  # of the angular acceleration in that band: less is a loop that swings under a model a little wrong
+SMALLEST = 0.0004  # of weight times arm
+
+
+def standardised(model: Model, point: Point, turned: NDArray | None = None) -> tuple[NDArray, NDArray]:
+    """(n, 3) innovations of the body rates in standard deviations, and (n,) which rows have all three.
+
+    Args:
+        turned: (3, 3) with which they are multiplied before; None leaves each axis its own.
+    """
+    swept = model.sweep(point)
+    innovation, variance = swept.innovation[:, 9:12], swept.variance[:, 9:12]
+    seen: NDArray = np.all(variance > 0, axis=1)
+    if turned is not None:
+        innovation, variance = innovation @ turned.T, variance @ np.square(turned).T
+    z = np.divide(innovation, np.sqrt(variance), where=seen[:, None], out=np.zeros((seen.size, 3)))
+    return np.clip(z, -OUTLYING, OUTLYING), seen
+
+
+def memoryless(data: Data, point: Point) -> Point:
+    """The point with torques that have no memory, and noise scales that fit then: what a filter remembers it follows,
+    and what it follows is no innovation any more."""
+    white = np.concatenate([point.noise.disturbance[:3], np.zeros(3)])
+    return data.fit_noise(replace(point, noise=replace(point.noise, disturbance=white)))
+
+
+def erratic_rotor(models: Sequence[Model], point: Point) -> Finding | None:
+    """The rotor whose random thrust the correlations between the axes' innovations point to, if they do.
+
+    Of flights fitted and held out alike: nothing is fitted here. Shows most where torques are `memoryless`. Of the
+    torques, not of what turns: products of inertia turn the torques of all rotors into rates that go together.
+    """
+    inertia = body_of(point.vehicle, point.effects).inertia
+    pairs = ((0, 1), (0, 2), (1, 2))
+    sums, count = [], 0
+    for model in models:
+        z, seen = standardised(model, point, inertia / np.max(inertia))
+        block = model.flight.block
+        sums.append(np.stack([np.bincount(block, z[:, i] * z[:, j], model.flight.blocks) for i, j in pairs], 1))
+        count += int(seen.sum())
+    scores = np.concatenate(sums)
+    if count == 0 or len(scores) < 8:
+        return None
+    vehicle = point.vehicle
+    torque = wrench(np.eye(4), arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust)[:, 1:]
+    best: tuple[float, int, float] = (0.0, 0, 0.0)
+    for rotor in range(4):
+        sign = np.array([np.sign(torque[rotor, i] * torque[rotor, j]) for i, j in pairs])
+        turned = scores * sign
+        tilt, yaw, all_three = (_t(s) for s in (turned[:, 0], turned[:, 1:].sum(1), turned.sum(1)))
+        if min(tilt, yaw) > EACH and all_three > best[0]:
+            best = (all_three, rotor, float(turned.sum() / (3 * count)))
+    t, rotor, correlation = best
+    chance = min(1.0, 4.0 * float(stats.t.sf(t, len(scores) - 1)))
+    if chance > CHANCE or correlation < LEAST:
+        return None
+    noise = point.noise
+    step = float(np.median(np.diff(models[0].flight.time)))
+    level = np.hypot(noise.disturbance[3:5], noise.impulse[3:5] / np.sqrt(step)) * vehicle.inertia[:2]
+    size = float(np.sqrt(correlation) * level.mean())
+    time = models[0].flight.time
+    return Finding("torque", "x", f"rotor {rotor + 1} at random", AT_RANDOM, (float(time[0]), float(time[-1])), size,
+                   size / (2 * t), "N m", float(-np.log(max(chance, 1e-300))), chance)  # fmt: skip
+
+
+def _t(sums: NDArray) -> float:
+    """Student's t of the mean of blocks."""
+    spread = float(sums.std(ddof=1))
+    return float(sums.mean() / spread * np.sqrt(sums.size)) if spread > 0 else 0.0
+
+
+def spectrum(values: NDArray, period: float) -> tuple[NDArray, NDArray, int]:
+    """Frequencies [Hz], power density [unit^2/Hz] of (n,) samples, and the number of pieces that it is a mean of."""
+    size = round(SPAN / period)
+    window = np.hanning(size)
+    begins = range(0, values.size - size + 1, max(1, size // 2))
+    powers = [np.abs(np.fft.rfft((p - p.mean()) * window)) ** 2 for b in begins for p in (values[b : b + size],)]
+    if not powers:
+        return np.zeros(0), np.zeros(0), 0
+    return np.fft.rfftfreq(size, period), 2 * period / float(np.sum(window**2)) * np.mean(powers, axis=0), len(powers)
+
+
+def hump(frequency: NDArray, power: NDArray) -> tuple[int, float]:
+    """Where the power stands out most from its surroundings, and how many times."""
+    best, where = 0.0, 0
+    inside = (frequency > SLOWEST) & (frequency < FASTEST * 2 * frequency[-1])
+    for k in np.flatnonzero(inside):
+        away = np.abs(frequency - frequency[k])
+        around = power[inside & (away > APART) & (away < AROUND)]
+        if around.size >= 8 and power[k] > best * np.median(around):
+            best, where = float(power[k] / np.median(around)), int(k)
+    return where, best
+
+
+class Peak(NamedTuple):
+    """A hump: axis 0 to 2, frequency [Hz], power over that of the surroundings, pieces that it is a mean of, and how
+    far it reaches to either side [Hz]."""
+
+    axis: int
+    frequency: float
+    ratio: float
+    pieces: int
+    reach: float = 0.5
+
+
+def peaks(model: Model, point: Point) -> list[Peak]:
+    """Humps in the spectra of the rates' innovations, whatever its cause."""
+    z, seen = standardised(model, point)
+    if seen.sum() < 256:
+        return []
+    period = float(np.median(np.diff(model.flight.time)))
+    grid = np.arange(model.flight.time[0], model.flight.time[-1], period)
+    found = []
+    for i in range(3):
+        frequency, power, pieces = spectrum(np.interp(grid, model.flight.time[seen], z[seen, i]), period)
+        if pieces >= FEWEST:
+            k, ratio = hump(frequency, power)
+            if ratio > HUMP:
+                found.append(Peak(i, float(frequency[k]), ratio, pieces, reach_of(frequency, power, k, ratio)))
+    return found
+
+
+def reach_of(frequency: NDArray, power: NDArray, k: int, ratio: float) -> float:
+    """How far a hump reaches to either side [Hz]: where its power has fallen to `FOOT` of the surroundings.
+
+    What shakes with a rotor wanders with the rotor's speed.
+    """
+    low = power < FOOT / ratio * power[k]
+    below, above = np.flatnonzero(low[:k]), np.flatnonzero(low[k:])
+    left = frequency[k] - frequency[below[-1]] if below.size else 0.0
+    right = frequency[k + above[0]] - frequency[k] if above.size else 0.0
+    return float(np.clip(max(left, right), 0.5, FARTHEST))
+
+
+def beside_peaks(data: Data, point: Point, columns: Sequence[Column], found: Sequence[Sequence[Peak]]) -> Gram:
+    """Score and information of columns by what is outside the humps of each flight.
+
+    A torque at the frequencies of the humps, its amplitude and phase free in every block, is profiled out.
+    """
+    score, information, flight = [], [], []
+    m = len(columns)
+    for k, (model, here) in enumerate(zip(data.models, found, strict=True)):
+        swept = model.sweep(point, [*columns, *(w for p in here for w in waves(model, p))])
+        b, a = swept.score, swept.information
+        if here:
+            own = np.einsum("bii->bi", a[:, m:, m:])
+            inner = a[:, m:, m:] + np.einsum("bi,ij->bij", 1e-6 * own + (own <= 0), np.eye(own.shape[1]))
+            gain = np.linalg.solve(inner, a[:, m:, :m])  # (b, w, m)
+            b, a = b[:, :m] - np.einsum("bwm,bw->bm", gain, b[:, m:]), a[:, :m, :m] - a[:, :m, m:] @ gain
+        score.append(b)
+        information.append(a)
+        flight.append(np.full(len(b), k))
+    return Gram(np.concatenate(score), np.concatenate(information), np.concatenate(flight))
+
+
+def waves(model: Model, peak: Peak) -> list[Column]:
+    """Torques about the axis of a hump at frequencies half a Hz apart as far as it reaches, sine and cosine."""
+    columns = []
+    count = round(peak.reach / 0.5)
+    for at in peak.frequency + 0.5 * np.arange(-count, count + 1):
+        for wave in (np.cos, np.sin):
+            acting = np.zeros((model.flight.time.size, 6))
+            acting[:, 3 + peak.axis] = wave(2 * np.pi * at * model.flight.time)
+            columns.append(Column("wave", acting=acting))
+    return columns
+
+
+def humps(model: Model, point: Point) -> list[Finding]:
+    """Humps in the spectra of the rates' innovations, with the torque that shakes there, whatever its phase."""
+    flight = model.flight
+    period = float(np.median(np.diff(flight.time)))
+    grid = np.arange(flight.time[0], flight.time[-1], period)
+    span = (float(flight.time[0]), float(flight.time[-1]))
+    least = SMALLEST * point.vehicle.mass * GRAVITY * max(*point.vehicle.arm, 0.01)
+    found = []
+    for i, at, ratio, pieces, _ in peaks(model, point):
+        amplitude, sd = amplitude_of(model, point, i, at)
+        if model.shown is None:  # it left the range of numbers, and tells nothing
+            continue
+        frequency, rate, _ = spectrum(np.interp(grid, flight.time, model.shown[:, 10 + i]), period)
+        band = np.abs(frequency - at) <= APART
+        swing = float(np.sqrt(2 * np.trapezoid((rate * (2 * np.pi * frequency) ** 2)[band], frequency[band])))
+        torque = amplitude * float(units_of(point)[3 + i])
+        if amplitude < SHAKEN * swing or torque < least:
+            continue
+        nats = pieces / 2 * (ratio - 1 - np.log(ratio))  # pieces overlap by half
+        where, chance = f"frequency {at:.1f} Hz", float(np.exp(-min(nats, 700.0)))
+        found.append(Finding("torque", AXES[i], where, "frequency", span, torque, torque * sd / amplitude, "N m",
+                             float(nats), chance))  # fmt: skip
+    return found
+
+
+def amplitude_of(model: Model, point: Point, axis: int, frequency: float) -> tuple[float, float]:
+    """Root mean square over the blocks of the amplitude of an angular acceleration [rad/s^2], its phase free in each.
+
+    Returns it with its standard deviation.
+    """
+    angle = 2 * np.pi * frequency * model.flight.time
+    columns = []
+    for wave in (np.cos(angle), np.sin(angle)):
+        acting = np.zeros((angle.size, 6))
+        acting[:, 3 + axis] = wave
+        columns.append(Column("wave", acting=acting))
+    swept = model.sweep(point, columns)
+    powers = []
+    for b, a in zip(swept.score, swept.information, strict=True):
+        if np.linalg.cond(a) < 1e3:
+            inverse = np.linalg.inv(a)
+            powers.append(float(np.sum((inverse @ b) ** 2) - np.trace(inverse)))
+    if len(powers) < 2:
+        return 0.0, 0.0
+    mean, sd = float(np.mean(powers)), float(np.std(powers, ddof=1) / np.sqrt(len(powers)))
+    amplitude = float(np.sqrt(max(mean, 0.0)))
+    return amplitude, sd / (2 * amplitude) if amplitude > 0 else 0.0

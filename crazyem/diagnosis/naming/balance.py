@@ -1,0 +1,190 @@
+"""A drone's balance: the steady thrust and torque that flights ask for beyond its file's, against what days differ by.
+
+Where a file has a trim, a weak rotor, a load and a wind are told apart by what is steady, and there nothing is as
+uncertain as the day: a rotor that is weak lacks thrust, torque and drag torque in one ratio, a load has no torque about
+z. The filter's likelihood says the same, but is so sure of what is steady (its scores scatter up to 13 times as much as
+it says) that a day's prior counts for nothing beside it. So the four steady numbers are fitted with nothing named, and
+weighed here with the covariance they have from day to day.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear, minimize_scalar
+
+from crazyem.diagnosis.fitting.always import THRUST_SD, nuisances, solved, with_nuisances
+from crazyem.diagnosis.fitting.candidates import ON_BOARD, TRIM, Candidate
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, refine
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.sampling import TRIM_SD
+from crazyem.diagnosis.naming.exchange import exchanged
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial
+from crazyem.diagnosis.naming.witness import TELLING
+from crazyem.physics.rotors import wrench
+
+# Degrees of freedom of the day's covariance: known from some twelve days of two drones, four numbers each. Normal tails
+# would be sure of what a propeller that was taken off and put on again may do.
+DAYS = 8.0
+HEAVIEST = 1.0  # a load's weight over the drone's
+# How many of the four numbers each moves freely; a rotor's are in one ratio, a load's bounded by where it can be.
+FREE = {"rotor_fault": 1, "thrust_scale": 1, "battery_sag": 1, "suspended_load": 1, "wind": 3, "payload": 3}
+BY_THRUST = ("thrust_scale", "battery_sag", "suspended_load")
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """What flights ask for beyond the file.
+
+    Attributes:
+        lack: (4,) thrust that is missing, relative; torque that acts besides, over thrust, about x, y, z [m], body.
+        covariance: (4, 4) of it, from day to day and as it was fitted.
+        rotors: (4, 4) rows: what each rotor does to it that has no thrust.
+    """
+
+    lack: NDArray
+    covariance: NDArray
+    rotors: NDArray
+
+
+def balance_of(data: Data, point: Point) -> Balance:
+    """The balance of flights; `point` is a model of a vehicle whose file has a trim, of which the noise is taken."""
+    point = replace(point, effects={n: dict(v) for n, v in point.vehicle.effects.items()})
+    free = [Candidate("thrust_scale", (), ("scale",)), Candidate(TRIM, (), ("x", "y", "z"))]
+    rest = nuisances(data, point, free)
+    start = with_nuisances(point, [*rest, *((c, ()) for c in free)])
+    fitted = refine(data.twin(), start, free, nuisances=rest, rounds=4, noise=False)
+    found, filed = (
+        np.array([p.effects[c.effect][n] for c in free for n in c.free], float) for p in (fitted.point, start)
+    )
+    as_lack = np.diag([-1.0 / filed[0], 1.0, 1.0, 1.0])  # stronger lacks less
+    own = as_lack @ solved(fitted)[0].covariance[:4, :4] @ as_lack
+    days = np.diag(np.square([THRUST_SD, *TRIM_SD]))
+    return Balance(as_lack @ (found - filed), own + days, without_each(data, point))
+
+
+def without_each(data: Data, point: Point) -> NDArray:
+    """(4, 4) rows: thrust that is missing, relative, and torque over thrust [m] without one rotor, by mean commands."""
+    vehicle = point.vehicle
+    thrust = np.concatenate([
+        f.inputs.thrust[(f.inputs.time > f.time[0]) & (f.inputs.time < f.time[-1])] for f in data.flights
+    ]).mean(0)  # fmt: skip
+    lost = wrench(-np.diag(thrust), arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust) / thrust.sum()
+    return np.column_stack([-lost[:, 0], lost[:, 1:]])
+
+
+def weighed(balance: Balance, effect: str, fixed: Mapping[str, Any]) -> float | None:
+    """Log-likelihood [nats] of the balance with an effect, at its best, less the number of numbers it moves; None where
+    nothing is known of what it does to it."""
+    if effect not in FREE:
+        return None
+    root = np.linalg.cholesky(np.linalg.inv(balance.covariance)).T
+    lack = root @ balance.lack
+    if effect == "rotor_fault":
+        moved = root @ balance.rotors[int(fixed["rotor"]) - 1]
+        rest = lack - moved * np.clip(moved @ lack / (moved @ moved), 0.0, 1.0)
+        return _likely(float(rest @ rest)) - FREE[effect]
+    if effect == "payload":
+        return _likely(_loaded(root, lack)) - FREE[effect]
+    moves = root[:, [0]] if effect in BY_THRUST else root[:, 1:3]
+    rest = lack - moves @ np.linalg.lstsq(moves, lack, rcond=None)[0]
+    return _likely(float(rest @ rest)) - FREE[effect]
+
+
+def _likely(distance: float) -> float:
+    """Log-likelihood of four numbers at this squared distance, by a t distribution of `DAYS`, but for a constant."""
+    return -0.5 * (DAYS + 4.0) * float(np.log1p(distance / DAYS))
+
+
+def _loaded(root: NDArray, lack: NDArray) -> float:
+    """Squared distance of the balance from that of the load which comes nearest."""
+
+    def distance(share: float) -> float:
+        """With a load of a share of the whole weight: it is missing thrust, and draws the centre to where it is."""
+        most = np.full(2, share * ON_BOARD)
+        rest = lack - root[:, 0] * share
+        if share <= 0.0:
+            return float(rest @ rest)
+        return 2.0 * float(lsq_linear(root[:, 1:3], rest, (-most, most)).cost)
+
+    return float(minimize_scalar(distance, bounds=(0.0, HEAVIEST / (1.0 + HEAVIEST)), method="bounded").fun)
+
+
+def prefers(balance: Balance, one: Candidate, other: Candidate) -> float | None:
+    """Nats by which the balance prefers one explanation; None where it says nothing of one of them."""
+    mine, its = (weighed(balance, c.effect, dict(c.fixed)) if steady(c) else None for c in (one, other))
+    return None if mine is None or its is None else mine - its
+
+
+def steady(candidate: Candidate) -> bool:
+    """Whether it acts all the time."""
+    return dict(candidate.fixed).get("onset_time") is None
+
+
+def how_weak(balance: Balance, rotor: int) -> tuple[float, float]:
+    """Share of its thrust that rotor 1 to 4 lacks by the balance, and its standard deviation."""
+    root = np.linalg.cholesky(np.linalg.inv(balance.covariance)).T
+    moved = root @ balance.rotors[rotor - 1]
+    return float(moved @ root @ balance.lack / (moved @ moved)), float(1.0 / np.linalg.norm(moved))
+
+
+def by_balance(data: Data, selection: Selection) -> tuple[Selection, Balance | None]:
+    """The selection with a steady effect named and sized by the balance, and that balance.
+
+    Of what the balance does not tell apart the simplest gives the name; what it prefers to the name takes its place.
+    None where there is nothing to be weighed: no trim in the vehicle's file, or not just one effect that brings a
+    steady force or torque.
+    """
+    names = {c.effect for c in selection.accepted}
+    mine = next((c for c in selection.accepted if c.effect in FREE), None)
+    single = len(names & set(FREE)) == 1 and TRIM not in names
+    if TRIM not in selection.nominal.vehicle.effects or mine is None or not single or not steady(mine):
+        return selection, None
+    try:
+        balance = balance_of(data, selection.nominal)
+        selection, mine = _named(data, selection, mine, balance)
+        if mine.effect == "rotor_fault":
+            lack = how_weak(balance, int(dict(mine.fixed)["rotor"]))[0]
+            if 0.0 < lack < 1.0:
+                selection = _sized(data, selection, mine, {"scale": 1.0 - lack})
+    except (DivergedError, np.linalg.LinAlgError):  # then the filter's likelihood is all there is
+        return selection, None
+    return selection, balance
+
+
+def _named(data: Data, selection: Selection, mine: Candidate, balance: Balance) -> tuple[Selection, Candidate]:
+    """The selection with what the balance prefers to all others, else with the simplest of what it does not tell from
+    the name; and which that is."""
+    step = next(s for s in selection.steps if s.taken and s.taken.candidate.effect == mine.effect)
+    rivals: list[tuple[float, Trial]] = []
+    for trial in step.explanations():
+        nats = prefers(balance, mine, trial.candidate)
+        if nats is not None and trial.fitted is not None:
+            rivals.append((nats, trial))
+    beaten = [r for r in rivals if r[0] < -TELLING]
+    simpler = [r for r in rivals if r[0] < TELLING and FREE[r[1].candidate.effect] < FREE[mine.effect]]
+    if not beaten and not simpler:
+        return selection, mine
+    best = min(beaten or simpler, key=lambda entry: entry[0])[1]
+    return _instead(data, selection, step, mine, best), best.candidate
+
+
+def _instead(data: Data, selection: Selection, step: Step, old: Candidate, trial: Trial) -> Selection:
+    """The selection with an effect of a turn exchanged for another that was tried in it."""
+    assert trial.fitted is not None
+    values = [float(trial.candidate.values(trial.fitted.point)[n]) for n in trial.candidate.free]
+    found = exchanged(data, selection, old, trial.candidate, values)
+    steps = tuple(replace(s, taken=trial) if s is step else s for s in selection.steps)
+    return replace(found, steps=steps)
+
+
+def _sized(data: Data, selection: Selection, candidate: Candidate, values: Mapping[str, float]) -> Selection:
+    """The selection with an effect of that size, and what is always free as it is beside it."""
+    there = selection.final.with_effects({candidate.effect: values})
+    rest = [c for c in selection.accepted if c is not candidate]
+    free = nuisances(data, there, selection.accepted)
+    fitted = refine(data, with_nuisances(there, free), rest, nuisances=free, rounds=4, noise=False)
+    fitted = refine(data, fitted.point, selection.accepted, nuisances=free, rounds=0, noise=False)
+    return replace(selection, final=fitted.point, fitted=fitted)

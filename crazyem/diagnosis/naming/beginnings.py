@@ -1,0 +1,102 @@
+"""Where to begin an effect whose likelihood has many maxima: a load explains a swing of its own period only.
+
+A pendulum of a wrong period falls out of step within the time it is damped in, so the likelihood over lengths has a
+peak some per cent wide, and a fit that begins beside it stays there. One pass gives what the amplitude alone explains
+at every beginning; the best few are tried in full. Where a load is driven into chaos, what a small one would do says
+nothing of a larger one, which is followed by how it pulls: there, beginnings are compared by likelihood.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.fitting.always import nuisances, with_nuisances
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.fitting.gram import Gram
+from crazyem.diagnosis.fitting.model import Column, Point
+from crazyem.physics.effects.catalogue import CATALOGUE
+
+FEW = 5  # beginnings that are all tried in full; of more,
+KEPT = 2  # the best peaks are
+SEEN = 50.0  # nats, from which an effect that has sizes is tried with them
+
+
+def best_begun(
+    data: Data, point: Point, accepted: Sequence[Candidate], candidates: Sequence[Candidate]
+) -> list[Candidate]:
+    """The candidates, of those with many beginnings only the ones from where most is explained."""
+    families: dict[tuple[object, ...], list[Candidate]] = {}
+    for c in candidates:
+        families.setdefault((c.effect, c.fixed, c.free), []).append(c)
+    many = [family for family in families.values() if len(family) > FEW]
+    if not many:
+        return list(candidates)
+    free = nuisances(data, point, accepted)
+    point = with_nuisances(point, free)
+    base = [*accepted, *(c for c, _ in free)]
+    columns = [x for c in base for x in c.columns(point)]
+    weights = np.array([0.0] * sum(len(c.free) for c in accepted) + [w for _, p in free for w in p])
+    for family in many:
+        columns += [_amplitude(c, point) for c in family]
+    gram = data.gram(point, columns)
+    dropped, added, at = set[Candidate](), list[Candidate](), len(weights)
+    for family in many:
+        gains = [_gain(gram, weights, at + i) for i in range(len(family))]
+        at += len(family)
+        best = peaks(gains)
+        found = larger(data, point, family, best) if max(gains) > SEEN else None
+        if found is None:
+            dropped |= set(family) - {family[i] for i in best}
+        else:
+            dropped |= set(family)
+            added.append(found)
+    return [*(c for c in candidates if c not in dropped), *added]
+
+
+def larger(data: Data, point: Point, family: Sequence[Candidate], peaks: Sequence[int]) -> Candidate | None:
+    """The beginning and the size that are likeliest, if they are not beside one of these peaks; None: they are, or none
+    is likelier than nothing. What is steady in an effect that weighs is given back by the thrust."""
+    effect = CATALOGUE[family[0].effect]
+    nothing = data.twin().loglik(point)
+
+    def gain(tried: tuple[float, Candidate]) -> float:
+        size, candidate = tried
+        values = {**candidate.neutral(point), **dict(candidate.begin), effect.amplitude: size}
+        scale = point.effects.get("thrust_scale", {}).get("scale", 1.0) * (1.0 + size / point.vehicle.mass)
+        return data.twin().loglik(point.with_effects({effect.name: values, "thrust_scale": {"scale": scale}})) - nothing
+
+    tried = list(product(effect.sizes, family))
+    gains = data.workers.map(gain, tried)
+    if not tried or max(gains) <= 0.0:
+        return None
+    size, best = tried[int(np.argmax(gains))]
+    if any(abs(family.index(best) - i) <= 1 for i in peaks):
+        return None
+    return replace(best, begin=tuple({**dict(best.begin), effect.amplitude: size}.items()))
+
+
+def peaks(gains: Sequence[float]) -> list[int]:
+    """Indices of the highest local maxima, `KEPT` at most, highest first."""
+    padded = [-np.inf, *gains, -np.inf]
+    local = [i for i in range(len(gains)) if padded[i] < padded[i + 1] >= padded[i + 2]]
+    return sorted(local, key=lambda i: -gains[i])[:KEPT]
+
+
+def _amplitude(candidate: Candidate, point: Point) -> Column:
+    name = CATALOGUE[candidate.effect].amplitude
+    return candidate.columns(point)[candidate.free.index(name)]
+
+
+def _gain(gram: Gram, weights: NDArray, column: int) -> float:
+    """Nats that a column gains beside those of the base, without bounds; none if it wants the amplitude negative."""
+    b, a = gram.total([*range(len(weights)), column])
+    a = a + np.diag(np.append(weights, 0.0))
+    scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
+    a, b = a / np.outer(scale, scale), b / scale
+    along = np.linalg.lstsq(a[:-1, :-1], a[:-1, -1], rcond=1e-12)[0]
+    left, size = b[-1] - along @ b[:-1], a[-1, -1] - along @ a[:-1, -1]
+    return float(left**2 / (2 * size)) if left > 0 and size > 1e-9 else 0.0

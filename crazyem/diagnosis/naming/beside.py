@@ -1,0 +1,98 @@
+"""What is no column of the regression: gusts, a tilted accelerometer, rotors that follow their commands late."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy import stats
+
+from crazyem.diagnosis.fitting.always import usual_gusts
+from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.naming import accelerometer, rotor_response
+from crazyem.diagnosis.naming.gusts import find_gusts
+from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, around, share
+from crazyem.diagnosis.naming.prune import ADMITTED
+from crazyem.diagnosis.naming.trials import SURE
+from crazyem.diagnosis.naming.unexplained import Unexplained
+from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.recordings.recording import Recording
+from crazyem.vehicle import Vehicle
+
+FIXED = 0.3  # share of the gain of gusts that a force which depends on place or motion may have beside it
+
+
+def beside_the_regression(
+    data: Data,
+    apart: Data | None,
+    point: Point,
+    remains: Unexplained,
+    wanted: Sequence[str],
+    left_out: dict[str, str],
+    pulled: bool,
+    say: Callable[[str], None],
+) -> list[Named]:
+    """What is no column of the regression: gusts, unless something pulls the drone to a place (`pulled`), and a tilted
+    accelerometer."""
+    found = []
+    if (not wanted or "gusts" in wanted) and "gusts" not in left_out and not pulled:
+        say("gusts")
+        gusts = find_gusts(data, point)
+        known = gusts is not None and gusts.speed < usual_gusts(point.vehicle)
+        if gusts is not None and not known and gusts.moving_air and remains.force_nats < FIXED * gusts.gain:
+            memory_sd = gusts.memory * gusts.memory_sd
+            # a memory that the flight says nothing of has an interval without end
+            p = next(p for p in CATALOGUE["gusts"].parameters if p.name == "correlation_time")
+            with np.errstate(over="ignore"):
+                reach = np.exp(np.log(gusts.memory) + np.array([-1.96, 1.96]) * gusts.memory_sd)
+            low, high = np.clip(reach, p.low, p.high)
+            values = {
+                "standard_deviation": Value(gusts.speed, "m/s", gusts.speed_sd, around(gusts.speed, gusts.speed_sd)),
+                "correlation_time": Value(gusts.memory, "s", memory_sd, (float(low), float(high))),
+            }
+            held = gusts.gain
+            if apart is not None:
+                there = find_gusts(apart, point)
+                held = there.gain if there else 0.0
+            if held > 0:
+                # what the regression explains, nothing where gusts are all there is, says nothing of them
+                sure = (DOUBTFUL if remains.without_force().found else 1.0) * share(min(gusts.gain, held), [])
+                found.append(Named("gusts", "gusts", values, {}, held, float(np.exp(-min(held, 700.0))), sure))
+    if not wanted or accelerometer.EFFECT in wanted:
+        tilted = accelerometer.tilt(data, point)
+        if tilted is not None:
+            solution, gram = tilted
+            sd = np.sqrt(np.diag(solution.covariance)[:3])
+            angles = solution.theta[:3]
+            wald = float(stats.f.sf(np.sum((angles / sd)[:2] ** 2) / 2, 2, max(len(gram.score) - 7, 3)))
+            held = accelerometer.held_out_gain(apart or data, point, angles, yaw_sd=float(sd[2]))
+            sure = max(solution.p_value, wald) < SURE and held > ADMITTED
+            if sure and np.abs(angles).max() > accelerometer.LEAST:
+                values = {n: Value(float(a), "rad", float(e), around(float(a), float(e)))
+                          for n, a, e in zip(accelerometer.ANGLES, angles, sd, strict=True)}  # fmt: skip
+                found.append(Named(accelerometer.EFFECT, accelerometer.EFFECT, values, {}, held, wald,
+                                   share(min(solution.gain / max(1.0, solution.dispersion), held), [])))  # fmt: skip
+    return found
+
+
+def late_rotors(
+    recordings: Sequence[Recording],
+    held_out: Sequence[Recording],
+    vehicle: Vehicle,
+    wanted: Sequence[str],
+    left_out: dict[str, str],
+) -> tuple[list[Named], tuple[tuple[str, ...], ...]]:
+    """Lag and delay of rotors whose speeds were measured, and the group of both where one is as good as the other."""
+    found = rotor_response.response(recordings, vehicle)
+    if found is None:
+        return [], ()
+    left_out.pop("motor_lag", None)
+    late = rotor_response.judged(found, rotor_response.response(held_out, vehicle), vehicle)
+    if late is None or (wanted and not set(late.values) & set(wanted)):
+        return [], ()
+    named = []
+    for name, (value, sd) in late.values.items():
+        p = CATALOGUE[name].parameters[0]
+        values = {p.name: Value(value, p.unit, sd, around(value, sd))}
+        sure = share(min(late.nats, late.held_out), []) * (0.5 if late.alike else 1.0)
+        named.append(Named(name, name, values, {}, late.held_out, float(np.exp(-min(late.nats, 700.0))), sure))
+    return named, (("motor_lag", "input_delay"),) if late.alike else ()

@@ -1,0 +1,111 @@
+"""Names that were given before the rest was known: each is asked again, beside all the others, against its rivals.
+
+Effects are found one after the other, and the first is named while the second still passes for noise or is taken up by
+a parameter that the right name does not have: a load off the centre wins over weaker rotors where a flapping moment,
+found later, is what was off the centre.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from crazyem.diagnosis.fitting.always import refine_anew, refine_base, without
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.fit import Data, DivergedError
+from crazyem.diagnosis.naming.least import at_the_end, matters
+from crazyem.diagnosis.naming.split import judged, tuned_of
+from crazyem.diagnosis.naming.trials import SURE, Selection, Step, Trial, margin, not_beaten, told_apart
+
+NEAR = 100.0  # nats by which a rival may have been worse when it was tried
+
+
+def named_again(
+    data: Data, held_out: Data | None, selection: Selection, say: Callable[[str], None] = lambda text: None
+) -> Selection:
+    """The selection with every name that a rival explains better, or as well with fewer parameters, exchanged for it.
+
+    With one effect there is nothing new to ask; with a trim in the vehicle file noise scales are not fitted again.
+    """
+    if len(selection.accepted) < 2 or TRIM in selection.final.vehicle.effects:
+        return selection
+    for name in [c.effect for c in selection.accepted]:
+        try:
+            selection = _asked_again(data, held_out, selection, name, say)
+        except DivergedError:  # one of the rivals leaves the range of numbers beside the others: the name stays
+            continue
+    return selection
+
+
+def nearly_as_good(step: Step, accepted: Sequence[Candidate], *, near: float = NEAR) -> list[Trial]:
+    """What else was within `near` nats when the effect was taken, and is not part of the model by now."""
+    taken, names = step.taken, {c.effect for c in accepted}
+    assert taken is not None
+    tried = [t for t in step.trials if t.fitted is not None and t.blocks.size == taken.blocks.size]
+    return [t for t in tried if t.candidate.effect not in names and t.p_value < SURE and margin(taken, t)[0] < near]
+
+
+def _asked_again(
+    data: Data, held_out: Data | None, selection: Selection, name: str, say: Callable[[str], None]
+) -> Selection:
+    step = next(s for s in selection.steps if s.taken and s.taken.candidate.effect == name)
+    mine = next(c for c in selection.accepted if c.effect == name)
+    ended = at_the_end(selection.final, mine)  # beside the others: it stands for something else, whatever that is worth
+    others = nearly_as_good(step, selection.accepted, near=np.inf if ended else NEAR)
+    if not others:
+        return selection
+    say(f"  asking again: {mine.label} or {', '.join(t.candidate.label for t in others)}")
+    assert step.taken is not None
+    bare = without(selection.final, name)
+    starts = [(selection.final, list(selection.accepted))]
+    for rival in others:
+        assert rival.fitted is not None
+        point = bare.with_effects({rival.candidate.effect: rival.candidate.values(rival.fitted.point)})
+        starts.append((point, _in_place(selection.accepted, mine, rival.candidate)))
+    found = data.workers.map(lambda start: judged(data, held_out, *start), starts)
+    tried = [
+        replace(trial, candidate=c, value=value, blocks=blocks, tuned=tuned_of(c, accepted, known))
+        for trial, c, (_, accepted), (value, blocks, known) in zip(
+            [step.taken, *others], [mine, *(t.candidate for t in others)], starts, found, strict=True
+        )
+    ]
+    now, tried = tried[0], tried[1:]
+    asked = tried if ended else [now, *tried]
+    best = max(asked, key=lambda t: t.worth)
+    equals = [t for t in asked if t is best or not told_apart(best, t, recordings=False)]
+    group = [t for t in asked if t is best or not told_apart(best, t)]
+    unbeaten = not_beaten(equals)
+    chosen = min(unbeaten, key=lambda t: (len(t.candidate.free), -t.value), default=best)
+    rest = [t for t in step.trials if t is not step.taken and all(t.candidate is not r.candidate for r in tried)]
+    trials = (*asked, *rest)  # what ended is no rival of what takes its place
+    if any(t is now for t in unbeaten) and len(chosen.candidate.free) == len(mine.free):
+        chosen = now
+    alike = tuple(t for t in group if t is not chosen and t.candidate.effect != chosen.candidate.effect)
+    steps = tuple(replace(step, taken=chosen, trials=trials, alike=alike) if s is step else s for s in selection.steps)
+    if chosen is now:
+        return replace(selection, steps=steps)
+    accepted = _in_place(selection.accepted, mine, chosen.candidate)
+    assert chosen.fitted is not None
+    values = {chosen.candidate.effect: chosen.candidate.values(chosen.fitted.point)}
+    fitted = refine_anew(data, without(selection.final, name).with_effects(values), accepted)
+    if not matters(fitted.point, chosen.candidate, data):
+        return selection
+    say(f"  beside the others it is {chosen.candidate.label}")
+    return replace(selection, final=fitted.point, fitted=fitted, accepted=tuple(accepted), steps=steps)
+
+
+def exchanged(data: Data, selection: Selection, old: Candidate, new: Candidate, values: Sequence[float]) -> Selection:
+    """The selection with an effect in the place of another, its free parameters beginning at `values`."""
+    bare = without(selection.final, old.effect)
+    point = bare.with_effects({new.effect: {**new.neutral(bare), **dict(zip(new.free, values, strict=True))}})
+    accepted = tuple(new if c is old else c for c in selection.accepted)
+    fitted = refine_base(data, point, accepted, rounds=3, noise=False)
+    steps = tuple(
+        replace(s, taken=replace(s.taken, candidate=new)) if s.taken and s.taken.candidate.effect == old.effect else s
+        for s in selection.steps
+    )
+    return replace(selection, final=fitted.point, fitted=fitted, accepted=accepted, steps=steps)
+
+
+def _in_place(accepted: Sequence[Candidate], old: Candidate, new: Candidate) -> list[Candidate]:
+    return [new if c is old else c for c in accepted]

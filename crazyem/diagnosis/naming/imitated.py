@@ -1,0 +1,79 @@
+"""Names that only imitate a force by place: wind and ground effect against a constant and slopes by x, y, z.
+
+A cable pulls down the more the higher the drone is, and to one side: near the floor that looks like lift, and on the
+whole like wind. Such names are compared, all of them together, with the force that they would have to be; where that
+explains the flights better, those kept apart as well, what is there is none of the effects.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from crazyem.diagnosis.fitting.always import refine_base, solved, without
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, remembering_anew
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.locating.locate import AXES, Finding
+from crazyem.diagnosis.locating.place import NATS, left_by_place, slope_finding
+from crazyem.diagnosis.naming.trials import TOLD, Selection, scatter
+from crazyem.physics.effects.force_by_place import FORCE_BY_PLACE
+
+IMITATE = ("wind", "ground_effect")
+FORCE = Candidate(FORCE_BY_PLACE.name, (), tuple(p.name for p in FORCE_BY_PLACE.parameters))
+
+
+def by_place(
+    data: Data, held_out: Data | None, selection: Selection, say: Callable[[str], None] = lambda text: None
+) -> tuple[Selection, Finding | None]:
+    """The selection without what imitates a force by place, and that force as a finding; else as it was, and None.
+
+    The force stays in the final model, but is no candidate of it: it has no name, and is never written anywhere. With a
+    trim in the vehicle file noise scales are not fitted again, and nothing is compared.
+    """
+    names = [c for c in selection.accepted if c.effect in IMITATE]
+    if not names or "position" not in data.signals or TRIM in selection.final.vehicle.effects:
+        return selection, None
+    # what imitates has another shape: something is left by place, on the flights fitted or on those kept apart
+    if max(left_by_place(d.twin(), selection.final) for d in (data, held_out) if d is not None) < NATS:
+        return selection, None
+    rest = [c for c in selection.accepted if c not in names]
+    bare = selection.final
+    for c in names:
+        bare = without(bare, c.effect)
+    bare = bare.with_effects({FORCE.effect: FORCE.neutral(bare)})
+    say(f"  asking again: {', '.join(c.label for c in names)}, or a force by place")
+
+    def both(start: Point, candidates: list[Candidate], rounds: int) -> tuple[Fitted, Data]:
+        together = data.together_with(held_out)  # a hover to fit does not show slopes
+        for _ in range(rounds):  # noise of a model that lacks the force at first
+            fit = refine_base(together, remembering_anew(together, start), candidates)
+            start = fit.point
+        return fit, together
+
+    runs = [(selection.final, list(selection.accepted), 1), (bare, [*rest, FORCE], 2)]
+    try:
+        (named, flights), (instead, again) = data.workers.map(lambda run: both(*run), runs)
+        theirs, ours = flights.block_loglik(named.point), again.block_loglik(instead.point)
+        better = instead.loglik - named.loglik - len(FORCE.free) + sum(len(c.free) for c in names)
+        if better < NATS or better < TOLD * scatter(ours - theirs):
+            return selection, None
+        finding = _finding(again, instead, better)
+        if finding is None:
+            return selection, None
+        found = refine_base(data, remembering_anew(data, instead.point), [*rest, FORCE])
+    except DivergedError:  # without the names the model leaves the range of numbers: they stay
+        return selection, None
+    say("  it is a force by place")
+    gone = {c.effect for c in names}
+    steps = tuple(s for s in selection.steps if not (s.taken and s.taken.candidate.effect in gone))
+    return replace(selection, final=found.point, fitted=found, accepted=tuple(rest), steps=steps), finding
+
+
+def _finding(data: Data, found: Fitted, nats: float) -> Finding | None:
+    k = len(AXES)
+    end = sum(len(c.free) for c in found.candidates)  # the force is the last of them, its slopes after its constant
+    sd = np.sqrt(np.maximum(np.diag(solved(found)[0].covariance), 0.0))[end - k * k : end].reshape(k, k)
+    values = FORCE.values(found.point)
+    slopes = np.array([[float(values[i + j]) for j in AXES] for i in AXES])
+    return slope_finding(data, slopes, sd, nats, found.point.vehicle)

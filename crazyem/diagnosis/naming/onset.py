@@ -1,0 +1,57 @@
+"""Effects that begin in mid-flight: whether one does, and since when."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from crazyem.diagnosis.fitting.always import refine_base
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.fit import Data, Fitted
+from crazyem.diagnosis.fitting.gram import Gram
+from crazyem.physics.effects.catalogue import CATALOGUE
+
+ONSET = "onset_time"  # of effects that may begin in mid-flight
+DATED = 6.0  # nats that an onset must gain
+SCANS = ((1.5, 0.1), (0.5, 0.1), (0.1, 0.02))  # s to either side, and the step between onsets tried
+
+
+def onset_of(data: Data, candidate: Candidate, gram: Gram, index: list[int]) -> Candidate | None:
+    """The same effect from a block on that explains more than from the start; None if there is none."""
+    known = dict(candidate.fixed)
+    if known.get(ONSET) is not None or all(p.name != ONSET for p in CATALOGUE[candidate.effect].parameters):
+        return None
+    flight = data.flights[0]
+    rows = gram.flight == 0
+    b, a = gram.score[rows][:, index[0]], gram.information[rows][:, index[0], index[0]]
+    after_b, after_a = np.cumsum(b[::-1])[::-1], np.cumsum(a[::-1])[::-1]
+    gains = np.divide(after_b**2, 2 * after_a, out=np.zeros_like(b), where=after_a > 0)
+    k = int(np.argmax(gains))
+    theta = after_b[k] / after_a[k] if after_a[k] > 0 else 0.0
+    residual = b - a * theta * (np.arange(len(b)) >= k)
+    scatter = max(1.0, float(residual @ residual / max(a.sum(), 1e-300) * len(b) / max(len(b) - 2, 1)))
+    if k < 2 or gains[k] - gains[0] < DATED * scatter:
+        return None
+    begins = float(flight.time[np.flatnonzero(flight.block == k)[0]])
+    return replace(candidate, fixed=(*candidate.fixed, (ONSET, begins)))
+
+
+def date(data: Data, fitted: Fitted, candidate: Candidate) -> tuple[Fitted, Candidate]:
+    """The effect with its onset to some hundredths of a second, by the likelihood; all else is fitted again.
+
+    At a wrong onset the noise takes the change for its own: torques with memory grow until the likelihood hardly sees
+    when it came. So every scan is followed by a fit at the best onset, in which the noise shrinks, and a finer scan.
+    """
+    begins = dict(candidate.fixed).get(ONSET)
+    if begins is None:
+        return fitted, candidate
+    for reach, step in SCANS:
+        count = round(reach / step)
+        tried = [begins + k * step for k in range(-count, count + 1)]
+        points = [fitted.point.with_effects({candidate.effect: {ONSET: at}}) for at in tried]
+        values = data.workers.map(lambda point: data.twin().loglik(point), points)
+        begins = tried[int(np.argmax(values))]
+        moved = replace(candidate, fixed=tuple((n, begins if n == ONSET else v) for n, v in candidate.fixed))
+        others = tuple(moved if c is candidate else c for c in fitted.candidates)
+        candidate = moved
+        fitted = refine_base(data, fitted.point.with_effects({candidate.effect: {ONSET: begins}}), others, rounds=3)
+    return fitted, candidate

@@ -1,0 +1,383 @@
+"""Which effects a flight asks for: one after the other, each fitted together with those before it, with a stop rule.
+
+Each turn one pass gives score and information of every candidate (`gram`); the most promising are fitted without the
+linear approximation, and compared by what they gain beyond their number of parameters, on the flights fitted (in
+units in which scores scatter as they should) and on those held out. What comes close to the winner is kept as a
+look-alike.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.fitting.always import (
+    by_gain,
+    nuisances,
+    on_held_out,
+    refine_anew,
+    refine_base,
+    unlike_a_body,
+    with_nuisances,
+)
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, held_near
+from crazyem.diagnosis.fitting.gram import Solution
+from crazyem.diagnosis.fitting.model import Column, Point
+from crazyem.diagnosis.naming.beginnings import best_begun
+from crazyem.diagnosis.naming.evidence import gain_of_both, known_by, tuning
+from crazyem.diagnosis.naming.least import at_the_end, matters
+from crazyem.diagnosis.naming.onset import date, onset_of
+from crazyem.diagnosis.naming.prune import ADMITTED, drop, shaken, survive
+from crazyem.diagnosis.naming.steady import as_steady, beside_a_trim, by_onsets
+from crazyem.diagnosis.naming.trials import (
+    SURE,
+    Selection,
+    Step,
+    Trial,
+    both,
+    not_beaten,
+    own_evidence,
+    significance,
+    sure_enough,
+    told_apart,
+    weighed,
+)
+
+SHORTLIST = 6
+WORTH, ANYWAY = 0.15, 3  # share of the largest linear gain from which a candidate is fitted, and how many are anyway
+MOST = 9  # effects: real drones differ from a file in more than one thing
+NEARLY, MOST_COMPARED = 0.8, 3  # share of the best's gain from which, and how many, explanations get noise of their own
+BESIDE = 0.5  # share of its gain that an effect keeps beside another which it is no other name for
+# Angular acceleration is torque over inertia: where the one is fitted, so is the other, to be told apart or not; both
+# at once would be any size. A longer lag with more torque is nearly the same as neither.
+PARTNERS = (("torque_scale", "inertia"), ("inertia", "torque_scale"), ("torque_scale", "motor_lag"),
+            ("motor_lag", "torque_scale"))  # fmt: skip
+TURNING = {name for pair in PARTNERS for name in pair}
+# A heavier drone with as much more thrust has more torque and nothing else: beside a lag that is the same again.
+TORQUE_AND_LAG = {"payload", "thrust_scale", "motor_lag"}
+
+
+def linear_trials(
+    data: Data, point: Point, accepted: Sequence[Candidate], candidates: Sequence[Candidate]
+) -> list[tuple[Trial, Solution]]:
+    """What each candidate would gain in the linear approximation, best first. The last columns are the candidate's."""
+    free = nuisances(data, point, accepted)
+    point = with_nuisances(point, free)
+    base = [*accepted, *(c for c, _ in free)]
+    tested = [c for c in candidates if all(c.effect != n.effect for n, _ in free)]
+    tested_nuisances = [n for n, _ in free if any(c.effect == n.effect for c in candidates)]
+    columns: list[Column] = []
+    index: list[list[int]] = []
+    for c in [*base, *tested]:
+        added = c.columns(point)
+        index.append(list(range(len(columns), len(columns) + len(added))))
+        columns += added
+    gram = data.gram(point, columns)
+    always = [i for group in index[: len(base)] for i in group]
+    weights = np.array([0.0 for c in accepted for _ in c.free] + [w for _, p in free for w in p])
+    low = np.array([b for c in base for b in c.bounds(point)[0]])
+    high = np.array([b for c in base for b in c.bounds(point)[1]])
+    away = [c.neutral(point)[n] - c.values(point)[n] for c, _ in free for n in c.free]
+    centre = np.array([0.0 for c in accepted for _ in c.free] + away)
+    wide_low, wide_high = low, high
+    low, high = held_near(low, high, -centre, weights)
+    zero = gram.solve(always, precision=weights, prior=centre, low=low, high=high) if always else None
+    gain0, held0 = (zero.gain, zero.held_out) if zero else (0.0, 0.0)
+    found = []
+
+    def judge(c: Candidate, order: list[int], w: NDArray, lo: NDArray, hi: NDArray, mid: NDArray) -> None:
+        k = len(c.free)
+        solution = gram.solve(order, precision=w, prior=mid, low=lo, high=hi, tested=range(len(order) - k, len(order)))
+        dispersion = max(1.0, gram.solve(order[-k:]).dispersion)
+        gain, held = solution.gain - gain0, solution.held_out - held0
+        p_value = by_gain(point, gain / dispersion, k, len(gram.score), solution.p_value)
+        found.append((Trial(c, gain, held, dispersion, p_value, gain / dispersion - k), solution))
+
+    for c, mine in zip(tested, index[len(base) :], strict=True):
+        later = onset_of(data, c, gram, mine)
+        if later is not None:
+            found += [
+                (replace(t, p_value=by_onsets(point, t.p_value, len(gram.score))), s)
+                for t, s in linear_trials(data, point, accepted, [later])
+            ]
+        lo, hi = (np.array(b) for b in c.bounds(point))
+        judge(c, always + mine, np.append(weights, np.zeros(len(mine))), np.append(low, lo), np.append(high, hi),
+              np.append(centre, np.zeros(len(mine))))  # fmt: skip
+    for c in tested_nuisances:
+        mine = index[base.index(c)]
+        order = [*(i for i in range(len(always)) if always[i] not in mine), *(always.index(i) for i in mine)]
+        w = weights[order].copy()
+        w[len(order) - len(mine) :] = 0.0
+        near = order[: len(order) - len(mine)]
+        lo = np.append(low[near], wide_low[order[len(near) :]])
+        hi = np.append(high[near], wide_high[order[len(near) :]])
+        asked = next(a for a in candidates if a.effect == c.effect)
+        judge(asked, [always[i] for i in order], w, lo, hi, centre[order])
+    return sorted(found, key=lambda t: -t[0].evidence)
+
+
+def with_started(point: Point, candidate: Candidate, solution: Solution) -> Point:
+    """The model with a candidate put in where the linear approximation says."""
+    change = solution.theta[len(solution.theta) - len(candidate.free) :]
+    if candidate.effect in point.effects and not candidate.begin:
+        here = candidate.values(point)
+        started = {
+            n: float(np.clip(here[n] + d, candidate.parameter(n).low, candidate.parameter(n).high))
+            for n, d in zip(candidate.free, change, strict=True)
+        }
+        return point.with_effects({candidate.effect: {**here, **started}})
+    return point.with_effects({candidate.effect: candidate.started(point, change.tolist())})
+
+
+@dataclass(frozen=True)
+class Basis:
+    """What a candidate is tried against: the flights, the model before it and its log-likelihoods."""
+
+    data: Data
+    held_out: Data | None
+    point: Point
+    accepted: tuple[Candidate, ...]
+    value: float
+    held_value: float
+
+
+def tried(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str], None]) -> Trial:
+    """The trial of the linear approximation after a fit without it; changes nothing of the basis."""
+    point = basis.point
+    say(f"  fitting {trial.candidate.label}")
+    data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
+    try:
+        fit = refine_base(data, with_started(point, trial.candidate, solution), mine, rounds=3, noise=False)
+        return compared(basis, trial, data, fit)
+    except DivergedError:  # the linear approximation went too far
+        return replace(trial, p_value=1.0)
+
+
+def sharpened(basis: Basis, trial: Trial) -> Trial:
+    """A trial with noise scales of its own: under those of the model before it, the right explanation gains little."""
+    assert trial.fitted is not None
+    data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
+    try:
+        fit = refine_anew(data, trial.fitted.point, mine, rounds=2)
+        return compared(basis, trial, data, fit)
+    except DivergedError:
+        return trial
+
+
+def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
+    """The trial with what its fit gains, on the flights fitted (`data`, where the fit is) and on those held out."""
+    gain = fit.loglik - basis.value
+    blocks, recording = data.block_loglik(fit.point), data.recordings_of_blocks()
+    held, value, mine = trial.held_out, gain, [*basis.accepted, trial.candidate]
+    if basis.held_out:
+        apart = basis.held_out.twin()
+        there = on_held_out(apart, fit.point, mine)
+        held = there.loglik - basis.held_value
+        more, beyond, covariance = gain_of_both(fit, apart, there, mine)
+        blocks = np.append(blocks, beyond)
+        recording = np.append(recording, len(data.models) + apart.recordings_of_blocks())
+        value += held + more
+    else:
+        covariance = known_by(fit, mine)
+    k = len(trial.candidate.free)
+    tuned = tuning([trial.candidate], covariance[-k:, -k:])
+    wald_p = significance(fit, k, offset=sum(len(c.free) for c in basis.accepted))
+    wald_p = by_gain(fit.point, gain / trial.dispersion, k, len(fit.gram.score), wald_p)
+    sure = both(max(trial.p_value, wald_p), held / trial.dispersion if basis.held_out else 0.0)
+    sure = sure if matters(fit.point, trial.candidate, data) else 1.0
+    judged = replace(trial, gain=gain, held_out=held, p_value=sure, fitted=fit)
+    return replace(judged, blocks=blocks, value=value, recording=recording, tuned=tuned)
+
+
+def may_join(effect: str, found: set[str]) -> bool:
+    """Whether an effect can be known beside those found: not twice, and not where it is what they are, differently."""
+    return (
+        effect not in found
+        and all((effect, f) not in PARTNERS for f in found)
+        and not (effect in TORQUE_AND_LAG and {effect, *found} >= TORQUE_AND_LAG)
+    )
+
+
+def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Callable[[str], None]) -> Step:
+    """One turn of the selection: the promising are fitted, and the best is taken if it is sure enough."""
+    counted = basis.held_out is not None
+    fitted = basis.data.workers.map(lambda entry: tried(basis, *entry, say=say), shortlist(linear))
+    trials = weighed(fitted, counted=counted)
+    rest = [t for t, _ in linear if all(t.candidate is not p.candidate for p in trials)]
+    if trim := next((t for t in trials if t.candidate.effect == TRIM and admitted(basis, t)), None):
+        return Step((*trials, *rest), trim, as_steady(trim, [t for t in trials if rivals(t, counted=counted)]))
+    if not trials or not admitted(basis, trials[0]):
+        return Step((*trials, *rest), None)
+    trials, equals = compared_again(basis, trials, say=say)
+    taken = name_of(equals, counted=counted)
+    return Step((*trials, *rest), taken, group_of(taken, equals, trials, counted=counted))
+
+
+def admitted(basis: Basis, trial: Trial) -> bool:
+    """Whether a trial is sure enough to be taken."""
+    enough = own_evidence(trial, counted=basis.held_out is not None) > ADMITTED
+    return enough and sure_enough(basis.point, trial.p_value)
+
+
+def select(
+    data: Data,
+    nominal_point: Point,
+    candidates: Sequence[Candidate],
+    *,
+    held_out: Data | None = None,
+    begun: Selection | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Selection:
+    """The effects that the flights ask for; beyond those `begun` with, where there are some."""
+    # with a trim in the file noise stays (see `steadied`), or what is steady would pass for a torque with memory
+    begin = refine_base if TRIM in nominal_point.vehicle.effects else refine_anew
+    fitted = begin(data, nominal_point, ()) if begun is None else begun.fitted
+    nominal = fitted.point if begun is None else begun.nominal
+    point, value = fitted.point, fitted.loglik
+    accepted: list[Candidate] = [] if begun is None else list(begun.accepted)
+    steps: list[Step] = [] if begun is None else [s for s in begun.steps if s.taken]
+    held_value = on_held_out(held_out, point, accepted).loglik if held_out else 0.0
+    first = len(accepted)
+    while True:
+        rest = [c for c in candidates if may_join(c.effect, {a.effect for a in accepted})]
+        rest = beside_a_trim(rest, accepted)
+        say(f"looking for effect {len(accepted) + 1} among {len(rest)} candidates")
+        linear = linear_trials(data, point, accepted, best_begun(data, point, accepted, rest))
+        if len(accepted) > first:
+            steps[-1] = replace(steps[-1], beside=additions(steps[-1], [t for t, _ in linear]))
+        if len(accepted) >= MOST:  # what stands beside the last is all that is asked
+            steps.append(Step(tuple(t for t, _ in linear), None))
+            break
+        steps.append(step_of(Basis(data, held_out, point, tuple(accepted), value, held_value), linear, say=say))
+        taken = steps[-1].taken
+        if taken is None:
+            break
+        assert taken.fitted is not None
+        dated, candidate = date(data, taken.fitted, taken.candidate)
+        accepted.append(candidate)
+        say(f"  found {candidate.label}: {taken.evidence:.1f} nats")
+        before, fitted = fitted, refine_anew(data, dated.point, accepted)
+        if at_the_end(fitted.point, candidate):
+            # together with all that is free it went on to where nothing more is admitted: it stands for something else
+            say(f"  left out again, nothing more of it is admitted: {candidate.label}")
+            accepted.pop()
+            steps.pop()
+            candidates = [c for c in candidates if c.effect != candidate.effect]
+            fitted = before
+            data.settle(fitted.point)
+            continue
+        point, value = fitted.point, fitted.loglik
+        if unlike_a_body(point, accepted):  # told by other means, or not at all: see `diagnose`
+            return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))
+        held_value = on_held_out(held_out, point, accepted).loglik if held_out else 0.0
+    found = [c.effect for c in accepted]
+    fitted, accepted, steps = drop(data, fitted, accepted, steps, held_out, say)
+    doubted: frozenset[str] = frozenset()
+    if TRIM not in point.vehicle.effects:  # both judge by the scatter of blocks (see `by_gain`)
+        fitted, accepted, steps = survive(data, fitted, accepted, steps, held_out, say)
+        doubted = shaken(data, nominal_point, fitted, accepted, say)
+    chosen = Selection(nominal, fitted.point, tuple(steps), tuple(accepted), fitted, len(candidates), doubted)
+    gone = {name for name in found if all(name != c.effect for c in accepted)}
+    if len(found) < MOST or not gone:
+        return chosen
+    # there was room for no more, and now there is
+    rest = [c for c in candidates if c.effect not in gone]
+    return select(data, nominal_point, rest, held_out=held_out, begun=chosen, say=say)
+
+
+def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Solution]]:
+    """Those worth a fit of their own: the largest gains, and the largest when scatter is allowed for; one beginning of
+    each."""
+    sound = [t for t in linear if t[0].evidence > 2.0 and t[0].p_value < 0.03]
+    chosen: list[tuple[Trial, Solution]] = []
+    least = WORTH * max((t.gain for t, _ in sound), default=0.0)
+    by_gain = sorted(sound, key=lambda t: 2 * len(t[0].candidate.free) - t[0].gain)
+    for entry in [x for pair in zip(by_gain, sound, strict=True) for x in pair]:
+        c = entry[0].candidate
+        twins = [t for t, _ in chosen if t.candidate.effect == c.effect]
+        same = any(t.candidate.fixed == c.fixed and t.candidate.free == c.free for t in twins)
+        if not same and len(twins) < 2 and (entry[0].gain > least or len(chosen) < ANYWAY):
+            chosen.append(entry)
+        if len(chosen) == SHORTLIST:
+            break
+    for one, other in PARTNERS:
+        names = {t.candidate.effect for t, _ in chosen}
+        if one in names and other not in names:
+            chosen += [e for e in linear if e[0].candidate.effect == other][:1]
+    trims = [e for e in linear if e[0].candidate.effect == TRIM][:1]
+    return chosen + [e for e in trims if all(e is not c for c in chosen)]
+
+
+def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
+    """Effects tried in a turn that gain nearly as much beside the one that was taken: no other name for it, but more.
+
+    Two explanations of one thing gain no more together than the better one alone.
+    """
+    left = {c: max(t.gain for t in later if t.candidate.effect == c) for c in {t.candidate.effect for t in later}}
+    fitted = [t for t in step.trials if t.fitted is not None and t.candidate.effect in left]
+    return frozenset(t.candidate.effect for t in fitted if 0 < BESIDE * t.gain < left[t.candidate.effect])
+
+
+def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], None]) -> tuple[list[Trial], list[Trial]]:
+    """The trials, and the best of them with what is not told apart from it, each of these with noise of its own.
+
+    So is what explains nearly as much: under the noise of a model without either, much of which is the effect, a torque
+    scale that is wrong by some per cent for each axis is better by 90 nats than the inertias that are right.
+    """
+    counted = basis.held_out is not None
+    equals = alike_with(trials[0], trials, counted=counted)
+    turns = trials[0].candidate.effect in TURNING
+    nearly = [
+        t
+        for t in trials
+        if rivals(t, counted=counted)
+        and (t.value > NEARLY * trials[0].value or (turns and t.candidate.effect in TURNING))
+    ]
+    equals += [t for t in nearly[:MOST_COMPARED] if all(t is not e for e in equals)]
+    if len(equals) == 1:
+        return trials, equals
+    say(f"  comparing {', '.join(t.candidate.label for t in equals)}")
+    again = basis.data.workers.map(partial(sharpened, basis), equals)
+    rest = [t for t in trials if all(t is not e for e in equals)]
+    trials = weighed([*again, *rest], counted=counted)
+    close = [t for t in trials if any(t.candidate is a.candidate for a in again)]
+    explain = [t for t in close if t is close[0] or admitted(basis, t)]
+    # as fitted to all flights: a drag fitted to slow flight is by chance what ruins a quick one least
+    best = max(explain, key=lambda t: t.worth)
+    return trials, alike_with(best, close, counted=counted)
+
+
+def alike_with(best: Trial, trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
+    """The best, and what is not told apart from it."""
+    others = [t for t in trials if t is not best and rivals(t, counted=counted)]
+    return [best, *(t for t in others if not told_apart(best, t))]
+
+
+def group_of(taken: Trial, equals: Sequence[Trial], trials: Sequence[Trial], *, counted: bool) -> tuple[Trial, ...]:
+    """What is not told apart from the best, nor from the one that gives the name, which may be another: a lag loses to
+    a ground effect, but not to the delay that is named before it."""
+    more = [t for t in alike_with(taken, trials, counted=counted) if all(t is not e for e in equals)]
+    return tuple(t for t in (*equals, *more) if t.candidate.effect != taken.candidate.effect)
+
+
+def name_of(equals: Sequence[Trial], *, counted: bool) -> Trial:
+    """Which of those that are not told apart gives the name: the simplest that none of the others beats (nine to
+    one), or its confidence would say that it is another.
+
+    By the scatter over blocks alone: how recordings differ widens a group, but is known from few of them, and a name
+    that loses by hundreds of nats is none because of that.
+    """
+    near = [t for t in equals if t is equals[0] or not told_apart(equals[0], t, recordings=False)]
+    simplest = min(not_beaten(near), key=lambda t: (len(t.candidate.free), -t.evidence), default=equals[0])
+    return simplest if own_evidence(simplest, counted=counted) > ADMITTED else equals[0]
+
+
+def rivals(trial: Trial, *, counted: bool) -> bool:
+    """Whether a candidate that was fitted is an explanation at all: significant, or with evidence enough; and of some
+    use on all flights together."""
+    evidence = own_evidence(trial, counted=counted)
+    sure = trial.p_value < SURE or (trial.p_value < 1.0 and evidence > ADMITTED)
+    return trial.fitted is not None and sure and evidence > 0

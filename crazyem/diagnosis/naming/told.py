@@ -1,0 +1,223 @@
+"""What was selected, as it is told: numbers with intervals, confidence, what is the same to every signal, and what
+would tell it apart."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from crazyem.diagnosis.fitting.always import by_a_wrong_lag, solved, unsure
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.naming.balance import DAYS, Balance, how_weak, prefers
+from crazyem.diagnosis.naming.balance import steady as steadily
+from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, at_most, one_factor, share, trust
+from crazyem.diagnosis.naming.split import LOAD, WEAKER, instead_of_a_load
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial, preferred, told_apart, wald
+from crazyem.diagnosis.naming.unexplained import Unexplained
+from crazyem.diagnosis.naming.witness import TELLING
+from crazyem.physics.effects.catalogue import CATALOGUE
+
+WITHIN = 0.05  # p-value from which an effect's own uncertainty holds that there is none of it
+SHAKES = "hold the drone with its rotors turning: what shakes then is not the loop that swings with a wrong model"
+# Exactly the same to every signal, but for forces of the air: two things at once, more mass and inertias to match.
+HEAVIER = "weigh the drone: with {:.3g} times its mass and its inertias it would fly the same"
+MEASURED_LATE = "measurement_delay"
+BY_TORQUE = ("velocity_moment",)  # of what is asked of flights whose torques say little, what they alone can tell
+# Told by forces that last, which no rotor feigns that pushes at random.
+BY_FORCE = ("thrust_scale", "thrust_curve", "battery_sag", "linear_drag", "quadratic_drag", "wind", "ground_effect",
+            "attitude_misalignment", "velocity_scale")  # fmt: skip
+# Two weak rotors beside each other lack thrust and tilt the drone as a weight on their side does, with no torque about
+# z; only what turns tells, which a drone whose trim changes from day to day does not show.
+WEAK_ROTOR = "rotor_fault"
+# Exactly the same to every signal: inputs that act late, and measurements that are all late together.
+SAME = {"input_delay": (MEASURED_LATE,)}
+
+
+@dataclass(frozen=True)
+class Told:
+    """The effects, strongest first; groups of names that these flights cannot tell apart, and what would."""
+
+    effects: tuple[Named, ...] = ()
+    groups: tuple[tuple[str, ...], ...] = ()
+    separate: tuple[str, ...] = ()
+
+
+def tell(
+    data: Data,
+    selection: Selection,
+    remains: Unexplained,
+    *,
+    witnessed: frozenset[str],
+    in_place: Mapping[str, tuple[Trial, Trial] | None],
+    balance: Balance | None = None,
+) -> Told:
+    """The selected effects as they are told.
+
+    Args:
+        remains: the structure that they leave, beside which no name is sure.
+        witnessed: names that a witness told from their look-alikes.
+        in_place: for an effect the two trials, of it and of what else could stand in its place.
+        balance: what is steady, by which names are told apart where a file has a trim.
+    """
+    if not selection.accepted:
+        return Told()
+    point, gram = selection.final, selection.fitted.gram
+    solution, used = solved(selection.fitted, wide=True)
+    sd = np.sqrt(np.maximum(np.diag(solution.covariance), 0.0))
+    width = float(stats.t.ppf(0.975, max(len(gram.score) - used, 3)))
+    never = unsure(data, point)
+    never |= {
+        name: float(np.hypot(never.get(name, 0.0), off)) for name, off in by_a_wrong_lag(data, selection.fitted).items()
+    }
+    found: list[tuple[float, Named]] = []
+    groups: list[tuple[str, ...]] = []
+    separate: list[str] = []
+    at = 0
+    for candidate, step in zip(selection.accepted, (s for s in selection.steps if s.taken), strict=True):
+        assert step.taken is not None
+        own = slice(at, at + len(candidate.free))
+        at = own.stop
+        away, covariance = _away(candidate, point), solution.covariance[own, own]
+        rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, witnessed), balance)
+        heard = _against(remains, candidate, data)
+        confidence = trust(heard) * share(step.taken.evidence, []) * preferred(step.taken, rivals)
+        confidence /= 1.0 + sum(float(np.exp(-nats)) for nats in steady.values())
+        doubted = candidate.effect in selection.doubted
+        by_day = _by_the_day(candidate, point, balance)
+        none_of_it = wald(away, covariance, gram, used) if by_day is None else by_day[1]
+        if doubted or none_of_it > WITHIN:
+            confidence = min(confidence, DOUBTFUL)
+        p_value = min(1.0, step.taken.p_value * max(1, selection.tried))
+        confidence = min(confidence, at_most(step.taken.held_out, p_value))
+        # late inputs and late measurements are one model, so it is fitted as the first, whatever it is called
+        late = candidate.effect == "input_delay" and MEASURED_LATE in witnessed
+        name, label = (MEASURED_LATE, MEASURED_LATE) if late else (candidate.effect, candidate.label)
+        chosen: dict[str, object] = {"streams": ("state", "gyro")} if late else dict(candidate.fixed)
+        numbers = by_day[0] if by_day else _numbers(candidate, point, sd[own], width, never)
+        named = Named(name, label, numbers, chosen, step.taken.held_out, p_value, confidence)
+        found.append((step.taken.evidence, named))
+
+        if doubted:
+            separate.append(SHAKES)
+        equal = [
+            *(t.candidate.effect for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}),
+            *(name for name, nats in steady.items() if nats < TELLING),
+            *(() if candidate.effect in witnessed else SAME.get(candidate.effect, ())),
+            *_in_place(candidate, in_place, selection),
+            *_as_a_factor(candidate, step, point, covariance),
+            *_by_turning_alone(candidate, data, selection),
+        ]
+        if equal:
+            groups.append(tuple(dict.fromkeys([name, *equal])))
+            separate += [CATALOGUE[n].separates for n in groups[-1] if CATALOGUE[n].separates]
+        elif candidate.effect == LOAD:  # told from weak rotors by where it sits, which is no proof
+            separate.append(CATALOGUE[LOAD].separates)
+        elif candidate.effect == "thrust_scale":
+            separate.append(HEAVIER.format(1.0 / candidate.values(point)["scale"]))
+    found.sort(key=lambda entry: -entry[0])
+    return Told(tuple(n for _, n in found), tuple(groups), tuple(dict.fromkeys(separate)))
+
+
+def strongest_first(effects: Sequence[Named], beside: Sequence[Named]) -> tuple[Named, ...]:
+    """The effects in their order, and among them, before the first that brings less on flight held out, those that the
+    selection cannot ask for (gusts, an accelerometer, what acts before measured rotors)."""
+    told = list(effects)
+    for one in beside:
+        at = next((i for i, e in enumerate(told) if e.held_out_nats < one.held_out_nats), len(told))
+        told.insert(at, one)
+    return tuple(told)
+
+
+def _against(remains: Unexplained, candidate: Candidate, data: Data) -> Unexplained:
+    """What speaks against a name of all that remains."""
+    if data.coarse and candidate.effect not in BY_TORQUE:
+        remains = remains.of_forces()  # where torques say nothing, what they leave says nothing against forces
+    if candidate.effect in BY_FORCE:
+        return remains.without_random_rotor()
+    if candidate.effect == WEAK_ROTOR:  # a propeller that is cut is out of balance as well
+        return remains.without_random_rotor(int(dict(candidate.fixed)["rotor"]))
+    return remains
+
+
+def _away(candidate: Candidate, point: Point) -> NDArray:
+    values, neutral = candidate.values(point), candidate.neutral(point)
+    return np.array([values[n] - neutral[n] for n in candidate.free])
+
+
+def _numbers(
+    candidate: Candidate, point: Point, sd: NDArray, width: float, never: Mapping[tuple[str, str], float]
+) -> dict[str, Value]:
+    """The free parameters with their sd (k,), intervals of so many of them within what is possible; `never` is the sd
+    that no flight takes away."""
+    values, out = candidate.values(point), {}
+    for name, own in zip(candidate.free, sd, strict=True):
+        p = candidate.parameter(name)
+        error = float(np.hypot(own, never.get((candidate.effect, name), 0.0)))
+        least, most = candidate.range_of(name)
+        if values[name] in (least, most) and values[name] != p.neutral:  # it may be anywhere, for all that is known
+            error = max(error, (most - least) / 12**0.5)
+        low, high = values[name] - width * error, values[name] + width * error
+        out[name] = Value(values[name], p.unit, error, (max(low, least), min(high, most)))
+    return out
+
+
+def _by_the_day(candidate: Candidate, point: Point, balance: Balance | None) -> tuple[dict[str, Value], float] | None:
+    """How weak a rotor is by the balance, of which the day is most of what is uncertain, and the p-value that it is not
+    weak at all; None for other effects, and where there is no balance."""
+    if balance is None or candidate.effect != WEAK_ROTOR or not steadily(candidate):
+        return None
+    scale = float(candidate.values(point)["scale"])
+    sd = how_weak(balance, int(dict(candidate.fixed)["rotor"]))[1]
+    reach = sd * float(stats.t.ppf(0.975, DAYS))
+    value = Value(scale, candidate.parameter("scale").unit, sd, (max(scale - reach, 0.0), scale + reach))
+    return {"scale": value}, 2.0 * float(stats.t.sf((1.0 - scale) / sd, DAYS))
+
+
+def _steady_rivals(
+    candidate: Candidate, rivals: Sequence[Trial], balance: Balance | None
+) -> tuple[list[Trial], dict[str, float]]:
+    """The rivals of which the balance says nothing, and of the others the nats by which it prefers the candidate."""
+    if balance is None:
+        return list(rivals), {}
+    said = [(t, prefers(balance, candidate, t.candidate)) for t in rivals]
+    nats: dict[str, float] = {}
+    for trial, margin in said:
+        if margin is not None:
+            nats[trial.candidate.effect] = min(margin, nats.get(trial.candidate.effect, np.inf))
+    return [t for t, margin in said if margin is None], nats
+
+
+def _rivals(candidate: Candidate, step: Step, witnessed: frozenset[str]) -> list[Trial]:
+    """What else explains what the effect explains; not what a witness told from it."""
+    others = {candidate.effect, *step.beside} | (witnessed if candidate.effect in witnessed else frozenset())
+    return [t for t in step.explanations() if t.candidate.effect not in others]
+
+
+def _in_place(
+    candidate: Candidate, in_place: Mapping[str, tuple[Trial, Trial] | None], selection: Selection
+) -> Sequence[str]:
+    """A load, or what stands in its place, where neither explains more."""
+    pair = in_place.get(candidate.effect)
+    if pair is None or told_apart(*pair):
+        return ()
+    return [c.effect for c in instead_of_a_load(selection.final.vehicle)] if candidate.effect == LOAD else [LOAD]
+
+
+def _as_a_factor(candidate: Candidate, step: Step, point: Point, covariance: NDArray) -> Sequence[str]:
+    """Torques for inertias that are one factor, where these were not asked beside what was found before."""
+    if candidate.effect != "inertia" or any(t.candidate.effect == "torque_scale" for t in step.trials):
+        return ()
+    values, neutral = candidate.values(point), candidate.neutral(point)
+    here, before = (np.array([v[n] for n in candidate.free]) for v in (values, neutral))
+    return ["torque_scale"] if one_factor(here, before, covariance) else ()
+
+
+def _by_turning_alone(candidate: Candidate, data: Data, selection: Selection) -> Sequence[str]:
+    """A load for weak rotors, and the other way round, where nothing but torques would tell, which say nothing here."""
+    if candidate.effect == LOAD and TRIM in selection.final.vehicle.effects:
+        return [WEAK_ROTOR]
+    return [LOAD] if candidate.effect == WEAKER.effect and data.coarse else ()

@@ -1,0 +1,148 @@
+"""What none of the effects explains: structure left in the innovations of the final model."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.fitting.candidates import TRIM
+from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.fitting.model import Point, Swept
+from crazyem.diagnosis.locating.locate import AXES, Finding, Located, strongest
+from crazyem.diagnosis.locating.restless import AT_RANDOM, erratic_rotor, humps, memoryless
+from crazyem.diagnosis.naming.trials import Selection
+from crazyem.vehicle import GRAVITY
+
+STRUCTURE = 25.0  # nats of structure left over that count as unexplained
+# Smaller than this is what onboard filters and sampled commands leave in every flight: share of weight, share of the
+# weight times the arm, rad, m/s.
+TOLERANCE = {"force": 0.01, "torque": 0.0004, "attitude": 5e-3, "velocity": 0.05}
+DAILY = 2.0  # times that, where trims, thrust and leaning differ by 2 % from day to day or flight to flight (always.py)
+SLOWEST = 1.5  # Hz: below, onboard filters wander
+LINE = 25.0  # nats: peak of the spectrum over its surroundings (power), the number of frequencies allowed for
+SHAKEN = 0.3  # of what an unknown torque would leave of a swing
+TURNING = ("torque", "body_rate")
+NEAR = 0.15  # share of the frequency range that is "surroundings"
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What remains.
+
+    Attributes:
+        findings: where structure is left that no effect explains, strongest first.
+        gained: nats that the effects explain.
+    """
+
+    findings: tuple[Finding, ...]
+    gained: float
+
+    @property
+    def found(self) -> bool:
+        """Whether there is structure that no effect explains."""
+        return bool(self.findings)
+
+    @property
+    def nats(self) -> float:
+        """Of the strongest finding."""
+        return self.findings[0].nats if self.findings else 0.0
+
+    @property
+    def explained(self) -> float:
+        """Share of the structure that the effects explain, 0 to 1."""
+        return self.gained / (self.gained + self.nats) if self.gained + self.nats > 0 else 1.0
+
+    @property
+    def force_nats(self) -> float:
+        """Of the strongest force that depends on place or motion."""
+        return max(
+            (f.nats for f in self.findings if f.signal == "force" and f.variable not in ("", "time")), default=0.0
+        )
+
+    def beside(self, finding: Finding) -> "Unexplained":
+        """The same with one more finding."""
+        return Unexplained(tuple(sorted((*self.findings, finding), key=lambda f: -f.nats)), self.gained)
+
+    def of_forces(self) -> "Unexplained":
+        """What remains of forces, attitudes and velocities: all that speaks of effects that forces tell, where the
+        turning does not follow the commands as they were recorded."""
+        return Unexplained(tuple(f for f in self.findings if f.signal not in TURNING), self.gained)
+
+    def without_random_rotor(self, rotor: int | None = None) -> "Unexplained":
+        """What remains but a rotor (1 to 4; None: any) that pushes at random, which is no force that lasts."""
+        which = "" if rotor is None else f"rotor {rotor} "
+        left = (f for f in self.findings if f.variable != AT_RANDOM or not f.regime.startswith(which))
+        return Unexplained(tuple(left), self.gained)
+
+    def without_force(self) -> "Unexplained":
+        """What remains once a random force explains the forces."""
+        return Unexplained(tuple(f for f in self.findings if f.signal != "force"), self.gained)
+
+
+def unexplained(data: Data, selection: Selection, after: Located, apart: Data | None = None) -> Unexplained:
+    """Compare what is left with what was gained; random torques are looked for on the flights held out, too."""
+    point = selection.final
+    # what is always free gives way to a vibration, so that is looked for with it where the vehicle file has it
+    named = {c.effect: point.effects[c.effect] for c in selection.accepted if c.effect not in selection.doubted}
+    filed = replace(point, effects={**point.vehicle.effects, **named})
+    # along axes of the body: a force of the room is asked for by `place.py`, and `wind` is of the catalogue
+    of_the_body = [f for f in after.findings if f.axis in AXES]
+    left = [f for f in strongest(of_the_body, most=40) if f.nats > STRUCTURE and notable(f, point, differ=data.differ)]
+    for model in data.models:
+        left += lines(model.sweep(point), model.flight.time) + humps(model, filed)
+        model.settle(point)
+    everything, quiet = data.together_with(apart), memoryless(data.twin(), point)
+    everything.settle(quiet)
+    erratic = erratic_rotor(everything.models, quiet)
+    left += [erratic] if erratic else []
+    left.sort(key=lambda f: -f.nats)
+    gained = sum(s.taken.evidence for s in selection.steps if s.taken)
+    return Unexplained(tuple(left[:12]), gained)
+
+
+def notable(finding: Finding, point: Point, *, differ: bool = False) -> bool:
+    """Whether a finding is larger than what every flight shows; of flights that `differ` in their thrusts as well."""
+    weight = point.vehicle.mass * GRAVITY
+    arm = max(point.vehicle.arm) or 0.03
+    size = {"force": weight, "torque": weight * arm}.get(finding.signal, 1.0)
+    daily = DAILY if differ or TRIM in point.vehicle.effects else 1.0
+    return abs(finding.effect_size) > TOLERANCE.get(finding.signal, 0.0) * daily * size
+
+
+def shaking(rate: NDArray, window: NDArray, k: int) -> float:
+    """rad/s: change within a step of a rate's part at one frequency, all of which an unknown torque would leave."""
+    amplitude = 2 * np.abs(np.fft.rfft((rate - rate.mean()) * window))[max(k - 2, 0) : k + 3].max() / window.sum()
+    return float(amplitude * min(1.0, 2 * np.pi * k / rate.size))
+
+
+def lines(swept: Swept, time: NDArray) -> list[Finding]:
+    """Lines in the spectrum of the body rates' innovations: something that shakes at one frequency."""
+    found = []
+    period = float(np.median(np.diff(time)))
+    grid = np.arange(time[0], time[-1], period)
+    for i in range(3):
+        seen = swept.variance[:, 9 + i] > 0
+        if seen.sum() < 256:
+            continue
+        z = np.interp(grid, time[seen], swept.innovation[seen, 9 + i] / np.sqrt(swept.variance[seen, 9 + i]))
+        window = np.hanning(z.size)
+        power = np.abs(np.fft.rfft((z - z.mean()) * window)) ** 2
+        frequency = np.fft.rfftfreq(z.size, period)
+        width = max(8, int(NEAR * power.size))
+        first = max(4, int(np.searchsorted(frequency, SLOWEST)))
+        k = int(np.argmax(power[first:-1])) + first
+        around = np.r_[power[max(2, k - width) : max(2, k - 3)], power[k + 4 : k + width]]
+        if around.size < 16:
+            continue
+        ratio = float(power[k] / np.median(around) * np.log(2.0))  # of the mean of exponential powers
+        if ratio > LINE + np.log(power.size):
+            nats = float(ratio - np.log(power.size))
+            where = f"frequency {frequency[k]:.2f} Hz"
+            size = float(2 * np.sqrt(power[k]) / window.sum() * np.sqrt(np.median(swept.variance[seen, 9 + i])))
+            if size < SHAKEN * shaking(np.interp(grid, time, swept.filtered[:, 10 + i]), window, k):
+                continue  # the loop swings at that frequency, and the model is wrong by a small part of it
+            span = (float(time[0]), float(time[-1]))
+            sd = size / float(np.sqrt(max(ratio, 1.0)))
+            chance = float(np.exp(-nats))
+            found.append(Finding("body_rate", AXES[i], where, "frequency", span, size, sd, "rad/s", nats, chance))
+    return found

@@ -1,0 +1,233 @@
+"""How far open-loop simulation and flight part: errors at fixed horizons, from starts all along the flight.
+
+The same starts for every model, so that before and after a fit can be compared; what a start may know is the business
+of `predict`. The truth at the end of a horizon is what was recorded there, interpolated where streams differ in stamps.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.prediction.earned import Weights
+from crazyem.diagnosis.prediction.predict import SAME, Recorded, start_rows
+from crazyem.diagnosis.prediction.simulate import Simulator
+from crazyem.errors import DataError
+from crazyem.physics.effects.effect import Effects
+from crazyem.physics.rotations import quaternion_conjugate, quaternion_product
+from crazyem.vehicle import Vehicle
+
+HORIZONS = (0.01, 0.1, 0.5)  # s
+SPACING = 0.1  # s between starts
+NEAR = 0.025  # s between two samples, at most, for a truth between them
+UNITS = {"position": "m", "velocity": "m/s", "attitude": "rad", "body_rate": "rad/s"}
+_COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
+
+
+@dataclass(frozen=True)
+class HorizonErrors:
+    """Open-loop errors by quantity: position [m], velocity [m/s], attitude [rad, geodesic], body_rate [rad/s].
+
+    Attributes:
+        horizons: s.
+        starts: how many.
+        rms: quantity -> root mean square of the error's length at each horizon; NaN where nothing was measured, inf
+            where the model left the range of numbers.
+        mean: quantity -> mean length.
+    """
+
+    horizons: tuple[float, ...]
+    starts: int
+    rms: Mapping[str, tuple[float, ...]]
+    mean: Mapping[str, tuple[float, ...]]
+
+    def to_json(self) -> dict[str, Any]:
+        """For the result document; what is not a number becomes None."""
+        found: dict[str, Any] = {"horizon_s": list(self.horizons), "starts": self.starts}
+        for name, unit in UNITS.items():
+            found[name] = {"unit": unit, "rms": _plain(self.rms[name]), "mean": _plain(self.mean[name])}
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Starts and ends of open-loop runs along a flight; the same for every model.
+
+    Attributes:
+        rows: (n,) rows of `Recorded` to start from.
+        times: (n, 1 + h) s: of the start, and of the recorded sample next to each horizon's end.
+        truth: (n, h, 13) what was recorded there; NaN where nothing was.
+        horizons: (h,) s.
+    """
+
+    rows: NDArray
+    times: NDArray
+    truth: NDArray
+    horizons: tuple[float, ...]
+
+
+def windows(
+    shown: Recorded,
+    *,
+    horizons: Sequence[float] = HORIZONS,
+    spacing: float = SPACING,
+    within: Sequence[tuple[float, float]] | None = None,
+) -> Windows:
+    """Where open-loop runs start and what they should come to.
+
+    Args:
+        shown: the recording.
+        horizons: s, increasing.
+        spacing: s from start to start.
+        within: only runs that lie in one of these intervals [s]; None: the flights. They must also lie in a flight.
+
+    Raises: DataError if there is no such run.
+    """
+    parts = [_rows_between(shown, a, b, horizons[-1], spacing) for a, b in _common(shown.flights, within)]
+    rows = np.concatenate([np.empty(0, np.int64), *parts])
+    ends = shown.time[rows][:, None] + np.asarray(horizons)
+    at = np.clip(np.searchsorted(shown.time, ends), 1, shown.time.size - 1)
+    at -= (ends - shown.time[at - 1]) < (shown.time[at] - ends)
+    at = np.maximum(at, rows[:, None] + 1)  # a horizon shorter than a sample ends with the next one
+    good = np.isfinite(shown.state[rows]).all(axis=1)
+    good &= start_rows(shown, rows, horizon=1, step=horizons[-1] + shown.period)
+    good &= (np.diff(at, axis=1) > 0).all(axis=1) & (at[:, -1] < shown.time.size)
+    age = shown.age[rows]
+    if good.any():  # fresh states only; where streams never meet, as fresh as they come
+        good &= age <= max(SAME, float(np.median(age[good])) + SAME)
+    if not good.any():
+        raise DataError(
+            f"{shown.path}: no stretch of flight is long enough for {horizons[-1]:g} s of open-loop simulation"
+        )
+    rows, at = rows[good], at[good]
+    times = np.concatenate([shown.time[rows][:, None], shown.time[at]], axis=1)
+    truth = np.stack([recorded_at(shown, times[:, k]) for k in range(1, times.shape[1])], axis=1)
+    return Windows(rows, times, truth, tuple(horizons))
+
+
+def open_loop(
+    shown: Recorded,
+    at: Windows,
+    *,
+    vehicle: Vehicle | None = None,
+    effects: Effects | None = None,
+    measured_attitude: bool = False,
+    weights: Weights | None = None,
+) -> NDArray:
+    """(n, h, 13) predictions for windows.
+
+    Args:
+        shown: the recording.
+        at: where to start and end.
+        vehicle: other constants than the recording was read with (mass, inertia, arm, lag; not the law of thrust).
+        effects: None takes those of the vehicle.
+        measured_attitude: follow the recorded attitude and rate, so that forces are judged alone.
+        weights: what was learned before each start (see `earned`); None: the model alone.
+    """
+    simulator = Simulator(shown.inputs, effects, vehicle=vehicle)
+    swings = simulator.swings(shown.time, shown.state, shown.airborne)
+    return simulator.run(
+        shown.state[at.rows],
+        at.times,
+        swing=None if swings is None else swings[at.rows],
+        given=at.times[:, -1] - shown.period,  # as in `predict`, where steps are the recording's
+        attitude=(lambda time: recorded_attitude(shown, time)) if measured_attitude else None,
+        weights=weights,
+    )
+
+
+def errors(prediction: NDArray, at: Windows) -> HorizonErrors:
+    """Errors of predictions (n, h, 13) against what was recorded."""
+    rms: dict[str, tuple[float, ...]] = {}
+    mean: dict[str, tuple[float, ...]] = {}
+    for name, columns in _COLUMNS.items():
+        length = lengths(prediction[..., columns], at.truth[..., columns], attitude=name == "attitude")
+        known = np.isfinite(at.truth[..., columns]).all(axis=2)
+        length = np.where(known & ~np.isfinite(length), np.inf, length)
+        rms[name] = tuple(_over(np.square(length[:, k]), known[:, k], root=True) for k in range(length.shape[1]))
+        mean[name] = tuple(_over(length[:, k], known[:, k]) for k in range(length.shape[1]))
+    return HorizonErrors(at.horizons, len(at.rows), rms, mean)
+
+
+def horizon_errors(
+    shown: Recorded, *, effects: Effects | None = None, vehicle: Vehicle | None = None, at: Windows | None = None
+) -> HorizonErrors:
+    """Errors of a model along a recording, at 10, 100 and 500 ms unless `at` says otherwise. Raises as `windows`."""
+    at = windows(shown) if at is None else at
+    return errors(open_loop(shown, at, vehicle=vehicle, effects=effects), at)
+
+
+def lengths(prediction: NDArray, truth: NDArray, *, attitude: bool) -> NDArray:
+    """(...,) length of the difference of (..., 3) vectors, or the angle [rad] between (..., 4) attitudes."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        if not attitude:
+            return np.linalg.norm(prediction - truth, axis=-1)
+        between = quaternion_product(quaternion_conjugate(truth), prediction)
+        return 2.0 * np.arctan2(np.linalg.norm(between[..., :3], axis=-1), np.abs(between[..., 3]))
+
+
+def recorded_at(shown: Recorded, time: NDArray) -> NDArray:
+    """(n, 13) what was recorded at (n,) s: a sample there, or a line between two not further apart than `NEAR`."""
+    found = np.full((time.size, 13), np.nan)
+    for name, columns in _COLUMNS.items():
+        when, value = shown.parts[name]
+        if when.size < 2:
+            continue
+        after = np.clip(np.searchsorted(when, time - 1e-9), 1, when.size - 1)
+        before = after - 1
+        gap = when[after] - when[before]
+        share = np.clip((time - when[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)[:, None]
+        first, second = value[before], value[after]
+        if name == "attitude":
+            second = np.where(np.sum(first * second, axis=1, keepdims=True) < 0, -second, second)
+        mixed = (1 - share) * first + share * second
+        if name == "attitude":
+            mixed = mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
+        there = np.minimum(np.abs(time - when[before]), np.abs(time - when[after])) < 1e-6
+        inside = (gap <= NEAR) & (time >= when[before] - SAME) & (time <= when[after] + SAME)
+        known = there | inside
+        found[known, columns] = mixed[known]
+    return found
+
+
+def recorded_attitude(shown: Recorded, time: NDArray) -> tuple[NDArray, NDArray]:
+    """Attitude (n, 4) and body rate (n, 3) at (n,) s, on lines between samples however far apart."""
+    when, value = shown.parts["attitude"]
+    after = np.clip(np.searchsorted(when, time), 1, when.size - 1)
+    first, second = value[after - 1], value[after]
+    second = np.where(np.sum(first * second, axis=1, keepdims=True) < 0, -second, second)
+    share = np.clip((time - when[after - 1]) / np.maximum(when[after] - when[after - 1], 1e-9), 0.0, 1.0)[:, None]
+    mixed = (1 - share) * first + share * second
+    when, rate = shown.parts["body_rate"]
+    rates = np.stack([np.interp(time, when, rate[:, c]) for c in range(3)], axis=1)
+    return mixed / np.linalg.norm(mixed, axis=1, keepdims=True), rates
+
+
+def _rows_between(shown: Recorded, begin: float, end: float, longest: float, spacing: float) -> NDArray:
+    first = np.arange(begin, end - longest - 1e-9, spacing)
+    rows = np.searchsorted(shown.time, first - 1e-9)
+    return np.unique(rows[rows < shown.time.size])
+
+
+def _common(
+    flights: Sequence[tuple[float, float]], within: Sequence[tuple[float, float]] | None
+) -> list[tuple[float, float]]:
+    if within is None:
+        return list(flights)
+    pairs = [(max(a, c), min(b, d)) for a, b in flights for c, d in within]
+    return [(a, b) for a, b in pairs if b > a]
+
+
+def _over(values: NDArray, known: NDArray, *, root: bool = False) -> float:
+    if not known.any():
+        return math.nan
+    with np.errstate(over="ignore"):
+        mean = float(values[known].mean())
+    return math.sqrt(mean) if root else mean
+
+
+def _plain(values: Sequence[float]) -> list[float | None]:
+    return [v if math.isfinite(v) else None for v in values]

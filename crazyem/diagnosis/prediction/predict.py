@@ -1,0 +1,289 @@
+"""Open-loop prediction: from a recorded state and the recorded inputs alone, where the model says the drone goes.
+
+From every start the rigid body with its effects is carried forward; no state measured after the start is used, and no
+input stamped after the beginning of the last step. The lagged thrust at the start follows from the inputs before it.
+A prediction is of what the recording would show.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.flights.inputs import Inputs, inputs_of
+from crazyem.diagnosis.flights.level import LOOKS
+from crazyem.diagnosis.prediction.earned import Turned, earned
+from crazyem.diagnosis.prediction.simulate import Simulator
+from crazyem.doctor.kinematics import quaternion_of_euler
+from crazyem.doctor.streams import airtime, inside, ordered
+from crazyem.errors import DataError
+from crazyem.physics.rotations import rotation_matrix
+from crazyem.recordings.recording import Recording, SignalArray
+from crazyem.vehicle import Vehicle
+
+NAMES = ("x", "y", "z", "vx", "vy", "vz", "qx", "qy", "qz", "qw", "wx", "wy", "wz")
+SAME = 1.5e-3  # s: samples closer than this are of one moment
+OLDEST = 0.05  # s: a part of the state that was last seen earlier is not known at a start
+MAX_GAP = 0.1  # s without inputs, within which a prediction is worth nothing
+CHUNK = 2048  # starts integrated together, to bound memory
+_PARTS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """The states a recording shows, at the samples of its position.
+
+    Attributes:
+        path: of the recording.
+        time: (r,) s, increasing.
+        state: (r, 13) as `NAMES`, SI; every part the newest at or before that time, NaN where that is too old.
+        age: (r,) s, how much older than its time the oldest part is.
+        row: (r,) index of the sample in the recording's position.
+        airborne: (r,) bool.
+        inputs: what the rotors were told.
+        parts: samples of position, velocity, attitude and body_rate as recorded: (k,) s and (k, 3 or 4), by name.
+        flights: intervals in the air [s].
+        before: inputs as they were known before their level was (see `level`), by what was known when: for starts
+            until then. Empty where the voltage is recorded.
+    """
+
+    path: str
+    time: NDArray
+    state: NDArray
+    age: NDArray
+    row: NDArray
+    airborne: NDArray
+    inputs: Inputs
+    parts: Mapping[str, tuple[NDArray, NDArray]]
+    flights: tuple[tuple[float, float], ...]
+    before: tuple[Inputs, ...] = ()
+
+    @property
+    def period(self) -> float:
+        """Median time between samples [s]."""
+        return float(np.median(np.diff(self.time)))
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Predicted states.
+
+    Attributes:
+        prediction: (starts, N, 13) as `NAMES`: position m and velocity m/s (world), attitude x y z w (body to world),
+            body rate rad/s (FLU).
+        time: (starts, N) s of each predicted state, on the recording's clock.
+        start_time: (starts,) s.
+        start_index: (starts,) sample of the recording's position.
+        start_age: (starts,) s, how much older the oldest part of the start's state is.
+        airborne: (starts,) bool: the drone flew at the start, as far as the recording tells.
+        step: s; the median one where the steps are the recording's.
+    """
+
+    prediction: NDArray
+    time: NDArray
+    start_time: NDArray
+    start_index: NDArray
+    start_age: NDArray
+    airborne: NDArray
+    step: float
+
+    def arrays(self) -> dict[str, NDArray]:
+        """Everything by name, for a file."""
+        return {
+            "prediction": self.prediction,
+            "time": self.time,
+            "start_time": self.start_time,
+            "start_index": self.start_index,
+            "start_age": self.start_age,
+            "airborne": self.airborne,
+            "step": np.array(self.step),
+            "names": np.array(NAMES),
+        }
+
+
+# -- what was recorded -------------------------------------------------------------------------------------------------
+
+
+def recorded(recording: Recording, vehicle: Vehicle) -> Recorded:
+    """States and inputs of a recording.
+
+    Raises: DataError if a part of the state, or every input, is missing.
+    """
+    arrays = _state_signals(recording)
+    flight = airtime(recording)
+    inputs = inputs_of(recording, vehicle, flight=flight)
+    base = arrays["position"]
+    row = np.flatnonzero(np.isfinite(base.time))
+    row = row[np.argsort(base.time[row], kind="stable")]
+    row = row[np.concatenate([[True], np.diff(base.time[row]) > 0])] if row.size else row
+    time = base.time[row]
+    if time.size < 2:
+        raise DataError(f"{recording.path}: fewer than two positions, so there is nothing to predict")
+    state, age = np.full((time.size, 13), np.nan), np.zeros(time.size)
+    parts: dict[str, tuple[NDArray, NDArray]] = {}
+    for name, columns in _PARTS.items():
+        when, value = ordered(arrays[name])
+        if name == "attitude":
+            norm = np.linalg.norm(value, axis=1, keepdims=True)
+            sound = (norm > 0.5)[:, 0] & (norm < 2.0)[:, 0]
+            when, value = when[sound], value[sound] / norm[sound]
+        parts[name] = when, value
+        at = np.searchsorted(when, time + 1e-9, "right") - 1
+        since = np.where(at >= 0, time - when[np.maximum(at, 0)], np.inf) if when.size else np.full(time.size, np.inf)
+        known = since <= OLDEST
+        state[known, columns] = value[at[known]]
+        age = np.maximum(age, np.maximum(since, 0.0))
+    flights = () if flight is None else flight.flown
+    looks = () if inputs.level is None or flight is None else (0.0, *LOOKS)
+    before = tuple(inputs_of(recording, vehicle, flight=flight, until=inputs.took_off + s) for s in looks)
+    return Recorded(recording.path, time, state, age, row, inside(time, flights), inputs, parts, flights, before)
+
+
+def _state_signals(recording: Recording) -> dict[str, SignalArray]:
+    """Position, velocity, attitude and rate: the signal itself, else another of its quantity; Euler angles will do."""
+    found = {}
+    for name in _PARTS:
+        wanted = [name, *(n for n in recording.signals if n.startswith(f"{name}@"))]
+        array = next((recording.signals[n] for n in wanted if n in recording.signals), None)
+        if array is None and name == "attitude" and "euler" in recording.signals:
+            euler = recording.signals["euler"]
+            array = SignalArray(
+                euler.time, quaternion_of_euler(euler.value), euler.order, euler.host_time, euler.marked, "attitude"
+            )
+        if array is not None and array.time.size:
+            found[name] = array
+    missing = [name for name in _PARTS if name not in found]
+    if missing:
+        raise DataError(
+            f"{recording.path}: the recording has no {' and no '.join(missing)}; a prediction needs a whole state to "
+            "start from (position, velocity, attitude and body rate)"
+        )
+    return found
+
+
+# -- a whole recording -------------------------------------------------------------------------------------------------
+
+
+def predict(
+    shown: Recorded,
+    *,
+    horizon: int,
+    step: float | None = None,
+    every: int = 1,
+    plain: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Prediction:
+    """Predict `horizon` steps from every `every`-th recorded state.
+
+    Args:
+        shown: states and inputs, and the vehicle with its effects: `recorded(recording, vehicle)`.
+        horizon: N, steps.
+        step: s between predicted states; None: the recording's own samples, so that row h of start i is the state at
+            sample i + h + 1, at its own stamp.
+        every: samples from one start to the next.
+        plain: the model alone; else its torque is believed as much as it was right before the start (see `earned`).
+        progress: told how many starts of how many are done.
+
+    Raises:
+        DataError: no start has its whole horizon in the recording.
+    """
+    rows = np.arange(0, shown.time.size, every)
+    rows = rows[start_rows(shown, rows, horizon=horizon, step=step)]
+    span = horizon * (shown.period if step is None else step)
+    if not rows.size:
+        raise DataError(
+            f"{shown.path}: no state can be predicted from: none is whole and followed by {span:.3g} s "
+            "of inputs without a gap"
+        )
+    pieces, done = [], 0
+    for known, those in _by_knowledge(shown, rows):
+        weights = None if plain else earned(turned_by(known), known.time[those], horizon=span)
+        simulator = Simulator(known.inputs)
+        swings = simulator.swings(known.time, known.state, known.airborne)
+        at = 0
+        for part in _parts(those, max(1, min(CHUNK, 2_000_000 // horizon))):
+            grid = _times(known, part, horizon=horizon, step=step)
+            swing = None if swings is None else swings[part]
+            believed = None if weights is None else weights.of(slice(at, at + part.size))
+            pieces.append((simulator.run(known.state[part], grid, swing=swing, weights=believed), grid[:, 1:]))
+            at += part.size
+            if progress is not None:
+                progress(done + at, rows.size)
+        done += at
+    result, times = (np.concatenate(whole) for whole in zip(*pieces, strict=True))
+    return Prediction(
+        result, times, shown.time[rows], shown.row[rows], shown.age[rows], shown.airborne[rows],
+        shown.period if step is None else step,
+    )  # fmt: skip
+
+
+def _by_knowledge(shown: Recorded, rows: NDArray) -> list[tuple[Recorded, NDArray]]:
+    """The starts, each with what was known of the battery by then."""
+    stages = [(i.level.known, i) for i in (*shown.before, shown.inputs) if i.level is not None]
+    stages.insert(0, (-np.inf, shown.before[0] if shown.before else shown.inputs))
+    known = np.array([when for when, _ in stages])
+    stage = np.searchsorted(known, shown.time[rows], "right") - 1
+    return [(replace(shown, inputs=stages[k][1]), rows[stage == k]) for k in np.unique(stage)]
+
+
+def turned_by(shown: Recorded) -> Turned:
+    """What the model says of the turning of a recorded flight, one step ahead of every row."""
+    simulator = Simulator(shown.inputs)
+    swings = simulator.swings(shown.time, shown.state, shown.airborne)
+    gained, lacking = np.zeros((shown.time.size, 3)), np.zeros((shown.time.size, 3))
+    flying = np.zeros(shown.time.size, bool)
+    rows = np.arange(shown.time.size - 1)
+    rows = rows[np.isfinite(shown.state[rows]).all(axis=1) & shown.airborne[rows] & shown.airborne[rows + 1]]
+    rows = rows[start_rows(shown, rows, horizon=1, step=None) & (np.diff(shown.time)[rows] < MAX_GAP)]
+    for part in _parts(rows, CHUNK):
+        grid = shown.time[part[:, None] + np.arange(2)]
+        ahead = simulator.run(shown.state[part], grid, swing=None if swings is None else swings[part])
+        gained[part] = ahead[:, 0, 10:13] - shown.state[part, 10:13]
+        missed = (shown.state[part + 1, 3:6] - ahead[:, 0, 3:6]) / np.diff(grid)
+        lacking[part] = np.einsum("nji,nj->ni", rotation_matrix(shown.state[part, 6:10]), missed)
+    flying[rows] = True
+    return Turned(shown.time, shown.state[:, 10:13], gained, _at_start(shown, gained, flying), flying, lacking)
+
+
+def _at_start(shown: Recorded, gained: NDArray, flying: NDArray) -> NDArray:
+    """(r, 3, 4) what is known at every row, by axis: the angular acceleration that the model lacked in the step that
+    ends there, the rate, and how far the body leans and how fast it moves across the axis (about z: 0)."""
+    rotation = rotation_matrix(shown.state[:, 6:10])
+    rate, velocity = shown.state[:, 10:13], np.einsum("nji,nj->ni", rotation, shown.state[:, 3:6])
+    up = rotation[:, 2]
+    across = [np.column_stack([v[:, 1], -v[:, 0], np.zeros(len(v))]) for v in (up, velocity)]
+    lacked = np.zeros_like(rate)
+    step = np.diff(shown.time)[:, None]
+    lacked[1:] = np.where(flying[:-1, None], (np.diff(rate, axis=0) - gained[:-1]) / step, 0.0)
+    return np.stack([lacked, rate, *across], axis=2)
+
+
+def start_rows(shown: Recorded, rows: NDArray, *, horizon: int, step: float | None) -> NDArray:
+    """(n,) bool: rows (n,) whose state is whole, and whose horizon lies in the recording with inputs all along."""
+    good = np.isfinite(shown.state[rows]).all(axis=1)
+    begin, stamps = shown.time[rows], shown.inputs.rotor.time
+    if step is None:
+        good &= rows + horizon < shown.time.size
+        end, before = (shown.time[np.minimum(rows + k, shown.time.size - 1)] for k in (horizon, horizon - 1))
+    else:
+        end, before = begin + horizon * step, begin + (horizon - 1) * step
+        good &= end <= max(shown.time[-1], stamps[-1]) + 1e-6
+    good &= begin >= stamps[0] - 1e-9
+    good &= before - stamps[np.maximum(np.searchsorted(stamps, before + 1e-9, "right") - 1, 0)] <= MAX_GAP
+    for gap in np.flatnonzero(np.diff(stamps) > MAX_GAP):
+        good &= (end <= stamps[gap]) | (begin >= stamps[gap + 1])
+    return good
+
+
+def _parts(rows: NDArray, size: int) -> Iterator[NDArray]:
+    for first in range(0, rows.size, size):
+        yield rows[first : first + size]
+
+
+def _times(shown: Recorded, rows: NDArray, *, horizon: int, step: float | None) -> NDArray:
+    """(n, N + 1) s."""
+    count = np.arange(horizon + 1)
+    if step is None:
+        return shown.time[rows[:, None] + count]
+    return shown.time[rows][:, None] + step * count
