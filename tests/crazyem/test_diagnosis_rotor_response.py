@@ -1,5 +1,6 @@
 """Lag and delay of measured rotors from their commands, on rotors made by a recursion that the code does not have."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -7,9 +8,19 @@ import pytest
 from closed_loop import DRONE, fly
 from made_flight import array_of
 
-from crazyem.diagnosis.naming.rotor_response import DELAY_SD, ENOUGH, LAG_BIAS, PUNCTUAL, Response, judged, response
+from crazyem.diagnosis.naming.rotor_response import (
+    DELAY_SD,
+    ENOUGH,
+    LAG_BIAS,
+    PUNCTUAL,
+    Response,
+    disobedient,
+    judged,
+    response,
+)
 from crazyem.recordings.recording import Recording
 
+NONE: Mapping[int, float] = {}
 ROTORS = replace(DRONE, rotor_constant=2e-8, motor_time_constant=0.03)
 
 
@@ -18,8 +29,19 @@ def flown() -> Recording:
     return fly(seconds=16.0)
 
 
-def answering(flown: Recording, lag: float, late: float, *, seed: int = 0, noise: float = 0.0) -> Recording:
-    """Commands of a controller at 500 Hz, of which every fifth is logged, and what rotors make of all of them."""
+def answering(
+    flown: Recording,
+    lag: float,
+    late: float,
+    *,
+    seed: int = 0,
+    noise: float = 0.0,
+    sticks: Mapping[int, float] = NONE,
+) -> Recording:
+    """Commands of a controller at 500 Hz, of which every fifth is logged, and what rotors make of all of them.
+
+    sticks: rotors (1 to 4) that heed no change of their command up to this.
+    """
     rng = np.random.default_rng(seed)
     start, end = flown.signals["motor_command"].time[[0, -1]]
     step = 0.002
@@ -27,7 +49,12 @@ def answering(flown: Recording, lag: float, late: float, *, seed: int = 0, noise
     smooth = np.hanning(25) / np.hanning(25).sum()  # to some 20 Hz
     quick = np.stack([np.convolve(c, smooth, "same") for c in rng.normal(size=(4, time.size))], 1)
     command = np.clip(0.5 + 0.4 * quick + 0.01 * rng.normal(size=quick.shape), 0.1, 1.0)
-    wanted = 0.06 * command + 0.08 * command**2  # N
+    heeded = command.copy()
+    for rotor, band in sticks.items():
+        for k in range(1, len(heeded)):
+            if abs(command[k, rotor - 1] - heeded[k - 1, rotor - 1]) < band:
+                heeded[k, rotor - 1] = heeded[k - 1, rotor - 1]
+    wanted = 0.06 * heeded + 0.08 * heeded**2  # N
     behind = round(late / step)
     acting = np.vstack([np.repeat(wanted[:1], behind, axis=0), wanted[: len(wanted) - behind]])
     thrust = np.empty_like(acting)
@@ -120,3 +147,25 @@ def test_wild_and_slow_samples_are_refused(flown):
     assert sound.lag * LAG_BIAS == pytest.approx(0.03, rel=0.06)
     slow = array_of("motor_command", 300.0 * command.time, command.value, place=92)
     assert response([replace(made, signals={**made.signals, "motor_command": slow})], ROTORS) is None
+
+
+@pytest.mark.parametrize("rotor", [1, 4])
+def test_a_rotor_that_sticks_is_told_by_what_it_leaves_of_its_command(flown, rotor):
+    sticking = [answering(flown, 0.03, 0.0, seed=s, sticks={rotor: 0.1}) for s in (0, 1)]
+    told = disobedient(sticking, ROTORS)
+    assert told is not None
+    assert told.regime == f"rotor {rotor} does not follow its command"
+    assert (told.signal, told.axis, told.unit, told.variable) == ("force", "z", "N", "rotor")
+    most = (0.06 + 2 * 0.08 * 0.5) * 0.1 / np.sqrt(3)  # N: errors within the band, were all as likely
+    assert 0.4 * most < told.effect_size < most
+    assert told.nats > 100
+    assert told.interval[0] < told.interval[1]
+
+
+def test_a_rotor_that_sticks_in_one_flight_only_or_as_all_do_is_not_told(flown):
+    whole = answering(flown, 0.03, 0.0, seed=2, noise=1e-3)
+    assert disobedient([whole], ROTORS) is None
+    assert disobedient([], ROTORS) is None
+    assert disobedient([flown], ROTORS) is None  # no speeds
+    assert disobedient([answering(flown, 0.03, 0.0, sticks={2: 0.05}), whole], ROTORS) is None
+    assert disobedient([answering(flown, 0.03, 0.0, sticks=dict.fromkeys((1, 2, 3, 4), 0.03))], ROTORS) is None
