@@ -92,6 +92,15 @@ def test_of_what_is_not_seen_the_path_alone_tells() -> None:
     np.testing.assert_allclose(found, swing_along(**plain(steps), length=LENGTH), atol=1e-12)
 
 
+def test_a_load_of_no_mass_or_without_noise_stays_finite() -> None:
+    truth = hang(shaken, STEP * np.arange(100), drone=DRONE, load=LOAD, length=LENGTH, start=tilted(0.0))
+    steps = steps_of(truth, shaken)
+    for share, noise in ((0.0, 0.0), (SHARE, 0.0), (0.9, NOISE)):
+        found = watched_along(**{**steps, "noise": np.full(3, noise)}, length=LENGTH, share=share)
+        assert np.isfinite(found).all()
+        np.testing.assert_allclose(np.linalg.norm(found[:, :3], axis=1), 1.0, atol=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_slopes_are_derivatives(seed: int) -> None:
     """Of the equation of the module's docstring, by differences."""

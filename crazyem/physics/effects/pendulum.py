@@ -116,13 +116,74 @@ def _slopes(state, pull, velocity, air, length, out):
 
 
 @compiled
+def _spread(cov, slopes, gap, after, length):
+    """Carry the covariance (6, 6) over a step with these slopes at its begin, to the swing `after` it; in place."""
+    phi, flat = np.zeros((6, 6)), np.zeros((6, 6))
+    for i in range(6):
+        for j in range(6):
+            square = 0.0
+            for m in range(6):
+                square += slopes[i, m] * slopes[m, j]
+            phi[i, j] = (1.0 if i == j else 0.0) + gap * slopes[i, j] + 0.5 * gap**2 * square
+    cov[:] = phi @ cov @ phi.T
+    for i in range(3):
+        cov[i, i] += gap * (ASTRAY / length) ** 2
+        for j in range(3):
+            flat[i, j] = flat[3 + i, 3 + j] = (1.0 if i == j else 0.0) - after[i] * after[j]
+    cov[:] = flat @ cov @ flat  # a string does not change its length
+
+
+@compiled
+def _corrected(state, cov, velocity, air, length, share, rotation, free, shown, variance):
+    """Kalman's update of the swing and its covariance by the pull that was seen in a step, in place.
+
+    The pull: share (n.(d - f) + L |dn/dt|^2) n, body axes; variance (3,) of what was seen.
+    """
+    drag, row, change, shows = np.zeros(3), np.zeros(6), np.zeros(6), np.zeros(6)
+    taut = 0.0
+    for i in range(3):
+        force = 0.0
+        for j in range(3):
+            force += rotation[i, j] * free[j]
+        drag[i] = -DAMPING * (velocity[i] + length * state[3 + i] - air[i]) - force
+        taut += state[i] * drag[i] + length * state[3 + i] * state[3 + i]
+    for axis in range(3):
+        if not np.isfinite(shown[axis]):
+            continue
+        along = 0.0
+        for i in range(3):
+            along += rotation[i, axis] * state[i]
+        missed = shown[axis] - free[axis] - share * taut * along
+        spread = variance[axis]
+        for i in range(3):
+            shows[i] = share * (taut * rotation[i, axis] + along * drag[i])
+            shows[3 + i] = share * along * 2.0 * length * state[3 + i]
+        for i in range(6):
+            row[i] = 0.0
+            missed -= shows[i] * change[i]
+            for j in range(6):
+                row[i] += cov[i, j] * shows[j]
+            spread += shows[i] * row[i]
+        if not spread > 0.0:  # nothing is unknown
+            continue
+        for i in range(6):
+            change[i] += row[i] / spread * missed
+            for j in range(6):
+                cov[i, j] -= row[i] * row[j] / spread
+    for i in range(6):
+        state[i] += change[i]
+        for j in range(i):
+            cov[i, j] = cov[j, i] = 0.5 * (cov[i, j] + cov[j, i])
+    _straighten(state)
+
+
+@compiled
 def _watched(gap, broken, velocity, air, length, share, rotation, free, shown, noise, out):
     """As `_along`, corrected by what is seen of the pull; see `watched_along`."""
     work = np.zeros((6, 6))
     state, before = np.zeros(6), np.zeros(6)
-    acceleration, pull, drag = np.zeros(3), np.zeros(3), np.zeros(3)
-    cov, slopes, phi, flat = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), np.eye(6)
-    row, gain, pulls = np.zeros(6), np.zeros(6), np.zeros((3, 6))
+    acceleration, pull = np.zeros(3), np.zeros(3)
+    cov, slopes = np.zeros((6, 6)), np.zeros((6, 6))
     swinging = np.sqrt(GRAVITY / length)
     for k in range(len(gap)):
         if broken[k]:
@@ -140,61 +201,11 @@ def _watched(gap, broken, velocity, air, length, share, rotation, free, shown, n
         pull[2] -= GRAVITY
         before[:] = state
         _swing(state, acceleration, velocity[k - 1], air[k], gap[k], length, work)
-        out[k] = state
+        out[k] = state  # what is seen of this step is known after it
         _slopes(before, pull, velocity[k - 1], air[k], length, slopes)
-        for i in range(6):
-            for j in range(6):
-                square = 0.0
-                for m in range(6):
-                    square += slopes[i, m] * slopes[m, j]
-                phi[i, j] = (1.0 if i == j else 0.0) + gap[k] * slopes[i, j] + 0.5 * gap[k] ** 2 * square
-        cov[:] = phi @ cov @ phi.T
-        for i in range(3):
-            cov[i, i] += gap[k] * (ASTRAY / length) ** 2
-        for i in range(3):
-            for j in range(3):
-                flat[i, j] = flat[3 + i, 3 + j] = (1.0 if i == j else 0.0) - state[i] * state[j]
-        cov[:] = flat @ cov @ flat
-        # the pull by the state: share (n.(d - f) + L |dn/dt|^2) n, world, and turned into body axes
-        taut = 0.0
-        for i in range(3):
-            force = 0.0
-            for j in range(3):
-                force += rotation[k, i, j] * free[k, j]
-            drag[i] = -DAMPING * (velocity[k, i] + length * state[3 + i] - air[k, i]) - force
-            taut += state[i] * drag[i] + length * state[3 + i] * state[3 + i]
-        for axis in range(3):
-            along = 0.0
-            for i in range(3):
-                along += rotation[k, i, axis] * state[i]
-            for i in range(3):
-                pulls[axis, i] = share * (taut * rotation[k, i, axis] + along * drag[i])
-                pulls[axis, 3 + i] = share * along * 2.0 * length * state[3 + i]
-        before[:] = 0.0  # what is corrected
-        for axis in range(3):
-            if not np.isfinite(shown[k, axis]):
-                continue
-            expected = 0.0
-            for i in range(3):
-                expected += rotation[k, i, axis] * state[i]
-            missed = shown[k, axis] - free[k, axis] - share * taut * expected
-            variance = noise[axis] ** 2 / gap[k]
-            for i in range(6):
-                row[i] = 0.0
-                missed -= pulls[axis, i] * before[i]
-                for j in range(6):
-                    row[i] += cov[i, j] * pulls[axis, j]
-                variance += pulls[axis, i] * row[i]
-            for i in range(6):
-                gain[i] = row[i] / variance
-                before[i] += gain[i] * missed
-                for j in range(6):
-                    cov[i, j] -= gain[i] * row[j]
-        for i in range(6):
-            state[i] += before[i]
-            for j in range(i):
-                cov[i, j] = cov[j, i] = 0.5 * (cov[i, j] + cov[j, i])
-        _straighten(state)
+        _spread(cov, slopes, gap[k], state, length)
+        variance = noise * noise / gap[k]
+        _corrected(state, cov, velocity[k], air[k], length, share, rotation[k], free[k], shown[k], variance)
 
 
 @compiled
