@@ -116,30 +116,57 @@ def _slopes(state, pull, velocity, air, length, out):
 
 
 @compiled
-def _spread(cov, slopes, gap, after, length):
-    """Carry the covariance (6, 6) over a step with these slopes at its begin, to the swing `after` it; in place."""
-    phi, flat = np.zeros((6, 6)), np.zeros((6, 6))
+def _both_sides(a, cov, half):
+    """cov = a cov a' for (6, 6), in place; half: (6, 6) scratch. cov is symmetric."""
     for i in range(6):
         for j in range(6):
-            square = 0.0
-            for m in range(6):
-                square += slopes[i, m] * slopes[m, j]
-            phi[i, j] = (1.0 if i == j else 0.0) + gap * slopes[i, j] + 0.5 * gap**2 * square
-    cov[:] = phi @ cov @ phi.T
-    for i in range(3):
-        cov[i, i] += gap * (ASTRAY / length) ** 2
-        for j in range(3):
-            flat[i, j] = flat[3 + i, 3 + j] = (1.0 if i == j else 0.0) - after[i] * after[j]
-    cov[:] = flat @ cov @ flat  # a string does not change its length
+            total = 0.0
+            for k in range(6):
+                total += a[i, k] * cov[k, j]
+            half[i, j] = total
+    for i in range(6):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(6):
+                total += half[i, k] * a[j, k]
+            cov[i, j] = total
+            cov[j, i] = total
 
 
 @compiled
-def _corrected(state, cov, velocity, air, length, share, rotation, free, shown, variance):
+def _spread(cov, slopes, gap, after, length, phi, half):
+    """Carry the covariance (6, 6) over a step with these slopes at its begin, to the swing `after` it; in place.
+
+    phi, half: (6, 6) scratch. The upper half of the slopes is (0, 1), so only the lower is multiplied out.
+    """
+    square = 0.5 * gap * gap
+    for i in range(3):
+        for j in range(6):
+            twice = 0.0
+            for m in range(6):
+                twice += slopes[3 + i, m] * slopes[m, j]
+            phi[i, j] = gap * slopes[i, j] + square * slopes[3 + i, j]
+            phi[3 + i, j] = gap * slopes[3 + i, j] + square * twice
+        phi[i, i] += 1.0
+        phi[3 + i, 3 + i] += 1.0
+    _both_sides(phi, cov, half)
+    for i in range(3):
+        cov[i, i] += gap * (ASTRAY / length) ** 2
+    phi[:] = 0.0
+    for i in range(3):
+        for j in range(3):
+            phi[i, j] = phi[3 + i, 3 + j] = (1.0 if i == j else 0.0) - after[i] * after[j]
+    _both_sides(phi, cov, half)  # a string does not change its length
+
+
+@compiled
+def _corrected(state, cov, velocity, air, length, share, rotation, free, shown, noise, gap, scratch):
     """Kalman's update of the swing and its covariance by the pull that was seen in a step, in place.
 
-    The pull: share (n.(d - f) + L |dn/dt|^2) n, body axes; variance (3,) of what was seen.
+    The pull: share (n.(d - f) + L |dn/dt|^2) n, body axes. scratch: (6, 6).
     """
-    drag, row, change, shows = np.zeros(3), np.zeros(6), np.zeros(6), np.zeros(6)
+    drag, row, change, shows = scratch[0, :3], scratch[1], scratch[2], scratch[3]
+    change[:] = 0.0
     taut = 0.0
     for i in range(3):
         force = 0.0
@@ -154,7 +181,7 @@ def _corrected(state, cov, velocity, air, length, share, rotation, free, shown, 
         for i in range(3):
             along += rotation[i, axis] * state[i]
         missed = shown[axis] - free[axis] - share * taut * along
-        spread = variance[axis]
+        spread = noise[axis] * noise[axis] / gap
         for i in range(3):
             shows[i] = share * (taut * rotation[i, axis] + along * drag[i])
             shows[3 + i] = share * along * 2.0 * length * state[3 + i]
@@ -183,7 +210,7 @@ def _watched(gap, broken, velocity, air, length, share, rotation, free, shown, n
     work = np.zeros((6, 6))
     state, before = np.zeros(6), np.zeros(6)
     acceleration, pull = np.zeros(3), np.zeros(3)
-    cov, slopes = np.zeros((6, 6)), np.zeros((6, 6))
+    cov, slopes, phi = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
     swinging = np.sqrt(GRAVITY / length)
     for k in range(len(gap)):
         if broken[k]:
@@ -203,9 +230,8 @@ def _watched(gap, broken, velocity, air, length, share, rotation, free, shown, n
         _swing(state, acceleration, velocity[k - 1], air[k], gap[k], length, work)
         out[k] = state  # what is seen of this step is known after it
         _slopes(before, pull, velocity[k - 1], air[k], length, slopes)
-        _spread(cov, slopes, gap[k], state, length)
-        variance = noise * noise / gap[k]
-        _corrected(state, cov, velocity[k], air[k], length, share, rotation[k], free[k], shown[k], variance)
+        _spread(cov, slopes, gap[k], state, length, phi, work)
+        _corrected(state, cov, velocity[k], air[k], length, share, rotation[k], free[k], shown[k], noise, gap[k], work)
 
 
 @compiled
