@@ -17,15 +17,12 @@ from crazyem.diagnosis.fitting.always import nuisances, with_nuisances
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.gram import Gram
-from crazyem.diagnosis.fitting.model import Column, Point, initial_path
+from crazyem.diagnosis.fitting.model import Column, Point
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 FEW = 5  # beginnings that are all tried in full; of more,
 KEPT = 2  # the best peaks are
-SEEN = 50.0  # nats, from which an effect that has sizes is tried with them, where it
-# is driven astray: a path 1 cm/s off, as a filter's may be from row to row, changes what of its force comes and goes by
-# 30 %; and that is a fifth of its force and more, since in a hover noise is all that swings.
-OFF, ASTRAY, SWINGING = 0.01, 0.3, 0.2
+SEEN = 50.0  # nats, from which an effect that has sizes is tried with them, where it is driven astray
 FEWER = 6  # of its beginnings one in so many is asked
 
 
@@ -63,27 +60,8 @@ def best_begun(
 
 def strays(data: Data, point: Point, family: Sequence[Candidate]) -> bool:
     """Whether a flight drives what an effect does into chaos, so that its recorded path does not say what that was."""
-    effect = CATALOGUE[family[0].effect]
-    if not effect.sizes:
-        return False
-    size = effect.sizes[len(effect.sizes) // 2]
-    for model in data.models:
-        known = initial_path(model.flight) if model.path is None else model.path
-        off = known.copy()
-        off[:, 3:6] += OFF * np.random.default_rng(0).normal(size=(len(off), 3))
-        paths = [replace(model.twin(), path=p, seen=None, _rotation=None) for p in (known, off)]
-        for candidate in family[FEWER // 2 :: FEWER]:
-            values = {**candidate.neutral(point), **dict(candidate.begin), effect.amplitude: size}
-            there = point.with_effects({effect.name: values})
-            one, other = (m.accelerations(there)[0][:, :3] - m.accelerations(point)[0][:, :3] for m in paths)
-            swing = _rms(one - one.mean(axis=0))
-            if swing > SWINGING * _rms(one) and _rms(other - one) > ASTRAY * swing:
-                return True
-    return False
-
-
-def _rms(values: NDArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    some = [(c.effect, {**c.neutral(point), **dict(c.begin)}) for c in family[FEWER // 2 :: FEWER]]
+    return any(model.strays(point, name, values) for model in data.models for name, values in some)
 
 
 def larger(data: Data, point: Point, family: Sequence[Candidate], peaks: Sequence[int]) -> Candidate | None:
