@@ -218,7 +218,7 @@ class Model:
     _thrusts: dict[str, tuple[NDArray, NDArray]] = field(default_factory=dict)
     _rotation: NDArray | None = None  # of the path
     _rotation_shown: NDArray | None = None
-    _strays: dict[tuple[str | int, ...], bool] = field(default_factory=dict)
+    _strays: dict[tuple[object, ...], bool] = field(default_factory=dict)
     _felt_alone: bool | None = None
     _vibration: NDArray | None = None
 
