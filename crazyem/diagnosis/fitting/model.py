@@ -1,6 +1,5 @@
 """A flight under a model: vehicle, effects, noise -> innovations, and their derivatives by any columns."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -13,7 +12,7 @@ from crazyem.diagnosis.fitting import felt
 from crazyem.diagnosis.fitting.kernel import sweep
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.effects.catalogue import CATALOGUE
-from crazyem.physics.effects.effect import Effects, Situation
+from crazyem.physics.effects.effect import Effect, Effects, Situation
 from crazyem.physics.motion import measured, motion, rotor_thrust
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.vehicle import Vehicle
@@ -25,7 +24,7 @@ STRENGTH = "strength"
 # m/s from row to row; shares: see `Model.strays`. In simulated flights that shake all of the force changes, in others
 # some per cent.
 OFF, ASTRAY, SWINGING = 0.01, 0.3, 0.2
-ALIKE = 10.0  # values are alike within a tenth
+FEWER = 6
 WIDE = np.array([1.0] * 3 + [2.0] * 3 + [0.5] * 3 + [3.0] * 3) ** 2  # variances at a start of what is not measured
 
 
@@ -218,7 +217,7 @@ class Model:
     _thrusts: dict[str, tuple[NDArray, NDArray]] = field(default_factory=dict)
     _rotation: NDArray | None = None  # of the path
     _rotation_shown: NDArray | None = None
-    _strays: dict[tuple[object, ...], bool] = field(default_factory=dict)
+    _strays: dict[str, bool] = field(default_factory=dict)
     _felt_alone: bool | None = None
     _vibration: NDArray | None = None
 
@@ -245,40 +244,40 @@ class Model:
             self._rotation = rotation_matrix(path[:, 6:10])
         thrusts = self.thrusts(point.vehicle, effects)
         situation = situation_of(self.flight, path, point.vehicle, thrusts, self._rotation)
-        # what a model does not have yet is begun by the path alone; so is what the path tells well enough: there, the
-        # drift of an attitude would be taken for a pull
-        if self.seen is not None and any(_ties(n) and self.strays(point, n, v) for n, v in point.effects.items()):
+        # where the path tells well enough, the drift of an attitude would be taken for a pull
+        if self.seen is not None and any(_ties(name) and self.strays(point, name) for name in effects):
             situation = replace(situation, seen=self.seen, unrest=unrest(point.noise))
         moved = motion(situation, vehicle=point.vehicle, effects=effects)
         return np.concatenate([moved.specific_force, moved.angular_acceleration], axis=1), situation
 
-    def strays(self, point: Point, name: str, values: Mapping[str, Any]) -> bool:
+    def strays(self, point: Point, name: str) -> bool:
         """Whether the flight drives what an effect does into chaos, so that the path does not say what it did.
 
         A path `OFF` from row to row, as a filter's may be, then changes what comes and goes of its force by `ASTRAY`;
-        and `SWINGING` of the force comes and goes, since in a hover noise is all that swings. Remembered for values
-        that are alike.
+        and `SWINGING` of the force comes and goes, since in a hover noise is all that swings. Asked of one in `FEWER`
+        of its beginnings, once.
         """
         effect = CATALOGUE[name]
-        if not effect.sizes:
-            return False
-        shape = {n: float(v) for n, v in effect.complete(values, {}).items() if n != effect.amplitude}
-        key = (name, *(round(ALIKE * math.log(max(v, 1e-6))) for v in shape.values()))
-        if key not in self._strays:
-            tied = {name: {**shape, effect.amplitude: effect.sizes[len(effect.sizes) // 2]}}
+        if name not in self._strays:
             known = initial_path(self.flight) if self.path is None else self.path
             off = known.copy()
             off[:, 3:6] += OFF * np.random.default_rng(0).normal(size=(len(off), 3))
             rest = {n: v for n, v in of_recording(point.effects, self.flight.name).items() if not _ties(n)}
-            thrusts, pulls = self.thrusts(point.vehicle, rest), []
-            for path in (known, off):
-                situation = situation_of(self.flight, path, point.vehicle, thrusts)
-                there, without = (motion(situation, vehicle=point.vehicle, effects=e) for e in ({**rest, **tied}, rest))
-                pulls.append(there.specific_force - without.specific_force)
-            swing = _rms(pulls[0] - pulls[0].mean(axis=0))
-            much = swing > SWINGING * _rms(pulls[0])
-            self._strays[key] = bool(much and _rms(pulls[1] - pulls[0]) > ASTRAY * swing)
-        return self._strays[key]
+            thrusts = self.thrusts(point.vehicle, rest)
+            paths = [situation_of(self.flight, path, point.vehicle, thrusts) for path in (known, off)]
+            free = [motion(there, vehicle=point.vehicle, effects=rest).specific_force for there in paths]
+            self._strays[name] = False
+            for begin in _some(effect):
+                tied = {**rest, name: begin}
+                pull, other = (
+                    motion(there, vehicle=point.vehicle, effects=tied).specific_force - without
+                    for there, without in zip(paths, free, strict=True)
+                )
+                swing = _rms(pull - pull.mean(axis=0))
+                if swing > SWINGING * _rms(pull) and _rms(other - pull) > ASTRAY * swing:
+                    self._strays[name] = True
+                    break
+        return self._strays[name]
 
     def offsets(self, point: Point, accelerations: NDArray, effects: Effects | None = None) -> NDArray:
         """(n, 12) what the sensors show beyond the truth, evaluated at the filtered states.
@@ -402,6 +401,18 @@ def _before_rotors(name: str) -> bool:
 
 def _ties(name: str) -> bool:
     return CATALOGUE[name].tied is not None
+
+
+def _some(effect: Effect) -> list[dict[str, float]]:
+    """Values of an effect that has sizes, from one in `FEWER` of its beginnings."""
+    if not effect.sizes:
+        return []
+    size = effect.sizes[len(effect.sizes) // 2]
+    return [
+        {effect.amplitude: size, name: value}
+        for name, values in effect.beginnings.items()
+        for value in values[FEWER // 2 :: FEWER]
+    ]
 
 
 def _shows(name: str) -> bool:

@@ -23,7 +23,6 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 FEW = 5  # beginnings that are all tried in full; of more,
 KEPT = 2  # the best peaks are
 SEEN = 50.0  # nats, from which an effect that has sizes is tried with them, where it is driven astray
-FEWER = 6  # of its beginnings one in so many is asked
 
 
 def best_begun(
@@ -49,19 +48,14 @@ def best_begun(
         gains = [_gain(gram, weights, at + i) for i in range(len(family))]
         at += len(family)
         best = peaks(gains)
-        found = larger(data, point, family, best) if max(gains) > SEEN and strays(data, point, family) else None
+        astray = any(model.strays(point, family[0].effect) for model in data.models)
+        found = larger(data, point, family, best) if max(gains) > SEEN and astray else None
         if found is None:
             dropped |= set(family) - {family[i] for i in best}
         else:
             dropped |= set(family)
             added.append(found)
     return [*(c for c in candidates if c not in dropped), *added]
-
-
-def strays(data: Data, point: Point, family: Sequence[Candidate]) -> bool:
-    """Whether a flight drives what an effect does into chaos, so that its recorded path does not say what that was."""
-    some = [(c.effect, {**c.neutral(point), **dict(c.begin)}) for c in family[FEWER // 2 :: FEWER]]
-    return any(model.strays(point, name, values) for model in data.models for name, values in some)
 
 
 def larger(data: Data, point: Point, family: Sequence[Candidate], peaks: Sequence[int]) -> Candidate | None:
