@@ -93,6 +93,10 @@ def test_what_no_scatter_shows_is_part_of_an_interval() -> None:
     assert never["suspended_load", "length"] == pytest.approx(0.002)
     assert never["suspended_load", "mass"] == pytest.approx(3e-3 * DRONE.mass)
     assert never["thrust_curve", "slope_error"] == pytest.approx(0.02)
+    data.models[0]._strays["suspended_load"] = True
+    shaken = unsure(data, point_of(suspended_load={"mass": 0.002, "length": 0.4}))
+    assert shaken["suspended_load", "length"] == pytest.approx(0.008)
+    assert shaken["suspended_load", "mass"] == never["suspended_load", "mass"]
     assert unsure(data, point_of())["suspended_load", "length"] == 0.0
 
 
