@@ -24,7 +24,7 @@ from crazyem.diagnosis.naming.exchange import exchanged, named_again
 from crazyem.diagnosis.naming.foretold import with_found, without_what_misleads
 from crazyem.diagnosis.naming.imitated import by_place
 from crazyem.diagnosis.naming.named import Named
-from crazyem.diagnosis.naming.rotor_response import disobedient
+from crazyem.diagnosis.naming.rotor_response import answers, disobedient
 from crazyem.diagnosis.naming.select import select
 from crazyem.diagnosis.naming.split import LOAD, WEAKER, as_load, as_two
 from crazyem.diagnosis.naming.steady import left_as_trim, with_its_thrust, with_whole_torques
@@ -129,14 +129,16 @@ def diagnose(
     }
     told = tell(data, selection, remains, witnessed=witnessed, in_place=in_place, balance=balance)
     groups, separate = told.groups, told.separate
-    if flights[0].inputs.measured and not any(e.name == "input_delay" for e in told.effects):
-        late, alike = late_rotors(recordings, held_out, vehicle, wanted, left_out)
-        beside += late
-        groups = (*groups, *alike)
-        separate = tuple(dict.fromkeys((*separate, *(CATALOGUE[n].separates for g in alike for n in g))))
+    if flights[0].inputs.measured:
+        here, there = answers(recordings, vehicle), answers(held_out, vehicle)
         # the body answers to the speeds that were measured, so this says nothing against what was told of it
-        deaf = disobedient([*recordings, *held_out], vehicle)
+        deaf = disobedient([*here, *there])
         remains = remains.beside(deaf) if deaf else remains
+        if not any(e.name == "input_delay" for e in told.effects):
+            late, alike = late_rotors(here, there, vehicle, wanted, left_out)
+            beside += late
+            groups = (*groups, *alike)
+            separate = tuple(dict.fromkeys((*separate, *(CATALOGUE[n].separates for g in alike for n in g))))
     effects = strongest_first(told.effects, beside)
     left_out = {n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)}
     fitted_vehicle = _with_effects(assumed, selection, beside)

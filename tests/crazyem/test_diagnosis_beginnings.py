@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.diagnosis.fitting.always import refine_base
+from crazyem.diagnosis.fitting.astray import strays
 from crazyem.diagnosis.fitting.candidates import Candidate, variants
 from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
 from crazyem.diagnosis.fitting.model import Model, Point
@@ -102,16 +103,29 @@ def test_a_load_that_is_followed_only_by_one_as_heavy_is_begun_with_its_mass(lin
 
 @pytest.mark.parametrize(("shaken", "chaotic"), [(0.0, False), (0.6, True)])  # m/s
 def test_only_a_load_that_is_shaken_strays_from_its_path(shaken, chaotic):
-    data = Data([flight_of(fly(seconds=20.0), DRONE)])
-    data.settle(POINT)
-    model = data.models[0]
+    flight = flight_of(fly(seconds=20.0), DRONE)
     if shaken:
-        t = model.flight.time[:, None]
-        path = model.path.copy()
-        path[:, 3:6] = shaken * np.sin([5.6, 6.1, 9.0] * t + [0.0, 1.0, 0.0]) * [1, 1, 0.2]
-        model.path = path
-    assert model.strays(POINT, "suspended_load") == chaotic
-    assert not model.strays(POINT, "payload")  # nothing to be lost
+        y = flight.y.copy()
+        y[:, 3:6] = shaken * np.sin([5.6, 6.1, 9.0] * flight.time[:, None] + [0.0, 1.0, 0.0]) * [1, 1, 0.2]
+        flight = replace(flight, y=y)
+    assert strays(flight, DRONE, "suspended_load") == chaotic
+    assert not strays(flight, DRONE, "payload")  # nothing to be lost
+
+
+@pytest.mark.parametrize("chaotic", [False, True])
+def test_a_load_is_followed_by_its_pull_only_where_a_flight_drives_it_astray(chaotic):
+    """A pull that the path does not know of, seen in one second, is believed in the next or not at all."""
+    model = Model(flight_of(fly(seconds=8.0), DRONE))
+    point = POINT.with_effects({"suspended_load": {"mass": 0.002, "length": 0.3}})
+    model.settle(point)
+    model._strays["suspended_load"] = chaotic
+    before = model.accelerations(point)[0]
+    at = model.flight.time.size // 2
+    model.seen = model.seen.copy()
+    model.seen[at : at + 100, 0] += 0.5
+    after = model.accelerations(point)[0]
+    assert np.array_equal(before[: at + 1], after[: at + 1])
+    assert np.array_equal(before, after) != chaotic
 
 
 def test_what_swings_goes_on_through_steps_that_are_left_out():

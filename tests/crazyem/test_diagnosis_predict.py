@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from flown import DRONE, START, G, fly, recording_of, smooth_thrust, speeds
-from hanging_load import hang, tilted
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_flight import changed
@@ -195,38 +194,6 @@ def test_measured_speeds_give_the_thrust_that_the_diagnosis_sees() -> None:
     course = ThrustCourse(inputs, vehicle=DRONE, effects=effects)
     ours, _ = course.over(nodes[:-1], nodes[1:], last=np.full(nodes.size - 1, stamps.size - 1))
     assert np.allclose(ours, mean[1:], atol=1e-12)
-
-
-def test_a_load_at_rest_below_a_hovering_drone_stays_there() -> None:
-    load = 0.006
-    each = (DRONE.mass + load) * G / 4
-    states = np.tile([0, 0, 2, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0.0], (TIMES.size, 1))
-    hanging = replace(DRONE, effects={"suspended_load": {"mass": load, "length": 0.5}})
-    recording = recording_of(TIMES, states, rotor_speed=(TIMES, np.full((TIMES.size, 4), np.sqrt(each / 4e-8))))
-    found = predicted(recording, hanging)
-    assert_close(found.prediction, along(states, found.start_index, 50), position=1e-9, rest=1e-9)
-
-
-@pytest.mark.parametrize("angle", [0.0, 0.5])
-def test_a_load_is_where_it_was_seen_to_pull(angle: float) -> None:
-    """A level drone whose load began to swing before anything was recorded: its path alone does not say where it is."""
-    load, length, time = 0.004, 0.3, np.arange(0.0, 5.0, 0.01)
-    weight = (DRONE.mass + load) * G
-    truth = hang(
-        lambda t: np.array([0, 0, weight]), time, drone=DRONE.mass, load=load, length=length, start=tilted(angle)
-    )
-    states = np.zeros((time.size, 13))
-    states[:, :3], states[:, 3:6], states[:, 9] = truth.position, truth.velocity, 1.0
-    hanging = replace(DRONE, effects={"suspended_load": {"mass": load, "length": length}})
-    recording = recording_of(time, states, rotor_speed=(time, np.full((time.size, 4), np.sqrt(weight / 4 / 4e-8))))
-    found = predicted(recording, hanging)
-    late = found.start_time > 3.0
-    missed = found.prediction[late] - along(states, found.start_index[late], 50)
-    assert np.abs(missed[..., :3]).max() < 3e-3
-    assert np.abs(missed[..., 3:6]).max() < 0.015
-    without = predicted(recording, replace(DRONE, effects={"payload": {"mass": load}}))
-    worst = np.abs(without.prediction[late] - along(states, without.start_index[late], 50))[..., 3:6].max()
-    assert worst > 0.1 or angle == 0.0
 
 
 # -- sensors -----------------------------------------------------------------------------------------------------------

@@ -8,12 +8,16 @@ import pytest
 from closed_loop import DRONE, fly
 from made_flight import array_of
 
+from crazyem.diagnosis import diagnose as diagnosing
+from crazyem.diagnosis.flights.inputs import inputs_of
 from crazyem.diagnosis.naming.rotor_response import (
     DELAY_SD,
     ENOUGH,
     LAG_BIAS,
     PUNCTUAL,
+    Answer,
     Response,
+    answers,
     disobedient,
     judged,
     response,
@@ -72,22 +76,22 @@ def answering(
 
 @pytest.mark.parametrize(("lag", "late"), [(0.015, 0.0), (0.03, 0.006), (0.03, 0.0), (0.06, 0.01)])
 def test_lag_and_delay_are_those_of_the_rotors(flown, lag, late):
-    found = response([answering(flown, lag, late)], ROTORS)
+    found = response(answers([answering(flown, lag, late)], ROTORS))
     assert found is not None
     assert found.lag * LAG_BIAS == pytest.approx(lag, rel=0.06)
     assert found.delay + PUNCTUAL == pytest.approx(late + 1e-3, abs=1e-3)  # a command is held for 2 ms
 
 
 def test_what_does_not_answer_says_nothing(flown):
-    assert response([flown], ROTORS) is None  # no speeds
+    assert response(answers([flown], ROTORS)) is None  # no speeds
     made = answering(flown, 0.03, 0.0)
-    assert response([made], DRONE) is None  # no rotor constant
+    assert response(answers([made], DRONE)) is None  # no rotor constant
     other = answering(flown, 0.03, 0.0, seed=1)
     strange = replace(made, signals={**made.signals, "rotor_speed": other.signals["rotor_speed"]})
-    assert response([strange], ROTORS) is None
+    assert response(answers([strange], ROTORS)) is None
     held = made.signals["rotor_speed"]
     stuck = array_of("rotor_speed", held.time, np.full_like(held.value, 2000.0), place=90)
-    assert response([replace(made, signals={**made.signals, "rotor_speed": stuck})], ROTORS) is None
+    assert response(answers([replace(made, signals={**made.signals, "rotor_speed": stuck})], ROTORS)) is None
 
 
 def found(lag: float, delay: float, sd: float = 1.4e-3) -> Response:
@@ -142,17 +146,17 @@ def test_wild_and_slow_samples_are_refused(flown):
     speed, command = made.signals["rotor_speed"], made.signals["motor_command"]
     wild = array_of("rotor_speed", speed.time, np.where(np.arange(speed.time.size)[:, None] % 50, speed.value, 1e300),
                     place=91)  # fmt: skip
-    sound = response([replace(made, signals={**made.signals, "rotor_speed": wild})], ROTORS)
+    sound = response(answers([replace(made, signals={**made.signals, "rotor_speed": wild})], ROTORS))
     assert sound is not None
     assert sound.lag * LAG_BIAS == pytest.approx(0.03, rel=0.06)
     slow = array_of("motor_command", 300.0 * command.time, command.value, place=92)
-    assert response([replace(made, signals={**made.signals, "motor_command": slow})], ROTORS) is None
+    assert response(answers([replace(made, signals={**made.signals, "motor_command": slow})], ROTORS)) is None
 
 
 @pytest.mark.parametrize("rotor", [1, 4])
 def test_a_rotor_that_sticks_is_told_by_what_it_leaves_of_its_command(flown, rotor):
     sticking = [answering(flown, 0.03, 0.0, seed=s, sticks={rotor: 0.1}) for s in (0, 1)]
-    told = disobedient(sticking, ROTORS)
+    told = disobedient(answers(sticking, ROTORS))
     assert told is not None
     assert told.regime == f"rotor {rotor} does not follow its command"
     assert (told.signal, told.axis, told.unit, told.variable) == ("force", "z", "N", "rotor")
@@ -164,8 +168,34 @@ def test_a_rotor_that_sticks_is_told_by_what_it_leaves_of_its_command(flown, rot
 
 def test_a_rotor_that_sticks_in_one_flight_only_or_as_all_do_is_not_told(flown):
     whole = answering(flown, 0.03, 0.0, seed=2, noise=1e-3)
-    assert disobedient([whole], ROTORS) is None
-    assert disobedient([], ROTORS) is None
-    assert disobedient([flown], ROTORS) is None  # no speeds
-    assert disobedient([answering(flown, 0.03, 0.0, sticks={2: 0.05}), whole], ROTORS) is None
-    assert disobedient([answering(flown, 0.03, 0.0, sticks=dict.fromkeys((1, 2, 3, 4), 0.03))], ROTORS) is None
+    assert disobedient(answers([whole], ROTORS)) is None
+    assert disobedient(answers([], ROTORS)) is None
+    assert disobedient(answers([flown], ROTORS)) is None  # no speeds
+    assert disobedient(answers([answering(flown, 0.03, 0.0, sticks={2: 0.05}), whole], ROTORS)) is None
+    assert disobedient(answers([answering(flown, 0.03, 0.0, sticks=dict.fromkeys((1, 2, 3, 4), 0.03))], ROTORS)) is None
+
+
+def behind(time, wanted, *, lag):
+    """(n, 4) what a first-order lag makes of values (n, 4) that are held."""
+    out = wanted.copy()
+    for k in range(1, len(out)):
+        out[k] = wanted[k - 1] + (out[k - 1] - wanted[k - 1]) * np.exp(-(time[k] - time[k - 1]) / lag)
+    return out
+
+
+@pytest.mark.parametrize("sticks", [False, True])
+def test_a_diagnosis_tells_of_a_rotor_that_does_not_follow_its_command(monkeypatch, sticks):
+    """Speeds that carry the drone as its commands do; of what the commands say of them, only whether one sticks."""
+    flown = fly(seconds=10.0, seed=4)
+    command = flown.signals["motor_command"]
+    thrust = behind(command.time, inputs_of(flown, DRONE).rotor.thrust, lag=DRONE.motor_time_constant)
+    speed = array_of("rotor_speed", command.time, np.sqrt(thrust / 2e-8), place=90)
+    measured = replace(flown, signals={**flown.signals, "rotor_speed": speed})
+    left = np.ones((4, 1000)) * np.array([[1.0], [1.0], [30.0 if sticks else 1.0], [1.0]]) * 1e-4
+    told = Answer(np.array([0.03, 0.0]), np.diag([1e-6, 1e-6]), left, (1.0, 9.0))
+    monkeypatch.setattr(diagnosing, "answers", lambda recordings, vehicle: [told] * len(recordings))
+    found = diagnosing.diagnose([measured], ROTORS, wanted=["linear_drag"])
+    regimes = [f.regime for f in found.unexplained.findings]
+    assert ("rotor 3 does not follow its command" in regimes) == sticks
+    assert found.mismatch or not sticks
+    assert found.effects == ()

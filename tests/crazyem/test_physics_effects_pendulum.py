@@ -6,7 +6,7 @@ from hanging_load import Array, G, hang, tilted
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crazyem.physics.effects.pendulum import ASTRAY, HANGING, _slopes, swing_along, swing_on, watched_along
+from crazyem.physics.effects.pendulum import HANGING, WANDERING, _slopes, swing_along, swing_on, watched_along
 
 DRONE, LOAD, LENGTH = 0.03, 0.003, 0.25
 SHARE = LOAD / (DRONE + LOAD)
@@ -151,7 +151,7 @@ def test_the_filter_is_the_textbooks() -> None:
         transition = derivative(lambda s, k=k: on(s, k), x)
         x = on(x, k)
         expected.append(x)
-        p = transition @ p @ transition.T + np.diag([STEP * (ASTRAY / LENGTH) ** 2] * 3 + [0] * 3)
+        p = transition @ p @ transition.T + np.diag([STEP * (WANDERING / LENGTH) ** 2] * 3 + [0] * 3)
         p = flat(x[:3]) @ p @ flat(x[:3])
         shows = derivative(lambda s, k=k: pull(s, k), x)
         gain = p @ shows.T @ np.linalg.inv(shows @ p @ shows.T + NOISE**2 / STEP * np.eye(3))

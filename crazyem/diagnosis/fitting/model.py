@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from crazyem.diagnosis.fitting import felt
+from crazyem.diagnosis.fitting.astray import strays
 from crazyem.diagnosis.fitting.kernel import sweep
+from crazyem.diagnosis.fitting.situation import causal_middle, initial_path, situation_of, thrust_of
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.effects.catalogue import CATALOGUE
-from crazyem.physics.effects.effect import Effect, Effects, Situation
-from crazyem.physics.motion import measured, motion, rotor_thrust
+from crazyem.physics.effects.effect import Effects, Situation
+from crazyem.physics.motion import measured, motion
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.vehicle import Vehicle
 
@@ -21,10 +23,6 @@ RECENT = 0.5  # s, over which what a model lacks is averaged: long enough that t
 # The thrust of one recording over what the vehicle file and its effects say: batteries and propellers of another day.
 # No effect of the catalogue, since it belongs to no drone: name of the flight -> factor.
 STRENGTH = "strength"
-# m/s from row to row; shares: see `Model.strays`. In simulated flights that shake all of the force changes, in others
-# some per cent.
-OFF, ASTRAY, SWINGING = 0.01, 0.3, 0.2
-FEWER = 6
 WIDE = np.array([1.0] * 3 + [2.0] * 3 + [0.5] * 3 + [3.0] * 3) ** 2  # variances at a start of what is not measured
 
 
@@ -98,59 +96,6 @@ class Column:
     showing: NDArray | None = None
 
 
-def initial_path(flight: Flight) -> NDArray:
-    """(n, 19) states to begin with: what was measured, interpolated where it was not."""
-    path = np.zeros((flight.time.size, 19))
-    path[:, 9] = 1.0
-    for c in range(13):
-        known = np.isfinite(flight.y[:, c])
-        if known.any():
-            path[:, c] = np.interp(flight.time, flight.time[known], flight.y[known, c])
-    if not np.isfinite(flight.y[:, 3:6]).any() and np.isfinite(flight.y[:, 0:3]).any():
-        path[:, 3:6] = np.gradient(path[:, 0:3], flight.time, axis=0)
-    path[:, 6:10] /= np.linalg.norm(path[:, 6:10], axis=1, keepdims=True)
-    return path
-
-
-def thrust_of(flight: Flight, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, NDArray]:
-    """Mean thrust of each rotor over the steps, and its rate: (n, 4) N, (n, 4) N/s."""
-    return rotor_thrust(
-        flight.inputs, flight.time, vehicle=vehicle, effects=effects, breaks=np.flatnonzero(flight.gaps).tolist()
-    )
-
-
-def situation_of(
-    flight: Flight, path: NDArray, vehicle: Vehicle, thrusts: tuple[NDArray, NDArray], rotation: NDArray | None = None
-) -> Situation:
-    """The situation at the rows of a path (n, 19)."""
-    thrust, rate = thrusts
-    step = np.concatenate([[0.0], np.diff(flight.time)])
-    step[flight.gaps] = 0.0
-    rotation = rotation_matrix(path[:, 6:10]) if rotation is None else rotation
-    n = flight.time.size
-    return Situation(
-        time=flight.time, flown=flight.flown, step=step, position=path[:, 0:3],
-        height=np.maximum(path[:, 2] - flight.ground, 0.0), velocity=path[:, 3:6], rotation=rotation,
-        body_rate=path[:, 10:13], specific_force=np.zeros((n, 3)), angular_acceleration=np.zeros((n, 3)),
-        thrust=thrust, thrust_rate=rate, voltage=flight.voltage,
-        rotor_constant=float("nan") if vehicle.rotor_constant is None else vehicle.rotor_constant,
-        air=np.zeros((n, 3)),
-    )  # fmt: skip
-
-
-def causal_middle(filtered: NDArray, predicted: NDArray, starts: NDArray) -> NDArray:
-    """(n, 19) states in the middle of each step: filtered at its begin, predicted to its end."""
-    middle = predicted.copy()
-    before = filtered[:-1]
-    inside = ~starts[1:]
-    sign = np.sign(np.sum(before[:, 6:10] * predicted[1:, 6:10], axis=1, keepdims=True))
-    mean = 0.5 * (before + predicted[1:])
-    mean[:, 6:10] = before[:, 6:10] * np.where(sign == 0, 1.0, sign) + predicted[1:, 6:10]
-    mean[:, 6:10] /= np.linalg.norm(mean[:, 6:10], axis=1, keepdims=True)
-    middle[1:][inside] = mean[inside]
-    return middle
-
-
 def corrected(swept: Swept, flight: Flight) -> tuple[NDArray, NDArray, NDArray]:
     """What a pass of the filter found beyond its model, step by step: changes (n, 6) of velocity m/s and body rate
     rad/s, body axes; lengths (n,) of the steps [s]; which of them (n,) are known (0 where not)."""
@@ -217,7 +162,7 @@ class Model:
     _thrusts: dict[str, tuple[NDArray, NDArray]] = field(default_factory=dict)
     _rotation: NDArray | None = None  # of the path
     _rotation_shown: NDArray | None = None
-    _strays: dict[str, bool] = field(default_factory=dict)
+    _strays: dict[str, bool] = field(default_factory=dict)  # shared by twins: it is of the flight alone
     _felt_alone: bool | None = None
     _vibration: NDArray | None = None
 
@@ -245,38 +190,15 @@ class Model:
         thrusts = self.thrusts(point.vehicle, effects)
         situation = situation_of(self.flight, path, point.vehicle, thrusts, self._rotation)
         # where the path tells well enough, the drift of an attitude would be taken for a pull
-        if self.seen is not None and any(_ties(name) and self.strays(point, name) for name in effects):
+        if self.seen is not None and any(_ties(name) and self.strays(name, point.vehicle) for name in effects):
             situation = replace(situation, seen=self.seen, unrest=unrest(point.noise))
         moved = motion(situation, vehicle=point.vehicle, effects=effects)
         return np.concatenate([moved.specific_force, moved.angular_acceleration], axis=1), situation
 
-    def strays(self, point: Point, name: str) -> bool:
-        """Whether the flight drives what an effect does into chaos, so that the path does not say what it did.
-
-        A path `OFF` from row to row, as a filter's may be, then changes what comes and goes of its force by `ASTRAY`;
-        and `SWINGING` of the force comes and goes, since in a hover noise is all that swings. Asked of one in `FEWER`
-        of its beginnings, once.
-        """
-        effect = CATALOGUE[name]
+    def strays(self, name: str, vehicle: Vehicle) -> bool:
+        """Whether the flight drives what an effect does into chaos (`astray.strays`); remembered."""
         if name not in self._strays:
-            known = initial_path(self.flight) if self.path is None else self.path
-            off = known.copy()
-            off[:, 3:6] += OFF * np.random.default_rng(0).normal(size=(len(off), 3))
-            rest = {n: v for n, v in of_recording(point.effects, self.flight.name).items() if not _ties(n)}
-            thrusts = self.thrusts(point.vehicle, rest)
-            paths = [situation_of(self.flight, path, point.vehicle, thrusts) for path in (known, off)]
-            free = [motion(there, vehicle=point.vehicle, effects=rest).specific_force for there in paths]
-            self._strays[name] = False
-            for begin in _some(effect):
-                tied = {**rest, name: begin}
-                pull, other = (
-                    motion(there, vehicle=point.vehicle, effects=tied).specific_force - without
-                    for there, without in zip(paths, free, strict=True)
-                )
-                swing = _rms(pull - pull.mean(axis=0))
-                if swing > SWINGING * _rms(pull) and _rms(other - pull) > ASTRAY * swing:
-                    self._strays[name] = True
-                    break
+            self._strays[name] = strays(self.flight, vehicle, name)
         return self._strays[name]
 
     def offsets(self, point: Point, accelerations: NDArray, effects: Effects | None = None) -> NDArray:
@@ -390,10 +312,6 @@ class Model:
         return np.ascontiguousarray(stack[0]), np.ascontiguousarray(stack[1]), order
 
 
-def _rms(values: NDArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def _before_rotors(name: str) -> bool:
     effect = CATALOGUE[name]
     return effect.commanded is not None or effect.timing is not None or effect.speed is not None
@@ -401,18 +319,6 @@ def _before_rotors(name: str) -> bool:
 
 def _ties(name: str) -> bool:
     return CATALOGUE[name].tied is not None
-
-
-def _some(effect: Effect) -> list[dict[str, float]]:
-    """Values of an effect that has sizes, from one in `FEWER` of its beginnings."""
-    if not effect.sizes:
-        return []
-    size = effect.sizes[len(effect.sizes) // 2]
-    return [
-        {effect.amplitude: size, name: value}
-        for name, values in effect.beginnings.items()
-        for value in values[FEWER // 2 :: FEWER]
-    ]
 
 
 def _shows(name: str) -> bool:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.gram import Gram
-from crazyem.diagnosis.fitting.model import Column, Model, Point, initial_path
+from crazyem.diagnosis.fitting.model import Column, Model, Point
+from crazyem.diagnosis.fitting.situation import initial_path
 from crazyem.diagnosis.locating.locate import AXES, Finding
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.vehicle import GRAVITY, Vehicle

@@ -48,19 +48,16 @@ def best_begun(
         gains = [_gain(gram, weights, at + i) for i in range(len(family))]
         at += len(family)
         best = peaks(gains)
-        astray = any(model.strays(point, family[0].effect) for model in data.models)
-        found = larger(data, point, family, best) if max(gains) > SEEN and astray else None
-        if found is None:
-            dropped |= set(family) - {family[i] for i in best}
-        else:
-            dropped |= set(family)
-            added.append(found)
+        astray = max(gains) > SEEN and any(model.strays(family[0].effect, point.vehicle) for model in data.models)
+        found = larger(data, point, family, best) if astray else None
+        dropped |= set(family) - ({family[i] for i in best} if found is None else set())
+        added += [found] if found is not None else []
     return [*(c for c in candidates if c not in dropped), *added]
 
 
-def larger(data: Data, point: Point, family: Sequence[Candidate], peaks: Sequence[int]) -> Candidate | None:
-    """The beginning and the size that are likeliest, if they are not beside one of these peaks; None: they are, or none
-    is likelier than nothing. What is steady in an effect that weighs is given back by the thrust."""
+def larger(data: Data, point: Point, family: Sequence[Candidate], best: Sequence[int]) -> Candidate | None:
+    """The beginning and the size that are likeliest, if they are not beside one of the `best` (indices) by derivatives;
+    None: they are, or none is likelier than nothing. The thrust gives back what is steady in an effect that weighs."""
     effect = CATALOGUE[family[0].effect]
     nothing = data.twin().loglik(point)
 
@@ -74,10 +71,10 @@ def larger(data: Data, point: Point, family: Sequence[Candidate], peaks: Sequenc
     gains = data.workers.map(gain, tried)
     if not tried or max(gains) <= 0.0:
         return None
-    size, best = tried[int(np.argmax(gains))]
-    if any(abs(family.index(best) - i) <= 1 for i in peaks):
+    size, likeliest = tried[int(np.argmax(gains))]
+    if any(abs(family.index(likeliest) - i) <= 1 for i in best):
         return None
-    return replace(best, begin=tuple({**dict(best.begin), effect.amplitude: size}.items()))
+    return replace(likeliest, begin=tuple({**dict(likeliest.begin), effect.amplitude: size}.items()))
 
 
 def peaks(gains: Sequence[float]) -> list[int]:

@@ -15,7 +15,6 @@ from crazyem.diagnosis.naming.prune import ADMITTED
 from crazyem.diagnosis.naming.trials import SURE
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
-from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
 FIXED = 0.3  # share of the gain of gusts that a force which depends on place or motion may have beside it
@@ -75,18 +74,18 @@ def beside_the_regression(
 
 
 def late_rotors(
-    recordings: Sequence[Recording],
-    held_out: Sequence[Recording],
+    answers: Sequence[rotor_response.Answer],
+    held_out: Sequence[rotor_response.Answer],
     vehicle: Vehicle,
     wanted: Sequence[str],
     left_out: dict[str, str],
 ) -> tuple[list[Named], tuple[tuple[str, ...], ...]]:
     """Lag and delay of rotors whose speeds were measured, and the group of both where one is as good as the other."""
-    found = rotor_response.response(recordings, vehicle)
+    found = rotor_response.response(answers)
     if found is None:
         return [], ()
     left_out.pop("motor_lag", None)
-    late = rotor_response.judged(found, rotor_response.response(held_out, vehicle), vehicle)
+    late = rotor_response.judged(found, rotor_response.response(held_out), vehicle)
     if late is None or (wanted and not set(late.values) & set(wanted)):
         return [], ()
     named = []

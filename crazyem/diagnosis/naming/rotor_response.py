@@ -61,9 +61,24 @@ class Response:
         return -0.5 * float(z @ np.linalg.solve(self.covariance, z))
 
 
-def response(recordings: Sequence[Recording], vehicle: Vehicle) -> Response | None:
-    """Of all recordings together; None where commands or speeds are missing, or one does not tell the other."""
-    found = [r for r in (_of_one(recording, vehicle) for recording in recordings) if r is not None]
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What one recording says: best (2,) lag and delay [s], their covariance by scatter, left (4, n) N, thrust that
+    each rotor was told and did not give, span of time [s]."""
+
+    best: NDArray
+    covariance: NDArray
+    left: NDArray
+    span: tuple[float, float]
+
+
+def answers(recordings: Sequence[Recording], vehicle: Vehicle) -> list[Answer]:
+    """Of the recordings that have both commands and speeds, of which one tells the other."""
+    return [a for a in (_of_one(recording, vehicle) for recording in recordings) if a is not None]
+
+
+def response(found: Sequence[Answer]) -> Response | None:
+    """Of all recordings together; None where none tells."""
     if not found:
         return None
     information = sum(np.linalg.inv(r.covariance) for r in found)
@@ -75,9 +90,8 @@ def response(recordings: Sequence[Recording], vehicle: Vehicle) -> Response | No
     return Response(float(lag), float(delay), covariance + usual)
 
 
-def disobedient(recordings: Sequence[Recording], vehicle: Vehicle) -> Finding | None:
+def disobedient(found: Sequence[Answer]) -> Finding | None:
     """The rotor that does not follow its command as the others do theirs, in all recordings that tell; None: none."""
-    found = [r for r in (_of_one(recording, vehicle) for recording in recordings) if r is not None]
     if not found:
         return None
     power = np.array([np.mean(r.left**2, axis=1) for r in found])
@@ -94,18 +108,7 @@ def disobedient(recordings: Sequence[Recording], vehicle: Vehicle) -> Finding | 
     return Finding("force", "z", where, "rotor", found[0].span, size, sd, "N", nats, float(np.exp(-min(nats, 700.0))))
 
 
-@dataclass(frozen=True)
-class _OfOne:
-    """What one recording says: best (2,) lag and delay [s], their covariance by scatter, left (4, n) N, thrust that
-    each rotor was told and did not give, span of time [s]."""
-
-    best: NDArray
-    covariance: NDArray
-    left: NDArray
-    span: tuple[float, float]
-
-
-def _of_one(recording: Recording, vehicle: Vehicle) -> _OfOne | None:
+def _of_one(recording: Recording, vehicle: Vehicle) -> Answer | None:
     """Of one recording; None where it does not tell."""
     air = airtime(recording)
     if vehicle.rotor_constant is None or air is None or not air.flown:
@@ -161,7 +164,7 @@ def _of_one(recording: Recording, vehicle: Vehicle) -> _OfOne | None:
     if not np.all(np.abs(slope) > 0):
         return None
     covariance = variance * np.linalg.inv(best.jac.T @ best.jac)
-    return _OfOne(best.x, covariance, commands / slope[:, None], (float(at[0]), float(at[-1])))
+    return Answer(best.x, covariance, commands / slope[:, None], (float(at[0]), float(at[-1])))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ GRAVITY = 9.81  # m/s^2
 DAMPING = 0.1  # 1/s: drag of the load over its mass
 FASTEST = 200.0  # 1/s: only absurd paths swing faster
 # What a load may do that its path does not say: a filtered path is wrong by some 1 cm/s from one 10 ms to the next.
-ASTRAY = 1e-3  # m/sqrt(s)
+WANDERING = 1e-3  # m/sqrt(s)
 HANGING = 0.1  # rad, and rad per radian of its swing: how far it may be from hanging at rest where a stretch begins
 
 
@@ -151,7 +151,7 @@ def _spread(cov, slopes, gap, after, length, phi, half):
         phi[3 + i, 3 + i] += 1.0
     _both_sides(phi, cov, half)
     for i in range(3):
-        cov[i, i] += gap * (ASTRAY / length) ** 2
+        cov[i, i] += gap * (WANDERING / length) ** 2
     phi[:] = 0.0
     for i in range(3):
         for j in range(3):
