@@ -148,6 +148,17 @@ def test_what_may_as_well_be_none_is_not_sure(slow_to_turn, monkeypatch):
         assert any(np.allclose(away[e.name], a) for a in asked)
 
 
+def test_what_a_wrong_lag_does_is_part_of_an_interval(slow_to_turn, monkeypatch):
+    asked = {"wanted": ["linear_drag", "inertia"]}
+    before = {e.name: e.parameters for e in diagnose([slow_to_turn], DRONE, **asked).effects}
+    monkeypatch.setattr(told, "by_a_wrong_lag", lambda data, fitted: {("inertia", "xx"): 1e-5})
+    after = {e.name: e.parameters for e in diagnose([slow_to_turn], DRONE, **asked).effects}
+    assert before["inertia"]["xx"].sd < 5e-6
+    assert 1e-5 < after["inertia"]["xx"].sd <= np.hypot(1e-5, before["inertia"]["xx"].sd)
+    assert after["inertia"]["yy"].sd < before["inertia"]["yy"].sd  # what the lag does to it was there before
+    assert after["linear_drag"] == before["linear_drag"]
+
+
 @pytest.mark.parametrize(("vehicle", "alike"), [(DRONE, False), (TRIMMED, True)])
 def test_with_a_trim_a_load_is_told_with_two_weak_rotors(vehicle, alike):
     """A tenth less thrust of the left rotors; a load there explains it, where nothing else is asked."""

@@ -17,6 +17,7 @@ from crazyem.diagnosis.fitting.candidates import Candidate, variants
 from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
 from crazyem.diagnosis.fitting.model import Model, Point
 from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.naming import beginnings
 from crazyem.diagnosis.naming.beginnings import KEPT, best_begun, larger, peaks
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -99,6 +100,19 @@ def test_a_load_that_is_followed_only_by_one_as_heavy_is_begun_with_its_mass(lin
         started = begun.started(point, [0.002, 0.0])
         assert started["mass"] == 0.002
         assert started["length"] == dict(begun.begin)["length"]
+
+
+@pytest.mark.parametrize("chaotic", [False, True])
+def test_where_a_flight_drives_loads_astray_the_likeliest_is_begun_with_alone(monkeypatch, chaotic):
+    data = Data([flight_of(fly(Hidden(load=(0.0015, 0.5)), seconds=10.0), DRONE)])
+    point = refine_base(data, nominal(data, POINT), ()).point
+    data.models[0]._strays["suspended_load"] = chaotic
+    family = variants(LOAD, point, data.signals)
+    likeliest = replace(family[7], begin=(*family[7].begin, ("mass", 0.004)))
+    monkeypatch.setattr(beginnings, "larger", lambda data, point, family, best: likeliest)
+    begun = best_begun(data, point, (), family)
+    assert (begun == [likeliest]) == chaotic
+    assert chaotic or set(begun) <= set(family)
 
 
 @pytest.mark.parametrize(("shaken", "chaotic"), [(0.0, False), (0.6, True)])  # m/s

@@ -21,7 +21,7 @@ from crazyem.vehicle import GRAVITY, Vehicle
 DELAY_SD = {False: 2e-3, True: 5e-3}  # s, by whether rotor speeds are measured
 INERTIA_SD = np.array([0.02, 0.02, 0.04])  # relative
 LAG_SD = 2e-3  # s: with nothing hidden and torques as free, 51 to 55 ms instead of 50 in ten flights
-# s: fits find the rotors' lag off all the same: in sixteen more flights with nothing hidden 47 to 55 ms, 2.9 ms (rms),
+# s: fits find the rotors' lag off all the same: in sixteen more flights with nothing hidden 47 to 55 ms, 3.1 ms (rms),
 # with inertias 3 % too small for each ms too long where the drone turns little.
 LAG_OFF = 3e-3
 # Relative, about z: rotors that are heavy answer with torque at once, without the lag that hides what sampled commands

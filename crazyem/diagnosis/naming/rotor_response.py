@@ -40,7 +40,7 @@ EXPLAINED = 0.8  # share of the commands' variance
 # other is down; counted a little wider.
 LAG_BIAS, PUNCTUAL = 0.97, -0.7e-3
 LAG_SD, DELAY_SD, TOGETHER = 0.045, 1e-3, -0.5  # relative; s; correlation
-# Power of what a rotor leaves over that of the middle one of the others, in every recording that tells: up to 1.3 in 13
+# Power of what a rotor leaves over that of the middle one of the others, in every recording that tells: up to 1.2 in 13
 # simulated drones, 5.5 and more in ten flights of five with a rotor that sticks within 1.4 to 5 % of full command.
 DISOBEYS = 3.0
 INDEPENDENT = 10.0  # samples that say what one does
