@@ -54,6 +54,10 @@ def test_a_tilted_accelerometer_is_measured_and_an_upright_one_is_not_accused(re
         assert np.all(np.abs(solution.theta[:2] - true) < 4 * sd)
         assert np.all(sd < 2e-3)
         assert (solution.p_value < 1e-6) == (flown is turned)
+        # thrust along z does not show the yaw: a board's few degrees, not what the residuals' scatter makes of it
+        yaw, unsure = solution.theta[2], np.sqrt(solution.covariance[2, 2])
+        assert abs(yaw) < 2 * unsure
+        assert 0.02 < unsure < 1.01 * accelerometer.UNSEEN_SD
 
 
 def test_a_yaw_that_was_not_seen_does_not_cost_what_the_tilt_brings(recording):

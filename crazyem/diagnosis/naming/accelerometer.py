@@ -21,7 +21,7 @@ ANGLES = ("roll", "pitch", "yaw")
 STEP = 1e-3  # rad
 BIAS_SD = 0.03  # m/s^2: what is left of a bias that the firmware removes at rest
 LAG_SD = 0.02  # s
-UNSEEN_SD = 0.5  # rad, prior of the yaw: thrust along body z does not show it
+UNSEEN_SD = 0.1  # rad, prior of the yaw: thrust along body z does not show it; boards are glued within degrees
 LEAST = 3e-3  # rad
 
 
