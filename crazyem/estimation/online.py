@@ -44,7 +44,7 @@ MOVED_SD, MOVED, MOVED_FAR = 0.5, 0.02, 0.1
 # No drone is faster, further or stronger (SI): a sample beyond is an error of transmission, used as missing.
 SANE = {
     "position": 1e4, "velocity": 1e2, "attitude": 2.0, "body_rate": 2e2,
-    "motor_command": 1.5, "rotor_speed": 1e5, "wrench_command": 1e3,
+    "motor_command": 1.5, "rotor_speed": 8e3, "wrench_command": 1e3,
     "specific_force": 1e3,
 }  # fmt: skip
 

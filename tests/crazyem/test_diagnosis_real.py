@@ -71,6 +71,31 @@ def test_the_delay_of_rotor_speeds_is_found_whatever_its_sign(delay: float, seed
     assert alignment.running[-1] == pytest.approx(delay, abs=2e-3)
 
 
+def spoilt(recording: Recording, name: str, value: NDArray) -> Recording:
+    array = recording.signals[name]
+    return replace(recording, signals={**recording.signals, name: replace(array, value=value)})
+
+
+def test_speeds_that_no_rotor_has_are_errors_of_transmission() -> None:
+    """One sample of a million rpm is 400 N, and outweighs the flight."""
+    sound = shaken(delay=0.02)
+    speed = sound.signals["rotor_speed"].value.copy()
+    speed[700, 3], speed[900, 0] = 104720.0, 33036.0
+    assert found(spoilt(sound, "rotor_speed", speed)).delay == pytest.approx(found(sound).delay, abs=2e-4)
+
+
+def test_a_blow_is_no_answer_to_the_rotors() -> None:
+    """A drone that is thrown about at its landing, thrice by 30 rad/s within some hundredths of a second: nine
+    tenths of its acceleration are nothing that rotors do."""
+    sound = shaken(delay=-0.03)
+    rate = sound.signals["body_rate"].value.copy()
+    for begin in (-120, -111, -102):
+        rate[begin : begin + 4, :2] += np.array([[-16.0, 13.0], [32.0, 27.0], [-11.0, 2.0], [0.0, -7.0]])
+    hit = found(spoilt(sound, "body_rate", rate))
+    assert hit.delay == pytest.approx(found(sound).delay, abs=5e-4)
+    assert hit.running[-1] == pytest.approx(hit.delay, abs=2e-3)
+
+
 def test_without_a_relation_nothing_is_said() -> None:
     inputs = inputs_of(shaken(delay=0.01, related=False), VEHICLE)
     assert inputs.alignment is None
@@ -178,7 +203,9 @@ def test_vibration_is_what_is_faster_than_motion() -> None:
 # -- real recordings ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("run", ["raw/square_run1", "raw/square_run2", "processed/square_run4"])
+@pytest.mark.parametrize(
+    "run", ["raw/square_run1", "raw/square_run2", "raw/chirp_run1", "raw/chirp_run4", "processed/square_run4"]
+)
 def test_roll_and_pitch_agree_on_the_delay_of_a_real_run(shared_recordings, run: str) -> None:
     alignment = found(open_recording(shared_recordings / "nanodrone" / f"{run}.csv.gz"))
     assert abs(alignment.roll - alignment.pitch) < 2e-3

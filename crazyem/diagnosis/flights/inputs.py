@@ -27,8 +27,8 @@ _SAMPLED = ("motor_command", "motor_request", "mixer_command")
 FULL = 65535.0  # counts of PWM
 STAND_IN = 0.01  # m, arm and torque per thrust of a vehicle without rotors; cancels
 
-# No signal of a drone is larger (SI): a sample beyond is an error of transmission.
-_SANE = {"motor_command": 1.5, "motor_request": 1.5, "rotor_speed": 1e5, "wrench_command": 1e3, "mixer_command": 1e6}
+# No signal of a drone is larger (SI; the fastest rotors reach 6e3 rad/s): a sample beyond is an error of transmission.
+_SANE = {"motor_command": 1.5, "motor_request": 1.5, "rotor_speed": 8e3, "wrench_command": 1e3, "mixer_command": 1e6}
 
 # Thrust asked for -> motor volts, in the battery compensation of crazyflie-firmware until 2022-11 (motors.c): grams of
 # thrust of all four motors, then a parabola.
