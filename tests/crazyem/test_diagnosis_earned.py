@@ -22,6 +22,7 @@ from crazyem.diagnosis.prediction.earned import (
     Weights,
     earned,
     regressed,
+    remembered,
 )
 from crazyem.diagnosis.prediction.predict import _at_start, predict, recorded
 from crazyem.recordings import open_recording
@@ -118,9 +119,10 @@ def test_what_is_known_at_a_start() -> None:
     turned = Rotation.from_euler("ZYX", [[0.0, 0.0, 0.0], [1.0, 0.0, 0.2], [2.0, 0.3, 0.0], [0.5, 0.0, 0.0]])
     along = np.array([[1.0, 2.0, 3.0]] * 4)  # m/s, body
     rate = np.array([[0.0, 0.0, 0.0], [0.1, 0.2, 0.3], [0.1, 0.5, 0.3], [0.4, 0.5, 0.3]])
-    state = np.concatenate([np.zeros((4, 3)), turned.apply(along), turned.as_quat(), rate], axis=1)
+    place = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 1.0], [2.0, 1.0, 1.0], [0.0, 4.0, 1.0]])
+    state = np.concatenate([place, turned.apply(along), turned.as_quat(), rate], axis=1)
     gained = np.array([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [9.0, 9.0, 9.0], [0.0, 0.0, 0.0]])
-    shown = SimpleNamespace(state=state, time=np.array([0.0, 0.01, 0.03, 0.04]))
+    shown = SimpleNamespace(state=state, time=np.array([0.0, 0.01, 0.03, 0.04]), period=0.01)
     start = _at_start(shown, gained, np.array([True, True, False, False]))  # type: ignore[arg-type]
     assert start[:, :, 0] == pytest.approx(  # in the step that ends there, of those that count
         np.array([[0, 0, 0], [0, 20, 30], [0, 10, 0], [0, 0, 0]], float), abs=1e-9
@@ -129,6 +131,24 @@ def test_what_is_known_at_a_start() -> None:
     leaning = [[0, 0, 0], [np.sin(0.2), 0, 0], [0, np.sin(0.3), 0], [0, 0, 0]]
     assert start[:, :, 2] == pytest.approx(np.array(leaning), abs=1e-9)
     assert start[:, :, 3] == pytest.approx(np.array([[2.0, -1.0, 0.0]] * 4), abs=1e-9)
+    assert start[:, :, 4] == pytest.approx(np.array([[6.0, -3.0, 0.0]] * 4), abs=1e-9)
+    # where it has flown to is the second and third place; what is 10 ms older counts a thousandth less
+    weight = np.exp(-0.01 / MEMORY)
+    mean = [place[0], place[1], *[(weight * place[1] + place[2]) / (weight + 1.0)] * 2]
+    away = turned.inv().apply(place - np.array(mean))
+    assert start[:, :, 5] == pytest.approx(np.column_stack([away[:, 1], -away[:, 0], np.zeros(4)]), abs=1e-9)
+
+
+def test_a_mean_of_what_counts_so_far_is_that_of_a_plain_loop() -> None:
+    draw = np.random.default_rng(7)
+    value, counts = draw.standard_normal((300, 3)), draw.random(300) < 0.6
+    counts[:20], value[50] = False, np.nan
+    found = remembered(value, counts, STEP)
+    for row in (0, 19, 120, 299):
+        use = np.flatnonzero(counts[: row + 1] & np.isfinite(value[: row + 1, 0]))
+        weight = np.exp(-(row - use) * STEP / MEMORY)
+        wanted = weight @ value[use] / weight.sum() if use.size else value[row]
+        assert found[row] == pytest.approx(wanted, rel=1e-9)
 
 
 def test_what_is_flown_after_a_start_changes_no_prediction_from_it() -> None:

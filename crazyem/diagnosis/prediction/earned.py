@@ -9,7 +9,8 @@ on h itself (a steady torque that the model lacks), and on what is known at the 
 knows come and go with what the drone does, and the loop takes rates, tilts and velocities back to what it wants,
 
     change that came = weight(h) * change by the model + offset(h) * h + feedback(h) . start,
-    start = (angular acceleration that the model lacked in the last step, rate, tilt and velocity across the axis),
+    start = (angular acceleration that the model lacked in the last step, rate, and across the axis tilt, velocity,
+             velocity times the flow along the rotors' axis, and how far the drone is from where it was on average),
 
 over the flight so far, never what comes after a start; what is older than `MEMORY` counts less. While little has been
 seen, everything is drawn towards the model itself: weight 1, the rest 0. The force, in body axes, is a battery or a
@@ -25,7 +26,8 @@ from scipy.signal import lfilter
 LAGS = 10  # of them up to the horizon
 MEMORY = 10.0  # s
 WEIGHT_SD, OFFSET_SD = 1.0, 2.0  # 1, rad/s^2: before anything was seen
-FEEDBACK_SD = (1.0, 2.0, 10.0, 2.0)  # 1/s, 1/s, rad/s^2 per rad and per m/s: times h, of what is known at the start
+# 1/s, 1/s, rad/s^2 per rad, per m/s, per (m/s)^2 and per m: times h, of what is known at the start
+FEEDBACK_SD = (1.0, 2.0, 10.0, 2.0, 1.0, 1.0)
 FORCE_SD, CORRELATED = 0.5, 0.1  # m/s^2 before anything was seen; s within which one moment is as wrong as the next
 MOST = 2.0  # weight; of a model that is right it is 1
 LEAST_TIME = 2.0  # s of flight before anything is said of the turning,
@@ -163,3 +165,13 @@ def lacked(turned: Turned, starts: NDArray) -> NDArray:
     known = (at + 1) * turned.period > FORCE_TIME
     found[known] = mean[at[known]]
     return found
+
+
+def remembered(value: NDArray, counting: NDArray, period: float) -> NDArray:
+    """(r, k): mean of the rows (r, k) up to each of those that count (r,), what is older than `MEMORY` counting less;
+    before any the row itself."""
+    counts = counting & np.isfinite(value).all(1)
+    forget = np.exp(-period / MEMORY)
+    count = lfilter([1.0], [1.0, -forget], counts.astype(float))
+    total = lfilter([1.0], [1.0, -forget], np.where(counts[:, None], value, 0.0), axis=0)
+    return np.where(count[:, None] > 0.0, total / np.maximum(count, 1e-300)[:, None], value)

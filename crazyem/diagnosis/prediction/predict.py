@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.inputs import Inputs, inputs_of
 from crazyem.diagnosis.flights.level import LOOKS
-from crazyem.diagnosis.prediction.earned import Turned, earned
+from crazyem.diagnosis.prediction.earned import Turned, earned, remembered
 from crazyem.diagnosis.prediction.simulate import Simulator
 from crazyem.doctor.kinematics import quaternion_of_euler
 from crazyem.doctor.streams import airtime, inside, ordered
@@ -247,12 +247,17 @@ def turned_by(shown: Recorded) -> Turned:
 
 
 def _at_start(shown: Recorded, gained: NDArray, flying: NDArray) -> NDArray:
-    """(r, 3, 4) what is known at every row, by axis: the angular acceleration that the model lacked in the step that
-    ends there, the rate, and how far the body leans and how fast it moves across the axis (about z: 0)."""
+    """(r, 3, 6) what is known at every row, by axis: the angular acceleration that the model lacked in the step that
+    ends there, the rate, and across the axis (about z: 0) how far the body leans, how fast it moves, that times the
+    flow along the rotors' axis, and how far it is from where it was on average so far."""
     rotation = rotation_matrix(shown.state[:, 6:10])
     rate, velocity = shown.state[:, 10:13], np.einsum("nji,nj->ni", rotation, shown.state[:, 3:6])
-    up = rotation[:, 2]
-    across = [np.column_stack([v[:, 1], -v[:, 0], np.zeros(len(v))]) for v in (up, velocity)]
+    place, arrived = shown.state[:, :3], np.concatenate([[False], flying[:-1]])
+    away = np.einsum("nji,nj->ni", rotation, place - remembered(place, arrived, shown.period))
+    across = [
+        np.column_stack([v[:, 1], -v[:, 0], np.zeros(len(v))])
+        for v in (rotation[:, 2], velocity, velocity * velocity[:, 2:], away)
+    ]
     lacked = np.zeros_like(rate)
     step = np.diff(shown.time)[:, None]
     lacked[1:] = np.where(flying[:-1, None], (np.diff(rate, axis=0) - gained[:-1]) / step, 0.0)
