@@ -46,6 +46,22 @@ def test_a_heading_that_goes_with_x_is_found_with_its_size(flights) -> None:
     assert heading_by_place(one, None) is not None
 
 
+def hovering(recording: Recording) -> Recording:
+    """As if it had stayed within a hundredth of its way."""
+    place = recording.signals["position"]
+    near = array_of("position", place.time, 0.01 * place.value + [0.1, 0.2, 1.0], place=97)
+    return replace(recording, signals={**recording.signals, "position": near})
+
+
+def test_it_is_found_on_a_flight_held_out_where_the_one_fitted_hovers(flights) -> None:
+    calm, there = data_of(hovering(flights[0])), data_of(magnetic(flights[1], 0.1))
+    found, same = heading_by_place(calm, there), heading_by_place(there, calm)
+    assert found is not None
+    assert found == same
+    assert found.regime == "x position"
+    assert heading_by_place(calm, data_of(flights[1])) is None
+
+
 def test_what_is_not_so_on_the_other_flight_is_not_named(flights) -> None:
     assert heading_by_place(data_of(magnetic(flights[0], 0.1)), data_of(magnetic(flights[1], -0.1))) is None
 

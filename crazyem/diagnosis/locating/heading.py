@@ -23,6 +23,7 @@ from crazyem.physics.rotations import (
 
 WINDOW = 0.05  # s, between the attitudes that are compared
 NATS, HELD = 15.0, 5.0  # that it must gain on the flights fitted, and on those held out; healthy flights: 5 at most
+SHARE = 0.1  # of that gain, that other flights must be expected to show before they are asked
 SMALLEST = 5e-3  # rad, standard deviation along the flight
 FEWEST = 100  # windows
 WAVES = (4.0, 2.0, 1.3, 1.0, 0.8)  # m, wavelengths: bounded where the other flight goes further
@@ -40,24 +41,36 @@ class _Turns:
 def heading_by_place(data: Data, apart: Data | None) -> Finding | None:
     """The error of the heading as a finding, where it depends on place on all flights alike; None if not.
 
-    Without flights held out, or where they hardly move, every other second is.
+    Nothing of it is fitted to be kept, so flights held out may show it, too: where those fitted hover, they do not.
     """
     if not {"position", "attitude", "body_rate"} <= data.signals:
         return None
-    fitted = [t for t in (_turns(f) for f in data.flights) if t is not None]
-    others = None if apart is None else [t for t in (_turns(f) for f in apart.flights) if t is not None]
-    if not fitted or others == []:
+    fitted, others = _seen(data), None if apart is None else _seen(apart)
+    if fitted is None or apart is None:
+        return None if fitted is None else _told(fitted, None, data)
+    if others is None:
         return None
-    every = _joined(fitted)
+    return _told(fitted, others, data) or _told(others, fitted, apart)
+
+
+def _seen(data: Data) -> _Turns | None:
+    """Turns of all flights; None where none has any."""
+    turns = [t for t in (_turns(f) for f in data.flights) if t is not None]
+    return _Turns(*(np.concatenate([getattr(t, n) for t in turns]) for n in _Turns.__annotations__)) if turns else None
+
+
+def _told(every: _Turns, other: _Turns | None, data: Data) -> Finding | None:
+    """What flights show, where others do as well; where there are none or they hardly move, every other second of
+    those that show it."""
     middle = np.median(every.place, axis=0)
     shapes = _shapes(every, middle)
     theta = _least(shapes, every)
-    x = _without(every.usual, shapes)
-    gained = _nats(shapes, every, theta) - _used(x)
-    other = None if others is None else _joined(others)
-    if other is not None and _expected(_shapes(other, middle), other, theta) > 2 * HELD:
-        held = _nats(_shapes(other, middle), other, theta)
-    else:  # none, or one that hardly moves
+    gained = _nats(shapes, every, theta) - _used(_without(every.usual, shapes))
+    asked = None if other is None else _shapes(other, middle)
+    # a hover has biases of its own, by which it speaks against a tenth of what a flight shows that goes somewhere
+    if other is not None and asked is not None and _expected(asked, other, theta) > max(2 * HELD, SHARE * gained):
+        held = _nats(asked, other, theta)
+    else:
         second = (np.arange(len(shapes)) * WINDOW).astype(int) % 2 == 0
         one, two = (_Turns(*(getattr(every, n)[s] for n in _Turns.__annotations__)) for s in (second, ~second))
         held = _nats(shapes[~second], two, _least(shapes[second], one))
@@ -96,10 +109,6 @@ def _turns(flight: Flight) -> _Turns | None:
     shown = angle[last] - angle[first]
     usual = np.column_stack([time[last] - time[first], shown, rate[last] - rate[first], shown[:, 2] ** 2])
     return _Turns(turn[:, 2] - shown[:, 2], usual, y[last, :3], y[first, :3])
-
-
-def _joined(turns: list[_Turns]) -> _Turns:
-    return _Turns(*(np.concatenate([getattr(t, n) for t in turns]) for n in _Turns.__annotations__))
 
 
 def _waves(place: NDArray) -> NDArray:
