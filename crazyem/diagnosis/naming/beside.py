@@ -65,7 +65,7 @@ def beside_the_regression(
             wald = float(stats.f.sf(np.sum((angles / sd)[:2] ** 2) / 2, 2, max(len(gram.score) - 7, 3)))
             held = accelerometer.held_out_gain(apart or data, point, angles, yaw_sd=float(sd[2]))
             sure = max(solution.p_value, wald) < SURE and held > ADMITTED
-            if sure and np.abs(angles).max() > accelerometer.LEAST:
+            if sure and np.abs(angles[:2]).max() > accelerometer.LEAST:
                 values = {n: Value(float(a), "rad", float(e), around(float(a), float(e)))
                           for n, a, e in zip(accelerometer.ANGLES, angles, sd, strict=True)}  # fmt: skip
                 found.append(Named(accelerometer.EFFECT, accelerometer.EFFECT, values, {}, held, wald,
