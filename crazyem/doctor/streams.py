@@ -235,7 +235,8 @@ SHORTEST_FLIGHT = 0.4  # s of lift; less is a hop or a test of the rotors
 LONGEST_FALL = 0.6  # s without lift that a manoeuvre may have
 LIFTED, CLEAR = 0.03, 0.1  # m above the ground: in the air; and surely so,
 BOUNCE = 0.25  # or this share of the greatest height: a hard landing throws a drone up by 0.12 m, from 1 m
-_POSSIBLE = {"rotor_speed": 8000.0, "motor_command": 1.5, "motor_request": 1.5}
+# No signal of a drone is larger (SI; the fastest rotors reach 6e3 rad/s): a sample beyond is an error of transmission.
+POSSIBLE = {"rotor_speed": 8000.0, "motor_command": 1.5, "motor_request": 1.5}
 _RAW_MOTORS = ("motor.m1", "motor.m2", "motor.m3", "motor.m4")
 _LIFT_SIGNALS = ("motor_command", "motor_request", "rotor_speed", "wrench_command", "mixer_command")
 
@@ -303,7 +304,7 @@ def _from_rotors(
     value: NDArray[np.float64],
     height: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
 ) -> Airtime:
-    possible = np.abs(value).max(axis=1) <= _POSSIBLE.get(name, math.inf)
+    possible = np.abs(value).max(axis=1) <= POSSIBLE.get(name, math.inf)
     if possible.sum() > 10:  # a wild sample is no flight
         time, value = time[possible], value[possible]
     thrust = value[:, 0] if name in ("wrench_command", "mixer_command") else value.mean(axis=1)

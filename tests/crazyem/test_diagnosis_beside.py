@@ -52,12 +52,25 @@ def test_a_tilted_accelerometer_is_measured_and_an_upright_one_is_not_accused(re
         solution, _ = accelerometer.tilt(*fitted(flown))
         sd = np.sqrt(np.diag(solution.covariance)[:2])
         assert np.all(np.abs(solution.theta[:2] - true) < 4 * sd)
-        assert np.all(sd < 2e-3)
+        assert np.all((sd > accelerometer.BESIDE_SCATTER) & (sd < 2e-3))
         assert (solution.p_value < 1e-6) == (flown is turned)
         # thrust along z does not show the yaw: a board's few degrees, not what the residuals' scatter makes of it
         yaw, unsure = solution.theta[2], np.sqrt(solution.covariance[2, 2])
         assert abs(yaw) < 2 * unsure
         assert 0.02 < unsure < 1.01 * accelerometer.UNSEEN_SD
+
+
+@pytest.mark.parametrize(("roll", "told"), [(2e-3, False), (5e-3, True)])
+def test_a_yaw_that_nothing_shows_is_no_tilt(recording, monkeypatch, roll, told):
+    data, point = fitted(recording)
+    solution, gram = accelerometer.tilt(data, point)
+    tilted = replace(solution, theta=np.array([roll, 0.0, 0.08, *np.zeros(4)]), p_value=1e-9,
+                     covariance=np.diag([1e-8, 1e-8, 1e-2, *np.ones(4)]))  # fmt: skip
+    monkeypatch.setattr(accelerometer, "tilt", lambda data, point: (tilted, gram))
+    monkeypatch.setattr(accelerometer, "held_out_gain", lambda *given, **more: 50.0)
+    remains = Unexplained((), 0.0)
+    found = beside_the_regression(data, None, point, remains, [accelerometer.EFFECT], {}, False, lambda text: None)
+    assert [f.name for f in found] == [accelerometer.EFFECT] * told
 
 
 def test_a_yaw_that_was_not_seen_does_not_cost_what_the_tilt_brings(recording):

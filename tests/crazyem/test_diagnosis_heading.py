@@ -46,10 +46,10 @@ def test_a_heading_that_goes_with_x_is_found_with_its_size(flights) -> None:
     assert heading_by_place(one, None) is not None
 
 
-def hovering(recording: Recording) -> Recording:
-    """As if it had stayed within a hundredth of its way."""
+def hovering(recording: Recording, share: float = 0.01) -> Recording:
+    """As if it had gone no more than this share of its way."""
     place = recording.signals["position"]
-    near = array_of("position", place.time, 0.01 * place.value + [0.1, 0.2, 1.0], place=97)
+    near = array_of("position", place.time, share * place.value + [0.1, 0.2, 1.0], place=97)
     return replace(recording, signals={**recording.signals, "position": near})
 
 
@@ -60,6 +60,12 @@ def test_it_is_found_on_a_flight_held_out_where_the_one_fitted_hovers(flights) -
     assert found == same
     assert found.regime == "x position"
     assert heading_by_place(calm, data_of(flights[1])) is None
+
+
+@pytest.mark.parametrize(("share", "heard"), [(0.2, False), (0.3, True)])  # 31 and 64 nats expected of 514
+def test_a_flight_that_shows_little_of_it_does_not_speak_against_it(flights, share, heard) -> None:
+    there, elsewhere = data_of(magnetic(flights[1], 0.1)), data_of(hovering(flights[0], share))
+    assert (heading_by_place(there, elsewhere) is None) == heard
 
 
 def test_what_is_not_so_on_the_other_flight_is_not_named(flights) -> None:

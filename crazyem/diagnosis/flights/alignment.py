@@ -5,7 +5,7 @@ either sign. It is no property of the drone, so it belongs to no vehicle file; b
 back at some hertz do not fit any rigid body. It is found where the torque of the rotors explains most of the angular
 acceleration, with rate and velocity beside it (damping, flapping) so that the loop around them is not taken for a
 delay, in a band in which the drone shakes and sensors are not noise alone. Roll and pitch are judged apart: they share
-the clock, so they must agree.
+the clock, so they must agree. A block in which something hit the drone says nothing of its rotors, and is left out.
 
 Sums are kept by blocks of flight, so that a prediction can use what was known when it starts and no more.
 """

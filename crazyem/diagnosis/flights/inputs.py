@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.alignment import Alignment, align
 from crazyem.diagnosis.flights.level import Level, level_of
-from crazyem.doctor.streams import Airtime, airtime, ordered
+from crazyem.doctor.streams import POSSIBLE, Airtime, airtime, ordered
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
 from crazyem.physics.rotors import thrust_from_command, thrust_from_speed, wrench
@@ -27,8 +27,7 @@ _SAMPLED = ("motor_command", "motor_request", "mixer_command")
 FULL = 65535.0  # counts of PWM
 STAND_IN = 0.01  # m, arm and torque per thrust of a vehicle without rotors; cancels
 
-# No signal of a drone is larger (SI; the fastest rotors reach 6e3 rad/s): a sample beyond is an error of transmission.
-_SANE = {"motor_command": 1.5, "motor_request": 1.5, "rotor_speed": 8e3, "wrench_command": 1e3, "mixer_command": 1e6}
+_SANE = {**POSSIBLE, "wrench_command": 1e3, "mixer_command": 1e6}  # as `POSSIBLE`, SI and counts
 
 # Thrust asked for -> motor volts, in the battery compensation of crazyflie-firmware until 2022-11 (motors.c): grams of
 # thrust of all four motors, then a parabola.

@@ -6,7 +6,8 @@ a torque that no model knows. Over some tenths of a second the model's net torqu
 rate that stays as it is the better prediction; in hard manoeuvres the model is. Which of them is a matter of record:
 for every time ahead h and each axis, the change of the rate that came is regressed on the change that the model gave,
 on h itself (a steady torque that the model lacks), and on what is known at the start, since torques that no model
-knows come and go with what the drone does, and the loop takes rates, tilts and velocities back to what it wants,
+knows come and go with what the drone does, and the loop takes rates, tilts, velocities and places back to what it
+wants,
 
     change that came = weight(h) * change by the model + offset(h) * h + feedback(h) . start,
     start = (angular acceleration that the model lacked in the last step, rate, and across the axis tilt, velocity,
