@@ -19,6 +19,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from types import TracebackType
 
 
 class Collector(logging.Handler):
@@ -33,9 +34,9 @@ class Collector(logging.Handler):
         if record.levelno >= logging.ERROR or record.exc_info:
             self.troubles.append(f"logged by {record.name}: {record.getMessage()}")
 
-    def raised(self, kind: type, value: BaseException, trace: object) -> None:
+    def raised(self, kind: type[BaseException], value: BaseException | None, trace: TracebackType | None) -> None:
         """Collect an uncaught exception."""
-        self.troubles.append("".join(traceback.format_exception(kind, value, trace)))  # type: ignore[arg-type]
+        self.troubles.append("".join(traceback.format_exception(kind, value, trace)))
 
 
 def main() -> int:

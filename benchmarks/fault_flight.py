@@ -257,7 +257,9 @@ class NoGuard:
 class Listening(Engine):
     """A relay's engine that keeps every parameter write that passed upwards: what really left for the drone."""
 
-    written: set[bytes] = set()  # noqa: RUF012
+    def __init__(self, seed: int) -> None:
+        super().__init__((), seed)
+        self.written: set[bytes] = set()
 
     def take(self, now: float, route: Any, direction: str, datagram: bytes) -> None:
         if direction == UP and datagram and datagram[0] & 0xF3 == 0x22 and len(datagram) == 7:
@@ -296,8 +298,7 @@ def fly(seed: int, arm: str, folder: Path, *, speed: float) -> Result:
     vehicle = load_vehicle("cf2")
     warm_up(vehicle)
     faults = [_fault(f, speed) for f in case.link]
-    engine = Listening((), seed)
-    engine.written = set()
+    engine = Listening(seed)
     with contextlib.ExitStack() as stack:
         pace = Pace(speed)
         address = stack.enter_context(simulator(scenario, seed=seed, truth=truth, pace=pace))

@@ -77,8 +77,7 @@ def test_what_is_a_crash(benches, tmp_path, states, says):
 
 def test_a_write_that_is_not_in_the_recording_is_noticed(benches, tmp_path):
     _, flight = benches
-    engine = flight.Listening((), 0)
-    engine.written = set()
+    engine = flight.Listening(0)
     for value in (0.03, 0.031):
         engine.take(0.0, "a", UP, bytes([0x2E]) + struct.pack("<Hf", 7, value))
     engine.take(0.0, "a", UP, bytes([0x2D]) + struct.pack("<H", 7))  # a read
