@@ -92,6 +92,24 @@ def test_what_none_explains_is_said() -> None:
     assert "none of the known effects explains it" in verdict({"mismatch": True, "effects": []})
 
 
+@pytest.mark.parametrize(
+    ("confidences", "groups", "sentence"),
+    [
+        ((0.01,), [], "differ, and none of the known effects explains it; nearest: linear drag (1 % sure)."),
+        ((0.95, 0.01), [], "The model lacks linear drag (95 % sure), and something else, of which the nearest is wind"),
+        ((0.01,), [["linear_drag", "wind"]], "The model lacks linear drag (or wind, which this flight cannot tell"),
+        ((0.1,), [], "The model lacks linear drag (10 % sure)."),
+    ],
+)
+def test_what_is_improbable_is_not_said_to_be_lacking(
+    confidences: tuple[float, ...], groups: list[list[str]], sentence: str
+) -> None:
+    """A name that hardly explains anything is the nearest, not the answer; one of a group may be any of it."""
+    names = ("linear_drag", "wind")
+    effects = [{"name": n, "confidence": c} for n, c in zip(names, confidences, strict=False)]
+    assert sentence in verdict({"mismatch": True, "effects": effects, "indistinguishable": groups})
+
+
 def test_a_simulated_flight_is_compared_signal_by_signal() -> None:
     signals = {"body_rate": {"rms": 0.1234, "unit": "rad/s", "largest": 1.5}}
     against = {"simulated": "sim.mcap", "seconds": 12.0, "signals": signals}
