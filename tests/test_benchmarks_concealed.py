@@ -220,7 +220,8 @@ def test_figures_of_made_up_answers_are_those_counted_by_hand() -> None:
     assert f["pairs"]["each_known"] == 2
     assert f["pairs"]["up_to_declared_groups"] == {"n": 3, "share": pytest.approx(2 / 3)}
     assert f["outside"]["wrong_confident_name"] == {"n": 2, "share": 0.5}
-    assert f["held_out"] == {"within_10_percent_of_true_model": {"n": 2, "share": 0.5}, "median_ratio": 1.5}
+    within = {"n": 2, "share": 0.5}
+    assert f["held_out"] == {"within_10_percent_of_true_model": within, "median_ratio": 1.5, "mean_ratio": 1.5}
     # claims: 0.7 wrong, 0.96 right four times, 0.6 right (declared alike), 0.9 right, 0.95 wrong
     assert f["confidence"]["n"] == 8
     brier = (0.7**2 + 4 * 0.04**2 + 0.4**2 + 0.1**2 + 0.95**2) / 8

@@ -176,6 +176,7 @@ def _held_out(cases: Iterable[Outcome]) -> dict[str, Any]:
     return {
         "within_10_percent_of_true_model": _share([float(r <= WITHIN) for r in ratios]),
         "median_ratio": float(np.median(ratios)) if ratios else None,
+        "mean_ratio": float(np.mean(ratios)) if ratios else None,
     }
 
 
