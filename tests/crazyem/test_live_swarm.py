@@ -83,7 +83,8 @@ def test_what_happens_to_one_drone_does_not_stop_the_others(fake):
     fake["fake://0"].lost_at = 9000
     fake["fake://1"] = LinkError("nothing answers at fake://1")
     fake["fake://3"].controllers = (1,)
-    code, said = flown(*URIS, "--uri", "fake://3")
+    # long enough to be lost while it flies: four seconds may have landed by then on a busy machine
+    code, said = flown(*URIS, "--uri", "fake://3", "--duration", "12")
     lost, absent, good, refused = said["drones"]
     assert code == 4
     assert "was lost" in lost["error"]
