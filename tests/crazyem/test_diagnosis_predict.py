@@ -233,6 +233,33 @@ def test_a_prediction_is_of_what_the_sensors_would_show(name: str) -> None:
     assert np.abs(plain - expected).max() > 0.01
 
 
+def test_a_prediction_is_of_what_an_onboard_filter_makes_of_a_late_gyro() -> None:
+    """The filter runs at 1 kHz and is drawn back to the true attitude; the prediction knows nothing but its shape."""
+    late, back = 6, 0.04  # ms, s
+    thrust = smooth_thrust(7)
+    fine = np.arange(0.0, 1.2, 0.001)
+    states = fly(thrust, fine)
+    rate = states[np.maximum(np.arange(fine.size) - late, 0), 10:13]
+    true, held = Rotation.from_quat(states[:, 6:10]), Rotation.from_quat(states[0, 6:10])
+    made = []
+    for i in range(fine.size):
+        made.append(held.as_quat())
+        off = (true[i].inv() * held).as_rotvec()
+        held = held * Rotation.from_rotvec(0.001 * (rate[i] - off / back))
+    seen = states.copy()
+    seen[:, 6:10], seen[:, 10:13] = made, rate
+    seen = seen[::10]
+    recording = recording_of(TIMES, seen, rotor_speed=(fine, speeds(thrust, fine)))
+    drone = replace(DRONE, effects={"measurement_delay": {"delay": 1e-3 * late, "streams": ["gyro"]}})
+    errors = {}
+    for claimed in ("onboard", "apart"):
+        found = predicted(replace(recording, metadata={"claims": {"attitude": claimed}}), drone)
+        rows = found.start_index >= 30  # before, the filter still forgets how it began
+        wanted = along(seen, found.start_index[rows], 49)
+        errors[claimed] = angle(found.prediction[rows][:, :-1, 6:10], wanted[..., 6:10])
+    assert errors["onboard"] < 0.15 * errors["apart"]
+
+
 # -- causality ---------------------------------------------------------------------------------------------------------
 
 COMMANDED = replace(DRONE, thrust_curve=(0.0, 0.02, 0.005), rotor_constant=None, motor_time_constant=0.04)

@@ -46,7 +46,7 @@ def situation_of(
         body_rate=path[:, 10:13], specific_force=np.zeros((n, 3)), angular_acceleration=np.zeros((n, 3)),
         thrust=thrust, thrust_rate=rate, voltage=flight.voltage,
         rotor_constant=float("nan") if vehicle.rotor_constant is None else vehicle.rotor_constant,
-        air=np.zeros((n, 3)),
+        air=np.zeros((n, 3)), fused=flight.attitude is not None,
     )  # fmt: skip
 
 

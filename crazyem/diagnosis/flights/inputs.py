@@ -16,6 +16,7 @@ from crazyem.doctor.streams import POSSIBLE, Airtime, airtime, ordered
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
 from crazyem.physics.rotors import thrust_from_command, thrust_from_speed, wrench
+from crazyem.recordings.attitudes import onboard_attitude
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
@@ -48,6 +49,7 @@ class Inputs:
         took_off: when the drone first left the floor [s]; the first input where that is unknown.
         alignment: how late measured rotor speeds are behind the body rates, in this recording; None where unknown.
         level: the voltage that was taken, where none is recorded and the flight shows one; else None.
+        fused: whether a filter on board made the recorded attitude.
     """
 
     rotor: RotorInput
@@ -58,6 +60,7 @@ class Inputs:
     took_off: float
     alignment: Alignment | None = None
     level: Level | None = None
+    fused: bool = False
 
 
 def rotor_input(recording: Recording, vehicle: Vehicle) -> RotorInput:
@@ -110,7 +113,8 @@ def inputs_of(
         measured=name == "rotor_speed",
         delay=late,
     )
-    return Inputs(rotor, name, found.vehicle or vehicle, notices, ground, took_off, alignment, level)
+    fused = onboard_attitude(recording)
+    return Inputs(rotor, name, found.vehicle or vehicle, notices, ground, took_off, alignment, level, fused)
 
 
 @dataclass(frozen=True, eq=False)

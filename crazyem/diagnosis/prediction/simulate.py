@@ -15,8 +15,9 @@ from crazyem.diagnosis.flights.inputs import Inputs
 from crazyem.diagnosis.prediction.course import ThrustCourse
 from crazyem.diagnosis.prediction.earned import Weights
 from crazyem.physics.effects.effect import Effects, Situation
-from crazyem.physics.effects.measurement_delay import LONGEST_STEP
+from crazyem.physics.effects.fused_attitude import FORGOTTEN, leads_astray
 from crazyem.physics.effects.pendulum import swing_along, swing_on, watched_along
+from crazyem.physics.effects.stretches import LONGEST_STEP
 from crazyem.physics.motion import Motion, active, body_of, measured, motion
 from crazyem.physics.rotations import (
     quaternion_conjugate,
@@ -101,7 +102,9 @@ class Simulator:
         self._weights: Weights | None = None
         self._begun = np.zeros((0, 3))
         self._late: NDArray | float = 0.0  # s: what was not known of the delay at each start
-        self._looks_back = max((float(values.get("delay", 0.0)) for values in sensors), default=0.0)  # s
+        back = max((float(values.get("delay", 0.0)) for values in sensors), default=0.0)  # s
+        forgotten = FORGOTTEN if inputs.fused and any(leads_astray(values) for values in sensors) else 0.0
+        self._looks_back = back + forgotten
         values = {effect.name: found for effect, found in active(self.effects, self.vehicle)}
         load = values.get("suspended_load", {"mass": 0.0, "length": None})
         self._load: float = load["mass"]
@@ -271,6 +274,7 @@ class Simulator:
             rotor_constant=self._rotor_constant,
             air=zero,
             swing=body.swing,
+            fused=self.inputs.fused,
         )
 
     # what sensors show: a matter of the path, since some show the past

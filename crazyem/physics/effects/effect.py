@@ -90,6 +90,7 @@ class Situation:
         seen: (n, 3) m/s^2, body: specific force that the drone was seen to have in each step, NaN where it was not;
             None: not known. An effect may go by rows before its own only.
         unrest: (3,) m/s^2 sqrt(s): how much of it comes and goes at random.
+        fused: whether the attitude that is shown was made on board, from the gyro (`fused_attitude.py`).
     """
 
     time: NDArray
@@ -113,6 +114,7 @@ class Situation:
     turned: NDArray | None = None
     seen: NDArray | None = None
     unrest: NDArray | None = None
+    fused: bool = False
 
     @property
     def size(self) -> int:

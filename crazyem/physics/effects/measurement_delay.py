@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
+from crazyem.physics.effects.fused_attitude import led_astray
 from crazyem.physics.effects.rotation import rotation_between
+from crazyem.physics.effects.stretches import stretches
 
-LONGEST_STEP = 0.1  # s: across a longer one nothing is interpolated
 SHOWN = {  # which of position, velocity, attitude, rate, specific force a stream shows
     "state": ("position", "velocity", "attitude"),
     "pose": ("position", "attitude"),
@@ -21,7 +22,8 @@ def late(situation: Situation, *, delay: float, streams: str | Sequence[str]) ->
     """What was `delay` [s] ago, less what is now, for the streams "state", "pose", "gyro", "accelerometer".
 
     Interpolates between rows, which are one path broken where a step is 0 or longer than 0.1 s. Before the first row of
-    a stretch the drone moved and turned as in that row. Of a filter's rates differences over some ms are half the noise
+    a stretch the drone moved and turned as in that row. An attitude that was made on board of a late gyro is off where
+    the drone turns fast (`fused_attitude.py`). Of a filter's rates differences over some ms are half the noise
     of the gyro, that of the very sample which is to be explained; `Situation.turned` has none.
     """
     offset = Offset(np.zeros((situation.size, 12)), np.zeros((situation.size, 3)))
@@ -40,17 +42,10 @@ def late(situation: Situation, *, delay: float, streams: str | Sequence[str]) ->
     if "body_rate" in shown:
         rate = situation.body_rate if situation.turned is None else situation.turned
         offset.state[:, 9:12] = _past(rate, row, part) - rate
+        offset.state[:, 6:9] += led_astray(situation, offset.state[:, 9:12], delay=delay)
     if "specific_force" in shown:
         offset.specific_force[:] = _past(situation.specific_force, row, part) - situation.specific_force
     return offset
-
-
-def stretches(situation: Situation) -> tuple[NDArray, NDArray]:
-    """Where rows hang together: (n,) s from the row before to each row (0 at breaks), (n,) whether a break."""
-    gap = np.diff(situation.time, prepend=situation.time[:1])
-    broken = ~((situation.step > 0) & (situation.step <= LONGEST_STEP) & (gap > 0) & (gap <= LONGEST_STEP))
-    broken[:1] = True
-    return np.where(broken, 0.0, gap), broken
 
 
 def _looked_up(situation: Situation, delay: float) -> tuple[NDArray, NDArray, NDArray]:

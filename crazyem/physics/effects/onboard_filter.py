@@ -2,7 +2,8 @@
 
 A gyro is low-passed before it is logged (crazyflie-firmware, sensors_bmi088_bmp3xx.c: second order at 80 Hz, 2.8 ms),
 and so are the accelerations that carry an onboard estimate of velocity from one fix of the pose to the next; attitude
-and position, which the fixes show, are later by less. So rates are behind the attitude, velocities behind the position.
+and position, which the fixes show, are later by less. So rates are behind the attitude, velocities behind the position;
+and an attitude made on board of that gyro is off where the drone turns fast (`fused_attitude.py`).
 It belongs to the log and not to the drone: no vehicle file needs it, and diagnosis leaves it free
 (`crazyem/diagnosis/fitting/always.py`).
 """
@@ -10,6 +11,7 @@ It belongs to the log and not to the drone: no vehicle file needs it, and diagno
 import numpy as np
 
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
+from crazyem.physics.effects.fused_attitude import led_astray
 from crazyem.vehicle import GRAVITY
 
 
@@ -20,6 +22,7 @@ def filtered(situation: Situation, *, rate_lag: float, velocity_lag: float) -> O
     acceleration[:, 2] -= GRAVITY
     offset.state[:, 3:6] = -velocity_lag * acceleration
     offset.state[:, 9:12] = -rate_lag * situation.angular_acceleration
+    offset.state[:, 6:9] = led_astray(situation, offset.state[:, 9:12], delay=max(rate_lag, 0.0))
     return offset
 
 
