@@ -65,7 +65,7 @@ def test_so_does_the_low_pass_of_a_gyro_that_is_logged() -> None:
     wanted = solved(time, lambda t: shown(t) - rate(t))
     found = measured(situation, vehicle=CF2, effects={"onboard_filter": {"rate_lag": lag}}).state
     later = time > 0.25
-    np.testing.assert_allclose(found[later, 6:9], wanted[later], atol=0.1 * np.abs(wanted).max())
+    np.testing.assert_allclose(found[later, 6:9], wanted[later], atol=0.02 * np.abs(wanted).max())
 
 
 @settings(max_examples=30, deadline=None)
