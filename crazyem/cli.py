@@ -200,6 +200,9 @@ def _diagnose(commands: Any) -> None:
         "--held-out", nargs="+", action="extend", default=[], metavar="RECORDING", help="flights only to judge by"
     )
     p.add_argument(
+        "--strict-held-out", action="store_true", help="fit nothing to these even where the others only hover"
+    )
+    p.add_argument(
         "--withhold", action="append", default=[], metavar="SIGNAL", help="a signal to leave unused, e.g. pm.vbat"
     )
     p.add_argument("--candidates", metavar="A,B,...", help="effects to look for (default: the whole catalogue)")

@@ -38,8 +38,9 @@ def run(arguments: argparse.Namespace) -> int:
     vehicle = vehicle_of(recordings[0], arguments.vehicle)
     wanted = [n.strip() for n in (arguments.candidates or "").split(",") if n.strip()]
     found = diagnose(
-        recordings, vehicle, held_out=held_out, wanted=wanted, withhold=arguments.withhold, jobs=arguments.jobs, say=say
-    )
+        recordings, vehicle, held_out=held_out, wanted=wanted, withhold=arguments.withhold,
+        strict=arguments.strict_held_out, jobs=arguments.jobs, say=say,
+    )  # fmt: skip
     say("open-loop errors before and after")
     document, pictures = document_of(found, recordings, held_out, withhold=arguments.withhold)
     document["notices"] = [*(n for r in recordings for n in r.notices), *document["notices"]]

@@ -11,6 +11,7 @@ from crazyem.diagnosis.fitting.fit import nominal as nominal_of
 from crazyem.diagnosis.fitting.model import STRENGTH, Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.sampling import of_a_real_drone
+from crazyem.diagnosis.flights import roles
 from crazyem.diagnosis.flights.flight import Flight, flight_of
 from crazyem.diagnosis.flights.floor import on_one_floor
 from crazyem.diagnosis.flights.frame import alike as in_one_frame
@@ -43,7 +44,8 @@ WEAK_OR_MISREAD = ("rotor_fault", "rotor_sensor")
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All that was found; `document.py` turns it into JSON."""
+    """All that was found; `document.py` turns it into JSON. Where `swapped`, `recordings` are those that were held out
+    (see `flights/roles.py`)."""
 
     vehicle: Vehicle
     fitted_vehicle: Vehicle
@@ -60,6 +62,7 @@ class Diagnosis:
     left_out: dict[str, str]
     explained: float
     own: tuple[Own, ...]
+    swapped: bool = False
 
 
 def diagnose(
@@ -69,12 +72,15 @@ def diagnose(
     held_out: Sequence[Recording] = (),
     wanted: Sequence[str] = (),
     withhold: Sequence[str] = (),
+    strict: bool = False,
     jobs: int | None = 1,
     say: Say = lambda text: None,
 ) -> Diagnosis:
     """Which physics is missing from a vehicle's model, by its recordings.
 
     Args:
+        held_out: flights that confirm what is found; where the recordings only hover and these do not, it is the other
+            way round (`flights/roles.py`), unless `strict`.
         jobs: threads that share the candidates; None: one a core. The result is the same for any number.
 
     Raises:
@@ -83,6 +89,10 @@ def diagnose(
     """
     flights = [flight_of(r, vehicle, withhold=withhold) for r in recordings]
     kept_apart = [flight_of(r, vehicle, withhold=withhold) for r in held_out]
+    swapped = not strict and roles.swapped(flights, kept_apart)
+    if swapped:
+        flights, kept_apart, recordings, held_out = kept_apart, flights, held_out, recordings
+        say(roles.told([r.path for r in recordings], [r.path for r in held_out]))
     assumed = of_a_real_drone(flights, vehicle)
     untrimmed = assumed is not vehicle and not wanted  # its trim is looked for, too
     flights, kept_apart = differing(*in_one_frame(*on_one_floor(flights, kept_apart)), assumed)
@@ -148,7 +158,7 @@ def diagnose(
     return Diagnosis(
         vehicle, fitted_vehicle, tuple(r.path for r in recordings), tuple(r.path for r in held_out), mismatch,
         before, after, effects, groups, separate, remains, selection, left_out, remains.explained,
-        owned(flights, kept_apart, selection.final.effects.get(STRENGTH)),
+        owned(flights, kept_apart, selection.final.effects.get(STRENGTH)), swapped,
     )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from crazyem.diagnosis.diagnose import Diagnosis
+from crazyem.diagnosis.flights import roles
 from crazyem.diagnosis.flights.flight import without
 from crazyem.diagnosis.flights.own import Own
 from crazyem.diagnosis.locating.locate import Finding, strongest
@@ -30,7 +31,13 @@ def document_of(
     *,
     withhold: Sequence[str] = (),
 ) -> tuple[dict[str, Any], dict[str, Series]]:
-    """The JSON document of a diagnosis (names as in docs/diagnosis.md), and pictures."""
+    """The JSON document of a diagnosis (names as in docs/diagnosis.md), and pictures.
+
+    Args:
+        recordings, held_out: as they were given to `diagnose`.
+    """
+    if diagnosis.swapped:
+        recordings, held_out = held_out, recordings
     train, pictures = _compared(diagnosis, [without(r, withhold) for r in recordings], draw=True)
     apart, _ = _compared(diagnosis, [without(r, withhold) for r in held_out], draw=False)
     left = diagnosis.unexplained
@@ -40,6 +47,7 @@ def document_of(
         "version": 1,
         "recordings": list(diagnosis.recordings),
         "held_out_recordings": list(diagnosis.held_out),
+        "swapped": diagnosis.swapped,
         "vehicle": diagnosis.vehicle.name,
         "mismatch": diagnosis.mismatch,
         "where": [_finding(f) for f in where] if diagnosis.mismatch else [],
@@ -61,9 +69,13 @@ def document_of(
         "not_identifiable": [{"name": n, "reason": r} for n, r in diagnosis.left_out.items()],
         "ranking": _ranking(diagnosis),
         "of_recordings": [own.to_json() for own in diagnosis.own],
-        "notices": notices_of(diagnosis.own),
+        "notices": [*_roles(diagnosis.swapped, diagnosis.recordings, diagnosis.held_out), *notices_of(diagnosis.own)],
     }
     return document, {**disturbance_pictures(diagnosis), **pictures}
+
+
+def _roles(swapped: bool, fitted: Sequence[str], kept_apart: Sequence[str]) -> list[str]:
+    return [roles.told(fitted, kept_apart)] if swapped else []
 
 
 def notices_of(own: Sequence[Own]) -> list[str]:
@@ -219,6 +231,8 @@ def text_of(document: Mapping[str, Any]) -> str:
         for f in document["unexplained"]["where"][:4]:
             size = f"{_short(f['effect_size'], '+.3g')} {f['unit']}"
             lines.append(f"  unexplained: {f['signal']} {f['axis']}, {f['regime']}: {size}")
+    swapped = _roles(document["swapped"], document["recordings"], document["held_out_recordings"])
+    lines += [f"  note: {text}" for text in swapped]
     several = len(document["of_recordings"]) > 1
     for own in document["of_recordings"]:
         lines += [f"  note: {_named(own['recording'], text, several)}" for text in own["notices"]]
