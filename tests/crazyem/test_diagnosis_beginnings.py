@@ -4,6 +4,7 @@ Loads are those of `closed_loop.py`: plane pendulums, which share no line with t
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,8 @@ from crazyem.diagnosis.fitting.model import Model, Point
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import beginnings
 from crazyem.diagnosis.naming.beginnings import KEPT, best_begun, larger, peaks
+from crazyem.diagnosis.naming.select import shortlist, with_started
+from crazyem.diagnosis.naming.trials import Trial
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 
@@ -80,26 +83,31 @@ class Likely:
 
 
 @pytest.mark.parametrize(
-    ("linear", "height", "found"),
-    [
-        (0.5, 100.0, True),  # another length is the likeliest
-        (0.252, 100.0, False),  # the same, or one beside it: derivatives of a small load said it as well
-        (0.5, -50.0, False),  # none is likelier than nothing
-    ],
-)
-def test_a_load_that_is_followed_only_by_one_as_heavy_is_begun_with_its_mass(linear, height, found):
+    ("height", "found"), [(100.0, True), (-50.0, False)]
+)  # of the latter none is likelier than nothing
+def test_a_load_that_is_followed_only_by_one_as_heavy_is_begun_with_its_mass(height, found):
     point = POINT.with_effects({"thrust_scale": {"scale": 0.9}})
     family = variants(LOAD, point, frozenset({"position", "velocity"}))
-    lengths = np.array([dict(c.begin)["length"] for c in family])
-    near = int(np.argmin(np.abs(lengths - linear)))
-    begun = larger(Likely(0.0018, 0.25, height), point, family, [near])
+    begun = larger(Likely(0.0018, 0.25, height), point, family)
     assert (begun is not None) == found
     if begun is not None:
+        assert begun.likeliest
         assert dict(begun.begin)["length"] == pytest.approx(0.25, rel=0.05)
         assert dict(begun.begin)["mass"] == 0.002  # the nearest, by ratio
-        started = begun.started(point, [0.002, 0.0])
-        assert started["mass"] == 0.002
-        assert started["length"] == dict(begun.begin)["length"]
+        started = with_started(POINT, begun, SimpleNamespace(theta=np.array([9.0, -0.004, 0.2])))
+        assert started.effects["suspended_load"] == dict(begun.begin)  # whatever derivatives say
+
+
+def test_what_is_begun_by_its_likelihood_is_tried_whatever_derivatives_say():
+    def entry(name, gain, **begun):
+        return Trial(
+            Candidate(name, (), ("mass",), **begun), gain, 0.0, 1.0, 1e-6 if gain > 0 else 1.0, gain - 1.0
+        ), None
+
+    others = [entry(n, g) for n, g in (("payload", 90.0), ("wind", 80.0), ("thrust_scale", 70.0))]
+    load = entry("suspended_load", -5.0, likeliest=True)
+    assert shortlist([*others, load])[-1] is load
+    assert len(shortlist([*others, entry("suspended_load", -5.0)])) == len(others)
 
 
 @pytest.mark.parametrize("chaotic", [False, True])
@@ -109,7 +117,7 @@ def test_where_a_flight_drives_loads_astray_the_likeliest_is_begun_with_alone(mo
     data.models[0]._strays["suspended_load"] = chaotic
     family = variants(LOAD, point, data.signals)
     likeliest = replace(family[7], begin=(*family[7].begin, ("mass", 0.004)))
-    monkeypatch.setattr(beginnings, "larger", lambda data, point, family, best: likeliest)
+    monkeypatch.setattr(beginnings, "larger", lambda data, point, family: likeliest)
     begun = best_begun(data, point, (), family)
     assert (begun == [likeliest]) == chaotic
     assert chaotic or set(begun) <= set(family)

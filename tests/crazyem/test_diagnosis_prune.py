@@ -111,12 +111,13 @@ def test_what_holds_another_within_its_range_stays(monkeypatch, slope, kept):
     assert found is (fitted if kept else bare)
 
 
-@pytest.mark.parametrize(("expected", "held", "kept"), [(1.0, -25.0, True), (1.0, -31.0, False), (50.0, -5.0, False),
-                                                        (50.0, 5.0, True)])  # fmt: skip
+@pytest.mark.parametrize(("expected", "held", "kept"), [(1.0, -25.0, True), (1.0, -31.0, False), (20.0, -25.0, True),
+                                                        (50.0, -5.0, False), (50.0, 5.0, True)])  # fmt: skip
 def test_flights_held_out_are_asked_where_they_can_answer(monkeypatch, expected, held, kept):
     """An effect that brings 300 nats where it was fitted, and `held` where `expected` nats would be the effect's.
 
-    A flight that cannot show it may speak against it with a tenth of that: hovers have biases of their own.
+    A flight that cannot show it, or less than a tenth of that, may speak against it with a tenth of that: hovers have
+    biases of their own.
     """
     step = replace(TAKEN, taken=replace(TAKEN.taken, dispersion=1.0))
     fitted = SimpleNamespace(point=POINT, loglik=0.0)
@@ -128,6 +129,28 @@ def test_flights_held_out_are_asked_where_they_can_answer(monkeypatch, expected,
     data = SimpleNamespace(loglik=lambda point, passes: 0.0, workers=Workers(1))
     _, accepted, _ = prune.drop(data, fitted, [DRAG], [step], SimpleNamespace(), lambda text: None)
     assert accepted == ([DRAG] if kept else [])
+
+
+def test_what_no_flight_needs_goes_before_what_one_speaks_against(monkeypatch):
+    """A payload of no mass beside a load on a string, which a hover does not confirm while the payload is there."""
+    payload, load = (Candidate(n, (), ("mass",)) for n in ("payload", "suspended_load"))
+    steps = [replace(TAKEN, taken=replace(TAKEN.taken, candidate=c, dispersion=1.0)) for c in (payload, load)]
+    fitted = SimpleNamespace(point=POINT, loglik=0.0)
+
+    def bare_fit(data, held_out, fitted, accepted, candidate):
+        nats, held = {payload: (2.0, 0.0), load: (200.0, -14.0 if payload in accepted else 300.0)}[candidate]
+        return SimpleNamespace(point=POINT, loglik=-nats), -held
+
+    monkeypatch.setattr(prune, "expected", lambda *a: 280.0)
+    monkeypatch.setattr(prune, "bare_fit", bare_fit)
+    monkeypatch.setattr(prune, "on_held_out", lambda *a: SimpleNamespace(loglik=0.0))
+    monkeypatch.setattr(prune, "refine_base", lambda *a, **k: fitted)
+    data = SimpleNamespace(loglik=lambda point, passes: 0.0, settle=lambda point: None, workers=Workers(1))
+    said = []
+    _, accepted, left = prune.drop(data, fitted, [payload, load], steps, SimpleNamespace(), said.append)
+    assert accepted == [load]
+    assert [s.taken.candidate for s in left] == [load]
+    assert said == ["  left out again: payload"]
 
 
 def test_one_number_at_the_end_of_its_range_is_no_finding():

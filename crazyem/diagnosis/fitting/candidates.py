@@ -32,6 +32,7 @@ class Candidate:
         free: parameters that are fitted.
         begin: values at which derivatives are taken while the effect is not part of the model.
         both_ways: it may be less than nothing as well: a delay that is already counted may be counted too long.
+        likeliest: `begin` is the likeliest of many in full, so it is fitted from there, whatever derivatives say.
     """
 
     effect: str
@@ -39,6 +40,7 @@ class Candidate:
     free: tuple[str, ...]
     begin: tuple[tuple[str, float], ...] = ()
     both_ways: bool = False
+    likeliest: bool = False
 
     @property
     def label(self) -> str:

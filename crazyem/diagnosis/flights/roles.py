@@ -31,9 +31,7 @@ def swapped(fitted: Sequence[Flight], kept_apart: Sequence[Flight]) -> bool:
 def told(fitted: Sequence[str], kept_apart: Sequence[str]) -> str:
     """The sentence that says so, of what is fitted now and what was named first."""
     now, first = (", ".join(Path(p).name for p in part) for part in (fitted, kept_apart))
-    return (
-        f"{first}: only hovers, so physics is fitted to what was held out, {now}, and confirmed by it (--strict-held-out forbids that)"
-    )
+    return f"{first}: only hovers, so physics is fitted to what was held out, {now}, and confirmed by it (--strict-held-out forbids that)"
 
 
 def _quick(flight: Flight) -> NDArray:

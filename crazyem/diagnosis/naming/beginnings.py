@@ -49,15 +49,17 @@ def best_begun(
         at += len(family)
         best = peaks(gains)
         astray = max(gains) > SEEN and any(model.strays(family[0].effect, point.vehicle) for model in data.models)
-        found = larger(data, point, family, best) if astray else None
+        found = larger(data, point, family) if astray else None
         dropped |= set(family) - ({family[i] for i in best} if found is None else set())
         added += [found] if found is not None else []
     return [*(c for c in candidates if c not in dropped), *added]
 
 
-def larger(data: Data, point: Point, family: Sequence[Candidate], best: Sequence[int]) -> Candidate | None:
-    """The beginning and the size that are likeliest, if they are not beside one of the `best` (indices) by derivatives;
-    None: they are, or none is likelier than nothing. The thrust gives back what is steady in an effect that weighs."""
+def larger(data: Data, point: Point, family: Sequence[Candidate]) -> Candidate | None:
+    """The likeliest beginning, with its size; None: none is likelier than nothing.
+
+    The thrust gives back what is steady in an effect that weighs.
+    """
     effect = CATALOGUE[family[0].effect]
     nothing = data.twin().loglik(point)
 
@@ -72,9 +74,8 @@ def larger(data: Data, point: Point, family: Sequence[Candidate], best: Sequence
     if not tried or max(gains) <= 0.0:
         return None
     size, likeliest = tried[int(np.argmax(gains))]
-    if any(abs(family.index(likeliest) - i) <= 1 for i in best):
-        return None
-    return replace(likeliest, begin=tuple({**dict(likeliest.begin), effect.amplitude: size}.items()))
+    begin = {**dict(likeliest.begin), effect.amplitude: size}
+    return replace(likeliest, begin=tuple(begin.items()), likeliest=True)
 
 
 def peaks(gains: Sequence[float]) -> list[int]:

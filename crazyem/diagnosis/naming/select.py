@@ -129,6 +129,8 @@ def with_started(point: Point, candidate: Candidate, solution: Solution) -> Poin
             for n, d in zip(candidate.free, change, strict=True)
         }
         return point.with_effects({candidate.effect: {**here, **started}})
+    if candidate.likeliest:
+        return point.with_effects({candidate.effect: {**candidate.neutral(point), **dict(candidate.begin)}})
     return point.with_effects({candidate.effect: candidate.started(point, change.tolist())})
 
 
@@ -307,8 +309,9 @@ def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Sol
         names = {t.candidate.effect for t, _ in chosen}
         if one in names and other not in names:
             chosen += [e for e in linear if e[0].candidate.effect == other][:1]
-    trims = [e for e in linear if e[0].candidate.effect == TRIM][:1]
-    return chosen + [e for e in trims if all(e is not c for c in chosen)]
+    asked = [e for e in linear if e[0].candidate.likeliest]
+    asked += [e for e in linear if e[0].candidate.effect == TRIM][:1]
+    return chosen + [e for e in asked if all(e is not c for c in chosen)]
 
 
 def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
