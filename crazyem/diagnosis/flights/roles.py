@@ -16,7 +16,7 @@ LIVELIER = 3.0  # times as quick, at least: rooms are never still, and flights o
 
 
 def swapped(fitted: Sequence[Flight], kept_apart: Sequence[Flight]) -> bool:
-    """Whether the flights to fit only hover, and those kept apart do not: then these are fitted, and the hovers confirm.
+    """Whether the flights to fit only hover and those kept apart do not: then these are fitted, the hovers confirm.
 
     A velocity scale of 1.13 was 1.56 to a hover, and ruined what it was held against; a quadratic drag of 0.02 was
     0.07 (two of seed 2045 in docs/concealed.md).
@@ -31,7 +31,8 @@ def swapped(fitted: Sequence[Flight], kept_apart: Sequence[Flight]) -> bool:
 def told(fitted: Sequence[str], kept_apart: Sequence[str]) -> str:
     """The sentence that says so, of what is fitted now and what was named first."""
     now, first = (", ".join(Path(p).name for p in part) for part in (fitted, kept_apart))
-    return f"{first}: only hovers, so physics is fitted to what was held out, {now}, and confirmed by it (--strict-held-out forbids that)"
+    here = f"physics is fitted to what was held out, {now}, and confirmed by it"
+    return f"{first}: only hovers, so {here} (--strict-held-out forbids that)"
 
 
 def _quick(flight: Flight) -> NDArray:
