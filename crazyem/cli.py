@@ -197,7 +197,12 @@ def _diagnose(commands: Any) -> None:
     p.add_argument("--vehicle", metavar="NAME|FILE", help="the nominal model (default: the one that was flown)")
     p.add_argument("--against", metavar="SIMULATED", help="a simulated recording of the same mission, to look at first")
     p.add_argument(
-        "--held-out", nargs="+", action="extend", default=[], metavar="RECORDING", help="flights only to judge by"
+        "--held-out",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="RECORDING",
+        help="flights only to judge by, unless only they move (see --strict-held-out)",
     )
     p.add_argument(
         "--strict-held-out", action="store_true", help="fit nothing to these even where the others only hover"

@@ -82,9 +82,7 @@ class Likely:
         return self.height - 100.0 * off
 
 
-@pytest.mark.parametrize(
-    ("height", "found"), [(100.0, True), (-50.0, False)]
-)  # of the latter none is likelier than nothing
+@pytest.mark.parametrize(("height", "found"), [(100.0, True), (-50.0, False)])  # the latter: nothing is likelier
 def test_a_load_that_is_followed_only_by_one_as_heavy_is_begun_with_its_mass(height, found):
     point = POINT.with_effects({"thrust_scale": {"scale": 0.9}})
     family = variants(LOAD, point, frozenset({"position", "velocity"}))
