@@ -13,6 +13,8 @@ from crazyem.live.telemetry import ARMED, AUTO_ARM, CAN_ARM, CAN_FLY, FLYING
 from crazyem.signals.vocabulary import MOTOR_BLOCK, compress_quaternion
 
 LEVEL = float(compress_quaternion((0.0, 0.0, 0.0, 1.0)))
+WAITING = 10  # packets of a block that a session may be behind
+PATIENCE = 5.0  # s; who does not catch up for so long is not waited for any more
 SAG = 0.3  # m below the wanted height until the believed mass is right
 TRUTH = {"mass": 0.036, "Ixx": 2.0e-5, "Iyy": 2.1e-5, "Izz": 3.6e-5, "motor_time_constant": 0.06}
 
@@ -22,7 +24,7 @@ def float32(value):
 
 
 class FakeLink:
-    """A Link; `speed` firmware seconds pass per second."""
+    """A Link; `speed` firmware seconds pass per second, fewer where it must not outrun a session (`follow`)."""
 
     def __init__(self, *, speed=20.0, controllers=(1, 5, 6), lose_echo_after=None, lost_at=None, nan_at=None):
         self.uri = "fake://0"
@@ -50,10 +52,15 @@ class FakeLink:
         self.writes = 0
         self.fm = 1000
         self._landing = False
+        self._session = None
         self._stop = threading.Event()
         self._thread = None
 
     parameters = property(lambda self: dict.fromkeys(self.values, "float"))
+
+    def follow(self, session):
+        """Let no time pass while `session` has not digested what was sent: a busy machine starves its threads."""
+        self._session = session
 
     def connect(self, timeout=15.0):
         pass
@@ -118,8 +125,23 @@ class FakeLink:
         self.calls.append("stop")
         self.motors = False
 
+    def _outruns(self):
+        s = self._session
+        if s is None or s.failure is not None or s.lost is not None:
+            return False
+        waiting = self.packets.qsize() + s._samples.qsize() > WAITING * len(self.blocks)
+        return waiting or (s.pusher is not None and s.pusher.busy)
+
+    def _wait(self):
+        end = time.monotonic() + PATIENCE
+        while self._outruns() and not self._stop.is_set():
+            time.sleep(0.001)
+            if time.monotonic() > end:
+                self._session = None  # it does not catch up, perhaps because it waits for the drone
+
     def _run(self):
         while not self._stop.is_set():
+            self._wait()
             self.fm += 10
             if self.lost_at is not None and self.fm > self.lost_at:
                 self.packets.put(LinkLost("the link closed.", time.time()))

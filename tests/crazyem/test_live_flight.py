@@ -38,6 +38,7 @@ class Run:
         self.recorder = ListRecorder()
         self.session = Session(link, vehicle=load_vehicle("cf2"), estimator=estimator or fake.FakeEstimator(),
                                recorder=self.recorder)  # fmt: skip
+        link.follow(self.session)
         self.interrupts = Interrupts()
         self.phases = []
         self.flight = Flight(self.session, flight_plan, interrupts=self.interrupts)

@@ -80,6 +80,7 @@ class Flown:
         self.link, self.recorder, self.error = link, Recorder(), None
         self.estimator = estimator or Estimator()
         self.session = Session(link, vehicle=load_vehicle("cf2"), estimator=self.estimator, recorder=self.recorder)
+        link.follow(self.session)
         plan = FlightPlan(
             trajectory=lambda position, yaw: hover(position=position, yaw=yaw, duration=duration),
             controller=LEE, rules=rules, push=push,
