@@ -16,7 +16,7 @@ from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import prune
 from crazyem.diagnosis.naming.least import at_the_end, matters
-from crazyem.diagnosis.naming.select import shortlist
+from crazyem.diagnosis.naming.select import shortlist, with_started
 from crazyem.diagnosis.naming.trials import LIKELY, SURE, Step, Trial, significance
 from crazyem.diagnosis.workers import Workers
 
@@ -127,8 +127,25 @@ def test_flights_held_out_are_asked_where_they_can_answer(monkeypatch, expected,
     monkeypatch.setattr(prune, "on_held_out", lambda *a: SimpleNamespace(loglik=0.0))
     monkeypatch.setattr(prune, "refine_base", lambda *a, **k: bare)
     data = SimpleNamespace(loglik=lambda point, passes: 0.0, workers=Workers(1))
+    monkeypatch.setattr(prune, "nuisances", lambda *a: [])
     _, accepted, _ = prune.drop(data, fitted, [DRAG], [step], SimpleNamespace(), lambda text: None)
     assert accepted == ([DRAG] if kept else [])
+
+
+@pytest.mark.parametrize(("held", "kept"), [(0.0, True), (-4.9, True), (-5.1, False)])
+def test_what_a_flight_held_out_goes_half_way_to_must_cost_there_to_be_left_out(monkeypatch, held, kept):
+    """A torque scale that should bring 20 nats, of a kind that is always free: none is neither for nor against."""
+    torques = Candidate("torque_scale", (), ("scale",))
+    step = replace(TAKEN, taken=replace(TAKEN.taken, candidate=torques, dispersion=1.0))
+    fitted, bare = (SimpleNamespace(point=POINT, loglik=nats) for nats in (0.0, -90.0))
+    monkeypatch.setattr(prune, "nuisances", lambda *a: [(torques, (1.0,))])
+    monkeypatch.setattr(prune, "expected", lambda *a: 20.0)
+    monkeypatch.setattr(prune, "bare_fit", lambda *a: (bare, -held))
+    monkeypatch.setattr(prune, "on_held_out", lambda *a: SimpleNamespace(loglik=0.0))
+    monkeypatch.setattr(prune, "refine_base", lambda *a, **k: bare)
+    data = SimpleNamespace(loglik=lambda point, passes: 0.0, workers=Workers(1))
+    _, accepted, _ = prune.drop(data, fitted, [torques], [step], SimpleNamespace(), lambda text: None)
+    assert accepted == ([torques] if kept else [])
 
 
 def test_what_no_flight_needs_goes_before_what_one_speaks_against(monkeypatch):
@@ -145,6 +162,7 @@ def test_what_no_flight_needs_goes_before_what_one_speaks_against(monkeypatch):
     monkeypatch.setattr(prune, "bare_fit", bare_fit)
     monkeypatch.setattr(prune, "on_held_out", lambda *a: SimpleNamespace(loglik=0.0))
     monkeypatch.setattr(prune, "refine_base", lambda *a, **k: fitted)
+    monkeypatch.setattr(prune, "nuisances", lambda *a: [])
     data = SimpleNamespace(loglik=lambda point, passes: 0.0, settle=lambda point: None, workers=Workers(1))
     said = []
     _, accepted, left = prune.drop(data, fitted, [payload, load], steps, SimpleNamespace(), said.append)
@@ -269,3 +287,18 @@ def test_torques_and_inertias_are_fitted_together_or_not_at_all():
     linear = [entry("torque_scale", 100.0), entry("linear_drag", 50.0), entry("inertia", 3.0, p_value=0.5)]
     assert [t.candidate.effect for t, _ in shortlist(linear)] == ["torque_scale", "linear_drag", "inertia"]
     assert [t.candidate.effect for t, _ in shortlist(linear[1:])] == ["linear_drag"]
+
+
+def test_heavy_rotors_are_fitted_beside_a_damping_from_where_they_are_heavy():
+    def entry(effect, gain, p_value=1e-6):
+        free = ("inertia",) if effect == "rotor_inertia" else ("x",)
+        return Trial(Candidate(effect, (), free), gain, 0.0, 1.0, p_value, gain - 1.0), None
+
+    damping, drag, rotors = entry("rate_damping", 200.0), entry("linear_drag", 50.0), entry("rotor_inertia", 0.0, 1.0)
+    *_, (trial, _) = shortlist([damping, drag, rotors])
+    assert trial.candidate.effect == "rotor_inertia"
+    begun = with_started(POINT, trial.candidate, SimpleNamespace(theta=np.array([-1e-7])))
+    assert begun.effects["rotor_inertia"]["inertia"] == 5e-8  # derivatives at none do not lead there
+    assert [t.candidate.effect for t, _ in shortlist([drag, rotors])] == ["linear_drag"]
+    found = [entry("rotor_inertia", 300.0), damping]  # by its derivative: once is enough
+    assert sum(t.candidate.effect == "rotor_inertia" for t, _ in shortlist(found)) == 1

@@ -32,7 +32,8 @@ class Candidate:
         free: parameters that are fitted.
         begin: values at which derivatives are taken while the effect is not part of the model.
         both_ways: it may be less than nothing as well: a delay that is already counted may be counted too long.
-        likeliest: `begin` is the likeliest of many in full, so it is fitted from there, whatever derivatives say.
+        likeliest: it is fitted from `begin`, whatever derivatives say: that is the likeliest of many in full, or where
+            an effect is something of which derivatives at nothing say nothing.
     """
 
     effect: str
