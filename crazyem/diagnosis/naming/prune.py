@@ -17,10 +17,10 @@ from crazyem.diagnosis.naming.trials import LIKELY, SURE, Step, both, significan
 ADMITTED = 8.0  # nats of evidence that an effect must bring
 HELD = 1.0  # nats it must bring on flight held out,
 TELLING = 6.0  # if so many are to be expected there; else it must not cost what it must bring
-# share of that which one of a kind that is always free must cost: a flight that goes half-way to it by itself brings
-# nothing, whether it is there or not (2046/0221: a torque scale of 97 nats, -0.01 held out, where 21 were expected)
-AGAINST = 0.25
 MISLED = 0.1  # share of its gain that it may cost where it cannot be seen: hovers have biases of their own
+# Share of what it should bring that an effect of a kind that is always free may cost: a flight goes half-way to it by
+# itself and then brings nothing, whether it is there or not (2046/0221: 97 nats, -0.01 held out, 21 expected)
+AGAINST = 0.25
 OTHERWISE = 0.01  # p-value of an effect's being the same size beside what shakes (Hausman 1978)
 APART = 1 / 3  # of its size, at least: sampled commands make some per cent of difference
 FORCES = np.full(3, 0.2)  # m/s^2, where wandering forces begin
