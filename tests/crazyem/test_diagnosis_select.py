@@ -8,7 +8,7 @@ import pytest
 from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis.fitting.always import on_held_out, refine_base
-from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, remembering, remembering_anew
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
@@ -17,6 +17,8 @@ from crazyem.diagnosis.locating.restless import peaks
 from crazyem.diagnosis.naming.evidence import gain_of_both
 from crazyem.diagnosis.naming.onset import ONSET, date
 from crazyem.diagnosis.naming.prune import shaken
+from crazyem.diagnosis.naming.select import Basis, compared, noise_apart
+from crazyem.diagnosis.naming.trials import Trial
 
 ONSET_TIME = 4.37  # s
 
@@ -112,3 +114,34 @@ def test_what_an_effect_would_gain_fitted_to_both_flights_is_the_top_of_their_li
     wanted = max(both(here + d) for d in np.linspace(-0.14, 0.05, 20)) - both(here)
     there = on_held_out(apart, fitted.point, [candidate])
     assert gain_of_both(fitted, apart, there, [candidate])[0] == pytest.approx(wanted, rel=0.1, abs=0.1)
+
+
+def test_noise_of_another_flight_does_not_decide_between_two_names() -> None:
+    """One explanation under two noises, as two fits end with: by the value of flights held out it is one."""
+    candidate = Candidate("torque_scale", (), ("scale",))
+    data, apart = (Data([flight_of(fly(Hidden(torque=0.8), seconds=6, seed=seed), DRONE)]) for seed in (5, 7))
+    point = nominal(data, Point(DRONE, {}, first_guess()))
+    begun = point.with_effects({"torque_scale": {"scale": 0.9}})
+    fitted = refine_base(data, begun, [candidate], rounds=3)
+    noise = fitted.point.noise
+    louder = replace(fitted.point, noise=replace(noise, impulse=1.3 * noise.impulse))
+    basis = Basis(data, apart, point, (), 0.0, 0.0)
+    trial = Trial(candidate, 0.0, 0.0, 1.0, 0.0, 0.0, fitted=fitted)
+    own = noise_apart(basis, trial)
+    assert own is not None
+    assert own.gain > 0.0
+    fits = fitted, replace(fitted, point=louder)
+    plain, fair = ([compared(basis, trial, data, f, own=o) for f in fits] for o in (None, own))
+    assert abs(plain[0].value - plain[1].value) > 3.0
+    assert fair[0].value == pytest.approx(fair[1].value, abs=0.3)
+    assert [t.held_out for t in fair] == [t.held_out for t in plain]  # to be admitted an effect must hold as it is
+    assert fair[0].value == pytest.approx(plain[0].value, abs=3.0)  # on one scale with trials that are not compared
+
+
+def test_noise_stays_where_a_file_has_a_trim() -> None:
+    vehicle = replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}})
+    point = Point(vehicle, dict(vehicle.effects), first_guess())
+    data = Data([flight_of(fly(seconds=5.0), DRONE)])
+    trial = Trial(INERTIA, 0.0, 0.0, 1.0, 0.0, 0.0)
+    assert noise_apart(Basis(data, data.twin(), point, (), 0.0, 0.0), trial) is None
+    assert noise_apart(Basis(data, None, replace(point, vehicle=DRONE), (), 0.0, 0.0), trial) is None
