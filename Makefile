@@ -32,7 +32,7 @@ bench: $(READY)  ## speed against named peers (those installed: pip install -e '
 	$(BIN)/python benchmarks/speed.py
 
 concealed: $(READY)  ## physics hidden in the simulator, and whether diagnose finds it; goes on where it was stopped
-	$(BIN)/python -m benchmarks.concealed draw --cases 320 --seed 2047 --out out/concealed
+	$(BIN)/python -m benchmarks.concealed draw --cases 320 --seed 2048 --out out/concealed
 	$(BIN)/python -m benchmarks.concealed fly --out out/concealed
 	$(BIN)/python -m benchmarks.concealed diagnose --out out/concealed
 	$(BIN)/python -m benchmarks.concealed score --out out/concealed --write-docs

