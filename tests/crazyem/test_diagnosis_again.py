@@ -43,6 +43,7 @@ def slow_to_turn():
     return fly(Hidden(torque=0.6, drag=(0.02, 0.02, 0.02)), seconds=20.0, seed=5)
 
 
+@pytest.mark.slow
 def test_an_inertia_that_no_body_has_leaves_open_what_turns_the_drone(slow_to_turn, monkeypatch):
     wanted = ("inertia", "linear_drag")
     found = diagnose([slow_to_turn], DRONE, wanted=wanted)
@@ -97,6 +98,7 @@ def test_what_went_on_to_its_end_is_taken_back_and_the_selection_goes_on(monkeyp
     assert all(s.taken.candidate.effect != "thrust_scale" for s in found.steps if s.taken)
 
 
+@pytest.mark.slow
 def test_where_there_was_room_for_no_more_it_goes_on_after_something_is_left_out(monkeypatch):
     data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02), thrust=(0.9,) * 4), seconds=20.0), DRONE)])
     point = nominal(data, Point(DRONE, {}, first_guess()))
@@ -113,6 +115,7 @@ def test_where_there_was_room_for_no_more_it_goes_on_after_something_is_left_out
         assert [c.effect for c in select(data, point, [THRUST, DRAG]).accepted] == names
 
 
+@pytest.mark.slow
 def test_after_an_exchange_the_selection_goes_on(slow_to_turn, monkeypatch):
     """Made to exchange what it found for nothing, it finds it again; where nothing is exchanged, it is not asked."""
     calls = []

@@ -119,7 +119,8 @@ def test_the_better_explanation_of_all_flights_leads_whichever_ruins_those_held_
     linear, quadratic = replace(linear, evidence=26000.0), replace(quadratic, evidence=12000.0)
     point = Point(DRONE, {}, first_guess())
     basis = SimpleNamespace(held_out=object(), point=point, data=SimpleNamespace(workers=Workers(1)))
-    monkeypatch.setattr(select, "sharpened", lambda basis, trial: trial)
+    monkeypatch.setattr(select, "noise_apart", lambda basis, trial: None)
+    monkeypatch.setattr(select, "sharpened", lambda basis, own, trial: trial)
     monkeypatch.setattr(select, "weighed", lambda trials, counted: sorted(trials, key=lambda t: -t.evidence))
     trials, equals = select.compared_again(basis, [linear, quadratic], say=lambda text: None)
     assert trials[0] is linear

@@ -57,6 +57,7 @@ def trial(candidate: Candidate, value: float, scatter: float = 0.1) -> Trial:
     return Trial(candidate, value, value, 1.0, 1e-9, value, fitted=fitted, blocks=blocks, value=value)
 
 
+@pytest.mark.slow
 def test_a_steady_torque_that_nothing_explains_is_written_as_a_trim() -> None:
     found = diagnose([fly(Hidden(twist=TWIST), seconds=14.0, seed=5)], DRONE)
     assert [(f.signal, f.axis, f.variable) for f in found.unexplained.findings][:1] == [("torque", "z", "")]
@@ -77,6 +78,7 @@ def test_what_a_file_explains_leaves_no_trim() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_drone_whose_commands_shake_has_a_trim_first() -> None:
     """As those of real drones with a deck, logged at 100 Hz; judged by a file that knows no trim, then by its own."""
     strong = 1.04  # within what any drone may have, and part of its file all the same
