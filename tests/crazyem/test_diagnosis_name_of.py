@@ -119,12 +119,14 @@ def test_the_better_explanation_of_all_flights_leads_whichever_ruins_those_held_
     linear, quadratic = replace(linear, evidence=26000.0), replace(quadratic, evidence=12000.0)
     point = Point(DRONE, {}, first_guess())
     basis = SimpleNamespace(held_out=object(), point=point, data=SimpleNamespace(workers=Workers(1)))
-    monkeypatch.setattr(select, "noise_apart", lambda basis, trial: None)
-    monkeypatch.setattr(select, "sharpened", lambda basis, own, trial: trial)
+    own, given = object(), []
+    monkeypatch.setattr(select, "noise_apart", lambda basis, trial: own)
+    monkeypatch.setattr(select, "sharpened", lambda basis, noise, trial: given.append(noise) or trial)
     monkeypatch.setattr(select, "weighed", lambda trials, counted: sorted(trials, key=lambda t: -t.evidence))
     trials, equals = select.compared_again(basis, [linear, quadratic], say=lambda text: None)
     assert trials[0] is linear
     assert equals == [quadratic]
+    assert given == [own, own]  # all that are compared begin with the same noise of the flights held out
     unsure = replace(quadratic, p_value=0.5)  # what may not be taken does not lead, however well it would fit
     assert select.compared_again(basis, [linear, unsure], say=lambda text: None)[1][0] is linear
 
