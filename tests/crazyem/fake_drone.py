@@ -14,6 +14,7 @@ from crazyem.signals.vocabulary import MOTOR_BLOCK, compress_quaternion
 
 LEVEL = float(compress_quaternion((0.0, 0.0, 0.0, 1.0)))
 WAITING = 10  # packets of a block that a session may be behind
+AHEAD = 0.1  # s of the drone's clock that a flight may be behind
 PATIENCE = 5.0  # s; who does not catch up for so long is not waited for any more
 SAG = 0.3  # m below the wanted height until the believed mass is right
 TRUTH = {"mass": 0.036, "Ixx": 2.0e-5, "Iyy": 2.1e-5, "Izz": 3.6e-5, "motor_time_constant": 0.06}
@@ -52,15 +53,18 @@ class FakeLink:
         self.writes = 0
         self.fm = 1000
         self._landing = False
-        self._session = None
+        self._session = self._flight = None
         self._stop = threading.Event()
         self._thread = None
 
     parameters = property(lambda self: dict.fromkeys(self.values, "float"))
 
-    def follow(self, session):
-        """Let no time pass while `session` has not digested what was sent: a busy machine starves its threads."""
-        self._session = session
+    def follow(self, session, flight=None):
+        """Let no time pass while `session` has not digested what was sent, nor `flight` looked at it.
+
+        A busy machine starves their threads.
+        """
+        self._session, self._flight = session, flight
 
     def connect(self, timeout=15.0):
         pass
@@ -130,7 +134,11 @@ class FakeLink:
         if s is None or s.failure is not None or s.lost is not None:
             return False
         waiting = self.packets.qsize() + s._samples.qsize() > WAITING * len(self.blocks)
-        return waiting or (s.pusher is not None and s.pusher.busy)
+        return waiting or self._unseen() or (s.pusher is not None and s.pusher.busy)
+
+    def _unseen(self):
+        seen = self._flight._moved[0] if self._flight is not None else -1.0
+        return seen >= 0.0 and self.fm / 1000.0 - seen > AHEAD  # not while it has seen nothing at all
 
     def _wait(self):
         end = time.monotonic() + PATIENCE

@@ -38,10 +38,10 @@ class Run:
         self.recorder = ListRecorder()
         self.session = Session(link, vehicle=load_vehicle("cf2"), estimator=estimator or fake.FakeEstimator(),
                                recorder=self.recorder)  # fmt: skip
-        link.follow(self.session)
         self.interrupts = Interrupts()
         self.phases = []
         self.flight = Flight(self.session, flight_plan, interrupts=self.interrupts)
+        link.follow(self.session, self.flight)
         self.times = interrupt_at
 
     def __call__(self):
@@ -71,7 +71,7 @@ def landed(link):
 
 def test_a_whole_flight_pushes_and_lands():
     link = fake.FakeLink()
-    run = Run(link, plan(hover, duration=25.0))  # long: on a busy machine the first push may come seconds late
+    run = Run(link, plan(hover, duration=25.0))
     run()
     assert order(link) == ["release", "take_off", "setpoint", *3 * ["land", "release"], "stop"]
     assert landed(link)

@@ -80,17 +80,18 @@ class Flown:
         self.link, self.recorder, self.error = link, Recorder(), None
         self.estimator = estimator or Estimator()
         self.session = Session(link, vehicle=load_vehicle("cf2"), estimator=self.estimator, recorder=self.recorder)
-        link.follow(self.session)
         plan = FlightPlan(
             trajectory=lambda position, yaw: hover(position=position, yaw=yaw, duration=duration),
             controller=LEE, rules=rules, push=push,
         )  # fmt: skip
         interrupts = Interrupts()
+        flight = Flight(self.session, plan, interrupts=interrupts)
+        link.follow(self.session, flight)
         self.session.start()
         for when in interrupt:
             threading.Thread(target=self._interrupt, args=(interrupts, when), daemon=True).start()
         try:
-            Flight(self.session, plan, interrupts=interrupts).fly()
+            flight.fly()
         except CrazyemError as error:
             self.error = error
         except (FlightInterruptedError, MotorsCutError) as error:
