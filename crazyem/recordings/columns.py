@@ -227,7 +227,8 @@ def _rows(arrays: dict[str, SignalArray], taken: dict[str, NDArray[np.int64]]) -
     host = np.concatenate([np.asarray(a.host_time, float)[taken[name]] for name, a in arrays.items()])
     by_order = np.argsort(order, kind="stable")
     place, sample, time, host = place[by_order], sample[by_order], time[by_order], host[by_order]
-    host[np.isnan(host)] = np.nan  # one bit pattern, so that unknown equals unknown
+    for stamps in (time, host):
+        stamps[np.isnan(stamps)] = np.nan  # one bit pattern, so that unknown equals unknown
     starts = np.ones(time.size, bool)
     starts[1:] = (
         (time[1:].view(np.int64) != time[:-1].view(np.int64))

@@ -137,6 +137,7 @@ def test_after_an_exchange_the_selection_goes_on(slow_to_turn, monkeypatch):
     assert calls[2].accepted == ()
 
 
+@pytest.mark.slow
 def test_what_may_as_well_be_none_is_not_sure(slow_to_turn, monkeypatch):
     sure = diagnose([slow_to_turn], DRONE, wanted=["linear_drag", "inertia"])
     assert max(e.confidence for e in sure.effects) > DOUBTFUL
@@ -151,6 +152,7 @@ def test_what_may_as_well_be_none_is_not_sure(slow_to_turn, monkeypatch):
         assert any(np.allclose(away[e.name], a) for a in asked)
 
 
+@pytest.mark.slow
 def test_what_a_wrong_lag_does_is_part_of_an_interval(slow_to_turn, monkeypatch):
     asked = {"wanted": ["linear_drag", "inertia"]}
     before = {e.name: e.parameters for e in diagnose([slow_to_turn], DRONE, **asked).effects}

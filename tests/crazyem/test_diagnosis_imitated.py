@@ -39,6 +39,7 @@ def diagnosed(hidden: Hidden) -> Diagnosis:
     return diagnose([fly(hidden)], DRONE, held_out=[fly(hidden, seed=1)], wanted=AIR)
 
 
+@pytest.mark.slow
 def test_a_cable_is_unexplained_and_told_by_place() -> None:
     """Pulled down the more the higher it is, and to one side: wind and lift near the floor to the catalogue."""
     found = diagnosed(Hidden(cable=(0.06, 0.4)))

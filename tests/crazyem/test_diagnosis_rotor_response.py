@@ -183,7 +183,7 @@ def behind(time, wanted, *, lag):
     return out
 
 
-@pytest.mark.parametrize("sticks", [False, True])
+@pytest.mark.parametrize("sticks", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_diagnosis_tells_of_a_rotor_that_does_not_follow_its_command(monkeypatch, sticks):
     """Speeds that carry the drone as its commands do; of what the commands say of them, only whether one sticks."""
     flown = fly(seconds=10.0, seed=4)

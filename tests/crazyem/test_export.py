@@ -144,6 +144,19 @@ def test_round_trip_through_csv_loses_nothing(recording: Recording) -> None:
         assert again.read_bytes() == path.read_bytes()
 
 
+def test_a_stamp_that_is_no_number_is_one_whatever_its_bits(tmp_path: Path) -> None:
+    other = np.array([math.nan]).view(np.int64) ^ 1
+    one, two = (
+        SignalArray(time, np.zeros((1, 1)), np.array([order]), np.full(1, math.nan), np.zeros(1, bool), "", "", "",
+                    "", "s", (name,))
+        for name, time, order in (("a", np.array([math.nan]), 0), ("b", other.view(np.float64), 1))
+    )  # fmt: skip
+    recording = Recording("there", "made:up", {"a": one, "b": two}, {}, (), (), 0.0)
+    export(recording, tmp_path / "out.csv")
+    export(open_recording(tmp_path / "out.csv"), tmp_path / "again.csv")
+    assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "out.csv").read_bytes()
+
+
 @settings(max_examples=100, deadline=None)
 @given(recordings())
 def test_parquet_holds_every_sample(recording: Recording) -> None:
