@@ -137,7 +137,9 @@ def diagnose(
         # only torques would tell weaker rotors from a load
         WEAKER.effect: None if data.coarse else as_load(data, apart, selection),
     }
-    told = tell(data, selection, remains, witnessed=witnessed, in_place=in_place, balance=balance)
+    told = tell(
+        data, selection, remains, witnessed=witnessed, in_place=in_place, balance=balance, apart=apart is not None
+    )
     groups, separate = told.groups, told.separate
     if flights[0].inputs.measured:
         here, there = answers(recordings, vehicle), answers(held_out, vehicle)

@@ -69,6 +69,8 @@ def test_a_name_that_brings_little_elsewhere_is_not_sure() -> None:
     assert at_most(8.0, 0.003) == DOUBTFUL
     assert at_most(8.0, 1e-6) == SELDOM
     assert at_most(30.0, 0.003) == CALIBRATED
+    assert at_most(30.0, 0.003, apart=False) == SELDOM  # blocks of one flight share what is peculiar to it
+    assert at_most(30.0, 1e-6, apart=False) == CALIBRATED
 
 
 def point_of(**effects: dict[str, Any]) -> Point:

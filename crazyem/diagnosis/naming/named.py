@@ -67,11 +67,16 @@ def share(best: float, others: Sequence[float]) -> float:
     return CALIBRATED / float(1.0 + weights.sum())
 
 
-def at_most(held_out_nats: float, p_value: float) -> float:
-    """The most that a name is worth by what it brings on flight held out [nats] and by its p-value."""
+def at_most(held_out_nats: float, p_value: float, *, apart: bool = True) -> float:
+    """The most that a name is worth by what it brings on flight held out [nats] and by its p-value.
+
+    Where no flight is `apart`, what was held out are blocks of the flight that was fitted, which share what is peculiar
+    to it: a name that is weak by its p-value is weak.
+    """
+    unsure = p_value > WEAK_TWICE
     if held_out_nats >= WEAK:
-        return CALIBRATED
-    return DOUBTFUL if p_value > WEAK_TWICE else SELDOM
+        return SELDOM if unsure and not apart else CALIBRATED
+    return DOUBTFUL if unsure else SELDOM
 
 
 def one_factor(values: NDArray, neutral: NDArray, covariance: NDArray) -> bool:

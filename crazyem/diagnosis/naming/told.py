@@ -54,6 +54,7 @@ def tell(
     witnessed: frozenset[str],
     in_place: Mapping[str, tuple[Trial, Trial] | None],
     balance: Balance | None = None,
+    apart: bool = True,
 ) -> Told:
     """The selected effects as they are told.
 
@@ -62,6 +63,7 @@ def tell(
         witnessed: names that a witness told from their look-alikes.
         in_place: for an effect the two trials, of it and of what else could stand in its place.
         balance: what is steady, by which names are told apart where a file has a trim.
+        apart: whether a flight was held out.
     """
     if not selection.accepted:
         return Told()
@@ -92,7 +94,7 @@ def tell(
         if doubted or none_of_it > WITHIN:
             confidence = min(confidence, DOUBTFUL)
         p_value = min(1.0, step.taken.p_value * max(1, selection.tried))
-        confidence = min(confidence, at_most(step.taken.held_out, p_value))
+        confidence = min(confidence, at_most(step.taken.held_out, p_value, apart=apart))
         # late inputs and late measurements are one model, so it is fitted as the first, whatever it is called
         late = candidate.effect == "input_delay" and MEASURED_LATE in witnessed
         name, label = (MEASURED_LATE, MEASURED_LATE) if late else (candidate.effect, candidate.label)
