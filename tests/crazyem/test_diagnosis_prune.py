@@ -186,6 +186,20 @@ def test_one_number_at_the_end_of_its_range_is_no_finding():
         assert matters(point, DRAG) == counts
 
 
+@pytest.mark.parametrize(
+    ("roll", "pitch", "counts"),
+    [
+        (4e-6, -1e-6, True), (2e-6, -2e-6, False), (4e-6, 9e-6, True),
+        (-7e-6, 9e-6, False), (-1.2e-5, 5e-6, False), (-2e-5, 1e-6, True),
+    ],
+)  # fmt: skip
+def test_a_moment_that_no_rotor_makes_counts_from_a_larger_size_on(roll, pitch, counts):
+    """Air on rotors above the centre of mass tips the drone back; what tips it onward is feigned where it is small."""
+    moment = Candidate("velocity_moment", (), ("roll_per_vy", "pitch_per_vx"))
+    point = POINT.with_effects({"velocity_moment": {"roll_per_vy": roll, "pitch_per_vx": pitch}})
+    assert matters(point, moment) == counts
+
+
 def test_a_rotor_that_is_much_stronger_than_the_others_is_no_faulty_one():
     """1.2 and 1.3 were said of real drones with another propeller cut."""
     fault = Candidate("rotor_fault", (("rotor", 2), ("onset_time", None)), ("scale",))
