@@ -276,6 +276,22 @@ def test_the_diagnosing_process_sees_two_recordings_and_a_name(tmp_path: Path) -
     assert result["files"] == ["held_out.mcap", "recording.mcap"]
     assert not any(str(tmp_path) in word or "/" in word for word in result["words"])
     assert "0.0 % of 1" in report(study)
+    alone = Study(study.folder, alone=True)
+    assert diagnose_all(alone, command=[sys.executable, str(spy)]) == 1
+    result = read(alone.answer("0001"))["result"]
+    assert result["files"] == ["recording.mcap"]
+    assert "--held-out" not in result["words"]
+    assert alone.answer("0001") != study.answer("0001")
+    assert "0.0 % of 1" in report(alone)
+
+
+def test_the_documents_tell_of_two_flights_alone(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    from benchmarks.concealed.__main__ import main
+
+    with pytest.raises(SystemExit) as ended:
+        main(["score", "--out", str(tmp_path), "--alone", "--write-docs"])
+    assert ended.value.code == 2
+    assert "--write-docs goes without --alone" in capsys.readouterr().err
 
 
 def test_the_ideal_observer_is_asked_for_what_went_wrong_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,6 +22,7 @@ def _parser() -> argparse.ArgumentParser:
         "--part", type=int, nargs=2, default=(0, 1), metavar=("K", "N"), help="fly, diagnose: share K of N"
     )
     parser.add_argument("--command", nargs="+", help="diagnose: instead of `crazyem diagnose`")
+    parser.add_argument("--alone", action="store_true", help="diagnose, score: by one flight, with none held out")
     parser.add_argument("--write-docs", action="store_true", help="score: docs/concealed.md and docs/concealed.json")
     parser.add_argument(
         "--ideal", choices=("all", "failures", "kept"), default="all",
@@ -32,8 +33,11 @@ def _parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one step of a study."""
-    arguments = _parser().parse_args(argv)
-    study, part = Study(arguments.out.resolve()), (arguments.part[0], arguments.part[1])
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    if arguments.alone and arguments.write_docs:
+        parser.error("the table of the documents is that with a flight held out: --write-docs goes without --alone.")
+    study, part = Study(arguments.out.resolve(), arguments.alone), (arguments.part[0], arguments.part[1])
     if arguments.step == "draw":
         from .draw import write_cases
 

@@ -1,5 +1,7 @@
 """Runs the diagnosis on every flown case, as a process that sees two recordings and the name of the nominal vehicle.
 
+Or one recording, where the study says so, with nothing held out.
+
 It works in an empty folder with links to the recordings; nothing that it is given leads to the truth.
 """
 
@@ -24,11 +26,12 @@ def diagnose_one(study: Study, case: str, vehicle: str, command: Sequence[str]) 
     """The answer file of a case: case, seconds, code, said (last line on standard error), result (the JSON or None)."""
     with tempfile.TemporaryDirectory() as folder:
         link = os.link if _same_disk(study, folder) else os.symlink
-        for flight in ("recording", "held_out"):
+        for flight in study.given:
             link(study.recording(case, flight), Path(folder) / f"{flight}.mcap")
+        apart = [] if study.alone else ["--held-out", "held_out.mcap"]
         words = [
-            *command, "recording.mcap", "--vehicle", vehicle, "--held-out", "held_out.mcap", "--json", "answer.json",
-            "--write-vehicle", "fitted.toml",
+            *command, "recording.mcap", "--vehicle", vehicle, *apart, "--json", "answer.json", "--write-vehicle",
+            "fitted.toml",
         ]  # fmt: skip
         begun = time.monotonic()
         try:
@@ -65,7 +68,7 @@ def diagnose_all(
     minutes: float = math.inf,
     part: tuple[int, int] = (0, 1),
 ) -> int:
-    """Diagnose what has no answer yet; returns how many. Answers are kept: delete OUT/answers to ask again."""
+    """Diagnose what has no answer yet; returns how many. Answers are kept: delete them to ask again."""
     begun, asked = time.monotonic(), 0
     for case in flown(study):
         if int(case) % part[1] != part[0] or study.answer(case).is_file():

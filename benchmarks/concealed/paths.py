@@ -9,9 +9,13 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Study:
-    """OUT/cases is what the diagnosing process is told of; OUT/truth is what it is not."""
+    """OUT/cases is what the diagnosing process is told of; OUT/truth is what it is not.
+
+    Where it is given one flight `alone`, its answers are in OUT/alone instead of OUT/answers.
+    """
 
     folder: Path
+    alone: bool = False
 
     def truth(self, case: str) -> Path:
         return self.folder / "truth" / f"{case}.json"
@@ -23,11 +27,20 @@ class Study:
         """flight: "recording" or "held_out"."""
         return self.folder / "cases" / case / f"{flight}.mcap"
 
+    @property
+    def given(self) -> tuple[str, ...]:
+        """The flights that the diagnosing process gets."""
+        return ("recording",) if self.alone else ("recording", "held_out")
+
     def answer(self, case: str) -> Path:
-        return self.folder / "answers" / f"{case}.json"
+        return self._answers / f"{case}.json"
 
     def fitted(self, case: str) -> Path:
-        return self.folder / "answers" / f"{case}.toml"
+        return self._answers / f"{case}.toml"
+
+    @property
+    def _answers(self) -> Path:
+        return self.folder / ("alone" if self.alone else "answers")
 
     def cases(self) -> list[str]:
         return sorted(p.stem for p in (self.folder / "truth").glob("[0-9]*.json"))

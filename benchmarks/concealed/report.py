@@ -27,14 +27,14 @@ def outcomes(study: Study, *, ideal: Ideal = "all") -> list[Outcome]:
     for outcome in kept:
         case = outcome.truth["case"]
         if ideal == "all" or case in wanted:
-            _know(study, case, outcome.truth, held_out=ideal == "all")
+            _know(study, case, outcome.truth, held_out=ideal == "all" and not study.alone)
     return [_outcome(study, outcome.truth["case"]) for outcome in kept]
 
 
 def _outcome(study: Study, case: str) -> Outcome:
     answer, truth, known = read(study.answer(case)), read(study.truth(case)), read(_known(study, case)) or {}
-    return Outcome(truth, answer["result"], answer["seconds"], known.get("nats"), known.get("held_out", {}),
-                   known.get("of_each") or {})  # fmt: skip
+    held_out = {} if study.alone else known.get("held_out", {})  # of the vehicle that both flights gave
+    return Outcome(truth, answer["result"], answer["seconds"], known.get("nats"), held_out, known.get("of_each") or {})
 
 
 def _known(study: Study, case: str) -> Path:
