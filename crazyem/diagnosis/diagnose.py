@@ -147,7 +147,7 @@ def diagnose(
         deaf = disobedient([*here, *there])
         remains = remains.beside(deaf) if deaf else remains
         if not any(e.name == "input_delay" for e in told.effects):
-            late, alike = late_rotors(here, there, vehicle, wanted, left_out)
+            late, alike = late_rotors(here, there, vehicle, wanted, left_out, deaf=deaf is not None)
             beside += late
             groups = (*groups, *alike)
             separate = tuple(dict.fromkeys((*separate, *(CATALOGUE[n].separates for g in alike for n in g))))

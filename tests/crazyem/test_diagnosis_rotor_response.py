@@ -10,6 +10,8 @@ from made_flight import array_of
 
 from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis.flights.inputs import inputs_of
+from crazyem.diagnosis.naming.beside import late_rotors
+from crazyem.diagnosis.naming.named import CALIBRATED, DOUBTFUL, SELDOM
 from crazyem.diagnosis.naming.rotor_response import (
     DELAY_SD,
     ENOUGH,
@@ -181,6 +183,23 @@ def behind(time, wanted, *, lag):
     for k in range(1, len(out)):
         out[k] = wanted[k - 1] + (out[k - 1] - wanted[k - 1]) * np.exp(-(time[k] - time[k - 1]) / lag)
     return out
+
+
+@pytest.mark.parametrize(
+    ("lag", "held_out", "deaf", "most"),
+    [
+        (0.06, True, False, CALIBRATED), (0.06, False, False, CALIBRATED), (0.06, True, True, DOUBTFUL),
+        (0.037, False, False, SELDOM),
+    ],
+)  # fmt: skip
+def test_a_late_rotor_is_as_sure_as_what_speaks_for_it(lag, held_out, deaf, most):
+    """One rotor of four that sticks makes all of them look late (2048/0068: by 6 ms, 0.94 sure by one flight)."""
+    slow = Answer(np.array([lag, 0.0]), np.diag([1e-6, 1e-6]), np.ones((4, 1000)) * 1e-4, (1.0, 9.0))
+    found, groups = late_rotors([slow], [slow] if held_out else [], ROTORS, (), {}, deaf=deaf)
+    assert groups == ()
+    assert [e.name for e in found] == ["motor_lag"]
+    assert found[0].confidence <= most
+    assert found[0].confidence > most - 0.05
 
 
 @pytest.mark.parametrize("sticks", [pytest.param(False, marks=pytest.mark.slow), True])

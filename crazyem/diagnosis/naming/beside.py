@@ -10,7 +10,7 @@ from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.naming import accelerometer, rotor_response
 from crazyem.diagnosis.naming.gusts import find_gusts
-from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, around, share
+from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, around, at_most, share
 from crazyem.diagnosis.naming.prune import ADMITTED
 from crazyem.diagnosis.naming.trials import SURE
 from crazyem.diagnosis.naming.unexplained import Unexplained
@@ -79,8 +79,13 @@ def late_rotors(
     vehicle: Vehicle,
     wanted: Sequence[str],
     left_out: dict[str, str],
+    *,
+    deaf: bool = False,
 ) -> tuple[list[Named], tuple[tuple[str, ...], ...]]:
-    """Lag and delay of rotors whose speeds were measured, and the group of both where one is as good as the other."""
+    """Lag and delay of rotors whose speeds were measured, and the group of both where one is as good as the other.
+
+    Where one of the rotors is `deaf` to what is commanded, it makes all four look late or prompt, so neither is sure.
+    """
     found = rotor_response.response(answers)
     if found is None:
         return [], ()
@@ -92,6 +97,8 @@ def late_rotors(
     for name, (value, sd) in late.values.items():
         p = CATALOGUE[name].parameters[0]
         values = {p.name: Value(value, p.unit, sd, around(value, sd))}
+        p_value = float(np.exp(-min(late.nats, 700.0)))
         sure = share(min(late.nats, late.held_out), []) * (0.5 if late.alike else 1.0)
-        named.append(Named(name, name, values, {}, late.held_out, float(np.exp(-min(late.nats, 700.0))), sure))
+        most = DOUBTFUL if deaf else at_most(late.held_out, p_value, apart=bool(held_out))
+        named.append(Named(name, name, values, {}, late.held_out, p_value, min(sure, most)))
     return named, (("motor_lag", "input_delay"),) if late.alike else ()
