@@ -1,5 +1,6 @@
 """What a name is said with: inertias that are one factor on the torques, and a group that says so."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,8 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming.named import CALIBRATED, DOUBTFUL, SELDOM, Named, at_most, one_factor
-from crazyem.diagnosis.naming.told import _numbers, strongest_first
+from crazyem.diagnosis.naming.told import _numbers, _rivals, strongest_first
+from crazyem.diagnosis.naming.trials import Step, Trial
 
 OWN = np.array([1.66e-5, 1.67e-5, 2.93e-5])
 
@@ -123,3 +125,27 @@ def test_inertias_are_as_unsure_as_a_lag_that_is_a_little_wrong_makes_them() -> 
     assert (
         by_a_wrong_lag(data, refine_base(data, start, [Candidate("motor_lag", (), ("time_constant",))], rounds=1)) == {}
     )
+
+
+@pytest.mark.parametrize(
+    ("accepted", "rivals"),
+    [
+        (["velocity_moment"], {"inertia", "torque_scale", "rate_damping"}),
+        (["velocity_moment", "rate_damping"], {"inertia", "torque_scale"}),
+        (["velocity_moment", "inertia"], {"rate_damping"}),
+        (["velocity_moment", "torque_scale"], {"inertia", "rate_damping"}),  # inertias may be more than a factor
+    ],
+)
+def test_what_is_needed_beside_a_name_is_no_other_name_for_it(accepted: list[str], rivals: set[str]) -> None:
+    """Of drag and gyro bias, both hidden and both found, each was told as perhaps the other (2045/0179)."""
+    one, *others = (
+        Trial(Candidate(n, (), ("x",)), 50.0, 20.0, 1.0, 1e-9, 60.0)
+        for n in ("velocity_moment", "inertia", "torque_scale", "rate_damping")
+    )
+    step = Step((one, *others), one, alike=tuple(others))
+    found = SimpleNamespace(accepted=tuple(Candidate(n, (), ("x",)) for n in accepted))
+    assert {t.candidate.effect for t in _rivals(one.candidate, step, found, frozenset())} == rivals
+    inertia = next(t for t in others if t.candidate.effect == "inertia")
+    turned = Step((inertia, *others), inertia, alike=(others[1],))
+    found = SimpleNamespace(accepted=(inertia.candidate,))
+    assert "torque_scale" in {t.candidate.effect for t in _rivals(inertia.candidate, turned, found, frozenset())}

@@ -84,7 +84,7 @@ def tell(
         own = slice(at, at + len(candidate.free))
         at = own.stop
         away, covariance = _away(candidate, point), solution.covariance[own, own]
-        rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, witnessed), balance)
+        rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, selection, witnessed), balance)
         heard = _against(remains, candidate, data)
         confidence = trust(heard) * share(step.taken.evidence, []) * preferred(step.taken, rivals)
         confidence /= 1.0 + sum(float(np.exp(-nats)) for nats in steady.values())
@@ -193,9 +193,15 @@ def _steady_rivals(
     return [t for t, margin in said if margin is None], nats
 
 
-def _rivals(candidate: Candidate, step: Step, witnessed: frozenset[str]) -> list[Trial]:
-    """What else explains what the effect explains; not what a witness told from it."""
-    others = {candidate.effect, *step.beside} | (witnessed if candidate.effect in witnessed else frozenset())
+def _rivals(candidate: Candidate, step: Step, selection: Selection, witnessed: frozenset[str]) -> list[Trial]:
+    """What else explains what the effect explains; not what a witness told from it, nor what was found beside it.
+
+    Of two effects that the final model needs beside each other neither is another name for the other. Nor is a factor
+    on the torques one for what is needed beside inertias, which can be such a factor themselves.
+    """
+    found = {c.effect for c in selection.accepted}
+    found |= {"torque_scale"} if "inertia" in found and candidate.effect != "inertia" else set()
+    others = {candidate.effect, *step.beside, *found} | (witnessed if candidate.effect in witnessed else frozenset())
     return [t for t in step.explanations() if t.candidate.effect not in others]
 
 
