@@ -16,6 +16,7 @@ from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.naming import told
 from crazyem.diagnosis.naming.named import CALIBRATED, DOUBTFUL, SELDOM, Named, at_most, one_factor
 from crazyem.diagnosis.naming.told import _numbers, _rivals, strongest_first
 from crazyem.diagnosis.naming.trials import Step, Trial
@@ -39,10 +40,13 @@ def test_chance_tells_one_factor_as_several_in_one_of_twenty():
     assert np.mean(told) == pytest.approx(0.95, abs=0.02)
 
 
-def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_asked():
+def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_asked(monkeypatch):
     flown = fly(Hidden(torque=0.7), seconds=20.0, seed=6)
+    held_out = []
+    monkeypatch.setattr(told, "at_most", lambda held, p_value, *, apart: held_out.append(apart) or 0.123)
     found = diagnose([flown], DRONE, wanted=["inertia"])
-    assert [e.name for e in found.effects] == ["inertia"]
+    assert [(e.name, e.confidence) for e in found.effects] == [("inertia", 0.123)]
+    assert held_out == [False]  # it is one flight alone
     assert found.indistinguishable == (("inertia", "torque_scale"),)
 
 

@@ -53,8 +53,8 @@ def tell(
     *,
     witnessed: frozenset[str],
     in_place: Mapping[str, tuple[Trial, Trial] | None],
+    apart: bool,
     balance: Balance | None = None,
-    apart: bool = True,
 ) -> Told:
     """The selected effects as they are told.
 
@@ -62,8 +62,8 @@ def tell(
         remains: the structure that they leave, beside which no name is sure.
         witnessed: names that a witness told from their look-alikes.
         in_place: for an effect the two trials, of it and of what else could stand in its place.
-        balance: what is steady, by which names are told apart where a file has a trim.
         apart: whether a flight was held out.
+        balance: what is steady, by which names are told apart where a file has a trim.
     """
     if not selection.accepted:
         return Told()
