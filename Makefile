@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
+WARM   := $(VENV)/.compiled
 
 .PHONY: fly test slow lint bench concealed paper paper-docs cfclient-test clean setup
 
@@ -11,16 +12,20 @@ $(READY): pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	touch $(READY)
 
+$(WARM): $(READY)  # once: what is compiled stays on the disk
+	$(BIN)/python tests/compile_first.py
+	touch $(WARM)
+
 setup: $(READY)
 
 fly: $(READY)  ## fly the simulated firmware with wrong constants and watch them being corrected
 	$(BIN)/crazyem fly --scenario firmware_sim/scenarios/payload.toml --trajectory excite --duration 20 \
 		--record flight.mcap --json flight.json
 
-test: $(READY)  ## everything that is not marked slow
+test: $(WARM)  ## everything that is not marked slow
 	$(BIN)/python -m pytest -q -n 2
 
-slow: $(READY)  ## the long ones: many seeds, many flights
+slow: $(WARM)  ## the long ones: many seeds, many flights
 	$(BIN)/python -m pytest -q -n 2 -m slow
 
 lint: $(READY)

@@ -59,6 +59,7 @@ def test_an_inertia_that_no_body_has_leaves_open_what_turns_the_drone(slow_to_tu
         assert again.effects[0].parameters[axis].value == pytest.approx(0.02, abs=0.006)
 
 
+@pytest.mark.slow
 def test_a_selection_goes_on_from_where_another_began(monkeypatch):
     data = Data([flight_of(fly(Hidden(thrust=(0.9,) * 4, drag=(0.02, 0.02, 0.02)), seconds=20.0), DRONE)])
     point = nominal(data, Point(DRONE, {}, first_guess()))
@@ -77,6 +78,7 @@ def test_a_selection_goes_on_from_where_another_began(monkeypatch):
     assert found.final.effects["linear_drag"]["x"] == pytest.approx(0.02, abs=0.004)
 
 
+@pytest.mark.slow
 def test_what_went_on_to_its_end_is_taken_back_and_the_selection_goes_on(monkeypatch):
     """As a slope of the thrust curve did, in the fit with all that is free: a thrust that does not heed its command."""
     data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02), thrust=(0.9,) * 4), seconds=20.0), DRONE)])
@@ -164,6 +166,7 @@ def test_what_a_wrong_lag_does_is_part_of_an_interval(slow_to_turn, monkeypatch)
     assert after["linear_drag"] == before["linear_drag"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("vehicle", "alike"), [(DRONE, False), (TRIMMED, True)])
 def test_with_a_trim_a_load_is_told_with_two_weak_rotors(vehicle, alike):
     """A tenth less thrust of the left rotors; a load there explains it, where nothing else is asked."""

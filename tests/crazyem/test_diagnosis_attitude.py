@@ -125,6 +125,7 @@ def test_where_the_filter_begins_anew_there_is_an_attitude() -> None:
     assert np.array_equal(some.rows(np.ones(some.time.size, bool)).y, some.y, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_errors_that_last_are_no_shaking_and_no_noise_of_the_gyro() -> None:
     """A filter that takes them for white noise at 100 Hz finds a gyro more than twice as noisy and a drone that is
     shaken less; one attitude in 80 ms leaves both as they are by an attitude without such errors."""

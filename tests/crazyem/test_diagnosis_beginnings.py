@@ -44,6 +44,7 @@ def fitted(data, point, candidate):
     return refine_base(data.twin(), start, [candidate], rounds=6, noise=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [0.27, 0.5])  # at 0.15 m the plane pendulum itself is 5 % from the real one
 def test_a_load_is_begun_at_the_length_whose_swing_the_flight_shows(length):
     recording = fly(Hidden(load=(0.0015, length)), seconds=20.0, seed=3)

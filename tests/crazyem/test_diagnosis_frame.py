@@ -76,6 +76,7 @@ def test_a_drone_that_never_moves_is_upright() -> None:
     assert alike(still, []) == (still, [])
 
 
+@pytest.mark.slow
 def test_a_diagnosis_tells_whose_frame_it_turned_and_names_no_tilt() -> None:
     """Flights of one healthy drone whose frames lie 30 mrad apart, about a mean of nothing."""
     recordings = [replace(turned(fly(seed=s), r, 0.0), path=f"{s}.csv") for s, r in enumerate((0.015, -0.015, 0.03))]

@@ -51,6 +51,7 @@ def test_a_cable_is_unexplained_and_told_by_place() -> None:
     assert "force_by_place" not in found.fitted_vehicle.effects
 
 
+@pytest.mark.slow
 def test_wind_stays_wind() -> None:
     found = diagnosed(Hidden(breeze=(0.02, -0.01, 0.0)))
     assert [e.name for e in found.effects] == ["wind"]

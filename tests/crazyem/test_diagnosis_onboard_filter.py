@@ -55,6 +55,7 @@ def behind(recording: Recording, name: str, lag: float) -> Recording:
     return replace(recording, signals={**recording.signals, name: array_of(name, signal.time, then, place=95)})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "parameter", "lags"), [("body_rate", "rate_lag", (0.0, 2e-3)),
                                                          ("velocity", "velocity_lag", (0.0, 1.5e-3))])  # fmt: skip
 def test_lags_of_the_log_are_found(name, parameter, lags):

@@ -71,6 +71,7 @@ def test_never_both_ways(here: list[float], there: list[float]) -> None:
     assert not (roles.swapped(one, other) and roles.swapped(other, one))
 
 
+@pytest.mark.slow
 def test_all_that_is_told_follows(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -202,7 +202,8 @@ def test_a_late_rotor_is_as_sure_as_what_speaks_for_it(lag, held_out, deaf, most
     assert found[0].confidence > most - 0.05
 
 
-@pytest.mark.parametrize("sticks", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("sticks", [False, True])
 def test_a_diagnosis_tells_of_a_rotor_that_does_not_follow_its_command(monkeypatch, sticks):
     """Speeds that carry the drone as its commands do; of what the commands say of them, only whether one sticks."""
     flown = fly(seconds=10.0, seed=4)

@@ -99,7 +99,9 @@ def test_weighing_is_asked_for_whether_a_load_is_told_apart_or_not() -> None:
     selection = Selection(point, fitted.point, (Step((trial,), trial),), (LOAD,), fitted, 1)
     for value, group in ((30.0, ()), (49.0, (("payload", "thrust_scale", "center_of_mass"),))):
         pair = (trial, replace(weaker, value=value))
-        told = tell(data, selection, Unexplained((), 50.0), witnessed=frozenset(), apart=True, in_place={"payload": pair})
+        told = tell(
+            data, selection, Unexplained((), 50.0), witnessed=frozenset(), apart=True, in_place={"payload": pair}
+        )
         assert told.groups == group
         assert CATALOGUE["payload"].separates in told.separate
 

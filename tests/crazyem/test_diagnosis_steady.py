@@ -72,6 +72,7 @@ def test_a_steady_torque_that_nothing_explains_is_written_as_a_trim() -> None:
     assert not diagnose([other], found.fitted_vehicle).mismatch
 
 
+@pytest.mark.slow
 def test_what_a_file_explains_leaves_no_trim() -> None:
     assert (
         TRIM not in diagnose([fly(Hidden(drag=(0.02, 0.02, 0.0)), seconds=12.0, seed=7)], DRONE).fitted_vehicle.effects

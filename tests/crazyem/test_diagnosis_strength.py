@@ -25,6 +25,7 @@ def flights() -> list[Flight]:
     return differing(made, [], DRONE)[0]
 
 
+@pytest.mark.slow
 def test_each_is_found_and_the_mean_is_left_to_the_thrust_scale() -> None:
     data = Data(flights())
     point = nominal(data, Point(DRONE, {}, first_guess()))
@@ -35,6 +36,7 @@ def test_each_is_found_and_the_mean_is_left_to_the_thrust_scale() -> None:
     assert own.mean() == pytest.approx(1.0, abs=2e-3)  # priors
 
 
+@pytest.mark.slow
 def test_a_recording_hears_of_its_own_strength_only() -> None:
     """Derivatives by the strength of one recording, against differences of the log-likelihood of each."""
     data = Data(flights()[:3])

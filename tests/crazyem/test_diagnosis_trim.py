@@ -61,6 +61,7 @@ def test_a_day_is_free_only_where_the_file_has_a_trim() -> None:
     assert usual_gusts(stormy) == pytest.approx(4.0)
 
 
+@pytest.mark.slow
 def test_a_trim_is_free_where_no_centre_of_mass_is_asked_for() -> None:
     """Rotors on the left weaker by 3 %, on the right stronger: thrust acts 3 % of the arm right of the middle."""
     lopsided = Hidden(thrust=(1.03, 1.03, 0.97, 0.97), drag=(0.02, 0.02, 0.0))

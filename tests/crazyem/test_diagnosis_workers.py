@@ -57,6 +57,7 @@ def test_what_is_done_to_a_twin_leaves_the_data_as_it_is():
     assert not np.array_equal(twin.models[0].path, kept)
 
 
+@pytest.mark.slow
 def test_any_number_of_threads_finds_the_same():
     recording = fly(Hidden(thrust=(1, 1, 0.9, 1)), seconds=8.0)
     alone, shared = (

@@ -254,6 +254,7 @@ def test_a_description_of_another_file_is_not_believed(tmp_path: Path) -> None:
     assert any("other columns" in f.text for f in open_recording(tmp_path / "a.csv").findings)
 
 
+@pytest.mark.slow
 def test_parts_add_up_to_the_whole(tmp_path: Path) -> None:
     recording = made_flight(seconds=120.0, more=["rpm"])
     path, second = tmp_path / "f.csv", tmp_path / "g.csv"

@@ -1,6 +1,7 @@
 """What is no column of the regression: gusts, a tilted accelerometer, rotors that follow their commands late."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
@@ -10,7 +11,7 @@ from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.naming import accelerometer, rotor_response
 from crazyem.diagnosis.naming.gusts import find_gusts
-from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, around, at_most, share
+from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, around, at_most, share, trust
 from crazyem.diagnosis.naming.prune import ADMITTED
 from crazyem.diagnosis.naming.trials import SURE
 from crazyem.diagnosis.naming.unexplained import Unexplained
@@ -54,7 +55,8 @@ def beside_the_regression(
                 held = there.gain if there else 0.0
             if held > 0:
                 # what the regression explains, nothing where gusts are all there is, says nothing of them
-                sure = (DOUBTFUL if remains.without_force().found else 1.0) * share(min(gusts.gain, held), [])
+                left = replace(remains.without_force(), gained=gusts.gain)
+                sure = trust(left, held) * share(min(gusts.gain, held), [])
                 found.append(Named("gusts", "gusts", values, {}, held, float(np.exp(-min(held, 700.0))), sure))
     if not wanted or accelerometer.EFFECT in wanted:
         tilted = accelerometer.tilt(data, point)

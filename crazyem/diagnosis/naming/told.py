@@ -86,7 +86,7 @@ def tell(
         away, covariance = _away(candidate, point), solution.covariance[own, own]
         rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, selection, witnessed), balance)
         heard = _against(remains, candidate, data)
-        confidence = trust(heard) * share(step.taken.evidence, []) * preferred(step.taken, rivals)
+        confidence = trust(heard, step.taken.held_out) * share(step.taken.evidence, []) * preferred(step.taken, rivals)
         confidence /= 1.0 + sum(float(np.exp(-nats)) for nats in steady.values())
         doubted = candidate.effect in selection.doubted
         by_day = _by_the_day(candidate, point, balance)

@@ -1,0 +1,56 @@
+"""Compiles what the tests run, side by side: on a fresh machine each of their workers would compile all of it itself.
+
+python tests/compile_first.py
+
+`make test` runs it once. Whatever fails here fails in the tests, which say why.
+"""
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+ESTIMATOR = """
+from crazyem.live.warm_up import warm_up
+from crazyem.vehicle import load_vehicle
+warm_up(load_vehicle("cf2"))
+"""
+
+
+def python(*arguments: str) -> subprocess.Popen[str]:
+    """A child process that says nothing but what it prints."""
+    return subprocess.Popen(
+        [sys.executable, *arguments], cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+
+
+def simulated() -> None:
+    """Once the simulator says where it listens, it is compiled."""
+    simulator = python("-m", "firmware_sim", "--port", "0")
+    assert simulator.stdout is not None
+    while (line := simulator.stdout.readline()) and "udp://" not in line:
+        pass
+    simulator.terminate()
+    simulator.wait()
+
+
+def diagnosed(folder: str) -> None:
+    """A shipped flight, asked for one effect."""
+    log = "logs/clean_figure8.mcap"
+    python("-m", "crazyem", "diagnose", log, "--candidates", "linear_drag", "--json", f"{folder}/d.json").communicate()
+
+
+def main(arguments: Sequence[str] = ()) -> int:
+    """The estimator beside the simulator and the diagnosis, which take as long."""
+    estimator = python("-c", ESTIMATOR)
+    with TemporaryDirectory() as folder:
+        simulated()
+        diagnosed(folder)
+    estimator.communicate()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
