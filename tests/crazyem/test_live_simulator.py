@@ -56,9 +56,9 @@ def wait_for(process, word, seconds=90.0):
 
 def test_a_flight_learns_its_mass_pushes_it_and_replays_bit_for_bit(tmp_path, payload, capsys, monkeypatch):
     out, log = tmp_path / "f.json", tmp_path / "f.mcap"
-    code = main(["fly", "--trajectory", "hover", "--duration", "11", "--scenario", payload, "--speed", "2",
+    code = main(["fly", "--trajectory", "hover", "--duration", "11", "--scenario", payload,
                  "--record", str(log), "--json", str(out)])  # fmt: skip
-    assert code == 0
+    assert code == 0  # as fast as time: beside other work the estimator is late at twice that, and nothing is pushed
     summary = json.loads(out.read_text())
     assert summary["estimates"]["mass"]["value"] == pytest.approx(0.036, rel=0.01)
     assert summary["pushes"]
