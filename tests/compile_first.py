@@ -7,7 +7,6 @@ python tests/compile_first.py
 
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -42,15 +41,14 @@ def diagnosed(folder: str) -> None:
     python("-m", "crazyem", "diagnose", log, "--candidates", "linear_drag", "--json", f"{folder}/d.json").communicate()
 
 
-def main(arguments: Sequence[str] = ()) -> int:
+def main() -> None:
     """The estimator beside the simulator and the diagnosis, which take as long."""
     estimator = python("-c", ESTIMATOR)
     with TemporaryDirectory() as folder:
         simulated()
         diagnosed(folder)
     estimator.communicate()
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

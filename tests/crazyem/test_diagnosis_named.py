@@ -44,11 +44,13 @@ def test_chance_tells_one_factor_as_several_in_one_of_twenty():
 
 def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_asked(monkeypatch):
     flown = fly(Hidden(torque=0.7), seconds=20.0, seed=6)
-    held_out = []
+    held_out, brought = [], []
+    monkeypatch.setattr(told, "trust", lambda remains, nats: brought.append(nats) or 1.0)
     monkeypatch.setattr(told, "at_most", lambda held, p_value, *, apart: held_out.append(apart) or 0.123)
     found = diagnose([flown], DRONE, wanted=["inertia"])
     assert [(e.name, e.confidence) for e in found.effects] == [("inertia", 0.123)]
     assert held_out == [False]  # it is one flight alone
+    assert brought == [found.effects[0].held_out_nats] != [0.0]  # what is weighed against what is left
     assert found.indistinguishable == (("inertia", "torque_scale"),)
 
 
