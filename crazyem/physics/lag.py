@@ -29,8 +29,8 @@ _AHEAD = 64  # most commands known or predicted inside one step
 
 @compiled
 def _segment(u0, u1, h, tau, state, acc):
-    """One linear stretch of the command, u0 to u1 (4,), h long: advance `state`, add its integral to `acc` (12,)."""
-    for v in range(3):
+    """One linear stretch of the command, u0 to u1 (4,), h long: advance `state`, add its integral to `acc`."""
+    for v in range(len(acc) // 4):
         tv = tau * (1.0 + STEP * (v if v < 2 else -1))
         decay = np.exp(-h / tv) if tv > 0 else 0.0
         for c in range(4):
@@ -136,7 +136,7 @@ def _run(times, commands, i, last, begin, end, mode, tau, state, acc):
 def _back(t0, t1, u0, u1, t, tau, state):
     """Undo the lag from t back to t0 on the line from (t0, u0) to (t1, u1)."""
     h = t - t0
-    for v in range(3):
+    for v in range(len(state) // 4):
         tv = tau * (1.0 + STEP * (v if v < 2 else -1))
         if tv <= 0.0:
             continue
@@ -165,22 +165,23 @@ def lagged_means(
         tau: s; 0 means no lag.
         delay: s by which the command acts later than its stamp says.
         state: (13,) lagged values for tau, tau (1 + STEP) and tau (1 - STEP), 4 each, then their time [s] on the clock
-            of the commands; updated in place, so that a later call goes on from the last node.
+            of the commands; updated in place, so that a later call goes on from the last node. (5,): for tau alone.
         mean: (m, 4) receives the means.
-        mean_tau: (m, 4) receives d mean / d tau [1/s].
+        mean_tau: (m, 4) receives d mean / d tau [1/s]; for tau alone nothing.
         mean_delay: (m, 4) receives d mean / d delay [1/s].
 
     Returns:
         Index of the last command at or before the last node: the `first` of a later call.
     """
     i = first
-    acc = np.empty(12)
-    junk = np.empty(12)
-    guess = np.empty(13)
+    values = len(state) - 1
+    acc = np.empty(values)
+    junk = np.empty(values)
+    guess = np.empty(values + 1)
     path_times = np.empty(_AHEAD)
     path = np.empty((_AHEAD, 4))
     start = np.empty(4)
-    begin = state[12]
+    begin = state[values]
     while i + 1 < last and times[i + 1] <= begin:
         i += 1
     for k in range(node_first, node_last):
@@ -189,8 +190,9 @@ def lagged_means(
         if span <= 0.0:
             for c in range(4):
                 mean[k, c] = state[c]
-                mean_tau[k, c] = 0.0
                 mean_delay[k, c] = 0.0
+                if values > 4:
+                    mean_tau[k, c] = 0.0
             continue
         for c in range(4):
             start[c] = state[c]
@@ -225,7 +227,8 @@ def lagged_means(
                 mean_delay[k, c] = -(state[c] - start[c]) / span
         for c in range(4):
             mean[k, c] = acc[c] / span
-            mean_tau[k, c] = (acc[4 + c] - acc[8 + c]) / (2 * STEP * tau * span) if tau > 0 else 0.0
+            if values > 4:
+                mean_tau[k, c] = (acc[4 + c] - acc[8 + c]) / (2 * STEP * tau * span) if tau > 0 else 0.0
         begin = end
-        state[12] = end
+        state[values] = end
     return i

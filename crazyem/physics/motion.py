@@ -15,10 +15,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.compiled import compiled
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Body, Effect, Effects, Offset, Situation
 from crazyem.physics.lag import CAUSAL, HOLD, LINEAR, fit_predictor, hold_predictor, lagged_means
-from crazyem.physics.rotations import cross
 from crazyem.physics.rotors import wrench
 from crazyem.vehicle import GRAVITY, Vehicle
 
@@ -103,17 +103,16 @@ def rotor_thrust(
     thrust, lag, delay = settled(inputs, vehicle=vehicle, effects=effects)
     mode = LINEAR if inputs.measured else (CAUSAL if lag > 0 and inputs.aged else HOLD)
     mean, rate = np.zeros((len(nodes), 4)), np.zeros((len(nodes), 4))
-    scratch = np.zeros((len(nodes), 4))
+    unused = np.zeros((0, 4))
     predictor = fit_predictor(thrust) if mode == CAUSAL else hold_predictor()
-    state = np.zeros(13)
+    state = np.zeros(5)
     starts = sorted({0, *breaks, len(nodes)})
     for first, last in pairwise(starts):
         begin = nodes[first] - delay - 10 * max(lag, 0.02)
         at = max(0, int(np.searchsorted(inputs.time, begin, "right")) - 1)
-        state[:12] = np.tile(thrust[at], 3)
-        state[12] = inputs.time[at]
+        state[:4], state[4] = thrust[at], inputs.time[at]
         lagged_means(inputs.time, thrust, at, len(inputs.time), predictor, nodes, first, last, mode, lag, delay, state,
-                     mean, scratch, rate)  # fmt: skip
+                     mean, unused, rate)  # fmt: skip
     return mean, -rate
 
 
@@ -167,17 +166,38 @@ def motion(situation: Situation, *, vehicle: Vehicle, effects: Effects) -> Motio
     return accelerated(force, torque, body=body, body_rate=situation.body_rate)
 
 
+@compiled
+def _accelerated(force, torque, rate, centre, mass, inertia, inverse, specific, angular):
+    """Rows of `accelerated`: receives (n, 3) m/s^2 and (n, 3) rad/s^2."""
+    cx, cy, cz = centre[0], centre[1], centre[2]
+    for k in range(len(force)):
+        fx, fy, fz = force[k, 0], force[k, 1], force[k, 2]
+        wx, wy, wz = rate[k, 0], rate[k, 1], rate[k, 2]
+        hx = inertia[0, 0] * wx + inertia[0, 1] * wy + inertia[0, 2] * wz
+        hy = inertia[1, 0] * wx + inertia[1, 1] * wy + inertia[1, 2] * wz
+        hz = inertia[2, 0] * wx + inertia[2, 1] * wy + inertia[2, 2] * wz
+        tx = torque[k, 0] - (cy * fz - cz * fy) - (wy * hz - wz * hy)
+        ty = torque[k, 1] - (cz * fx - cx * fz) - (wz * hx - wx * hz)
+        tz = torque[k, 2] - (cx * fy - cy * fx) - (wx * hy - wy * hx)
+        ax = inverse[0, 0] * tx + inverse[0, 1] * ty + inverse[0, 2] * tz
+        ay = inverse[1, 0] * tx + inverse[1, 1] * ty + inverse[1, 2] * tz
+        az = inverse[2, 0] * tx + inverse[2, 1] * ty + inverse[2, 2] * tz
+        angular[k, 0], angular[k, 1], angular[k, 2] = ax, ay, az
+        ux, uy, uz = wy * cz - wz * cy, wz * cx - wx * cz, wx * cy - wy * cx
+        specific[k, 0] = fx / mass - (ay * cz - az * cy) - (wy * uz - wz * uy)
+        specific[k, 1] = fy / mass - (az * cx - ax * cz) - (wz * ux - wx * uz)
+        specific[k, 2] = fz / mass - (ax * cy - ay * cx) - (wx * uy - wy * ux)
+
+
 def accelerated(force: NDArray, torque: NDArray, *, body: Body, body_rate: NDArray) -> Motion:
     """Newton and Euler: force (n, 3) N at O and torque (n, 3) N m about O to the motion of O, body axes."""
-    centre = body.centre
-    shifted = bool(centre.any())
-    if shifted:
-        torque = torque - cross(centre, force)
-    angular = (torque - cross(body_rate, body_rate @ body.inertia)) @ np.linalg.inv(body.inertia)
-    specific = force / body.mass
-    if shifted:
-        specific = specific - cross(angular, centre) - cross(body_rate, cross(body_rate, centre))
-    return Motion(specific, angular)
+    rows = [np.ascontiguousarray(v, np.float64) for v in (force, torque, body_rate)]
+    motion = Motion(np.empty(rows[0].shape), np.empty(rows[0].shape))
+    _accelerated(
+        *rows, np.asarray(body.centre, np.float64), float(body.mass), body.inertia, np.linalg.inv(body.inertia),
+        motion.specific_force, motion.angular_acceleration,
+    )  # fmt: skip
+    return motion
 
 
 def measured(situation: Situation, *, vehicle: Vehicle, effects: Effects) -> Offset:

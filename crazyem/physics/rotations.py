@@ -55,15 +55,14 @@ def rotation_vector_from_quaternion(q: ArrayLike) -> NDArray:
 
 def rotation_matrix(q: ArrayLike) -> NDArray:
     """Body to world. q: (..., 4) -> (..., 3, 3)."""
-    x, y, z, w = np.moveaxis(np.asarray(q, float), -1, 0)
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], -1),
-            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], -1),
-            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        -2,
-    )
+    q = np.asarray(q, float)
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    matrix = np.empty((*q.shape[:-1], 3, 3))
+    matrix[..., 0, 0], matrix[..., 1, 1] = 1 - 2 * (y * y + z * z), 1 - 2 * (x * x + z * z)
+    matrix[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    for i, j, even, odd in ((0, 1, x * y, z * w), (2, 0, x * z, y * w), (1, 2, y * z, x * w)):
+        matrix[..., i, j], matrix[..., j, i] = 2 * (even - odd), 2 * (even + odd)
+    return matrix
 
 
 def cross(a: NDArray, b: NDArray) -> NDArray:

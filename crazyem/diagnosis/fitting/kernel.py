@@ -19,7 +19,11 @@ from crazyem.vehicle import GRAVITY
 # disturbing specific force. Torques with memory alone are what most flights need, so they come first.
 STATES = 18
 MEASURED = 12
-TOGETHER = 6  # measurements whose products are added at once (`_add_products` is written out for as many)
+# Inner loops run over rows of a multiple of 4, of 16 at least: what a vector does not fill is done number by number,
+# and takes three times as long.
+LANES, LEAST = 4, 16
+# Measurements whose products are added at once, by a product of matrices: few enough that BLAS does it in this thread.
+PRODUCT, MOST_ROWS = 200_000, 600
 
 
 @compiled
@@ -68,13 +72,28 @@ def _transition(dt, decay, turned, rate_turn, middle, specific, jr, x, out):
 
 
 @compiled
-def _add_products(z, total):
-    """total += z' z for z (TOGETHER, m); the upper triangle."""
-    for j in range(z.shape[1]):
-        a, b, c, d, e, f = z[0, j], z[1, j], z[2, j], z[3, j], z[4, j], z[5, j]
-        if a != 0.0 or b != 0.0 or c != 0.0 or d != 0.0 or e != 0.0 or f != 0.0:
-            for i in range(j, z.shape[1]):
-                total[j, i] += a * z[0, i] + b * z[1, i] + c * z[2, i] + d * z[3, i] + e * z[4, i] + f * z[5, i]
+def _take_away(x, scale, left, right):
+    """x (n, m) -= scale left right'; left (n or more,), right (m,)."""
+    for i in range(x.shape[0]):
+        g = scale * left[i]
+        row = x[i]
+        for j in range(x.shape[1]):
+            row[j] -= g * right[j]
+
+
+@compiled
+def _padded(size):
+    """Numbers in a row that holds `size` of them."""
+    return max(LEAST, (size + LANES - 1) // LANES * LANES)
+
+
+@compiled
+def _add_products(shown, total):
+    """total (m, m) += z' z for z, the first m columns of shown (rows, m or more)."""
+    product = np.dot(shown.T, shown)
+    for i in range(total.shape[0]):
+        for j in range(total.shape[1]):
+            total[i, j] += product[i, j]
 
 
 @compiled
@@ -100,7 +119,7 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
         e, s: (n, 12) receive innovations and their variances, sequential scalars; s is 0 where nothing was measured.
         loglik: (n,) receives log-likelihoods.
         score: (b, c + d) sums of derivative times innovation over variance are added here, by block.
-        information: (b, c + d, c + d) likewise, products of derivatives over variance; the upper triangle.
+        information: (b, c + d, c + d) likewise, products of derivatives over variance.
     """
     n = len(time)
     c, d = acting.shape[2], showing.shape[2]
@@ -111,13 +130,16 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
             size = max(size, 15 if i >= 3 else 18)
     which = np.array([3, 4, 5, 0, 1, 2])  # of the disturbances, in the filter's order
     decay = np.empty(6)
-    cov = np.zeros((size, size))
-    tmp = np.empty((size, size))
-    tra = np.empty((size, size))
-    sens = np.zeros((size, m))
-    new = np.empty((size, m))
-    z = np.empty(m)
-    shown = np.empty((TOGETHER, m))
+    wide, broad = _padded(size), _padded(m)
+    rows = max(MEASURED, min(MOST_ROWS, PRODUCT // (broad * broad)))
+    cov = np.zeros((size, wide))
+    tmp = np.empty((size, wide))
+    tra = np.zeros((size, wide))
+    sens = np.zeros((size, broad))
+    new = np.empty((size, broad))
+    z = np.zeros(broad)
+    shown = np.empty((rows, broad))
+    seen, filled = 0, 0  # rows of `shown` in use, and the block they are of
     quat = np.empty(4)
     turn = np.empty((3, 3))
     start = np.empty((3, 3))
@@ -127,8 +149,8 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
     rate_turn = np.empty((3, 3))
     jr = np.empty((3, 3))
     phi = np.empty(3)
-    gain = np.empty(18)
-    correction = np.empty(18)
+    gain = np.zeros(wide)
+    correction = np.zeros(LEAST + LANES)
     innov = np.empty(12)
     f = np.empty(3)
     total = 0.0
@@ -260,11 +282,13 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
                 innov[6 + i] -= offset[k, 6 + i]
         for i in range(3):
             innov[9 + i] = y[k, 10 + i] - x[10 + i] - offset[k, 9 + i]
-        for i in range(18):
-            correction[i] = 0.0
+        correction[:] = 0.0
         ll = 0.0
-        seen = 0
         bl = block[k]
+        if seen and (bl != filled or seen + MEASURED > rows):
+            _add_products(shown[:seen], information[filled])
+            seen = 0
+        filled = bl
         for i in range(12):
             if np.isnan(innov[i]):
                 s[k, i] = 0.0
@@ -275,36 +299,24 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
             inv = 1.0 / var
             s[k, i] = var
             e[k, i] = err
-            for j in range(size):
+            for j in range(wide):
                 gain[j] = cov[i, j] * inv
             for j in range(size):
                 correction[j] += gain[j] * err
-                g = gain[j] * var
-                row = cov[j]
-                for i2 in range(size):
-                    row[i2] -= g * gain[i2]
+            _take_away(cov, var, gain, gain)
             if m:
-                for j in range(m):
+                for j in range(broad):
                     z[j] = sens[i, j]
                 for j in range(d):
                     z[c + j] += showing[k, i, j]
-                for i2 in range(size):
-                    g = gain[i2]
-                    if g != 0.0:
-                        for j in range(m):
-                            sens[i2, j] -= g * z[j]
+                _take_away(sens, 1.0, gain, z)
                 weight, root = err * inv, np.sqrt(inv)
                 for j in range(m):
                     score[bl, j] += weight * z[j]
+                for j in range(broad):
                     shown[seen, j] = root * z[j]
                 seen += 1
-                if seen == TOGETHER:
-                    _add_products(shown, information[bl])
-                    seen = 0
             ll -= 0.5 * (np.log(2 * np.pi * var) + err * err * inv)
-        if seen:
-            shown[seen:] = 0.0
-            _add_products(shown, information[bl])
         loglik[k] = ll
         total += ll
         for i in range(6):
@@ -319,4 +331,6 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
                 v = 0.5 * (cov[i, j] + cov[j, i])
                 cov[i, j] = v
                 cov[j, i] = v
+    if seen:
+        _add_products(shown[:seen], information[filled])
     return total

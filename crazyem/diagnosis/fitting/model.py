@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from crazyem.diagnosis.fitting import felt
 from crazyem.diagnosis.fitting.astray import strays
 from crazyem.diagnosis.fitting.kernel import sweep
-from crazyem.diagnosis.fitting.situation import causal_middle, initial_path, situation_of, thrust_of
+from crazyem.diagnosis.fitting.situation import causal_middle, initial_path, situation_of, thrust_of, with_rotors
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effects, Situation
@@ -111,9 +111,9 @@ def corrected(swept: Swept, flight: Flight) -> tuple[NDArray, NDArray, NDArray]:
     )
 
 
-def seen_force(swept: Swept, flight: Flight, acceleration: NDArray) -> NDArray:
-    """(n, 3) m/s^2: specific force over each step by the model and what the filter found beside it; NaN: not known."""
-    impulse, step, known = corrected(swept, flight)
+def seen_force(acceleration: NDArray, impulse: NDArray, step: NDArray, known: NDArray) -> NDArray:
+    """(n, 3) m/s^2: specific force over each step by the model and what the filter found beside it (`corrected`); NaN:
+    not known."""
     with np.errstate(invalid="ignore", divide="ignore"):
         seen: NDArray = np.where(known[:, None], acceleration[:, :3] + impulse[:, :3] / step[:, None], np.nan)
     return seen
@@ -126,13 +126,12 @@ def unrest(noise: Noise) -> NDArray:
     return found
 
 
-def lacking(swept: Swept, flight: Flight) -> NDArray:
+def lacking(impulse: NDArray, step: NDArray, known: NDArray) -> NDArray:
     """(n, 6) specific force m/s^2 and angular acceleration rad/s^2, body axes, that a model lacks along a flight.
 
-    The mean over the last `RECENT` of the disturbances with a memory and of what measurements corrected: what comes
-    and goes faster is known to the filter too late, and would look like a gyro that is early.
+    The mean over the last `RECENT` of the disturbances with a memory and of what measurements corrected (both in
+    `corrected`): what comes and goes faster is known to the filter too late, and would look like a gyro that is early.
     """
-    impulse, step, known = corrected(swept, flight)
     forget = [1.0, -np.exp(-float(np.median(step[known])) / RECENT)] if known.any() else [1.0, 0.0]
     total, span = (lfilter([1.0], forget, v, axis=0) for v in (impulse, step[:, None]))
     mean: NDArray = total / np.maximum(span, RECENT)
@@ -160,8 +159,9 @@ class Model:
     moved: NDArray | None = None  # (n, 6) accelerations of that path, with what the model lacks
     seen: NDArray | None = None  # (n, 3) specific force over each step of that path, as it was found to be
     _thrusts: dict[str, tuple[NDArray, NDArray]] = field(default_factory=dict)
-    _rotation: NDArray | None = None  # of the path
-    _rotation_shown: NDArray | None = None
+    _there: Situation | None = None  # along the path
+    _as_shown: Situation | None = None  # at the rows
+    _offsets: dict[str, NDArray] = field(default_factory=dict)  # of one effect each, there
     _strays: dict[str, bool] = field(default_factory=dict)  # shared by twins: it is of the flight alone
     _felt_alone: bool | None = None
     _vibration: NDArray | None = None
@@ -185,10 +185,10 @@ class Model:
         """(n, 6) specific force and angular acceleration over each step, and the situation."""
         effects = of_recording(point.effects if effects is None else effects, self.flight.name)
         path = initial_path(self.flight) if self.path is None else self.path
-        if self._rotation is None:
-            self._rotation = rotation_matrix(path[:, 6:10])
         thrusts = self.thrusts(point.vehicle, effects)
-        situation = situation_of(self.flight, path, point.vehicle, thrusts, self._rotation)
+        if self._there is None:
+            self._there = situation_of(self.flight, path, point.vehicle, thrusts)
+        situation = with_rotors(self._there, point.vehicle, thrusts)
         # where the path tells well enough, the drift of an attitude would be taken for a pull
         if self.seen is not None and any(_ties(name) and self.strays(name, point.vehicle) for name in effects):
             situation = replace(situation, seen=self.seen, unrest=unrest(point.noise))
@@ -208,20 +208,31 @@ class Model:
         mass of 0.7 mm is 10 rad/s^2, and 1 ms of that would be a gyro's bias of 10 mrad/s.
         """
         effects = of_recording(point.effects if effects is None else effects, self.flight.name)
-        accelerations = accelerations if self.moved is None else self.moved
-        if not any(_shows(name) for name in effects):
-            return np.zeros((self.flight.time.size, 12))
+        showing = [name for name in CATALOGUE if name in effects and _shows(name)]
+        offset = np.zeros((self.flight.time.size, 12))
+        if not showing:
+            return offset
+        situation = self._situation_shown(point, accelerations)
+        for name in showing:
+            key = f"{name} {effects[name]!r}"
+            if key not in self._offsets or self.moved is None:
+                only = {name: effects[name]}
+                self._offsets[key] = measured(situation, vehicle=point.vehicle, effects=only).state
+            offset += self._offsets[key]
+        return offset
+
+    def _situation_shown(self, point: Point, accelerations: NDArray) -> Situation:
+        """The situation at the rows; remembered, once a pass has told the accelerations that the drone has."""
+        if self._as_shown is not None and self.moved is not None:
+            return self._as_shown
         path = initial_path(self.flight) if self.shown is None else self.shown
-        if self._rotation_shown is None:
-            self._rotation_shown = rotation_matrix(path[:, 6:10])
-        thrusts = self.thrusts(point.vehicle, {})
-        situation = replace(
-            situation_of(self.flight, path, point.vehicle, thrusts, self._rotation_shown),
-            specific_force=accelerations[:, :3], angular_acceleration=accelerations[:, 3:],
-        )  # fmt: skip
+        accelerations = accelerations if self.moved is None else self.moved
+        situation = situation_of(self.flight, path, point.vehicle, self.thrusts(point.vehicle, {}))
         turned = np.cumsum(accelerations[:, 3:] * situation.step[:, None], axis=0)
-        situation = replace(situation, turned=turned)
-        return measured(situation, vehicle=point.vehicle, effects=effects).state
+        self._as_shown = replace(
+            situation, specific_force=accelerations[:, :3], angular_acceleration=accelerations[:, 3:], turned=turned
+        )
+        return self._as_shown
 
     def sweep(self, point: Point, columns: Sequence[Column] = (), *, passes: int = 1) -> Swept:
         """Filter the flight; with columns, score and information by block. Later passes evaluate physics anew."""
@@ -243,14 +254,16 @@ class Model:
             swept = self._felt(swept, acceleration, acting)
         if order is not None:
             swept = replace(swept, score=swept.score[:, order], information=swept.information[:, order][:, :, order])
-        self._rotation = self._rotation_shown = None
+        self._there = self._as_shown = None
+        self._offsets = {}
         if not np.isfinite(swept.filtered).all():  # a model that left the range of numbers must not spoil the next one
             self.path = self.shown = self.moved = self.seen = None
             return swept
         self.path = causal_middle(swept.filtered, swept.predicted, flight.starts)
         self.shown = swept.filtered
-        self.moved = acceleration + lacking(swept, flight)
-        self.seen = seen_force(swept, flight, acceleration)
+        found = corrected(swept, flight)
+        self.moved = acceleration + lacking(*found)
+        self.seen = seen_force(acceleration, *found)
         return swept
 
     def _is_felt(self) -> bool:

@@ -1,5 +1,7 @@
 """Where physics is evaluated along a flight: path of the drone, thrusts of its rotors, situation at each row."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,23 +33,29 @@ def thrust_of(flight: Flight, vehicle: Vehicle, effects: Effects) -> tuple[NDArr
     )
 
 
-def situation_of(
-    flight: Flight, path: NDArray, vehicle: Vehicle, thrusts: tuple[NDArray, NDArray], rotation: NDArray | None = None
-) -> Situation:
+def situation_of(flight: Flight, path: NDArray, vehicle: Vehicle, thrusts: tuple[NDArray, NDArray]) -> Situation:
     """The situation at the rows of a path (n, 19)."""
     thrust, rate = thrusts
     step = np.concatenate([[0.0], np.diff(flight.time)])
     step[flight.gaps] = 0.0
-    rotation = rotation_matrix(path[:, 6:10]) if rotation is None else rotation
     n = flight.time.size
     return Situation(
         time=flight.time, flown=flight.flown, step=step, position=path[:, 0:3],
-        height=np.maximum(path[:, 2] - flight.ground, 0.0), velocity=path[:, 3:6], rotation=rotation,
-        body_rate=path[:, 10:13], specific_force=np.zeros((n, 3)), angular_acceleration=np.zeros((n, 3)),
-        thrust=thrust, thrust_rate=rate, voltage=flight.voltage,
-        rotor_constant=float("nan") if vehicle.rotor_constant is None else vehicle.rotor_constant,
-        air=np.zeros((n, 3)), fused=flight.attitude is not None,
+        height=np.maximum(path[:, 2] - flight.ground, 0.0), velocity=path[:, 3:6],
+        rotation=rotation_matrix(path[:, 6:10]), body_rate=path[:, 10:13], specific_force=np.zeros((n, 3)),
+        angular_acceleration=np.zeros((n, 3)), thrust=thrust, thrust_rate=rate, voltage=flight.voltage,
+        rotor_constant=_rotor_constant(vehicle), air=np.zeros((n, 3)), fused=flight.attitude is not None,
     )  # fmt: skip
+
+
+def with_rotors(situation: Situation, vehicle: Vehicle, thrusts: tuple[NDArray, NDArray]) -> Situation:
+    """The situation with other rotors' thrusts, and rates of them."""
+    thrust, rate = thrusts
+    return replace(situation, thrust=thrust, thrust_rate=rate, rotor_constant=_rotor_constant(vehicle))
+
+
+def _rotor_constant(vehicle: Vehicle) -> float:
+    return float("nan") if vehicle.rotor_constant is None else vehicle.rotor_constant
 
 
 def causal_middle(filtered: NDArray, predicted: NDArray, starts: NDArray) -> NDArray:
