@@ -1,22 +1,24 @@
 """Threads that share independent work: the kernels release the interpreter lock, so two of them use two cores."""
 
+import contextvars
 import os
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, Generic, TypeVar
 
 from crazyem.errors import UsageError
 
 T = TypeVar("T")
 R = TypeVar("R")
 MOST = 64
-
-_busy = threading.local()  # .inside: this thread is one of a pool's; what it starts itself it also does itself
+_depth: contextvars.ContextVar[int] = contextvars.ContextVar("depth", default=0)  # of work that is shared out
 
 
 class Workers:
     """Maps functions over items with up to `jobs` threads; results in order, the same for any number of threads.
+
+    Work may share out work of its own: whoever is idle helps, and nobody waits for what has not been begun.
 
     Args:
         jobs: threads; None: one for each core that this process may use.
@@ -32,17 +34,89 @@ class Workers:
         if not 1 <= jobs <= MOST:
             raise UsageError(f"--jobs must lie between 1 and {MOST}, not {jobs}.")
         self.jobs = jobs
-        self._pool: ThreadPoolExecutor | None = None
+        # the thread that asks works, too
+        self._pool = ThreadPoolExecutor(jobs - 1, "crazyem-diagnose") if jobs > 1 else None
+        self._changed = threading.Condition()
+        self._open: list[_Shared[Any, Any]] = []
 
     def map(self, function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-        """What `function` gives for each item; it must not change what another item's call reads."""
+        """What `function` gives for each item; it must not change what another item's call reads.
+
+        Raises: what `function` raised for the first of the items with which it failed.
+        """
         items = list(items)
-        if self.jobs == 1 or len(items) < 2 or getattr(_busy, "inside", False):
+        if self._pool is None or len(items) < 2:
             return [function(item) for item in items]
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(self.jobs, "crazyem-diagnose", initializer=_enter)
-        return list(self._pool.map(function, items))
+        shared = _Shared(function, items, self._changed)
+        with self._changed:
+            self._open.append(shared)
+            self._changed.notify_all()
+        helpers = [self._pool.submit(shared.work) for _ in range(min(self.jobs, len(items)) - 1)]
+        try:
+            shared.work()
+            self._help_until_done(shared)
+        finally:  # where the user interrupts, nobody goes on with the rest
+            shared.stop()
+            for helper in helpers:
+                helper.cancel()
+            with self._changed:
+                self._open.remove(shared)
+        return shared.results()
+
+    def _help_until_done(self, shared: "_Shared[Any, Any]") -> None:
+        """Wait for those who are at the last items, and help where they share these out."""
+        while True:
+            with self._changed:
+                while shared.busy and not (inner := [o for o in self._open if o.depth > shared.depth and o.left]):
+                    self._changed.wait()
+                if not shared.busy:
+                    return
+            inner[-1].work()
 
 
-def _enter() -> None:
-    _busy.inside = True
+class _Shared(Generic[T, R]):
+    """Items that several threads take one after the other, each in the context of the one who asks, in which numpy
+    keeps what it says of overflow."""
+
+    def __init__(self, function: Callable[[T], R], items: list[T], changed: threading.Condition) -> None:
+        self._function, self._items, self._changed = function, items, changed
+        self.depth = _depth.get() + 1  # 1: of who is no worker
+        self.left, self.busy = len(items), 0
+        self._context = contextvars.copy_context()
+        self._context.run(_depth.set, self.depth)
+        self._done: dict[int, R] = {}
+        self._failed: dict[int, Exception] = {}
+
+    def work(self) -> None:
+        """Take items until none is left."""
+        self._context.copy().run(self._work)
+
+    def _work(self) -> None:
+        while (i := self._take()) is not None:
+            try:
+                self._done[i] = self._function(self._items[i])
+            except Exception as error:  # told by `results`
+                self._failed[i] = error
+            finally:
+                with self._changed:
+                    self.busy -= 1
+                    self._changed.notify_all()
+
+    def _take(self) -> int | None:
+        with self._changed:
+            if not self.left:
+                return None
+            self.left -= 1
+            self.busy += 1
+            return len(self._items) - 1 - self.left
+
+    def stop(self) -> None:
+        """Let nobody take another one."""
+        with self._changed:
+            self.left = 0
+
+    def results(self) -> list[R]:
+        """All of them, once nobody works any more."""
+        if self._failed:
+            raise self._failed[min(self._failed)]
+        return [self._done[i] for i in range(len(self._items))]

@@ -286,6 +286,24 @@ def test_score_and_information_are_differences_of_the_plain_filter(disturbed: bo
         assert np.all(np.abs(found.score[b] - weighted) / scale < [0.02, 0.02, 0.02, 0.1])
 
 
+@pytest.mark.parametrize("columns", [13, 60, 150])
+def test_any_number_of_columns_says_the_same_of_each(columns: int) -> None:
+    """Among many, whose products are added in several portions, a few columns have what they have alone."""
+    given = made(2, disturbed=True, missing=0.3, rows=150)
+    acting, showing = columns_of(given)
+    block = (np.arange(len(given.time)) // 40).astype(np.int64)
+    few = swept(given, acting, showing, block)
+    others = np.random.default_rng(1).normal(size=(len(given.time), 6, columns - 4))
+    many = swept(given, np.concatenate([acting, others], 2), showing, block)
+    mine = [0, 1, columns - 2, columns - 1]
+    scale = np.sqrt(np.diagonal(few.information.sum(0)))
+    np.testing.assert_allclose(many.score[:, mine] / scale, few.score / scale, atol=1e-9)
+    found, expected = (
+        np.triu(i) / np.outer(scale, scale) for i in (many.information[:, mine][:, :, mine], few.information)
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
 def test_columns_change_nothing_of_the_filter() -> None:
     given = made(3, disturbed=True, missing=0.2)
     without, beside = swept(given), swept(given, *columns_of(given))

@@ -1,6 +1,7 @@
 """Threads that share a diagnosis: the same result for any number of them, in order, and nobody waits for himself."""
 
 import threading
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -25,16 +26,60 @@ def test_two_items_are_worked_on_at_a_time():
     assert sorted(Workers(2).map(lambda _: meet.wait(), range(2))) == [0, 1]
 
 
-def test_a_worker_that_shares_work_does_it_himself():
+def test_who_is_idle_helps_a_worker_that_shares_work():
+    meet = threading.Barrier(2, timeout=20.0)
     workers = Workers(2)
-    inner = workers.map(lambda i: workers.map(lambda k: (i, k, threading.get_ident()), range(3)), range(4))
-    assert [[entry[:2] for entry in row] for row in inner] == [[(i, k) for k in range(3)] for i in range(4)]
-    assert all(len({thread for _, _, thread in row}) == 1 for row in inner)
+    done = workers.map(lambda shares: workers.map(lambda _: meet.wait(), range(2)) if shares else [], [False, True])
+    assert [sorted(row) for row in done] == [[], [0, 1]]
+
+
+@pytest.mark.parametrize("jobs", [2, 3, 8])
+def test_nobody_waits_for_work_that_is_not_begun(jobs):
+    workers = Workers(jobs)
+
+    def shared(depth, name):
+        return [name] if depth == 0 else list(chain(*workers.map(lambda i: shared(depth - 1, f"{name}{i}"), range(3))))
+
+    assert shared(4, "") == [f"{a}{b}{c}{d}" for a in range(3) for b in range(3) for c in range(3) for d in range(3)]
+
+
+def test_helpers_say_of_overflow_what_the_asker_says():
+    meet = threading.Barrier(2, timeout=20.0)
+    with np.errstate(over="ignore"):
+        there = Workers(2).map(lambda _: (meet.wait(), np.geterr()["over"])[1], range(2))
+    assert there == ["ignore", "ignore"]
+    assert np.geterr()["over"] != "ignore"
 
 
 def test_a_failure_comes_out():
     with pytest.raises(ZeroDivisionError):
         Workers(2).map(lambda x: 1 / x, [1, 0, 2])
+
+
+def test_of_several_failures_the_first_comes_out():
+    meet = threading.Barrier(2, timeout=20.0)
+
+    def fail(number):
+        meet.wait()
+        raise ValueError(number)
+
+    with pytest.raises(ValueError, match=r"^7$"):
+        Workers(2).map(fail, [7, 8])
+
+
+def test_after_an_interruption_nobody_goes_on():
+    taken, begun = [], threading.Event()
+
+    def interrupted(number):
+        taken.append(number)
+        if threading.current_thread() is threading.main_thread():
+            begun.set()
+            raise KeyboardInterrupt
+        begun.wait(20.0)
+
+    with pytest.raises(KeyboardInterrupt):
+        Workers(2).map(interrupted, range(1_000_000))
+    assert len(taken) < 1_000_000
 
 
 @pytest.mark.parametrize("jobs", [0, -1, MOST + 1])

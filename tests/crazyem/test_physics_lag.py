@@ -236,3 +236,20 @@ def test_predictor_does_not_depend_on_units(seed, scale):
     a, b = fit_predictor(x), fit_predictor(scale * x)
     np.testing.assert_allclose(a[:, :ORDER], b[:, :ORDER], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(a[:, ORDER] * scale, b[:, ORDER], rtol=1e-5, atol=1e-9 * scale)
+
+
+@given(
+    seeds, st.sampled_from([0.0, 0.003, 0.06]), st.sampled_from([0.0, 0.004]), st.sampled_from([LINEAR, HOLD, CAUSAL])
+)
+@settings(max_examples=20)
+def test_without_derivatives_the_means_are_the_same(seed, tau, delay, mode):
+    _, times, commands, nodes = irregular(seed)
+    mean, _, by_delay, state = run(times, commands, nodes, mode=mode, tau=tau, delay=delay)
+    alone, late = np.zeros_like(mean), np.zeros_like(mean)
+    lagged = np.append(commands[0], nodes[0] - delay)
+    by_lag = np.zeros((0, 4))
+    lagged_means(times, commands, 0, len(times), hold_predictor(), nodes, 1, len(nodes), mode, tau, delay, lagged,
+                 alone, by_lag, late)  # fmt: skip
+    np.testing.assert_array_equal(alone, mean)
+    np.testing.assert_array_equal(late, by_delay)
+    np.testing.assert_array_equal(lagged, state[[0, 1, 2, 3, 12]])
