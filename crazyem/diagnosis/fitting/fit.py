@@ -163,7 +163,9 @@ class Data:
     def gram_and_loglik(self, point: Point, columns: Sequence[Column]) -> tuple[Gram, float]:
         """Score and information of columns, and the log-likelihood."""
         score, information, flight, loglik = [], [], [], 0.0
-        for i, swept in enumerate(self.workers.map(lambda m: m.sweep(point, columns), self.models)):
+        for i, swept in enumerate(
+            self.workers.map(lambda m: m.sweep(point, columns, workers=self.workers), self.models)
+        ):
             score.append(swept.score)
             information.append(swept.information)
             flight.append(np.full(len(swept.score), i))

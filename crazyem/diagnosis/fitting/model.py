@@ -11,12 +11,19 @@ from scipy.signal import lfilter
 from crazyem.diagnosis.fitting import felt
 from crazyem.diagnosis.fitting.astray import strays
 from crazyem.diagnosis.fitting.kernel import sweep
-from crazyem.diagnosis.fitting.situation import causal_middle, initial_path, situation_of, thrust_of, with_rotors
+from crazyem.diagnosis.fitting.situation import (
+    causal_middle,
+    impulses,
+    initial_path,
+    situation_of,
+    thrust_of,
+    with_rotors,
+)
 from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effects, Situation
 from crazyem.physics.motion import measured, motion
-from crazyem.physics.rotations import rotation_matrix
 from crazyem.vehicle import Vehicle
 
 RECENT = 0.5  # s, over which what a model lacks is averaged: long enough that the noise of one sample is nothing
@@ -101,14 +108,9 @@ def corrected(swept: Swept, flight: Flight) -> tuple[NDArray, NDArray, NDArray]:
     rad/s, body axes; lengths (n,) of the steps [s]; which of them (n,) are known (0 where not)."""
     step = np.diff(flight.time, prepend=flight.time[0])
     known = (step > 0) & ~flight.starts
-    change = swept.filtered - swept.predicted
-    force = np.einsum("nji,nj->ni", rotation_matrix(swept.filtered[:, 6:10]), change[:, 3:6])
-    carried = swept.filtered[:, 13:19] * step[:, None]
-    return (
-        np.where(known[:, None], carried + np.concatenate([force, change[:, 10:13]], axis=1), 0.0),
-        np.where(known, step, 0.0),
-        known,
-    )
+    impulse = np.zeros((step.size, 6))
+    impulses(swept.predicted, swept.filtered, step, known, impulse)
+    return impulse, np.where(known, step, 0.0), known
 
 
 def seen_force(acceleration: NDArray, impulse: NDArray, step: NDArray, known: NDArray) -> NDArray:
@@ -175,11 +177,12 @@ class Model:
         effects = of_recording(effects, self.flight.name)
         before = {n: effects[n] for n in effects if _before_rotors(n)}
         key = f"{vehicle!r} {before!r}"
-        if key not in self._thrusts:
-            if len(self._thrusts) > 8:
-                self._thrusts.clear()
-            self._thrusts[key] = thrust_of(self.flight, vehicle, before)
-        return self._thrusts[key]
+        found = self._thrusts.get(key)
+        if found is None:
+            found = thrust_of(self.flight, vehicle, before)
+            # another one, where columns are shared out: somebody may be looking at the old one
+            self._thrusts = {**(self._thrusts if len(self._thrusts) <= 8 else {}), key: found}
+        return found
 
     def accelerations(self, point: Point, effects: Effects | None = None) -> tuple[NDArray, Situation]:
         """(n, 6) specific force and angular acceleration over each step, and the situation."""
@@ -234,21 +237,23 @@ class Model:
         )
         return self._as_shown
 
-    def sweep(self, point: Point, columns: Sequence[Column] = (), *, passes: int = 1) -> Swept:
+    def sweep(
+        self, point: Point, columns: Sequence[Column] = (), *, passes: int = 1, workers: Workers | None = None
+    ) -> Swept:
         """Filter the flight; with columns, score and information by block. Later passes evaluate physics anew."""
         for _ in range(max(1, passes) - 1):
             self._once(point, ())
-        return self._once(point, columns)
+        return self._once(point, columns, workers)
 
     def settle(self, point: Point, passes: int = 2) -> Swept:
         """Passes without columns until physics is evaluated where the filter is."""
         return self.sweep(point, passes=passes)
 
-    def _once(self, point: Point, columns: Sequence[Column]) -> Swept:
+    def _once(self, point: Point, columns: Sequence[Column], workers: Workers | None = None) -> Swept:
         flight = self.flight
         acceleration, _ = self.accelerations(point)
         offset = self.offsets(point, acceleration)
-        acting, showing, order = self.derivatives(point, columns, acceleration, offset)
+        acting, showing, order = self.derivatives(point, columns, acceleration, offset, workers or Workers(1))
         swept = run_sweep(flight, acceleration, offset, acting, showing, point.noise)
         if self._is_felt():
             swept = self._felt(swept, acceleration, acting)
@@ -285,44 +290,56 @@ class Model:
         return replace(swept, loglik=swept.loglik + loglik)
 
     def derivatives(
-        self, point: Point, columns: Sequence[Column], acceleration: NDArray, offset: NDArray
+        self,
+        point: Point,
+        columns: Sequence[Column],
+        acceleration: NDArray,
+        offset: NDArray,
+        workers: Workers,
     ) -> tuple[NDArray, NDArray, NDArray | None]:
         """Derivatives of accelerations (n, 6, c) and offsets (n, 12, d), and where each column went (None: no columns).
 
         A column changes either accelerations or what is shown.
         """
         n = self.flight.time.size
+        if not columns:
+            return np.zeros((n, 6, 0)), np.zeros((n, 12, 0)), None
         acting: list[NDArray] = []
         showing: list[NDArray] = []
         where: list[tuple[bool, int]] = []
-        here = of_recording(point.effects, self.flight.name)
-        for column in columns:
-            d_acting, d_showing = column.acting, column.showing
-            plus = None if column.plus is None else of_recording(column.plus, self.flight.name)
-            if plus is not None and not (STRENGTH in point.effects and column.minus is None and plus == here):
-                shows = any(_shows(name) for name in plus)
-                moves = any(not _shows(name) for name in plus)
-                up = self.accelerations(point, plus)[0] if moves else acceleration
-                down = acceleration if column.minus is None or not moves else self.accelerations(point, column.minus)[0]
-                d_acting = (up - down) / column.width
-                if shows:
-                    up = self.offsets(point, acceleration, plus)
-                    down = offset if column.minus is None else self.offsets(point, acceleration, column.minus)
-                    d_showing = (up - down) / column.width
-                    if not d_showing.any():
-                        d_showing = None
+        for d_acting, d_showing in workers.map(lambda c: self._derivative(point, c, acceleration, offset), columns):
             if d_showing is not None:
                 where.append((True, len(showing)))
                 showing.append(d_showing)
             else:
                 where.append((False, len(acting)))
                 acting.append(np.zeros((n, 6)) if d_acting is None else d_acting)
-        if not columns:
-            return np.zeros((n, 6, 0)), np.zeros((n, 12, 0)), None
         order = np.array([len(acting) + at if shown else at for shown, at in where])
         stack = (np.stack(acting, 2) if acting else np.zeros((n, 6, 0)),
                  np.stack(showing, 2) if showing else np.zeros((n, 12, 0)))  # fmt: skip
         return np.ascontiguousarray(stack[0]), np.ascontiguousarray(stack[1]), order
+
+    def _derivative(
+        self, point: Point, column: Column, acceleration: NDArray, offset: NDArray
+    ) -> tuple[NDArray | None, NDArray | None]:
+        """What a column changes: accelerations (n, 6), what is shown (n, 12); None: nothing."""
+        d_acting, d_showing = column.acting, column.showing
+        here = of_recording(point.effects, self.flight.name)
+        plus = None if column.plus is None else of_recording(column.plus, self.flight.name)
+        if plus is None or (STRENGTH in point.effects and column.minus is None and plus == here):
+            return d_acting, d_showing
+        shows = any(_shows(name) for name in plus)
+        moves = any(not _shows(name) for name in plus)
+        up = self.accelerations(point, plus)[0] if moves else acceleration
+        down = acceleration if column.minus is None or not moves else self.accelerations(point, column.minus)[0]
+        d_acting = (up - down) / column.width
+        if shows:
+            up = self.offsets(point, acceleration, plus)
+            down = offset if column.minus is None else self.offsets(point, acceleration, column.minus)
+            d_showing = (up - down) / column.width
+            if not d_showing.any():
+                d_showing = None
+        return d_acting, d_showing
 
 
 def _before_rotors(name: str) -> bool:

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.compiled import compiled
 from crazyem.diagnosis.flights.flight import Flight
+from crazyem.estimation.kernels.algebra import matrix
 from crazyem.physics.effects.effect import Effects, Situation
 from crazyem.physics.motion import rotor_thrust
 from crazyem.physics.rotations import rotation_matrix
@@ -61,11 +63,47 @@ def _rotor_constant(vehicle: Vehicle) -> float:
 def causal_middle(filtered: NDArray, predicted: NDArray, starts: NDArray) -> NDArray:
     """(n, 19) states in the middle of each step: filtered at its begin, predicted to its end."""
     middle = predicted.copy()
-    before = filtered[:-1]
-    inside = ~starts[1:]
-    sign = np.sign(np.sum(before[:, 6:10] * predicted[1:, 6:10], axis=1, keepdims=True))
-    mean = 0.5 * (before + predicted[1:])
-    mean[:, 6:10] = before[:, 6:10] * np.where(sign == 0, 1.0, sign) + predicted[1:, 6:10]
-    mean[:, 6:10] /= np.linalg.norm(mean[:, 6:10], axis=1, keepdims=True)
-    middle[1:][inside] = mean[inside]
+    _middle(filtered, predicted, starts, middle)
     return middle
+
+
+@compiled
+def _middle(filtered, predicted, starts, middle):
+    """Rows of `causal_middle` that are no start, into middle (n, 19)."""
+    for k in range(1, len(predicted)):
+        if starts[k]:
+            continue
+        before, after, out = filtered[k - 1], predicted[k], middle[k]
+        for i in range(19):
+            out[i] = 0.5 * (before[i] + after[i])
+        along = 0.0
+        for i in range(6, 10):
+            along += before[i] * after[i]
+        sign = -1.0 if along < 0.0 else 1.0  # the same attitude has two quaternions
+        size = 0.0
+        for i in range(6, 10):
+            out[i] = sign * before[i] + after[i]
+            size += out[i] * out[i]
+        size = np.sqrt(size)
+        for i in range(6, 10):
+            out[i] /= size
+
+
+@compiled
+def impulses(predicted, filtered, step, known, out):
+    """What measurements and disturbances with a memory brought in each step that is known: (n, 6) changes of velocity
+    [m/s] and body rate [rad/s], body axes, into out; the others are left as they are.
+
+    predicted, filtered: (n, 19) states at the end of the steps; step: (n,) s; known: (n,) bool.
+    """
+    turn = np.empty((3, 3))
+    for k in range(len(step)):
+        if not known[k]:
+            continue
+        matrix(filtered[k, 6:10], turn)
+        for i in range(3):
+            seen = 0.0
+            for j in range(3):
+                seen += turn[j, i] * (filtered[k, 3 + j] - predicted[k, 3 + j])
+            out[k, i] = seen + step[k] * filtered[k, 13 + i]
+            out[k, 3 + i] = filtered[k, 10 + i] - predicted[k, 10 + i] + step[k] * filtered[k, 16 + i]

@@ -1,0 +1,48 @@
+"""Compiled pieces between two passes against plain numpy and scipy."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from crazyem.diagnosis.fitting.situation import causal_middle, impulses
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def states(seed, n=20):
+    """Filtered and predicted states (n, 19) that differ a little, with quaternions of either sign, and starts (n,)."""
+    rng = np.random.default_rng(seed)
+    filtered = rng.normal(size=(n, 19))
+    filtered[:, 6:10] = Rotation.random(n, random_state=seed).as_quat()
+    predicted = filtered + 0.1 * rng.normal(size=(n, 19))
+    turned = Rotation.from_rotvec(0.1 * rng.normal(size=(n, 3))) * Rotation.from_quat(np.roll(filtered, 1, 0)[:, 6:10])
+    predicted[:, 6:10] = turned.as_quat() * rng.choice([-1.0, 1.0], size=(n, 1))
+    return filtered, predicted, rng.random(n) < 0.2
+
+
+@given(seeds)
+def test_middle_of_a_step(seed):
+    filtered, predicted, starts = states(seed)
+    middle = causal_middle(filtered, predicted, starts)
+    for k in range(len(middle)):
+        if k == 0 or starts[k]:
+            np.testing.assert_array_equal(middle[k], predicted[k])
+            continue
+        rest = np.r_[0:6, 10:19]
+        np.testing.assert_allclose(middle[k, rest], 0.5 * (filtered[k - 1, rest] + predicted[k, rest]), atol=1e-14)
+        begin, end = Rotation.from_quat(filtered[k - 1, 6:10]), Rotation.from_quat(predicted[k, 6:10])
+        half = begin * Rotation.from_rotvec(0.5 * (begin.inv() * end).as_rotvec())
+        assert (Rotation.from_quat(middle[k, 6:10]).inv() * half).magnitude() < 1e-7
+        assert abs(np.linalg.norm(middle[k, 6:10]) - 1.0) < 1e-14
+
+
+@given(seeds)
+def test_what_measurements_brought(seed):
+    filtered, predicted, starts = states(seed)
+    step = np.random.default_rng(seed).uniform(0.0, 0.02, len(starts))
+    found = np.zeros((len(starts), 6))
+    impulses(predicted, filtered, step, ~starts, found)
+    body = Rotation.from_quat(filtered[:, 6:10]).inv().apply(filtered[:, 3:6] - predicted[:, 3:6])
+    expected = np.concatenate([body, filtered[:, 10:13] - predicted[:, 10:13]], 1) + step[:, None] * filtered[:, 13:19]
+    np.testing.assert_allclose(found, np.where(starts[:, None], 0.0, expected), atol=1e-13)
