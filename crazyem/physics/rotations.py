@@ -65,14 +65,6 @@ def rotation_matrix(q: ArrayLike) -> NDArray:
     return matrix
 
 
-def cross(a: NDArray, b: NDArray) -> NDArray:
-    """Vector product along the last axis, shapes broadcast: numpy's own without its checks, up to 4 times as fast."""
-    a0, a1, a2, b0, b1, b2 = (v[..., i] for v in (a, b) for i in range(3))
-    product = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    product[..., 0], product[..., 1], product[..., 2] = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
-    return product
-
-
 def quaternion_from_euler(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> NDArray:
     """R = Rz(yaw) Ry(pitch) Rx(roll), right-handed, rad. (...,) each -> (..., 4)."""
     cr, sr = np.cos(np.asarray(roll) / 2), np.sin(np.asarray(roll) / 2)

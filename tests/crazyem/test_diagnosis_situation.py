@@ -1,11 +1,17 @@
-"""Compiled pieces between two passes against plain numpy and scipy."""
+"""Between two passes: compiled pieces against plain numpy and scipy; what a pass remembers is that of the last path."""
+
+from dataclasses import replace
 
 import numpy as np
+from closed_loop import DRONE, fly
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from crazyem.diagnosis.fitting.model import Model, Point
+from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.situation import causal_middle, impulses
+from crazyem.diagnosis.flights.flight import flight_of
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -46,3 +52,24 @@ def test_what_measurements_brought(seed):
     body = Rotation.from_quat(filtered[:, 6:10]).inv().apply(filtered[:, 3:6] - predicted[:, 3:6])
     expected = np.concatenate([body, filtered[:, 10:13] - predicted[:, 10:13]], 1) + step[:, None] * filtered[:, 13:19]
     np.testing.assert_allclose(found, np.where(starts[:, None], 0.0, expected), atol=1e-13)
+
+
+def test_what_is_remembered_is_of_the_last_path():
+    """A model that was elsewhere before, and was asked there, says the same as one that remembers nothing."""
+    model = Model(flight_of(fly(seconds=5.0), DRONE))
+    lags = {
+        "onboard_filter": {"rate_lag": 0.003, "velocity_lag": 0.004},
+        "velocity_scale": {"x": 1.1, "y": 0.9, "z": 1.0},
+    }
+    there = []
+    for mass in (0.0, 0.01):
+        point = Point(DRONE, {**lags, "payload": {"mass": mass, "x": 0.0, "y": 0.0, "z": 0.0}}, first_guess())
+        model.settle(point)
+        forgetful = replace(model, _thrusts={}, _there=None, _as_shown=None, _offsets={})
+        expected, _ = forgetful.accelerations(point)
+        for _ in range(2):
+            found, _ = model.accelerations(point)
+            np.testing.assert_array_equal(found, expected)
+            np.testing.assert_array_equal(model.offsets(point, found), forgetful.offsets(point, expected))
+        there.append(model.offsets(point, found))
+    assert not np.array_equal(*there)  # or nothing was asked

@@ -150,7 +150,7 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
     jr = np.empty((3, 3))
     phi = np.empty(3)
     gain = np.zeros(wide)
-    correction = np.zeros(LEAST + LANES)
+    correction = np.zeros(STATES)
     innov = np.empty(12)
     f = np.empty(3)
     total = 0.0

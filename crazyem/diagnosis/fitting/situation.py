@@ -1,4 +1,5 @@
-"""Where physics is evaluated along a flight: path of the drone, thrusts of its rotors, situation at each row."""
+"""Where physics is evaluated along a flight: path of the drone, thrusts of its rotors, situation at each row; and what
+a pass of the filter says of it: states in the middle of steps, what measurements brought."""
 
 from dataclasses import replace
 
