@@ -24,6 +24,8 @@ WANDER = 0.5  # s: memory of torques that moving air brings
 SAMPLED, WANDERING = 3.0, 2.0  # nats; nats a second: that torques with the memory of the lag, of the air must gain
 PASSES, CONVERGED, SLIGHT = 8, 0.2, 0.01  # passes, nats, relative error of velocity that one pass finds
 ENOUGH = 0.05  # nats: a round that gains less ends the fit
+NOTHING = 0.005  # nats: a step that promises less, a tenth of a standard deviation, is not taken
+TRIES = 6  # of a step, each a third of the one before
 
 
 @dataclass(frozen=True)
@@ -298,15 +300,16 @@ def refine(
         raise DivergedError("the vehicle's model leaves the range of numbers on this flight: is it this drone's?")
     for turn in range(rounds if free else 0):
         low, high = held_near(*bounds_of(free, point), away(point), weight)
-        step = gram.solve(range(gram.size), low=low, high=high, precision=weight, prior=-away(point)).theta
+        best = gram.solve(range(gram.size), low=low, high=high, precision=weight, prior=-away(point))
         before = value
-        for _ in range(6):
-            there = moved(point, free, step)
+        for k in range(TRIES if best.gain > NOTHING else 0):
+            there = moved(point, free, best.theta / 3**k)
             found, slopes = look(there)
             if found > value - 1e-6:
                 point, value, gram = there, found, slopes
                 break
-            step = step / 3
+            if found > value - ENOUGH:  # nor would a smaller step gain more than what ends the fit
+                break
         gained = value - before
         if noise and (turn < 1 or gained > 2.0):
             better = data.fit_noise(point, iterations=4)
