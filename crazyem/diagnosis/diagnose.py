@@ -19,7 +19,7 @@ from crazyem.diagnosis.flights.own import Own, owned
 from crazyem.diagnosis.locating.heading import heading_by_place
 from crazyem.diagnosis.locating.locate import Located, locate
 from crazyem.diagnosis.locating.place import depends_on_place
-from crazyem.diagnosis.naming.balance import by_balance
+from crazyem.diagnosis.naming.balance import by_balance, hidden_by_the_day
 from crazyem.diagnosis.naming.beside import beside_the_regression, late_rotors
 from crazyem.diagnosis.naming.exchange import exchanged, named_again
 from crazyem.diagnosis.naming.foretold import with_found, without_what_misleads
@@ -152,6 +152,7 @@ def diagnose(
             groups = (*groups, *alike)
             separate = tuple(dict.fromkeys((*separate, *(CATALOGUE[n].separates for g in alike for n in g))))
     effects = strongest_first(told.effects, beside)
+    left_out |= hidden_by_the_day(data, selection, candidates)
     left_out = {n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)}
     fitted_vehicle = _with_effects(assumed, selection, beside)
     fitted_vehicle = with_its_thrust(fitted_vehicle, data, selection.final, selection.accepted)

@@ -210,6 +210,8 @@ def text_of(document: Mapping[str, Any]) -> str:
     from crazyem.diagnosis.report.html import verdict
 
     lines = [verdict(document)]
+    if not document["mismatch"]:
+        lines += [f"  it could not reveal: {text}" for text in _hidden(document["not_identifiable"])]
     for f in document["where"][:6]:
         size = f"{_short(f['effect_size'], '+.3g')} +- {_short(f['sd'], '.2g')} {f['unit']}"
         lines.append(f"  where: {f['signal']} {f['axis']}, {f['regime']}: {size}")
@@ -247,6 +249,12 @@ def text_of(document: Mapping[str, Any]) -> str:
                 )
                 lines.append(f"  {title}, open-loop rms {name} [{one['unit']}]: {pairs}")
     return "\n".join(lines)
+
+
+def _hidden(missing: Sequence[Mapping[str, str]]) -> list[str]:
+    """Names and reasons of what is not identifiable, a line for each reason."""
+    reasons = dict.fromkeys(m["reason"] for m in missing)
+    return [f"{', '.join(m['name'] for m in missing if m['reason'] == reason)}: {reason}" for reason in reasons]
 
 
 def _short(value: float | None, how: str = ".3g") -> str:

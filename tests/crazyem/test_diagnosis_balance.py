@@ -24,6 +24,7 @@ from crazyem.diagnosis.naming.balance import (
     Balance,
     balance_of,
     by_balance,
+    hidden_by_the_day,
     how_weak,
     prefers,
     steady,
@@ -32,6 +33,7 @@ from crazyem.diagnosis.naming.balance import (
 )
 from crazyem.diagnosis.naming.told import _by_the_day, _steady_rivals
 from crazyem.diagnosis.naming.trials import Trial
+from crazyem.vehicle import Vehicle
 
 SD = np.array([0.02, 5e-4, 5e-4, 1.6e-4])  # thrust, relative; torque over thrust, m
 ARM, TURN = 0.033, 0.006  # m
@@ -215,6 +217,32 @@ def test_a_name_stands_unless_another_is_better_or_a_simpler_one_no_worse(monkey
 
     monkeypatch.setattr(balancing, "balance_of", lost)
     assert by_balance(data, selection) == (selection, None)
+
+
+def test_where_nothing_steady_is_found_it_is_said_what_a_day_hides_of_a_weak_rotor(monkeypatch) -> None:
+    shown, asked = balance(0.07 * EACH[2]), [rotor(k) for k in (1, 2, 3, 4)]
+    monkeypatch.setattr(balancing, "balance_of", lambda data, point: shown)
+    data: Any = None
+
+    def selection(*accepted: Candidate, vehicle: Vehicle = TRIMMED) -> Any:
+        return SimpleNamespace(accepted=accepted, nominal=Point(vehicle, {}, first_guess()))
+
+    reach = 100 * stats.t.ppf(0.975, DAYS) * max(how_weak(shown, k)[1] for k in (1, 2, 3, 4))
+    each = ", ".join(f"{100 * how_weak(shown, k)[0]:.0f}" for k in (1, 2, 3, 4)).replace("-0", "0")
+    (text,) = hidden_by_the_day(data, selection(DRAG), asked).values()
+    assert f"lacks up to {reach:.0f} % of its thrust" in text
+    assert f"rotors 1 to 4 lack {each} %, each +- {reach:.0f} (95 %)" in text
+    assert each.split(", ")[2] == "7"
+    # what was found or not asked for, and a drone without a trim of the day
+    assert not hidden_by_the_day(data, selection(rotor(3)), asked)
+    assert not hidden_by_the_day(data, selection(), [DRAG, STRONG])
+    assert not hidden_by_the_day(data, selection(vehicle=DRONE), asked)
+
+    def lost(data: Data, point: Point) -> Balance:
+        raise DivergedError("lost")
+
+    monkeypatch.setattr(balancing, "balance_of", lost)
+    assert not hidden_by_the_day(data, selection(), asked)
 
 
 def test_a_rotor_is_told_with_the_day_as_its_uncertainty_and_rivals_by_the_balance() -> None:

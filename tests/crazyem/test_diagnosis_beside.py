@@ -186,6 +186,22 @@ def test_what_is_not_finite_is_said_as_a_dash(recording):
     assert "+0.1 +- - N" in text
 
 
+@pytest.mark.parametrize("mismatch", [False, True])
+def test_where_nothing_is_missing_it_is_said_what_the_flight_could_not_reveal(mismatch):
+    reasons = {"inertia": "needs attitude", "gyro_bias": "needs body_rate", "torque_scale": "needs attitude"}
+    document = {
+        "mismatch": mismatch, "where": [], "effects": [], "indistinguishable": [], "would_separate": [],
+        "unexplained": {"found": False, "where": []}, "swapped": False, "recordings": [], "held_out_recordings": [],
+        "of_recordings": [], "fit": {"train": {}, "held_out": {}},
+        "not_identifiable": [{"name": n, "reason": r} for n, r in reasons.items()],
+    }  # fmt: skip
+    said = [
+        "  it could not reveal: inertia, torque_scale: needs attitude",
+        "  it could not reveal: gyro_bias: needs body_rate",
+    ]
+    assert text_of(document).splitlines()[1:] == ([] if mismatch else said)
+
+
 def test_a_recording_compared_with_itself_and_with_itself_moved(recording):
     same = compare(recording, recording)["signals"]
     assert all(entry["rms"] < 1e-6 for entry in same.values())

@@ -7,12 +7,13 @@ it says) that a day's prior counts for nothing beside it. So the four steady num
 weighed here with the covariance they have from day to day.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.optimize import lsq_linear, minimize_scalar
 
 from crazyem.diagnosis.fitting.always import THRUST_SD, nuisances, solved, with_nuisances
@@ -128,6 +129,28 @@ def how_weak(balance: Balance, rotor: int) -> tuple[float, float]:
     root = np.linalg.cholesky(np.linalg.inv(balance.covariance)).T
     moved = root @ balance.rotors[rotor - 1]
     return float(moved @ root @ balance.lack / (moved @ moved)), float(1.0 / np.linalg.norm(moved))
+
+
+def hidden_by_the_day(data: Data, selection: Selection, asked: Sequence[Candidate]) -> dict[str, str]:
+    """What days hide of a rotor where nothing steady was found: the effect's name and how much, in a sentence.
+
+    Empty where there is nothing to be weighed, or weak rotors were not among the candidates `asked`.
+    """
+    steadied = TRIM in selection.nominal.vehicle.effects and not any(c.effect in FREE for c in selection.accepted)
+    if not steadied or all(c.effect != "rotor_fault" for c in asked):
+        return {}
+    try:
+        balance = balance_of(data, selection.nominal)
+    except (DivergedError, np.linalg.LinAlgError):
+        return {}
+    lacks = [how_weak(balance, rotor) for rotor in (1, 2, 3, 4)]
+    reach = float(stats.t.ppf(0.975, DAYS)) * max(sd for _, sd in lacks)
+    each = ", ".join(str(round(100 * lack)) for lack, _ in lacks)
+    text = (
+        f"what changes from day to day hides a rotor that lacks up to {100 * reach:.0f} % of its thrust; by what is "
+        f"steady rotors 1 to 4 lack {each} %, each +- {100 * reach:.0f} (95 %), as if it alone were weak"
+    )
+    return {"rotor_fault": text}
 
 
 def by_balance(data: Data, selection: Selection) -> tuple[Selection, Balance | None]:
