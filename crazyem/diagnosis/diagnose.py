@@ -29,8 +29,8 @@ from crazyem.diagnosis.naming.rotor_response import answers, disobedient
 from crazyem.diagnosis.naming.select import select
 from crazyem.diagnosis.naming.split import LOAD, WEAKER, as_load, as_two
 from crazyem.diagnosis.naming.steady import left_as_trim, with_its_thrust, with_whole_torques
-from crazyem.diagnosis.naming.told import MEASURED_LATE, strongest_first, tell
-from crazyem.diagnosis.naming.trials import Selection
+from crazyem.diagnosis.naming.told import MEASURED_LATE, Told, strongest_first, tell
+from crazyem.diagnosis.naming.trials import Selection, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained, unexplained
 from crazyem.diagnosis.naming.witness import TELLING, false_speed, late_measurements
 from crazyem.diagnosis.workers import Workers
@@ -87,6 +87,95 @@ def diagnose(
         DataError: a recording cannot be used (no flight, no inputs, too short).
         UsageError: an unknown effect among those wanted.
     """
+    asked = _asked(recordings, vehicle, held_out, wanted, withhold, strict=strict, say=say)
+    workers = Workers(jobs)
+    say(f"nominal model of {vehicle.name}: {sum(f.duration for f in asked.flights):.0f} s of flight")
+    chosen = _chosen(asked, workers, say)
+    data, apart = chosen.data, chosen.apart
+    selection, pull = by_place(data, apart, chosen.selection, say)
+    selection, witnessed = _heard(data, apart, selection, asked.recordings)
+    selection, balance = by_balance(data, with_whole_torques(data, selection))
+    judges = asked.held_out or asked.recordings
+    selection = without_what_misleads(data, selection, asked.vehicle, judges, withhold=withhold, say=say)
+    before, after = _located(data, selection, say)
+    place = depends_on_place(data, apart, selection.final)
+    remains = unexplained(data, selection, after, apart)
+    for finding in (pull, place and place.finding, heading_by_place(data, apart)):
+        remains = remains.beside(finding) if finding else remains
+    left_out = {**chosen.left_out, **hidden_by_the_day(data, selection, chosen.candidates)}
+    pulled = pull is not None or (place is not None and not place.pushed)
+    beside = beside_the_regression(data, apart, selection.final, remains, wanted, left_out, pulled, say)
+    if any(e.name == "gusts" for e in beside):
+        remains = remains.without_force()
+    told = tell(
+        data, selection, remains, witnessed=witnessed, in_place=_in_place(data, apart, selection), balance=balance,
+        apart=apart is not None,
+    )  # fmt: skip
+    if asked.flights[0].inputs.measured:
+        told, late, remains = _late_rotors(asked, vehicle, told, remains, left_out)
+        beside += late
+    effects = strongest_first(told.effects, beside)
+    fitted_vehicle = _with_effects(asked.vehicle, selection, beside)
+    fitted_vehicle = with_its_thrust(fitted_vehicle, data, selection.final, selection.accepted)
+    fitted_vehicle = left_as_trim(chosen.asked.flights, fitted_vehicle, remains, workers)
+    return Diagnosis(
+        vehicle=vehicle,
+        fitted_vehicle=fitted_vehicle,
+        recordings=tuple(r.path for r in asked.recordings),
+        held_out=tuple(r.path for r in asked.held_out),
+        mismatch=bool(effects) or remains.found,
+        before=before,
+        after=after,
+        effects=effects,
+        indistinguishable=told.groups,
+        would_separate=told.separate,
+        unexplained=remains,
+        selection=selection,
+        left_out={n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)},
+        explained=remains.explained,
+        own=owned(chosen.asked.flights, chosen.asked.kept_apart, selection.final.effects.get(STRENGTH)),
+        swapped=asked.swapped,
+    )
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What is asked: recordings to fit and their flights, those held out, the vehicle that is assumed to begin with."""
+
+    recordings: Sequence[Recording]
+    held_out: Sequence[Recording]
+    flights: Sequence[Flight]
+    kept_apart: Sequence[Flight]
+    vehicle: Vehicle
+    wanted: Sequence[str]
+    besides: Sequence[Candidate]  # asked for whatever is wanted
+    swapped: bool
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """What the flights ask for: `asked` with these as they were used, the selection, the candidates for it, and what
+    the flights cannot speak of and why."""
+
+    asked: _Asked
+    data: Data
+    apart: Data | None
+    selection: Selection
+    candidates: list[Candidate]
+    left_out: dict[str, str]
+
+
+def _asked(
+    recordings: Sequence[Recording],
+    vehicle: Vehicle,
+    held_out: Sequence[Recording],
+    wanted: Sequence[str],
+    withhold: Sequence[str],
+    *,
+    strict: bool,
+    say: Say,
+) -> _Asked:
+    """The flights of the recordings, in one frame; those held out are fitted where the others only hover."""
     flights = [flight_of(r, vehicle, withhold=withhold) for r in recordings]
     kept_apart = [flight_of(r, vehicle, withhold=withhold) for r in held_out]
     swapped = not strict and roles.swapped(flights, kept_apart)
@@ -96,87 +185,32 @@ def diagnose(
     assumed = of_a_real_drone(flights, vehicle)
     untrimmed = assumed is not vehicle and not wanted  # its trim is looked for, too
     flights, kept_apart = differing(*in_one_frame(*on_one_floor(flights, kept_apart)), assumed)
-    workers = Workers(jobs)
-    say(f"nominal model of {vehicle.name}: {sum(f.duration for f in flights):.0f} s of flight")
-    asked = [Candidate(TRIM, (), ("x", "y", "z"))] if untrimmed else []
-    data, apart, selection, candidates, left_out = _selected(flights, kept_apart, assumed, wanted, asked, workers, say)
-    if unlike_a_body(selection.final, selection.accepted) and not any(f.coarse for f in flights):
+    besides = [Candidate(TRIM, (), ("x", "y", "z"))] if untrimmed else []
+    return _Asked(recordings, held_out, flights, kept_apart, assumed, wanted, besides, swapped)
+
+
+def _chosen(asked: _Asked, workers: Workers, say: Say) -> _Chosen:
+    """The selection by the flights as they are, or, where these turn no body, without what is fast; under its last
+    names, with what there is room for beside these."""
+    chosen = _selected(asked, workers, say)
+    deaf = unlike_a_body(chosen.selection.final, chosen.selection.accepted)
+    if deaf and not any(f.coarse for f in asked.flights):
         say("the turning does not follow the commands as they were recorded: once more without what is fast")
-        flights, kept_apart = ([replace(f, coarse=True) for f in part] for part in (flights, kept_apart))
-        data, apart, selection, candidates, left_out = _selected(
-            flights, kept_apart, assumed, wanted, asked, workers, say
-        )
-    named = selection.accepted
-    selection = named_again(data, apart, selection, say)
-    if {c.effect for c in selection.accepted} != {c.effect for c in named}:
+        flights, kept_apart = ([replace(f, coarse=True) for f in part] for part in (asked.flights, asked.kept_apart))
+        chosen = _selected(replace(asked, flights=flights, kept_apart=kept_apart), workers, say)
+    selection = named_again(chosen.data, chosen.apart, chosen.selection, say)
+    if {c.effect for c in selection.accepted} != {c.effect for c in chosen.selection.accepted}:
         # beside the new name there may be room for others
-        selection = select(data, selection.nominal, candidates, held_out=apart, begun=selection, say=say)
-    selection, pull = by_place(data, apart, selection, say)
-    selection, witnessed = _heard(data, apart, selection, recordings)
-    selection, balance = by_balance(data, with_whole_torques(data, selection))
-    judges = held_out or recordings
-    selection = without_what_misleads(data, selection, assumed, judges, withhold=withhold, say=say)
-    say("where the nominal model fails")
-    data.settle(selection.nominal)
-    before = locate(data, selection.nominal)
-    after = before
-    if selection.accepted:
-        say("what remains")
-        data.settle(selection.final)
-        after = locate(data, selection.final)
-    place = depends_on_place(data, apart, selection.final)
-    remains = unexplained(data, selection, after, apart)
-    for finding in (pull, place and place.finding, heading_by_place(data, apart)):
-        remains = remains.beside(finding) if finding else remains
-    pulled = pull is not None or (place is not None and not place.pushed)
-    beside = beside_the_regression(data, apart, selection.final, remains, wanted, left_out, pulled, say)
-    if any(e.name == "gusts" for e in beside):
-        remains = remains.without_force()
-    in_place = {
-        LOAD: as_two(data, apart, selection),
-        # only torques would tell weaker rotors from a load
-        WEAKER.effect: None if data.coarse else as_load(data, apart, selection),
-    }
-    told = tell(
-        data, selection, remains, witnessed=witnessed, in_place=in_place, balance=balance, apart=apart is not None
-    )
-    groups, separate = told.groups, told.separate
-    if flights[0].inputs.measured:
-        here, there = answers(recordings, vehicle), answers(held_out, vehicle)
-        # the body answers to the speeds that were measured, so this says nothing against what was told of it
-        deaf = disobedient([*here, *there])
-        remains = remains.beside(deaf) if deaf else remains
-        if not any(e.name == "input_delay" for e in told.effects):
-            late, alike = late_rotors(here, there, vehicle, wanted, left_out, deaf=deaf is not None)
-            beside += late
-            groups = (*groups, *alike)
-            separate = tuple(dict.fromkeys((*separate, *(CATALOGUE[n].separates for g in alike for n in g))))
-    effects = strongest_first(told.effects, beside)
-    left_out |= hidden_by_the_day(data, selection, candidates)
-    left_out = {n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)}
-    fitted_vehicle = _with_effects(assumed, selection, beside)
-    fitted_vehicle = with_its_thrust(fitted_vehicle, data, selection.final, selection.accepted)
-    fitted_vehicle = left_as_trim(flights, fitted_vehicle, remains, workers)
-    mismatch = bool(effects) or remains.found
-    return Diagnosis(
-        vehicle, fitted_vehicle, tuple(r.path for r in recordings), tuple(r.path for r in held_out), mismatch,
-        before, after, effects, groups, separate, remains, selection, left_out, remains.explained,
-        owned(flights, kept_apart, selection.final.effects.get(STRENGTH)), swapped,
-    )  # fmt: skip
+        selection = select(
+            chosen.data, selection.nominal, chosen.candidates, held_out=chosen.apart, begun=selection, say=say
+        )
+    return replace(chosen, selection=selection)
 
 
-def _selected(
-    flights: Sequence[Flight],
-    kept_apart: Sequence[Flight],
-    vehicle: Vehicle,
-    wanted: Sequence[str],
-    asked: Sequence[Candidate],
-    workers: Workers,
-    say: Say,
-) -> tuple[Data, Data | None, Selection, list[Candidate], dict[str, str]]:
-    """The flights, those kept apart, what they ask for, what was asked (all candidates, and those `asked` besides), and
-    what they cannot speak of and why."""
-    data, apart = Data(flights, workers), Data(kept_apart, workers) if kept_apart else None
+def _selected(asked: _Asked, workers: Workers, say: Say) -> _Chosen:
+    """The selection by the flights, from all that they can speak of."""
+    data, apart = Data(asked.flights, workers), Data(asked.kept_apart, workers) if asked.kept_apart else None
+    vehicle = asked.vehicle
     bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, first_guess())
     nominal = nominal_of(data, bare)
     if apart:
@@ -184,11 +218,49 @@ def _selected(
         apart.leave_out_wild(nominal)
         apart.settle(nominal)
     candidates, left_out = candidates_for(
-        nominal, data.signals, measured_speeds=flights[0].inputs.measured, wanted=wanted
+        nominal, data.signals, measured_speeds=asked.flights[0].inputs.measured, wanted=asked.wanted
     )
-    candidates, left_out = abstained(data, nominal, [*candidates, *asked], left_out)
+    candidates, left_out = abstained(data, nominal, [*candidates, *asked.besides], left_out)
     nominal = steadied(data, nominal)
-    return data, apart, select(data, nominal, candidates, held_out=apart, say=say), candidates, left_out
+    selection = select(data, nominal, candidates, held_out=apart, say=say)
+    return _Chosen(asked, data, apart, selection, candidates, left_out)
+
+
+def _located(data: Data, selection: Selection, say: Say) -> tuple[Located, Located]:
+    """Where the nominal model fails, and where the final one does."""
+    say("where the nominal model fails")
+    data.settle(selection.nominal)
+    before = locate(data, selection.nominal)
+    if not selection.accepted:
+        return before, before
+    say("what remains")
+    data.settle(selection.final)
+    return before, locate(data, selection.final)
+
+
+def _in_place(data: Data, apart: Data | None, selection: Selection) -> dict[str, tuple[Trial, Trial] | None]:
+    """For a load and for weaker rotors the trials of it and of what else could stand in its place."""
+    return {
+        LOAD: as_two(data, apart, selection),
+        # only torques would tell weaker rotors from a load
+        WEAKER.effect: None if data.coarse else as_load(data, apart, selection),
+    }
+
+
+def _late_rotors(
+    asked: _Asked, vehicle: Vehicle, told: Told, remains: Unexplained, left_out: dict[str, str]
+) -> tuple[Told, list[Named], Unexplained]:
+    """What is told, what is found beside it, and what remains, with what measured rotor speeds say of the commands."""
+    here, there = answers(asked.recordings, vehicle), answers(asked.held_out, vehicle)
+    # the body answers to the speeds that were measured, so this says nothing against what was told of it
+    deaf = disobedient([*here, *there])
+    remains = remains.beside(deaf) if deaf else remains
+    if any(e.name == "input_delay" for e in told.effects):
+        return told, [], remains
+    late, alike = late_rotors(here, there, vehicle, asked.wanted, left_out, deaf=deaf is not None)
+    separate = (*told.separate, *(CATALOGUE[n].separates for g in alike for n in g))
+    told = replace(told, groups=(*told.groups, *alike), separate=tuple(dict.fromkeys(separate)))
+    return told, late, remains
 
 
 def _heard(
