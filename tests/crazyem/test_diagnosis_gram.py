@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from crazyem.diagnosis.fitting.gram import CHUNK, FOLDS, Gram, bounded
+from crazyem.diagnosis.fitting.gram import CHUNK, FOLDS, MANY, Gram, bounded
 
 Array = NDArray[np.float64]
 
@@ -223,3 +223,37 @@ def test_errors_are_never_smaller_than_the_information_allows() -> None:
     b, a = quiet.total(range(3))
     assert np.all(np.diag(quiet.solve(range(3)).covariance) >= np.diag(np.linalg.inv(a)) * (1 - 1e-9))
     assert b.shape == (3,)
+
+
+def differing(seed: int, flights: int, spread: float) -> Gram:
+    """Flights of 20 blocks that each have parameters of their own, `spread` about 0."""
+    parts = [
+        simulated(1000 * seed + k, blocks=20, columns=2, truth=spread * np.random.default_rng((seed, k)).normal(size=2))
+        for k in range(flights)
+    ]
+    which = np.repeat(np.arange(flights), 20)
+    return Gram(np.concatenate([p.score for p in parts]), np.concatenate([p.information for p in parts]), which)
+
+
+def test_errors_by_flights_are_those_of_parameters_that_differ_from_flight_to_flight() -> None:
+    """Told by 9 flights, 200 times: what is said against how far the fits are from 0, and blocks that do not see it."""
+    off, said, by_blocks = [], [], []
+    for seed in range(200):
+        gram = differing(seed, 9, 0.2)
+        found = gram.solve(range(2))
+        sd, freedom = gram.by_flights(found.theta, np.zeros(2))
+        assert freedom == 8
+        off.append(found.theta)
+        said.append(sd)
+        by_blocks.append(np.sqrt(np.diag(found.covariance)))
+    rms, told, blind = (np.sqrt(np.mean(np.square(x), axis=0)) for x in (off, said, by_blocks))
+    np.testing.assert_allclose(told, rms, rtol=0.15)
+    assert np.all(blind < 0.6 * rms)
+    within = np.abs(off) < stats.t.ppf(0.975, 8) * np.array(said)
+    assert 0.90 < within.mean() < 0.98
+
+
+def test_few_flights_do_not_tell_by_how_much_they_differ() -> None:
+    sd, freedom = differing(1, MANY - 1, 1.0).by_flights(np.zeros(2), np.zeros(2))
+    assert freedom == 0
+    assert not sd.any()

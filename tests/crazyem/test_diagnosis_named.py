@@ -8,18 +8,20 @@ import pytest
 from closed_loop import DRONE, Hidden, fly
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fitting.always import LAG_OFF, by_a_wrong_lag, nuisances, refine_base, unsure
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal
+from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.naming import told
 from crazyem.diagnosis.naming.named import CALIBRATED, DOUBTFUL, SELDOM, Named, at_most, one_factor, trust
-from crazyem.diagnosis.naming.told import _numbers, _rivals, strongest_first
+from crazyem.diagnosis.naming.told import _numbers, _rivals, _uncertainty, strongest_first
 from crazyem.diagnosis.naming.trials import Step, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained
 
@@ -116,13 +118,32 @@ def point_of(**effects: dict[str, Any]) -> Point:
 def test_a_number_at_the_end_of_what_is_admitted_may_be_anywhere() -> None:
     load = Candidate("payload", (), ("mass", "x", "y"))
     point = point_of(payload={"mass": 0.002, "x": -0.04, "y": 0.01, "z": 0.0})
-    told = _numbers(load, point, np.array([1e-4, 1e-3, 1e-3]), 2.0, {})
+    told = _numbers(load, point, np.array([1e-4, 1e-3, 1e-3]), np.full(3, 2.0), {})
     assert told["y"].ci95 == pytest.approx((0.008, 0.012))
     assert told["x"].sd == pytest.approx(0.08 / 12**0.5)
     assert told["x"].ci95[0] == pytest.approx(-0.04)  # never beyond
     drag = Candidate("linear_drag", (), ("x", "z"))
-    told = _numbers(drag, point_of(linear_drag={"x": 0.02, "z": 0.0}), np.array([1e-3, 1e-3]), 2.0, {})
+    told = _numbers(drag, point_of(linear_drag={"x": 0.02, "z": 0.0}), np.array([1e-3, 1e-3]), np.full(2, 2.0), {})
     assert told["z"].ci95 == pytest.approx((0.0, 2e-3))  # none of it is no end
+
+
+def test_intervals_count_by_how_much_flights_differ_where_there_are_many() -> None:
+    """Nine flights that want +1 and -1 of a parameter in turns: all of their blocks agree, they do not."""
+    wants = np.repeat(np.array([1.0, -1.0] * 4 + [0.0]), 10)
+    noise = np.random.default_rng(1).normal(size=90)
+    score = np.stack([100.0 * wants + 10.0 * noise, 10.0 * noise[::-1]], 1)
+    information = np.tile(np.diag([100.0, 100.0]), (90, 1, 1))
+    for flights, freedom in ((np.repeat(np.arange(9), 10), 8), (np.zeros(90, int), 0)):
+        fitted = Fitted(point_of(), (), 0.0, Gram(score, information, flights), np.zeros(2))
+        sd, width, covariance, _ = _uncertainty(fitted)
+        assert np.sqrt(np.diag(covariance)) == pytest.approx(sd)
+        if freedom:
+            assert sd[0] == pytest.approx(np.std(np.append([1.0, -1.0] * 4, 0.0), ddof=1) / 3.0, rel=0.1)
+            assert width[0] == pytest.approx(stats.t.ppf(0.975, 8))
+        else:
+            assert sd[0] < 0.16
+            assert width[0] == pytest.approx(stats.t.ppf(0.975, 88))
+        assert sd[1] < 0.02
 
 
 def test_what_no_scatter_shows_is_part_of_an_interval() -> None:

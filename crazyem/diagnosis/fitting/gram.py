@@ -15,6 +15,7 @@ from scipy import stats
 
 FOLDS = 5
 CHUNK = 3  # blocks that stay together in a fold
+MANY = 5  # flights, from which on it is seen by how much they differ
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,30 @@ class Gram:
             if fast.any():
                 p_value = min(p_value, self._p_value(rest, infos, curvature, meat, which, fast, len(scores)))
         return Solution(theta, gain, held, p_value, covariance, dispersion)
+
+    def by_flights(self, theta: NDArray, precision: NDArray) -> tuple[NDArray, int]:
+        """Standard deviations (c,) of all columns by how the flights' scores scatter, and its degrees of freedom.
+
+        What belongs to a flight (its clock, its battery, the air of the hour) is the same in all of its blocks, whose
+        scatter does not show it (the sandwich by clusters; Liang and Zeger, Biometrika 73, 1986). 0 for fewer flights
+        than `MANY`.
+
+        Args:
+            theta: (c,) change of the parameters to the maximum.
+            precision: (c,) of Gaussian priors.
+        """
+        which, of_flight = np.unique(self.flight, return_inverse=True)
+        if which.size < MANY:
+            return np.zeros(self.size), 0
+        residual = self.score - self.information @ theta
+        scores = np.zeros((which.size, self.size))
+        np.add.at(scores, of_flight, residual)
+        scores -= scores.mean(0)
+        a = self.information.sum(0) + np.diag(precision)
+        scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
+        inverse = np.linalg.pinv(a / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
+        each = scores @ inverse
+        return np.sqrt(np.square(each).sum(0) * which.size / (which.size - 1)), which.size - 1
 
     @staticmethod
     def _sandwich(

@@ -10,7 +10,7 @@ from scipy import stats
 
 from crazyem.diagnosis.fitting.always import by_a_wrong_lag, solved, unsure
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
-from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.fitting.fit import Data, Fitted
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.naming.balance import DAYS, Balance, how_weak, prefers
 from crazyem.diagnosis.naming.balance import steady as steadily
@@ -68,9 +68,7 @@ def tell(
     if not selection.accepted:
         return Told()
     point, gram = selection.final, selection.fitted.gram
-    solution, used = solved(selection.fitted, wide=True)
-    sd = np.sqrt(np.maximum(np.diag(solution.covariance), 0.0))
-    width = float(stats.t.ppf(0.975, max(len(gram.score) - used, 3)))
+    sd, width, all_covariance, used = _uncertainty(selection.fitted)
     never = unsure(data, point)
     never |= {
         name: float(np.hypot(never.get(name, 0.0), off)) for name, off in by_a_wrong_lag(data, selection.fitted).items()
@@ -83,7 +81,7 @@ def tell(
         assert step.taken is not None
         own = slice(at, at + len(candidate.free))
         at = own.stop
-        away, covariance = _away(candidate, point), solution.covariance[own, own]
+        away, covariance = _away(candidate, point), all_covariance[own, own]
         rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, selection, witnessed), balance)
         heard = _against(remains, candidate, data)
         confidence = trust(heard, step.taken.held_out) * share(step.taken.evidence, []) * preferred(step.taken, rivals)
@@ -99,7 +97,7 @@ def tell(
         late = candidate.effect == "input_delay" and MEASURED_LATE in witnessed
         name, label = (MEASURED_LATE, MEASURED_LATE) if late else (candidate.effect, candidate.label)
         chosen: dict[str, object] = {"streams": ("state", "gyro")} if late else dict(candidate.fixed)
-        numbers = by_day[0] if by_day else _numbers(candidate, point, sd[own], width, never)
+        numbers = by_day[0] if by_day else _numbers(candidate, point, sd[own], width[own], never)
         named = Named(name, label, numbers, chosen, step.taken.held_out, p_value, confidence)
         found.append((step.taken.evidence, named))
 
@@ -150,19 +148,37 @@ def _away(candidate: Candidate, point: Point) -> NDArray:
     return np.array([values[n] - neutral[n] for n in candidate.free])
 
 
+def _uncertainty(fitted: Fitted) -> tuple[NDArray, NDArray, NDArray, float]:
+    """Standard deviations (k,) of all free parameters, how many of them (k,) an interval of 95 % is to either side,
+    their covariance (k, k), and the degrees of freedom that they take.
+
+    By the scatter of blocks, or by that of flights where that makes the interval wider.
+    """
+    solution, used = solved(fitted, wide=True)
+    sd = np.sqrt(np.maximum(np.diag(solution.covariance), 0.0))
+    width = np.full(sd.size, stats.t.ppf(0.975, max(len(fitted.gram.score) - used, 3)))
+    apart, freedom = fitted.gram.by_flights(solution.theta, fitted.precision)
+    if not freedom:
+        return sd, width, solution.covariance, used
+    wider = stats.t.ppf(0.975, freedom) * apart > width * sd
+    width = np.where(wider, stats.t.ppf(0.975, freedom), width)
+    larger = np.where(wider, np.maximum(apart / np.maximum(sd, 1e-300), 1.0), 1.0)
+    return sd * larger, width, solution.covariance * np.outer(larger, larger), used
+
+
 def _numbers(
-    candidate: Candidate, point: Point, sd: NDArray, width: float, never: Mapping[tuple[str, str], float]
+    candidate: Candidate, point: Point, sd: NDArray, width: NDArray, never: Mapping[tuple[str, str], float]
 ) -> dict[str, Value]:
-    """The free parameters with their sd (k,), intervals of so many of them within what is possible; `never` is the sd
-    that no flight takes away."""
+    """The free parameters with their sd (k,), intervals of so many (k,) of them within what is possible; `never` is the
+    sd that no flight takes away."""
     values, out = candidate.values(point), {}
-    for name, own in zip(candidate.free, sd, strict=True):
+    for name, own, many in zip(candidate.free, sd, width, strict=True):
         p = candidate.parameter(name)
         error = float(np.hypot(own, never.get((candidate.effect, name), 0.0)))
         least, most = candidate.range_of(name)
         if values[name] in (least, most) and values[name] != p.neutral:  # it may be anywhere, for all that is known
             error = max(error, (most - least) / 12**0.5)
-        low, high = values[name] - width * error, values[name] + width * error
+        low, high = values[name] - many * error, values[name] + many * error
         out[name] = Value(values[name], p.unit, error, (max(low, least), min(high, most)))
     return out
 

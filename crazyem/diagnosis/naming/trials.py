@@ -11,7 +11,7 @@ from scipy.special import expit
 from crazyem.diagnosis.fitting.always import solved
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Fitted
-from crazyem.diagnosis.fitting.gram import Gram
+from crazyem.diagnosis.fitting.gram import MANY, Gram
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.physics.effects.catalogue import CATALOGUE
 
@@ -23,7 +23,6 @@ CLOSE = 4.0  # nats within which two explanations cannot be told apart,
 EVEN = 0.5  # what a name is worth, at least, beside a rival that is not significant itself
 TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks or recordings
 BEATEN = 0.1  # probability of being the better explanation below which a simpler one does not give the name
-MANY = 5  # recordings, from which on it is seen by how much they differ
 
 
 @dataclass(frozen=True)
