@@ -129,10 +129,7 @@ class Gram:
         scores = np.zeros((which.size, self.size))
         np.add.at(scores, of_flight, residual)
         scores -= scores.mean(0)
-        a = self.information.sum(0) + np.diag(precision)
-        scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
-        inverse = np.linalg.pinv(a / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
-        each = scores @ inverse
+        each = scores @ _inverse(self.information.sum(0) + np.diag(precision))
         return np.sqrt(np.square(each).sum(0) * which.size / (which.size - 1)), which.size - 1
 
     @staticmethod
@@ -149,8 +146,7 @@ class Gram:
             both = meat + 0.5 * (lagged + lagged.T)
             if np.all(np.linalg.eigvalsh(both) > 0.3 * np.linalg.eigvalsh(meat).min()):
                 meat = both
-        scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
-        inverse = np.linalg.pinv(a / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
+        inverse = _inverse(a)
         ratio = float(np.median(np.diag(meat) / np.maximum(np.diag(infos.sum(0)), 1e-300))) if k else 1.0
         freedom = max(blocks - (used(infos.sum(0), a) if effective else k), 2)
         sandwich = inverse @ meat @ inverse * blocks / freedom
@@ -191,6 +187,13 @@ class Gram:
         t2 = float(np.sum((vectors.T @ b) ** 2 / np.maximum(floor, 1e-9)))
         freedom = max(blocks - k, 1)
         return float(stats.f.sf(t2 * freedom / (k * max(blocks - 1, 1)), k, freedom))
+
+
+def _inverse(curvature: NDArray) -> NDArray:
+    """Of a curvature (k, k) of columns of very different sizes."""
+    scale = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
+    inverse: NDArray = np.linalg.pinv(curvature / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
+    return inverse
 
 
 def _beside(a: NDArray, b: NDArray, low: NDArray, high: NDArray, which: NDArray) -> tuple[NDArray, NDArray]:
