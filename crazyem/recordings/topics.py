@@ -69,6 +69,7 @@ class Source:
         convert: from c columns of (n,) to (n, c) SI.
         invalid: (n,) True in rows that the message itself calls invalid; they become missing.
         absent_is_nan: a NaN is the format's way to say that there is no value.
+        zero_is_absent: columns that are 0 in every row are of a sensor that is not connected; they stay as they are.
         frame, origin: as in `Mapped`.
     """
 
@@ -80,11 +81,12 @@ class Source:
     absent_is_nan: bool = False
     frame: str = ""
     origin: str = ""
+    zero_is_absent: bool = False
 
     def of(self, topics: Sequence[Topic]) -> Iterator[Mapped]:
         """The signal, from the topic if it is there and has the columns."""
         for topic in topics:
-            if topic.name != self.topic or not set(self.columns) <= topic.columns.keys():
+            if not self.fits(topic) or self.is_absent(topic):
                 continue
             marked = np.zeros(topic.time.size, bool) if self.invalid is None else self.invalid(topic)
             if marked.all() and marked.size:
@@ -95,6 +97,37 @@ class Source:
             if self.absent_is_nan:
                 marked = marked | ~np.isfinite(value).all(axis=1)
             yield Mapped(self.quantity, topic, value, self.columns, marked, self.frame, self.origin)
+
+    def fits(self, topic: Topic) -> bool:
+        """Whether the topic is the one meant and has the columns."""
+        return topic.name == self.topic and set(self.columns) <= topic.columns.keys()
+
+    def is_absent(self, topic: Topic) -> bool:
+        """Whether the topic says by zeros throughout that no sensor is connected."""
+        return self.zero_is_absent and topic.time.size > 0 and not any(topic.columns[c].any() for c in self.columns)
+
+
+# What reads 0 throughout where nothing is connected, in words.
+_SENSORS = {"voltage": "no battery monitor is connected", "rotor_speed": "no sensor is connected, or no rotor turned"}
+
+
+def unconnected(
+    topics: Sequence[Topic], sources: Sequence[Source], measured: Mapping[str, object]
+) -> tuple[dict[str, str], list[Finding]]:
+    """Signals that nothing measures although the file has a topic for them: signal -> why, and a finding for each.
+
+    Args:
+        topics, sources: of the reader.
+        measured: the signals that the recording has all the same.
+    """
+    why: dict[str, str] = {}
+    for source in sources:
+        for topic in topics:
+            if source.quantity not in measured and source.fits(topic) and source.is_absent(topic):
+                text = f"{topic.name} reads 0 in all of its {topic.time.size} records: {_SENSORS[source.quantity]}"
+                why.setdefault(source.quantity, text)
+    found = [Finding("mapping", Grade.HARMLESS, f"{s} is not measured: {text}.", signal=s) for s, text in why.items()]
+    return why, found
 
 
 def named(pattern: str, parts: str) -> tuple[str, ...]:

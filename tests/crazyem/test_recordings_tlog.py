@@ -434,3 +434,37 @@ def test_every_message_with_any_payload_is_read(
 def test_nothing_sound_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="sound checksum"):
         opened(tmp_path, b"\xfd" * 1000)
+
+
+def test_messages_that_come_twice_or_late_are_not_lost(tmp_path: Path) -> None:
+    log = Log()
+    for k in range(600):
+        log.beat(START + k)
+    whole = [struct.pack(">Q", START + k) + frame for k, frame in enumerate(frames(log.bytes))]
+    sent = [*whole[:100], whole[99], *whole[100:200], whole[201], whole[200], *whole[202:300], *whole[310:]]
+    recording = opened(tmp_path, b"".join(sent))
+    finding = next(f for f in recording.findings if f.check == "gaps")
+    assert finding.evidence["lost"] == 10
+    assert finding.evidence["received"] == 590
+    start, end = finding.intervals[0]
+    assert end - start == pytest.approx(11e-6, abs=1e-6)  # between the 300th and the 311th
+    assert recording.metadata["lost_records"] == {"HEARTBEAT": "10"}
+
+
+@pytest.mark.parametrize(("kind", "words"), [(1, "fixed wing aircraft"), (2, "quadrotor"), (13, "hexarotor")])
+def test_the_kind_of_vehicle_is_kept(tmp_path: Path, kind: int, words: str) -> None:
+    log = Log()
+    for k in range(5):
+        log.beat(START + k, kind=kind)
+    assert opened(tmp_path, log.bytes).metadata["vehicle"] == {"kind": words, "mav_type": str(kind)}
+
+
+def test_a_battery_monitor_that_reads_zero_is_not_connected(tmp_path: Path) -> None:
+    log = Log()
+    for k in range(5):
+        log.beat(START + 1000 * k)
+        log.add(START + 1000 * k + 1, mavlink.MAVLink_sys_status_message(*[0] * 13))
+    recording = opened(tmp_path, log.bytes)
+    assert "voltage" not in recording.signals
+    assert "no battery monitor" in recording.metadata["not_measured"]["voltage"]
+    assert [f.signal for f in recording.findings if f.signal] == ["voltage"]

@@ -326,7 +326,7 @@ def test_appended_data_is_read(tmp_path: Path) -> None:
 
 def test_truncation_at_every_byte(tmp_path: Path) -> None:
     content = header() + definitions("vehicle_attitude", "battery_status", "esc_status")
-    for i in range(4):
+    for i in range(1, 5):
         content += data("vehicle_attitude", 1000 * i, 1, 0, i, 0) + data("battery_status", 1000 * i + 5, 4, i)
         content += data("esc_status", 1000 * i + 9, 4, *[i] * 24)
     whole = opened(tmp_path, content)

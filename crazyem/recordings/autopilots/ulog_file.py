@@ -28,11 +28,12 @@ from crazyem.recordings.autopilots.frd_ned import (
     vectors,
 )
 from crazyem.recordings.autopilots.ulog_scan import HEADER, MAGIC, Scan, scan, unknown_flags
+from crazyem.recordings.autopilots.vehicle import vehicle_of
 from crazyem.recordings.contents import contents
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
-from crazyem.recordings.topics import Source, Topic, damage, named, ranks, seconds, signals_of, text_of
+from crazyem.recordings.topics import Source, Topic, damage, named, ranks, seconds, signals_of, text_of, unconnected
 
 CLOCK = "autopilot"  # microseconds since boot
 _RPM = 2.0 * math.pi / 60.0
@@ -66,8 +67,19 @@ def read(path: Path, options: ReadOptions) -> Recording:
         raise FileFormatError(f"{path}: the log holds not a single message of a topic ({sound.messages} others).")
     mapped = [m for source in _SIGNALS for m in source.of(topics)]
     signals, left_out = signals_of(topics, mapped)
-    findings = [*_integrity(sound, topics, log), *left_out, *_notes(signals)]
-    return Recording(str(path), "ulog", signals, _metadata(log), tuple(findings))
+    absent, unplugged = unconnected(topics, _SIGNALS, signals)
+    findings = [*_integrity(sound, topics, log), *left_out, *unplugged, *_notes(signals)]
+    metadata = _metadata(log) | {"vehicle": vehicle_of(_kind(log)), "not_measured": absent}
+    return Recording(str(path), "ulog", signals, {k: v for k, v in metadata.items() if v}, tuple(findings))
+
+
+def _kind(log: ULog) -> int:
+    """MAV_TYPE: of the status that PX4 publishes, else of its parameter; 0 where neither says."""
+    status = next((d.data["system_type"] for d in log.data_list if "system_type" in d.data), None)
+    if status is not None and status.size and int(status[-1]):
+        return int(status[-1])
+    parameter = log.initial_parameters.get("MAV_TYPE", 0)
+    return int(parameter) if isinstance(parameter, int) else 0
 
 
 def _decode(path: Path, sound: Scan) -> ULog:
@@ -159,8 +171,8 @@ _SIGNALS: tuple[Source, ...] = (
     Source("body_rate", "vehicle_attitude", named("*speed", "roll pitch yaw"), vectors, frame=BODY),
     Source("specific_force", "sensor_combined", named("accelerometer_m_s2[*]", _THREE), vectors, frame=BODY),
     Source("specific_force", "vehicle_acceleration", named("xyz[*]", _THREE), vectors, frame=BODY),
-    Source("rotor_speed", "esc_status", named("esc[*].esc_rpm", _FOUR), _rad_per_s, frame=MOTORS),
-    Source("voltage", "battery_status", ("voltage_v",), stacked),
+    Source("rotor_speed", "esc_status", named("esc[*].esc_rpm", _FOUR), _rad_per_s, frame=MOTORS, zero_is_absent=True),
+    Source("voltage", "battery_status", ("voltage_v",), stacked, zero_is_absent=True),
     Source("setpoint_position", _TARGET, _XYZ, vectors, absent_is_nan=True, frame=WORLD),
     Source("setpoint_velocity", _TARGET, named("*", "vx vy vz"), vectors, absent_is_nan=True, frame=WORLD),
     Source("flying", "vehicle_land_detected", ("landed",), _not, frame="1 while the autopilot does not say landed"),

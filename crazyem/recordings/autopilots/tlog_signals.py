@@ -1,0 +1,130 @@
+"""Which fields of which MAVLink messages are which signals in a telemetry log: the best source first.
+
+docs/formats/tlog.md explains the table. Sources: mavlink.io/en/messages/common.html, ArduPilot's GCS_MAVLINK (units of
+RAW_IMU).
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.recordings.autopilots.frd_ned import (
+    ATTITUDE,
+    BODY,
+    MOTORS,
+    WORLD,
+    Columns,
+    euler,
+    euler_from_quaternions,
+    quaternions,
+    quaternions_from_euler,
+    stacked,
+    vectors,
+)
+from crazyem.recordings.topics import Source, Topic, named
+from crazyem.signals.mavlink import RPM, mapping
+
+ARMED = 128  # in HEARTBEAT.base_mode
+
+
+def _scaled(factor: float, turned: Callable[[Columns], NDArray[np.float64]] = stacked) -> Callable:
+    return lambda columns: turned(columns) * factor
+
+
+def _quaternions_of_angles(columns: Columns) -> NDArray[np.float64]:
+    return quaternions_from_euler(euler(columns))
+
+
+def _angles_of_quaternion(columns: Columns) -> NDArray[np.float64]:
+    return euler_from_quaternions(quaternions(columns))
+
+
+def _cells(columns: Columns) -> NDArray[np.float64]:
+    """V of a battery from its cells [mV]; 65535 is a cell that is not there, 0 one of the extension that is not."""
+    cells = stacked(columns)
+    return np.where(cells == 65535, 0.0, cells).sum(axis=1, keepdims=True) * 1e-3
+
+
+def _in_air(columns: Columns) -> NDArray[np.float64]:
+    return (stacked(columns) >= 2).astype(float)
+
+
+def _armed(columns: Columns) -> NDArray[np.float64]:
+    return ((np.asarray(columns[0]).astype(np.int64) & ARMED) != 0).astype(float)[:, None]
+
+
+def _equal(column: str, value: int) -> Callable[[Topic], NDArray[np.bool_]]:
+    return lambda topic: topic.columns[column] == value
+
+
+def _masked(bits: int, *, local: bool = False) -> Callable[[Topic], NDArray[np.bool_]]:
+    """Rows whose `type_mask` says to ignore the value; with `local`, also those that are not in the local frame."""
+
+    def invalid(topic: Topic) -> NDArray[np.bool_]:
+        rows = (topic.columns["type_mask"].astype(np.int64) & bits) != 0
+        return rows | (topic.columns["coordinate_frame"] != 1) if local else rows
+
+    return invalid
+
+
+def _shared(signal: str, message: str) -> Source:
+    """What a live link reads from a message, read from a log the same way."""
+    row = mapping(signal, message)
+    turned = {"vector": vectors, "quaternion": quaternions, "angles": _quaternions_of_angles}[row.kind]
+    frame = {"position": WORLD, "velocity": WORLD, "attitude": ATTITUDE}.get(signal, BODY)
+    return Source(signal, message, row.fields, _scaled(row.factor, turned), frame=frame)
+
+
+_XYZ = named("*", "x y z")
+_V = named("v*", "x y z")
+_ANGLES = named("*", "roll pitch yaw")
+_Q = named("q[*]", "0 1 2 3")
+_RPMS = named("rpm[*]", "0 1 2 3")
+_VOLTAGES = named("voltages[*]", "0 1 2 3 4 5 6 7 8 9") + named("voltages_ext[*]", "0 1 2 3")
+_TARGET = "POSITION_TARGET_LOCAL_NED"
+_BODY_RATES = named("body_*_rate", "roll pitch yaw")
+
+SIGNALS: tuple[Source, ...] = (
+    _shared("position", "LOCAL_POSITION_NED"),
+    _shared("velocity", "LOCAL_POSITION_NED"),
+    _shared("attitude", "ATTITUDE_QUATERNION"),
+    _shared("attitude", "ATTITUDE"),
+    _shared("body_rate", "HIGHRES_IMU"),
+    _shared("body_rate", "SCALED_IMU"),
+    _shared("body_rate", "ATTITUDE_QUATERNION"),
+    _shared("body_rate", "ATTITUDE"),
+    _shared("specific_force", "HIGHRES_IMU"),
+    _shared("specific_force", "SCALED_IMU"),
+    Source("rotor_speed", "ESC_STATUS", _RPMS, _scaled(RPM), frame=MOTORS, zero_is_absent=True),
+    Source("rotor_speed", "ESC_TELEMETRY_1_TO_4", _RPMS, _scaled(RPM), frame=MOTORS, zero_is_absent=True),
+    Source("voltage", "BATTERY_STATUS", _VOLTAGES, _cells, _equal("voltages[0]", 65535), zero_is_absent=True),
+    Source(
+        "voltage",
+        "SYS_STATUS",
+        ("voltage_battery",),
+        _scaled(1e-3),
+        _equal("voltage_battery", 65535),
+        zero_is_absent=True,
+    ),
+    Source("setpoint_position", _TARGET, _XYZ, vectors, _masked(0x007, local=True), frame=WORLD),
+    Source("setpoint_velocity", _TARGET, _V, vectors, _masked(0x038, local=True), frame=WORLD),
+    Source(
+        "flying",
+        "EXTENDED_SYS_STATE",
+        ("landed_state",),
+        _in_air,
+        _equal("landed_state", 0),
+        frame="1 while in the air, taking off or landing",
+    ),
+    Source("flying", "HEARTBEAT", ("base_mode",), _armed, frame="1 while armed"),
+    Source("euler", "ATTITUDE", _ANGLES, euler, frame="roll, pitch, yaw (ZYX), body FLU to world (north-west-up)"),
+    Source("setpoint_acceleration", _TARGET, named("af*", "x y z"), vectors, _masked(0x3C0, local=True), frame=WORLD),
+    Source("setpoint_euler", "ATTITUDE_TARGET", _Q, _angles_of_quaternion, _masked(0x80)),
+    Source("setpoint_rate", "ATTITUDE_TARGET", _BODY_RATES, vectors, _masked(0x07), frame=BODY),
+    Source("position", "ATT_POS_MOCAP", _XYZ, vectors, frame=WORLD, origin="mocap"),
+    Source("attitude", "ATT_POS_MOCAP", _Q, quaternions, frame=ATTITUDE, origin="mocap"),
+    Source("position", "VISION_POSITION_ESTIMATE", _XYZ, vectors, frame=WORLD, origin="vision"),
+)
+# raw counts by the definition, milli-g and mrad/s from ArduPilot
+RAW_IMU: tuple[Source, ...] = (_shared("body_rate", "RAW_IMU"), _shared("specific_force", "RAW_IMU"))
