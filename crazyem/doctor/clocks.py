@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from crazyem.doctor.streams import QUIET, Cadence, Stream, cadence, listed, longest, streams
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording
+from crazyem.recordings.stamps import RESTART
 
 Column = NDArray[np.float64]
 
@@ -20,7 +21,6 @@ WRAPS: dict[str, float] = {
     "32 bits of microseconds": 2.0**32 * 1e-6,
     "16 bits of milliseconds": 2.0**16 * 1e-3,
 }
-RESTART = 1.0  # s back from which a clock was set or started again; less is a record out of order
 OFF_NOMINAL = 0.002  # relative deviation of the rate worth a word
 WRONG_NOMINAL = 0.1  # from which a claimed rate is wrong
 _NICE = (1, 2, 4, 5, 8, 10, 12.5, 20, 25, 30, 40, 50, 60, 100, 120, 125, 200, 240, 250, 300, 400, 500, 800, 1000, 2000)

@@ -170,6 +170,7 @@ _KINDS: dict[str, Callable[[SignalArray, Fix, Recording], SignalArray]] = {
     "mark": _mark,
     "sort": _sort,
     "world_to_body": _world_to_body,
+    "stamps": lambda array, fix, recording: array,
 }
 
 

@@ -25,6 +25,7 @@ FIXES = {
     "unwrap": "add `factor[i]` seconds to the stamps from sample `rows[i]` on",
     "mark": "the samples in `rows` become missing (they were never measured)",
     "sort": "samples into the order of their stamps",
+    "stamps": "the reader has left out, placed or shifted what had stamps that cannot be; nothing is left to change",
 }
 
 
@@ -55,7 +56,8 @@ class Finding:
     """One thing that is odd about a recording.
 
     Attributes:
-        check: which check found it, e.g. "gaps"; readers use "integrity", "interpolated", "mapping", "motor_meaning".
+        check: which check found it, e.g. "gaps"; readers use "integrity", "interpolated", "mapping", "motor_meaning",
+            "stamps".
         grade: how much it matters.
         text: one sentence for people.
         signal: name of the signal concerned; "" for the whole recording.

@@ -1,6 +1,5 @@
 """Recordings too large for memory, read a stretch at a time where their reader can."""
 
-import importlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -59,5 +58,4 @@ def open_parts(
     reader = reader_of(path)
     if not reader.has("read_parts"):
         raise UsageError(f"{path}: a {reader.name} cannot be read in parts, only whole.")
-    module = importlib.import_module(f"crazyem.recordings.{reader.module}")
-    yield from module.read_parts(path, options or ReadOptions(), seconds=seconds)
+    yield from reader.read_parts(path, options or ReadOptions(), seconds)

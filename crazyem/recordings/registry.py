@@ -6,12 +6,14 @@ A reader for a new format is one file with `recognises` and `read`, and one line
 import gzip
 import importlib
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
+from crazyem.recordings.stamps import screened, screened_parts
 
 _HEAD_BYTES = 64 * 1024
 
@@ -40,7 +42,11 @@ class Reader:
     def read(self, path: Path, options: ReadOptions) -> Recording:
         recording = self._module().read(path, options)
         assert isinstance(recording, Recording)
-        return recording
+        return screened(recording)
+
+    def read_parts(self, path: Path, options: ReadOptions, seconds: float) -> Iterator[Recording]:
+        """As `read`, in parts; only of a reader that has the function."""
+        return screened_parts(self._module().read_parts(path, options, seconds=seconds))
 
     def _module(self):
         return importlib.import_module(f"crazyem.recordings.{self.module}")

@@ -1,59 +1,93 @@
 """The clocks of a telemetry log on one axis: the autopilot's time since boot, or arrival where nothing has that."""
 
+import itertools
 from collections import Counter
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.recordings.autopilots.tlog_frames import MESSAGES, Frames, Frameset, columns_of
 from crazyem.recordings.finding import Finding, Grade, note
+from crazyem.recordings.stamps import CHECK, Fault, impossible, restarts
 from crazyem.recordings.topics import seconds
 
 _EPOCH = 10**15  # us; a `time_usec` beyond is since 1970, below since boot
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Own:
+    """The times that messages of one kind carry.
+
+    Attributes:
+        time: (n,) s since boot, or since 1970.
+        utc: whether since 1970.
+        bad: (n,) True where the message has none that can be.
+        host: (n,) s since 1970 of arrival.
+        place: (n,) in the order of the log.
+    """
+
+    time: NDArray[np.float64]
+    utc: bool
+    bad: NDArray[np.bool_]
+    host: NDArray[np.float64]
+    place: NDArray[np.int64]
+
+
 class Clocks:
     """The clocks of a log on one axis: time since boot of the autopilot, or the host's if no message has that.
 
-    A message without a time of its own is placed by its arrival, less the median of what others took to arrive.
+    A message without a time of its own is placed by its arrival, less the median of what others took to arrive. Where
+    the autopilot was started again in the middle of a log, the median of each start places the messages that follow.
     """
 
     def __init__(self, found: Frameset, system: int) -> None:
-        self._offset: dict[int, float] = {}  # component -> host time minus its time since boot, s
-        self._utc: dict[int, float] = {}  # component -> host time minus its own UTC, s
         counts: Counter[int] = Counter()
-        boots: dict[int, list[NDArray[np.float64]]] = {}
-        epochs: dict[int, list[NDArray[np.float64]]] = {}
+        boots: dict[int, list[_Own]] = {}
+        epochs: dict[int, list[_Own]] = {}
         for (sender, component, identifier), frames in found.frames.items():
             if sender != system:
                 continue
             counts[component] += len(frames.stamps) * (1000 if identifier == 0 else 1)
-            boot, utc = _own_time(MESSAGES[identifier], frames)
-            host = seconds(np.array(frames.stamps, np.int64))
-            if boot is not None:
-                boots.setdefault(component, []).append(host - boot)
-            if utc is not None:
-                epochs.setdefault(component, []).append(host - utc)
-        self._offset = {c: float(np.median(np.concatenate(v))) for c, v in boots.items()}
-        self._utc = {c: float(np.median(np.concatenate(v))) for c, v in epochs.items()}
-        self.component = max(counts, key=lambda c: (c in self._offset, counts[c], -c))
+            own = _own_time(MESSAGES[identifier], frames)
+            if own is not None:
+                (epochs if own.utc else boots).setdefault(component, []).append(own)
+        self._utc = {c: float(np.median(_joined([o.host - o.time for o in v], v))) for c, v in epochs.items()}
+        # component -> place of the first message of each start but the first; host time at which each start was
+        self._starts = {c: _starts(v) for c, v in boots.items()}
+        self._boots = {c: _offsets(v, self._starts[c]) for c, v in boots.items()}
+        self.component = max(counts, key=lambda c: (c in self._boots, counts[c], -c))
+        self.boot: float | None = None  # host time at which the axis is 0, None: no such axis
+        if self.component in self._boots:
+            self.boot = float(self._boots[self.component][0])
+        own_of = boots.get(self.component, [])
+        self._ends = (min(o.host.min() for o in own_of), max(o.host.max() for o in own_of)) if own_of else (0.0, 0.0)
+        self._firsts = [min(o.host[o.place >= s].min(initial=np.inf) for o in own_of) for s in self.starts]
         first = min(f.stamps[0] for f in found.frames.values())
-        self.boot = self._offset.get(self.component)  # host time at which the axis is 0, None: no such axis
         self.origin = 0.0 if self.boot is not None else float(first // 1_000_000)
+        self.faults: list[Fault] = []
 
-    def place(self, component: int, frames: Frames, message: object) -> tuple[NDArray[np.float64], str]:
-        """Times of frames on the axis [s], and the clock they are of."""
-        host = np.array(frames.stamps, np.int64)
-        boot, utc = _own_time(message, frames)
-        if self.boot is None:
-            return self.arrival(host), "host"
-        if boot is not None:
-            if component == self.component:
-                return boot, "autopilot"
-            return boot + (self._offset[component] - self.boot), f"component {component}"
-        if utc is not None:
-            return utc + (self._utc[component] - self.boot), f"UTC of component {component}"
-        return self.arrival(host), "host"
+    @property
+    def starts(self) -> NDArray[np.int64]:
+        """Places (k,) in the log from which on the autopilot read is one started again."""
+        return self._starts.get(self.component, np.empty(0, np.int64))
+
+    def place(self, component: int, frames: Frames, message: object, name: str) -> tuple[NDArray[np.float64], str]:
+        """Times of frames on the axis [s], and the clock they are of; takes note of stamps that cannot be."""
+        arrival = self.arrival(np.array(frames.stamps, np.int64))
+        own = _own_time(message, frames) if self.boot is not None else None
+        if own is None or self.boot is None:
+            return arrival, "host"
+        if own.utc:
+            time, clock = own.time + (self._utc[component] - self.boot), f"UTC of component {component}"
+        else:
+            start = np.searchsorted(self._starts[component], own.place, side="right")
+            time = own.time + (self._boots[component] - self.boot)[start]
+            clock = "autopilot" if component == self.component else f"component {component}"
+        if own.bad.any():
+            example = float(own.time[int(np.argmax(own.bad))])
+            self.faults.append(Fault(name, int(own.bad.sum()), own.bad.size, "placed by arrival", example))
+        return np.where(own.bad, arrival, time), clock
 
     def arrival(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
         """Times on the axis [s] of what arrived at these times [us]."""
@@ -62,6 +96,7 @@ class Clocks:
         return seconds(stamps) - self.boot
 
     def findings(self) -> list[Finding]:
+        """What to know of the time axis."""
         if self.boot is None:
             text = "No message has the autopilot's own time; all times are those of arrival at the ground station."
             return [note("mapping", text, Grade.DEGRADES)]
@@ -69,23 +104,62 @@ class Clocks:
             'Messages without a time of their own (clock "host") are placed by their arrival less the median delay '
             'of the others; among signals of clock "host" times are exact, against others they are not.'
         )
-        return [note("mapping", text, boot_s=self.boot)]
+        return [note("mapping", text, boot_s=self.boot), *self._parts(self.boot)]
+
+    def _parts(self, boot: float) -> list[Finding]:
+        """That the autopilot was started again, and where the parts of the log are."""
+        if not self._firsts:
+            return []
+        edges = [self._ends[0], *self._firsts, self._ends[1]]
+        parts = tuple((a - boot, b - boot) for a, b in itertools.pairwise(edges))
+        said = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in parts[:10])
+        text = (
+            f"The autopilot was started {len(parts)} times within the log, whose parts are {said}; "
+            "each part is placed by when its messages arrived."
+        )
+        advice = f"Use one part at a time: --from {parts[-1][0]:.1f} for the last."
+        evidence = {"starts": float(len(parts))}
+        return [Finding(CHECK, Grade.DEGRADES, text, intervals=parts, evidence=evidence, advice=advice)]
 
 
-def _own_time(message: object, frames: Frames) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
-    """Times that messages carry: since boot [s], and since 1970 [s]; at most one of them."""
+def _joined(columns: list[NDArray[np.float64]], own: list[_Own]) -> NDArray[np.float64]:
+    return np.concatenate([column[~o.bad] for column, o in zip(columns, own, strict=True)])
+
+
+def _starts(own: list[_Own]) -> NDArray[np.int64]:
+    """Places (k,) of the first message of each start of an autopilot but the first."""
+    place = np.concatenate([o.place[~o.bad] for o in own])
+    order = np.argsort(place)
+    return place[order][restarts(_joined([o.time for o in own], own)[order])]
+
+
+def _offsets(own: list[_Own], starts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Host time [s] of each start."""
+    part = np.searchsorted(starts, np.concatenate([o.place[~o.bad] for o in own]), side="right")
+    lead = _joined([o.host - o.time for o in own], own)
+    return np.array([float(np.median(lead[part == k])) for k in range(starts.size + 1)])
+
+
+def _own_time(message: object, frames: Frames) -> _Own | None:
+    """Times that messages carry; None if they carry none, or too few that can be."""
     names = message.fieldnames  # type: ignore[attr-defined]
-    if "time_boot_ms" in names:
-        return seconds(columns_of(message, frames.payloads)["time_boot_ms"], 1e3), None
-    if "time_usec" not in names:
-        return None, None
-    raw = columns_of(message, frames.payloads)["time_usec"]
-    stamps = np.asarray(raw).astype(np.int64)
-    if raw.dtype.itemsize == 4:  # wraps after 71 minutes
-        steps = (np.diff(stamps) + (1 << 31)) % (1 << 32) - (1 << 31)
-        stamps = stamps[:1].repeat(stamps.size) + np.concatenate([[0], np.cumsum(steps)])
-    if (stamps <= 0).any():
-        return None, None
-    if (stamps > _EPOCH).all():
-        return None, seconds(stamps)
-    return (seconds(stamps), None) if (stamps < _EPOCH).all() else (None, None)
+    column = next((name for name in ("time_boot_ms", "time_usec") if name in names), None)
+    if column is None:
+        return None
+    raw = np.asarray(columns_of(message, frames.payloads)[column])
+    stamps = raw.astype(np.int64)
+    known = stamps > 0
+    if 2 * known.sum() <= known.size:
+        return None
+    utc = False
+    if column == "time_usec":
+        utc = bool(np.median(stamps[known]) > _EPOCH)
+        known &= (stamps > _EPOCH) == utc
+        if raw.dtype.itemsize == 4:  # wraps after 71 minutes
+            steps = (np.diff(stamps[known]) + (1 << 31)) % (1 << 32) - (1 << 31)
+            stamps[known] = stamps[known][0] + np.concatenate([[0], np.cumsum(steps)])
+    time = seconds(stamps, 1e3 if column == "time_boot_ms" else 1e6)
+    bad = ~known
+    bad[known] = impossible(time[known])
+    host = seconds(np.array(frames.stamps, np.int64))
+    return _Own(time, utc, bad, host, np.array(frames.places, np.int64))

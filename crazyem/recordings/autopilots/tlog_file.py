@@ -22,6 +22,7 @@ from crazyem.recordings.contents import contents
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Event, Recording
+from crazyem.recordings.stamps import finding
 from crazyem.recordings.topics import Topic, damage, seconds, signals_of, text_of, unconnected
 
 _ARDUPILOT = 3
@@ -72,8 +73,10 @@ def read(path: Path, options: ReadOptions) -> Recording:
     sources = (*SIGNALS, *(RAW_IMU if autopilot == _ARDUPILOT else ()))
     signals, left_out = signals_of(topics, [m for source in sources for m in source.of(topics)])
     absent, unplugged = unconnected(topics, sources, signals)
-    losses = link(found, system, clocks.component)
-    findings = [*damage(found.skipped, size, "MAVLink frame"), *losses.findings(clocks.arrival), *others]
+    losses = link(found, system, clocks.component, clocks.starts)
+    streams = {fault.stream for fault in clocks.faults}
+    odd = finding(clocks.faults, [name for name, array in signals.items() if array.stream in streams])
+    findings = [*damage(found.skipped, size, "MAVLink frame"), *losses.findings(clocks.arrival), *others, *odd]
     findings += [*clocks.findings(), *left_out, *unplugged, *_notes(signals, found, autopilot == _ARDUPILOT)]
     metadata = {
         "tlog": _about(found, system, clocks),
@@ -130,11 +133,11 @@ def _topics(found: Frameset, system: int, clocks: Clocks) -> list[Topic]:
         if sender != system or message.msgname in _NO_SIGNALS:
             continue
         columns = columns_of(message, frames.payloads)
-        time, clock = clocks.place(component, frames, message)
+        prefix = "" if component == clocks.component else f"{component}/"
+        time, clock = clocks.place(component, frames, message, prefix + message.msgname)
         host = seconds(np.array(frames.stamps, np.int64))
         order = np.array(frames.places, np.int64)
         used = "time_boot_ms" if "time_boot_ms" in columns else "time_usec" if clock != "host" else ""
-        prefix = "" if component == clocks.component else f"{component}/"
         for suffix, rows in _instances(message.msgname, columns):
             numbers = {c: v[rows] for c, v in columns.items() if v.dtype.kind != "S" and c != used}
             name = prefix + message.msgname + suffix

@@ -49,14 +49,28 @@ class Link:
         ]
 
 
-def link(found: Frameset, system: int, component: int) -> Link:
-    """The messages of a component; those that came twice or late are neither lost nor counted again."""
+def link(found: Frameset, system: int, component: int, starts: NDArray[np.int64]) -> Link:
+    """The messages of a component; those that came twice or late are neither lost nor counted again.
+
+    Args:
+        starts: places (k,) in the log at which the numbers begin anew.
+    """
     chosen = [f for (s, c, _), f in found.frames.items() if (s, c) == (system, component)]
-    place = np.argsort(np.concatenate([np.array(f.places, np.int64) for f in chosen]))
-    stamp = np.concatenate([np.array(f.stamps, np.int64) for f in chosen])[place]
-    sequence = np.concatenate([np.array(f.sequence, np.int64) for f in chosen])[place]
-    number = np.concatenate([[0], np.cumsum((np.diff(sequence) + _LATE) % 256 - _LATE)])
-    sent, first = np.unique(number, return_index=True)
-    missing = np.diff(sent) - 1
-    rows = np.flatnonzero(missing)
-    return Link(sent.size, int(missing.sum()), stamp[first[rows]], stamp[first[rows + 1]])
+    place = np.concatenate([np.array(f.places, np.int64) for f in chosen])
+    order = np.argsort(place)
+    stamp = np.concatenate([np.array(f.stamps, np.int64) for f in chosen])[order]
+    sequence = np.concatenate([np.array(f.sequence, np.int64) for f in chosen])[order]
+    cuts = np.searchsorted(place[order], starts)
+    received = lost = 0
+    before, after = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for numbers, stamps in zip(np.split(sequence, cuts), np.split(stamp, cuts), strict=True):
+        if not numbers.size:
+            continue
+        number = np.concatenate([[0], np.cumsum((np.diff(numbers) + _LATE) % 256 - _LATE)])
+        sent, first = np.unique(number, return_index=True)
+        missing = np.diff(sent) - 1
+        rows = np.flatnonzero(missing)
+        received, lost = received + sent.size, lost + int(missing.sum())
+        before.append(stamps[first[rows]])
+        after.append(stamps[first[rows + 1]])
+    return Link(received, lost, np.concatenate(before), np.concatenate(after))

@@ -8,6 +8,7 @@ import contextlib
 import io
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,8 @@ from crazyem.recordings.autopilots.vehicle import vehicle_of
 from crazyem.recordings.contents import contents
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.options import ReadOptions
-from crazyem.recordings.recording import Recording
+from crazyem.recordings.recording import Recording, SignalArray
+from crazyem.recordings.stamps import Fault, believed, finding
 from crazyem.recordings.topics import Source, Topic, damage, named, ranks, seconds, signals_of, text_of, unconnected
 
 CLOCK = "autopilot"  # microseconds since boot
@@ -62,15 +64,21 @@ def read(path: Path, options: ReadOptions) -> Recording:
     del data
     log = _decode(path, sound)
     sound.data = b""  # pyulog has its own copy
-    topics = _topics(log)
+    topics, faults = _topics(log, np.frombuffer(sound.identifiers, np.uint16))
     if not any(topic.time.size for topic in topics):
         raise FileFormatError(f"{path}: the log holds not a single message of a topic ({sound.messages} others).")
     mapped = [m for source in _SIGNALS for m in source.of(topics)]
     signals, left_out = signals_of(topics, mapped)
     absent, unplugged = unconnected(topics, _SIGNALS, signals)
-    findings = [*_integrity(sound, topics, log), *left_out, *unplugged, *_notes(signals)]
+    findings = [*_integrity(sound, topics, log), *finding(faults, _concerned(signals, faults)), *left_out]
+    findings += [*unplugged, *_notes(signals)]
     metadata = _metadata(log) | {"vehicle": vehicle_of(_kind(log)), "not_measured": absent}
     return Recording(str(path), "ulog", signals, {k: v for k, v in metadata.items() if v}, tuple(findings))
+
+
+def _concerned(signals: Mapping[str, SignalArray], faults: list[Fault]) -> list[str]:
+    streams = {fault.stream for fault in faults}
+    return [name for name, array in signals.items() if array.stream in streams]
 
 
 def _kind(log: ULog) -> int:
@@ -91,18 +99,43 @@ def _decode(path: Path, sound: Scan) -> ULog:
         raise FileFormatError(f"{path}: the log cannot be decoded ({type(error).__name__}: {error}).") from error
 
 
-def _topics(log: ULog) -> list[Topic]:
-    """One topic a message and instance, its rows in the order of the file, times in s since boot."""
+def _topics(log: ULog, identifiers: NDArray[np.uint16]) -> tuple[list[Topic], list[Fault]]:
+    """One topic a message and instance, its rows in the order of the file, times in s since boot.
+
+    Args:
+        log: decoded.
+        identifiers: (m,) of the topic of each data message, in the order of the file.
+
+    Returns: the topics without the records whose stamps cannot be, and what was wrong with those.
+    """
     sets = [d for d in log.data_list if d.data["timestamp"].size]
-    stamps = [_stamps(d.data) for d in sets]
-    topics = []
-    for d, (stamp, used), order in zip(sets, stamps, ranks([s for s, _ in stamps]), strict=True):
-        name = d.name if d.multi_id == 0 else f"{d.name}_{d.multi_id}"
+    published = [seconds(d.data["timestamp"]) for d in sets]
+    places = [_places(d, identifiers) for d in sets]
+    kept, shifts, faults = believed([_name(d) for d in sets], published, places, absent=0.0)
+    topics, stamps = [], []
+    for d, rows, shift in zip(sets, kept, shifts, strict=True):
+        if not rows.any():
+            continue
+        data = {k: v[rows] for k, v in d.data.items()}
+        stamp, used = _stamps(data)
+        stamps.append(seconds(stamp) + shift)
         chars = {f.field_name for f in d.field_data if f.type_str == "char"}
-        columns = {k: v for k, v in d.data.items() if k != used and k not in chars and "_padding" not in k}
+        columns = {k: v for k, v in data.items() if k != used and k not in chars and "_padding" not in k}
         units = {k: "us" for k in columns if k.rpartition(".")[2] in ("timestamp", "timestamp_sample")}
-        topics.append(Topic(name, columns, seconds(stamp), order, clock=CLOCK, units=units))
-    return topics
+        topics.append(Topic(_name(d), columns, stamps[-1], np.empty(0, np.int64), clock=CLOCK, units=units))
+    ordered = [replace(topic, order=order) for topic, order in zip(topics, ranks(stamps), strict=True)]
+    return ordered, faults
+
+
+def _name(d: ULog.Data) -> str:
+    return str(d.name) if d.multi_id == 0 else f"{d.name}_{d.multi_id}"
+
+
+def _places(d: ULog.Data, identifiers: NDArray[np.uint16]) -> NDArray[np.float64]:
+    """(n,) where the records of a topic stand among all of the file; NaN where that is not known."""
+    places = np.flatnonzero(identifiers == d.msg_id).astype(float)
+    count = d.data["timestamp"].size
+    return places if places.size == count else np.full(count, np.nan)
 
 
 def _stamps(data: Data) -> tuple[NDArray[np.uint64], str]:

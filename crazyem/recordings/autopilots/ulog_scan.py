@@ -10,6 +10,7 @@ Source: docs.px4.io/main/en/dev_log/ulog_file_format.
 
 import re
 import struct
+from array import array
 from dataclasses import dataclass, field
 
 MAGIC = b"ULog\x01\x12\x35"
@@ -49,6 +50,7 @@ class Scan:
         skipped: (offset, count) of each run of bytes that is no sound message.
         refused: why a topic that the file announces is not read, by name.
         messages: how many are sound.
+        identifiers: of the topic of each sound data message, in the order of the file.
         size: of the file, bytes.
     """
 
@@ -56,6 +58,7 @@ class Scan:
     skipped: list[tuple[int, int]] = field(default_factory=list)
     refused: dict[str, str] = field(default_factory=dict)
     messages: int = 0
+    identifiers: "array[int]" = field(default_factory=lambda: array("H"))
     size: int = 0
 
 
@@ -135,6 +138,7 @@ def scan(data: bytes) -> Scan:
     unpack = struct.Struct("<HB").unpack_from
     two = struct.Struct("<H").unpack_from
     topics = types.topics
+    record = found.identifiers.append
     while position < size:
         sound = False
         if position >= limit:
@@ -144,9 +148,13 @@ def scan(data: bytes) -> Scan:
             after = position + 3 + length
             if after <= limit:
                 if kind == 0x44 and length > 2:  # 'D', nearly all of a file
-                    limits = topics.get(two(data, position + 3)[0])
+                    identifier = two(data, position + 3)[0]
+                    limits = topics.get(identifier)
                     sound = limits is not None and length - 2 == limits[0]
-                    if not sound and limits is not None and limits[0] < length - 2 <= limits[1]:
+                    if sound:
+                        record(identifier)
+                    elif limits is not None and limits[0] < length - 2 <= limits[1]:
+                        record(identifier)
                         found.messages += 1
                         kept += [view[start:position], _without_padding(data, position, limits[0])]
                         start = position = after

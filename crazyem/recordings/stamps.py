@@ -1,0 +1,258 @@
+"""Stamps that cannot be: of messages never published, of other clocks, of erased or damaged bytes.
+
+One rule for all readers. A stamp cannot be if
+
+- the format writes it for "no stamp" (0 of a latched message; the reader says which value that is), or
+- it is farther from the others than any recording is long, or
+- it leaves the order of the records around it, which are in order without it. A clock that runs forward is its own
+  running median, so this is the filter of Hampel (1974) with a fixed limit.
+
+A stream all of whose stamps are far from the others, and run beside them, is of another clock: it is shifted by one
+constant. What is left of a disorder (records that changed places, a clock that was set) is for the doctor.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.recording import Recording, SignalArray
+
+Column = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+LONGEST = 86_400.0  # s; no recording of a flight is longer than a day
+RESTART = 1.0  # s back from which a clock was set or started again; less is a record out of order
+_REACH = 3  # records before and after one that tell where its stamp should be
+CHECK = "stamps"
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Stamps of one stream that cannot be.
+
+    Attributes:
+        stream: its name.
+        count: records concerned.
+        total: records of the stream.
+        what: was done with them: "left out", "placed by arrival" or "shifted".
+        example: one of the stamps [s], as in the file; the shift [s] of what was shifted.
+    """
+
+    stream: str
+    count: int
+    total: int
+    what: str
+    example: float
+
+
+def impossible(time: Column, *, centre: float | None = None, absent: float | None = None) -> Flags:
+    """(n,) True for stamps that cannot be.
+
+    Args:
+        time: (n,) s, of one clock, in the order of the file.
+        centre: s, what other streams of the clock lie around; None: the median of these stamps.
+        absent: the stamp that says that there is none; None if there is no such.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        bad = ~np.isfinite(time)
+        if absent is not None:
+            bad |= time == absent
+        rest = time[~bad]
+        if not rest.size or (centre is None and absent is None and _sound(time)):
+            return bad
+        middle = float(np.median(rest)) if centre is None else centre
+        bad |= ~(np.abs(time - middle) <= LONGEST)
+    keep = np.flatnonzero(~bad)
+    bad[keep[out_of_order(time[keep])]] = True
+    return bad
+
+
+def _sound(time: Column) -> bool:
+    """Whether there is nothing to look for: finite, in order, no longer than a recording can be."""
+    return time.size < 2 or bool((np.diff(time) >= 0).all() and time[-1] - time[0] <= LONGEST)
+
+
+def out_of_order(time: Column) -> Flags:
+    """(n,) True where a stamp is far from the median of those around it, which a stamp in order is."""
+    if time.size < 3 or bool((np.diff(time) >= 0).all()):
+        return np.zeros(time.size, bool)
+    padded = np.concatenate([np.full(_REACH, -np.inf), time, np.full(_REACH, np.inf)])
+    middle = median_filter(padded, 2 * _REACH + 1, mode="nearest")[_REACH:-_REACH]
+    # where a clock starts again, the median may be of the other side, as many steps away as it reaches
+    limit = max(RESTART, 2 * _REACH * float(np.median(np.abs(np.diff(time)))))
+    with np.errstate(invalid="ignore"):
+        return ~(np.abs(time - middle) <= limit)
+
+
+def restarts(time: Column) -> NDArray[np.int64]:
+    """Rows (k,) from which on a clock runs anew, from (n,) stamps [s] in order of arrival, of several streams or one.
+
+    A few stamps that are late or cannot be are no restart: the running median goes back where the clock does.
+    """
+    if time.size < 2 * _REACH + 1:
+        return np.flatnonzero(np.diff(time) < -RESTART) + 1
+    padded = np.pad(time, _REACH, mode="edge")
+    middle = median_filter(padded, 2 * _REACH + 1, mode="nearest")[_REACH:-_REACH]
+    rows = []
+    for row in np.flatnonzero(np.diff(middle) < -RESTART):
+        # the median crosses over where most of its window has; the stamps themselves do so nearby
+        window = np.arange(max(0, row - _REACH), min(time.size - 1, row + _REACH + 1))
+        rows.append(int(window[np.argmin(np.diff(time)[window])]) + 1)
+    return np.unique(np.array(rows, np.int64))
+
+
+def shift_beside(time: Column, place: Column, others: Column, places: Column) -> float | None:
+    """Seconds to add to the stamps of another clock; None if they do not run beside the others.
+
+    Args:
+        time: (n,) s, stamps of one stream, place: (n,) where its records stand in the file, ascending.
+        others, places: (m,) the same of the streams on the recording's clock.
+    """
+    if time.size < _REACH or others.size < 2:
+        return None
+    lead = np.interp(place, places, others) - time
+    shift = float(np.median(lead))
+    return shift if float(np.median(np.abs(lead - shift))) <= RESTART else None
+
+
+def believed(
+    names: Sequence[str], times: Sequence[Column], places: Sequence[Column], *, absent: float | None = None
+) -> tuple[list[Flags], list[float], list[Fault]]:
+    """Streams on one clock: that of most records, which others are shifted to.
+
+    Args:
+        names: of the streams.
+        times: (n,) s of each, in the order of the file.
+        places: (n,) where the records stand among those of all streams (or when they arrived); NaN where not known.
+        absent: as in `impossible`.
+
+    Returns: the records of each stream to keep, the seconds to add to their stamps, and what was wrong.
+    """
+    pooled = np.concatenate(times) if times else np.empty(0)
+    pooled = pooled[np.isfinite(pooled) & (pooled != absent)]
+    if not pooled.size:
+        return [np.ones(t.size, bool) for t in times], [0.0] * len(times), []
+    centre = float(np.median(pooled))
+    keep = [~impossible(time, centre=centre, absent=absent) for time in times]
+    beside = [k & np.isfinite(p) for k, p in zip(keep, places, strict=True)]
+    known = np.concatenate([p[k] for p, k in zip(places, beside, strict=True)])
+    order = np.argsort(known, kind="stable")
+    known, others = known[order], np.concatenate([t[k] for t, k in zip(times, beside, strict=True)])[order]
+    shifts, faults = [0.0] * len(times), []
+    for i, (name, time, place) in enumerate(zip(names, times, places, strict=True)):
+        own = ~impossible(time, absent=absent) & np.isfinite(place)
+        shift = shift_beside(time[own], place[own], others, known) if not keep[i].any() and own.any() else None
+        if shift is not None:
+            keep[i], shifts[i] = ~impossible(time, absent=absent), shift
+            faults.append(Fault(name, int(keep[i].sum()), time.size, "shifted", shift))
+        if not keep[i].all():
+            lost = np.flatnonzero(~keep[i])
+            faults.append(Fault(name, lost.size, time.size, "left out", float(time[lost[0]])))
+    return keep, shifts, faults
+
+
+def finding(faults: Sequence[Fault], signals: Iterable[str] = ()) -> list[Finding]:
+    """One finding for all faults of a recording; none without faults.
+
+    Args:
+        signals: names of those concerned that the recording still has.
+    """
+    if not faults:
+        return []
+    count = sum(fault.count for fault in faults)
+    moved = [fault for fault in faults if fault.what == "shifted"]
+    said = [_words(fault) for fault in faults[:5]]
+    if len(faults) > len(said):
+        said.append(f"and so on in {len(faults) - len(said)} more streams")
+    grave = bool(moved) or any(2 * fault.count > fault.total > 1 for fault in faults)
+    names = tuple(dict.fromkeys(signals))
+    evidence = {"records": float(count), "streams": float(len(faults))}
+    if moved:
+        evidence["shift_s"] = moved[0].example
+    return [
+        Finding(
+            CHECK,
+            Grade.DEGRADES if grave else Grade.HARMLESS,
+            f"Stamps that cannot be: {'; '.join(said)}.",
+            evidence=evidence,
+            advice="Compare the shifted stream with others only as exactly as the file's order tells." if moved else "",
+            fix=Fix(CHECK, names) if names else None,
+        )
+    ]
+
+
+def _words(fault: Fault) -> str:
+    name = fault.stream or "a stream without a name"
+    if fault.what == "shifted":
+        side = "ahead of" if fault.example < 0 else "behind"
+        return f"{name} is stamped by another clock, {abs(fault.example):.6g} s {side} the others, and was shifted"
+    stamp = f"{fault.example:.3f}".rstrip("0").rstrip(".") if abs(fault.example) < 1e6 else f"{fault.example:.4g}"
+    if fault.count == fault.total and fault.what == "left out":
+        records = "its only record" if fault.count == 1 else f"all of its {fault.count} records"
+        return f"{name} has no stamps ({records}: stamp {stamp} s), so it has no place in time and was left out"
+    verb = "was" if fault.count == 1 else "were"
+    return f"{fault.count} of {fault.total} records of {name} (stamp {stamp} s) {verb} {fault.what}"
+
+
+def screened(recording: Recording) -> Recording:
+    """A recording without the samples whose stamps cannot be, and with a finding that says so; else the same."""
+    return next(screened_parts(iter([recording])))
+
+
+def screened_parts(parts: Iterator[Recording]) -> Iterator[Recording]:
+    """As `screened`, of a recording in parts; a stamp is judged beside its neighbours in the parts before and after."""
+    before: dict[str, Column] = {}
+    current = next(parts, None)
+    while current is not None:
+        after = next(parts, None)
+        yield _screened(current, before, after)
+        before = {s: np.concatenate([before.get(s, np.empty(0)), a.time])[-_REACH:] for s, a in _streams(current)}
+        current = after
+
+
+def _streams(recording: Recording) -> Iterator[tuple[str, SignalArray]]:
+    """One array for all that share their stamps, by a name of the stream."""
+    seen: set[int] = set()
+    for name, array in recording.signals.items():
+        if id(array.time) not in seen:
+            seen.add(id(array.time))
+            yield array.stream or name, array
+
+
+def _screened(recording: Recording, before: Mapping[str, Column], after: Recording | None) -> Recording:
+    later = {s: a.time[:_REACH] for s, a in _streams(after)} if after is not None else {}
+    streams = list(_streams(recording))
+    times = [np.concatenate([before.get(s, np.empty(0)), a.time, later.get(s, np.empty(0))]) for s, a in streams]
+    if all(_sound(time) for time in times) and _close(times):
+        return recording
+    pooled = np.concatenate(times)
+    centre = float(np.median(pooled[np.isfinite(pooled)])) if np.isfinite(pooled).any() else None
+    rows: dict[int, NDArray[np.int64]] = {}  # id of an array of stamps -> rows that stay
+    faults = []
+    for (stream, array), time in zip(streams, times, strict=True):
+        start = min(before[stream].size, time.size) if stream in before else 0
+        bad = impossible(time, centre=centre)[start : start + array.time.size]
+        if bad.any():
+            rows[id(array.time)] = np.flatnonzero(~bad)
+            example = float(array.time[int(np.argmax(bad))]) + recording.origin
+            fault = Fault(stream, int(bad.sum()), bad.size, "left out", example)
+            faults += [fault] if fault not in faults else []
+    if not faults:
+        return recording
+    signals = {
+        name: array.rows(rows[id(array.time)]) if id(array.time) in rows else array
+        for name, array in recording.signals.items()
+    }
+    names = [name for name, array in recording.signals.items() if id(array.time) in rows and signals[name].time.size]
+    left = {name: array for name, array in signals.items() if array.time.size or after is not None or before}
+    return replace(recording, signals=left, findings=(*recording.findings, *finding(faults, names)))
+
+
+def _close(times: Sequence[Column]) -> bool:
+    """Whether all streams, each in order, lie within the length of a recording."""
+    ends = np.concatenate([time[[0, -1]] for time in times if time.size] or [np.zeros(1)])
+    return bool(ends.max() - ends.min() <= LONGEST)
