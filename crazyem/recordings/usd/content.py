@@ -90,7 +90,7 @@ def metadata(header: Header, counts: Sequence[int], verdict: str) -> dict[str, s
 
 
 def integrity(
-    *, size: int, stop: int, unknown: int | None, checksum: Checksum, last: float
+    *, size: int, stop: int, unknown: int | None, checksum: Checksum, last: float, blank: int | None = None
 ) -> tuple[str, list[Finding]]:
     """What the checksum and the end of a file say: one word for the metadata, and findings.
 
@@ -99,11 +99,18 @@ def integrity(
         stop, unknown: where its last whole record ends and what follows there, as in `Records`.
         checksum: of the file.
         last: time of the last record [s].
+        blank: from which byte on nothing was written (`records.blank_from`).
     """
     left = size - stop - (CRC_BYTES if checksum.right else 0)
     evidence = {"offset_bytes": float(stop), "left_bytes": float(left), "last_s": last}
     if checksum.right and not left:
         return "ok", []
+    if blank is not None and not checksum.right and blank <= stop and left > CRC_BYTES:
+        text = (
+            f"From byte {stop} on there are only bytes that nobody wrote (0xFF of erased flash, or 0): {left} bytes "
+            f"were not read (the last record read is at {last:.3f} s; power lost while logging?)."
+        )
+        return "missing", [Finding("integrity", Grade.HARMLESS, text, evidence=evidence)]
     if checksum.right or (unknown is not None and left > CRC_BYTES):
         what = "is cut off" if unknown is None else f"is of the unknown event {unknown}"
         text = (

@@ -13,7 +13,7 @@ from crazyem.recordings.recording import Recording
 from crazyem.recordings.tables import signals_from_tables
 from crazyem.recordings.usd import content
 from crazyem.recordings.usd.format import Header, parse_header, plausible
-from crazyem.recordings.usd.records import gather, locate
+from crazyem.recordings.usd.records import blank_from, gather, locate, written
 from crazyem.recordings.usd.stretches import Survey, stretches
 
 
@@ -34,6 +34,8 @@ def read(path: Path, options: ReadOptions) -> Recording:
     header = parse_header(data, path)
     checksum = content.checksum_of(data, header)
     records = locate(data, header.events, header.size, len(data) - (content.CRC_BYTES if checksum.right else 0))
+    blank = len(data) if checksum.right else blank_from(data)
+    records = written(records, blank)
     if not records.start.size:
         raise _empty(path, header)
     order = [np.flatnonzero(records.kind == kind) for kind in range(len(header.events))]
@@ -46,7 +48,12 @@ def read(path: Path, options: ReadOptions) -> Recording:
     )
     del packed
     verdict, findings = content.integrity(
-        size=len(data), stop=records.stop, unknown=records.unknown, checksum=checksum, last=float(time[-1])
+        size=len(data),
+        stop=records.stop,
+        unknown=records.unknown,
+        checksum=checksum,
+        last=float(time[-1]),
+        blank=blank,
     )
     metadata = {"usd": content.metadata(header, [rows.size for rows in order], verdict)}
     meaning = motor_meaning.decide(tables, given=options.motor, metadata=metadata)

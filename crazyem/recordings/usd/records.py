@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from crazyem.recordings.usd.format import EventType
 
+BLANK = (b"\xff", b"\x00")  # erased flash; clusters that were set aside and never written
 _STREAK = 16  # records of one kind in a row before a run is guessed
 _WINDOW = 1 << 16  # records compared at once, at most: bounds the memory of a comparison
 _GATHERED = 1 << 22  # bytes copied at once where records of one kind do not lie side by side
@@ -60,6 +61,20 @@ def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int) -> 
     starts = np.frombuffer(start, np.int64)
     unknown = int.from_bytes(identifier, "little") if size is None and at + 2 <= end else None
     return Records(starts, _kinds(data, events, starts), at, unknown)
+
+
+def blank_from(data: bytes) -> int:
+    """Where a run of one and the same byte that nobody wrote (0xFF of erased flash, 0) begins that ends the data."""
+    last = data[-1:]
+    return len(data.rstrip(last)) if last in BLANK else len(data)
+
+
+def written(records: Records, blank: int) -> Records:
+    """The records that begin before `blank`, a byte: in erased flash even the number of an event is 0xFFFF."""
+    count = int(np.searchsorted(records.start, blank))
+    if count == records.start.size:
+        return records
+    return Records(records.start[:count], records.kind[:count], int(records.start[count]), None)
 
 
 def _kinds(data: bytes, events: tuple[EventType, ...], start: NDArray[np.int64]) -> NDArray[np.uint16]:

@@ -17,7 +17,7 @@ from crazyem.recordings.motor_meaning import MOTORS
 from crazyem.recordings.tables import Table
 from crazyem.recordings.usd.content import CRC_BYTES, Checksum, Clock, integrity, table
 from crazyem.recordings.usd.format import EventType, Header, parse_header
-from crazyem.recordings.usd.records import Records, gather, locate
+from crazyem.recordings.usd.records import BLANK, Records, gather, locate, written
 
 _PIECE = 1 << 22  # bytes read at a time
 _LONGEST_HEADER = 1 << 27  # bytes; what the limits of usd/format.py add up to is less
@@ -34,6 +34,7 @@ class Survey:
         header: of the file.
         size: of the file, unpacked [bytes].
         checksum: of the file.
+        blank: byte from which on nothing was written, as `records.blank_from`.
         stop, unknown: where its last whole record ends and what follows there, as in `Records`.
         counts: records of each kind.
 
@@ -49,13 +50,16 @@ class Survey:
         samples = {k: _Sample() for k, e in enumerate(self.header.events) if set(MOTORS) <= set(e.variables)}
         tail = b""
         self.size, computed = 0, 0
+        blanks = dict.fromkeys(BLANK, 0)  # where the last other byte ends
         for piece in _pieces(path):
+            blanks = {b: self.size + len(r) if (r := piece.rstrip(b)) else at for b, at in blanks.items()}
             self.size += len(piece)
             tail += piece
             computed = zlib.crc32(memoryview(tail)[:-CRC_BYTES], computed)
             tail = tail[-CRC_BYTES:]
         room = self.size >= self.header.size + CRC_BYTES
         self.checksum = Checksum(int.from_bytes(tail, "little"), computed) if room else Checksum(None, None)
+        self.blank = self.size if self.checksum.right else min(blanks.values())
         for begin, data, records in _walk(self):
             self.stop, self.unknown = begin + records.stop, records.unknown
             order = [np.flatnonzero(records.kind == kind) for kind in range(len(self.counts))]
@@ -66,7 +70,9 @@ class Survey:
 
     def integrity(self, *, last: float) -> tuple[str, list[Finding]]:
         """As `content.integrity`."""
-        return integrity(size=self.size, stop=self.stop, unknown=self.unknown, checksum=self.checksum, last=last)
+        return integrity(
+            size=self.size, stop=self.stop, unknown=self.unknown, checksum=self.checksum, last=last, blank=self.blank
+        )
 
     def tables(self) -> list[Table]:
         """Tables as the whole file has them, with some rows of those that hold motor.m1..4 and none of the others."""
@@ -181,9 +187,9 @@ def _walk(survey: Survey) -> Iterator[tuple[int, bytes, Records]]:
         data += piece
         if len(data) <= skip:
             continue
-        records = locate(data, header.events, skip, min(len(data), end - begin))
+        records = written(locate(data, header.events, skip, min(len(data), end - begin)), survey.blank - begin)
         yield begin, data, records
-        if records.unknown is not None:
+        if records.unknown is not None or begin + records.stop >= survey.blank:
             return
         data, begin, skip = data[records.stop :], begin + records.stop, 0
 
