@@ -65,6 +65,21 @@ READERS: tuple[Reader, ...] = (
 )
 
 
+# What a file is by its first bytes that no reader reads, and what to do.
+_REFUSALS: tuple[tuple[bytes, str], ...] = (
+    (
+        b"version https://git-lfs.github.com/spec/",
+        "is a Git LFS pointer, not the file itself: run `git lfs pull` in its repository.",
+    ),
+    (
+        b"\xa3\x95\x80\x80",
+        "is an ArduPilot DataFlash log (.BIN), which is not read here. Read the tlog of the same flight, or convert a "
+        "message to CSV with pymavlink (mavlogdump.py --format csv --types ATT FILE.BIN > att.csv) and say what its "
+        "columns are with --map.",
+    ),
+)
+
+
 def open_recording(path: str | Path, options: ReadOptions | None = None) -> Recording:
     """Read a flight from any format we know.
 
@@ -91,6 +106,9 @@ def reader_of(path: Path) -> Reader:
     for reader in READERS:
         if reader.recognises(head):
             return reader
+    refusal = next((why for start, why in _REFUSALS if head.startswith(start)), None)
+    if refusal is not None:
+        raise FileFormatError(f"{path} {refusal}")
     what = "is empty" if not head else f"is not a recording in a format known here ({known})"
     raise FileFormatError(f"{path} {what}.")
 

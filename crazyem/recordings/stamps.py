@@ -98,7 +98,7 @@ def restarts(time: Column) -> NDArray[np.int64]:
     padded = np.pad(time, _REACH, mode="edge")
     middle = median_filter(padded, 2 * _REACH + 1, mode="nearest")[_REACH:-_REACH]
     rows = []
-    for row in np.flatnonzero(np.diff(middle) < -RESTART):
+    for row in np.flatnonzero(np.diff(middle) < -RESTART).tolist():
         # the median crosses over where most of its window has; the stamps themselves do so nearby
         window = np.arange(max(0, row - _REACH), min(time.size - 1, row + _REACH + 1))
         rows.append(int(window[np.argmin(np.diff(time)[window])]) + 1)
@@ -168,8 +168,11 @@ def finding(faults: Sequence[Fault], signals: Iterable[str] = ()) -> list[Findin
     said = [_words(fault) for fault in faults[:5]]
     if len(faults) > len(said):
         said.append(f"and so on in {len(faults) - len(said)} more streams")
-    grave = bool(moved) or any(2 * fault.count > fault.total > 1 for fault in faults)
+    grave = bool(moved) or any(fault.count > 1 and 2 * fault.count >= fault.total for fault in faults)
     names = tuple(dict.fromkeys(signals))
+    advice = "Look for what wrote these stamps: much of the recording has no time." if grave else ""
+    if moved:
+        advice = "Compare the shifted stream with others only as exactly as the file's order tells."
     evidence = {"records": float(count), "streams": float(len(faults))}
     if moved:
         evidence["shift_s"] = moved[0].example
@@ -179,7 +182,7 @@ def finding(faults: Sequence[Fault], signals: Iterable[str] = ()) -> list[Findin
             Grade.DEGRADES if grave else Grade.HARMLESS,
             f"Stamps that cannot be: {'; '.join(said)}.",
             evidence=evidence,
-            advice="Compare the shifted stream with others only as exactly as the file's order tells." if moved else "",
+            advice=advice,
             fix=Fix(CHECK, names) if names else None,
         )
     ]

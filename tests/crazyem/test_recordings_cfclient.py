@@ -236,10 +236,10 @@ def test_line_ends_blank_lines_byte_order_mark_and_gzip(put):
         ("Timestamp,a.b\n1,2\n2,x\n", "line 3 holds"),
         ("\n\nTimestamp,a.b\n1,2\n2,x\n", "line 5 holds"),
         ("Timestamp,a.b\n1,2\n2,\n", "line 3 holds"),
-        ("Timestamp,a.b\n1,2\nnan,3\n", "not a stamp"),
-        ("Timestamp,a.b\n1,2\n-4,3\n", "not a stamp"),
-        ("Timestamp,a.b\n1,2\n1.5,3\n", "not a stamp"),
-        ("Timestamp,a.b\n1,2\n1e300,3\n", "not a stamp"),
+        ("Timestamp,a.b\nnan,3\n", "not a stamp"),
+        ("Timestamp,a.b\n16777216,2\n50000000000,3\n", "not a stamp"),
+        ("Timestamp\n1\n2\n", "stamps only"),
+        ("timestamp\n1\n2\n", "stamps only"),
         ("Timestamp,a.b,a.b\n1,2,3\n", "twice"),
         ("Timestamp,a.b\n1,2\nTimestamp,a.c\n3,4\n", "line 3 is a header"),
         ("time,a.b\n1,2\n", "not a header"),
@@ -248,6 +248,22 @@ def test_line_ends_blank_lines_byte_order_mark_and_gzip(put):
 def test_errors_name_the_line(put, text, words):
     with pytest.raises(FileFormatError, match=words):
         opened(put("block.csv", text))
+
+
+@pytest.mark.parametrize("stamp", ["nan", "-4", "1.5", "1e300", "16777216", "50000000000"])
+def test_rows_whose_stamps_are_not_24_bits_of_ms_are_left_out_and_counted(put, stamp):
+    recording = opened(put("block.csv", f"Timestamp,a.b\n1,2\n{stamp},3\n2,4\n"))
+    assert recording.signals["a.b"].value.tolist() == [[2.0], [4.0]]
+    (finding,) = [f for f in recording.findings if f.check == "stamps"]
+    assert finding.evidence["records"] == 1
+    assert "1 of 3 records of block" in finding.text
+
+
+def test_a_lower_case_column_of_stamps_is_read_unless_a_mapping_says_otherwise(put):
+    path = put("flight.csv", "timestamp,stateEstimate.x,stateEstimate.y,stateEstimate.z\n100,1,2,3\n110,4,5,6\n")
+    assert opened(path).signals["position"].time.tolist() == [0.1, 0.11]
+    mapping = put("map.toml", '[time]\ncolumn = "timestamp"\n[signals.voltage]\ncolumns = ["stateEstimate.x"]\n')
+    assert opened(path, mapping=str(mapping)).signals["voltage"].time.tolist() == [0.0, 10.0]
 
 
 def test_an_empty_block_of_a_session_is_mentioned(put):
@@ -277,7 +293,7 @@ def test_garbage_never_gives_a_traceback(tmp_path_factory, noise, place):
 
 def test_told_from_other_csv():
     assert recognises(as_cfclient(STATE, []).encode())
-    for header in ("t,px,py", "Timestamp", "Timestamp,", "Timestamp,x", "Timestamp,a b.c", "timestamp,a.b", ""):
+    for header in ("t,px,py", "Timestamp,", "Timestamp,x", "Timestamp,a b.c", "times,a.b", ""):
         assert not recognises(header.encode() + b"\n1,2\n")
 
 

@@ -21,9 +21,11 @@ from crazyem.errors import FileFormatError, UsageError
 from crazyem.links.clock import STAMP_MODULUS
 from crazyem.recordings import motor_meaning
 from crazyem.recordings.contents import contents
+from crazyem.recordings.csv.file import read as read_csv
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
+from crazyem.recordings.stamps import Fault, finding
 from crazyem.recordings.tables import Table, signals_from_tables
 
 _VARIABLE = re.compile(r"[A-Za-z_]\w*\.[\w\[\]]+")
@@ -57,8 +59,9 @@ class _Part:
 
 
 def recognises(head: bytes) -> bool:
-    """True if the first line is "Timestamp" and names like "group.variable"."""
-    return bool(_variables(_first_line(head)))
+    """True if the first line is "Timestamp" and names like "group.variable", or that word alone."""
+    line = _first_line(head)
+    return bool(_variables(line)) or _is_time(line)
 
 
 def recognises_folder(path: Path) -> bool:
@@ -88,11 +91,16 @@ def recognises_folder(path: Path) -> bool:
 def read(path: Path, options: ReadOptions) -> Recording:
     """Read a folder of log blocks, or one block alone. Time is the stamp in seconds, unwrapped (`origin` is 0).
 
+    Rows whose stamps are not 24 bits of ms are left out, and a finding says so.
+
     Raises: FileFormatError naming the file and line; UsageError if it cannot be read.
     """
+    if options.mapping is not None and path.is_file() and not _first_line(_head(path)).startswith(b"Timestamp"):
+        return read_csv(path, options)  # not cfclient's own: the user knows better what it is
     findings: list[Finding] = []
+    faults: list[Fault] = []
     folder = path.is_dir()
-    parts = [_read_file(file, findings) for file in (_files(path) if folder else [path])]
+    parts = [_read_file(file, findings, faults) for file in (_files(path) if folder else [path])]
     full = [part for part in parts if part.stamp.size]
     if not full:
         raise FileFormatError(f"{path}: there is a header but not a single row.")
@@ -106,6 +114,8 @@ def read(path: Path, options: ReadOptions) -> Recording:
     metadata = {"cfclient": _metadata(path, full)}
     meaning = motor_meaning.decide(tables, given=options.motor, metadata=metadata)
     signals = signals_from_tables(tables, motor=meaning.meaning)
+    streams = {fault.stream for fault in faults}
+    findings += finding(faults, [name for name, array in signals.items() if array.stream in streams])
     return Recording(str(path), "csv:cfclient", signals, metadata | meaning.metadata, (*findings, *meaning.findings))
 
 
@@ -145,7 +155,12 @@ def _first_line(data: bytes) -> bytes:
 def _variables(line: bytes) -> tuple[str, ...]:
     """Names in a header line; () if it is none."""
     first, *names = line.decode("latin-1").split(",")
-    return tuple(names) if first == "Timestamp" and all(_VARIABLE.fullmatch(name) for name in names) else ()
+    return tuple(names) if _is_time(first.encode()) and all(_VARIABLE.fullmatch(name) for name in names) else ()
+
+
+def _is_time(name: bytes) -> bool:
+    """Whether a column is that of the stamps: "Timestamp" of cfclient, "timestamp" of scripts after its example."""
+    return name.strip().lower() == b"timestamp"
 
 
 def _first_stamp(head: bytes) -> int | None:
@@ -161,10 +176,15 @@ def _spread(starts: list[float]) -> float:
     return max(offsets) - min(offsets) if offsets else 0.0
 
 
-def _read_file(path: Path, findings: list[Finding]) -> _Part:
+def _read_file(path: Path, findings: list[Finding], faults: list[Fault]) -> _Part:
     data = contents(path).removeprefix(b"\xef\xbb\xbf")
     header = _first_line(data)
     variables = _variables(header)
+    if _is_time(header):
+        raise FileFormatError(
+            f"{path}: a file of cfclient with stamps only: its log block has no variables. Give the block variables in "
+            "cfclient (Settings, Logging configurations) and fly again."
+        )
     if not variables:
         raise FileFormatError(f"{path}: the first line is not a header of cfclient (Timestamp,group.variable,...).")
     if len(set(variables)) < len(variables):
@@ -187,24 +207,28 @@ def _read_file(path: Path, findings: list[Finding]) -> _Part:
     ]
     table = np.concatenate(segments)
     stamp = table[:, 0]
-    sound = (stamp >= 0) & (stamp == np.floor(stamp)) & (stamp < 2.0**53)
-    if not sound.all():
-        raise FileFormatError(f"{path}: {stamp[int(np.argmin(sound))]:g} is not a stamp in ms.")
+    sound = (stamp >= 0) & (stamp == np.floor(stamp)) & (stamp < STAMP_MODULUS)
     block, date = _named(path)
-    return _Part(path, block, date, variables, _unwrapped(stamp.astype(np.int64)), table[:, 1:])
+    if not sound.all():
+        example = float(stamp[int(np.argmin(sound))])
+        if not sound.any():
+            raise FileFormatError(f"{path}: {example:g} is not a stamp of the firmware, which are 24 bits of ms.")
+        faults.append(Fault(block, int((~sound).sum()), stamp.size, "left out", example / 1000.0))
+        table = table[sound]
+    return _Part(path, block, date, variables, _unwrapped(table[:, 0].astype(np.int64)), table[:, 1:])
 
 
 def _segments(
     path: Path, header: bytes, body: bytes, line: int, findings: list[Finding]
 ) -> Iterator[tuple[int, bytes]]:
     """(lines before it, text) of each stretch of rows between headers: files of one block may have been joined."""
-    if b"Timestamp" not in body:
+    if b"timestamp" not in body.lower():
         yield 0, body
         return
     lines = body.split(b"\n")
     first, again = 0, []
     for number, text in enumerate(lines):
-        if not text.startswith(b"Timestamp"):
+        if not text.lower().startswith(b"timestamp"):
             continue
         if text.strip() != header:
             raise FileFormatError(f"{path}: line {line + number} is a header with other variables than the first.")

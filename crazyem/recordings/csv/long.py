@@ -167,7 +167,7 @@ def _with_host_signal(signals: dict[str, SignalArray], name: str, source: Signal
     arrays = [signals[key] for key in parts if key is not None]
     if len(arrays) != len(variables) or any(a.time is not arrays[0].time for a in arrays):
         return signals
-    value = np.column_stack([a.value[:, 0] * f for a, f in zip(arrays, source.scale, strict=True)])
+    value = source.converted(np.column_stack([a.value[:, 0] for a in arrays]))
     unit, frame = SIGNALS[source.quantity][1:]
     whole = replace(arrays[0], value=value, quantity=source.quantity, unit=unit, frame=frame, source=variables)
     rest = {key: array for key, array in signals.items() if key not in parts and key != name}

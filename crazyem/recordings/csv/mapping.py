@@ -9,8 +9,11 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.recordings.csv.mapping_units import is_electrical, time_divisor, unit_factor
+from crazyem.recordings.csv.mapping_units import is_electrical, time_divisor, unit_factor, unit_offset
 from crazyem.signals.sample import SIGNALS, components
 
 BODY_AXES, WORLD_AXES = ("FLU", "FRD"), ("ENU", "NED")
@@ -22,7 +25,7 @@ _TOP = {
     "name", "title", "layout", "recognise", "time", "claims", "units", "packets", "signals", "host_signals", "columns",
 }  # fmt: skip
 _TIME = {"column", "unit", "clock", "rate_hz"}
-_CLAIMABLE = {"unit", "frame", "sign", "scale", "order", "direction"}
+_CLAIMABLE = {"unit", "frame", "sign", "scale", "offset", "order", "direction"}
 _ENTRY = _CLAIMABLE | {
     "columns", "variables", "packet", "stream", "clock", "missing", "above", "hold", "rotors", "pole_pairs", "attitude",
     "corners", "published",
@@ -37,6 +40,7 @@ class SignalColumns:
         quantity: key of `SIGNALS`; the name of the signal up to its "@".
         columns: in the order of the signal's components. Three for an attitude given as roll, pitch, yaw.
         scale: factor to SI, sign included, one a column.
+        offset: SI, added after the factor, one a column; () for none.
         packet: name of the onboard packet the columns came in, if the file's publisher interpolated it; else None.
         stream: signals of one stream were sampled together.
         clock: name of the clock of the stamps; None: the clock of the file's rows.
@@ -54,6 +58,7 @@ class SignalColumns:
     quantity: str
     columns: tuple[str, ...]
     scale: tuple[float, ...]
+    offset: tuple[float, ...] = ()
     packet: str | None = None
     stream: str = ""
     clock: str | None = None
@@ -66,6 +71,13 @@ class SignalColumns:
     above: float | None = None
     hold: float = 0.0
     corners: bool = False
+
+    def converted(self, value: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, c) SI from numbers as in the file, which may be changed in place."""
+        value *= self.scale
+        if self.offset:
+            value += self.offset
+        return value
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +241,7 @@ def _signal(name: str, entry: Mapping[str, Any], where: str, key: str) -> Signal
     if direction not in ("body to world", "world to body"):
         raise FileFormatError(f'{where}.direction: must be "body to world" or "world to body", not "{direction}".')
     packet = _get(entry, "packet", str, where, None)
-    factors = _factors(quantity, len(columns), entry, above, where)
+    factors, offsets = _factors(quantity, len(columns), entry, above, where)
     corners = bool(_get(entry, "corners", bool, where, False))
     if corners and len(columns) != 1:
         raise FileFormatError(f"{where}.corners: only for signals of one column.")
@@ -238,6 +250,7 @@ def _signal(name: str, entry: Mapping[str, Any], where: str, key: str) -> Signal
         columns=columns,
         # factors, signs and scales are written in the order of the file's columns
         scale=tuple(float(factors[i] * signs[i]) for i in order),
+        offset=tuple(offsets[0][i] * signs[i] + offsets[1][i] for i in order) if any(map(any, offsets)) else (),
         packet=packet,
         stream=_get(entry, "stream", str, where, packet or "rows"),
         clock=_get(entry, "clock", str, where, None),
@@ -278,18 +291,25 @@ def _ordered(
     return tuple(columns[i] for i in order), order
 
 
-def _factors(quantity: str, count: int, entry: Mapping[str, Any], above: float | None, where: str) -> tuple[float, ...]:
-    """Factor to SI of each column, in the order of the file's columns."""
+def _factors(
+    quantity: str, count: int, entry: Mapping[str, Any], above: float | None, where: str
+) -> tuple[tuple[float, ...], tuple[tuple[float, ...], tuple[float, ...]]]:
+    """Factor to SI of each column, in the order of the file's columns, and offsets: of the unit, and as given."""
     units = entry.get("unit", "")
     units = units if isinstance(units, list) else [units] * count
     scales = entry.get("scale", 1.0)
     scales = scales if isinstance(scales, list) else [scales] * count
+    offsets = entry.get("offset", 0.0)
+    offsets = offsets if isinstance(offsets, list) else [offsets] * count
     if len(units) != count or not all(isinstance(u, str) for u in units):
         raise FileFormatError(f"{where}.unit: must be a text, or one for each of the {count} columns.")
     if len(scales) != count or not all(_is_number(s) and s != 0 for s in scales):
         raise FileFormatError(f"{where}.scale: must be a number other than 0, or one for each of the {count} columns.")
+    if len(offsets) != count or not all(map(_is_number, offsets)):
+        raise FileFormatError(f"{where}.offset: must be a number, or one for each of the {count} columns.")
+    added = tuple(float(o) for o in offsets)
     if above is not None:
-        return tuple(float(s) for s in scales)
+        return tuple(float(s) for s in scales), ((0.0,) * count, added)
     pairs = _number(entry, "pole_pairs", where, None)
     if any(map(is_electrical, units)) and not (pairs and pairs > 0):
         raise FileFormatError(f"{where}.pole_pairs: erpm needs the number of pole pairs of the motor.")
@@ -301,7 +321,8 @@ def _factors(quantity: str, count: int, entry: Mapping[str, Any], above: float |
         ours = SIGNALS[turned][1].split(", ")
         units = [ours[min(c, len(ours) - 1)] for c in order]
     factors = [unit_factor(u, turned, c, f"{where}.unit") for u, c in zip(units, order, strict=True)]
-    return tuple(f * float(s) / (pairs or 1.0) for f, s in zip(factors, scales, strict=True))
+    zeros = tuple(unit_offset(u, turned, c) * float(s) for u, c, s in zip(units, order, scales, strict=True))
+    return tuple(f * float(s) / (pairs or 1.0) for f, s in zip(factors, scales, strict=True)), (zeros, added)
 
 
 def _component_order(quantity: str, entry: Mapping[str, Any], count: int) -> list[int]:

@@ -36,10 +36,13 @@ _KINDS: dict[str, dict[str, float]] = {
     "voltage": {"V": 1.0, "mV": 1e-3, "cV": 1e-2},
     "force": {"N": 1.0, "mN": 1e-3, "gf": _FORCE_OF_GRAM, "kgf": 1e3 * _FORCE_OF_GRAM},
     "torque": {"N m": 1.0, "mN m": 1e-3, "uN m": 1e-6, "gf cm": 1e-2 * _FORCE_OF_GRAM},
-    "ratio": {"1": 1.0, "%": 1e-2, "pwm": 1.0 / 65535.0, "pwm8": 1.0 / 255.0},
+    "ratio": {"1": 1.0, "%": 1e-2, "pwm": 1.0 / 65535.0, "pwm8": 1.0 / 255.0, "us": 1e-3},
     "count": {"1": 1.0, "pwm": 1.0},
     "number": {"1": 1.0},
 }
+
+# what 0 of a unit is in SI, where not 0: pulses of servo outputs are 1000 us at no thrust, 2000 us at full thrust
+_ZEROS: dict[tuple[str, str], float] = {("ratio", "us"): -1.0}
 
 _TIMES: dict[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1.0 / 60.0, "h": 1.0 / 3600.0}
 
@@ -130,6 +133,11 @@ def unit_factor(unit: str, quantity: str, component: int, where: str) -> float:
             f"(units: {', '.join(known)})."
         )
     raise FileFormatError(f'{where}: unknown unit "{unit}"; known for {quantity} are {", ".join(known)}.')
+
+
+def unit_offset(unit: str, quantity: str, component: int) -> float:
+    """What 0 of `unit` is in the SI unit of a component of a signal."""
+    return _ZEROS.get((kind_of(quantity, component), _spelled(unit)), 0.0)
 
 
 def time_divisor(unit: str, where: str) -> float:

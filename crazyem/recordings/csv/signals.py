@@ -180,7 +180,7 @@ class _Kept:
         )
         mine = (found.row >= first) & (found.row < last)
         time = found.time[mine]
-        value = found.value[mine, None] * source.scale[0]
+        value = source.converted(found.value[mine, None])
         missing = self._missing(source, found.value[mine, None])
         value[missing] = np.nan
         return SignalArray(
@@ -236,11 +236,10 @@ class _Kept:
     def _scaled(self, source: SignalColumns) -> tuple[Array, NDArray[np.bool_]]:
         value = np.column_stack([self.column(c) for c in source.columns])
         if not (source.missing or source.empty_is_missing):
-            value *= source.scale
-            return value, self.unmarked
+            return source.converted(value), self.unmarked
         missing = self._missing(source, value)
         theirs = np.isnan(value) & ~missing
-        value *= source.scale
+        value = source.converted(value)
         value[missing] = np.nan
         return value, np.asarray(missing.any(axis=1) & ~theirs.any(axis=1))
 
@@ -268,7 +267,7 @@ class _Kept:
     def _held(self, name: str, source: SignalColumns) -> Array:
         """1 where any column exceeded the threshold within the last `hold` seconds, else 0."""
         assert source.above is not None
-        table = np.column_stack([self.column(c) * f for c, f in zip(source.columns, source.scale, strict=True)])
+        table = source.converted(np.column_stack([self.column(c) for c in source.columns]))
         on = (table > source.above).any(axis=1)
         stamp = self.rows.stamp[self.slice]
         # stamps as they are in the file decide, not times since the origin: the same in every part of a file

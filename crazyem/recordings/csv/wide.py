@@ -213,6 +213,8 @@ def _planned(path: Path, header: Header, mapping: CsvMapping, as_published: bool
             )
     at = {name: place for place, name in enumerate(header.names)}
     time = mapping.time[0]
+    if time not in at:  # "Time" of one logger is "time" of the next
+        time = next((name for name in at if name.lower() == time.lower()), time)
     if time and time not in at:
         raise FileFormatError(f"{path}: the column {time}, which has the time, is missing.")
     stamp = at[time] if time else None
