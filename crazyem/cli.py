@@ -85,6 +85,7 @@ def parser() -> argparse.ArgumentParser:
     replay = common("replay", "run the estimator over a recording", recorded=True)
     replay.add_argument("file", metavar="FILE", help="a recording of any known format")
     _reading(replay)
+    _cutting(replay)
 
     watch = common("watch", "estimate without commanding; of MAVLink drones, write hover thrust if asked")
     watch.add_argument("uri", nargs="?", metavar="URI")
@@ -189,6 +190,14 @@ def _reading(p: argparse.ArgumentParser) -> None:
     )
 
 
+def _cutting(p: argparse.ArgumentParser) -> None:
+    """Which part of a recording is used (`crazyem.recordings.cut`)."""
+    seconds = _number(-1e12, 1e12, " seconds")
+    text = "only from this time on, in seconds as info and doctor show them"
+    p.add_argument("--from", dest="start", type=seconds, metavar="S", help=text)
+    p.add_argument("--to", dest="end", type=seconds, metavar="S", help="only up to this time")
+
+
 def _diagnose(commands: Any) -> None:
     """Where simulation and flight part."""
     text = "where a vehicle's model and its flights part, which physics was left out, and the model with it"
@@ -216,6 +225,7 @@ def _diagnose(commands: Any) -> None:
     p.add_argument("--json", metavar="OUT.json", help="the diagnosis for programs; - for standard output")
     p.add_argument("--write-vehicle", metavar="FITTED.toml", help="the vehicle with what was found")
     _reading(p)
+    _cutting(p)
 
 
 def _predict(commands: Any) -> None:
@@ -234,6 +244,7 @@ def _predict(commands: Any) -> None:
     p.add_argument("-o", "--output", required=True, metavar="OUT.npz", help="array `prediction`, and which starts")
     p.add_argument("--force", action="store_true", help="replace what is there (never a recording that is read)")
     _reading(p)
+    _cutting(p)
 
 
 def _on_recordings(commands: Any) -> None:
@@ -268,12 +279,15 @@ def _on_recordings(commands: Any) -> None:
     doctor.add_argument("--strict", action="store_true", help="exit code 5 if anything is unusable")
     doctor.add_argument("--parts", action="store_true", help=in_parts)
 
-    writes(command("import", "recordings of any format into ours"), "OUT.mcap", "file; for several recordings a folder")
+    import_ = command("import", "recordings of any format into ours")
+    writes(import_, "OUT.mcap", "file; for several recordings a folder")
+    _cutting(import_)
 
     export = command("export", "recordings as tables: CSV or Parquet, units beside the numbers")
     writes(export, "OUT.csv|OUT.parquet", "file; for several recordings a folder")
     export.add_argument("--format", choices=("csv", "parquet"), help="in a folder (default: csv)")
     export.add_argument("--parts", action="store_true", help=in_parts)
+    _cutting(export)
 
     recover = command("recover", "a cut or damaged MCAP file into a valid one", many=False)
     recover.add_argument("file", metavar="BROKEN.mcap", help="of any program; it is only read")

@@ -178,8 +178,11 @@ def _is_recording_folder(path: Path) -> bool:
 
 
 def read_options(arguments: Any) -> ReadOptions:
-    """--map, --motor, --as-published."""
-    return ReadOptions(arguments.map, arguments.motor, arguments.as_published)
+    """--map, --motor, --as-published; --from and --to of commands that have them."""
+    start, end = getattr(arguments, "start", None), getattr(arguments, "end", None)
+    if start is not None and end is not None and not start < end:
+        raise UsageError(f"--from {start:g} is not before --to {end:g}.")
+    return ReadOptions(arguments.map, arguments.motor, arguments.as_published, start, end)
 
 
 def stem(path: Path) -> str:

@@ -102,7 +102,7 @@ def _restart(stream: Stream, rows: NDArray[np.int64]) -> Finding:
         signal=stream.names[0] if len(stream.names) == 1 else "",
         intervals=longest((float(stream.time[i + 1]), float(stream.time[i])) for i in rows),
         evidence={"jumps": len(rows), "largest_s": float(back.max()), "first_row": int(rows[0]) + 1},
-        advice="Cut the recording there and use the parts as recordings of their own.",
+        advice="Write a file for each part and use these as recordings of their own.",
     )
 
 
@@ -237,7 +237,7 @@ def _jumps(stream: Stream, time: Column, offset: Column, rows: NDArray[np.int64]
             f"{abs(worst[1]):.3f} s {'ahead' if forward else 'back'}.",
             intervals=longest((float(time[i]), float(time[i + 1])) for i, _ in sizes),
             evidence={"jumps": len(sizes), "largest_s": -worst[1]},
-            advice="Take the jumps out (--fix), or use the parts between them.",
+            advice="Take the jumps out (--fix), or use a part between them (--from, --to).",
             fix=Fix(
                 "unwrap",
                 stream.names,

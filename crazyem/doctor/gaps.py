@@ -90,7 +90,7 @@ def _pause_finding(pauses: Intervals) -> Finding:
         f"Everything falls silent {times}, for {total:.2f} s in all (the longest {lasting:.2f} s).",
         intervals=longest(pauses),
         evidence={"pauses": len(pauses), "silent_s": total, "longest_s": lasting},
-        advice="Treat the parts before and after as flights of their own.",
+        advice="Treat the parts before and after as flights of their own (--from, --to).",
     )
 
 
@@ -186,7 +186,7 @@ def _end_findings(ends: list[_End], duration: float) -> list[Finding]:
                 signal=names[0] if len(names) == 1 else "",
                 intervals=((min(e.start for e in close), max(e.end for e in close)),),
                 evidence={"silent_s": silent, "share": share, "signals": len(names)},
-                advice="Use only the part of the flight in which all needed signals are there.",
+                advice="Use only the part of the flight in which all needed signals are there (--from, --to).",
             )
         )
     return found

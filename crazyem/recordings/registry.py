@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crazyem.errors import FileFormatError, UsageError
+from crazyem.recordings.cut import cut, cut_parts
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.stamps import screened, screened_parts
@@ -42,11 +43,12 @@ class Reader:
     def read(self, path: Path, options: ReadOptions) -> Recording:
         recording = self._module().read(path, options)
         assert isinstance(recording, Recording)
-        return screened(recording)
+        return cut(screened(recording), options.start, options.end)
 
     def read_parts(self, path: Path, options: ReadOptions, seconds: float) -> Iterator[Recording]:
         """As `read`, in parts; only of a reader that has the function."""
-        return screened_parts(self._module().read_parts(path, options, seconds=seconds))
+        parts = screened_parts(self._module().read_parts(path, options, seconds=seconds))
+        return cut_parts(parts, options.start, options.end)
 
     def _module(self):
         return importlib.import_module(f"crazyem.recordings.{self.module}")

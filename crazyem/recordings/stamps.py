@@ -11,6 +11,7 @@ A stream all of whose stamps are far from the others, and run beside them, is of
 constant. What is left of a disorder (records that changed places, a clock that was set) is for the doctor.
 """
 
+import bisect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -77,15 +78,37 @@ def _sound(time: Column) -> bool:
 
 
 def out_of_order(time: Column) -> Flags:
-    """(n,) True where a stamp is far from the median of those around it, which a stamp in order is."""
+    """(n,) True where a stamp breaks the order of those around it and is far from their median."""
     if time.size < 3 or bool((np.diff(time) >= 0).all()):
         return np.zeros(time.size, bool)
-    padded = np.concatenate([np.full(_REACH, -np.inf), time, np.full(_REACH, np.inf)])
-    middle = median_filter(padded, 2 * _REACH + 1, mode="nearest")[_REACH:-_REACH]
     # where a clock starts again, the median may be of the other side, as many steps away as it reaches
     limit = max(RESTART, 2 * _REACH * float(np.median(np.abs(np.diff(time)))))
-    with np.errstate(invalid="ignore"):
-        return ~(np.abs(time - middle) <= limit)
+    away = np.abs(time - _running_median(time))
+    far = ~(away <= limit)
+    broken = np.zeros(time.size, bool)
+    for step in range(1, _REACH + 1):
+        back = time[step:] < time[:-step]
+        broken[step:] |= back
+        broken[:-step] |= back
+    return _without_those_in_order(time, far & broken, away)
+
+
+def _without_those_in_order(time: Column, odd: Flags, away: Column) -> Flags:
+    """Flags without the stamps that are in order once the others are gone, those nearest to the median first."""
+    kept = np.flatnonzero(~odd).tolist()
+    for row in sorted(np.flatnonzero(odd).tolist(), key=lambda row: away[row]):
+        place = bisect.bisect(kept, row)
+        before = time[kept[place - 1]] if place > 0 else -np.inf
+        after = time[kept[place]] if place < len(kept) else np.inf
+        if before <= time[row] <= after:
+            kept.insert(place, row)
+    found = np.ones(time.size, bool)
+    found[kept] = False
+    return found
+
+
+def _running_median(time: Column) -> Column:
+    return np.asarray(median_filter(time, 2 * _REACH + 1, mode="mirror"), float)
 
 
 def restarts(time: Column) -> NDArray[np.int64]:
@@ -95,8 +118,7 @@ def restarts(time: Column) -> NDArray[np.int64]:
     """
     if time.size < 2 * _REACH + 1:
         return np.flatnonzero(np.diff(time) < -RESTART) + 1
-    padded = np.pad(time, _REACH, mode="edge")
-    middle = median_filter(padded, 2 * _REACH + 1, mode="nearest")[_REACH:-_REACH]
+    middle = _running_median(time)
     rows = []
     for row in np.flatnonzero(np.diff(middle) < -RESTART).tolist():
         # the median crosses over where most of its window has; the stamps themselves do so nearby

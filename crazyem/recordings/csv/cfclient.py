@@ -241,7 +241,7 @@ def _segments(
             f"{path.name}: the header stands {len(again)} more times (first in line {again[0]}); "
             "what follows may be another flight."
         )
-        advice = "Look for a clock that jumps back, and cut the file there."
+        advice = "Look for a clock that jumps back, and use the parts one at a time (--from, --to)."
         findings.append(Finding("integrity", Grade.DEGRADES, said, advice=advice))
 
 
