@@ -24,8 +24,8 @@ import peer_numpy
 from speed import settled, window_of
 
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.doctor.streams import airtime
 from crazyem.recordings import open_recording
+from crazyem.recordings.airborne import airtime
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.vehicle import load_vehicle
 

@@ -4,8 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from crazyem.doctor.streams import airtime, ordered
 from crazyem.errors import DataError
+from crazyem.recordings.airborne import airtime
+from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording
 from crazyem.signals.sample import SIGNALS
 
@@ -21,7 +22,7 @@ def compare(recording: Recording, simulated: Recording) -> dict[str, Any]:
     begins, lasts = [], []
     for one in (recording, simulated):
         air = airtime(one)
-        if air is None or not air.flown:
+        if not air.flown:
             raise DataError(f"{one.path}: nothing was flown in this recording, so there is nothing to compare")
         begins.append(air.flown[0][0])
         lasts.append(air.flown[-1][1] - air.flown[0][0])

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from crazyem.doctor.envelope import sound_samples
 from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.ordering import sound_samples
 from crazyem.recordings.recording import Recording, SignalArray
 
 Array = NDArray[np.float64]

@@ -15,11 +15,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.envelope import Airborne, held, sound_samples
 from crazyem.doctor.whitening import ORDER, Fit, autoregression, filtered, long_run
 from crazyem.physics.lag import CAUSAL, LINEAR, fit_predictor, hold_predictor, lagged_means
 from crazyem.physics.rotations import quaternion_conjugate, quaternion_product, rotation_vector_from_quaternion
 from crazyem.physics.rotors import wrench_from_command, wrench_from_speed
+from crazyem.recordings.airborne import Airtime
+from crazyem.recordings.ordering import held, sound_samples
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import GRAVITY, Vehicle
 
@@ -99,7 +100,7 @@ def _sane(inputs: Inputs, vehicle: Vehicle) -> Inputs:
     return inputs if good.all() else replace(inputs, time=inputs.time[good], wrench=inputs.wrench[good])
 
 
-def steps_of(time: Array, value: Array, air: Airborne) -> Steps | None:
+def steps_of(time: Array, value: Array, air: Airtime) -> Steps | None:
     """Stretches of samples (n, c) in the air, thinned to steps of at least 4 ms by averaging; None with too few."""
     inside = air.covers(time)
     time, value = time[inside], value[inside]

@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.envelope import sound_samples
 from crazyem.doctor.examine import CHECKS
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.finding import Finding, Fix
+from crazyem.recordings.ordering import sound_samples
 from crazyem.recordings.recording import Recording, SignalArray
 
 Array = NDArray[np.float64]

@@ -9,8 +9,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import QUIET, Airtime, Intervals, airtime, inside, longest, ordered, runs
+from crazyem.doctor.streams import QUIET, longest, runs
+from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.ordering import Intervals, inside, ordered
 from crazyem.recordings.recording import Recording
 
 UPSET = 90.0  # degrees of tilt
@@ -18,6 +20,7 @@ LYING = 60.0  # degrees of tilt at rest
 FAST = 1.5  # m/s into the ground; a controller lands at up to 0.8, a drop from 10 cm ends at 1.4
 IMPOSSIBLE = 50.0  # m/s: a wrong position, not a fall
 APPROACH = 0.05  # s before the ground, over which that speed is taken
+CARRIED = 0.3  # m of height that a drone changes whose rotors do not turn: by hand
 DROPPED = 0.4  # m above ground at which rotors stop
 
 
@@ -25,7 +28,7 @@ DROPPED = 0.4  # m above ground at which rotors stop
 def check(recording: Recording) -> list[Finding]:
     """No flight, a recording that is cut, upsets and crashes."""
     flight = airtime(recording)
-    if flight is None:
+    if not flight.known:
         return []
     if not flight.airborne:
         return [_no_flight(flight)]
@@ -41,14 +44,9 @@ def check(recording: Recording) -> list[Finding]:
 
 def _no_flight(flight: Airtime) -> Finding:
     evidence = {"climbed_m": flight.climbed} if math.isfinite(flight.climbed) else {}
-    text = "The drone never flew: its rotors never carried it."
-    if flight.lifting:
-        text = "The rotors turned, but the drone did not leave the ground."
-    elif flight.climbed > 0.3:
-        text = (
-            f"The rotors never carried the drone, though its height changes by {flight.climbed:.1f} m: "
-            "carried by hand, or the motor signal is not what it says."
-        )
+    text = f"The drone never flew: {flight.reason}."
+    if not flight.lifting and flight.climbed > CARRIED and not flight.by_height_alone:
+        text += " Somebody carried it, or the motor signal is not what it says."
     return Finding(
         "flight",
         Grade.UNUSABLE,
@@ -63,13 +61,14 @@ def _course(flight: Airtime) -> list[Finding]:
     starts = flight.lifting[0][0] <= flight.begin
     ends = flight.lifting[-1][1] >= flight.end
     count = len(flight.airborne)
+    where = "in the air" if flight.by_height_alone else "with rotors at work"
     remarks = []
     if count > 1:
         remarks.append(f"holds {count} flights")
     if starts:
-        remarks.append("begins with rotors at work")
+        remarks.append(f"begins {where}")
     if ends:
-        remarks.append("ends with rotors at work")
+        remarks.append(f"ends {where}")
     if not remarks:
         return []
     total = sum(b - a for a, b in flight.airborne)

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import COMMANDED, QUIET, Airtime, airtime, inside, listed, longest, runs
+from crazyem.doctor.streams import COMMANDED, QUIET, listed, longest, runs
+from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.ordering import inside
 from crazyem.recordings.recording import Recording, SignalArray
 
 Flags = NDArray[np.bool_]
@@ -47,7 +49,7 @@ def check(recording: Recording) -> list[Finding]:
                 idle.append(name)
         elif array.quantity in SHORTEST:
             stuck += _signal(recording, name, array, flight)
-        elif array.quantity == "voltage" and _constant(array.value) and flight is not None and flight.airborne:
+        elif array.quantity == "voltage" and _constant(array.value) and flight.known and flight.airborne:
             found.append(_flat_voltage(name, array))
     while stuck:
         first = stuck.pop(0)
@@ -128,9 +130,9 @@ def _flat_voltage(name: str, array: SignalArray) -> Finding:
     )
 
 
-def _signal(recording: Recording, name: str, array: SignalArray, flight: Airtime | None) -> list[_Stuck]:
+def _signal(recording: Recording, name: str, array: SignalArray, flight: Airtime) -> list[_Stuck]:
     """Stuck stretches of all components together, then of single ones of sensors."""
-    if flight is None or not flight.airborne:
+    if not flight.known or not flight.airborne:
         return []
     flying = inside(array.time, flight.airborne)
     if flying.sum() < LEAST_SAMPLES:

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import QUIET, Cadence, Intervals, Stream, cadence, graded, listed, longest, streams
+from crazyem.doctor.streams import QUIET, Cadence, Stream, cadence, graded, listed, longest, streams
 from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.ordering import Intervals
 from crazyem.recordings.recording import Recording
 
 PAUSE = 1.0  # s of silence of everything: the recorder stood still, or the link was gone

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor import excitation
-from crazyem.doctor.envelope import Airborne, held, sound_samples
 from crazyem.doctor.excitation import Inputs, Steps
 from crazyem.doctor.whitening import Fit, linear_fit
 from crazyem.physics.rotations import rotation_matrix
+from crazyem.recordings.airborne import Airtime
+from crazyem.recordings.ordering import held, sound_samples
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import GRAVITY, Vehicle
 
@@ -76,7 +77,7 @@ def percent(share: float) -> str:
     return f"{100 * share:.2g} %" if share < 0.995 else "over 100 %" if share > 10 else f"{100 * share:.0f} %"
 
 
-def identifiability(recording: Recording, vehicle: Vehicle, air: Airborne) -> tuple[Verdict, ...]:
+def identifiability(recording: Recording, vehicle: Vehicle, air: Airtime) -> tuple[Verdict, ...]:
     """Verdicts on mass, inertias, lag, delay, torque offsets, drag and battery law, in this order."""
     if air.seconds < SHORTEST:
         why = f"only {air.seconds:.1f} s in the air"
@@ -127,7 +128,7 @@ class _Vertical:
     systematic: float
 
 
-def _vertical(recording: Recording, air: Airborne) -> _Vertical | None:
+def _vertical(recording: Recording, air: Airtime) -> _Vertical | None:
     velocity, attitude = _sound(recording, "velocity"), _sound(recording, "attitude")
     if velocity is not None:
         steps = excitation.steps_of(*_with_attitude(velocity, attitude), air)
@@ -194,7 +195,7 @@ def _slow(time: Array, velocity: Array) -> Array:
 # rotation ------------------------------------------------------------------------------------------------------
 
 
-def _rates(recording: Recording, air: Airborne) -> tuple[Steps | None, str]:
+def _rates(recording: Recording, air: Airtime) -> tuple[Steps | None, str]:
     rate = _sound(recording, "body_rate")
     if rate is not None:
         return excitation.steps_of(rate[0], rate[1], air), "body rate"
@@ -304,7 +305,7 @@ def _offsets(fit: Fit, vehicle: Vehicle) -> Verdict:
 # drag and battery ----------------------------------------------------------------------------------------------
 
 
-def _drag(recording: Recording, air: Airborne) -> Verdict:
+def _drag(recording: Recording, air: Airtime) -> Verdict:
     velocity, attitude = _sound(recording, "velocity"), _sound(recording, "attitude")
     if velocity is None or attitude is None:
         return Verdict("drag", "no", "needs velocity and attitude")
@@ -322,7 +323,7 @@ def _drag(recording: Recording, air: Airborne) -> Verdict:
 
 
 def _sideways(
-    velocity: tuple[Array, Array], attitude: tuple[Array, Array], force: tuple[Array, Array] | None, air: Airborne
+    velocity: tuple[Array, Array], attitude: tuple[Array, Array], force: tuple[Array, Array] | None, air: Airtime
 ) -> tuple[list[Array], list[Array], str, Steps | None]:
     """Horizontal body components of specific force (2 k,) and their columns: velocity and a constant an axis."""
     time, both = _with_attitude(velocity, attitude)

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from crazyem.doctor.envelope import Envelope, airborne, envelope, sound_rows
+from crazyem.doctor.envelope import Envelope, envelope
 from crazyem.doctor.identifiability import Verdict, identifiability
+from crazyem.recordings.airborne import airtime
+from crazyem.recordings.ordering import sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
 
@@ -115,7 +117,7 @@ def inventory(recording: Recording, vehicle: Vehicle | None = None) -> Inventory
         vehicle: whose rotor law and inertia to judge by; None: the one it was flown with, else by what it logs.
     """
     vehicle = vehicle or vehicle_for(recording)
-    air = airborne(recording)
+    air = airtime(recording)
     kinds: dict[str, int] = {}
     for event in recording.events:
         kinds[event.kind] = kinds.get(event.kind, 0) + 1

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import QUIET, listed, places, sound_rows
+from crazyem.doctor.streams import QUIET, listed, places
 from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.ordering import sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
 
 Rows = NDArray[np.bool_]

@@ -8,22 +8,10 @@ packet.
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import (
-    COMMANDED,
-    QUIET,
-    Airtime,
-    Stream,
-    airtime,
-    cadence,
-    inside,
-    listed,
-    places,
-    runs,
-    same_as_before,
-    sound_rows,
-    streams,
-)
+from crazyem.doctor.streams import COMMANDED, QUIET, Stream, cadence, listed, places, runs, same_as_before, streams
+from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.ordering import inside, sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
 
 # may come from a slower task of the firmware than the rest of their table, and are held meanwhile
@@ -40,18 +28,18 @@ TOGETHER = 0.9  # share of common repeats from which signals came in one packet
 def check(recording: Recording) -> list[Finding]:
     """Repeated rows of each stream, then signals that are held between slower measurements of their own."""
     flight = airtime(recording)
-    found = []
+    found: list[Finding] = []
+    if not flight.airborne:
+        return found  # what stands on the ground may repeat
     for stream in streams(recording):
         found += _stream(stream, flight)
     return found
 
 
-def _stream(stream: Stream, flight: Airtime | None) -> list[Finding]:
+def _stream(stream: Stream, flight: Airtime) -> list[Finding]:
     time = stream.time
     stored = cadence(time).period
-    considered = np.ones(time.size, bool)
-    if flight is not None and flight.airborne:
-        considered = inside(time, flight.airborne)
+    considered = inside(time, flight.airborne)
     if considered.sum() < 50 or not stored > 0:
         return []
     considered[0] = False

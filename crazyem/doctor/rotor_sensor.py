@@ -10,8 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import QUIET, Intervals, airtime, cadence, inside, listed, longest, ordered, runs
+from crazyem.doctor.streams import QUIET, cadence, listed, longest, runs
+from crazyem.recordings.airborne import airtime
 from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.ordering import Intervals, inside, ordered
 from crazyem.recordings.recording import Recording, SignalArray
 
 FRACTIONS: dict[str, float] = {
@@ -35,7 +37,7 @@ _MOST_LEAPS = 5000
 def check(recording: Recording) -> list[Finding]:
     """Findings for each rotor of each rotor_speed signal, within the time in the air."""
     flight = airtime(recording)
-    if flight is None or not flight.lifting:
+    if not flight.lifting:
         return []
     inner: Intervals = tuple((a + 0.3, b - 0.3) for a, b in flight.lifting if b - a > 1.0)
     found = []

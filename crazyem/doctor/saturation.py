@@ -3,8 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import QUIET, Airtime, Intervals, airtime, inside, longest, ordered, runs
+from crazyem.doctor.streams import QUIET, longest, runs
+from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.ordering import Intervals, inside, ordered
 from crazyem.recordings.recording import Recording
 
 FULL = 0.999  # of the greatest duty
@@ -24,7 +26,7 @@ def check(recording: Recording) -> list[Finding]:
         if array is None or array.time.size < 20:
             continue
         time, value = ordered(array)
-        airborne = flight.airborne if flight is not None else ()
+        airborne = flight.airborne if flight.known else ()
         rows = inside(time, airborne)
         if rows.sum() >= 20:
             found += _upper(recording, name, time, value, rows)
@@ -91,10 +93,10 @@ def _lower(
     time: NDArray[np.float64],
     value: NDArray[np.float64],
     rows: NDArray[np.bool_],
-    flight: Airtime | None,
+    flight: Airtime,
 ) -> list[Finding]:
     """Rotors at idle or off while airborne, but not in the first and last half second, when they start and stop."""
-    inner: Intervals = tuple((a + 0.5, b - 0.5) for a, b in (flight.airborne if flight else ()) if b - a > 1.5)
+    inner: Intervals = tuple((a + 0.5, b - 0.5) for a, b in flight.airborne if b - a > 1.5)
     rows = rows & inside(time, inner)
     if rows.sum() < 20:
         return []

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.recordings.finding import Grade, intervals_of
+from crazyem.recordings.finding import Grade
+from crazyem.recordings.ordering import Intervals
 from crazyem.recordings.recording import Recording, SignalArray
 
 MOST_INTERVALS = 50  # a finding names at most this many places, the longest ones; its evidence counts all
-Intervals = tuple[tuple[float, float], ...]
 
 # What a drone is told or wants, rather than what was measured: may be straight, constant or stepped in good health.
 COMMANDED = frozenset(
@@ -181,184 +181,8 @@ def same_as_before(value: NDArray[np.float64]) -> NDArray[np.bool_]:
     return same
 
 
-def inside(time: NDArray[np.float64], intervals: Intervals) -> NDArray[np.bool_]:
-    """(n,) True where a time lies in one of the intervals."""
-    flags = np.zeros(time.size, bool)
-    for start, end in intervals:
-        flags |= (time >= start) & (time <= end)
-    return flags
-
-
-def sound_rows(value: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(n,) True where all components of (n, c) are finite; column by column, which is fastest."""
-    sound = np.isfinite(value[:, 0])
-    for column in range(1, value.shape[1]):
-        sound &= np.isfinite(value[:, column])
-    return sound
-
-
-def thinned(array: SignalArray) -> SignalArray:
-    """Every k-th sample, so that some 200 a second are left: enough to see take-off and landing."""
-    if array.time.size < 2:
-        return array
-    period = (float(array.time[-1]) - float(array.time[0])) / max(array.time.size - 1, 1)
-    step = int(0.005 / period) if 0.0 < period < 0.0025 else 1
-    if step < 2:
-        return array
-    return array.rows(slice(None, None, step))
-
-
-def ordered(array: SignalArray, *, finite: bool = True) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(n,) times and (n, c) values with increasing times; rows with NaN dropped if `finite`. No copy if avoidable."""
-    time, value = array.time, array.value
-    keep = np.isfinite(time)
-    if finite:
-        keep &= sound_rows(value)
-    if not keep.all():
-        time, value = time[keep], value[keep]
-    if time.size > 1 and (time[1:] < time[:-1]).any():
-        order = np.argsort(time, kind="stable")
-        time, value = time[order], value[order]
-    return time, value
-
-
 def graded(share: float, *, degrades: float, unusable: float = math.inf) -> Grade:
     """By the share of samples concerned."""
     if share >= unusable:
         return Grade.UNUSABLE
     return Grade.DEGRADES if share >= degrades else Grade.HARMLESS
-
-
-# -- when the drone flew ----------------------------------------------------------------------------------------------
-
-SHORTEST_FLIGHT = 0.4  # s of lift; less is a hop or a test of the rotors
-LONGEST_FALL = 0.6  # s without lift that a manoeuvre may have
-LIFTED, CLEAR = 0.03, 0.1  # m above the ground: in the air; and surely so,
-BOUNCE = 0.25  # or this share of the greatest height: a hard landing throws a drone up by 0.12 m, from 1 m
-# No signal of a drone is larger (SI; the fastest rotors reach 6e3 rad/s): a sample beyond is an error of transmission.
-POSSIBLE = {"rotor_speed": 8000.0, "motor_command": 1.5, "motor_request": 1.5}
-_RAW_MOTORS = ("motor.m1", "motor.m2", "motor.m3", "motor.m4")
-_LIFT_SIGNALS = ("motor_command", "motor_request", "rotor_speed", "wrench_command", "mixer_command")
-
-
-@dataclass(frozen=True, slots=True)
-class Airtime:
-    """When the drone flew.
-
-    Attributes:
-        lifting: intervals in which the rotors carried about the weight [s].
-        airborne: the same, less the time before it left the ground and after it came back, where a position tells.
-        ground: height of the ground in the frame of the position [m]; NaN where unknown.
-        peak: greatest thrust as a share of what the signal can say (duty squared, ...), for "never left the ground".
-        climbed: m, range of height; NaN without a position.
-        begin, end: s, of what the rotors said.
-        flown: as `airborne`, without bounces before the climb and after the descent: no force of the floor in it.
-    """
-
-    lifting: Intervals
-    airborne: Intervals
-    ground: float
-    peak: float
-    climbed: float
-    begin: float
-    end: float
-    flown: Intervals
-
-
-def airtime(recording: Recording) -> Airtime | None:
-    """When the drone flew, from rotors and height; None if the recording has neither."""
-    height = _height(recording)
-    for name in _LIFT_SIGNALS:
-        if name in recording.signals:
-            time, value = ordered(thinned(recording.signals[name]))
-            if time.size > 10:
-                return _from_rotors(name, time, value, height)
-    raw = [recording.signals[name] for name in _RAW_MOTORS if name in recording.signals]
-    if len(raw) == len(_RAW_MOTORS) and len({array.time.size for array in raw}) == 1 and raw[0].time.size > 10:
-        # duty or request: nobody knows which, but both say when the rotors carried
-        value = np.column_stack([array.value[:, 0] for array in raw]) / 65535.0
-        sound = np.isfinite(value).all(axis=1) & np.isfinite(raw[0].time)
-        if sound.sum() > 10 and (np.diff(raw[0].time[sound]) >= 0).all():
-            return _from_rotors("motor_command", raw[0].time[sound], value[sound], height)
-    if height is None:
-        return None
-    time, z = height
-    ground = float(np.percentile(z, 2))
-    flags = z > ground + 0.1
-    found = _closed(time, flags) if np.ptp(z) > 0.15 else ()
-    return Airtime(found, found, ground, math.nan, float(np.ptp(z)), float(time[0]), float(time[-1]), found)
-
-
-def _height(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    for name, array in recording.signals.items():
-        if array.quantity == "position" or name == "position":
-            time, value = ordered(thinned(array))
-            if time.size > 10:
-                return time, value[:, 2]
-    return None
-
-
-def _from_rotors(
-    name: str,
-    time: NDArray[np.float64],
-    value: NDArray[np.float64],
-    height: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
-) -> Airtime:
-    possible = np.abs(value).max(axis=1) <= POSSIBLE.get(name, math.inf)
-    if possible.sum() > 10:  # a wild sample is no flight
-        time, value = time[possible], value[possible]
-    thrust = value[:, 0] if name in ("wrench_command", "mixer_command") else value.mean(axis=1)
-    thrust = np.maximum(thrust, 0.0)
-    if name in ("motor_command", "rotor_speed"):
-        thrust = thrust * thrust  # about: thrust grows with the square of duty and of speed
-    peak = float(np.percentile(thrust, 99))
-    floor = {"motor_command": 0.03, "motor_request": 0.1, "rotor_speed": 200.0**2, "mixer_command": 3000.0}
-    lifting: Intervals = ()
-    if peak > floor.get(name, 1e-3):
-        high = thrust[thrust > 0.4 * peak]
-        level = float(np.median(high)) if high.size else peak  # near hover: most of a flight is
-        lifting = _closed(time, thrust > 0.3 * level)
-    if height is None:
-        return Airtime(lifting, lifting, math.nan, peak, math.nan, float(time[0]), float(time[-1]), lifting)
-    when, z = height
-    known = (when >= time[0]) & (when <= time[-1] + 0.5)
-    resting = known & ~inside(when, tuple((a - 0.1, b + 0.5) for a, b in lifting))
-    climbed = float(np.ptp(z))
-    if resting.sum() < 5:  # the rotors never rest: the recording does not show the ground
-        return Airtime(lifting, lifting, math.nan, peak, climbed, float(time[0]), float(time[-1]), lifting)
-    ground = float(np.median(z[resting]))
-    airborne: list[tuple[float, float]] = []
-    flown: list[tuple[float, float]] = []
-    for start, end in lifting:
-        within = np.flatnonzero((when >= start) & (when <= end))
-        if not within.size:
-            airborne.append((start, end))
-            flown.append((start, end))
-        for found, up in ((airborne, z[within] - ground > LIFTED), (flown, _off_the_ground(z[within] - ground))):
-            if up.any():
-                found.append((float(when[within[up][0]]), float(when[within[up][-1]])))
-    begin, end = float(time[0]), float(time[-1])
-    return Airtime(lifting, tuple(airborne), ground, peak, climbed, begin, end, tuple(flown))
-
-
-def _off_the_ground(height: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Rows (n,) in the air, of heights above the ground [m]: without bounces before the climb and after the descent."""
-    lifted = height > LIFTED
-    high = np.flatnonzero(height > max(CLEAR, BOUNCE * float(height.max(initial=0.0))))
-    if high.size:
-        down = np.flatnonzero(~lifted)
-        first, last = np.searchsorted(down, high[0]) - 1, np.searchsorted(down, high[-1])
-        lifted[: down[first] if first >= 0 else 0] = False
-        lifted[down[last] if last < down.size else height.size :] = False
-    return lifted
-
-
-def _closed(time: NDArray[np.float64], flags: NDArray[np.bool_]) -> Intervals:
-    """Runs of True with short breaks closed and short runs dropped."""
-    merged: list[tuple[float, float]] = []
-    for start, end in intervals_of(time, flags):
-        if merged and start - merged[-1][1] <= LONGEST_FALL:
-            merged[-1] = (merged[-1][0], end)
-        else:
-            merged.append((start, end))
-    return tuple(span for span in merged if span[1] - span[0] >= SHORTEST_FLIGHT)

@@ -16,7 +16,7 @@ from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.flights.inputs import NOMINAL_VOLTAGE, inputs_of
 from crazyem.diagnosis.prediction.predict import predict, recorded
-from crazyem.doctor.streams import airtime
+from crazyem.recordings.airborne import airtime
 from crazyem.vehicle import GRAVITY, load_vehicle
 
 MOTION = Motion(seconds=12.0, drag=0.0)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_flight import array_of, changed, made_flight, without
 
-from crazyem.doctor.streams import _off_the_ground, airtime
+from crazyem.recordings.airborne import _off_the_ground, airtime
 from crazyem.recordings.finding import Grade
 from crazyem.recordings.recording import Recording
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from doctor_checks import everything, only, run
 
-from crazyem.doctor.streams import airtime, runs
+from crazyem.doctor.streams import runs
+from crazyem.recordings.airborne import airtime
 from crazyem.recordings.finding import Grade
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.registry import open_recording

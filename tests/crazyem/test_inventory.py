@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from made_flight import Motion, array_of, changed, made_flight, without
 from synthetic import COLUMNS, Truth, fly
 
-from crazyem.doctor.envelope import airborne, envelope
+from crazyem.doctor.envelope import envelope
 from crazyem.doctor.excitation import inputs_of, rotation_fit, steps_of
 from crazyem.doctor.identifiability import NAMES, Verdict, replay_objection
 from crazyem.doctor.inventory import Inventory, inventory
 from crazyem.recordings import Recording, open_recording
+from crazyem.recordings.airborne import airtime
 from crazyem.vehicle import GRAVITY, Vehicle, load_vehicle
 
 TRUTH = Truth()
@@ -108,13 +109,13 @@ def test_the_envelope_is_that_of_the_closed_form(
 ) -> None:
     motion = Motion(seconds=20.0, seed=seed, size=size, frequency=frequency, height=height + size)
     made = made_flight(motion, noise=0.0, rates={"state": rate, "imu": rate, "motor": rate})
-    air = airborne(made)
+    air = airtime(made)
     found = envelope(made, air)
 
     fine = np.arange(0.0, 20.0, 1.0 / 1000.0)
-    up = fine[motion.position(fine)[:, 2] > 0.08]
-    (start, end) = air.intervals[0][0], air.intervals[-1][1]
-    assert abs(start - up[0]) < 0.3  # rotors must carry it, and it must be 8 cm up
+    up = fine[motion.position(fine)[:, 2] > 0.03]
+    (start, end) = air.airborne[0][0], air.airborne[-1][1]
+    assert abs(start - up[0]) < 0.3  # rotors must carry it, and it must be 3 cm up
     assert abs(end - up[-1]) < 0.3
     inside = fine[(fine >= start) & (fine <= end)]
     speed = np.linalg.norm(motion.velocity(inside), axis=1)
@@ -131,17 +132,17 @@ def test_the_envelope_is_that_of_the_closed_form(
 
 def test_airborne_needs_no_particular_signal() -> None:
     made = made_flight(seconds=20.0, more=("rpm",))
-    whole = airborne(made).intervals[0]
+    whole = airtime(made).airborne[0]
     for left, by in (
         (without(made, "rotor_speed", "motor_command", "flying"), ("position",)),
         (without(made, "motor_command", "flying"), ("rotor_speed", "position")),
         (without(made, "position", "flying"), ("motor_command",)),
         (without(made, "position", "motor_command", "rotor_speed"), ("flying",)),
     ):
-        air = airborne(left)
+        air = airtime(left)
         assert air.judged_by == by
-        assert air.intervals[0] == pytest.approx(whole, abs=0.8)  # rotors turn before it is 8 cm up
-    nothing = airborne(without(made, "position", "motor_command", "rotor_speed", "flying"))
+        assert air.airborne[0] == pytest.approx(whole, abs=0.8)  # rotors turn before it is 3 cm up
+    nothing = airtime(without(made, "position", "motor_command", "rotor_speed", "flying"))
     assert nothing.judged_by == ()
     assert nothing.seconds == pytest.approx(20.0, abs=0.05)
 
@@ -159,7 +160,7 @@ def test_two_hops_are_two_stretches_and_a_short_dip_of_the_rotors_is_none() -> N
             "motor_command": array_of("motor_command", t, np.tile(duty[:, None], 4), place=1),
         },
     )  # fmt: skip
-    assert [(round(a), round(b)) for a, b in airborne(made).intervals] == [(2, 8), (12, 18)]
+    assert [(round(a), round(b)) for a, b in airtime(made).airborne] == [(2, 8), (12, 18)]
 
 
 def test_a_crash_ends_the_flight() -> None:
@@ -167,15 +168,15 @@ def test_a_crash_ends_the_flight() -> None:
     force = made.signals["specific_force"]
     value = force.value.copy()
     value[np.searchsorted(force.time, 17.5)] = [80.0, 60.0, 150.0]
-    air = airborne(without(changed(made, "specific_force", value=value), "position", "flying"))
-    assert 17.0 < air.intervals[-1][1] < 17.5
+    air = airtime(without(changed(made, "specific_force", value=value), "position", "flying"))
+    assert 17.0 < air.airborne[-1][1] < 17.5
 
 
 def test_saturation_is_a_share_of_the_flight() -> None:
     made = made_flight(seconds=20.0)
     command = made.signals["motor_command"]
     value = np.minimum(command.value, 0.95)
-    air = airborne(made)
+    air = airtime(made)
     inside = np.flatnonzero(air.covers(command.time))
     value[inside[: inside.size // 4], 2] = 1.0
     found = envelope(changed(made, "motor_command", value=value), air)
@@ -210,7 +211,7 @@ def test_the_expected_errors_are_the_real_ones() -> None:
         made = recorded(TRUTH, seed=seed, duration=10.0)
         inputs, gyro = inputs_of(made, DRONE), made.signals["body_rate"]
         assert not isinstance(inputs, str)
-        steps = steps_of(gyro.time, gyro.value, airborne(made))
+        steps = steps_of(gyro.time, gyro.value, airtime(made))
         assert steps is not None
         fit = rotation_fit(inputs, steps, DRONE)
         assert fit is not None
@@ -338,7 +339,7 @@ def test_crazypad_balances_its_weight(shared_recordings: Path) -> None:
     mass = verdicts(found)["mass"]
     assert mass.verdict == "yes"
     command, volts = recording.signals["motor_command"], recording.signals["voltage"]
-    inside = airborne(recording).covers(command.time)
+    inside = airtime(recording).covers(command.time)
     curve = np.polynomial.Polynomial(load_vehicle("cf2-legacy").thrust_curve)
     plain = curve(command.value * volts.value).sum(axis=1)[inside].mean() / GRAVITY
     assert mass.value == pytest.approx(plain, rel=0.015)

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import Airtime, inside, ordered
 from crazyem.physics.rotors import PITCH_SIGN, ROLL_SIGN
+from crazyem.recordings.airborne import Airtime
+from crazyem.recordings.ordering import inside, ordered
 from crazyem.recordings.recording import Recording
 
 REACH = 0.15  # s, on either side

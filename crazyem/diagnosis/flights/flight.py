@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 from crazyem.diagnosis.flights.alignment import Alignment
 from crazyem.diagnosis.flights.frame import Frame
 from crazyem.diagnosis.flights.inputs import inputs_of
-from crazyem.doctor.streams import airtime, ordered
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
+from crazyem.recordings.airborne import airtime
 from crazyem.recordings.attitudes import onboard_attitude
+from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import GRAVITY, Vehicle
 
@@ -132,7 +133,7 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
     air = airtime(recording)
     found = inputs_of(recording, vehicle, flight=air)
     inputs = found.rotor
-    if air is None or not air.flown:
+    if not air.flown:
         raise DataError(f"{recording.path}: nothing was flown in this recording, so there is nothing to diagnose")
     measured = {name: ordered(recording.signals[name]) for name in COLUMNS if name in recording.signals}
     if "attitude" not in measured and "body_rate" not in measured and "acceleration" in recording.signals:

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.alignment import Alignment, align
 from crazyem.diagnosis.flights.level import Level, level_of
-from crazyem.doctor.streams import POSSIBLE, Airtime, airtime, ordered
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
 from crazyem.physics.rotors import thrust_from_command, thrust_from_speed, wrench
+from crazyem.recordings.airborne import POSSIBLE, Airtime, airtime
 from crazyem.recordings.attitudes import onboard_attitude
+from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 

@@ -14,8 +14,9 @@ from scipy.integrate import trapezoid
 from scipy.optimize import brentq
 
 from crazyem.doctor.kinematics import quaternion_of_euler
-from crazyem.doctor.streams import Airtime, ordered
 from crazyem.physics.rotors import thrust_from_command
+from crazyem.recordings.airborne import Airtime
+from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import GRAVITY, Vehicle
 

@@ -24,8 +24,8 @@ from scipy.signal import butter, sosfiltfilt
 
 from crazyem.diagnosis.flights.inputs import samples
 from crazyem.diagnosis.locating.locate import Finding
-from crazyem.doctor.streams import airtime
 from crazyem.physics.rotors import thrust_from_speed
+from crazyem.recordings.airborne import airtime
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
@@ -111,7 +111,7 @@ def disobedient(found: Sequence[Answer]) -> Finding | None:
 def _of_one(recording: Recording, vehicle: Vehicle) -> Answer | None:
     """Of one recording; None where it does not tell."""
     air = airtime(recording)
-    if vehicle.rotor_constant is None or air is None or not air.flown:
+    if vehicle.rotor_constant is None or not air.flown:
         return None
     if any(n not in recording.signals for n in ("motor_command", "rotor_speed")):
         return None

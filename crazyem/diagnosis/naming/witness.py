@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.naming.accelerometer import tilt
-from crazyem.doctor.streams import airtime, ordered
+from crazyem.recordings.airborne import airtime
+from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording
 
 TELLING = 3.0  # nats by which a witness tells two effects apart
@@ -77,7 +78,7 @@ def false_speed(recordings: Sequence[Recording], rotor: int, scale: float, lag: 
 def _beyond(recording: Recording, rotor: int, lag: float) -> NDArray | None:
     """(b,) by blocks: logarithm of a rotor's speed over what the others show at its command."""
     air = airtime(recording)
-    if any(n not in recording.signals for n in ("motor_command", "rotor_speed")) or air is None:
+    if any(n not in recording.signals for n in ("motor_command", "rotor_speed")):
         return None
     time, command = ordered(recording.signals["motor_command"])
     when, speed = ordered(recording.signals["rotor_speed"])

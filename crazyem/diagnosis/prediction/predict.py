@@ -16,9 +16,10 @@ from crazyem.diagnosis.flights.level import LOOKS
 from crazyem.diagnosis.prediction.earned import Turned, earned, remembered
 from crazyem.diagnosis.prediction.simulate import Simulator
 from crazyem.doctor.kinematics import quaternion_of_euler
-from crazyem.doctor.streams import airtime, inside, ordered
 from crazyem.errors import DataError
 from crazyem.physics.rotations import rotation_matrix
+from crazyem.recordings.airborne import airtime
+from crazyem.recordings.ordering import inside, ordered
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.vehicle import Vehicle
 
@@ -134,8 +135,8 @@ def recorded(recording: Recording, vehicle: Vehicle) -> Recorded:
         known = since <= OLDEST
         state[known, columns] = value[at[known]]
         age = np.maximum(age, np.maximum(since, 0.0))
-    flights = () if flight is None else flight.flown
-    looks = () if inputs.level is None or flight is None else (0.0, *LOOKS)
+    flights = flight.flown
+    looks = () if inputs.level is None else (0.0, *LOOKS)
     before = tuple(inputs_of(recording, vehicle, flight=flight, until=inputs.took_off + s) for s in looks)
     return Recorded(recording.path, time, state, age, row, inside(time, flights), inputs, parts, flights, before)
 
