@@ -127,17 +127,22 @@ def raise_after(error: BaseException | None) -> None:
         raise error
 
 
-def new_estimator(vehicle: Vehicle, arguments: argparse.Namespace, *, onboard: bool = True) -> Any:
+def new_estimator(
+    vehicle: Vehicle, arguments: argparse.Namespace, *, onboard: bool = True, input_signal: str | None = None
+) -> Any:
     """The estimator with the window of the command line; it begins its window anew when the mass steps.
 
-    `onboard`: attitudes come from a filter on board, as those of every link do.
+    `onboard`: attitudes come from a filter on board, as those of every link do. `input_signal`: None takes what comes
+    first.
     """
     from crazyem.estimation.online import ATTITUDE_PERIOD, OnlineEstimator
     from crazyem.estimation.steps import StepAwareEstimator
 
     period = ATTITUDE_PERIOD if onboard else 0.0
     return StepAwareEstimator(
-        OnlineEstimator(vehicle, window=arguments.window, every=arguments.every, attitude_period=period)
+        OnlineEstimator(
+            vehicle, window=arguments.window, every=arguments.every, attitude_period=period, input_signal=input_signal
+        )
     )
 
 

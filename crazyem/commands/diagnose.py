@@ -10,7 +10,7 @@ from typing import Any
 
 from crazyem.commands.files import read_options
 from crazyem.commands.output import put
-from crazyem.commands.replay import vehicle_of
+from crazyem.doctor.thrust import vehicle_for
 from crazyem.errors import UsageError
 from crazyem.live.summary import check_writable
 from crazyem.recordings import open_recording
@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     options = read_options(arguments)
     recordings = [open_recording(p, options) for p in arguments.files]
     held_out = [open_recording(p, options) for p in arguments.held_out]
-    vehicle = vehicle_of(recordings[0], arguments.vehicle)
+    vehicle = vehicle_for(recordings[0], arguments.vehicle)
     wanted = [n.strip() for n in (arguments.candidates or "").split(",") if n.strip()]
     found = diagnose(
         recordings, vehicle, held_out=held_out, wanted=wanted, withhold=arguments.withhold,

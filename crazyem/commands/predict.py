@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from crazyem.commands.files import Found, read_options, targets
 from crazyem.commands.output import Progress, put
-from crazyem.commands.replay import vehicle_of
+from crazyem.doctor.thrust import vehicle_for
 from crazyem.errors import UsageError
 from crazyem.recordings import open_recording
 
@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
     recording_path = Path(arguments.file)
     output = targets([Found(recording_path)], arguments.output, ".npz", force=arguments.force)[0]
     recording = open_recording(recording_path, read_options(arguments))
-    vehicle = vehicle_of(recording, arguments.vehicle)
+    vehicle = vehicle_for(recording, arguments.vehicle)
     shown = recorded(recording, vehicle)
     size = 14 * 8 * arguments.horizon * (shown.time.size / arguments.every)
     if size > LARGEST:

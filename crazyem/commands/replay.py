@@ -5,13 +5,16 @@ import time
 
 from crazyem.commands.common import new_estimator, plot_path, report, say, tell_steps
 from crazyem.commands.files import read_options
+from crazyem.doctor.thrust import kind_objection, signal_for, vehicle_for, weight_objection
 from crazyem.errors import DataError
 from crazyem.live.history import History, Push
 from crazyem.live.pipeline import Pipeline
 from crazyem.live.summary import check_writable, live_line
 from crazyem.physics import folding
-from crazyem.recordings import Recording, open_recording
+from crazyem.recordings import Finding, Grade, Recording, open_recording
+from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.attitudes import onboard_attitude
+from crazyem.signals.sample import ESTIMATOR_SIGNALS
 from crazyem.vehicle import Vehicle
 
 SCALE_NOTICE = (
@@ -20,33 +23,43 @@ SCALE_NOTICE = (
 )
 
 
-def vehicle_of(recording: Recording, given: str | None) -> Vehicle:
-    """--vehicle, else the vehicle the recording was flown with, else cf2."""
-    if given:
-        return folding.load(given)
-    stored = recording.metadata.get("vehicle", {}).get("toml")
-    return folding.parse(stored, where=f"vehicle in {recording.path}") if stored else folding.load("cf2")
-
-
-def required_signals(recording: Recording, vehicle: Vehicle) -> list[str]:
-    """What the estimator needs of this recording.
+def required_signals(recording: Recording, vehicle: Vehicle) -> tuple[str, list[str]]:
+    """The signal that thrust is computed from, and all that the estimator needs of this recording.
 
     Raises:
-        DataError: there is nothing to compute thrust from.
+        DataError: there is nothing to compute thrust from, or its voltage is not known.
     """
+    if other := kind_objection(recording):
+        raise DataError(f"{recording.path}: {other}.")
+    name, why = signal_for(recording, vehicle)
+    if not name:
+        raise DataError(f"{recording.path}: nothing says what the rotors did: {why}.")
     names = {n for n, a in recording.signals.items() if a.time.size}
-    if "motor_command" in names and vehicle.thrust_curve:
-        inputs = ["motor_command", "voltage"]
-    elif "rotor_speed" in names and vehicle.rotor_constant is not None:
-        inputs = []  # NaN means a missing speed there
-    elif "wrench_command" in names:
-        inputs = ["wrench_command"]
-    else:
+    if name == "motor_command" and "voltage" not in names:
+        absent = recording.metadata.get("not_measured", {}).get("voltage", "")
         raise DataError(
-            f"{recording.path}: there are no motor commands, rotor speeds or commanded thrust that the vehicle "
-            f"'{vehicle.name}' can turn into forces."
+            f"{recording.path}: the recording has no voltage{f' ({absent})' if absent else ''}, and without one "
+            "motor_command is no thrust; crazyem diagnose can take a voltage from the flight."
         )
-    return ["position", "attitude", *inputs, *(n for n in ("velocity", "body_rate") if n in names)]
+    inputs = {"motor_command": ["motor_command", "voltage"], "wrench_command": ["wrench_command"]}.get(name, [])
+    return name, ["position", "attitude", *inputs, *(n for n in ("velocity", "body_rate") if n in names)]
+
+
+def check_flown(recording: Recording, vehicle: Vehicle, air: Airtime, samples: int | None = None) -> None:
+    """Raise DataError, saying why, if nothing was flown: by the recording, or (`samples` 0) by the estimator's gate."""
+    if air.known and not air.airborne:
+        raise DataError(f"{recording.path}: nothing was flown in this recording: {air.reason}.")
+    if samples == 0:
+        why = weight_objection(recording, vehicle, air) or "no sample of position and attitude is off the ground"
+        raise DataError(f"{recording.path}: {air.seconds:.1f} s in the air, but nothing to estimate from: {why}.")
+
+
+def doctors_findings(recording: Recording) -> list[Finding]:
+    """What the doctor finds that bears on an estimate: more than harmless, of a signal that the estimator uses."""
+    from crazyem.doctor import examine
+
+    used = {*ESTIMATOR_SIGNALS, ""}
+    return [f for f in examine(recording) if f.grade is not Grade.HARMLESS and f.signal in used]
 
 
 def replay(recording: Recording, pipeline: Pipeline, *, progress: bool = True) -> None:
@@ -69,20 +82,26 @@ def run(arguments: argparse.Namespace) -> int:
     for path in (arguments.json, plot):
         check_writable(path)
     recording = open_recording(arguments.file, read_options(arguments))
-    vehicle, left_out = folding.fold(vehicle_of(recording, arguments.vehicle))
+    vehicle, left_out = folding.fold(vehicle_for(recording, arguments.vehicle))
     configured = recording.metadata.get("configuration", {})
     for name, default in (("window", "800"), ("every", "4")):
         if getattr(arguments, name) is None:
             setattr(arguments, name, int(configured.get(name, default)))
-    recording.check(required_signals(recording, vehicle))
+    thrust_from, required = required_signals(recording, vehicle)
+    recording.check(required)
+    air = airtime(recording)
+    check_flown(recording, vehicle, air)
+    findings = doctors_findings(recording)
     history = History()
     take_events(recording, history)
-    estimator = new_estimator(vehicle, arguments, onboard=onboard_attitude(recording))
+    # a live flight takes what comes first, and a replay must do the same; but never what says nothing
+    unfit = [n for n in ("rotor_speed", "motor_command") if n in recording.signals and n != thrust_from]
+    chosen = thrust_from if unfit or thrust_from == "wrench_command" else None
+    estimator = new_estimator(vehicle, arguments, onboard=onboard_attitude(recording), input_signal=chosen)
     pipeline = Pipeline(estimator, history=history)
     pipeline.estimate_until = history.marks.get("estimate_end", pipeline.estimate_until)
     replay(recording, pipeline)
-    if not any(e.samples for e in history.estimates):
-        raise DataError(f"{recording.path}: nothing in this recording was flown (no samples off the ground).")
+    check_flown(recording, vehicle, air, max((e.samples for e in history.estimates), default=0))
     received, lost = packet_counts(recording)
     report(
         arguments,
@@ -93,10 +112,25 @@ def run(arguments: argparse.Namespace) -> int:
         title=f"crazyem replay {recording.path.rsplit('/', 1)[-1]}, vehicle {vehicle.name}",
         received=received,
         lost=lost,
-        extra={"source": recording.source, "duration_s": recording.duration},
-        notices=(SCALE_NOTICE, *filter(None, [folding.notice(left_out)]), *recording.notices),
+        extra={
+            "source": recording.source,
+            "duration_s": recording.duration,
+            "airborne_s": air.seconds,
+            "findings": [f.to_dict() for f in findings],
+        },
+        notices=(
+            SCALE_NOTICE,
+            *filter(None, [folding.notice(left_out), sentence(weight_objection(recording, vehicle, air))]),
+            *recording.notices,
+            *(f"the doctor says ({f.grade}): {f.text}" for f in findings if f not in recording.findings),
+        ),
     )
     return 0
+
+
+def sentence(clause: str) -> str:
+    """A clause as a sentence; "" stays."""
+    return clause[:1].upper() + clause[1:]
 
 
 def packet_counts(recording: Recording) -> tuple[int, int]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor.streams import QUIET, Cadence, Stream, cadence, listed, longest, streams
-from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.stamps import RESTART
 
@@ -112,8 +112,7 @@ def _late(stream: Stream, rows: NDArray[np.int64], *, clean: bool) -> Finding:
     return Finding(
         "clocks",
         Grade.DEGRADES,
-        f"{stream.name}: {rows.size} records ({100 * share:.2g} %) are out of order, "
-        f"by up to {1000 * back.max():.1f} ms.",
+        f"{stream.name}: {rows.size} records ({percent(share)}) are out of order, by up to {1000 * back.max():.1f} ms.",
         signal=stream.names[0] if len(stream.names) == 1 else "",
         intervals=longest((float(stream.time[i + 1]), float(stream.time[i])) for i in rows),
         evidence={"records": int(rows.size), "share": share, "largest_s": float(back.max())},
@@ -133,7 +132,7 @@ def _twice(stream: Stream, rows: NDArray[np.int64]) -> Finding:
     return Finding(
         "clocks",
         Grade.DEGRADES if share > 0.01 else Grade.HARMLESS,
-        f"{stream.name}: {rows.size} records ({100 * share:.2g} %) carry the stamp of the record before, "
+        f"{stream.name}: {rows.size} records ({percent(share)}) carry the stamp of the record before, "
         + ("with the same values." if all_copies else f"{rows.size - copies} of them with other values."),
         signal=stream.names[0] if len(stream.names) == 1 else "",
         intervals=longest((float(stream.time[i]), float(stream.time[i])) for i in rows),

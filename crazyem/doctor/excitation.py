@@ -15,13 +15,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.doctor.thrust import Inputs
 from crazyem.doctor.whitening import ORDER, Fit, autoregression, filtered, long_run
 from crazyem.physics.lag import CAUSAL, LINEAR, fit_predictor, hold_predictor, lagged_means
 from crazyem.physics.rotations import quaternion_conjugate, quaternion_product, rotation_vector_from_quaternion
-from crazyem.physics.rotors import wrench_from_command, wrench_from_speed
 from crazyem.recordings.airborne import Airtime
-from crazyem.recordings.ordering import held, sound_samples
-from crazyem.recordings.recording import Recording
 from crazyem.vehicle import GRAVITY, Vehicle
 
 Array = NDArray[np.float64]
@@ -31,8 +29,6 @@ COARSE = 5e-3
 LONGEST_STEP = 0.05  # s; a longer hole between two samples parts two stretches
 MOST_STEPS = 6_000  # more are sampled in blocks, and the information scaled
 BLOCK = 1_000
-MOST_THRUST = 2.0  # of what the vehicle file says of its rotors, above which a sample is no thrust
-ASSUMED_VOLTAGE = 3.7  # V, where none is logged
 DELAY, DELAY_SD = 3.5e-3, 2e-3  # s, prior of the estimator for commands
 SPEED_DELAY_SD = 10e-3  # s, and for measured rotor speeds
 LAG_SD = 0.7  # of the logarithm
@@ -41,17 +37,6 @@ TRIM = 0.05  # shift of the centre of mass over the arm: prior of the torque off
 _DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])
 # of one iteration: logarithms of inertia and lag, delay [ms], offsets as far as they like
 _LONGEST_MOVE = np.array([0.4, 0.4, 0.4, 0.4, 5.0, np.inf, np.inf, np.inf])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Inputs:
-    """Commanded wrench: time (n,) s, wrench (n, 4) N and N m, which signal it is from, whether rotor lag is to come."""
-
-    time: Array
-    wrench: Array
-    signal: str
-    lagged: bool
-    voltage_known: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,38 +51,6 @@ class Steps:
     @property
     def count(self) -> int:
         return sum(t.size - 1 for t in self.nodes)
-
-
-def inputs_of(recording: Recording, vehicle: Vehicle) -> Inputs | str:
-    """The wrench the estimator would use, or why there is none."""
-    speed = _sound(recording, "rotor_speed")
-    if speed is not None and vehicle.rotor_constant is not None:
-        return _sane(Inputs(speed[0], wrench_from_speed(speed[1], vehicle), "rotor_speed", False, True), vehicle)
-    command = _sound(recording, "motor_command")
-    if command is not None and vehicle.thrust_curve:
-        voltage = _sound(recording, "voltage")
-        volts = (
-            np.full(command[0].size, ASSUMED_VOLTAGE)
-            if voltage is None
-            else held(voltage[0], voltage[1][:, 0], command[0])
-        )
-        wrench = wrench_from_command(command[1], volts, vehicle)
-        has_lag = vehicle.motor_time_constant > 0
-        return _sane(Inputs(command[0], wrench, "motor_command", has_lag, voltage is not None), vehicle)
-    asked = _sound(recording, "wrench_command")
-    if asked is not None:
-        return Inputs(asked[0], asked[1], "wrench_command", vehicle.motor_time_constant > 0, True)
-    if speed is not None:
-        return f"rotor speeds are known, but not the thrust they give (vehicle {vehicle.name} has no rotor_constant)"
-    if "motor_request" in recording.signals or "mixer_command" in recording.signals:
-        return "only what was asked of the rotors is known, not the duty that was sent to them"
-    return "there are no motor commands, rotor speeds or commanded thrust"
-
-
-def _sane(inputs: Inputs, vehicle: Vehicle) -> Inputs:
-    """Less the samples that claim far more thrust than the rotors have: no rotor did that."""
-    good = (inputs.wrench[:, 0] < MOST_THRUST * 4.0 * vehicle.thrust_max) & (np.diff(inputs.time, prepend=-np.inf) > 0)
-    return inputs if good.all() else replace(inputs, time=inputs.time[good], wrench=inputs.wrench[good])
 
 
 def steps_of(time: Array, value: Array, air: Airtime) -> Steps | None:
@@ -369,8 +322,3 @@ def _indices(inputs: Inputs, nodes: Array) -> NDArray[np.int64]:
 
 def _all_between(inputs: Inputs, steps: Steps) -> Array:
     return inputs.wrench[np.concatenate([_indices(inputs, nodes) for nodes in steps.nodes])]
-
-
-def _sound(recording: Recording, name: str) -> tuple[Array, Array] | None:
-    array = recording.signals.get(name)
-    return None if array is None else sound_samples(array)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from crazyem.doctor.streams import COMMANDED, QUIET, listed, longest, runs
 from crazyem.recordings.airborne import Airtime, airtime
-from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.ordering import inside
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -260,7 +260,7 @@ def _finding(first: _Stuck, names: list[str]) -> Finding:
     return Finding(
         "frozen",
         Grade.UNUSABLE if share > 0.5 else Grade.DEGRADES,
-        f"{label} {'stand' if together else 'stands'} still {times} in flight, for {100 * share:.2g} % of it "
+        f"{label} {'stand' if together else 'stands'} still {times} in flight, for {percent(share)} of it "
         f"(the longest {lasting:.2f} s)" + (": the log stood still, not the drone." if together else "."),
         signal="" if together else first.name,
         intervals=longest(first.spans),

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor.streams import QUIET, Cadence, Stream, cadence, graded, listed, longest, streams
-from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.finding import Finding, Grade, percent
 from crazyem.recordings.ordering import Intervals
 from crazyem.recordings.recording import Recording
 
@@ -120,7 +120,7 @@ def _drops(sharing: list[Stream], time: NDArray[np.float64], rhythm: Cadence, pa
         Finding(
             "gaps",
             grade,
-            f"{listed([stream.name for stream in sharing])}: {_number(count, 'record')} ({100 * share:.2g} %) missing "
+            f"{listed([stream.name for stream in sharing])}: {_number(count, 'record')} ({percent(share)}) missing "
             f"in {_number(rows.size, 'place')}, the longest gap {1000 * lasting:.0f} ms.",
             signal=names[0] if len(names) == 1 else "",
             intervals=longest((float(time[i]), float(time[i + 1])) for i in rows),

@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor import excitation
-from crazyem.doctor.excitation import Inputs, Steps
+from crazyem.doctor.excitation import Steps
+from crazyem.doctor.thrust import Inputs, inputs_of
 from crazyem.doctor.whitening import Fit, linear_fit
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.airborne import Airtime
+from crazyem.recordings.finding import percent
 from crazyem.recordings.ordering import held, sound_samples
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import GRAVITY, Vehicle
@@ -66,15 +68,10 @@ class Verdict:
         """For a terminal."""
         size = ""
         if self.relative_sd is not None:
-            size = f"{percent(self.relative_sd)}"
+            size = percent(self.relative_sd) if self.relative_sd <= 10.0 else "over 1000 %"
         elif self.sd is not None:
             size = f"{self.sd:.2g} {self.unit}"
         return f"  {self.name:<20} {self.verdict:<5} {size:>12}  {self.reason}"
-
-
-def percent(share: float) -> str:
-    """A relative standard deviation for people."""
-    return f"{100 * share:.2g} %" if share < 0.995 else "over 100 %" if share > 10 else f"{100 * share:.0f} %"
 
 
 def identifiability(recording: Recording, vehicle: Vehicle, air: Airtime) -> tuple[Verdict, ...]:
@@ -82,7 +79,7 @@ def identifiability(recording: Recording, vehicle: Vehicle, air: Airtime) -> tup
     if air.seconds < SHORTEST:
         why = f"only {air.seconds:.1f} s in the air"
         return tuple(Verdict(name, "no", why) for name in NAMES)
-    inputs = excitation.inputs_of(recording, vehicle)
+    inputs = inputs_of(recording, vehicle)
     turning, turn_from = _rates(recording, air)
     if isinstance(inputs, str):
         rotation = tuple(Verdict(name, "no", inputs) for name in NAMES[1:7])
@@ -107,7 +104,7 @@ NAMES = (
 
 def replay_objection(recording: Recording, vehicle: Vehicle) -> str:
     """Why `crazyem replay` cannot use the recording; empty if it can."""
-    inputs = excitation.inputs_of(recording, vehicle)
+    inputs = inputs_of(recording, vehicle)
     if isinstance(inputs, str):
         return inputs
     lacking = [name for name in ("position", "attitude") if not _has(recording, name)]

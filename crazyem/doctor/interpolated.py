@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor.streams import COMMANDED, QUIET, cadence, graded, places, runs
-from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.recording import Recording, SignalArray
 
 STRAIGHT = 1e-4  # of the change over two steps
@@ -131,7 +131,7 @@ def _signal(name: str, array: SignalArray) -> list[Finding]:
         Finding(
             "interpolated",
             graded(share, degrades=NOTED, unusable=0.6),
-            f"{100 * share:.2g} % of {name} lie on straight lines ({len(spans)} runs, the longest {lasting:.2f} s): "
+            f"{percent(share)} of {name} lie on straight lines ({len(spans)} runs, the longest {lasting:.2f} s): "
             "drawn across lost samples, not measured.",
             signal=name,
             intervals=places(time, wide),

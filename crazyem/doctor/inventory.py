@@ -9,10 +9,11 @@ import numpy as np
 
 from crazyem.doctor.envelope import Envelope, envelope
 from crazyem.doctor.identifiability import Verdict, identifiability
+from crazyem.doctor.thrust import vehicle_for
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.ordering import sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
-from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
+from crazyem.vehicle import Vehicle
 
 _MOST_ENTRIES = 12  # of a section of metadata that are shown as text
 _LONGEST_TEXT = 120  # characters of a metadata value that are shown
@@ -134,15 +135,6 @@ def inventory(recording: Recording, vehicle: Vehicle | None = None) -> Inventory
         envelope=envelope(recording, air),
         verdicts=identifiability(recording, vehicle, air),
     )
-
-
-def vehicle_for(recording: Recording) -> Vehicle:
-    """The vehicle the recording was flown with; else cf21bl where only rotor speeds are known; else cf2."""
-    stored = recording.metadata.get("vehicle", {}).get("toml")
-    if stored:
-        return parse_vehicle(stored, where=f"vehicle in {recording.path}")
-    speeds = "rotor_speed" in recording.signals
-    return load_vehicle("cf21bl" if speeds else "cf2")
 
 
 def _row(name: str, array: SignalArray) -> SignalRow:

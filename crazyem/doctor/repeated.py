@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from crazyem.doctor.streams import COMMANDED, QUIET, Stream, cadence, listed, places, runs, same_as_before, streams
 from crazyem.recordings.airborne import Airtime, airtime
-from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.ordering import inside, sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -156,7 +156,7 @@ def _finding(
     return Finding(
         "repeated",
         Grade.DEGRADES if share > NOTED else Grade.HARMLESS,
-        f"{100 * share:.2g} % of the {what} of {listed(names)} in flight repeat the one before: "
+        f"{percent(share)} of the {what} of {listed(names)} in flight repeat the one before: "
         f"stored at {stored:.0f} Hz, measured at about {rate:.0f} Hz.",
         signal=names[0] if len(names) == 1 else "",
         intervals=places(time, rows),

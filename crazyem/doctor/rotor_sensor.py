@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from crazyem.doctor.streams import QUIET, cadence, listed, longest, runs
 from crazyem.recordings.airborne import airtime
-from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.ordering import Intervals, inside, ordered
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -233,7 +233,7 @@ def _finding(
     return Finding(
         "rotor_sensor",
         Grade.DEGRADES if share >= NOTED else Grade.HARMLESS,
-        f"The speed sensor of m{rotor + 1} {what} in {len(spans)} stretches, {100 * share:.2g} % of the flight.",
+        f"The speed sensor of m{rotor + 1} {what} in {len(spans)} stretches, {percent(share)} of the flight.",
         signal=name,
         intervals=longest(spans),
         evidence={
@@ -263,7 +263,7 @@ def _missing(name: str, array: SignalArray, rows: NDArray[np.bool_]) -> list[Fin
         Finding(
             "rotor_sensor",
             Grade.DEGRADES if share > 0.05 else Grade.HARMLESS,
-            f"{name} is missing in {int(flags.sum())} samples in the air ({100 * share:.2g} %; {listed(which)}).",
+            f"{name} is missing in {int(flags.sum())} samples in the air ({percent(share)}; {listed(which)}).",
             signal=name,
             intervals=longest(spans),
             evidence={"samples": int(flags.sum()), "share": share, "longest_s": max(b - a for a, b in spans)},

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from crazyem.doctor.streams import QUIET, longest, runs
 from crazyem.recordings.airborne import Airtime, airtime
-from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.finding import Finding, Grade, percent
 from crazyem.recordings.ordering import Intervals, inside, ordered
 from crazyem.recordings.recording import Recording
 
@@ -57,8 +57,8 @@ def _upper(
     evidence |= {f"share_m{i + 1}": float(s) for i, s in enumerate(shares)}
     if ceilings:
         evidence["ceiling"] = min(ceilings)
-    words = ", ".join(f"m{i + 1} {100 * s:.2g} %" for i, s in enumerate(shares) if s > 0)
-    text = f"The {_WORDS[name]} of a rotor is at its upper limit in {100 * share:.2g} % of the flight ({words})"
+    words = ", ".join(f"m{i + 1} {percent(s)}" for i, s in enumerate(shares) if s > 0)
+    text = f"The {_WORDS[name]} of a rotor is at its upper limit in {percent(share)} of the flight ({words})"
     volts = _voltage(recording, time[any_rotor])
     if np.isfinite(volts):
         evidence["voltage_V"] = volts
@@ -115,12 +115,12 @@ def _lower(
         return []
     shares = flags[rows].mean(axis=0)
     spans = _merged(time, any_rotor)
-    words = ", ".join(f"m{i + 1} {100 * s:.2g} %" for i, s in enumerate(shares) if s > 0)
+    words = ", ".join(f"m{i + 1} {percent(s)}" for i, s in enumerate(shares) if s > 0)
     return [
         Finding(
             "saturation",
             Grade.DEGRADES if share >= 4.0 * NOTED else Grade.HARMLESS,
-            f"The {_WORDS[name]} of a rotor is at its lower limit in {100 * share:.2g} % of the flight ({words}).",
+            f"The {_WORDS[name]} of a rotor is at its lower limit in {percent(share)} of the flight ({words}).",
             signal=name,
             intervals=longest(spans),
             evidence={

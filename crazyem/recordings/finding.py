@@ -90,6 +90,14 @@ class Finding:
         }
 
 
+def percent(share: float) -> str:
+    """A share for people, to two digits and never as a power of ten: "0.43 %", "12 %", "100 %"."""
+    size = abs(100.0 * share)
+    if 0.0 < size < 0.01:
+        return "under 0.01 %"
+    return f"{100.0 * share:.0f} %" if size >= 9.95 else f"{100.0 * share:.2g} %"
+
+
 def note(check: str, text: str, grade: Grade = Grade.HARMLESS, **evidence: float) -> Finding:
     """A finding of a reader: a sentence and its numbers."""
     return Finding(check, grade, text, evidence=evidence)

@@ -15,9 +15,10 @@ from made_flight import Motion, array_of, changed, made_flight, without
 from synthetic import COLUMNS, Truth, fly
 
 from crazyem.doctor.envelope import envelope
-from crazyem.doctor.excitation import inputs_of, rotation_fit, steps_of
+from crazyem.doctor.excitation import rotation_fit, steps_of
 from crazyem.doctor.identifiability import NAMES, Verdict, replay_objection
 from crazyem.doctor.inventory import Inventory, inventory
+from crazyem.doctor.thrust import inputs_of
 from crazyem.recordings import Recording, open_recording
 from crazyem.recordings.airborne import airtime
 from crazyem.vehicle import GRAVITY, Vehicle, load_vehicle

@@ -134,7 +134,9 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
     found = inputs_of(recording, vehicle, flight=air)
     inputs = found.rotor
     if not air.flown:
-        raise DataError(f"{recording.path}: nothing was flown in this recording, so there is nothing to diagnose")
+        raise DataError(
+            f"{recording.path}: nothing was flown in this recording, so there is nothing to diagnose: {air.reason}"
+        )
     measured = {name: ordered(recording.signals[name]) for name in COLUMNS if name in recording.signals}
     if "attitude" not in measured and "body_rate" not in measured and "acceleration" in recording.signals:
         measured["attitude"] = leaning(recording)
@@ -175,8 +177,8 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
     flight = flight.started(flight.starts)
     if flight.duration < SHORTEST:
         raise DataError(
-            f"{recording.path}: {flight.duration:.1f} s in the air are too short for a diagnosis "
-            f"(at least {SHORTEST:g} s)"
+            f"{recording.path}: {flight.duration:.1f} of {air.seconds:.1f} s in the air have samples no more than "
+            f"{MAX_GAP:g} s apart, which is too short for a diagnosis (at least {SHORTEST:g} s)"
         )
     return flight
 

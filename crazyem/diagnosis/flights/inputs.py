@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.alignment import Alignment, align
 from crazyem.diagnosis.flights.level import Level, level_of
+from crazyem.doctor.thrust import kind_objection, signal_for, too_slow
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
 from crazyem.physics.rotors import thrust_from_command, thrust_from_speed, wrench
@@ -84,16 +85,17 @@ def inputs_of(
     Raises:
         DataError: the recording has no signal that this vehicle can turn into thrust.
     """
+    if other := kind_objection(recording):
+        raise DataError(f"{recording.path}: {other}.")
     for name, read in _CHOICES:
+        if too_slow(recording, name):
+            continue
         time, value = samples(recording, name)
         found = read(recording, vehicle, time, value) if time.size >= 2 else None
         if found is not None and found.time.size >= 2:
             break
     else:
-        raise DataError(
-            f"{recording.path}: there are no rotor speeds, motor commands or commanded thrust that the vehicle "
-            f"'{vehicle.name}' can turn into forces."
-        )
+        raise DataError(f"{recording.path}: nothing says what the rotors did: {signal_for(recording, vehicle)[1]}.")
     flight = airtime(recording) if flight is None else flight
     took_off = flight.flown[0][0] if flight is not None and flight.flown else float(found.time[0])
     ground = flight.ground if flight is not None and np.isfinite(flight.ground) else 0.0
@@ -156,7 +158,7 @@ def _voltage(recording: Recording, time: _Array) -> _Array:
 
 
 def _from_speed(recording: Recording, vehicle: Vehicle, time: _Array, value: _Array) -> _Found | None:
-    if vehicle.rotor_constant is None:
+    if vehicle.rotor_constant is None or not value.any():
         return None
     thrust = thrust_from_speed(value, rotor_constant=vehicle.rotor_constant)
     return _Found(time, thrust, _voltage(recording, time))

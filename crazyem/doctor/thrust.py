@@ -1,0 +1,168 @@
+"""The vehicle of a recording, and the signal that it can turn into thrust: one answer for every command, with why not.
+
+`info`, `replay` and `diagnose` use the same signal and refuse for the same reason. `diagnose` may go further: it also
+takes requests and mixer commands, and can do without a voltage.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.physics import folding
+from crazyem.physics.rotors import wrench_from_command, wrench_from_speed
+from crazyem.recordings.airborne import Airtime
+from crazyem.recordings.ordering import held, sound_samples
+from crazyem.recordings.recording import Recording
+from crazyem.vehicle import GRAVITY, Vehicle, load_vehicle, preset_names
+
+Array = NDArray[np.float64]
+
+# s between samples of a command or a rotor speed, at most: rotors lag by 30 to 70 ms, so what they did between samples
+# further apart is not known.
+SLOWEST = 0.1
+MOST_THRUST = 2.0  # of what the vehicle file says of its rotors, above which a sample is no thrust
+ASSUMED_VOLTAGE = 3.7  # V, where none is logged
+# Thrust in the air over the vehicle's weight that a payload explains: a Crazyflie of 29 g carries 15 g.
+CARRIED = 1.5
+_QUADROTOR, _ROTORCRAFT = "2", {"2", "3", "4", "13", "14", "15", "29", "35", "43"}  # MAV_TYPE, of lift by rotors alone
+_LAWS = {"rotor_speed": "rotor_constant", "motor_command": "thrust_curve"}
+
+
+def vehicle_for(recording: Recording, given: str | None = None) -> Vehicle:
+    """The vehicle that is named, else the one the recording was flown with, else by what the recording measures.
+
+    That is cf21bl where rotor speeds are measured (brushless motors report them), else cf2.
+
+    Raises: as `crazyem.physics.folding.load`.
+    """
+    if given:
+        return folding.load(given)
+    stored = recording.metadata.get("vehicle", {}).get("toml")
+    if stored:
+        return folding.parse(stored, where=f"vehicle in {recording.path}")
+    speed = recording.signals.get("rotor_speed")
+    return folding.load("cf21bl" if speed is not None and speed.value.any() else "cf2")
+
+
+def kind_objection(recording: Recording) -> str:
+    """Why the models here are not of this kind of vehicle; "" where they are, or where nobody says what it is."""
+    told = recording.metadata.get("vehicle", {})
+    if told.get("mav_type", _QUADROTOR) == _QUADROTOR:
+        return ""
+    kind = told.get("kind", "vehicle of another kind")
+    return f"{'an' if kind[:1] in 'aeiou' else 'a'} {kind}, by its autopilot; the models here are of quadrotors"
+
+
+def is_rotorcraft(recording: Recording) -> bool:
+    """Whether rotors alone lift it, as far as anybody says."""
+    return recording.metadata.get("vehicle", {}).get("mav_type", _QUADROTOR) in _ROTORCRAFT
+
+
+def too_slow(recording: Recording, name: str) -> str:
+    """Why a command or rotor speed comes too rarely to say what the rotors did; "" where it does not."""
+    found = _measured(recording, name)
+    if found is None or found[0].size < 3:
+        return ""
+    period = float(np.median(np.diff(found[0])))
+    if period <= SLOWEST:
+        return ""
+    return f"{name} at {1.0 / period:.2g} Hz is too slow: steps of {period:.2g} s are gaps (at most {SLOWEST:g} s)"
+
+
+def signal_for(recording: Recording, vehicle: Vehicle) -> tuple[str, str]:
+    """The signal that this vehicle turns into thrust and ""; or "" and why there is none, one clause."""
+    other = kind_objection(recording)
+    if other:
+        return "", other
+    laws = {"rotor_speed": vehicle.rotor_constant is not None, "motor_command": bool(vehicle.thrust_curve)}
+    why = []
+    for name in ("rotor_speed", "motor_command", "wrench_command"):
+        if name not in recording.signals or not recording.signals[name].time.size:
+            continue
+        if _measured(recording, name) is None:
+            why.append(f"{name} holds no numbers, or only zeros: no sensor is connected")
+        elif too_slow(recording, name):
+            why.append(too_slow(recording, name))
+        elif not laws.get(name, True):
+            why.append(_lawless(name, vehicle))
+        else:
+            return name, ""
+    if why:
+        return "", "; ".join(why)
+    if "motor_request" in recording.signals or "mixer_command" in recording.signals:
+        return "", "only what was asked of the rotors is known, not the duty that was sent to them"
+    absent = recording.metadata.get("not_measured", {}).get("rotor_speed", "")
+    return "", "there are no motor commands, rotor speeds or commanded thrust" + (f" ({absent})" if absent else "")
+
+
+def _measured(recording: Recording, name: str) -> tuple[Array, Array] | None:
+    """Times (n,) and values (n, c) of a signal; None without numbers, or where no sensor is connected (all 0)."""
+    array = recording.signals.get(name)
+    found = None if array is None else sound_samples(array)
+    unconnected = found is not None and name in ("rotor_speed", "voltage") and not found[1].any()
+    return None if unconnected else found
+
+
+def _lawless(name: str, vehicle: Vehicle) -> str:
+    key = _LAWS[name]
+    have = [preset for preset in preset_names() if getattr(load_vehicle(preset), key)]
+    return (
+        f"{name} is recorded, but not the thrust it gives: vehicle {vehicle.name} has no {key} "
+        f"(--vehicle {' or '.join(have)} has one)"
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inputs:
+    """Commanded wrench: time (n,) s, wrench (n, 4) N and N m, which signal it is from, whether rotor lag is to come."""
+
+    time: Array
+    wrench: Array
+    signal: str
+    lagged: bool
+    voltage_known: bool
+
+
+def inputs_of(recording: Recording, vehicle: Vehicle) -> Inputs | str:
+    """The wrench the estimator would use, or why there is none."""
+    name, why = signal_for(recording, vehicle)
+    if not name:
+        return why
+    found = _measured(recording, name)
+    assert found is not None
+    time, value = found
+    if name == "rotor_speed":
+        return _sane(Inputs(time, wrench_from_speed(value, vehicle), name, False, True), vehicle)
+    lagged = vehicle.motor_time_constant > 0
+    if name == "wrench_command":
+        return Inputs(time, value, name, lagged, True)
+    voltage = _measured(recording, "voltage")
+    volts = np.full(time.size, ASSUMED_VOLTAGE) if voltage is None else held(voltage[0], voltage[1][:, 0], time)
+    return _sane(Inputs(time, wrench_from_command(value, volts, vehicle), name, lagged, voltage is not None), vehicle)
+
+
+def _sane(inputs: Inputs, vehicle: Vehicle) -> Inputs:
+    """Less the samples that claim far more thrust than the rotors have: no rotor did that."""
+    good = (inputs.wrench[:, 0] < MOST_THRUST * 4.0 * vehicle.thrust_max) & (np.diff(inputs.time, prepend=-np.inf) > 0)
+    return inputs if good.all() else replace(inputs, time=inputs.time[good], wrench=inputs.wrench[good])
+
+
+def carried(recording: Recording, vehicle: Vehicle, air: Airtime) -> float:
+    """Median thrust in the air over the vehicle's weight; NaN where the recording cannot say."""
+    name, _ = signal_for(recording, vehicle)
+    inputs = inputs_of(recording, vehicle) if name else ""
+    if isinstance(inputs, str) or not inputs.voltage_known or not air.known:
+        return math.nan
+    rows = air.covers(inputs.time)
+    return float(np.median(inputs.wrench[rows, 0])) / (vehicle.mass * GRAVITY) if rows.any() else math.nan
+
+
+def weight_objection(recording: Recording, vehicle: Vehicle, air: Airtime) -> str:
+    """A clause where by this vehicle the rotors carry far more or far less than its weight, with the ratio; else ""."""
+    ratio = carried(recording, vehicle, air)
+    if math.isnan(ratio) or 1.0 / CARRIED <= ratio <= CARRIED:
+        return ""
+    never = "never carry its weight: they carry" if ratio < 1.0 else "carry"
+    return f"by vehicle {vehicle.name} the rotors {never} {ratio:.2g} times the weight in the air; is it this vehicle?"
