@@ -58,8 +58,8 @@ def _no_flight(flight: Airtime) -> Finding:
 
 def _course(flight: Airtime) -> list[Finding]:
     """Where a recording begins or ends in the air, or holds several flights: the times in the air."""
-    starts = flight.lifting[0][0] <= flight.begin
-    ends = flight.lifting[-1][1] >= flight.end
+    at_work = flight.airborne if flight.by_height_alone else flight.lifting
+    starts, ends = at_work[0][0] <= flight.begin, at_work[-1][1] >= flight.end
     count = len(flight.airborne)
     where = "in the air" if flight.by_height_alone else "with rotors at work"
     remarks = []

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor.streams import COMMANDED, QUIET, listed, longest, runs
+from crazyem.doctor.thrust import VOLTAGE_UNKNOWN, flat_voltage
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.ordering import inside
@@ -49,8 +50,8 @@ def check(recording: Recording) -> list[Finding]:
                 idle.append(name)
         elif array.quantity in SHORTEST:
             stuck += _signal(recording, name, array, flight)
-        elif array.quantity == "voltage" and _constant(array.value) and flight.known and flight.airborne:
-            found.append(_flat_voltage(name, array))
+        elif name == "voltage" and flat_voltage(recording, flight):
+            found.append(_flat_voltage(recording, array))
     while stuck:
         first = stuck.pop(0)
         alike = [other for other in stuck if _alike(first, other)]
@@ -119,14 +120,21 @@ def _idle(names: list[str]) -> Finding:
     )
 
 
-def _flat_voltage(name: str, array: SignalArray) -> Finding:
+def _flat_voltage(recording: Recording, array: SignalArray) -> Finding:
+    volts = float(np.nanmedian(array.value))
+    matters = "motor_command" in recording.signals or "motor_request" in recording.signals
+    cost = (
+        f" Thrust from duty goes with its square, so the mass may be {percent(VOLTAGE_UNKNOWN)} off."
+        if matters
+        else " Nothing here needs it."
+    )
     return Finding(
         "frozen",
-        Grade.HARMLESS,
-        f"{name} is {float(np.nanmax(array.value)):.3f} V throughout, though rotors load a battery.",
-        signal=name,
-        evidence={"voltage_V": float(np.nanmax(array.value))},
-        advice="A supply or a simulation? Otherwise the thrust from duty and voltage is off as the battery sags.",
+        Grade.DEGRADES if matters else Grade.HARMLESS,
+        f"voltage is {volts:.3f} V throughout the flight, though rotors load a battery.{cost}",
+        signal="voltage",
+        evidence={"voltage_V": volts},
+        advice="Look at what writes it. A supply or a simulation may hold its voltage; a battery does not.",
     )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from crazyem.doctor import excitation
 from crazyem.doctor.excitation import Steps
-from crazyem.doctor.thrust import Inputs, inputs_of
+from crazyem.doctor.thrust import VOLTAGE_UNKNOWN, Inputs, inputs_of
 from crazyem.doctor.whitening import Fit, linear_fit
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.airborne import Airtime
@@ -31,7 +31,6 @@ DOUBTFUL = 1.0  # and beyond which it is taken with care
 WINDOW = 800  # samples the estimator looks back by default
 SHORTEST = 2.0  # s in the air
 ACCELEROMETER_OFFSET = 0.02  # of gravity: 20 mg, typical zero-g offset of a BMI088
-VOLTAGE_UNKNOWN = 0.15  # of thrust: a cell between 3.2 and 4.2 V, thrust as its square
 TYPICAL_DRAG = 0.2  # 1/s, force per mass and speed: what the drag of a Crazyflie's rotors is near (Foerster 2015)
 SCALE = "only its ratio to the rotors' thrust scale is seen"
 

@@ -1,4 +1,4 @@
-"""Check: values that are no numbers, and values that no drone can have."""
+"""Check: values that are no numbers, values that no drone can have, and leaps that no drone can make."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.doctor.leaps import leaps
 from crazyem.doctor.streams import QUIET, listed, places
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.ordering import sound_rows
@@ -54,14 +55,44 @@ LIMITS: dict[str, Limit] = {
     "specific_force": Limit(_largest, 0.0, 400.0, "more than 400 m/s^2"),
     "acceleration": Limit(_largest, 0.0, 400.0, "more than 400 m/s^2"),
     "motor_command": Limit(_extreme, -1e-6, 1.0 + 1e-6, "outside 0..1"),
+    "motor_request": Limit(_extreme, -1e-6, 1.0 + 1e-6, "outside 0..1"),
     "rotor_speed": Limit(_largest, 0.0, 8000.0, "faster than 8000 rad/s"),
     "voltage": Limit(lambda value: value[:, 0], 2.0, 26.0, "outside 2..26 V"),
 }
 
 
+UNCONNECTED = {"voltage": "battery monitor", "rotor_speed": "rotor speed sensor"}  # read 0 where they are not there
+# What else the motors of a drone are told in: (name, lowest, highest) of all samples.
+_UNITS = (("a pulse length in us", 800.0, 2300.0), ("percent", 1.5, 100.0), ("counts of 16 bits", 100.0, 65535.0))
+
+
+def _unit_of_motors(array: SignalArray, values: NDArray[np.float64]) -> str:
+    """What unit the numbers look like, as advice; "" for other quantities."""
+    if array.quantity not in ("motor_command", "motor_request"):
+        return ""
+    low, high = float(values.min()), float(values.max())
+    running = float(np.median(values))
+    for unit, least, most in _UNITS:
+        if least <= running and high <= most and (low >= least or unit != _UNITS[0][0]):
+            return f"The numbers look like {unit}: say so in the mapping; 0 is off and 1 is full."
+    return ""
+
+
+def _unconnected(name: str, array: SignalArray) -> Finding:
+    sensor = UNCONNECTED[array.quantity]
+    return Finding(
+        "numbers",
+        Grade.HARMLESS,
+        f"{name} reads 0 in all of its {array.time.size} samples: no {sensor} is connected, {name} is not measured.",
+        signal=name,
+        evidence={"samples": array.time.size},
+        advice="Nothing to do, unless you expected it.",
+    )
+
+
 @QUIET
 def check(recording: Recording) -> list[Finding]:
-    """NaN and infinities that are the file's own, impossible values, stamps that are no numbers."""
+    """NaN and infinities that are the file's own, impossible values and leaps, stamps that are no numbers."""
     found: list[Finding] = []
     unmapped: list[tuple[str, int]] = []
     for name, array in recording.signals.items():
@@ -78,6 +109,8 @@ def check(recording: Recording) -> list[Finding]:
         limit = LIMITS.get(array.quantity)
         if limit is not None:
             found += _impossible(name, array, limit, sound)
+        if array.quantity == "position" and "velocity" not in recording.signals:
+            found += leaps(name, array, furthest=LIMITS["position"].high)
     if unmapped:
         names = [name for name, _ in unmapped]
         found.append(
@@ -131,6 +164,8 @@ def _impossible(name: str, array: SignalArray, limit: Limit, sound: Rows) -> lis
         bad = ((measure < limit.low) | (measure > limit.high)) & sound
     if not bad.any():
         return []
+    if array.quantity in UNCONNECTED and not array.value[sound].any():
+        return [_unconnected(name, array)]
     share = float(bad.mean())
     good = measure[sound & ~bad]
     worst = measure[bad]
@@ -139,6 +174,7 @@ def _impossible(name: str, array: SignalArray, limit: Limit, sound: Rows) -> lis
     fix: Fix | None = Fix("mark", (name,), rows=np.flatnonzero(bad))
     if share > 0.2:
         advice, fix = "Check the unit and what the column means; do not use the signal as it is.", None
+        advice = _unit_of_motors(array, measure[sound]) or advice
         if array.quantity == "voltage" and 2.0 <= float(np.median(measure[sound])) / 1000.0 <= 26.0:
             advice = "The numbers are millivolts; scale by 0.001 (--fix)."
             fix = Fix("scale", (name,), factor=(0.001,))
@@ -149,7 +185,7 @@ def _impossible(name: str, array: SignalArray, limit: Limit, sound: Rows) -> lis
         Finding(
             "numbers",
             Grade.UNUSABLE if share > 0.2 else Grade.DEGRADES,
-            f"{name} is {limit.words} in {int(bad.sum())} of {bad.size} samples (worst {worst_value:.4g}).",
+            f"{name} is {limit.words} in {int(bad.sum())} of {bad.size} samples (worst {worst_value:.6g}).",
             signal=name,
             intervals=places(array.time, bad),
             evidence=evidence,

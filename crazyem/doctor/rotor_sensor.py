@@ -2,7 +2,8 @@
 
 A rotor cannot halve its speed within a hundredth of a second, a sensor can. So a stretch is a fault if the speed leaps
 by the fraction where it begins, leaps back where it ends, and lies meanwhile near that fraction of what the duty, or
-the other rotors, make one expect. A fraction for the whole flight is told from the expectation alone.
+the other rotors, make one expect. A fraction for the whole flight is told from the expectation alone. Dropouts to zero
+are looked for beside it: a sensor that misses every second pulse often misses all of them for a while.
 """
 
 from dataclasses import dataclass
@@ -60,13 +61,15 @@ def _signal(recording: Recording, name: str, array: SignalArray, rows: NDArray[n
     sampled = cadence(array.time).period < SLOWEST
     for rotor in range(speed.shape[1]):
         own = ratio[:, rotor]
-        whole = _whole_flight(own[rows])
+        turning = own[rows & (own >= ZERO)]
+        whole = _whole_flight(turning)
+        usual = float(np.median(turning)) if whole else 1.0
         if whole:
-            found.append(_constant(name, array, rotor, whole, float(np.nanmedian(own[rows]))))
-        elif sampled:
-            zero = _stopped(array.time, np.abs(speed[:, rotor]), own, rows)
-            if zero.any():
-                found.append(_finding(name, array, rotor, zero, "zero", 0.0, rows))
+            found.append(_constant(name, array, rotor, whole, usual))
+        zero = _stopped(own / usual, rows)
+        if zero.any():
+            found.append(_finding(name, array, rotor, zero, "zero", 0.0, rows))
+        if sampled and not whole:
             leaps = _leaps(array.time, np.abs(speed[:, rotor]), own, rows)
             if leaps is None:
                 continue
@@ -178,18 +181,19 @@ def _between(leaps: _Leaps, fraction: float) -> NDArray[np.int64]:
     return np.concatenate(found)
 
 
-def _stopped(
-    time: NDArray[np.float64], speed: NDArray[np.float64], ratio: NDArray[np.float64], rows: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """(n,) True where the speed is about zero right after it was not."""
-    flags = np.zeros(time.size, bool)
-    with np.errstate(invalid="ignore"):
-        low = rows & (ratio < ZERO)
+def _stopped(ratio: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(n,) True where a rotor stands still that turned before or turns after.
+
+    `ratio` (n,) of the speed to what is usual for this sensor; what the sensor does not know (NaN) is no evidence.
+    """
+    flags = np.zeros(ratio.size, bool)
+    known = np.flatnonzero(np.isfinite(ratio))
+    low = ratio[known] < ZERO
     for first, last in runs(low):
-        before = ratio[max(first - 1, 0)]
-        if first > 0 and before > 0.5 and np.isfinite(speed[first]):
-            flags[first:last] = True
-    return flags
+        beside = [k for k in (first - 1, last) if 0 <= k < known.size]
+        if (ratio[known[beside]] > 0.5).any():
+            flags[known[first:last]] = True
+    return flags & rows
 
 
 def _whole_flight(ratio: NDArray[np.float64]) -> str:

@@ -64,6 +64,11 @@ class Stream:
         return all(array.quantity in COMMANDED for array in self.arrays)
 
     @property
+    def used(self) -> bool:
+        """True if anything here uses one of its signals."""
+        return any(array.quantity for array in self.arrays)
+
+    @property
     def slow(self) -> bool:
         """True if it varies so slowly that a lost sample does not matter: the voltage alone."""
         return all(array.quantity == "voltage" for array in self.arrays)

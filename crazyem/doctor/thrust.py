@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 SLOWEST = 0.1
 MOST_THRUST = 2.0  # of what the vehicle file says of its rotors, above which a sample is no thrust
 ASSUMED_VOLTAGE = 3.7  # V, where none is logged
+VOLTAGE_UNKNOWN = 0.15  # of thrust: a cell between 3.2 and 4.2 V, thrust as its square
+STEADY = 5.0  # s in the air over which the voltage of a battery changes by more than its resolution
 # Thrust in the air over the vehicle's weight that a payload explains: a Crazyflie of 29 g carries 15 g.
 CARRIED = 1.5
 _QUADROTOR, _ROTORCRAFT = "2", {"2", "3", "4", "13", "14", "15", "29", "35", "43"}  # MAV_TYPE, of lift by rotors alone
@@ -123,6 +125,15 @@ class Inputs:
     signal: str
     lagged: bool
     voltage_known: bool
+
+
+def flat_voltage(recording: Recording, air: Airtime) -> bool:
+    """Whether the voltage is one number in all of a flight of 5 s or more, as that of a battery never is."""
+    voltage = _measured(recording, "voltage")
+    if voltage is None or not air.known or air.seconds < STEADY:
+        return False
+    flying = voltage[1][air.covers(voltage[0]), 0]
+    return flying.size > 1 and bool((flying == flying[0]).all())
 
 
 def inputs_of(recording: Recording, vehicle: Vehicle) -> Inputs | str:
