@@ -46,6 +46,9 @@ def _parser() -> argparse.ArgumentParser:
         help="speak MAVLink as a PX4 would, instead of CRTP: to a ground station, to whoever calls, or at a "
         "pseudo-terminal whose name is printed (repeatable: all hear the same, all may command)",
     )
+    parser.add_argument(
+        "--storage", type=Path, help="JSON file of the stored (persistent) parameters: they survive a restart in it"
+    )
     parser.add_argument("--truth", type=Path, help="write the true motion to this CSV file, 100 rows per second")
     return parser
 
@@ -54,6 +57,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the simulator until SIGINT or SIGTERM; 0 then, 2 after a mistake of the user, told in one sentence."""
     arguments = _parser().parse_args(argv)
     try:
+        if arguments.storage and (arguments.swarm is not None or arguments.mavlink is not None):
+            other = "--mavlink" if arguments.mavlink is not None else "--swarm"
+            raise FirmwareSimError(f"--storage is for one Crazyflie: leave it out with {other}")
         if arguments.mavlink is not None:
             from firmware_sim.mavlink.run import run as run_mavlink
 
@@ -77,8 +83,10 @@ def _run(arguments: argparse.Namespace) -> None:
         sock = stack.enter_context(contextlib.closing(bind(arguments.host, arguments.port)))
         from firmware_sim.flight import Flight  # here: compiled code takes a while to load, a port in use should not
         from firmware_sim.scenario import load_scenario
+        from firmware_sim.services.storage import Storage
 
         scenario = load_scenario(arguments.scenario)
+        storage = Storage(arguments.storage)
         truth = None
         if arguments.truth:
             try:
@@ -86,7 +94,13 @@ def _run(arguments: argparse.Namespace) -> None:
             except OSError as error:
                 raise ServerError(f"cannot write {arguments.truth}: {error.strerror}") from None
         flight = Flight(scenario, arguments.seed)
-        firmware = Firmware(flight, platform=scenario.platform, seed=arguments.seed, parameters=scenario.parameters)
+        firmware = Firmware(
+            flight,
+            platform=scenario.platform,
+            seed=arguments.seed,
+            parameters=scenario.parameters,
+            storage=storage,
+        )
         firmware.advance(1)  # compiles what is not compiled yet, before the clock starts
         air = Air(scenario.link.loss, scenario.link.burst, arguments.seed)
         server = Server(firmware, sock, speed=arguments.speed, truth=truth, air=air)

@@ -9,7 +9,7 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from firmware_sim import tables, wire
+from firmware_sim import contents, tables, wire
 from firmware_sim.commander.arbiter import HIGH_LEVEL, Arbiter
 from firmware_sim.commander.decode import RpytDecoder
 from firmware_sim.commander.supervisor import PERIOD as SUPERVISOR_PERIOD
@@ -25,40 +25,20 @@ from firmware_sim.services.memory import MemoryService
 from firmware_sim.services.param import ParamService
 from firmware_sim.services.platform import FIRMWARE_VERSION, PlatformService
 from firmware_sim.services.setpoint import SetpointService
+from firmware_sim.services.storage import Storage
 from firmware_sim.tables import Slot
 
-# Parameters that clients expect and that describe hardware this drone does not have, or has no more than one value for.
-_FIXED_PARAMETERS = {
-    "system.selftestPassed": 1.0,
-    "imu_sensors.HMC5883L_SIM": 1.0,
-    "imu_sensors.MS5611_SIM": 1.0,
-    "firmware.revision0": float(0x2A18FC29),
-    "firmware.revision1": 0.0,
-    "firmware.modified": 1.0,
-    "memTst.resetW": 0.0,
-    # cfclient cannot do without the deck group: no decks attached.
-    **{
-        f"deck.{name}": 0.0
-        for name in (
-            "bcZRanger",
-            "bcZRanger2",
-            "bcFlow",
-            "bcFlow2",
-            "bcLighthouse4",
-            "bcLoco",
-            "bcDWM1000",
-            "bcLedRing",
-        )
-    },
-}
-_FLIGHT_MODES = {
-    "flightmode.althold": 0.0,
-    "flightmode.poshold": 0.0,
-    "flightmode.posSet": 0.0,
-    "flightmode.yawMode": 2.0,
-    "flightmode.stabModeRoll": 1.0,
-    "flightmode.stabModePitch": 1.0,
-    "flightmode.stabModeYaw": 0.0,
+# Log variables that stand still here and are not 0 on the ground of a desk: rates [Hz] of the loops, and the state of
+# the complementary estimator, which does not run.
+_CONSTANT_LOG = {
+    "stabilizer.rtStab": 1000.0,
+    "kalman.rtPred": 100.0,
+    "kalman.rtUpdate": 1000.0,
+    "kalman.rtFinal": 1000.0,
+    "estimator.rtApnd": 100.0,
+    "sensfusion6.qw": 1.0,
+    "sensfusion6.accZbase": 1.0,
+    "pm.temp": 25.0,
 }
 
 
@@ -91,12 +71,29 @@ class FlightLike(Protocol):
 
 
 class Firmware:
-    """A drone that has booted at tick 0. platform: "cf2" or "cf21bl"; parameters: boot values that replace defaults.
+    """A drone that has booted at tick 0.
 
-    Raises ScenarioError when a boot value names no parameter.
+    Args:
+        flight: what flies.
+        platform: "cf2" or "cf21bl".
+        seed: of the timers' jitter.
+        parameters: boot values that replace defaults.
+        storage: what survives a reboot; its stored parameters replace boot values. None: empty.
+
+    Raises:
+        ScenarioError: a boot value names no parameter.
     """
 
-    def __init__(self, flight: FlightLike, *, platform: str, seed: int, parameters: Mapping[str, float] | None = None):
+    def __init__(
+        self,
+        flight: FlightLike,
+        *,
+        platform: str,
+        seed: int,
+        parameters: Mapping[str, float] | None = None,
+        storage: Storage | None = None,
+    ):
+        boot = contents.defaults(list(contents.PARAMETERS), platform)
         self.flight = flight
         self.outbox: deque[tuple[bytes, bool]] = deque()  # datagram, and whether it may be dropped
         self._console: list[str] = []
@@ -106,8 +103,8 @@ class Firmware:
         )
         self.high_level = HighLevelService(flight.log, self._tick)
         self.arbiter = Arbiter(low_level=self.high_level.planner.stop, relaxed=self.high_level.tell_state)
-        own_log = tables.slots({"crtp.rxRate": 0.0, "crtp.txRate": 0.0, "memTst.errCntW": 0.0})
-        own_param = tables.slots({**_FIXED_PARAMETERS, **_FLIGHT_MODES})
+        own_log = tables.slots(dict.fromkeys(contents.LOG, 0.0) | _CONSTANT_LOG)
+        own_param = tables.slots(boot | dict.fromkeys(tables.DECKS, 0.0))
         log = {**own_log, **self.supervisor.log, **flight.log}
         param = {**own_param, **self.supervisor.param, **self.high_level.param, **flight.param}
         # A parameter that the flight has too must be the flight's everywhere.
@@ -115,9 +112,9 @@ class Firmware:
         self._rates = (own_log["crtp.rxRate"], own_log["crtp.txRate"])
         self._packets = [0, 0]  # received and sent since the last update of the rates
 
-        defaults = {name: float(array[index]) for name, (array, index) in param.items()} | flight.param_defaults
+        defaults = boot | flight.param_defaults
         self.log = LogService(tables.log_table(log), seed)
-        self.param = ParamService(tables.param_table(param), defaults, self._written)
+        self.param = ParamService(tables.param_table(param), defaults, self._written, storage or Storage())
         self.memory = MemoryService(self.high_level.memory, own_log["memTst.errCntW"])
         self.platform = PlatformService(platform, self.supervisor)
         self.localisation = LocalisationService(flight.external_position, flight.external_pose, self.supervisor)
@@ -128,6 +125,7 @@ class Firmware:
             if item is None:
                 raise ScenarioError(f"the scenario sets the parameter {name}, which this firmware does not have")
             self.param.set(item, value)
+        self.param.restore()
         self._say("SYS: ----------------------------\n")
         self._say(f"SYS: {platform} is up and running!\n")
         self._say(f"SYS: {FIRMWARE_VERSION}\n")
@@ -188,6 +186,8 @@ class Firmware:
                 self.log.table.by_name["memTst.errCntW"].index,
             )
             array[index] = 0.0
+        if name == "system.storageReformat":
+            self.param.reformat()
         if name in self.flight.param:
             self.flight.parameter_written(name)
 

@@ -11,7 +11,8 @@ from typing import Any
 from numba import njit
 
 _ROOT = Path(__file__).parent
-_SOURCES = sorted(p for folder in ("plant", "controllers", "commander") for p in (_ROOT / folder).rglob("*.py"))
+_FOLDERS = ("plant", "controllers", "commander")
+_SOURCES = sorted([_ROOT / "contents.py", *(p for folder in _FOLDERS for p in (_ROOT / folder).rglob("*.py"))])
 _STAMP = tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in _SOURCES)
 
 

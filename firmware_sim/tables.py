@@ -1,7 +1,7 @@
 """The tables of contents of log variables and parameters, their storage types, and values in and out of bytes.
 
-Names, types and flags as in crazyflie-firmware (log.h, param.h; PARAM_ADD and LOG_ADD of each module). A name that is
-not listed here is a float, which most of the firmware's variables are.
+Types and flags are those of the real tables (contents.py); type bytes and conversions as in crazyflie-firmware (log.h,
+param.h, log.c). A name that no table lists is a float, which most of the firmware's variables are.
 """
 
 import math
@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from firmware_sim import contents
+
 Slot = tuple[np.ndarray, int]  # where a value lives: a float64 array and an index into it
 
 LOG_TYPE = {"u8": 1, "u16": 2, "u32": 3, "i8": 4, "i16": 5, "i32": 6, "float": 7, "fp16": 8}
@@ -20,76 +22,18 @@ FORMAT = {"u8": "<B", "u16": "<H", "u32": "<I", "i8": "<b", "i16": "<h", "i32": 
 SIZE = {name: struct.calcsize(form) for name, form in FORMAT.items()}
 LOG_TYPE_NAME = {code: name for name, code in LOG_TYPE.items()}
 
-PARAM_READ_ONLY, PARAM_EXTENDED = 0x40, 0x10
+PARAM_READ_ONLY, PARAM_CORE, PARAM_EXTENDED = 0x40, 0x20, 0x10
 MAX_NAME = 24  # len(group) + len(name), so that a table item fits a packet
 
-# "group type names", everything that is not a float.
-_LOG_TYPES = """
-crtp u16 rxRate txRate
-sys i8 testLogParam
-sys u8 canfly isFlying isTumbled
-memTst u32 errCntW
-supervisor u16 info
-locSrvZ u16 tick
-motor i32 m1req m2req m3req m4req
-motor u16 m1 m2 m3 m4 m1_rpm m2_rpm m3_rpm m4_rpm
-sensfusion6 u8 isInit isCalibrated
-stateEstimateZ i16 x y z vx vy vz ax ay az rateRoll ratePitch rateYaw
-stateEstimateZ u32 quat
-controller i16 ctr_yaw
-stabilizer u32 intToOut
-ctrltargetZ i16 x y z vx vy vz ax ay az
-ctrltarget u8 mode_x mode_y mode_z mode_roll mode_pitch mode_yaw mode_quat
-pm u16 vbatMV
-pm i8 state
-pm u8 batteryLevel
-"""
-
-_PARAM_TYPES = """
-system u8 storageStats storageReformat assertInfo testLogParam doAssert taskDump
-system i8 selftestPassed
-imu_sensors u8 HMC5883L MS5611 BMM150 BMP388 HMC5883L_SIM MS5611_SIM
-crtpsrv u16 echoDelay
-memTst u8 resetW
-supervisor u8 infdmp tmblChckEn
-supervisor u16 prefltTimeout landedTimeout spinupTimeout
-stabilizer u8 stop estimator controller
-commander u8 enHighLevel
-flightmode u8 althold poshold posSet yawMode stabModeRoll stabModePitch stabModeYaw
-locSrv u8 enRangeStreamFP32 enLhAngleStream enLhMtchStm maxTimeLhMtchStm minBsLhMtchStm
-kalman u8 resetEstimation robustTdoa robustTwr
-pid_rate i8 rateFiltEn
-pid_attitude i8 attFiltEn
-posCtlPid u16 thrustBase thrustMin
-ctrlINDI u8 outerLoopActive
-powerDist u32 idleThrust
-motorPowerSet u8 enable
-motorPowerSet u16 m1 m2 m3 m4
-hlCommander u8 groupmask
-firmware u32 revision0
-firmware u16 revision1
-firmware u8 modified
-deck u8 bcZRanger bcZRanger2 bcFlow bcFlow2 bcLighthouse4 bcLoco bcDWM1000 bcLedRing
-"""
-
-_READ_ONLY_GROUPS = {"deck", "firmware", "imu_sensors"}
-_READ_ONLY = {"system.selftestPassed"}
-_PERSISTENT_GROUPS = {"ctrlMel", "pid_rate", "pid_attitude", "posCtlPid", "velCtlPid", "ctrlINDI", "posCtrlIndi"}
-_PERSISTENT = {"powerDist.idleThrust"} | {
-    f"supervisor.{name}" for name in ("prefltTimeout", "landedTimeout", "tmblChckEn", "spinupTimeout", "crashDetectGs")
-}
-
-
-def _parse(facts: str) -> dict[str, str]:
-    types = {}
-    for line in facts.split("\n"):
-        if line:
-            group, kind, *names = line.split()
-            types.update({f"{group}.{name}": kind for name in names})
-    return types
-
-
-_LOG_KIND, _PARAM_KIND = _parse(_LOG_TYPES), _parse(_PARAM_TYPES)
+# What a drone has that the build for a PC (contents.py) has not. Any other name is a float.
+_LOG_EXTRA = dict.fromkeys((f"motor.m{n}_rpm" for n in range(1, 5)), "u16")
+DECKS = tuple(  # cfclient cannot do without the group
+    f"deck.{name}"
+    for name in ("bcZRanger", "bcZRanger2", "bcFlow", "bcFlow2", "bcLighthouse4", "bcLoco", "bcDWM1000", "bcLedRing")
+)
+_LOG_KIND = contents.LOG | _LOG_EXTRA
+_PARAM = contents.PARAMETERS | dict.fromkeys(DECKS, contents.Parameter("u8", "rc", 0.0))
+_FLAGS = {"r": PARAM_READ_ONLY, "c": PARAM_CORE, "p": PARAM_EXTENDED}
 
 
 @dataclass(frozen=True)
@@ -160,10 +104,9 @@ def param_table(slots: Mapping[str, Slot]) -> Table:
     """The parameter table over live values, slots: name -> (float64 array, index)."""
     items = []
     for name in _grouped(slots):
-        kind, group = _PARAM_KIND.get(name, "float"), name.split(".", 1)[0]
-        flags = PARAM_READ_ONLY if group in _READ_ONLY_GROUPS or name in _READ_ONLY else 0
-        flags |= PARAM_EXTENDED if group in _PERSISTENT_GROUPS or name in _PERSISTENT else 0
-        items.append(Item(name, kind, PARAM_TYPE[kind] | flags, *slots[name]))
+        facts = _PARAM.get(name, contents.Parameter("float", "", 0.0))
+        flags = sum(_FLAGS[flag] for flag in facts.flags)
+        items.append(Item(name, facts.kind, PARAM_TYPE[facts.kind] | flags, *slots[name]))
     return Table(items, b"param")
 
 

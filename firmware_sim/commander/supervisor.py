@@ -9,6 +9,7 @@ from enum import IntEnum
 
 import numpy as np
 
+from firmware_sim import contents
 from firmware_sim.commander import setpoint as sp
 from firmware_sim.tables import Slot, slots
 
@@ -43,13 +44,8 @@ _MOTORS = {State.SPINNING_UP, State.READY, State.FLYING, State.LANDED, State.LEV
 _CAN_FLY = _MOTORS - {State.SPINNING_UP}
 _KEEP_ARMED = _MOTORS
 
-PARAMETERS = {
-    "supervisor.prefltTimeout": 30000.0,  # ms armed without flying before the drone disarms
-    "supervisor.landedTimeout": 3000.0,  # ms landed before it disarms
-    "supervisor.tmblChckEn": 1.0,
-    "supervisor.spinupTimeout": 2000.0,  # ms the rotors may take to spin up
-    "stabilizer.stop": 0.0,
-}
+_LIMITS = ("prefltTimeout", "landedTimeout", "tmblChckEn", "spinupTimeout", "crashDetectGs")
+_PARAMETERS = ("stabilizer.stop", *(f"supervisor.{name}" for name in _LIMITS))
 _VARIABLES = ("supervisor.info", "supervisor.accNorm", "sys.canfly", "sys.isFlying", "sys.isTumbled")
 
 
@@ -68,7 +64,7 @@ class Supervisor:
         clock: Callable[[], int],
         console: Callable[[str], None],
     ):
-        self.log, self.param = slots(dict.fromkeys(_VARIABLES, 0.0)), slots(PARAMETERS)
+        self.log, self.param = slots(dict.fromkeys(_VARIABLES, 0.0)), slots(contents.defaults(_PARAMETERS))
         self._acc = [log[f"acc.{axis}"] for axis in "xyz"]
         self._pwm = [log[f"motor.m{n}"] for n in range(1, 5)]
         self._rpm = [log[f"motor.m{n}_rpm"] for n in range(1, 5) if f"motor.m{n}_rpm" in log]
@@ -186,6 +182,10 @@ class Supervisor:
 
     def _is_tumbled(self, tick: int) -> bool:
         x, y, z = (float(array[index]) for array, index in self._acc)
+        limit, norm = self._get("supervisor.crashDetectGs"), math.hypot(x, y, z)
+        if limit > 0.0 and abs(norm - 1.0) > limit:
+            self._console(f"SUP: Crash detected @ {norm:.2f} Gs (max {limit:.2f})\n")
+            return True
         if max(abs(x), abs(y), abs(z)) < _FREE_FALL:
             self._tumble_since = None
         if z >= _TILTED:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from firmware_sim import contents
 from firmware_sim.commander import setpoint as sp
 from firmware_sim.commander.planner import Evaluation, Planner, PlannerState
 from firmware_sim.commander.polynomials import unpack_compressed, unpack_poly4d
@@ -23,12 +24,8 @@ _COMMANDS = set(range(14))
 MAX_TRAJECTORIES = 10
 POLY4D, COMPRESSED = 0, 1
 
-PARAMETERS = {
-    "hlCommander.vtoff": 0.5,  # m/s, take-off velocity when a command names none
-    "hlCommander.vland": 0.5,  # m/s
-    "hlCommander.groupmask": 0.0,
-    "commander.enHighLevel": 0.0,  # no effect, but clients set it
-}
+# enHighLevel has no effect, but clients set it
+_PARAMETERS = ("hlCommander.vtoff", "hlCommander.vland", "hlCommander.groupmask", "commander.enHighLevel")
 
 
 def setpoint_of(goal: Evaluation) -> np.ndarray:
@@ -48,7 +45,7 @@ class HighLevelService:
     """Commands in, setpoints out; `state` is the flight's estimate, `memory` the trajectory memory."""
 
     def __init__(self, state: Mapping[str, Slot], clock: Callable[[], int]):
-        self.param = slots(PARAMETERS)
+        self.param = slots(contents.defaults(_PARAMETERS))
         self.planner = Planner()
         self.memory = bytearray(TRAJECTORY_SIZE)
         self._clock = clock

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 
 from firmware_sim.services.log import toc_reply
+from firmware_sim.services.storage import Storage
 from firmware_sim.tables import SIZE, Item, Table, pack, unpack
 from firmware_sim.wire import EACCES, EINVAL, ENOENT
 
@@ -12,13 +13,27 @@ PERSISTENT = 1  # extended type
 
 
 class ParamService:
-    """Reads and writes live values; `stored` is the drone's EEPROM, as long as this process lives."""
+    """Reads and writes live values; `storage` holds what a client has stored for the next boot."""
 
-    def __init__(self, table: Table, defaults: Mapping[str, float], written: Callable[[str], None]):
+    def __init__(self, table: Table, defaults: Mapping[str, float], written: Callable[[str], None], storage: Storage):
         self.table = table
         self._defaults = dict(defaults)
         self._written = written
-        self.stored: dict[str, float] = {}
+        self.storage = storage
+
+    def restore(self) -> None:
+        """Give stored parameters their stored values, as the firmware does while booting."""
+        for name, value in list(self.storage.values.items()):
+            item = self.table.by_name.get(name)
+            if item is not None and item.persistent:
+                self.set(item, value)
+
+    def reformat(self) -> None:
+        """Forget all that is stored, once system.storageReformat asks for it."""
+        item = self.table.by_name["system.storageReformat"]
+        if item.value:
+            self.storage.clear()
+            item.array[item.index] = 0.0
 
     def handle(self, channel: int, data: bytes) -> list[tuple[int, bytes]]:
         """Replies (channel, data) to a packet on the parameter port."""
@@ -57,7 +72,7 @@ class ParamService:
         if command not in {EXTENDED_V1, STORE, STATE, CLEAR, DEFAULT_V1, EXTENDED, DEFAULT} or len(data) < 3:
             return b""
         head, item = data[:3], self.table.get(int.from_bytes(data[1:3], "little"))
-        if item is None or (command in {STORE, STATE, CLEAR, EXTENDED} and not item.persistent):
+        if item is None or not self._has(command, item):
             return head + bytes((ENOENT,))
         default = pack(self._defaults.get(item.name, 0.0), item.kind)
         if command == EXTENDED_V1:
@@ -69,14 +84,21 @@ class ParamService:
         if command == DEFAULT:
             return head + b"\0" + default
         if command == STORE:
-            self.stored[item.name] = item.value
+            self.storage.store(item.name, unpack(pack(item.value, item.kind), item.kind))
             return head + b"\0"
         if command == CLEAR:
-            self.stored.pop(item.name, None)
+            self.storage.remove(item.name)
             return head + b"\0"
-        if item.name in self.stored:
-            return head + b"\x01" + default + pack(self.stored[item.name], item.kind)
+        if item.name in self.storage.values:
+            return head + b"\x01" + default + pack(self.storage.values[item.name], item.kind)
         return head + b"\0" + default
+
+    @staticmethod
+    def _has(command: int, item: Item) -> bool:
+        """Whether the parameter has what the command asks for: only persistent ones can be stored."""
+        if command in {STORE, CLEAR, EXTENDED}:
+            return item.persistent
+        return not (item.read_only and command in {DEFAULT_V1, DEFAULT})
 
     def _set_by_name(self, data: bytes) -> bytes:
         """`00 group NUL name NUL type value` -> `00 group NUL name NUL error`."""

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_sim import tables, wire
+from firmware_sim import contents, tables, wire
 from firmware_sim.firmware import Firmware
 from firmware_sim.flight import Flight
 from firmware_sim.scenario import load_scenario
@@ -85,33 +85,78 @@ def test_types_and_flags_follow_the_firmware():
     )
     assert {item.name: item.type_byte for item in param.items} == {
         "ctrlLee.mass": 0x06,  # not persistent
-        "ctrlMel.mass": 0x16,
-        "stabilizer.controller": 0x08,
-        "deck.bcFlow": 0x48,
-        "powerDist.idleThrust": 0x1A,
+        "ctrlMel.mass": 0x36,
+        "stabilizer.controller": 0x28,
+        "deck.bcFlow": 0x68,
+        "powerDist.idleThrust": 0x3A,
     }
 
 
-REAL = {"uint8_t": "u8", "uint16_t": "u16", "uint32_t": "u32", "int8_t": "i8", "int16_t": "i16", "int32_t": "i32"}
+SHARED = Path(__file__).parents[3] / "shared"
+C_TYPE = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t", "i8": "int8_t", "i16": "int16_t", "i32": "int32_t",
+          "float": "float"}  # fmt: skip
+RPM = [f"motor.m{n}_rpm" for n in range(1, 5)]
 
 
-@pytest.mark.parametrize("platform", ["cf2", "cf21bl"])
-def test_every_name_that_the_real_firmware_has_is_of_its_type(platform, tmp_path):
-    path = Path(__file__).parents[3] / "shared" / "facts" / "toc_head.json"
+@pytest.fixture(scope="module", params=["cf2", "cf21bl"])
+def drone(request, tmp_path_factory):
+    path = tmp_path_factory.mktemp("scenario") / "scenario.toml"
+    path.write_text(f'platform = "{request.param}"\n')
+    scenario = load_scenario(path)
+    return request.param, Firmware(Flight(scenario, 0), platform=request.param, seed=0)
+
+
+def types(table):
+    return {item.name: C_TYPE[item.kind] for item in table.items}
+
+
+def test_the_tables_are_the_real_ones_of_2026_08_with_what_a_drone_has_besides(drone):
+    """354 log variables and 245 parameters with the real ids; ours come after them, rotor speeds within their group."""
+    platform, firmware = drone
+    log, param = types(firmware.log.table), types(firmware.param.table)
+    assert (len(contents.LOG), len(contents.PARAMETERS)) == (354, 245)
+    own = [name for name in log if name not in contents.LOG]
+    assert {name.split(".")[0] for name in own} - {"motor"} == {"ctrlLqg"}
+    assert [name for name in own if name.startswith("motor.")] == (RPM if platform == "cf21bl" else [])
+    assert [name for name in log if name in contents.LOG] == list(contents.LOG)
+    assert list(param)[:245] == list(contents.PARAMETERS)
+    assert {name.split(".")[0] for name in list(param)[245:]} == {"ctrlLqg", "deck"}
+
+
+def test_the_tables_agree_with_the_dump_of_the_real_firmware(drone):
+    """That dump is of a build with the unscented filter and without the power management of a drone."""
+    path = SHARED / "facts" / "toc_head.json"
     if not path.exists():
         pytest.skip("the dump of the real tables of contents is not at hand")
     real = json.loads(path.read_text())
-    scenario_file = tmp_path / "scenario.toml"
-    scenario_file.write_text(f'platform = "{platform}"\n')
-    scenario = load_scenario(scenario_file)
-    firmware = Firmware(Flight(scenario, 0), platform=platform, seed=0)
-    for kind, table in (("log", firmware.log.table), ("param", firmware.param.table)):
-        known = [item for item in table.items if item.name in real[kind]]
-        wrong = [i.name for i in known if i.kind != REAL.get(real[kind][i.name], real[kind][i.name])]
-        assert not wrong
-        assert len(known) > 50
-        ours = {item.name.split(".")[0] for item in table.items} - {name.split(".")[0] for name in real[kind]}
-        assert ours <= {"ctrlLqg", "deck", "crtp"}  # nothing invented but the out-of-tree controller
+    filters = ("ukf.", "navFilter.", "sensorFilter.")
+    for ours, theirs in (
+        (contents.LOG, real["log"]),
+        ({n: p.kind for n, p in contents.PARAMETERS.items()}, real["param"]),
+    ):
+        assert {name for name in theirs if not name.startswith(filters)} <= set(ours)
+        assert {name.split(".")[0] for name in set(ours) - set(theirs)} <= {"pm"}
+        assert all(C_TYPE[kind] == theirs[name] for name, kind in ours.items() if name in theirs)
+    assert sum("p" in contents.PARAMETERS[name].flags for name in real["param"] if name in contents.PARAMETERS) == 116
+
+
+@pytest.mark.parametrize(("flight", "platform"), [("A_excite_2", "cf2"), ("D_fig8_3", "cf21bl")])
+def test_order_types_and_boot_values_are_those_read_from_the_real_firmware(flight, platform):
+    path = SHARED / "recordings" / "real_firmware_flights" / f"{flight}.mcap"
+    if not path.exists():
+        pytest.skip("the flights of the real firmware are not at hand")
+    from mcap.reader import make_reader
+
+    with path.open("rb") as stream:
+        told = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
+    assert told["log_types"] == {name: C_TYPE[kind] for name, kind in contents.LOG.items()}
+    assert list(told["log_types"]) == list(contents.LOG)
+    assert told["parameter_types"] == {name: C_TYPE[p.kind] for name, p in contents.PARAMETERS.items()}
+    assert list(told["parameter_types"]) == list(contents.PARAMETERS)
+    boot = contents.defaults(list(contents.PARAMETERS), platform)
+    assert {n: np.float32(v) for n, v in told["parameter_values"].items()} == {
+        n: np.float32(v) for n, v in boot.items()
+    }
 
 
 def test_checksums_tell_tables_apart():
