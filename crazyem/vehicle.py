@@ -12,6 +12,9 @@ File format (all SI; `presets/*.toml` are examples):
     motor_time_constant = 0.05        # s, first-order lag of rotor thrust
     thrust_max = 0.12                 # N per rotor
     battery_compensated = true        # the firmware compensates the battery voltage
+    mass_sd = 0.5                     # optional: how sure the file is of a value, standard deviation over the value
+    inertia_sd = [0.5, 0.5, 0.7]      # optional: of Ixx, Iyy, Izz (one number for all three, or three)
+    motor_time_constant_sd = 0.7      # optional
     [effects.NAME]                    # fitted effects, parameter = value
 """
 
@@ -26,6 +29,7 @@ from typing import Any, TypeGuard
 from crazyem.errors import FileFormatError, UsageError
 
 GRAVITY = 9.81  # m/s^2, as the firmware has it
+LARGEST_SPREAD = 3.0  # standard deviation of a logarithm beyond which a prior says nothing
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,8 @@ class Vehicle:
         thrust_max: of one rotor [N].
         battery_compensated: whether the firmware scales commands by battery voltage.
         effects: fitted effects, name -> parameter -> value.
+        mass_sd, inertia_sd, motor_time_constant_sd: standard deviation of the value over the value, the estimator's
+            prior; None where the file does not say (estimation/model.py has what stands then).
     """
 
     name: str
@@ -59,6 +65,9 @@ class Vehicle:
     thrust_max: float = math.inf
     battery_compensated: bool = True
     effects: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    mass_sd: float | None = None
+    inertia_sd: tuple[float, float, float] | None = None
+    motor_time_constant_sd: float | None = None
 
     def to_toml(self) -> str:
         """The vehicle as the text of a vehicle file; reading it back gives an equal vehicle."""
@@ -73,6 +82,10 @@ class Vehicle:
         lines.append(f"motor_time_constant = {self.motor_time_constant!r}")
         lines.append(f"thrust_max = {self.thrust_max!r}")  # TOML knows inf
         lines.append(f"battery_compensated = {str(self.battery_compensated).lower()}")
+        for key in ("mass_sd", "inertia_sd", "motor_time_constant_sd"):
+            value = getattr(self, key)
+            if value is not None:
+                lines.append(f"{key} = {_toml_value(value)}")
         for name, parameters in self.effects.items():
             lines += ["", f"[effects.{_quote(name)}]"]
             lines += [f"{_quote(key)} = {_toml_value(value)}" for key, value in parameters.items()]
@@ -114,7 +127,8 @@ def parse_vehicle(source: str, *, where: str = "vehicle") -> Vehicle:
         raise FileFormatError(f"{where}: not valid TOML: {error}") from None
     known = {
         "name", "mass", "inertia", "arm", "thrust_curve", "rotor_constant", "torque_per_thrust",
-        "motor_time_constant", "thrust_max", "battery_compensated", "effects",
+        "motor_time_constant", "thrust_max", "battery_compensated", "effects", "mass_sd", "inertia_sd",
+        "motor_time_constant_sd",
     }  # fmt: skip
     for key in data:
         if key not in known:
@@ -152,7 +166,20 @@ def parse_vehicle(source: str, *, where: str = "vehicle") -> Vehicle:
         thrust_max=_number(data, "thrust_max", where, math.inf, low=1e-9),
         battery_compensated=data.get("battery_compensated", True),
         effects=effects,
+        mass_sd=_spread(data, "mass_sd", where, 1),
+        inertia_sd=_spread(data, "inertia_sd", where, 3),
+        motor_time_constant_sd=_spread(data, "motor_time_constant_sd", where, 1),
     )
+
+
+def _spread(data: Mapping[str, Any], key: str, where: str, count: int) -> Any:
+    """One number, or `count` of them (one in the file stands for all), each in (0, 3]; None if the key is not there."""
+    if key not in data:
+        return None
+    values = _numbers(data, key, where, lengths=sorted({1, count}))
+    if not all(0.0 < v <= LARGEST_SPREAD for v in values):
+        raise FileFormatError(f"{where}: key '{key}' must lie in (0, {LARGEST_SPREAD:g}], got {data[key]!r}")
+    return values[0] if count == 1 else (*values, *values, *values)[:count]
 
 
 def _check_inertia(moments: tuple[float, ...], products: tuple[float, ...], where: str) -> None:

@@ -12,6 +12,7 @@ from firmware_sim.commander import setpoint as sp
 from firmware_sim.controllers import layout as mem
 from firmware_sim.controllers import lqg_design, parameters, variables
 from firmware_sim.controllers import variables as lv
+from firmware_sim.controllers.externalise import RPM_UNREADABLE
 from firmware_sim.controllers.tick import tick_step
 from firmware_sim.controllers.tick_with_effects import tick_step_with_effects
 from firmware_sim.plant import layout as at
@@ -53,6 +54,7 @@ class Flight:
         self._P = np.zeros((9, 9))
         self._memory = np.zeros(mem.MEMORY_SIZE)
         self._log = np.zeros(len(variables.ALL))
+        self._log[lv.RPM : lv.RPM + 4] = RPM_UNREADABLE  # until the first report
         self._union = np.zeros(1, dtype=np.float32)
         self._union_short = self._union.view(np.int16)
         self.param_defaults = parameters.defaults(scenario.platform)
@@ -108,6 +110,7 @@ class Flight:
     def external_position(self, position: Sequence[float] | np.ndarray) -> None:
         """A position fix from outside: m, world; used at the next step. Values that are not finite are dropped."""
         p = np.asarray(position, dtype=float)
+        self._log[lv.LOC_TICK] = self.tick & 0xFFFF
         self._log[lv.EXT_POS : lv.EXT_POS + 3] = p
         self._log[lv.LOC : lv.LOC + 3] = p
         if np.all(np.isfinite(p)):

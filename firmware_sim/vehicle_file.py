@@ -1,8 +1,8 @@
 """A vehicle file as the truth of a scenario: `vehicle_file = "PATH.toml"`, the format in which crazyem keeps drones.
 
 TOML, SI: name, mass, inertia (3 or 6), arm (one number or [x, y]), thrust_curve (1 to 6 coefficients, constant first),
-rotor_constant, torque_per_thrust, motor_time_constant, thrust_max (inf: no limit), battery_compensated (of no meaning
-here), and tables [effects.NAME]. mass and inertia are required. What the file leaves out stays the platform's.
+rotor_constant, torque_per_thrust, motor_time_constant, thrust_max (inf: no limit), battery_compensated and *_sd (of no
+meaning here), and tables [effects.NAME]. mass and inertia are required. What the file leaves out stays the platform's.
 """
 
 import tomllib
@@ -17,7 +17,7 @@ _VEHICLE = (
     *("mass", "inertia", "arm", "thrust_curve", "rotor_constant"),
     *("torque_per_thrust", "motor_time_constant", "thrust_max"),
 )
-_IGNORED = ("name", "battery_compensated")
+_IGNORED = ("name", "battery_compensated", "mass_sd", "inertia_sd", "motor_time_constant_sd")
 
 
 def read_toml(path: Path) -> dict[str, Any]:

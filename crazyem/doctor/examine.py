@@ -41,6 +41,7 @@ CHECKS: tuple[Check, ...] = (
     Check("tilt", "a tilted pose frame"),
     Check("lag", "lag between streams, and its drift"),
     Check("weight", "thrust against weight, and a mass the publisher claims"),
+    Check("onboard_drag", "an onboard estimate that was told of a drag"),
     Check("flight", "crash, upset, never left the ground"),
 )
 

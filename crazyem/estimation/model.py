@@ -243,6 +243,18 @@ DELAY_UNIT = 1e-3  # s
 TRIM = 0.05
 
 
+# How far a drone may be from its vehicle file, where the file does not say: standard deviations of the logarithms of
+# mass, Ixx, Iyy, Izz and of the rotors' lag. A cold start is told neither mass nor inertia.
+SPREAD = (1.0, 0.5, 0.5, 0.5)
+COLD_SPREAD = (10.0, 1.5, 1.5, 1.5)
+SPREAD_OF_LAG = 0.7
+
+
+def _spread(vehicle: Vehicle) -> tuple[float, ...]:
+    mass = SPREAD[0] if vehicle.mass_sd is None else vehicle.mass_sd
+    return (mass, *(SPREAD[1:] if vehicle.inertia_sd is None else vehicle.inertia_sd))
+
+
 def setup_for(
     vehicle: Vehicle,
     *,
@@ -255,7 +267,7 @@ def setup_for(
     """Start and prior for a vehicle.
 
     Args:
-        vehicle: nominal constants; centre of the prior.
+        vehicle: nominal constants; centre of the prior, and its width where the file gives one.
         mass: [kg] start of a cold start, e.g. 0.001 (paper, eq. 116); the prior on mass is then flat in effect.
         inertia: [kg m^2] start of a cold start.
         lag: whether inputs are commands, with the rotor lag still to come (False: rotor speeds or true wrenches).
@@ -282,12 +294,11 @@ def setup_for(
     if not timed:
         start[5] = 0.0
     noise = Noise(START_IMPULSE.copy(), START_MEASUREMENT.copy())
+    lag_sd = SPREAD_OF_LAG if vehicle.motor_time_constant_sd is None else vehicle.motor_time_constant_sd
     # A cold start claims to know nothing: centred on the start, but so wide that 4 s of data drown it.
     prior = Prior(
         centre=np.append(np.where(start > 0, start if cold else centre, 1.0)[:5], start[5:]),
-        sd=np.array(
-            [*((10.0, 1.5, 1.5, 1.5) if cold else (1.0, 0.5, 0.5, 0.5)), 0.7, delay_sd / DELAY_UNIT, 1.0, 1.0, 1.0]
-        ),
+        sd=np.array([*(COLD_SPREAD if cold else _spread(vehicle)), lag_sd, delay_sd / DELAY_UNIT, 1.0, 1.0, 1.0]),
         noise=Noise(np.array([0.02, 0.02, 0.05, 0.5, 0.5, 0.5]), TYPICAL_MEASUREMENT.copy()),
     )
     free = np.array([True, True, True, True, has_lag, timed, timed, timed, timed])

@@ -71,6 +71,24 @@ def log_battery(sensor, log):
     log[lv.PM + 3] = level
 
 
+# Barometer (BMP388 datasheet, 0.3 Pa rms at standard resolution, through the firmware's sampling at 50 Hz).
+BARO_PERIOD = 20  # ms
+BARO_NOISE = 0.025  # m
+# The firmware's formula (sensors_bmi088_bmp3xx.c): asl = ((SEA_LEVEL / p)^POWER - 1) (T + 273.15) / LAPSE.
+SEA_LEVEL, POWER, LAPSE = 1015.7, 0.1902630958, 0.0065  # mbar, -, K/m
+TEMPERATURE = 25.0  # degC
+
+
+@kernel
+def log_baro(state, noise, tick, log):
+    """baro.*: height over the sea, of a floor at its level, temperature and pressure."""
+    if tick % BARO_PERIOD == 0:
+        height = state[at.POS + 2] + BARO_NOISE * noise[at.N_BARO]
+        log[lv.BARO] = height
+        log[lv.BARO + 1] = TEMPERATURE
+        log[lv.BARO + 2] = SEA_LEVEL * (1.0 + height * LAPSE / (TEMPERATURE + 273.15)) ** (-1.0 / POWER)
+
+
 @kernel
 def log_setpoint(setpoint, log):
     """ctrltarget.* and ctrltargetZ.* (ctrltarget.yaw is the yaw rate)."""
@@ -105,12 +123,16 @@ def log_control(memory, param, log, union_float, union_short):
 # (arXiv 2512.14450): 11 stretches at rest, duty 0.1526, 3.4 to 4.1 V, 0.47 to 0.64 of the least thrust by the curve.
 IDLE_SPEED = 0.90  # of the curve's; sd 0.006
 IDLE_UP_TO = 0.64  # of the least thrust
+RPM_UNREADABLE = 65535.0  # MOTORS_RPM_INVALID: no report yet, or one with a wrong checksum
 
 
 @kernel
-def log_rotor_speed(truth, board, state, log):
+def log_rotor_speed(truth, board, state, noise, log):
     """motor.m*_rpm, mechanical, of speed controllers that report it: thrust = constant * (rad/s)^2, less at idle."""
     for i in range(4):
+        if noise[at.N_RPM + i] > truth[at.RPM_INVALID]:
+            log[lv.RPM + i] = RPM_UNREADABLE
+            continue
         thrust = max(state[at.ROTOR + i], 0.0)
         share = min(max(thrust / board[at.B_THRUST_MIN], IDLE_UP_TO), 1.0)
         idle = IDLE_SPEED + (1.0 - IDLE_SPEED) * (share - IDLE_UP_TO) / (1.0 - IDLE_UP_TO)

@@ -11,6 +11,7 @@ import numpy as np
 from firmware_sim.controllers import layout as mem
 from firmware_sim.controllers import parameters as pm
 from firmware_sim.controllers.externalise import (
+    log_baro,
     log_battery,
     log_control,
     log_estimate,
@@ -89,7 +90,8 @@ def tick_step(
     log_estimate(sensor, estimate, P, log)
     log_inertial(sensor, log)
     log_battery(sensor, log)
+    log_baro(state, noise, tick, log)
     log_setpoint(setpoint, log)
     log_control(memory, param, log, union_float, union_short)
     if board[at.B_BRUSHLESS] > 0.0:
-        log_rotor_speed(truth, board, state, log)
+        log_rotor_speed(truth, board, state, noise, log)

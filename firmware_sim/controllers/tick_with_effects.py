@@ -1,6 +1,7 @@
 """One millisecond of a drone with effects: the order of tick.py, with plant and sensing of plant/effects/."""
 
 from firmware_sim.controllers.externalise import (
+    log_baro,
     log_battery,
     log_control,
     log_estimate,
@@ -35,7 +36,8 @@ def tick_step_with_effects(
     be_honest(sensor, estimate)
     log_inertial(sensor, log)
     log_battery(sensor, log)
+    log_baro(state, noise, tick, log)
     log_setpoint(setpoint, log)
     log_control(memory, param, log, union_float, union_short)
     if board[at.B_BRUSHLESS] > 0.0:
-        log_rotor_speed(truth, board, state, log)
+        log_rotor_speed(truth, board, state, noise, log)

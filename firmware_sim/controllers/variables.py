@@ -44,7 +44,9 @@ COMMON: list[str] = [
     *_run("kalman", "varX", "varY", "varZ", "varPX", "varPY", "varPZ", "varD0", "varD1", "varD2"),
     *_run("kalman", "q0", "q1", "q2", "q3"),
     *_run("locSrv", "x", "y", "z", "qx", "qy", "qz", "qw"),
+    *_run("locSrvZ", "tick"),
     *_run("ext_pos", "X", "Y", "Z"),
+    *_run("baro", "asl", "temp", "pressure"),
 ]
 BRUSHLESS: list[str] = _run("motor", "m1_rpm", "m2_rpm", "m3_rpm", "m4_rpm")
 
@@ -86,5 +88,7 @@ TARGET = INDEX["ctrltarget.x"]
 TARGETZ = INDEX["ctrltargetZ.x"]
 KALMAN = INDEX["kalman.stateX"]
 LOC = INDEX["locSrv.x"]
+LOC_TICK = INDEX["locSrvZ.tick"]
 EXT_POS = INDEX["ext_pos.X"]
+BARO = INDEX["baro.asl"]
 RPM = INDEX["motor.m1_rpm"]

@@ -95,7 +95,8 @@ class Telemetry:
         return mavlink.MAVLink_actuator_output_status_message(self._us(), 4, [*duty, *(0.0,) * 28])
 
     def _speeds(self) -> Any:
-        return EscStatus(self._us(), px4_order(self.get(*(f"motor.m{n}_rpm" for n in range(1, 5)))))
+        speeds = [0.0 if v == UNKNOWN else v for v in self.get(*(f"motor.m{n}_rpm" for n in range(1, 5)))]
+        return EscStatus(self._us(), px4_order(speeds))
 
     def _millivolts(self) -> int:
         return min(max(round(1000.0 * self.get("pm.vbat")[0]), 0), UNKNOWN - 1)

@@ -112,7 +112,8 @@ CABLE_LENGTH = 127  # m
 CABLE_POINT = 128  # m, world
 FEET_REACH = 131  # m, no foot touches while the origin is higher than that
 TRIM = 132  # m, steady torque of the rotors over their thrust, body x y z (an effect of the catalogue)
-TRUTH_SIZE = 135
+RPM_INVALID = 135  # a standard normal number above it makes a report of rotor speed unreadable
+TRUTH_SIZE = 136
 
 # board: compile-time constants of the firmware (platform_defaults_*.h)
 B_ARM = 0  # m, rotor offset along x and y: 0.707106781 ARM_LENGTH
@@ -161,4 +162,6 @@ N_FIX_POSITION = 13
 N_FIX_ATTITUDE = 16
 N_VBAT = 19
 N_GUST = 20
+N_RPM = 27
+N_BARO = 31
 NOISE_WIDTH = 32  # the rest is kept for effects, so that adding one does not change the others' noise

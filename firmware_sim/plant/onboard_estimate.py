@@ -28,6 +28,7 @@ def estimate_step(truth, state, sensor, estimate, P, param, noise, tick):
         estimate[at.E_RESET] = 0.0
         restart(truth, state, estimate, P)
     integrate(sensor, estimate, 1e-3)
+    drag(estimate, param, 1e-3)
     if tick % PREDICT_EVERY == 0:
         predict(estimate, P, param, 1e-3 * PREDICT_EVERY)
     kind = truth[at.FIX_KIND]
@@ -100,8 +101,31 @@ def integrate(sensor, estimate, dt):
 
 
 @kernel
+def drag(estimate, param, dt):
+    """The drag that kalman.dragB_* tells the filter of: acceleration -dragB v of the centre of pressure, body axes.
+
+    dragB [1/s] is drag over mass (the firmware's own text says N s/m); the centre of pressure lies at kalman.cop_* [m].
+    The firmware leaves it out while it does not fly, when nothing moves here.
+    """
+    if param[pm.DRAG] == 0.0 and param[pm.DRAG + 1] == 0.0 and param[pm.DRAG + 2] == 0.0:
+        return
+    R, w, r = np.empty((3, 3)), np.empty(3), np.empty(3)
+    matrix(estimate, at.E_QUAT, R)
+    for i in range(3):
+        w[i], r[i] = estimate[at.E_GYRO + i], param[pm.COP + i]
+    acc = np.empty(3)
+    for i in range(3):
+        speed = w[(i + 1) % 3] * r[(i + 2) % 3] - w[(i + 2) % 3] * r[(i + 1) % 3]
+        for k in range(3):
+            speed += R[k, i] * estimate[at.E_VEL + k]
+        acc[i] = -param[pm.DRAG + i] * speed
+    for i in range(3):
+        estimate[at.E_VEL + i] += dt * (R[i, 0] * acc[0] + R[i, 1] * acc[1] + R[i, 2] * acc[2])
+
+
+@kernel
 def predict(estimate, P, param, dt):
-    """P <- A P A' + Q with A = [[I, dt I, 0], [0, I, -dt R [a]x], [0, 0, I - dt [w]x]]."""
+    """P <- A P A' + Q with A = [[I, dt I, 0], [0, I - dt R dragB R', -dt R [a]x], [0, 0, I - dt [w]x]]."""
     R, A = np.empty((3, 3)), np.zeros((9, 9))
     matrix(estimate, at.E_QUAT, R)
     ax, ay, az = estimate[at.E_ACC], estimate[at.E_ACC + 1], estimate[at.E_ACC + 2]
@@ -110,6 +134,9 @@ def predict(estimate, P, param, dt):
         A[i, i] = 1.0
     for i in range(3):
         A[i, 3 + i] = dt
+        for j in range(3):
+            for k in range(3):
+                A[3 + i, 3 + j] -= dt * R[i, k] * param[pm.DRAG + k] * R[j, k]
         A[3 + i, 6] = -dt * (R[i, 1] * az - R[i, 2] * ay)
         A[3 + i, 7] = -dt * (R[i, 2] * ax - R[i, 0] * az)
         A[3 + i, 8] = -dt * (R[i, 0] * ay - R[i, 1] * ax)

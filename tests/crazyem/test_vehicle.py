@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
+from crazyem.estimation.model import SPREAD, setup_for
 from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle, preset_names
 
 GOOD = """
@@ -50,6 +52,7 @@ def test_presets_hold_the_constants_of_the_firmware(name):
 
 
 positive = st.floats(1e-9, 1e3)
+spread = st.floats(1e-3, 3.0)
 text = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
 value = st.recursive(
     st.booleans() | text | st.integers(-(2**40), 2**40) | st.floats(allow_nan=False),
@@ -86,7 +89,37 @@ def vehicles(draw):
         thrust_max=draw(positive | st.just(math.inf)),
         battery_compensated=draw(st.booleans()),
         effects=draw(st.dictionaries(text, st.dictionaries(text, value, max_size=3), max_size=2)),
+        mass_sd=draw(st.none() | spread),
+        inertia_sd=draw(st.none() | st.tuples(spread, spread, spread)),
+        motor_time_constant_sd=draw(st.none() | spread),
     )
+
+
+def test_the_brushless_preset_is_the_mean_of_its_sources_and_as_unsure_as_they_disagree():
+    """Inertias by arXiv 2603.05944, crazyflow cf21B_500, arXiv 2512.14450 [kg m^2]; lag by the first."""
+    sources = np.array([[33e-6, 36e-6, 59e-6], [25e-6, 28e-6, 49e-6], [23.95e-6, 23.95e-6, 32.35e-6]])
+    vehicle = load_vehicle("cf21bl")
+    assert vehicle.inertia == pytest.approx(np.exp(np.log(sources).mean(axis=0)), rel=2e-3)
+    assert vehicle.motor_time_constant == 0.05
+    t = stats.t.ppf(0.975, 2) / stats.norm.ppf(0.975)
+    spread = np.maximum(t * np.log(sources).std(axis=0, ddof=1), SPREAD[1:])
+    assert vehicle.inertia_sd == pytest.approx(spread, abs=0.01)
+
+
+def test_the_estimator_is_as_unsure_as_the_file_says():
+    unsaid = setup_for(parse_vehicle(GOOD)).prior
+    assert unsaid.sd[:5] == pytest.approx([1.0, 0.5, 0.5, 0.5, 0.7])
+    said = "motor_time_constant = 0.05\nmass_sd = 0.1\ninertia_sd = 0.2\nmotor_time_constant_sd = 0.3\n"
+    assert setup_for(parse_vehicle(GOOD + said)).prior.sd[:5] == pytest.approx([0.1, 0.2, 0.2, 0.2, 0.3])
+    assert setup_for(parse_vehicle(GOOD + said), mass=0.001).prior.sd[:4] == pytest.approx([10.0, 1.5, 1.5, 1.5])
+
+
+@pytest.mark.parametrize(
+    "line", ["mass_sd = 0", "inertia_sd = [0.1, 0.2]", "motor_time_constant_sd = 4", "mass_sd = [1, 1]"]
+)
+def test_a_spread_that_is_none_is_refused_by_name(line):
+    with pytest.raises(FileFormatError, match=f"key '{line.split()[0]}'"):
+        parse_vehicle(GOOD + line)
 
 
 @given(vehicles())

@@ -165,6 +165,18 @@ def test_parameters_persist_and_echo(uri):
         assert answers.get(timeout=TIMEOUT) == pytest.approx(state.default_value)
 
 
+def test_a_parameter_stored_by_cflib_survives_a_restart(tmp_path):
+    stored = ("--storage", str(tmp_path / "storage.json"))
+    answers = queue.Queue()
+    with simulator(*stored) as uri, connected(uri) as cf:
+        assert float(cf.param.get_value("kalman.dragB_x")) == 0.0
+        cf.param.set_value("kalman.dragB_x", "0.35")
+        cf.param.persistent_store("kalman.dragB_x", lambda _name, done: answers.put(done))
+        assert answers.get(timeout=TIMEOUT) is True
+    with simulator(*stored) as uri, connected(uri) as cf:
+        assert float(cf.param.get_value("kalman.dragB_x")) == pytest.approx(0.35)
+
+
 def test_supervisor_and_console(uri):
     with connected(uri) as cf:
         assert cf.supervisor.is_auto_armed

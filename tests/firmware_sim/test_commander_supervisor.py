@@ -53,6 +53,22 @@ def test_a_brushed_drone_arms_itself_and_shows_the_measured_idle_bits():
     assert bench.supervisor.info == 0x020E
 
 
+@pytest.mark.parametrize(("limit", "seen", "crashes"), [(0.0, 9.0, False), (3.0, 4.5, True), (3.0, 3.5, False)])
+def test_a_knock_beyond_crash_detect_gs_is_a_crash(limit, seen, crashes):
+    """| |acc| - 1 g | > supervisor.crashDetectGs, 0 switches it off (supervisor.c); accNorm shows what it looks at."""
+    bench = Bench()
+    array, index = bench.supervisor.param["supervisor.crashDetectGs"]
+    assert array[index] == 0.0  # as the firmware boots
+    array[index] = limit
+    bench.fly()
+    bench.set("acc.x", math.sqrt(seen**2 - 1.0))
+    bench.run(PERIOD)
+    array, index = bench.supervisor.log["supervisor.accNorm"]
+    assert array[index] == pytest.approx(seen)
+    assert (bench.supervisor.state == State.CRASHED) == crashes
+    assert any("Crash detected" in text for text in bench.console) == crashes
+
+
 def test_a_brushless_drone_must_be_armed_and_disarms_by_itself():
     bench = Bench(auto_arm=False)
     assert bench.run(400) == State.CHECKS_PASSED

@@ -15,7 +15,7 @@ from firmware_sim.controllers.externalise import log_rotor_speed
 from firmware_sim.controllers.power_distribution import motor_volts, motors_step
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.platforms import PLATFORMS
-from firmware_sim.scenario import Scenario
+from firmware_sim.scenario import Scenario, parse_scenario
 
 NANODRONE = Path(__file__).resolve().parents[3] / "shared" / "recordings" / "nanodrone" / "raw"
 
@@ -29,6 +29,7 @@ class Board:
         self.state, self.sensor = np.zeros(at.STATE_SIZE), np.zeros(at.SENSOR_SIZE)
         self.memory, self.log = np.zeros(mem.MEMORY_SIZE), np.zeros(len(variables.ALL))
         self.param = np.array([parameters.defaults(platform)[name] for name in parameters.NAMES])
+        self.noise = np.zeros(at.NOISE_WIDTH)
         self.sensor[at.VBAT] = self.sensor[at.VBAT_FILTERED] = volts
         self.volts = volts
 
@@ -162,11 +163,30 @@ def test_rotors_at_rest_turn_as_fast_as_those_of_real_brushless_drones() -> None
             truth = np.zeros(at.TRUTH_SIZE)
             truth[at.ROTOR_CONSTANT], truth[at.RPM_SCALE : at.RPM_SCALE + 4] = board.constants.rotor_constant, 1.0
             board.state[at.ROTOR : at.ROTOR + 4] = np.polynomial.polynomial.polyval(volts, board.constants.curve)
-            log_rotor_speed(truth, board.board, board.state, board.log)
+            log_rotor_speed(truth, board.board, board.state, board.noise, board.log)
             ratios.append(np.median(real[real < 10000]) / board.log[variables.RPM])
     assert len(ratios) == 11
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.01)
     assert np.std(ratios) < 0.01
+
+
+def test_a_share_of_the_reports_cannot_be_read_and_is_65535() -> None:
+    """MOTORS_RPM_INVALID; in Busetto's flights 191 of 263,764 were missing."""
+    assert Scenario(platform="cf21bl").sensors.rotor_speed_invalid == pytest.approx(191 / 263764, rel=0.05)
+    board, noise = Board("cf21bl"), np.random.default_rng(1)
+    truth = parse_scenario({"platform": "cf21bl", "sensors": {"rotor_speed_invalid": 0.1}}, "test").truth()
+    board.state[at.ROTOR : at.ROTOR + 4] = 0.1
+    seen = []
+    for _ in range(2000):
+        log_rotor_speed(truth, board.board, board.state, noise.standard_normal(at.NOISE_WIDTH), board.log)
+        seen.append(board.log[variables.RPM : variables.RPM + 4].copy())
+    lost = np.array(seen) == 65535.0
+    assert lost.mean(axis=0) == pytest.approx([0.1] * 4, abs=0.02)
+    assert len(np.unique(np.array(seen)[~lost])) == 1
+    for share, expected in ((0.0, False), (1.0, True)):
+        truth = parse_scenario({"platform": "cf21bl", "sensors": {"rotor_speed_invalid": share}}, "test").truth()
+        log_rotor_speed(truth, board.board, board.state, noise.standard_normal(at.NOISE_WIDTH), board.log)
+        assert np.all((board.log[variables.RPM : variables.RPM + 4] == 65535.0) == expected)
 
 
 def test_reported_speeds_are_the_thrust_law_in_flight() -> None:
@@ -175,5 +195,5 @@ def test_reported_speeds_are_the_thrust_law_in_flight() -> None:
     truth[at.ROTOR_CONSTANT], truth[at.RPM_SCALE : at.RPM_SCALE + 4] = 3.72e-8, 1.0
     for thrust in (board.constants.thrust_min, 0.1, 0.2):
         board.state[at.ROTOR : at.ROTOR + 4] = thrust
-        log_rotor_speed(truth, board.board, board.state, board.log)
+        log_rotor_speed(truth, board.board, board.state, board.noise, board.log)
         assert board.log[variables.RPM] == int(np.sqrt(thrust / 3.72e-8) * 30 / np.pi)
