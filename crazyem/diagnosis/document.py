@@ -269,5 +269,5 @@ def _number(value: Any) -> float | None:
 
 def saved_vehicle(diagnosis: Diagnosis, name: str) -> Vehicle:
     """The fitted vehicle under a name of its own; how sure the old file was of its values says nothing of these."""
-    unsaid = {"mass_sd": None, "inertia_sd": None, "motor_time_constant_sd": None}
-    return replace(diagnosis.fitted_vehicle, name=name, **unsaid)
+    fitted = diagnosis.fitted_vehicle
+    return replace(fitted, name=name, mass_sd=None, inertia_sd=None, motor_time_constant_sd=None)
