@@ -176,6 +176,17 @@ def test_missing_values_are_marked_and_only_those(tmp_path):
     assert not signals["velocity"].marked.any()
 
 
+@pytest.mark.parametrize(
+    ("more", "marked"), [('unit = "rpm"', 2), ('unit = "rpm"\nmissing = []', 0), ('unit = "Hz"', 0)]
+)
+def test_a_speed_controllers_65535_is_missing_unless_the_mapping_says_otherwise(tmp_path, more, marked):
+    table = table_of()
+    table["m1"][5:7] = 65535.0
+    mapping = f'[signals.rotor_speed]\ncolumns = ["m0", "m1", "m2", "m3"]\n{more}\n'
+    speed = opened(tmp_path, table, mapping).signals["rotor_speed"]
+    assert speed.marked.sum() == np.isnan(speed.value).sum() == marked
+
+
 def test_what_nobody_mapped_is_kept_as_it_is(tmp_path):
     table = table_of(extra=np.arange(40.0), velocity=np.arange(40.0), mode=["hover"] * 40, ok=["True", "False"] * 20)
     mapping = '[signals.position]\ncolumns = ["p0", "p1", "p2"]\n[units]\nextra = "degC"\n[claims]\nmass_kg = 0.03\n'

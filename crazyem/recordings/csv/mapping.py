@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.recordings.csv.mapping_units import is_electrical, time_divisor, unit_factor, unit_offset
+from crazyem.recordings.csv.mapping_units import (
+    counts_turns,
+    is_electrical,
+    time_divisor,
+    unit_factor,
+    unit_offset,
+)
 from crazyem.signals.sample import SIGNALS, components
 
 BODY_AXES, WORLD_AXES = ("FLU", "FRD"), ("ENU", "NED")
@@ -233,7 +239,7 @@ def _signal(name: str, entry: Mapping[str, Any], where: str, key: str) -> Signal
     if len(signs) != len(columns) or any(s not in (1, -1) for s in signs):
         raise FileFormatError(f"{where}.sign: needs 1 or -1 for each of the {len(columns)} columns.")
     frame, axes = _frame(quantity, entry, where)
-    missing = entry.get("missing", [])
+    missing = entry.get("missing", _unreadable(quantity, entry.get("unit")))
     missing = missing if isinstance(missing, list) else [missing]
     if any(m != "" and (isinstance(m, bool) or not isinstance(m, (int, float))) for m in missing):
         raise FileFormatError(f'{where}.missing: must be numbers, or "" for fields without a number.')
@@ -264,6 +270,13 @@ def _signal(name: str, entry: Mapping[str, Any], where: str, key: str) -> Signal
         hold=_number(entry, "hold", where, 0.0) or 0.0,
         corners=corners,
     )
+
+
+def _unreadable(quantity: str, unit: object) -> list[float]:
+    """What a speed controller's report that cannot be read is, where the mapping does not say: the largest 16 bits."""
+    units = unit if isinstance(unit, list) else [unit]
+    counted = quantity == "rotor_speed" and all(isinstance(u, str) and counts_turns(u) for u in units)
+    return [65535.0] if counted else []
 
 
 def _ordered(

@@ -153,6 +153,11 @@ def is_electrical(unit: str) -> bool:
     return _spelled(unit) == "erpm"
 
 
+def counts_turns(unit: str) -> bool:
+    """Whether a unit is that of speed controllers, turns a minute of the rotor or of the electrical field."""
+    return _spelled(unit) in ("rpm", "erpm")
+
+
 def _spelled(unit: str) -> str:
     text = unit.strip()
     return _SPELLINGS.get(text, text)
