@@ -13,10 +13,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from crazyem.errors import LinkError, UsageError
-from crazyem.links import connecting, high_level
 from crazyem.links.base import LinkLost, LinkStatistics, Outage, ParameterWrite
 from crazyem.links.blocks import LogBlocks
 from crazyem.links.clock import ClockFit
+from crazyem.links.connecting import connect, quiet_cflib, shut
+from crazyem.links.high_level import confirmed, land_command
 from crazyem.links.parameters import ParameterClient
 from crazyem.links.reconnecting import AnotherDroneError, Reviver
 from crazyem.signals.packet import Block, Packet
@@ -78,14 +79,14 @@ class CrazyflieLink:
         """
         if self._cf is not None:
             return
-        crazyflie = connecting.connect(self.uri, timeout)
+        crazyflie = connect(self.uri, timeout)
         if crazyflie.platform.get_protocol_version() < 4:
-            connecting.shut(crazyflie)
+            shut(crazyflie)
             raise LinkError(f"The firmware at {self.uri} is too old: it does not speak CRTP protocol 4 or newer.")
         self._adopt(crazyflie)
 
     def _adopt(self, crazyflie: Any) -> None:
-        connecting.quiet_cflib()
+        quiet_cflib()
         self._cf = crazyflie
         self._parameters = ParameterClient(crazyflie, self.uri)
         self._blocks.attach(crazyflie)
@@ -122,7 +123,7 @@ class CrazyflieLink:
             with contextlib.suppress(ValueError):
                 caller.remove_callback(callback)
         if self._owned:
-            connecting.shut(crazyflie, hand_back=self._commanded, cut_motors=self._commanded)
+            shut(crazyflie, hand_back=self._commanded, cut_motors=self._commanded)
         if self._watcher is not None:
             self._watcher.join(timeout=1.0)
 
@@ -326,8 +327,8 @@ class CrazyflieLink:
 
     def land_and_confirm(self, height: float, duration: float, *, timeout: float) -> bool:
         """As `land`, sent until the drone says that it has the command; False if it did not within `timeout` [s]."""
-        command = high_level.land_command(height, duration)
-        return high_level.confirmed(self._command(), command, timeout=timeout, repeat_after=0.04)
+        command = land_command(height, duration)
+        return confirmed(self._command(), command, timeout=timeout, repeat_after=0.04)
 
     def go_to(self, x: float, y: float, z: float, yaw: float, duration: float, relative: bool = False) -> None:
         """High-level move to x, y, z [m, world] and yaw [rad] in `duration` [s]."""

@@ -7,8 +7,8 @@ import time
 from typing import Any
 
 from crazyem.errors import LinkError
-from crazyem.links import connecting
 from crazyem.links.blocks import LogBlocks
+from crazyem.links.connecting import new_driver, shorten_naps, take_link
 from crazyem.links.courier import Courier
 
 _TABLES = (5, 2)  # ports: log, parameters
@@ -73,7 +73,7 @@ class Reviver:
         cf = self._cf
         from cflib.crazyflie import State
 
-        old = connecting.take_link(cf)
+        old = take_link(cf)
         callbacks = list(cf.incoming.cb)
         cf.incoming.stop()
         if old is not None:
@@ -85,10 +85,10 @@ class Reviver:
         cf.incoming.cb = callbacks
         cf.state = State.DISCONNECTED
         try:
-            cf.link = connecting.new_driver(cf, self._uri)
+            cf.link = new_driver(cf, self._uri)
         except Exception as error:  # a driver may raise anything: the dongle may be out
             raise LinkError(str(error) or type(error).__name__) from None
-        connecting.shorten_naps(cf)
+        shorten_naps(cf)
         cf.incoming.start()
 
     def _check_tables(self, blocks: LogBlocks) -> None:
