@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.flights.alignment import Alignment
-from crazyem.diagnosis.flights.frame import Frame
 from crazyem.diagnosis.flights.inputs import inputs_of
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
@@ -35,6 +34,27 @@ COMMANDS = ("motor_command", "motor_request", "mixer_command")
 YAW = "stateEstimate.yaw"  # deg, right-handed
 # rad/s: the gyro as the PID controller logs it, pitch negated (controller_pid.c)
 CONTROLLED = (("controller.r_roll", 1.0), ("controller.r_pitch", -1.0), ("controller.r_yaw", 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """How a recording's pose frame is turned against those of the others.
+
+    Attributes:
+        roll, pitch: rad, of the frame in the body, as `attitude_misalignment` has them; taken off already.
+        sd: rad, (roll, pitch).
+    """
+
+    roll: float
+    pitch: float
+    sd: tuple[float, float]
+
+    def said(self) -> str:
+        """For people."""
+        return (
+            f"the pose frame of this recording is tilted by {1e3 * self.roll:+.1f} mrad in roll and "
+            f"{1e3 * self.pitch:+.1f} mrad in pitch against the others; it is turned back by that much"
+        )
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,7 @@ it, beside what goes with the velocity, is the tilt.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +18,8 @@ from scipy import stats
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
+from crazyem.diagnosis.flights.flight import Flight, Frame
 from crazyem.vehicle import GRAVITY
-
-if TYPE_CHECKING:
-    from crazyem.diagnosis.flights.flight import Flight
 
 STEP, WIDTH = 0.01, 21  # s, samples: of the polynomials (Savitzky and Golay) whose curvature is the acceleration
 BLOCK, LEAST = 1.0, 8  # s that scatter together, and how many of them are needed
@@ -30,28 +27,7 @@ SMALLEST = 1e-5  # rad: of a drone that stands on its feet all along even scatte
 LIKELY = 1e-3  # p-value that the frames lie alike
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """How a recording's pose frame is turned against those of the others.
-
-    Attributes:
-        roll, pitch: rad, of the frame in the body, as `attitude_misalignment` has them; taken off already.
-        sd: rad, (roll, pitch).
-    """
-
-    roll: float
-    pitch: float
-    sd: tuple[float, float]
-
-    def said(self) -> str:
-        """For people."""
-        return (
-            f"the pose frame of this recording is tilted by {1e3 * self.roll:+.1f} mrad in roll and "
-            f"{1e3 * self.pitch:+.1f} mrad in pitch against the others; it is turned back by that much"
-        )
-
-
-def alike(flights: "Sequence[Flight]", kept_apart: "Sequence[Flight]") -> "tuple[list[Flight], list[Flight]]":
+def alike(flights: Sequence[Flight], kept_apart: Sequence[Flight]) -> tuple[list[Flight], list[Flight]]:
     """The flights with their pose frames turned to the mean of those that are fitted.
 
     How much frames differ is a variance between recordings beside each one's own error (DerSimonian and Laird 1986);
@@ -71,7 +47,7 @@ def alike(flights: "Sequence[Flight]", kept_apart: "Sequence[Flight]") -> "tuple
     return turned[: len(flights)], turned[len(flights) :]
 
 
-def tilt_of(flight: "Flight") -> tuple[NDArray, NDArray] | None:
+def tilt_of(flight: Flight) -> tuple[NDArray, NDArray] | None:
     """Roll and pitch (2,) rad of the pose frame in the body, and their standard deviations; None if not told."""
     if flight.attitude is not None or not {"position", "attitude"} <= flight.signals:
         return None
@@ -91,7 +67,7 @@ def tilt_of(flight: "Flight") -> tuple[NDArray, NDArray] | None:
     return np.array([lean[1], -lean[0]]), error[::-1]
 
 
-def _stretches(flight: "Flight") -> list[NDArray]:
+def _stretches(flight: Flight) -> list[NDArray]:
     """Rows of whole poses, in pieces without gaps."""
     seen = np.isfinite(flight.y[:, [0, 6]]).all(1)
     piece = np.cumsum(flight.gaps)
@@ -99,7 +75,7 @@ def _stretches(flight: "Flight") -> list[NDArray]:
     return [p for p in parts if p.size > 4 and flight.time[p[-1]] - flight.time[p[0]] > 2 * WIDTH * STEP]
 
 
-def _across(flight: "Flight", part: NDArray) -> NDArray:
+def _across(flight: Flight, part: NDArray) -> NDArray:
     """(k, 6): velocity [m/s], the force along z, and across it along x and y [m/s^2], in the axes of the pose."""
     time = flight.time[part]
     grid = np.arange(time[0], time[-1], STEP)
@@ -140,7 +116,7 @@ def _deviation(tilt: NDArray, sd: NDArray, fitted: int) -> NDArray:
     return away
 
 
-def _turned_back(flight: "Flight", away: NDArray, error: NDArray) -> "Flight":
+def _turned_back(flight: Flight, away: NDArray, error: NDArray) -> Flight:
     y, seen = flight.y.copy(), np.isfinite(flight.y[:, 6])
     by = Rotation.from_rotvec([-away[0], -away[1], 0.0])
     y[seen, 6:10] = (Rotation.from_quat(y[seen, 6:10]) * by).as_quat()

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from crazyem.diagnosis.flights.alignment import Alignment
-from crazyem.diagnosis.flights.flight import Flight
-from crazyem.diagnosis.flights.frame import Frame
+from crazyem.diagnosis.flights.flight import Flight, Frame
 
 WORTH_TELLING = 0.005  # of the thrust
 
