@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from crazyem.recordings.mcap import scan as mcap_scan
 from crazyem.recordings.mcap import schemas
 from crazyem.recordings.mcap.messages import EVENTS, OTHER_EVENTS, fields_of
-from crazyem.recordings.mcap.stream_codec import MOST_FIELDS, MOST_SIGNALS, FixedMessages, StreamLayout
+from crazyem.recordings.mcap.stream_codec import (
+    MOST_FIELDS,
+    MOST_SIGNALS,
+    FixedMessages,
+    StreamLayout,
+    block_messages,
+)
 from crazyem.recordings.mcap.survey import Part, parse
 from crazyem.recordings.recording import Event, SignalArray
 from crazyem.recordings.tables import Table
@@ -190,9 +196,7 @@ class Content:
                     raise ValueError("too many variables")
                 number = record.metadata.get("session", "1")
                 session = int(number) if number.isdecimal() and len(number) < 6 else 1
-                rows = _Rows(
-                    schemas.BlockCodec(block).table(), [1, 1, len(block.variables)], self._expected.get(record.id, 0)
-                )
+                rows = _Rows(block_messages(block), [1, 1, len(block.variables)], self._expected.get(record.id, 0))
                 self._blocks[record.id] = _BlockChannel(block, session, rows)
             elif name.startswith("crazyem.signals."):
                 layout = StreamLayout.from_metadata(record.metadata)

@@ -9,14 +9,11 @@ import functools
 import json
 import struct
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from crazyem.signals.packet import Block, Packet, Variable
-
-if TYPE_CHECKING:
-    from crazyem.recordings.mcap.stream_codec import FixedMessages
 
 _F = descriptor_pb2.FieldDescriptorProto
 _TYPES = {
@@ -212,12 +209,6 @@ class BlockCodec:
         fields = [("firmware_time_ms", "sfixed64"), ("host_time", "double")]
         fields += [(v.name.replace(".", "_"), "double") for v in self.block.variables]
         return dynamic_schema("crazyem.log", self.schema_name.rsplit(".", 1)[1], fields)
-
-    def table(self) -> "FixedMessages":
-        """The same messages as arrays: fields firmware_time_ms, host_time, then the variables."""
-        from crazyem.recordings.mcap.stream_codec import FixedMessages
-
-        return FixedMessages(["<i8", "<f8", *("<f8" for _ in self.block.variables)])
 
     def metadata(self) -> dict[str, str]:
         """What the channel says of the block: enough to decode it without any other record."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.recordings.mcap import schemas
+from crazyem.signals.packet import Block
 
 MOST_SIGNALS = 60  # in one message, a bit each in `marked`
 MOST_FIELDS = 4096  # in one message; guards against metadata that claim anything
@@ -66,6 +67,11 @@ class FixedMessages:
             gather(data, offsets, rows)
         sound = (rows[:, self._tags] == self._blank[self._tags]).all(axis=1)
         return rows.view(self._dtype)[:, 0], sound
+
+
+def block_messages(block: Block) -> FixedMessages:
+    """The messages of a log block (`schemas.BlockCodec`): firmware_time_ms, host_time, then its variables."""
+    return FixedMessages(["<i8", "<f8", *("<f8" for _ in block.variables)])
 
 
 @dataclass(frozen=True, slots=True)
