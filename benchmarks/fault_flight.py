@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.in_process import Pace, in_a_thread, simulator
+from benchmarks.in_process import OPEN_GATE, Pace, in_a_thread, simulator
 from crazyem.commands.fly import trajectory_maker
 from crazyem.errors import CrazyemError
 from crazyem.estimation.online import OnlineEstimator
@@ -369,7 +369,7 @@ def _without_guard(session: Session, note: str) -> str:
     originals = read_originals(session.link, LEE)
     guard: Any = NoGuard(originals)
     on_write = session.recorder.parameter_write if session.recorder else None
-    session.pusher = Pusher(session.link, guard, history=session.history, on_write=on_write)
+    session.pusher = Pusher(session.link, guard, gate=OPEN_GATE, history=session.history, on_write=on_write)
     session.oversight, session.pipeline.guard, session.pipeline.push = None, guard, session.pusher.submit
     return note
 

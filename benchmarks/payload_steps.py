@@ -33,7 +33,9 @@ from crazyem.live.pipeline import Pipeline
 from crazyem.live.policy import load_policy
 from crazyem.live.session import STATE
 from crazyem.live.telemetry import CAN_FLY, FLYING, Telemetry
+from crazyem.live.write_gate import WriteGate
 from crazyem.signals.packet import Block, Packet, Variable
+from crazyem.signals.sample import Sample
 from crazyem.signals.vocabulary import decoders
 from crazyem.vehicle import load_vehicle
 from firmware_sim.commander import setpoint as sp
@@ -187,7 +189,7 @@ class Now:
             self.history.pushes.append(Push(decision.time, name, value, True, decision.kind))
             if name == LEE.mass:
                 self.masses.append((decision.time, value))
-        self.oversight.done(decision, True)
+        self.oversight.done(decision, "")
 
 
 def fly(case: Case, seed: int, *, aware: bool = True, push: bool = True) -> dict[str, Any]:
@@ -195,7 +197,9 @@ def fly(case: Case, seed: int, *, aware: bool = True, push: bool = True) -> dict
     drone, vehicle, history = Drone(case, seed), load_vehicle("cf2"), History()
     inner = OnlineEstimator(vehicle)
     estimator: Any = StepAwareEstimator(inner) if aware else inner
-    telemetry, newest = Telemetry(info=FLYING | CAN_FLY), [0.0]
+    newest = [0.0]
+    gate = WriteGate(Telemetry(info=FLYING | CAN_FLY, heard=0.0), now=lambda: 0.0)
+    gate.telemetry.take(Sample("position", 0.0, (0.0, 0.0, 1.0)))  # this one begins in the air
     originals = {p: drone.read(p) for p in LEE.parameters}
     policy = load_policy()
     nominal = dict(zip(("mass", "Ixx", "Iyy", "Izz"), (vehicle.mass, *vehicle.inertia)))
@@ -204,7 +208,7 @@ def fly(case: Case, seed: int, *, aware: bool = True, push: bool = True) -> dict
         Rules(policy),
         originals=originals,
         history=history,
-        telemetry=telemetry,
+        gate=gate,
         now=lambda: newest[0],
         residual=lambda: inner.residual,
     )

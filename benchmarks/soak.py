@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.in_process import OPEN_GATE
 from crazyem.commands.fly import trajectory_maker
 from crazyem.errors import CrazyemError
 from crazyem.estimation.online import OnlineEstimator
@@ -125,7 +126,8 @@ class Writer:
         self.counts = {"written": 0, "confirmed": 0, "confirmed_again": 0, "unacknowledged": 0, "lost": 0,
                        "wrong": 0, "unread": 0}  # fmt: skip
         self.slowest = 0.0
-        self._pusher = Pusher(session.link, self, history=History(), on_write=self._attempted,  # type: ignore[arg-type]
+        self._pusher = Pusher(session.link, self, gate=OPEN_GATE,  # type: ignore[arg-type]
+                              history=History(), on_write=self._attempted,
                               wait_for_link=session.wait_for_link,
                               outages=lambda: len(session.outages) + session.returning)  # fmt: skip
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -154,7 +156,8 @@ class Writer:
     def _write(self, value: float) -> None:
         begun, before = time.monotonic(), self.counts["unacknowledged"]
         self.counts["written"] += 1
-        if not self._pusher._write(self._session.clock.newest, PROBE, value):
+        why, _ = self._pusher._write(self._session.clock.newest, PROBE, value)
+        if why:
             self.counts["lost"] += 1
             return
         self.counts["confirmed" if self.counts["unacknowledged"] == before else "confirmed_again"] += 1

@@ -8,7 +8,17 @@ from typing import Protocol
 
 from crazyem.signals.packet import Block, Packet, Variable
 
-__all__ = ["Block", "Link", "LinkLost", "LinkStatistics", "Outage", "Packet", "ParameterWrite", "Variable"]
+__all__ = [
+    "Block",
+    "Link",
+    "LinkLost",
+    "LinkStatistics",
+    "Outage",
+    "Packet",
+    "ParameterWrite",
+    "Variable",
+    "link_account",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +79,25 @@ class Outage:
     before_ms: float
     after_ms: float
     created: int
+
+
+def link_account(statistics: LinkStatistics, outages: Sequence[Outage]) -> dict[str, str]:
+    """What became of the packets, for a recording: clocks, round trip, and each block's fates and delays."""
+    account = {
+        "clock.offset_s": repr(statistics.clock_offset),
+        "clock.rate": repr(statistics.clock_rate),
+        "clock.drift_ppm": f"{1e6 * (statistics.clock_rate - 1.0):.3f}",
+        "round_trip_s": f"{statistics.round_trip:.6f}",
+        "outages": str(len(outages)),
+    }
+    for number, outage in enumerate(outages):
+        account[f"outage.{number}"] = f"{outage.before_ms:.0f} ms to {outage.after_ms:.0f} ms: {outage.reason}"
+    for block, (received, lost, late) in statistics.per_block.items():
+        account[f"block.{block}.packets"] = f"{received} received, {lost} lost, {late} late"
+        if block in statistics.delays:
+            median, p99 = statistics.delays[block]
+            account[f"block.{block}.delay_s"] = f"{median:.6f} median, {p99:.6f} 99th percentile"
+    return account
 
 
 class Link(Protocol):

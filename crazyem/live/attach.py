@@ -50,9 +50,14 @@ class Attachment:
         raise DataError(f"no identifiable {' and '.join(parameters)} within {timeout:g} s ({why}).")
 
     def close(self) -> None:
-        """Remove our log blocks; the Crazyflie object stays open and the flight is not touched."""
-        self.session.close()
-        self.session.link.close()
+        """End the writes first, then remove our log blocks; the Crazyflie object stays open, the flight goes on.
+
+        The estimator finishes what has arrived by then; nothing of that is written to the drone.
+        """
+        try:
+            self.session.close()
+        finally:
+            self.session.link.close()
 
     def __enter__(self) -> "Attachment":
         return self
@@ -109,7 +114,6 @@ def attach(
             session.push_to_controller(rules)
             session.pipeline.push_from = -math.inf
     except BaseException:
-        session.close()
-        link.close()
+        Attachment(session).close()
         raise
     return Attachment(session)

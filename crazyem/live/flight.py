@@ -135,19 +135,21 @@ class Flight:
             self._trajectory()
             self._land()
             self.session.end_pushing("landed")
-        except MotorsCutError:
-            self._cut()
-            self.session.end_pushing("interrupted")
-            raise
         except BaseException as error:
+            self.session.stop_pushing()
             try:
-                self._bring_down()
+                if isinstance(error, MotorsCutError):
+                    self._cut()
+                else:
+                    self._bring_down()
             finally:
                 # Only now, on the ground or with the motors off, may parameters jump.
                 self.session.end_pushing(self._outcome(error))
             raise
 
     def _outcome(self, error: BaseException) -> str:
+        if isinstance(error, MotorsCutError):
+            return "interrupted"
         if self.session.lost is not None or isinstance(error, LinkError):
             return "link_lost"
         return "interrupted" if isinstance(error, FlightInterruptedError | KeyboardInterrupt) else "failed"
@@ -208,10 +210,11 @@ class Flight:
 
     def _land(self) -> None:
         """Hand back to the high-level commander, land, and make sure that it has."""
+        self.session.stop_pushing()
         self._enter("landing")
         # What is sent into an outage is lost, and a second Ctrl-C still cuts.
         self._wait(lambda: not self.session.returning, math.inf)
-        self.session.pipeline.push_until = -math.inf
+        self.session.pipeline.push_until = -math.inf  # the watch on the writes ends, too
         self.session.end_estimates()
         if self._stream is not None:
             self._stream.stop()

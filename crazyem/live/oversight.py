@@ -19,8 +19,8 @@ from crazyem.live.health import Health
 from crazyem.live.history import History
 from crazyem.live.policy import Policy
 from crazyem.live.push import Pusher
-from crazyem.live.telemetry import FLYING, Telemetry
 from crazyem.live.watchdog import Watchdog
+from crazyem.live.write_gate import WriteGate
 from crazyem.signals.sample import Sample
 
 LOOK_EVERY = 0.04  # s between looks of the watch
@@ -60,7 +60,7 @@ class Oversight:
         rules: how.
         originals: parameter values at connect.
         history: gets notices and the account.
-        telemetry: what the supervisor says.
+        gate: what every write has to pass when it is sent; asked here first, so that nothing is decided in vain.
         now: newest time on the drone's clock, s.
         residual: time [s], innovations and their standard deviations of the newest sample, or None.
         enabled: whether a time [s] is in a phase of the flight in which parameters are pushed.
@@ -74,7 +74,7 @@ class Oversight:
         *,
         originals: Mapping[str, float],
         history: History,
-        telemetry: Telemetry,
+        gate: WriteGate,
         now: Callable[[], float],
         residual: Callable[[], Any] = lambda: None,
         enabled: Callable[[float], bool] = lambda time: True,
@@ -83,13 +83,13 @@ class Oversight:
         self.guard, self.rules = guard, rules
         self.originals, self.good = dict(originals), dict(originals)
         self.history, self.now, self.tell = history, now, tell
-        self.telemetry = telemetry
-        self.health = Health(rules.policy.health, telemetry)
+        self.gate = gate
+        self.health = Health(rules.policy.health, gate.telemetry)
         self.watch = Watchdog(rules.policy.watch)
         guard.capped = rules.policy.watch.enabled and not rules.dry_run
         self.pusher: Pusher | None = None
         self._residual, self._enabled = residual, enabled
-        self._airborne = self._reverted = False
+        self._airborne = self._reverted = self._owed = False
         self._looked = -math.inf
         self._residual_time = -math.inf
         self._held = ("", -math.inf)
@@ -140,11 +140,13 @@ class Oversight:
         self.guard.stepped(step)
         self.watch.stepped(began=step.time, now=time, real=step.real)
 
-    def done(self, decision: Decision, complete: bool) -> None:
-        """The pusher is through with a decision (its thread)."""
-        if decision.kind == "push" and complete:
+    def done(self, decision: Decision, why: str) -> None:
+        """The pusher is through with a decision (its thread); `why` not all of it is in the drone, "" if it is."""
+        if decision.kind == "push" and not why:
             self.watch.wrote(decision.time, max(self.now(), decision.time))
-        self._enter("written" if complete else "not written", self.now(), reason=decision.kind)
+        self._owed = bool(why) if decision.kind == "revert" else self._owed
+        reason = f"{decision.kind}: {why}" if why else decision.kind
+        self._enter("not written" if why else "written", self.now(), reason=reason)
 
     def take_back(self) -> str:
         """A person wants the last good values back: those at connect, where the last good ones are in the drone.
@@ -160,26 +162,37 @@ class Oversight:
             self.good = dict(self.originals)
         return self._revert(self.now(), "asked for by the user", asked=True)
 
+    def stop(self) -> None:
+        """No new set is written from now on: the first step of every way out, before anything else ends."""
+        self._ended.set()
+        if self._stopped is None:
+            self._stopped = self.guard.stopped  # the end of the flight is no reason worth telling
+        self.guard.stop("the flight is over")
+        self._reported_stop = self.guard.stopped
+
     def end(self, outcome: str) -> None:
         """The flight is over: keep what was written or put it back, as the policy says for this outcome.
+
+        A revert that the gate did not let pass is made up for here: what made the flight worse is not kept.
 
         Args:
             outcome: landed, interrupted, failed or link_lost.
         """
-        self._ended.set()
+        self.stop()
+        if self.pusher is None or not self.history.pushes:
+            return
         rule = getattr(self.rules.policy.end, outcome)
-        self._stopped = self.guard.stopped  # the end of the flight is no reason worth telling
-        self.guard.stop(f"the flight is over ({outcome.replace('_', ' ')})")
-        if self.pusher is None or rule == "keep" or not self.history.pushes:
+        rule = "good" if rule == "keep" and self._owed else rule
+        if rule == "keep":
             return
         target = self.good if rule == "good" else self.originals
         # What is still in flight is finished before this; whatever is right by then is not written again.
         values = "the values at connect" if rule == "restore" else "the last values judged good"
         until = time.monotonic() + GROUNDED_WITHIN
-        while outcome != "link_lost" and self.telemetry.has(FLYING) and time.monotonic() < until:
+        while not self.gate.stale() and self.gate.misplaced("restore") and time.monotonic() < until:
             time.sleep(0.01)
-        if outcome != "link_lost" and self.telemetry.has(FLYING):
-            self._say(f"{values} were not written back: the drone still flies.")
+        if why := self.gate.objection("restore"):
+            self._say(f"{values} were not written back: {why}.")
             return
         self._enter("restore", self.now(), writes=tuple(target.items()), reason=f"{outcome}: {rule}")
         self.pusher.submit(Decision(self.now(), writes=tuple(target.items()), reason=rule, kind="restore"))
@@ -218,10 +231,10 @@ class Oversight:
             return "waits for confirmation"
         if self.watch.full:
             return "what was written is still being judged"
-        return self.health.objection(age=self.now() - time)
+        return self.health.objection(age=self.now() - time) or self.gate.objection("push")
 
     def _judge(self, time: float) -> None:
-        if self.pusher is None or self.pusher.busy or self._reverted:
+        if self.pusher is None or self.pusher.busy or self._reverted or self._ended.is_set():
             return
         verdict, why = self.watch.judge(time)
         if verdict == "good":
@@ -247,7 +260,8 @@ class Oversight:
         self._enter("revert", time, writes=back, reason=why)
         self.watch.forget()
         # All of the good values: a set that is submitted in this moment is taken back with the rest.
-        self.pusher.submit(Decision(time, writes=tuple(self.good.items()), reason=sentence, kind="revert"))
+        kind = "restore" if asked and not self.gate.telemetry.airborne else "revert"  # a person may ask on the ground
+        self.pusher.submit(Decision(time, writes=tuple(self.good.items()), reason=sentence, kind=kind))
         return sentence
 
     def _begin_asking(self, decision: Decision) -> None:

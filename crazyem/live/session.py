@@ -8,11 +8,12 @@ sessions, a crew receives and estimates for all of them (crew.py).
 import math
 import queue
 import threading
+import time
 from collections.abc import Callable, Sequence
 
 from crazyem.errors import CrazyemError, DataError, LinkError, UsageError
 from crazyem.estimation.result import Estimate, Step
-from crazyem.links.base import Block, Link, LinkLost, LinkStatistics, Outage, Packet
+from crazyem.links.base import Block, Link, LinkLost, Outage, Packet, link_account
 from crazyem.live.clock import FirmwareClock
 from crazyem.live.crew import Crew, Mailbox
 from crazyem.live.guard import Guard
@@ -24,6 +25,7 @@ from crazyem.live.policy import load_policy
 from crazyem.live.push import Pusher, push_target, read_originals
 from crazyem.live.recorder import Recorder
 from crazyem.live.telemetry import Telemetry
+from crazyem.live.write_gate import WriteGate
 from crazyem.signals.sample import Sample
 from crazyem.signals.vocabulary import MOTOR_BLOCK, ROTOR_SPEED_BLOCK, STATE_BLOCK, decoders
 from crazyem.vehicle import Vehicle
@@ -59,25 +61,6 @@ def block_plan(available: Sequence[str], *, wrench: str = "ctrlLee") -> list[tup
     return [STATE, motors, *(extra for extra in optional if extra)]
 
 
-def link_account(statistics: LinkStatistics, outages: Sequence[Outage]) -> dict[str, str]:
-    """What became of the packets, for a recording: clocks, round trip, and each block's fates and delays."""
-    account = {
-        "clock.offset_s": repr(statistics.clock_offset),
-        "clock.rate": repr(statistics.clock_rate),
-        "clock.drift_ppm": f"{1e6 * (statistics.clock_rate - 1.0):.3f}",
-        "round_trip_s": f"{statistics.round_trip:.6f}",
-        "outages": str(len(outages)),
-    }
-    for number, outage in enumerate(outages):
-        account[f"outage.{number}"] = f"{outage.before_ms:.0f} ms to {outage.after_ms:.0f} ms: {outage.reason}"
-    for block, (received, lost, late) in statistics.per_block.items():
-        account[f"block.{block}.packets"] = f"{received} received, {lost} lost, {late} late"
-        if block in statistics.delays:
-            median, p99 = statistics.delays[block]
-            account[f"block.{block}.delay_s"] = f"{median:.6f} median, {p99:.6f} 99th percentile"
-    return account
-
-
 class Session:
     """Estimates from an open link until closed.
 
@@ -92,6 +75,9 @@ class Session:
         reconnect_within: s for which a lost link is tried again, 0 = never. The window is kept: the estimator sees the
             gap in the stamps and begins a new stretch after it.
         crew: whose threads receive and estimate, where one process has many sessions; None: threads of its own.
+
+    Attributes:
+        host_clock: s since the epoch, as in `Packet.host_time`; a test may bring one of its own.
     """
 
     def __init__(
@@ -113,6 +99,7 @@ class Session:
         self.history = History()
         self.clock = FirmwareClock()
         self.telemetry = Telemetry()
+        self.host_clock: Callable[[], float] = time.time
         self.lost: LinkLost | None = None
         self.outages: list[Outage] = []
         self.rate = rate
@@ -196,12 +183,13 @@ class Session:
             on_write = self.recorder.parameter_write
             self.recorder.metadata("parameters_at_connect", {k: repr(v) for k, v in originals.items()})
             self.recorder.metadata("guard", {"mode": rules.mode, "policy": rules.policy.to_toml()})
+        gate = WriteGate(self.telemetry, rate=lambda: self.clock.rate, now=self.host_clock)
         oversight = Oversight(
             guard,
             rules,
             originals=originals,
             history=self.history,
-            telemetry=self.telemetry,
+            gate=gate,
             now=lambda: self.clock.newest,
             residual=lambda: getattr(self.pipeline.estimator, "residual", None),
             enabled=lambda time: self.pipeline.push_from <= time <= self.pipeline.push_until,
@@ -211,6 +199,7 @@ class Session:
             self.pusher = oversight.pusher = Pusher(
                 self.link,
                 guard,
+                gate=gate,
                 history=self.history,
                 on_write=on_write,
                 wait_for_link=self.wait_for_link,
@@ -221,6 +210,11 @@ class Session:
             self.pipeline.push = self.pusher.submit
         self.pipeline.guard = self.oversight = oversight
         return note
+
+    def stop_pushing(self) -> None:
+        """Begin no new set of writes from now on: the first step of every way out."""
+        if self.oversight is not None:
+            self.oversight.stop()
 
     def end_pushing(self, outcome: str) -> None:
         """The flight is over, `landed`, `interrupted`, `failed` or `link_lost`: keep or restore, as the policy says."""
@@ -261,10 +255,17 @@ class Session:
         return f"{reason[:1].lower()}{reason[1:]}{tail}."
 
     def close(self) -> None:
-        """Stop receiving, let the estimator finish what has arrived, end the writes. Does not close the link."""
+        """End the writes, stop receiving, let the estimator finish what has arrived. Does not close the link.
+
+        In this order: as long as anything may be written, telemetry goes on, so that the write gate knows where the
+        drone is; and what the estimator finishes afterwards is not pushed any more.
+        """
         if self._closed:
             return
         self._closed = True
+        self.stop_pushing()
+        if self.pusher is not None:
+            self.pusher.close()
         self._stop.set()
         for thread in self._threads:
             thread.join(timeout=30.0)
@@ -273,8 +274,6 @@ class Session:
             if self._bringing_back is not None:
                 self._bringing_back.join(timeout=30.0)
             self._mailbox.wait(30.0)
-        if self.pusher is not None:
-            self.pusher.close()
         if self.oversight is not None:
             self.oversight.close()
         if self.recorder is not None and self.blocks:
@@ -346,6 +345,7 @@ class Session:
     def _receiving_failed(self, error: Exception) -> None:
         """A fault of ours must reach the flight as well: it has to land."""
         self._deaf = True
+        self.stop_pushing()
         self.failure = error if isinstance(error, CrazyemError) else CrazyemError(f"receiving failed: {error!r}")
 
     @property
@@ -362,14 +362,14 @@ class Session:
         """Bring the link back; there is nothing to receive meanwhile. False: lost for good."""
         reconnect = getattr(self.link, "reconnect", None)
         if reconnect is None or not getattr(self.link, "can_reconnect", True) or self.reconnect_within <= 0.0:
-            self.lost = lost
+            self._gone(lost)
             return False
         self._linked.clear()
         self._tell(f"the link was lost, trying again: {lost.reason}")
         try:
             outage: Outage = reconnect(self.reconnect_within, self._stop)
         except LinkError as error:
-            self.lost = LinkLost(f"{lost.reason.rstrip('.')}; {str(error)[:1].lower()}{str(error)[1:]}", lost.host_time)
+            self._gone(LinkLost(f"{lost.reason.rstrip('.')}; {str(error)[:1].lower()}{str(error)[1:]}", lost.host_time))
             return False
         else:
             self.outages.append(outage)
@@ -382,6 +382,10 @@ class Session:
         self.history.notice(sentence)
         self._tell(sentence)
         return True
+
+    def _gone(self, lost: LinkLost) -> None:
+        self.stop_pushing()
+        self.lost = lost
 
     def _tell(self, sentence: str) -> None:
         if self.recorder is not None:
@@ -402,6 +406,7 @@ class Session:
         if "supervisor.info" in names:
             info = packet.values[names.index("supervisor.info")]
             self.telemetry.info = int(info) if math.isfinite(info) else None
+            self.telemetry.heard = packet.host_time
         for name, value in zip(names, packet.values):
             if not math.isfinite(value):
                 if self.failure is None:

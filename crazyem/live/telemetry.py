@@ -1,8 +1,9 @@
 """The newest state of the drone, for sequencing a flight (never for estimating: that is the pipeline's)."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from crazyem.estimation.contact import ContactGate
 from crazyem.signals.sample import Sample
 
 # supervisor.info, firmware supervisor.c
@@ -15,20 +16,28 @@ class Telemetry:
 
     Attributes:
         info: bits of supervisor.info, None until seen.
+        heard: s since the epoch, host time at which the newest `info` arrived; -inf before any.
         position: m, world. yaw: rad. voltage: V. setpoint: m, world.
     """
 
     info: int | None = None
+    heard: float = -math.inf
     position: tuple[float, float, float] | None = None
     yaw: float = 0.0
     voltage: float = math.nan
     setpoint: tuple[float, float, float] | None = None
+    _duty: float = math.inf  # of the fastest rotor, 0..1; inf where nothing is known
+    _contact: ContactGate = field(default_factory=lambda: ContactGate(math.inf))
 
     def take(self, sample: Sample) -> None:
         """Keep what this sample says."""
         v = sample.value
         if sample.signal == "position":
             self.position = (v[0], v[1], v[2])
+            self._look(v[2])
+        elif sample.signal == "motor_command":
+            self._duty = max(v)
+            self._look(math.nan)
         elif sample.signal == "attitude":
             x, y, z, w = v
             self.yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -36,6 +45,18 @@ class Telemetry:
             self.voltage = v[0]
         elif sample.signal == "setpoint_position":
             self.setpoint = (v[0], v[1], v[2])
+
+    def _look(self, height: float) -> None:
+        flying = self.has(FLYING)
+        if flying and self._duty <= 0.0:
+            height = math.nan  # rotors that stop in a fall are no sign that the drone rests at this height
+        self._contact.update(height=height, thrust=self._duty, flying=flying)
+
+    @property
+    def airborne(self) -> bool:
+        """Whether the drone is in the air: the firmware says that it flies (and goes on to say so for 2 s after its
+        motors stopped), its rotors turn, and it is not down where it stood before, by the estimator's own rule."""
+        return self.has(FLYING) and self._contact.airborne
 
     def has(self, bit: int) -> bool:
         """Whether a bit of supervisor.info is set (False until it was seen)."""

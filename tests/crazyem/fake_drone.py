@@ -4,6 +4,7 @@ import queue
 import struct
 import threading
 import time
+from types import SimpleNamespace
 
 from crazyem.errors import LinkError
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
@@ -18,6 +19,9 @@ AHEAD = 0.1  # s of the drone's clock that a flight may be behind
 PATIENCE = 5.0  # s; who does not catch up for so long is not waited for any more
 SAG = 0.3  # m below the wanted height until the believed mass is right
 TRUTH = {"mass": 0.036, "Ixx": 2.0e-5, "Iyy": 2.1e-5, "Izz": 3.6e-5, "motor_time_constant": 0.06}
+
+
+OPEN = SimpleNamespace(stale=lambda: "", misplaced=lambda purpose: "")  # a write gate that lets everything pass
 
 
 def float32(value):
@@ -65,6 +69,11 @@ class FakeLink:
         A busy machine starves their threads.
         """
         self._session, self._flight = session, flight
+        session.host_clock = self.host_time
+
+    def host_time(self):
+        """Host time on which the drone's runs as fast as it should, however busy this machine is."""
+        return self.fm / 1000.0
 
     def connect(self, timeout=15.0):
         pass
@@ -152,7 +161,7 @@ class FakeLink:
             self._wait()
             self.fm += 10
             if self.lost_at is not None and self.fm > self.lost_at:
-                self.packets.put(LinkLost("the link closed.", time.time()))
+                self.packets.put(LinkLost("the link closed.", self.host_time()))
                 return
             sag = SAG * (0.036 - self.values["ctrlLee.mass"]) / 0.007
             goal = max(0.0, self.wanted[2] - sag) if self.motors else 0.0
@@ -161,7 +170,7 @@ class FakeLink:
                 self.motors = False
             for block in tuple(self.blocks):
                 values = tuple(self.value(v.name) for v in block.variables)
-                self.packets.put(Packet(block.identifier, self.fm, time.time(), values))
+                self.packets.put(Packet(block.identifier, self.fm, self.host_time(), values))
             time.sleep(0.01 / self.speed)
 
     def value(self, name):
@@ -174,6 +183,8 @@ class FakeLink:
             "ctrltargetZ.x": 1e3 * self.wanted[0], "ctrltargetZ.y": 1e3 * self.wanted[1],
             "ctrltargetZ.z": 1e3 * self.wanted[2], "supervisor.info": float(info), "pm.vbatMV": 3900.0, "acc.z": 1.0,
         }  # fmt: skip
+        if name in MOTOR_BLOCK[:4]:
+            return 40000.0 if self.motors else 0.0
         return fixed.get(name, 0.0)
 
 

@@ -12,13 +12,13 @@ from relayed import down, now_on, relayed, up
 from crazyem.control.trajectories import excite, hover
 from crazyem.errors import CrazyemError, LinkError
 from crazyem.estimation.online import OnlineEstimator
-from crazyem.links.base import LinkLost, LinkStatistics, Outage, ParameterWrite
+from crazyem.links.base import LinkLost, LinkStatistics, Outage, ParameterWrite, link_account
 from crazyem.links.crazyflie import CrazyflieLink
 from crazyem.live.controllers import LEE
 from crazyem.live.crew import Crew
 from crazyem.live.flight import Flight, FlightPlan
 from crazyem.live.mcap_recorder import open_recorder
-from crazyem.live.session import Session, link_account
+from crazyem.live.session import Session
 from crazyem.recordings import open_recording
 from crazyem.vehicle import load_vehicle
 
@@ -156,7 +156,7 @@ def test_a_write_that_falls_into_an_outage_is_made_up_for(crew):
 
 
 def test_every_attempt_of_a_write_is_recorded():
-    from crazyem.live.guard import Guard
+    from crazyem.live.guard import Decision, Guard
     from crazyem.live.history import History
     from crazyem.live.push import ATTEMPTS, Pusher
 
@@ -165,8 +165,8 @@ def test_every_attempt_of_a_write_is_recorded():
     guard = Guard(LEE, nominal=nominal, originals=dict(link.values))
     written: list[ParameterWrite] = []
     history = History()
-    pusher = Pusher(link, guard, history=history, on_write=written.append)
-    pusher._write(1.0, "ctrlLee.mass", 0.03)
+    pusher = Pusher(link, guard, gate=fake.OPEN, history=history, on_write=written.append)
+    pusher.submit(Decision(1.0, writes=(("ctrlLee.mass", 0.03),)))
     pusher.close()
     assert len(written) == ATTEMPTS
     assert [p.verified for p in history.pushes] == [False]

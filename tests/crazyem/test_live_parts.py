@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
+import fake_drone as fake
 import numpy as np
 import pytest
 
@@ -202,7 +203,7 @@ def test_a_fault_while_pushing_is_named_and_ends_the_pushing():
     guard = SimpleNamespace(stopped="")
     guard.stop = lambda reason: setattr(guard, "stopped", reason)
     history = History()
-    pusher = Pusher(_BrokenLink(), guard, history=history)
+    pusher = Pusher(_BrokenLink(), guard, gate=fake.OPEN, history=history)
     pusher.submit(Decision(1.0, writes=(("ctrlLee.mass", 0.03), ("ctrlLee.J_x", 1e-5))))
     pusher.close()
     assert [p.verified for p in history.pushes] == [False]  # the second write was never tried

@@ -5,6 +5,7 @@ import math
 import time
 from dataclasses import replace
 
+import fake_drone as fake
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -43,6 +44,11 @@ class Drone:
         return ParameterWrite(name, value, None if lost else value, not lost, time.time())
 
 
+@pytest.fixture(autouse=True)
+def _at_once(monkeypatch):
+    monkeypatch.setattr("crazyem.live.push.MOMENT", 0.001)
+
+
 def a_set(changed=None):
     return Decision(1.0, writes=writes_for(LEE, changed or NEW, beliefs=NOMINAL, originals=ORIGINALS))
 
@@ -50,8 +56,8 @@ def a_set(changed=None):
 def run(drone, *decisions, **kw):
     guard, history = Guard(LEE, nominal=NOMINAL, originals=ORIGINALS), History()
     done = []
-    pusher = Pusher(drone, guard, history=history, timeout=0.01, known=ORIGINALS,
-                    on_done=lambda d, complete: done.append((d.kind, complete)), **kw)  # fmt: skip
+    pusher = Pusher(drone, guard, gate=fake.OPEN, history=history, timeout=0.01, known=ORIGINALS,
+                    on_done=lambda d, why: done.append((d.kind, not why)), **kw)  # fmt: skip
     for decision in decisions:
         pusher.submit(decision)
     pusher.close()
@@ -138,7 +144,9 @@ def test_a_stop_before_a_set_drops_it_and_one_within_completes_it():
 
     drone.write_parameter = stop_in_the_middle
     done = []
-    pusher = Pusher(drone, guard, history=History(), known=ORIGINALS, on_done=lambda d, c: done.append(c))
+    pusher = Pusher(
+        drone, guard, gate=fake.OPEN, history=History(), known=ORIGINALS, on_done=lambda d, why: done.append(not why)
+    )
     pusher.submit(a_set())
     pusher.submit(a_set({"mass": 0.036}))
     pusher.close()

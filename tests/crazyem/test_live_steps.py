@@ -4,6 +4,7 @@ import json
 import math
 from pathlib import Path
 
+import fake_drone as fake
 import numpy as np
 import pytest
 from hovering import INERTIA, hover
@@ -302,7 +303,7 @@ def test_a_write_that_fails_with_the_link_is_recorded_too():
             raise LinkError("gone.")
 
     kept, guard = [], Guard(LEE, nominal=NOMINAL, originals=ORIGINALS)
-    pusher = Pusher(Gone(), guard, history=History(), on_write=kept.append)
+    pusher = Pusher(Gone(), guard, gate=fake.OPEN, history=History(), on_write=kept.append)
     pusher.submit(Decision(1.0, writes=(("ctrlLee.mass", 0.03),)))
     pusher.close()
     assert {(w.name, w.value, w.echoed, w.verified) for w in kept} == {("ctrlLee.mass", 0.03, None, False)}
