@@ -75,9 +75,6 @@ class Session:
         reconnect_within: s for which a lost link is tried again, 0 = never. The window is kept: the estimator sees the
             gap in the stamps and begins a new stretch after it.
         crew: whose threads receive and estimate, where one process has many sessions; None: threads of its own.
-
-    Attributes:
-        host_clock: s since the epoch, as in `Packet.host_time`; a test may bring one of its own.
     """
 
     def __init__(
@@ -99,7 +96,6 @@ class Session:
         self.history = History()
         self.clock = FirmwareClock()
         self.telemetry = Telemetry()
-        self.host_clock: Callable[[], float] = time.time
         self.lost: LinkLost | None = None
         self.outages: list[Outage] = []
         self.rate = rate
@@ -183,7 +179,8 @@ class Session:
             on_write = self.recorder.parameter_write
             self.recorder.metadata("parameters_at_connect", {k: repr(v) for k, v in originals.items()})
             self.recorder.metadata("guard", {"mode": rules.mode, "policy": rules.policy.to_toml()})
-        gate = WriteGate(self.telemetry, rate=lambda: self.clock.rate, now=self.host_clock)
+        host_clock = getattr(self.link, "host_clock", time.time)  # that of `Packet.host_time`
+        gate = WriteGate(self.telemetry, rate=lambda: self.clock.rate, now=host_clock)
         oversight = Oversight(
             guard,
             rules,

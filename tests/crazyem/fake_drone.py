@@ -57,6 +57,7 @@ class FakeLink:
         self.writes = 0
         self.fm = 1000
         self._landing = False
+        self._silent_since = None
         self._session = self._flight = None
         self._stop = threading.Event()
         self._thread = None
@@ -69,11 +70,11 @@ class FakeLink:
         A busy machine starves their threads.
         """
         self._session, self._flight = session, flight
-        session.host_clock = self.host_time
 
-    def host_time(self):
+    def host_clock(self):
         """Host time on which the drone's runs as fast as it should, however busy this machine is."""
-        return self.fm / 1000.0
+        silent = time.monotonic() - self._silent_since if self._silent_since is not None else 0.0
+        return self.fm / 1000.0 + self.speed * silent
 
     def connect(self, timeout=15.0):
         pass
@@ -161,7 +162,8 @@ class FakeLink:
             self._wait()
             self.fm += 10
             if self.lost_at is not None and self.fm > self.lost_at:
-                self.packets.put(LinkLost("the link closed.", self.host_time()))
+                self.packets.put(LinkLost("the link closed.", self.host_clock()))
+                self._silent_since = time.monotonic()
                 return
             sag = SAG * (0.036 - self.values["ctrlLee.mass"]) / 0.007
             goal = max(0.0, self.wanted[2] - sag) if self.motors else 0.0
@@ -170,7 +172,7 @@ class FakeLink:
                 self.motors = False
             for block in tuple(self.blocks):
                 values = tuple(self.value(v.name) for v in block.variables)
-                self.packets.put(Packet(block.identifier, self.fm, self.host_time(), values))
+                self.packets.put(Packet(block.identifier, self.fm, self.host_clock(), values))
             time.sleep(0.01 / self.speed)
 
     def value(self, name):

@@ -73,7 +73,7 @@ class _Filter:
         link = self.link
         if link.gone_at is not None and link.fm > link.gone_at:
             link.gone_at, link.gone = None, True
-            link._passed.put(LinkLost("it was away.", time.time()))
+            link._passed.put(LinkLost("it was away.", link.host_clock()))
         if not link.gone:
             link._passed.put(item)
 
