@@ -115,7 +115,7 @@ def report(
 
 def close_recorder(recorder: Recorder, statistics: LinkStatistics, history: History) -> None:
     """Finish the recording, with the account of lost packets in it; say so if it is not whole."""
-    counts = {"received": statistics.received, "lost": statistics.lost, "late": statistics.late}
+    counts = {n: getattr(statistics, n) for n in ("received", "lost", "late", "duplicates")}
     recorder.metadata("statistics", {k: str(v) for k, v in counts.items()})
     recorder.close()
     history.notice(recorder.failure)

@@ -50,6 +50,7 @@ class LinkStatistics:
         round_trip: median of the newest echoes, s; NaN where unknown.
         clock_offset, clock_rate: host time [s since the epoch] = offset + rate * firmware time [s]; NaN where unknown.
         outages: how often the link was lost and came back.
+        duplicates: packets that the link brought again; they are dropped and count as nothing else.
     """
 
     received: int = 0
@@ -61,6 +62,7 @@ class LinkStatistics:
     clock_offset: float = math.nan
     clock_rate: float = math.nan
     outages: int = 0
+    duplicates: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +91,7 @@ def link_account(statistics: LinkStatistics, outages: Sequence[Outage]) -> dict[
         "clock.drift_ppm": f"{1e6 * (statistics.clock_rate - 1.0):.3f}",
         "round_trip_s": f"{statistics.round_trip:.6f}",
         "outages": str(len(outages)),
+        "duplicates": str(statistics.duplicates),
     }
     for number, outage in enumerate(outages):
         account[f"outage.{number}"] = f"{outage.before_ms:.0f} ms to {outage.after_ms:.0f} ms: {outage.reason}"

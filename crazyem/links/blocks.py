@@ -170,8 +170,10 @@ class LogBlocks:
                 if edge is not None:
                     delay = host_time - edge.to_host(firmware_time)
                     late = delay > LATE_AFTER
+                if not self._counters[identifier].count(firmware_time, late=late):
+                    return
+                if edge is not None:
                     self._delays[identifier].append(delay)
-                self._counters[identifier].count(firmware_time, late=late)
                 # Inside the lock, so that nothing overtakes when held packets are let go.
                 self._packets.put(Packet(identifier, firmware_time, host_time, tuple(data[name] for name in names)))
 
@@ -191,6 +193,7 @@ class LogBlocks:
         """Packets by fate, in total and per block, their delays and the clocks."""
         with self._lock:
             fates = {i: (c.received, c.lost, c.late) for i, c in self._counters.items()}
+            duplicates = sum(c.duplicates for c in self._counters.values())
             delays = {i: list(d) for i, d in self._delays.items() if d}
             fit = self._clock.fit()
         totals = [sum(f[k] for f in fates.values()) for k in range(3)]
@@ -201,6 +204,7 @@ class LogBlocks:
             clock_offset=fit.offset if fit is not None else math.nan,
             clock_rate=fit.rate if fit is not None else math.nan,
             outages=self.outages,
+            duplicates=duplicates,
         )  # fmt: skip
 
     # --- after an outage --------------------------------------------------------------------------------------------

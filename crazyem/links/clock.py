@@ -42,23 +42,40 @@ class LossCounter:
     Periods elapsed since the first packet minus packets since then is therefore the number lost, plus the lateness
     of the newest packet, minus the lateness of the first, in periods. The minimum over the last few packets removes
     the second term; the least value ever seen is the third.
+
+    A stamp that was here before is a duplicate, which the link made, and counts for nothing else. There is one
+    exception: after a delay the firmware samples at once what is overdue, and two packets share a millisecond (1 in 500
+    of the real firmware's, each after a gap of two periods). So a repeated stamp is a packet while one is overdue, that
+    is, after a gap wider than a period. A packet that is doubled just after a loss looks the same, and hides that loss.
     """
 
     _SETTLING = 10  # packets; longer than any burst of late ones seen
+    _MEMORY = 1000  # newest stamps among which a duplicate is recognised
+    _ON_TIME = 0.75  # periods from one packet to the next: more, and nothing is overdue any more
 
     def __init__(self, period_ms: int) -> None:
         self.period_ms = int(period_ms)
         self.received = 0
         self.late = 0
+        self.duplicates = 0
+        self._stamps: deque[int] = deque(maxlen=self._MEMORY)
+        self._overdue = math.inf  # packets that may still come with the newest stamp; before the first any number
         self._first = 0
         self._newest = 0
         self._missing: deque[float] = deque(maxlen=self._SETTLING)
         self._least = 0.0
 
-    def count(self, firmware_time_ms: int, *, late: bool = False) -> None:
-        """Account for a packet stamped `firmware_time_ms` (unwrapped); `late` if the host got it with delay."""
+    def count(self, firmware_time_ms: int, *, late: bool = False) -> bool:
+        """Account for a packet stamped `firmware_time_ms` (unwrapped); False: a duplicate.
+
+        `late`: whether the host got it with delay.
+        """
         if self.received == 0:
             self._first = self._newest = firmware_time_ms
+        elif self._is_duplicate(firmware_time_ms):
+            self.duplicates += 1
+            return False
+        self._stamps.append(firmware_time_ms)
         if late or firmware_time_ms < self._newest:
             self.late += 1
         self._newest = max(self._newest, firmware_time_ms)
@@ -66,6 +83,19 @@ class LossCounter:
         self.received += 1
         self._missing.append(missing)
         self._least = min(self._least, missing)
+        return True
+
+    def _is_duplicate(self, stamp: int) -> bool:
+        gap = (stamp - self._newest) / self.period_ms
+        if gap > 0.0:
+            waiting = self._overdue if gap < self._ON_TIME else 0.0
+            self._overdue = max(waiting + gap - 1.0, 0.0)
+            return False
+        seen = stamp in self._stamps
+        if seen and (gap < 0.0 or self._overdue < self._ON_TIME):
+            return True
+        self._overdue = max(self._overdue - 1.0, 0.0)  # one of those that were due: it was late, or overtaken
+        return False
 
     @property
     def lost(self) -> int:

@@ -21,10 +21,16 @@ def test_unwrapping_follows_jumps_and_reordering(start, steps):
 
 
 def firmware_stamps(rng, count, period, jitter):
-    """As the firmware makes them: a timer on an exact grid, a worker that is late now and then and never reorders."""
+    """As the firmware makes them: a timer on an exact grid, and a worker that is held up now and then.
+
+    What became due meanwhile is sampled as soon as the worker goes on, so some packets share a millisecond.
+    """
     ideal = 1234 + period * np.arange(count)
-    delay = np.where(rng.random(count) < 0.05, rng.integers(0, jitter + 1, count), rng.integers(0, 2, count))
-    return np.maximum.accumulate(ideal + delay)
+    stamps = ideal + rng.integers(0, 2, count)
+    for k in range(0, count, 5):
+        if rng.random() < 0.25:
+            stamps[k] = ideal[k] + rng.integers(0, jitter + 1)
+    return np.maximum.accumulate(stamps)
 
 
 @settings(max_examples=60, deadline=None)
@@ -40,6 +46,77 @@ def test_losses_are_counted_exactly_under_jitter(seed, period, share):
     assert counter.received == kept.sum()
     assert counter.lost == 400 - kept.sum()
     assert counter.late == 0
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([10, 20, 100]),
+    st.floats(0.0, 0.3),
+    st.floats(0.0, 0.5),
+    st.integers(1, 3),
+    st.integers(0, 20),
+)
+def test_duplicates_cancel_no_loss(seed, period, share, doubled, copies, delay):
+    """Whatever is lost and doubled, at once or up to 20 packets later.
+
+    Only a copy of the newest packet that follows a loss hides it.
+    """
+    rng = np.random.default_rng(seed)
+    stamps = 1234 + period * np.arange(400) + rng.integers(0, 2, 400)
+    kept = rng.random(400) >= share
+    kept[:12] = kept[-12:] = True
+    arrivals, extra, hidden, gone = [], 0, 0, 0
+    for k in range(400):
+        if not kept[k]:
+            gone += 1
+            continue
+        arrivals.append((k, 0, stamps[k]))
+        if k and rng.random() < doubled:
+            later = int(rng.integers(0, delay + 1))
+            arrivals += [(k + later, 1, stamps[k])] * copies
+            extra += copies
+            newest = not kept[k + 1 : k + 1 + later].any()
+            hidden += min(copies, gone) if newest else 0
+        gone = 0
+    counter = LossCounter(period)
+    taken = [counter.count(int(stamp)) for _, _, stamp in sorted(arrivals, key=lambda a: a[:2])]
+    assert counter.lost == 400 - kept.sum() - hidden
+    assert counter.duplicates == taken.count(False) == extra - hidden
+    assert counter.received == taken.count(True)
+    assert counter.late == 0
+
+
+def test_three_in_a_hundred_lost_and_as_many_doubled():
+    rng = np.random.default_rng(5)
+    counter = LossCounter(10)
+    lost = doubled = 0
+    for k in range(9000):
+        if rng.random() < 0.03:
+            lost += 1
+            continue
+        counter.count(10 * k)
+        if rng.random() < 0.03:
+            doubled += 1
+            counter.count(10 * k)
+    assert counter.lost == pytest.approx(lost, abs=0.05 * lost)  # some are doubled just after a loss
+    assert counter.duplicates == pytest.approx(doubled, abs=0.05 * doubled)
+
+
+def test_two_packets_that_were_overdue_share_a_millisecond_and_are_both_counted():
+    """As the real firmware does after a delay: no duplicate, and nothing lost."""
+    counter = LossCounter(10)
+    for stamp in (0, 10, 20, 30, 40, 60, 60, 70, 80, 110, 110, 110, 118, 128, 138, 148, 158, 168, 178, 188):
+        assert counter.count(stamp)
+    assert not counter.count(188)
+    assert (counter.lost, counter.duplicates, counter.late) == (0, 1, 0)
+
+
+def test_a_duplicate_of_an_overtaken_packet():
+    counter = LossCounter(10)
+    stamps = (0, 10, 30, 20, 20, 30, 40, 50, 60, 70, 80, 90, 100, 110, 120)
+    assert [s for s in stamps if not counter.count(s)] == [20, 30]
+    assert (counter.received, counter.lost, counter.late, counter.duplicates) == (13, 0, 1, 2)
 
 
 def test_nothing_is_called_lost_on_the_way_when_nothing_is():

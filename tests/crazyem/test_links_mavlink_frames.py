@@ -219,6 +219,36 @@ def test_losses_are_counted_exactly_while_fewer_than_128_follow_each_other(kept)
         assert count.late == 0
 
 
+def test_a_repetition_that_comes_too_late_to_be_recognised_cancels_no_loss():
+    count = SequenceCounter()
+    for number in range(200):
+        if number != 150:
+            count.take(number, bytes([number]))
+    assert count.lost == 1
+    assert count.take(110, bytes([110]))
+    assert count.lost == 1
+    assert count.take(150, bytes([150]))  # the lost one, at last
+    assert (count.lost, count.late) == (0, 2)
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 120)), min_size=2, max_size=300))
+def test_repetitions_cancel_no_loss(course):
+    """Each frame is lost or comes, and comes again some frames later."""
+    arrivals, lost, run = [], 0, 0
+    for k, (keep, later) in enumerate([(True, 0), *course, (True, 0)]):
+        run = 0 if keep else run + 1
+        lost += not keep
+        if run > 100:
+            return
+        if keep:
+            arrivals += [(k, 0, k), (k + later, 1, k)]
+    count = SequenceCounter()
+    for _, _, k in sorted(arrivals):
+        count.take(k % 256, k.to_bytes(4, "big"))
+    assert count.lost == lost
+
+
 # --- addresses ---
 
 

@@ -120,6 +120,7 @@ class Receiver:
             clock_offset=fit.offset if fit is not None else math.nan,
             clock_rate=fit.rate if fit is not None else math.nan,
             outages=self.outages,
+            duplicates=self.sequence.repeated,
         )
 
     def account(self) -> Mapping[str, str]:

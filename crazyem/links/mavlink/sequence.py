@@ -4,6 +4,7 @@ from collections import deque
 
 _MEMORY = 64  # newest frames that a repetition is recognised among
 _LATE = 128  # numbers behind count as late, numbers ahead as a gap
+_NUMBERS = 256
 
 
 class SequenceCounter:
@@ -11,7 +12,8 @@ class SequenceCounter:
 
     def __init__(self) -> None:
         self.received = self.lost = self.late = self.repeated = 0
-        self._newest: int | None = None
+        self._newest: int | None = None  # continued beyond 8 bits
+        self._missing: set[int] = set()
         self._seen: deque[bytes] = deque(maxlen=_MEMORY)
 
     def take(self, sequence: int, raw: bytes) -> bool:
@@ -21,11 +23,19 @@ class SequenceCounter:
             return False
         self._seen.append(raw)
         self.received += 1
-        ahead = 1 if self._newest is None else (sequence - self._newest) % 256
+        if self._newest is None:
+            self._newest = sequence
+            return True
+        ahead = (sequence - self._newest) % _NUMBERS
         if 0 < ahead <= _LATE:
             self.lost += ahead - 1
-            self._newest = sequence
+            self._missing.update(range(self._newest + 1, self._newest + ahead))
+            self._newest += ahead
+            self._missing = {n for n in self._missing if n > self._newest - _LATE} if self._missing else self._missing
         elif ahead:  # 0: 256 lost, or a sender that does not count
             self.late += 1
-            self.lost = max(self.lost - 1, 0)
+            number = self._newest + ahead - _NUMBERS
+            if number in self._missing:  # else it is a repetition whose first arrival is forgotten
+                self._missing.remove(number)
+                self.lost -= 1
         return True
