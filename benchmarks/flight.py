@@ -9,11 +9,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle, load_vehicle
+from kernel_cache import kernel
 
 LOG_RATE = 100.0  # Hz
 VOLTAGE = 3.9  # V, constant
@@ -60,7 +60,7 @@ class Flight:
             yield Sample("body_rate", t, tuple(y[10:13]))
 
 
-@njit(cache=True)
+@kernel
 def _fly(steps, every, seed, mass, inertia, lag, force_noise, torque_noise, mixing, unmixing, phases, excitation):
     """States (n, 13) and rotor thrusts in force (n, 4) at every `every`-th millisecond."""
     np.random.seed(seed)

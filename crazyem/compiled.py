@@ -1,15 +1,14 @@
 """`compiled`: numba's njit with a disk cache that notices an edit in any kernel, not only in the function's own file.
 
-Numba stamps a cached function with the modification time of its own file; a kernel that calls kernels or reads layout
+Numba stamps a cached function with the content of its own file; a kernel that calls kernels or reads layout
 constants of another file would go on running old machine code after an edit there.
 """
 
-import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from numba import njit
+import kernel_cache
 
 FASTMATH = {"contract", "reassoc", "nsz"}  # lets dot products use vector registers; NaN keeps its meaning
 
@@ -31,8 +30,8 @@ def _has_kernels(path: Path) -> bool:
 
 def _stamp(folders: tuple[str, ...]) -> tuple[tuple[str, int, int], ...]:
     kernels = (p for folder in folders for p in sorted((_ROOT / folder).rglob("*.py")) if _has_kernels(p))
-    # this file says how to compile
-    return tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in (Path(__file__), *kernels))
+    how = (Path(__file__), Path(kernel_cache.__file__))  # these say how to compile
+    return tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in (*how, *kernels))
 
 
 _STAMPS = {folder: _stamp(called) for folder, called in _CALLS.items()}
@@ -44,11 +43,7 @@ def compiled(function: Callable[..., Any]) -> Any:
     A division by zero gives inf or NaN, as in numpy, and callers check what comes out; raising instead would put a
     branch at every division and cost a third of an update.
     """
-    dispatcher: Any = njit(cache=True, nogil=True, fastmath=FASTMATH, error_model="numpy")(function)
     path = Path(function.__code__.co_filename)
     folder = path.relative_to(_ROOT).parts[0] if path.is_relative_to(_ROOT) else ""
-    if folder not in _STAMPS:
-        return dispatcher  # a kernel elsewhere uses its own file only, whose time numba checks itself
-    with contextlib.suppress(AttributeError):  # private to numba; without it caching works, only less watchful
-        dispatcher._cache._cache_file._source_stamp = _STAMPS[folder]
-    return dispatcher
+    # a kernel elsewhere uses its own file only, which numba checks itself
+    return kernel_cache.kernel(function, stamp=_STAMPS.get(folder), fastmath=FASTMATH)

@@ -1,18 +1,18 @@
 """`kernel`: numba's njit for this package, with a cache that notices edits in any file, not only in the function's own.
 
-Numba stamps a cached function with the modification time of the file it is written in. Our kernels call kernels of
+Numba stamps a cached function with the content of the file it is written in. Our kernels call kernels of
 other files and read index constants of other files, so an edit there would silently leave old machine code in use.
 """
 
-import contextlib
 from pathlib import Path
 from typing import Any
 
-from numba import njit
+import kernel_cache
 
 _ROOT = Path(__file__).parent
 _FOLDERS = ("plant", "controllers", "commander")
-_SOURCES = sorted([_ROOT / "contents.py", *(p for folder in _FOLDERS for p in (_ROOT / folder).rglob("*.py"))])
+_SOURCES = [Path(__file__), Path(kernel_cache.__file__), _ROOT / "contents.py"]  # the first two say how to compile
+_SOURCES += sorted(p for folder in _FOLDERS for p in (_ROOT / folder).rglob("*.py"))
 _STAMP = tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in _SOURCES)
 
 
@@ -21,7 +21,4 @@ def kernel(function: Any) -> Any:
 
     Division by zero gives infinity as in C, not an exception.
     """
-    dispatcher: Any = njit(cache=True, nogil=True, error_model="numpy")(function)
-    with contextlib.suppress(AttributeError):  # private to numba; without it caching works, only less watchful
-        dispatcher._cache._cache_file._source_stamp = _STAMP
-    return dispatcher
+    return kernel_cache.kernel(function, stamp=_STAMP)

@@ -150,6 +150,5 @@ def compile_kernels(vehicle: Vehicle) -> None:
     """Compile before anything flies, and say so where it took its time."""
     from crazyem.live.warm_up import warm_up
 
-    seconds = warm_up(vehicle)
-    if seconds > 3.0:
+    if seconds := warm_up(vehicle):
         say(f"compiled the estimator in {seconds:.0f} s (once per installation)")

@@ -7,11 +7,12 @@ from crazyem.errors import CrazyemError
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle
+from kernel_cache import compilations
 
 
 def warm_up(vehicle: Vehicle) -> float:
-    """Compile the kernels; returns the seconds it took (once per installation, then they come from the disk)."""
-    begun = time.monotonic()
+    """Run every kernel once; returns the seconds it took if any was compiled, 0.0 if all came from the disk."""
+    begun, before = time.monotonic(), compilations()
     estimator = OnlineEstimator(vehicle, window=100, every=4)
     hover = 0.5
     try:
@@ -32,4 +33,4 @@ def warm_up(vehicle: Vehicle) -> float:
         estimator.finish()
     except CrazyemError:
         pass  # nonsense data may be refused; compiling was the point
-    return time.monotonic() - begun
+    return time.monotonic() - begun if compilations() > before else 0.0

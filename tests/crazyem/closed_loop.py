@@ -3,11 +3,8 @@
 Shares no line with the code that diagnoses: the oracle of `test_diagnosis_end_to_end.py`. Compiled, for speed alone.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
-import numba
 import numpy as np
 from made_flight import array_of
 from numpy.typing import NDArray
@@ -16,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
+from kernel_cache import kernel as compiled
 
 Array = NDArray[np.float64]
-compiled: Callable[..., Any] = numba.njit(cache=True)
 G = 9.81
 PER_VOLT = 0.04  # N of one rotor
 DRONE = Vehicle(

@@ -10,7 +10,8 @@ Attitude is kept as a quaternion (x, y, z, w), advanced by the exact turn of the
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+
+from kernel_cache import kernel
 
 G = 9.81  # m/s^2
 # rad/s of the dither, three sines each about x, y and z; out of step with each other
@@ -66,7 +67,7 @@ class Flight:
     fine_acting: np.ndarray  # (n * sub, 4) force and torque after the lag, before the disturbance
 
 
-@njit(cache=True)
+@kernel
 def turned(q, phi):
     """q * exp(phi), normalised."""
     angle = np.sqrt(phi[0] ** 2 + phi[1] ** 2 + phi[2] ** 2)
@@ -80,7 +81,7 @@ def turned(q, phi):
     return out / np.sqrt(np.sum(out**2))
 
 
-@njit(cache=True)
+@kernel
 def matrix(q):
     x, y, z, w = q
     return np.array([
@@ -90,7 +91,7 @@ def matrix(q):
     ])  # fmt: skip
 
 
-@njit(cache=True)
+@kernel
 def _fly(n, dt, control_every, mass, inertia, lag, scale, sensor, dither, heave, fade, gains, phases, noise, errors):
     """n sub-steps; noise (n, 4) and errors (n, 12) are standard normal. States, measurements, commands, acting."""
     inverse = np.linalg.inv(inertia)

@@ -9,8 +9,9 @@ of crazyem is imported but the type of a sample (in `samples`).
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from synthetic import matrix, turned
+
+from kernel_cache import kernel
 
 G = 9.81  # m/s^2
 MASS, INERTIA = 0.18, np.array([2.5e-4, 3.1e-4, 2.0e-4])  # kg, kg m^2
@@ -29,7 +30,7 @@ class Flight:
     x: np.ndarray
 
 
-@njit(cache=True)
+@kernel
 def _stepped(axes, w, dt):
     """Quaternion after roll, pitch and yaw have moved on by dt times their derivatives (eq. 47)."""
     roll, pitch, yaw = np.arctan2(axes[2, 1], axes[2, 2]), -np.arcsin(axes[2, 0]), np.arctan2(axes[1, 0], axes[0, 0])
@@ -45,7 +46,7 @@ def _stepped(axes, w, dt):
     ])  # fmt: skip
 
 
-@njit(cache=True)
+@kernel
 def _fly(n, dt, mass, inertia, s_force, s_torque, sensor, goals, leg, noise, errors):
     p, v, w = goals[0].copy(), np.zeros(3), np.zeros(3)
     q = np.array([0.0, 0.0, 0.0, 1.0])

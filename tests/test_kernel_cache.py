@@ -1,0 +1,132 @@
+"""One machine code: what a process compiled or loaded before has no say in the numbers, and the disk gives the same."""
+
+import json
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import kernel_cache
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# A library keeps a copy of `inner` that is large enough not to be inlined; reassociated sums are vectorised by context.
+TOY = """
+import sys
+import numpy as np
+from kernel_cache import compilations, kernel
+
+@kernel
+def inner(x, n):
+    s = 0.0
+    for i in range(n):
+        s += np.sin(x[i]) * x[n - 1 - i]
+        if s > 1e9:
+            s -= np.cos(x[i])
+    return s
+
+@kernel
+def outer(x):
+    return inner(x, 3) + inner(x, x.size) + inner(x[2:], 2)
+
+if __name__ == "__main__":
+    for name in sys.argv[1:]:
+        value = globals()[name](np.arange(5.0), *([5] if name == "inner" else []))
+        print(name, float(value).hex())
+    print("compiled", compilations())
+"""
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("toy") / "toy.py"
+    path.write_text(TOY, encoding="utf-8")
+    return path
+
+
+def run(program: Path, *arguments: str, cache: Path) -> dict[str, str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(cache)}
+    done = subprocess.run(
+        [sys.executable, str(program), *arguments], env=environment, capture_output=True, text=True, check=True
+    )
+    return dict(line.split() for line in done.stdout.splitlines())
+
+
+def test_what_is_compiled_is_counted_and_what_is_loaded_is_not(toy: Path, tmp_path: Path) -> None:
+    first = run(toy, "inner", "outer", cache=tmp_path)
+    again = run(toy, "outer", "inner", cache=tmp_path)
+    assert int(first.pop("compiled")) >= 2
+    assert again.pop("compiled") == "0"
+    assert first == again
+
+
+def test_no_function_can_be_taken_from_another_library() -> None:
+    """Symbols that are weak in a library are taken from whichever library was loaded first."""
+
+    @kernel_cache.kernel
+    def inner(x, n):
+        s = 0.0
+        for i in range(n):
+            s += np.sin(x[i]) * x[n - 1 - i]
+            if s > 1e9:
+                s -= np.cos(x[i])
+        return s
+
+    @kernel_cache.kernel
+    def outer(x):
+        return inner(x, 3) + inner(x, x.size) + inner(x[2:], 2)
+
+    outer(np.arange(5.0))
+    (compiled,) = outer.overloads.values()
+    defined = [f for f in compiled.library._final_module.functions if not f.is_declaration]
+    assert "linkonce_odr" not in {f.linkage.name for f in defined}
+    assert any("inner" in f.name and f.linkage.name == "internal" for f in defined), "nothing was left to bind"
+
+
+def test_processes_that_compile_at_once_leave_a_whole_cache(toy: Path, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(4) as threads:
+        found = list(threads.map(lambda name: run(toy, name, cache=tmp_path), ("inner", "outer") * 2))
+    later = run(toy, "inner", "outer", cache=tmp_path)
+    assert later["compiled"] == "0"
+    assert all(later[name] == value for one in found for name, value in one.items() if name != "compiled")
+
+
+BACKWARDS = """
+import sys
+import kernel_cache
+import crazyem.commands.replay, crazyem.estimation.online, crazyem.estimation.steps
+from crazyem.cli import main
+
+for kernel in reversed(kernel_cache._KERNELS):
+    for signature, *_ in kernel._cache._cache_file._load_index():
+        kernel.compile(signature)  # loads
+main(["replay", *sys.argv[1:]])
+"""
+
+
+def crazyem(*arguments: object, cache: Path, program: tuple[str, ...] = ("-m", "crazyem")) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(cache)}
+    command = [sys.executable, *program, *map(str, arguments)]
+    subprocess.run(command, env=environment, cwd=ROOT, check=True, capture_output=True)
+
+
+def numbers(document: Path) -> dict[str, object]:
+    content = json.loads(document.read_text(encoding="utf-8"))
+    return {key: content[key] for key in ("estimates", "noise", "converged", "updates", "samples")}
+
+
+@pytest.mark.slow
+def test_the_first_flight_after_installation_replays_to_the_last_bit(tmp_path: Path) -> None:
+    cache, flight = tmp_path / "cache", tmp_path / "flight.mcap"
+    scenario = ("--scenario", "firmware_sim/scenarios/payload.toml", "--trajectory", "excite", "--duration", "6")
+    crazyem("fly", *scenario, "--record", flight, "--json", tmp_path / "live.json", cache=cache)
+    crazyem("replay", flight, "--json", tmp_path / "replay.json", cache=cache)
+    arguments = (flight, "--json", tmp_path / "backwards.json")
+    crazyem(*arguments, cache=cache, program=("-c", BACKWARDS))
+    live = numbers(tmp_path / "live.json")
+    assert numbers(tmp_path / "replay.json") == live
+    assert numbers(tmp_path / "backwards.json") == live
