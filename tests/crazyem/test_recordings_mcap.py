@@ -2,11 +2,6 @@
 
 import contextlib
 import math
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import dataclass
 
 import pytest
@@ -208,7 +203,7 @@ def test_a_cut_file_says_so(small, tmp_path):
     assert any("ends in the middle" in notice for notice in open_recording(path).notices)
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_damaged_bytes_never_raise_anything_else(small, tmp_path, data):
     _, content, _ = small
@@ -221,7 +216,7 @@ def test_damaged_bytes_never_raise_anything_else(small, tmp_path, data):
         list(open_recording(path).samples())
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.sampled_from(
         [b"", b"\x89MCAP0\r\n", b"\x1f\x8b", b"\x1f\x8b\x08\x00", b"t,px,", b"host_t,block,fw_ms,name,value\n"]
@@ -274,33 +269,3 @@ def test_a_full_disk_stops_the_recording_not_the_flight(tmp_path, monkeypatch):
         writer.packet(packet)
     writer.close()
     assert "recording stopped" in writer.failure
-
-
-def test_a_killed_process_leaves_its_flight_readable(tmp_path):
-    path = tmp_path / "killed.mcap"
-    program = f"""
-import sys, time
-sys.path.insert(0, {os.getcwd()!r})
-from crazyem.recordings.mcap.writer import RecordingWriter
-from crazyem.signals.packet import Block, Packet, Variable
-writer = RecordingWriter({str(path)!r})
-writer.blocks((Block(0, (Variable("pm.vbat", "float"),), 10),))
-for k in range(100_000):
-    writer.packet(Packet(0, 10 * k, 1.7e9 + 0.01 * k, (4.0,)))
-    print(k, flush=True)
-    time.sleep(0.01)
-"""
-    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    sent = 0
-    deadline = time.monotonic() + 1.8
-    for line in process.stdout:
-        sent = int(line)
-        if time.monotonic() > deadline:
-            break
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    process.stdout.close()
-    recording = open_recording(path)
-    assert recording.signals["voltage"].time.size >= sent - 100  # at most the last second
-    assert recording.notices
