@@ -19,7 +19,7 @@ def swapped(fitted: Sequence[Flight], kept_apart: Sequence[Flight]) -> bool:
     """Whether the flights to fit only hover and those kept apart do not: then these are fitted, the hovers confirm.
 
     A velocity scale of 1.13 was 1.56 to a hover, and ruined what it was held against; a quadratic drag of 0.02 was
-    0.07 (two of seed 2045 in docs/concealed_history.md).
+    0.07.
     """
     if not kept_apart:
         return False
