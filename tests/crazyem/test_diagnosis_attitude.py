@@ -88,7 +88,7 @@ def test_the_estimator_of_the_commands_thins_attitudes_of_filters_on_board_and_n
     monkeypatch.setattr(online, "OnlineEstimator", lambda vehicle, **given: made.append(given) or SimpleNamespace())
     monkeypatch.setattr(steps, "StepAwareEstimator", lambda estimator: estimator)
     new_estimator(DRONE, SimpleNamespace(window=800, every=4), onboard=onboard)  # type: ignore[arg-type]
-    assert made == [{"window": 800, "every": 4, "attitude_period": period}]
+    assert made == [{"window": 800, "every": 4, "attitude_period": period, "input_signal": None}]
 
 
 def test_of_onboard_attitudes_one_in_so_many_is_used_and_none_is_lost() -> None:
