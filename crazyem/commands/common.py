@@ -54,8 +54,8 @@ def tell_steps(history: History, told: int, *, prefix: str = "") -> int:
     return told
 
 
-def plot_path(arguments: argparse.Namespace, *others: str | None) -> str:
-    """--plot, or a PNG beside the recording or the summary, or crazyem.png here."""
+def plot_path(arguments: argparse.Namespace, *others: str | None) -> str | None:
+    """--plot, or a PNG beside the recording or the summary; None where no file was asked for."""
     if arguments.plot:
         return str(arguments.plot)
     for other in others:
@@ -64,7 +64,7 @@ def plot_path(arguments: argparse.Namespace, *others: str | None) -> str:
             for suffix in (".csv.gz", ".csv", ".mcap", ".json"):
                 name = name.removesuffix(suffix)
             return str(Path(other).with_name(f"{name}.png"))
-    return "crazyem.png"
+    return None
 
 
 def report(
@@ -73,14 +73,14 @@ def report(
     pipeline: Pipeline,
     vehicle: Vehicle,
     log: str | None,
-    plot: str,
+    plot: str | None,
     title: str,
     received: int,
     lost: int,
     extra: Mapping[str, Any],
     notices: Iterable[str] = (),
 ) -> Estimate:
-    """Final estimate, summary on the terminal, JSON and plot.
+    """Final estimate, summary on the terminal, JSON and plot, where these are wanted.
 
     Raises:
         DataError: nothing was flown that could be estimated from.
@@ -108,8 +108,12 @@ def report(
         print(text, flush=True)
     if arguments.json:
         write_json(summary, arguments.json)
-    write_plot(plot, history, vehicle, title=title)
-    say(f"plot: {plot}" + (f"   summary: {arguments.json}" if arguments.json not in (None, "-") else ""))
+    files = {"summary": arguments.json} if arguments.json not in (None, "-") else {}
+    if plot is not None:
+        write_plot(plot, history, vehicle, title=title)
+        files = {"plot": plot, **files}
+    if files:
+        say("   ".join(f"{what}: {file}" for what, file in files.items()))
     return estimate
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import math
 import select
 import signal
 import sys
@@ -55,6 +56,15 @@ def trajectory_maker(words: list[str], duration: float) -> Callable[[Vector, flo
         raise UsageError(f"unknown trajectory '{' '.join(words)}' (hover, figure8, excite, or waypoints FILE).")
     make: Any = SIMPLE[name]
     return lambda position, yaw: make(position=position, yaw=yaw, duration=duration)
+
+
+def duration_note(words: list[str], duration: float) -> str:
+    """One line where the trajectory of these words takes another time than asked for, "" where it does not."""
+    make: Any = SIMPLE.get(words[0])
+    made = duration if make is None else make(position=(0.0, 0.0, HEIGHT), duration=duration).duration
+    if math.isclose(made, duration):
+        return ""
+    return f"{words[0]} flies whole periods and ends where it began: {made:g} s instead of {duration:g} s"
 
 
 @contextlib.contextmanager
@@ -141,6 +151,8 @@ def run(arguments: argparse.Namespace) -> int:
         push=not arguments.no_push,
         rules=write_rules(arguments),
     )
+    if note := duration_note(arguments.trajectory, arguments.duration):
+        say(note)
     plot = plot_path(arguments, arguments.record, arguments.json)
     for path in (arguments.json, arguments.record, plot):
         check_writable(path)
@@ -165,7 +177,7 @@ def _fly(
     vehicle: Any,
     left_out: list[str],
     uri: str,
-    plot: str,
+    plot: str | None,
     view: bool,
 ) -> int:
     error: BaseException | None = None

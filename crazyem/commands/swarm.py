@@ -111,12 +111,15 @@ def members(arguments: argparse.Namespace, trajectory: Sequence[str] = ("hover",
 
 def fly(arguments: argparse.Namespace) -> int:
     """Fly all drones; returns the exit code, that of the first error."""
-    from crazyem.commands.fly import HEIGHT, trajectory_maker, write_rules
+    from crazyem.commands.fly import HEIGHT, duration_note, trajectory_maker, write_rules
 
     if arguments.scenario or arguments.speed is not None or arguments.seed is not None:
         raise UsageError("--scenario, --seed and --speed belong to one drone in the built-in simulator.")
     drones = _drones(arguments, members(arguments, arguments.trajectory))
     controller = controller_named(arguments.controller)
+    for note in {duration_note(list(d.member.trajectory), arguments.duration): None for d in drones}:
+        if note:
+            say(note)
     for drone in drones:
         m = drone.member
         if m.uri.startswith("mavlink:"):

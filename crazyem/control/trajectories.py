@@ -88,15 +88,18 @@ def figure8(
     period: float = 5.0,
     ramp: float = 2.0,
 ) -> Trajectory:
-    """A lemniscate x = sx sin p, y = sy sin 2p around `position` [m, world].
+    """A lemniscate x = sx sin p, y = sy sin 2p around `position` [m, world], in whole figures: it ends where it begins.
 
     Args:
+        duration: s; the nearest whole number of figures is flown, at least one, so the trajectory's own may differ.
         size: half widths along x and y, m.
         period: s for one whole figure at full speed.
-        ramp: s to reach full speed, and to stop again.
+        ramp: s to reach full speed, and to stop again; at most a period.
     """
     rate = 2 * math.pi / period
-    ramp = min(ramp, duration / 2)
+    ramp = min(ramp, period)
+    figures = max(math.floor((duration - ramp) / period + 0.5), 1)
+    duration = figures * period + ramp  # the two ramps together cover one ramp's length of the figure
 
     def phase(t: float) -> tuple[float, float, float, float]:
         # The speed along the figure is ramped, not its shape; the phase is the integral of the ramp.

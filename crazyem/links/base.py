@@ -6,9 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from crazyem.errors import LinkError
 from crazyem.signals.packet import Block, Packet, Variable
 
 __all__ = [
+    "AnotherDroneError",
     "Block",
     "Link",
     "LinkLost",
@@ -21,12 +23,20 @@ __all__ = [
 ]
 
 
+class AnotherDroneError(LinkError):
+    """Somebody answers, but there is no going on with it: another firmware, or the same one started anew."""
+
+
 @dataclass(frozen=True, slots=True)
 class LinkLost:
-    """Put into the packet queue, once, when the drone is gone; `reason` is one sentence."""
+    """Put into the packet queue, once, when the drone is gone; `reason` is one sentence.
+
+    `restarted`: whoever answers now has started anew.
+    """
 
     reason: str
     host_time: float
+    restarted: bool = False
 
 
 @dataclass(frozen=True, slots=True)

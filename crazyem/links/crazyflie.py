@@ -13,13 +13,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from crazyem.errors import LinkError, UsageError
-from crazyem.links.base import LinkLost, LinkStatistics, Outage, ParameterWrite
+from crazyem.links.base import AnotherDroneError, LinkLost, LinkStatistics, Outage, ParameterWrite
 from crazyem.links.blocks import LogBlocks
 from crazyem.links.clock import ClockFit
 from crazyem.links.connecting import connect, quiet_cflib, shut
 from crazyem.links.high_level import confirmed, land_command
 from crazyem.links.parameters import ParameterClient
-from crazyem.links.reconnecting import AnotherDroneError, Reviver
+from crazyem.links.reconnecting import Reviver
 from crazyem.signals.packet import Block, Packet
 
 SILENT_AFTER = 2.0  # s without log data, while blocks run, after which the drone counts as lost

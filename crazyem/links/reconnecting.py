@@ -7,6 +7,7 @@ import time
 from typing import Any
 
 from crazyem.errors import LinkError
+from crazyem.links.base import AnotherDroneError
 from crazyem.links.blocks import LogBlocks
 from crazyem.links.connecting import new_driver, shorten_naps, take_link
 from crazyem.links.courier import Courier
@@ -16,10 +17,6 @@ _INFO = b"\x03"
 _ANSWER_WITHIN, _REPEAT_AFTER = 0.4, 0.1  # s
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.05, 0.8  # s between attempts
 _OWN_SOCKET = 2  # attempts with the driver that is still there, before another takes its place
-
-
-class AnotherDroneError(LinkError):
-    """Somebody answers, but there is no going on with it: another firmware, or the same one started anew."""
 
 
 class Reviver:

@@ -32,6 +32,7 @@ class Controller:
     wrench: str = ""
     note: str = ""
     mass_scale: float = 1.0  # kg a unit of the mass parameter, where that is not a mass (see crazyem.live.hover)
+    persistent: bool = False  # whether parameters outlive a restart of the firmware
 
     def scale(self, parameter: str) -> float:
         """SI units of the estimate in a unit of a parameter."""

@@ -38,7 +38,8 @@ def hover_target(link: Any, vehicle: Vehicle) -> tuple[Controller | None, str]:
     note = f"{name} = {value:.4g} is taken for right at {vehicle.mass:.4g} kg, and thrust for proportional to it."
     if link.own_hover_estimate:
         note += f" {link.own_hover_estimate}: what is written may have no effect, or be overwritten."
-    return Controller("hover thrust", _NUMBER, mass=name, mass_scale=vehicle.mass / value, note=note), note
+    scale = vehicle.mass / value
+    return Controller("hover thrust", _NUMBER, mass=name, mass_scale=scale, persistent=True, note=note), note
 
 
 def hover_rules(rules: Rules, link: Any, controller: Controller | None) -> Rules:

@@ -89,7 +89,7 @@ class Oversight:
         guard.capped = rules.policy.watch.enabled and not rules.dry_run
         self.pusher: Pusher | None = None
         self._residual, self._enabled = residual, enabled
-        self._airborne = self._reverted = self._owed = False
+        self._airborne = self._reverted = self._owed = self._restarted = False
         self._looked = -math.inf
         self._residual_time = -math.inf
         self._held = ("", -math.inf)
@@ -170,6 +170,14 @@ class Oversight:
         self.guard.stop("the flight is over")
         self._reported_stop = self.guard.stopped
 
+    def restarted(self) -> None:
+        """The firmware has started anew: what was written is gone with it, unless such parameters are kept."""
+        if self.pusher is None or not self.history.pushes or self.guard.controller.persistent:
+            return
+        self._restarted = True
+        self.pusher.known = dict.fromkeys(self.pusher.known, math.nan)
+        self._say("the firmware was restarted and holds the values of its start again, nothing of what was written.")
+
     def end(self, outcome: str) -> None:
         """The flight is over: keep what was written or put it back, as the policy says for this outcome.
 
@@ -179,7 +187,7 @@ class Oversight:
             outcome: landed, interrupted, failed or link_lost.
         """
         self.stop()
-        if self.pusher is None or not self.history.pushes:
+        if self.pusher is None or not self.history.pushes or self._restarted:
             return
         rule = getattr(self.rules.policy.end, outcome)
         rule = "good" if rule == "keep" and self._owed else rule
@@ -207,8 +215,9 @@ class Oversight:
         asked = next((e for e in reversed(self.entries) if e["action"] == "restore"), None)
         if asked is not None:
             left = [n for n, v in asked["writes"] if not math.isclose(account["in_drone"][n], v, rel_tol=1e-6)]
+            until = "" if self.guard.controller.persistent else " until it is restarted"
             self._say(
-                f"{', '.join(left)} could not be put back: the drone may keep what was pushed until it is restarted."
+                f"{', '.join(left)} could not be put back: the drone may keep what was pushed{until}."
                 if left
                 else f"the parameters were put back ({asked['reason']})."
             )

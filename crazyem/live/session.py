@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 
 from crazyem.errors import CrazyemError, DataError, LinkError, UsageError
 from crazyem.estimation.result import Estimate, Step
-from crazyem.links.base import Block, Link, LinkLost, Outage, Packet, link_account
+from crazyem.links.base import AnotherDroneError, Block, Link, LinkLost, Outage, Packet, link_account
 from crazyem.live.clock import FirmwareClock
 from crazyem.live.crew import Crew, Mailbox
 from crazyem.live.guard import Guard
@@ -366,7 +366,8 @@ class Session:
         try:
             outage: Outage = reconnect(self.reconnect_within, self._stop)
         except LinkError as error:
-            self._gone(LinkLost(f"{lost.reason.rstrip('.')}; {str(error)[:1].lower()}{str(error)[1:]}", lost.host_time))
+            reason = f"{lost.reason.rstrip('.')}; {str(error)[:1].lower()}{str(error)[1:]}"
+            self._gone(LinkLost(reason, lost.host_time, restarted=isinstance(error, AnotherDroneError)))
             return False
         else:
             self.outages.append(outage)
@@ -382,6 +383,8 @@ class Session:
 
     def _gone(self, lost: LinkLost) -> None:
         self.stop_pushing()
+        if lost.restarted and self.oversight is not None:
+            self.oversight.restarted()
         self.lost = lost
 
     def _tell(self, sentence: str) -> None:

@@ -180,3 +180,24 @@ def test_trajectory_maker_reads_the_waypoints_at_once(tmp_path):
     assert trajectory_maker(["waypoints", str(path)], 5.0)((0, 0, 1), 0.0).duration > 2
     with pytest.raises(UsageError):
         trajectory_maker(["hover", "extra"], 5.0)
+
+
+def test_whole_periods_are_told_in_one_line():
+    from crazyem.commands.fly import duration_note
+
+    assert duration_note(["figure8"], 20.0) == (
+        "figure8 flies whole periods and ends where it began: 22 s instead of 20 s"
+    )
+    assert duration_note(["figure8"], 22.0) == ""
+    assert duration_note(["excite"], 20.0) == duration_note(["waypoints", "w.csv"], 20.0) == ""
+
+
+def test_a_plot_is_written_only_beside_a_file_that_was_asked_for():
+    from argparse import Namespace
+
+    from crazyem.commands.common import plot_path
+
+    assert plot_path(Namespace(plot=None), None, None) is None
+    assert plot_path(Namespace(plot=None), None, "-") is None
+    assert plot_path(Namespace(plot=None), "a/f.csv.gz", "b.json") == "a/f.png"
+    assert plot_path(Namespace(plot="p.png"), None, "b.json") == "p.png"

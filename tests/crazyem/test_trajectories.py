@@ -82,6 +82,27 @@ def test_hover_and_excite_stay_finite_for_any_duration(yaw, duration):
             assert np.linalg.norm(r.quaternion) == pytest.approx(1)
 
 
+@settings(max_examples=60)
+@given(st.floats(0.5, 60.0), st.floats(1.0, 8.0), st.floats(0.2, 5.0))
+def test_a_figure_8_is_whole_and_ends_at_rest_where_it_began(duration, period, ramp):
+    trajectory = figure8(position=HOME, yaw=0.3, duration=duration, period=period, ramp=ramp)
+    assert abs(trajectory.duration - duration) <= period / 2 + 1e-9 or trajectory.duration == period + min(ramp, period)
+    end = trajectory.at(trajectory.duration)
+    np.testing.assert_allclose(end.position, HOME, atol=1e-9)
+    np.testing.assert_allclose(end.velocity + end.acceleration, 0, atol=1e-6)
+    # whole figures: as much time on either side
+    x = [trajectory.at(t).position[0] - HOME[0] for t in np.linspace(0.0, trajectory.duration, 4001)]
+    assert sum(v > 1e-3 for v in x) == pytest.approx(sum(v < -1e-3 for v in x), rel=0.02)
+
+
+@settings(max_examples=30)
+@given(st.floats(1.0, 40.0))
+def test_the_excitation_ends_where_it_began(duration):
+    trajectory = excite(position=HOME, duration=duration)
+    np.testing.assert_allclose(trajectory.at(duration).position, HOME, atol=1e-9)
+    assert trajectory.at(duration).yaw == pytest.approx(0.0, abs=1e-9)
+
+
 def test_waypoints_pass_through_points_at_their_times(tmp_path):
     path = way(tmp_path, "x,y,z,time\n0.5,0,1,3\n0.5,0.8,1.3,6\n0,0,1,9.5\n")
     trajectory = waypoints(path=path, position=HOME)

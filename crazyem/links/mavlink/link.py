@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 
 from crazyem.errors import LinkError, UsageError
-from crazyem.links.base import LinkLost, LinkStatistics, Outage, ParameterWrite
+from crazyem.links.base import AnotherDroneError, LinkLost, LinkStatistics, Outage, ParameterWrite
 from crazyem.links.clock import ClockFit
 from crazyem.links.mavlink import motors, streams
 from crazyem.links.mavlink.address import parse
@@ -236,7 +236,7 @@ class MavlinkLink:
         try:
             while ears.last <= since:
                 if ears.hopeless:
-                    raise LinkError(f"The drone at {self.uri} was restarted.")
+                    raise AnotherDroneError(f"The drone at {self.uri} was restarted.")
                 if time.monotonic() > until or (abort is not None and abort.is_set()):
                     raise LinkError(f"The drone at {self.uri} did not come back within {timeout:g} s.")
                 if ears.unplugged:

@@ -236,7 +236,7 @@ class Receiver:
             stamp = self.drone_clock.place(fields, now)
         except RestartedError:
             self.hopeless = True
-            self._report_lost(f"The drone at {self.uri} was restarted: its clock has begun anew.")
+            self._report_lost(f"The drone at {self.uri} was restarted: its clock has begun anew.", restarted=True)
             return
         if stamp is None or not self.streams.uses(name):
             return
@@ -255,9 +255,9 @@ class Receiver:
             self._received[block.identifier] += 1
         self._packets.put(Packet(block.identifier, stamp, host_time, tuple(map(float, found[1]))))
 
-    def _report_lost(self, reason: str) -> None:
+    def _report_lost(self, reason: str, *, restarted: bool = False) -> None:
         with self._lock:
             if self.lost or self._stop.is_set():
                 return
             self.lost = reason
-        self._packets.put(LinkLost(reason, time.time()))
+        self._packets.put(LinkLost(reason, time.time(), restarted))
