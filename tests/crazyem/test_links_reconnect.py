@@ -1,6 +1,7 @@
 """Outages in flight: the window is kept, the recording goes on, writes are made up for, and a fall is told as one."""
 
 import itertools
+import math
 import queue
 import time
 
@@ -12,7 +13,7 @@ from relayed import down, now_on, relayed, up
 from crazyem.control.trajectories import excite, hover
 from crazyem.errors import CrazyemError, LinkError
 from crazyem.estimation.online import OnlineEstimator
-from crazyem.links.base import LinkLost, LinkStatistics, Outage, ParameterWrite, link_account
+from crazyem.links.base import AnotherDroneError, LinkLost, LinkStatistics, Outage, ParameterWrite, link_account
 from crazyem.links.crazyflie import CrazyflieLink
 from crazyem.live.controllers import LEE
 from crazyem.live.crew import Crew
@@ -126,6 +127,33 @@ def test_an_outage_that_lasts_ends_the_flight_in_one_sentence(crew):
         LinkError, match=r"^the drone at fake://0 was lost: it was away; the drone did not come back\.$"
     ):
         fly(link, crew=crew)
+
+
+def test_after_a_restart_of_the_firmware_the_notes_agree(crew):
+    """What was pushed is gone with the firmware that had it: nothing is called kept, put back or not put back."""
+    link = LosingLink(speed=5.0, gone_at=None)
+    write = link.write_parameter
+
+    def write_and_restart(name, value, timeout=1.0):
+        if name == "ctrlLee.mass" and value > 0.0359:
+            link.gone_at = link.fm + 500
+        return write(name, value, timeout)
+
+    def another(timeout, abort):
+        raise AnotherDroneError("The drone was restarted: what it knew of the flight is gone.")
+
+    link.write_parameter, link.reconnect = write_and_restart, another
+    session = Session(link, vehicle=load_vehicle("cf2"), estimator=fake.FakeEstimator(), crew=crew)
+    plan = FlightPlan(lambda position, yaw: hover(position=position, yaw=yaw, duration=60.0), LEE)
+    session.start()
+    with pytest.raises(LinkError, match="was restarted"):
+        Flight(session, plan).fly()
+    session.close()
+    link.close()
+    notes = session.history.notices
+    assert [n for n in notes if "of its start" in n]
+    assert not [n for n in notes if "put back" in n or "written back" in n or "may keep" in n]
+    assert all(math.isnan(v) for v in session.history.guard["in_drone"].values())
 
 
 def test_a_link_that_cannot_come_back_is_not_asked(crew):
