@@ -137,10 +137,10 @@ def test_round_trip_through_csv_loses_nothing(recording: Recording) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "out.csv"
         export(recording, path)
-        same(recording, open_recording(path))
+        same(recording, read(path, ReadOptions()))
         assert list(slow(path)) == sequence(recording)
         again = Path(folder) / "again.csv"
-        export(open_recording(path), again)
+        export(read(path, ReadOptions()), again)
         assert again.read_bytes() == path.read_bytes()
 
 
@@ -153,7 +153,7 @@ def test_a_stamp_that_is_no_number_is_one_whatever_its_bits(tmp_path: Path) -> N
     )  # fmt: skip
     recording = Recording("there", "made:up", {"a": one, "b": two}, {}, (), (), 0.0)
     export(recording, tmp_path / "out.csv")
-    export(open_recording(tmp_path / "out.csv"), tmp_path / "again.csv")
+    export(read(tmp_path / "out.csv", ReadOptions()), tmp_path / "again.csv")
     assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "out.csv").read_bytes()
 
 

@@ -1,10 +1,14 @@
 """Bags written with mcap-ros2-support: exact values, two clocks, robots, log blocks, definitions that lie, damage."""
 
+import contextlib
 import io
 import math
 import re
+import sqlite3
+from operator import itemgetter
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +34,9 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as PlainWriter
 from mcap_ros2.decoder import DecoderFactory
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as BagWriter
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
@@ -273,17 +280,86 @@ def test_a_folder_of_split_files_is_one_recording(tmp_path: Path) -> None:
     np.testing.assert_array_equal(recording.signals["position"].value, values[:, :3])
 
 
-def test_bags_in_sqlite_say_how_to_convert(tmp_path: Path) -> None:
+def in_sqlite(folder: Path, messages: list[Any], *, definitions: bool = True) -> Path:
+    """The folder of a bag in SQLite storage, written by rosbags; older ones carry no definitions."""
+    store = get_typestore(Stores.EMPTY)
+    types: dict[str, Any] = {}
+    for kind in {message[1] for message in messages}:
+        types |= get_types_from_msg(DEFINITIONS[kind], kind)
+    store.register({kind: fields for kind, fields in types.items() if kind not in store.fielddefs})
+    with BagWriter(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        channels: dict[str, Any] = {}
+        for topic, kind, log, message in messages:
+            if topic not in channels:
+                channels[topic] = writer.add_connection(topic, kind, typestore=store)
+            (content,) = payloads(bag([(topic, kind, log, message)]))
+            writer.write(channels[topic], log, content)
+    if not definitions:
+        with contextlib.closing(sqlite3.connect(next(folder.glob("*.db3")))) as database:
+            database.execute("DROP TABLE message_definitions")
+            database.execute("DROP TABLE schema")
+            database.commit()
+    return folder
+
+
+def payloads(content: bytes) -> list[bytes]:
+    return [message.data for _, _, message in make_reader(io.BytesIO(content)).iter_messages()]
+
+
+def some_messages() -> list[Any]:
+    values = random_poses(12)
+    messages = [pose_message("/cf1/pose", START + i * 10**7, v) for i, v in enumerate(values)]
+    messages += [log_block("/cf1/log", START + i * 10**7, 100 + 10 * i, [i, 2.5]) for i in range(12)]
+    return sorted(
+        [*messages, *(status("/cf1/status", START + i * 10**7, 16, 4.0) for i in range(12))], key=itemgetter(2)
+    )
+
+
+@pytest.mark.parametrize("definitions", [True, False])
+@pytest.mark.parametrize("whole", [True, False])
+def test_bags_in_sqlite_are_read_as_those_in_mcap(tmp_path: Path, definitions: bool, whole: bool) -> None:
+    folder = in_sqlite(tmp_path / "bag", some_messages(), definitions=definitions)
+    found = open_recording(folder if whole else next(folder.glob("*.db3")))
+    expected = opened(tmp_path, bag(some_messages()))
+    assert list(found.signals) == list(expected.signals)
+    for name, array in expected.signals.items():
+        np.testing.assert_array_equal(found.signals[name].value, array.value)
+        np.testing.assert_array_equal(found.signals[name].time, array.time)
+        np.testing.assert_array_equal(found.signals[name].order, array.order)
+    assert found.notices == expected.notices
+
+
+def test_bags_in_sqlite_that_are_none_or_of_unknown_types_say_so(tmp_path: Path) -> None:
     head = b"SQLite format 3\0" + bytes(100) + b"CREATE TABLE topics CREATE TABLE messages"
     assert recognises(head)
-    with pytest.raises(FileFormatError, match="ros2 bag convert"):
+    with pytest.raises(FileFormatError, match="cannot be read"):
         read(save(tmp_path, head, "bag.db3"), ReadOptions())
+    with pytest.raises(FileFormatError, match="its name ends in"):
+        read(save(tmp_path, head, "bag.sqlite"), ReadOptions())
+    folder = in_sqlite(tmp_path / "bag", some_messages(), definitions=False)
+    with contextlib.closing(sqlite3.connect(next(folder.glob("*.db3")))) as database:
+        database.execute("UPDATE topics SET type = 'x/msg/Y' WHERE name = '/cf1/log'")
+        database.commit()
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("crazyflie_interfaces/msg/LogDataGeneric", "x/msg/Y"))
+    assert any("no definition of x/msg/Y" in notice for notice in open_recording(folder).notices)
     (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
-    with pytest.raises(FileFormatError, match="ros2 bag convert"):
-        read(tmp_path, ReadOptions())
     (tmp_path / "bag.db3").unlink()
-    with pytest.raises(FileFormatError, match="no MCAP file"):
+    with pytest.raises(FileFormatError, match="neither an MCAP nor an SQLite"):
         read(tmp_path, ReadOptions())
+
+
+def test_a_damaged_bag_in_sqlite_never_ends_in_anything_but_our_error(tmp_path: Path) -> None:
+    file = next(in_sqlite(tmp_path / "bag", some_messages()).glob("*.db3"))
+    content = file.read_bytes()
+    rng = np.random.default_rng(3)
+    for k in range(60):
+        damaged = bytearray(content[: rng.integers(200, len(content))] if k % 3 == 0 else content)
+        place = int(rng.integers(16, len(damaged)))
+        damaged[place : place + 40] = rng.bytes(min(40, len(damaged) - place))
+        path = save(tmp_path, bytes(damaged), f"d{k}.db3")
+        with contextlib.suppress(CrazyemError):
+            assert len(read(path, ReadOptions())) > 0
 
 
 def test_simulated_time_is_not_mixed_with_real_time(tmp_path: Path) -> None:

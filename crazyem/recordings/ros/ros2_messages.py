@@ -1,13 +1,14 @@
 """ROS 2 messages from the bytes in a bag to columns of numbers, with the definitions that the bag itself carries.
 
-Decoding CDR is mcap-ros2-support's. It runs no code from a file, but it believes a definition: an array of a claimed
-length of things that take no bytes would keep it busy for ever, and its pattern for constants takes exponential time on
-some names. So a definition is first reduced to its fields and refused where decoding could take more steps than the
-message has bytes. Formats: design.ros2.org/articles/legacy_interface_definition.html, OMG CDR.
+Decoding CDR is that of rosbags. It makes Python code from a definition and believes it: an array of a claimed length of
+things that take no bytes would keep it busy for ever. So a definition is first reduced to its fields, whose names are
+plain words, and refused where decoding could take more steps than the message has bytes.
+
+Formats: design.ros2.org/articles/legacy_interface_definition.html, OMG CDR.
 """
 
-import contextlib
-import io
+import functools
+import keyword
 import operator
 import re
 import struct
@@ -16,8 +17,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from mcap_ros2._dynamic import generate_dynamic
 from numpy.typing import NDArray
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 LARGEST_MESSAGE = 1 << 16  # bytes; larger ones are images, maps and point clouds
 _LARGEST_DEFINITION = 1 << 18  # characters
@@ -34,6 +36,8 @@ _PRIMITIVE = {*_NUMBERS, "string", "wstring"}
 _TIMES = {"builtin_interfaces/Time": ("sec", "nanosec"), "builtin_interfaces/Duration": ("sec", "nanosec")}
 # what the decoder raises on bytes that are no message of the type
 BROKEN: tuple[type[Exception], ...] = (
+    SerdeError,
+    AssertionError,
     ValueError,
     IndexError,
     KeyError,
@@ -70,6 +74,7 @@ class MessageType:
     stamped: bool
 
 
+@functools.lru_cache(maxsize=64)  # making the code of a decoder takes longer than reading a short bag
 def message_type(name: str, definition: str) -> MessageType:
     """From the name and the definition in a bag. Raises ValueError with the reason why it cannot be read."""
     if len(definition) > _LARGEST_DEFINITION:
@@ -78,8 +83,7 @@ def message_type(name: str, definition: str) -> MessageType:
     text, spec = _reduced(short, definition)
     _check(short, spec)
     try:
-        with contextlib.redirect_stderr(io.StringIO()):  # it prints what it dislikes
-            decode = generate_dynamic(short, text)[short]
+        decode = _decoder(f"{short.replace('/', '/msg/')}", text)
     except Exception as error:  # the parser has many of its own
         raise ValueError(f"its definition cannot be parsed ({type(error).__name__})") from error
     scalars: list[str] = []
@@ -91,6 +95,43 @@ def message_type(name: str, definition: str) -> MessageType:
     return MessageType(short, decode, own, tuple(arrays), tuple(strings), stamped)
 
 
+def _decoder(name: str, text: str) -> Callable[[bytes], Any]:
+    """From the bytes of a message of the type "package/msg/Name" to an object with its fields."""
+    store = get_typestore(Stores.EMPTY)  # it knows times and durations
+    types = get_types_from_msg(text, name)
+    store.register({kind: fields for kind, fields in types.items() if kind not in store.fielddefs})
+    store.get_msgdef(name)  # which makes the code now
+    return functools.partial(store.deserialize_cdr, typename=name)
+
+
+def standard_definition(name: str) -> str | None:
+    """The definition of a type that bags from before 2023 do not carry; None if it is not known here."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    try:
+        own = {kind: text for kind, text in CRAZYFLIE.items() if kind not in store.fielddefs}
+        for kind, text in own.items():
+            store.register({k: v for k, v in get_types_from_msg(text, kind).items() if k not in store.fielddefs})
+        package, _, kind = _short(name).partition("/")
+        return store.generate_msgdef(f"{package}/msg/{kind}", ros_version=2)[0]
+    except (KeyError, ValueError, TypesysError):
+        return None
+
+
+# Sources: IMRCLab/crazyswarm2 (crazyflie_interfaces/msg), IMRCLab/motion_capture_tracking.
+_HEADER = "std_msgs/Header header\n"
+CRAZYFLIE: dict[str, str] = {
+    "crazyflie_interfaces/msg/LogDataGeneric": f"{_HEADER}uint32 timestamp\nfloat32[] values\n",
+    "crazyflie_interfaces/msg/Status": f"{_HEADER}uint16 supervisor_info\nfloat32 battery_voltage\nuint8 pm_state\n"
+    "uint8 rssi\nuint32 num_rx_broadcast\nuint32 num_tx_broadcast\nuint32 num_rx_unicast\nuint32 num_tx_unicast\n",
+    "crazyflie_interfaces/msg/FullState": f"{_HEADER}geometry_msgs/Pose pose\ngeometry_msgs/Twist twist\n"
+    "geometry_msgs/Vector3 acc\n",
+    "crazyflie_interfaces/msg/Position": f"{_HEADER}float32 x\nfloat32 y\nfloat32 z\nfloat32 yaw\n",
+    "motion_capture_tracking_interfaces/msg/NamedPose": "string name\ngeometry_msgs/Pose pose\n",
+    "motion_capture_tracking_interfaces/msg/NamedPoseArray": f"{_HEADER}"
+    "motion_capture_tracking_interfaces/NamedPose[] poses\n",
+}
+
+
 def _short(name: str) -> str:
     """ "geometry_msgs/msg/Pose" and "geometry_msgs/Pose" are one."""
     parts = name.split("/")
@@ -100,7 +141,7 @@ def _short(name: str) -> str:
 
 
 def _reduced(name: str, definition: str) -> tuple[str, _Spec]:
-    """The definition without what nobody reads (comments, constants, defaults, long arrays), and as a table."""
+    """The definition without what nobody reads (comments, constants, defaults), and as a table."""
     spec: _Spec = {name: []}
     lines: list[str] = []
     current, package = name, name.partition("/")[0]
@@ -121,11 +162,7 @@ def _reduced(name: str, definition: str) -> tuple[str, _Spec]:
                 raise ValueError("its definition has a line that is no field")
             base, array, length = _type_of(match[1], package)
             spec[current].append((base, array, length, match[2]))
-            if base in _NUMBERS and length > _FIXED:  # nobody wants its elements: one, which aligns, and bytes
-                lines.append(f"{base} zz_first_{match[2]}")
-                lines.append(f"uint8[{(length - 1) * _NUMBERS[base]}] zz_rest_{match[2]}")
-            else:
-                lines.append(f"{match[1]} {match[2]}")
+            lines.append(f"{match[1]} {match[2]}")
     return "\n".join(lines), spec
 
 
@@ -253,6 +290,8 @@ def rows_of(kind: MessageType, messages: Sequence[tuple[int, bytes]], *, keep: b
 
 
 def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple[Any, ...]]:
+    # rosbags adds a line to names that mean something in Python
+    names = tuple(".".join(p + "_" * keyword.iskeyword(p) for p in name.split(".")) for name in names)
     if not names:
         return lambda message: ()
     if len(names) == 1:

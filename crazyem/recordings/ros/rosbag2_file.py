@@ -1,4 +1,4 @@
-"""rosbag2 recordings in MCAP storage: crazyswarm2's topics of one robot, and what other ROS 2 drones have in common.
+"""rosbag2 recordings (MCAP or SQLite): crazyswarm2's topics of one robot, and what other ROS 2 drones have in common.
 
 Two clocks: messages of log blocks (LogDataGeneric) carry the firmware's; all others are stamped by the host. Where the
 firmware's is there, it is the time axis. What becomes which signal is in `rosbag2_signals`; docs/formats/rosbag2.md
@@ -13,13 +13,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from crazyem.errors import FileFormatError, UsageError
+from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.rosbag2 import Reader
+
+from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.mcap import scan as mcap_scan
 from crazyem.recordings.mcap.scan import HEAD, MAGIC, MESSAGE_HEAD, Loss, Problem
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
-from crazyem.recordings.ros.ros2_messages import LARGEST_MESSAGE, MessageType, message_type
+from crazyem.recordings.ros.ros2_messages import LARGEST_MESSAGE, MessageType, message_type, standard_definition
 from crazyem.recordings.ros.rosbag2_signals import ROBOT_TYPES, WORLD_TOPICS, BagTopic, Told, recording_of
 from crazyem.recordings.topics import text_of
 
@@ -33,7 +36,7 @@ _KEYS = {"robot": str, "twist": str, "topics": dict}
 
 
 def recognises(head: bytes) -> bool:
-    """True for MCAP of the profile "ros2" or with its schemas, and for a bag in an SQLite file (which is refused)."""
+    """True for MCAP of the profile "ros2" or with its schemas, and for a bag in an SQLite file."""
     if head.startswith(_SQLITE):
         return b"topics" in head and b"messages" in head
     if not head.startswith(MAGIC):
@@ -60,7 +63,10 @@ def read(path: Path, options: ReadOptions) -> Recording:
     told = _told(options.mapping)
     bag = _Bag()
     for file in _files(path):
-        bag.add(file)
+        if file.is_dir() or _is_sqlite(file):
+            bag.add_sqlite(file)
+        else:
+            bag.add(file)
     if not any(topic.messages for topic in bag.topics.values()):
         raise FileFormatError(f"{path}: the bag holds no messages that can be read ({bag.why_nothing()}).")
     robot, others = _robot(path, bag, told)
@@ -69,43 +75,35 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
 
 def _files(path: Path) -> list[Path]:
-    """The MCAP files of a bag, in the order in which they were written."""
+    """The MCAP files of a bag in the order in which they were written; a folder itself where these are of SQLite."""
     if path.is_file():
-        with path.open("rb") as stream:
-            if stream.read(len(_SQLITE)) == _SQLITE:
-                raise FileFormatError(f"{path}: {_CONVERT}")
         return [path]
     names = sorted(
         path.glob("*.mcap"), key=lambda p: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", p.name)]
     )
     if names:
         return names[:_FILES]
-    if any(path.glob("*.db3")):
-        raise FileFormatError(f"{path}: {_CONVERT}")
     if any(path.glob("*.zstd")):
         raise FileFormatError(f"{path}: the files of the bag are compressed as a whole; unpack them with zstd -d.")
-    raise FileFormatError(f"{path}: the bag has no MCAP file.")
+    if any(path.glob("*.db3")):
+        return [path]
+    raise FileFormatError(f"{path}: the bag has neither an MCAP nor an SQLite file.")
 
 
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Key by which bag_10 comes after bag_9."""
-    return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", path.name)]
-
-
-_CONVERT = (
-    "a bag in SQLite storage (.db3) is not read here; convert it with `ros2 bag convert -i BAG -o out.yaml`, where "
-    'out.yaml says "output_bags: [{uri: NEW, storage_id: mcap, all: true}]".'
-)
+def _is_sqlite(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return stream.read(len(_SQLITE)) == _SQLITE
 
 
 @dataclass(slots=True)
 class _Bag:
-    """Everything that one or several MCAP files hold for us."""
+    """Everything that one or several files hold for us."""
 
     topics: dict[str, BagTopic] = field(default_factory=dict)
     problems: list[tuple[Path, Problem]] = field(default_factory=list)
     refused: dict[str, str] = field(default_factory=dict)  # topic -> why
     large: dict[str, int] = field(default_factory=dict)  # topic -> messages that were too large
+    damage: list[Finding] = field(default_factory=list)
     kept: int = 0
     unpacked: int = 0
     packed: int = 0
@@ -157,17 +155,51 @@ class _Bag:
         if len(data) < MESSAGE_HEAD.size - HEAD.size:
             return
         topic = channels.get(int.from_bytes(data[:2], "little"))
-        if topic is None:
-            return
-        payload = data[MESSAGE_HEAD.size - HEAD.size :]
+        if topic is not None:
+            log = int.from_bytes(data[6:14], "little")
+            self._take(path, topic, log, data[MESSAGE_HEAD.size - HEAD.size :])
+
+    def add_sqlite(self, path: Path) -> None:
+        """Read an SQLite file, or the folder of a bag with several, to its end or as far as it is sound."""
+        if path.is_file() and path.suffix != ".db3":
+            raise FileFormatError(f"{path}: a bag in SQLite storage is read where its name ends in .db3.")
+        before = self.count
+        try:
+            with Reader(path) as reader:
+                topics = {c.id: self._stored(c) for c in reader.connections}
+                for connection, log, payload in reader.messages():
+                    topic = topics[connection.id]
+                    if topic is not None:
+                        self._take(path, topic, log, bytes(payload))
+        except CrazyemError:
+            raise
+        except Exception as error:  # of rosbags and of SQLite, of many kinds
+            if self.count == before:
+                raise FileFormatError(f"{path}: the bag cannot be read ({error}).") from error
+            text = f"{path.name} is damaged after {self.count - before} messages ({error})."
+            self.damage.append(note("integrity", text, Grade.DEGRADES, messages=float(self.count - before)))
+
+    def _stored(self, connection: Connection) -> BagTopic | None:
+        """The topic of a connection if its messages can be decoded."""
+        definition: str | None = connection.msgdef.data
+        if connection.msgdef.format is MessageDefinitionFormat.NONE:
+            definition = standard_definition(connection.msgtype)
+        elif connection.msgdef.format is not MessageDefinitionFormat.MSG:
+            definition = None
+        if definition is None:
+            name = "/" + connection.topic.strip("/")
+            self.refused[name] = f"the bag has no definition of {text_of(connection.msgtype)} that can be read here"
+            return None
+        return self._announce(connection.topic, connection.msgtype, definition)
+
+    def _take(self, path: Path, topic: BagTopic, log: int, payload: bytes) -> None:
         if len(payload) > LARGEST_MESSAGE:
             self.large[topic.name] = self.large.get(topic.name, 0) + 1
             return
         self.kept += len(payload) + 100
         if self.kept > _LARGEST_TOTAL:
             raise FileFormatError(f"{path}: the bag holds more than {_LARGEST_TOTAL >> 20} MiB of messages; split it.")
-        log = min(int.from_bytes(data[6:14], "little"), 2**63 - 1)
-        topic.messages.append((log, payload))
+        topic.messages.append((min(log, 2**63 - 1), payload))
         topic.places.append(self.count)
         self.count += 1
 
@@ -178,8 +210,11 @@ class _Bag:
             encoding = f"{channel.message_encoding} with {schema.encoding if schema else 'no'} definitions"
             self.refused[name] = f"its encoding is {text_of(encoding)}"
             return None
-        definition = bytes(schema.data).decode("utf-8", "replace")
-        key = (str(schema.name), definition)
+        return self._announce(str(channel.topic), str(schema.name), bytes(schema.data).decode("utf-8", "replace"))
+
+    def _announce(self, topic: str, kind_name: str, definition: str) -> BagTopic | None:
+        name = "/" + topic.strip("/")
+        key = (kind_name, definition)
         if key not in self._types:
             try:
                 self._types[key] = message_type(*key)
@@ -206,7 +241,7 @@ class _Bag:
         return "it is empty"
 
     def findings(self) -> list[Finding]:
-        found = []
+        found = [*self.damage]
         for path, problem in self.problems[:20]:
             if problem.loss is Loss.OPEN:
                 text = f"{path.name} was not closed: the recorder was stopped before it could finish."

@@ -1,0 +1,124 @@
+"""--from and --to: a piece of a recording gives what a file gives that was cut beforehand."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from made_flight import made_flight
+
+from crazyem.cli import main
+from crazyem.errors import UsageError
+from crazyem.recordings import Event, Finding, Fix, Grade, ReadOptions, Recording, SignalArray, open_recording
+from crazyem.recordings.cut import cut, cut_parts
+from crazyem.recordings.export import METADATA_SUFFIX, export
+from crazyem.recordings.parts import open_parts
+
+
+def array(time: np.ndarray, stream: str = "s") -> SignalArray:
+    n = time.size
+    return SignalArray(time, time[:, None] * 2.0, np.arange(n), 1.7e9 + time, np.zeros(n, bool), stream=stream)
+
+
+def recording(**more: object) -> Recording:
+    signals = {"a": array(np.arange(0.0, 10.0, 0.1)), "b": array(np.arange(0.05, 10.0, 0.5), "t")}
+    return replace(Recording("there", "made:up", signals), **more)
+
+
+@given(st.floats(0.0, 4.9), st.floats(5.0, 12.0))
+def test_a_piece_holds_the_samples_between_its_ends_and_no_others(start: float, end: float) -> None:
+    whole = recording()
+    piece = cut(whole, start, end)
+    for name, signal in whole.signals.items():
+        inside = [t for t in signal.time.tolist() if start <= t <= end]
+        assert piece.signals[name].time.tolist() == inside
+        assert piece.signals[name].value[:, 0].tolist() == [2.0 * t for t in inside]
+    assert cut(piece, start, end).signals["a"].time.size == piece.signals["a"].time.size
+
+
+@given(st.floats(-1.0, 11.0))
+def test_two_pieces_are_the_whole(at: float) -> None:
+    whole = recording()
+    halves = [half for half in _halves(whole, at) if half is not None]
+    for name, signal in whole.signals.items():
+        joined = np.concatenate([half.signals[name].time for half in halves])
+        np.testing.assert_array_equal(joined, signal.time)
+
+
+def _halves(whole: Recording, at: float) -> Iterator[Recording | None]:
+    for start, end in ((None, at), (float(np.nextafter(at, np.inf)), None)):
+        try:
+            yield cut(whole, start, end)
+        except UsageError:
+            yield None
+
+
+def test_findings_and_events_outside_are_left_out_and_rows_are_counted_anew() -> None:
+    marks = Fix("mark", ("a",), rows=np.array([10, 50, 51]))
+    findings = (
+        Finding("gaps", Grade.HARMLESS, "early", intervals=((0.0, 1.0),)),
+        Finding("gaps", Grade.HARMLESS, "inside", intervals=((4.0, 5.5),)),
+        Finding("interpolated", Grade.DEGRADES, "rows", fix=marks),
+        Finding("unit", Grade.DEGRADES, "two streams", fix=Fix("mark", ("a", "b"), rows=np.array([1]))),
+    )
+    events = (*(Event(1.7e9 + t, "setpoint", {}) for t in (1.0, 6.0)), Event(0.0, "log", {"message": "x"}))
+    counted = {"statistics": {"received": "99", "lost": "3"}, "run": {"seed": "1"}}
+    piece = cut(recording(findings=findings, events=events, metadata=counted), 4.95, None)
+    assert [f.text for f in piece.findings] == ["inside", "rows", "two streams"]
+    assert [f.fix.rows.tolist() for f in piece.findings if f.fix and f.fix.rows is not None] == [[0, 1]]
+    assert [e.time for e in piece.events] == [1.7e9 + 6.0, 0.0]
+    assert piece.metadata == {"run": {"seed": "1"}}
+
+
+@pytest.mark.parametrize(("start", "end", "words"), [(20.0, None, "0.000 to 9.900"), (3.0, 3.0, "not before")])
+def test_limits_without_anything_between_them_are_an_error(start: float, end: float | None, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        cut(recording(), start, end)
+    with pytest.raises(UsageError):
+        list(cut_parts(iter([recording()]), start, end))
+
+
+def test_a_piece_is_the_file_that_was_cut_beforehand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A file whose rows before and after were deleted, and a file of the piece, both replayed: the same numbers."""
+    whole, beforehand = tmp_path / "whole.csv", tmp_path / "cut.csv"
+    export(made_flight(), whole)
+    header, *rows = whole.read_text().splitlines()
+    kept = [row for row in rows if 2.0 <= float(row.split(",")[0]) <= 6.0]
+    beforehand.write_text("\n".join([header, *kept]) + "\n")
+    Path(f"{beforehand}{METADATA_SUFFIX}").write_bytes(Path(f"{whole}{METADATA_SUFFIX}").read_bytes())
+    limits = ["--from", "2", "--to", "6"]
+    imported = tmp_path / "piece.mcap"
+    assert main(["import", str(whole), "-o", str(imported), *limits]) == 0
+    pieces = [open_recording(beforehand), open_recording(imported), open_recording(whole, ReadOptions(start=2, end=6))]
+    pieces.append(_joined(list(open_parts(whole, ReadOptions(start=2.0, end=6.0), seconds=1.0))))
+    for piece in pieces[1:]:
+        for name, signal in pieces[0].signals.items():
+            np.testing.assert_array_equal(piece.signals[name].time, signal.time)
+            np.testing.assert_array_equal(piece.signals[name].value, signal.value)
+    capsys.readouterr()
+    results = []
+    for command in ([str(beforehand)], [str(whole), *limits]):
+        plot = ["--plot", str(tmp_path / "p.png"), "--window", "200", "--every", "150"]
+        assert main(["replay", *command, "--vehicle", "cf2", "--json", "-", *plot]) == 0
+        results.append(json.loads(capsys.readouterr().out))
+    assert results[0]["updates"] > 0
+    for result in results:
+        for key in ("source", "log", "plot", "notices", "update_ms"):
+            result.pop(key, None)
+    assert results[0] == results[1]
+
+
+def _joined(parts: list[Recording]) -> Recording:
+    signals = {
+        name: replace(
+            signal,
+            time=np.concatenate([p.signals[name].time for p in parts if name in p.signals]),
+            value=np.concatenate([p.signals[name].value for p in parts if name in p.signals]),
+        )
+        for name, signal in parts[0].signals.items()
+    }
+    return replace(parts[0], signals=signals)
