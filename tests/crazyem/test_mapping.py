@@ -99,6 +99,30 @@ pole_pairs = 7
     assert signals["rotor_speed"].source == ("p2", "v0", "p1", "p0")
 
 
+def test_an_offset_is_added_in_si_after_factor_and_sign(tmp_path):
+    table = table_of()
+    found = opened(
+        tmp_path,
+        table,
+        '[signals.position]\ncolumns = ["p2", "p0", "p1"]\norder = "z x y"\nunit = "cm"\nsign = [-1, 1, 1]\n'
+        'offset = [5.0, 0.0, -1.5]\n[signals.voltage]\ncolumns = ["v0"]\nunit = "mV"\nscale = 2\noffset = 3.7\n',
+    ).signals
+    expected = np.column_stack([0.01 * table["p0"], 0.01 * table["p1"] - 1.5, 5.0 - 0.01 * table["p2"]])
+    np.testing.assert_allclose(found["position"].value, expected, rtol=1e-12)
+    np.testing.assert_allclose(found["voltage"].value[:, 0], 0.002 * table["v0"] + 3.7, rtol=1e-12)
+
+
+def test_pulses_of_1000_to_2000_us_are_0_to_1(tmp_path):
+    pulses = np.tile([1000.0, 1250.0, 1500.0, 2000.0], 10)
+    table = table_of(m0=pulses, m1=pulses, m2=pulses, m3=pulses, u=pulses)
+    mapping = '[signals.motor_request]\ncolumns = ["m0", "m1", "m2", "m3"]\nunit = "us"\n'
+    found = opened(tmp_path, table, mapping).signals["motor_request"]
+    np.testing.assert_allclose(found.value, np.repeat((pulses[:, None] - 1000.0) / 1000.0, 4, axis=1), atol=1e-12)
+    other = mapping.replace('"us"', '"1"\nscale = 0.00125\noffset = -1.375')  # 1100 to 1900 us
+    found = opened(tmp_path, table, other).signals["motor_request"]
+    np.testing.assert_allclose(found.value[:, 0], (pulses - 1100.0) / 800.0, atol=1e-12)
+
+
 def test_vectors_of_the_other_frame_are_turned_by_the_attitude_of_the_row(tmp_path):
     table = table_of()
     mapping = ATTITUDE + (

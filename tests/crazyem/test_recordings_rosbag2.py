@@ -372,6 +372,16 @@ def test_simulated_time_is_not_mixed_with_real_time(tmp_path: Path) -> None:
     np.testing.assert_allclose(signals["position"].time, signals["voltage"].time)
 
 
+def test_a_message_without_a_stamp_among_others_is_placed_by_its_arrival(tmp_path: Path) -> None:
+    messages = [pose_message("/cf1/pose", START + i * 10**7, [i, 0, 0, 0, 0, 0, 1]) for i in range(20)]
+    messages[7][3]["header"] = stamp(0)
+    recording = opened(tmp_path, bag(messages))
+    time = recording.signals["position"].time
+    np.testing.assert_allclose(time - time[0], 0.01 * np.arange(20), atol=1e-6)
+    (finding,) = [f for f in recording.findings if f.check == "stamps"]
+    assert "1 of 20 records of cf1/pose" in finding.text
+
+
 def test_truncation_keeps_every_whole_chunk(tmp_path: Path) -> None:
     values = random_poses(12)
     content = bag([pose_message("/cf1/pose", START + i * 10**7, v) for i, v in enumerate(values)], chunk=300)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.ros.ros2_messages import MessageType, Rows, rows_of
+from crazyem.recordings.stamps import Fault, finding
 from crazyem.recordings.tables import Table, signals_from_tables
 from crazyem.recordings.topics import Mapped, Topic, ranks, seconds, signals_of, text_of
 
@@ -61,7 +63,7 @@ class Told:
     variables: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(eq=False)
 class _Decoded:
     """A topic's numbers, its place in the order of the bag, and its times on the axis of the recording."""
 
@@ -71,12 +73,35 @@ class _Decoded:
     time: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     clock: str = HOST
 
+    @cached_property
+    def unknown(self) -> NDArray[np.bool_]:
+        """(n,) True where a message has no stamp, or one that is far from when it was recorded."""
+        own, log = self.rows.stamp, self.rows.log
+        return (own <= 0) | (np.abs(own - log) > _SAME_EPOCH)
+
+    @property
+    def moved(self) -> bool:
+        """Whether a few messages are placed by when they were recorded, and not all."""
+        return bool(self.unknown.any()) and 2 * int(self.unknown.sum()) < self.unknown.size
+
     @property
     def stamps(self) -> NDArray[np.int64]:
-        """(n,) ns: the messages' own stamps; when they were recorded, if they have none or are of another epoch."""
-        own = self.rows.stamp
-        believed = (own > 0).all() and abs(float(np.median(own - self.rows.log))) < _SAME_EPOCH
-        return own if believed else self.rows.log
+        """(n,) ns: the messages' own stamps; when they were recorded, if most have none or are of another epoch.
+
+        A message without a stamp among others is placed by when it was recorded, less the median delay of the others.
+        """
+        own, log = self.rows.stamp, self.rows.log
+        if not self.unknown.any():
+            return own
+        if not self.moved:
+            return log
+        delay = int(np.median((log - own)[~self.unknown]))
+        return np.where(self.unknown, log - delay, own)
+
+    def fault(self) -> Fault:
+        """What is wrong with the stamps of the topic."""
+        example = float(self.rows.stamp[self.unknown][0]) / _NS
+        return Fault(_label(self), int(self.unknown.sum()), self.unknown.size, "placed by arrival", example)
 
 
 def recording_of(
@@ -114,13 +139,26 @@ def recording_of(
         note("integrity", f"{n} messages of {text_of(name)} do not fit their type.", Grade.DEGRADES, messages=float(n))
         for name, n in broken
     ]
+    faults = [
+        Fault(
+            _label(d),
+            int(d.unknown.sum()),
+            d.unknown.size,
+            "placed by arrival",
+            float(d.rows.stamp[d.unknown][0]) / _NS,
+        )
+        for d in decoded
+        if d.moved and d.clock == HOST
+    ]
+    streams = {fault.stream for fault in faults}
+    odd = finding(faults, [name for name, array in signals.items() if array.stream in streams])
     about = {"robot": robot, "topics": " ".join(sorted(text_of(t.name) for t in topics))[:4000], **clocks}
     return Recording(
         str(path),
         "rosbag2",
         signals,
         {"rosbag2": about, **meaning.metadata},
-        (*findings, *damaged, *clock_notes, *log_notes, *meaning.findings, *twist_notes, *left_out),
+        (*findings, *damaged, *odd, *clock_notes, *log_notes, *meaning.findings, *twist_notes, *left_out),
         (),
         origin,
     )
@@ -204,8 +242,10 @@ def _place(decoded: list[_Decoded]) -> tuple[float, list[Finding], dict[str, str
 def _unwrap(logs: list[_Decoded]) -> None:
     """Firmware times [s] of log blocks: a packet's 24 bits of milliseconds made continuous, all blocks on one clock."""
     stamps = np.concatenate([d.rows.columns["timestamp"] for d in logs]).astype(np.int64)
-    if (stamps < STAMP_MODULUS).all():
+    small = stamps < STAMP_MODULUS
+    if 2 * int(small.sum()) > small.size:  # a few that are not cannot be; if most are not, somebody unwrapped them
         order = np.argsort(np.concatenate([d.order for d in logs]))
+        order = order[small[order]]
         unwrapper = StampUnwrapper()
         for i, stamp in zip(order.tolist(), stamps[order].tolist(), strict=True):
             stamps[i] = unwrapper.unwrap(stamp)
