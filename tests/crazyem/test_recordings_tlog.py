@@ -468,3 +468,43 @@ def test_a_battery_monitor_that_reads_zero_is_not_connected(tmp_path: Path) -> N
     assert "voltage" not in recording.signals
     assert "no battery monitor" in recording.metadata["not_measured"]["voltage"]
     assert [f.signal for f in recording.findings if f.signal] == ["voltage"]
+
+
+def test_an_autopilot_that_was_started_again_makes_two_parts_on_one_axis(tmp_path: Path) -> None:
+    log = Log()
+    for k in range(400):
+        if k == 250:
+            log.links[1, 1].seq = 0  # numbers begin anew, too
+        boot = START - 50_000_000 if k < 250 else START + 4_000_000  # started again after 50 s and 5 s of flight
+        stamp = START + 20_000 * k
+        log.add(stamp + 3000, mavlink.MAVLink_attitude_message((stamp - boot) // 1000, 0, 0, 0.001 * k, 0, 0, 0))
+    recording = opened(tmp_path, log.bytes)
+    time = recording.signals["attitude"].time
+    np.testing.assert_allclose(np.diff(time), 0.02, atol=1e-6)
+    assert time[0] == pytest.approx(50.0)
+    (finding,) = [f for f in recording.findings if f.check == "stamps"]
+    assert finding.evidence["starts"] == 2
+    (first, second) = finding.intervals
+    assert first == pytest.approx((50.0, 55.0), abs=1e-3)
+    assert second == pytest.approx((55.0, 57.98), abs=1e-3)
+    assert not [f for f in recording.findings if f.check == "gaps"]
+    last = open_recording(tmp_path / "flight.tlog", ReadOptions(start=second[0]))
+    assert last.signals["attitude"].time.size == 150
+
+
+@settings(max_examples=25, deadline=None)
+@given(rows=st.sets(st.integers(1, 28), max_size=8), wild=st.sampled_from([0, 0xFFFFFFFF]))
+def test_boot_times_that_cannot_be_are_placed_by_arrival(
+    tmp_path_factory: pytest.TempPathFactory, rows: set[int], wild: int
+) -> None:
+    logs = Log(), Log()
+    for k in range(30):
+        stamp = START + 20_000 * k
+        for log, bad in zip(logs, (set(), rows), strict=True):
+            milliseconds = wild if k in bad else boot_ms(stamp)
+            log.add(stamp + 3000, mavlink.MAVLink_attitude_message(milliseconds, 0, 0, 0.001 * k, 0, 0, 0))
+    folder = tmp_path_factory.mktemp("boot")
+    good, odd = (opened(folder, log.bytes) for log in logs)
+    np.testing.assert_allclose(odd.signals["euler"].time, good.signals["euler"].time, atol=1e-6)
+    np.testing.assert_array_equal(odd.signals["euler"].value, good.signals["euler"].value)
+    assert [f.evidence["records"] for f in odd.findings if f.check == "stamps"] == [len(rows)] * bool(rows)

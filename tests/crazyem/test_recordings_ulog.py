@@ -4,6 +4,7 @@ import gzip
 import io
 import math
 import struct
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -447,3 +448,57 @@ def test_a_thousand_large_topics_are_bounded(tmp_path: Path) -> None:
 def test_unusable_logs_say_why(tmp_path: Path, content: bytes, words: str) -> None:
     with pytest.raises(FileFormatError, match=words):
         opened(tmp_path, content)
+
+
+TOPICS = ("vehicle_attitude", "vehicle_angular_velocity", "battery_status")
+
+
+def with_stamps(change: Callable[[str, int, int], int], bad: Mapping[int, int]) -> bytes:
+    """A log of 60 instants of `TOPICS` from 2 s on; `change` of (topic, row, stamp), `bad`: more attitudes by row."""
+    content = header() + definitions(*TOPICS)
+    for k in range(60):
+        at = 2_000_000 + 20_000 * k
+        content += data(TOPICS[0], change(TOPICS[0], k, at), 1, 0, 0.01 * k, 0)
+        content += data(TOPICS[0], bad[k], 1, 0, 9, 0) if k in bad else b""
+        content += data(TOPICS[1], change(TOPICS[1], k, at), k, 2, 3)
+        content += data(TOPICS[2], change(TOPICS[2], k, at), 4.0, k)
+    return content
+
+
+def as_stamped(topic: str, row: int, stamp: int) -> int:
+    return stamp
+
+
+@settings(max_examples=25, deadline=None)
+@given(bad=st.dictionaries(st.integers(0, 59), st.sampled_from([0, 4 * 10**18, 2**64 - 1, 10**15]), max_size=9))
+def test_messages_with_stamps_that_cannot_be_cost_only_themselves(
+    tmp_path_factory: pytest.TempPathFactory, bad: dict[int, int]
+) -> None:
+    folder = tmp_path_factory.mktemp("stamps")
+    good = opened(folder, with_stamps(as_stamped, {}))
+    odd = opened(folder, with_stamps(as_stamped, bad))
+    for name, array in good.signals.items():
+        np.testing.assert_array_equal(odd.signals[name].time, array.time)
+        np.testing.assert_array_equal(odd.signals[name].value, array.value)
+    assert [f.evidence["records"] for f in odd.findings if f.check == "stamps"] == [len(bad)] * bool(bad)
+
+
+@settings(max_examples=10, deadline=None)
+@given(topic=st.sampled_from(TOPICS), ahead=st.sampled_from([1_700_000_000_000_000, 10**12]))
+def test_a_topic_of_another_clock_comes_back(tmp_path_factory: pytest.TempPathFactory, topic: str, ahead: int) -> None:
+    folder = tmp_path_factory.mktemp("clock")
+    good = opened(folder, with_stamps(as_stamped, {}))
+    odd = opened(folder, with_stamps(lambda name, row, at: at + ahead * (name == topic), {}))
+    for name, array in good.signals.items():
+        np.testing.assert_allclose(odd.signals[name].time, array.time, atol=0.021)  # by the file's order, to one step
+        np.testing.assert_array_equal(odd.signals[name].value, array.value)
+    (finding,) = [f for f in odd.findings if f.check == "stamps"]
+    assert topic in finding.text
+
+
+def test_a_topic_without_any_stamps_says_so(tmp_path: Path) -> None:
+    content = with_stamps(lambda name, row, at: at * (name != TOPICS[2]), {})
+    recording = opened(tmp_path, content)
+    assert "voltage" not in recording.signals
+    (finding,) = [f for f in recording.findings if f.check == "stamps"]
+    assert "battery_status has no stamps" in finding.text
