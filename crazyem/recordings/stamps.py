@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
@@ -108,6 +107,8 @@ def _without_those_in_order(time: Column, odd: Flags, away: Column) -> Flags:
 
 
 def _running_median(time: Column) -> Column:
+    from scipy.ndimage import median_filter  # takes long to import, and nearly no recording needs it
+
     return np.asarray(median_filter(time, 2 * _REACH + 1, mode="mirror"), float)
 
 
