@@ -271,6 +271,7 @@ def _on_recordings(commands: Any) -> None:
     in_parts = "read in stretches of a minute, whatever the size (else only what may not fit into memory)"
     info = command("info", "what is in recordings, how hard they flew, what could be identified from them")
     info.add_argument("--vehicle", metavar="NAME|FILE", help="judge by this vehicle (default: the one that was flown)")
+    info.add_argument("--all", action="store_true", help="all signals, clocks and metadata as well")
     info.add_argument("--parts", action="store_true", help=in_parts)
 
     doctor = command("doctor", "what is wrong with recordings, where, how bad, and what to do about it")

@@ -20,7 +20,14 @@ def run(arguments: argparse.Namespace) -> int:
     files = find(arguments.files, mapping=arguments.map)
     options = read_options(arguments)
     tasks = [
-        (str(f.path), options, arguments.vehicle, arguments.parts, processes(arguments.jobs, len(files.found)))
+        (
+            str(f.path),
+            options,
+            arguments.vehicle,
+            arguments.parts,
+            processes(arguments.jobs, len(files.found)),
+            arguments.all,
+        )
         for f in files.found
     ]
     names = [str(f.path) for f in files.found]
@@ -35,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     return report.close(skipped_files=files.skipped)
 
 
-def inspect(path: str, options: ReadOptions, vehicle: str | None, parts: bool, jobs: int) -> Result:
+def inspect(path: str, options: ReadOptions, vehicle: str | None, parts: bool, jobs: int, everything: bool) -> Result:
     """One file. Raises as `open_recording`."""
     from crazyem.doctor.inventory import inventory
 
@@ -45,7 +52,7 @@ def inspect(path: str, options: ReadOptions, vehicle: str | None, parts: bool, j
         found = merge_inventories(inventory(part, drone) for part in open_parts(path, options))
     else:
         found = inventory(open_recording(path, options), drone)
-    return Result(path, found.to_dict(), found.text())
+    return Result(path, found.to_dict(), found.text(everything=everything))
 
 
 def counted(results: list[Result], skipped: int) -> str:

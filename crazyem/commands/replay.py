@@ -59,7 +59,9 @@ def doctors_findings(recording: Recording) -> list[Finding]:
     from crazyem.doctor import examine
 
     used = {*ESTIMATOR_SIGNALS, ""}
-    return [f for f in examine(recording) if f.grade is not Grade.HARMLESS and f.signal in used]
+    # the weight is judged by the vehicle of the replay
+    found = [f for f in examine(recording) if f.grade is not Grade.HARMLESS and f.check != "weight"]
+    return [f for f in found if f.signal in used]
 
 
 def replay(recording: Recording, pipeline: Pipeline, *, progress: bool = True) -> None:

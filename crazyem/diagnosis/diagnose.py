@@ -128,7 +128,7 @@ def diagnose(
         after=after,
         effects=effects,
         indistinguishable=told.groups,
-        would_separate=told.separate,
+        would_separate=_advice(told.separate, [*recordings, *held_out]),
         unexplained=remains,
         selection=selection,
         left_out={n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)},
@@ -236,6 +236,13 @@ def _located(data: Data, selection: Selection, say: Say) -> tuple[Located, Locat
     say("what remains")
     data.settle(selection.final)
     return before, locate(data, selection.final)
+
+
+def _advice(texts: Sequence[str], recordings: Sequence[Recording]) -> tuple[str, ...]:
+    """What would tell more, without asking for signals that every recording holds; each once."""
+    recorded = set.intersection(*(set(r.signals) for r in recordings))
+    of = {effect.separates: effect for effect in CATALOGUE.values()}
+    return tuple(dict.fromkeys(of[text].advice(recorded) if text in of else text for text in texts))
 
 
 def _in_place(data: Data, apart: Data | None, selection: Selection) -> dict[str, tuple[Trial, Trial] | None]:

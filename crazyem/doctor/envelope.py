@@ -89,7 +89,7 @@ def envelope(recording: Recording, air: Airtime) -> Envelope:
     if command is not None:
         found["motor_command_max"] = float(command.max())
         found["motor_saturated_share"] = float((command >= SATURATED).any(axis=1).mean())
-    return Envelope(air.seconds, air.judged_by, airborne_intervals_s=air.airborne, **found)
+    return Envelope(air.seconds, air.judged_by, airborne_intervals_s=air.flown, **found)
 
 
 def inside_of(recording: Recording, name: str, air: Airtime) -> Array | None:

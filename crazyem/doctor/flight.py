@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor.streams import QUIET, longest, runs
+from crazyem.doctor.thrust import is_rotorcraft, kind_objection
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.ordering import Intervals, inside, ordered
@@ -28,18 +29,30 @@ DROPPED = 0.4  # m above ground at which rotors stop
 def check(recording: Recording) -> list[Finding]:
     """No flight, a recording that is cut, upsets and crashes."""
     flight = airtime(recording)
+    kind = _kind(recording)
     if not flight.known:
-        return []
+        return kind
     if not flight.airborne:
-        return [_no_flight(flight)]
+        return [*kind, _no_flight(flight)]
     tilt = _tilt(recording)
-    found = _upsets(flight, tilt)
+    found = [*kind, *_upsets(flight, tilt)]
     lying = _lying(recording, flight, tilt)
     found += lying
     if not lying:
         found += _impacts(recording, flight)
         found += _drops(recording, flight)
     return [*found, *_course(flight)]
+
+
+def _kind(recording: Recording) -> list[Finding]:
+    """Another kind of vehicle than the models are of."""
+    why = kind_objection(recording)
+    if not why:
+        return []
+    text = f"{why[:1].upper()}{why[1:]}."
+    grade = Grade.DEGRADES if is_rotorcraft(recording) else Grade.UNUSABLE
+    advice = "No mass, inertia or effect can be told by these models; the checks of the streams hold all the same."
+    return [Finding("flight", grade, text, evidence={}, advice=advice)]
 
 
 def _no_flight(flight: Airtime) -> Finding:
@@ -60,7 +73,7 @@ def _course(flight: Airtime) -> list[Finding]:
     """Where a recording begins or ends in the air, or holds several flights: the times in the air."""
     at_work = flight.airborne if flight.by_height_alone else flight.lifting
     starts, ends = at_work[0][0] <= flight.begin, at_work[-1][1] >= flight.end
-    count = len(flight.airborne)
+    count = len(flight.flown)
     where = "in the air" if flight.by_height_alone else "with rotors at work"
     remarks = []
     if count > 1:
@@ -71,18 +84,18 @@ def _course(flight: Airtime) -> list[Finding]:
         remarks.append(f"ends {where}")
     if not remarks:
         return []
-    total = sum(b - a for a, b in flight.airborne)
+    total = flight.seconds
     evidence = {"airborne_s": total, "flights": float(count)}
     if not starts:
-        evidence["take_off_s"] = flight.airborne[0][0]
+        evidence["take_off_s"] = flight.flown[0][0]
     if not ends:
-        evidence["landing_s"] = flight.airborne[-1][1]
+        evidence["landing_s"] = flight.flown[-1][1]
     return [
         Finding(
             "flight",
             Grade.HARMLESS,
             f"The recording {' and '.join(remarks)}; {total:.1f} s in the air.",
-            intervals=longest(flight.airborne),
+            intervals=longest(flight.flown),
             evidence=evidence,
             advice="Nothing to do.",
         )

@@ -76,7 +76,7 @@ class Verdict:
 def identifiability(recording: Recording, vehicle: Vehicle, air: Airtime) -> tuple[Verdict, ...]:
     """Verdicts on mass, inertias, lag, delay, torque offsets, drag and battery law, in this order."""
     if air.seconds < SHORTEST:
-        why = f"only {air.seconds:.1f} s in the air"
+        why = f"only {air.seconds:.1f} s in the air" + (f": {air.reason}" if air.reason else "")
         return tuple(Verdict(name, "no", why) for name in NAMES)
     inputs = inputs_of(recording, vehicle)
     turning, turn_from = _rates(recording, air)

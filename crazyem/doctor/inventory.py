@@ -8,14 +8,17 @@ from typing import Any
 import numpy as np
 
 from crazyem.doctor.envelope import Envelope, envelope
-from crazyem.doctor.identifiability import Verdict, identifiability
-from crazyem.doctor.thrust import vehicle_for
+from crazyem.doctor.identifiability import Verdict, identifiability, replay_objection
+from crazyem.doctor.thrust import kind_objection, vehicle_for, weight_objection
 from crazyem.recordings.airborne import airtime
+from crazyem.recordings.finding import percent
 from crazyem.recordings.ordering import sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.vehicle import Vehicle
 
 _MOST_ENTRIES = 12  # of a section of metadata that are shown as text
+_MOST_FLIGHTS = 4  # that the text names
+_MOST_SIGNALS = 16
 _LONGEST_TEXT = 120  # characters of a metadata value that are shown
 
 
@@ -69,7 +72,15 @@ class ClockRow:
 
 @dataclass(frozen=True, slots=True)
 class Inventory:
-    """What is in a recording. `to_dict` is JSON, `text` is for a terminal."""
+    """What is in a recording. `to_dict` is JSON, `text` is for a terminal.
+
+    Attributes (besides those that explain themselves):
+        kind: of vehicle, by its autopilot; "" where nobody says.
+        other_kind: why the models here are not of this kind of vehicle; "" where they are.
+        unlike: why the rotors do not fit the vehicle; "" where they do.
+        on_the_ground: why nothing was flown; "" if something was.
+        no_replay: why `crazyem replay` cannot use it; "" if it can.
+    """
 
     path: str
     source: str
@@ -82,6 +93,11 @@ class Inventory:
     events: Mapping[str, int]
     envelope: Envelope
     verdicts: tuple[Verdict, ...]
+    kind: str = ""
+    other_kind: str = ""
+    unlike: str = ""
+    on_the_ground: str = ""
+    no_replay: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: units in the names of the keys, None where unknown."""
@@ -97,17 +113,34 @@ class Inventory:
             "events": dict(self.events),
             "envelope": _listed(self.envelope.to_dict()),
             "identifiable": [verdict.to_dict() for verdict in self.verdicts],
+            "kind": self.kind,
+            "objections": {
+                "kind": self.other_kind,
+                "weight": self.unlike,
+                "flight": self.on_the_ground,
+                "replay": self.no_replay,
+            },
         }
 
-    def text(self) -> str:
-        """A readable table, plain text."""
-        head = f"{self.path}: {self.source}, {self.duration_s:.2f} s, {self.samples} samples, vehicle {self.vehicle}"
-        parts = [head, *_metadata_lines(self.metadata), "", *_signal_lines(self.signals), *_clock_lines(self.clocks)]
+    def text(self, *, everything: bool = False) -> str:
+        """What matters first, in at most 20 lines; with `everything` metadata, clocks and all signals below."""
+        head = f"{self.path}: {self.source}, {self.duration_s:.2f} s, {self.samples} samples"
+        parts = [head, *self._vehicle_lines(), *_flight_lines(self.envelope, self.on_the_ground)]
+        parts += [f"what it could identify, as vehicle {self.vehicle}:", *_verdict_lines(self.verdicts)]
+        if self.no_replay and all(verdict.reason != self.no_replay for verdict in self.verdicts):
+            parts.append(f"  crazyem replay cannot use it: {self.no_replay}")
+        if not everything:
+            return "\n".join([*parts, *_summary_lines(self.signals)])
+        parts += ["", *_metadata_lines(self.metadata), *_signal_lines(self.signals), *_clock_lines(self.clocks)]
         if self.events:
             parts.append("events: " + ", ".join(f"{count} {kind}" for kind, count in self.events.items()))
-        parts += ["", *_envelope_lines(self.envelope), "", f"what it could identify, as vehicle {self.vehicle}:"]
-        parts += [verdict.line() for verdict in self.verdicts]
         return "\n".join(parts)
+
+    def _vehicle_lines(self) -> list[str]:
+        """What flew, and what speaks against judging it by the vehicle."""
+        said = self.other_kind or (f"{self.kind}, by its autopilot" if self.kind else "")
+        lines = [f"vehicle: {said}"] if said else []
+        return [*lines, *([f"weight: {self.unlike}"] if self.unlike else [])]
 
 
 def inventory(recording: Recording, vehicle: Vehicle | None = None) -> Inventory:
@@ -134,6 +167,11 @@ def inventory(recording: Recording, vehicle: Vehicle | None = None) -> Inventory
         events=kinds,
         envelope=envelope(recording, air),
         verdicts=identifiability(recording, vehicle, air),
+        kind=recording.metadata.get("vehicle", {}).get("kind", ""),
+        other_kind=kind_objection(recording),
+        unlike=weight_objection(recording, vehicle, air),
+        on_the_ground=air.reason,
+        no_replay=replay_objection(recording, vehicle),
     )
 
 
@@ -258,32 +296,65 @@ def _clock_lines(rows: tuple[ClockRow, ...]) -> list[str]:
     return lines
 
 
-def _envelope_lines(e: Envelope) -> list[str]:
+def _flight_lines(e: Envelope, on_the_ground: str) -> list[str]:
+    """Time in the air, what says so, and how hard it flew: three lines at most."""
     by = "by " + ", ".join(e.judged_by) if e.judged_by else "no signal says when; all of it counts"
-    parts = " and ".join(f"{a:.2f} to {b:.2f}" for a, b in e.airborne_intervals_s[:4])
-    more = f" and {len(e.airborne_intervals_s) - 4} more" if len(e.airborne_intervals_s) > 4 else ""
-    lines = [f"in the air: {e.airborne_s:.2f} s ({parts}{more} s; {by})" if parts else f"in the air: never ({by})"]
+    spans = e.airborne_intervals_s
+    shown = " and ".join(f"{a:.2f} to {b:.2f}" for a, b in spans[:_MOST_FLIGHTS])
+    more = f" and {len(spans) - _MOST_FLIGHTS} more" if len(spans) > _MOST_FLIGHTS else ""
+    if not spans:
+        return [f"in the air: never ({by}): {on_the_ground}"]
+    lines = [f"in the air: {e.airborne_s:.2f} s ({shown}{more} s; {by})"]
+    motion = []
     if e.speed_max_m_s is not None:
         source = "" if e.speed_from == "velocity" else f" (from {e.speed_from})"
-        lines.append(
-            f"  speed up to {e.speed_max_m_s:.2f} m/s, rms {e.speed_rms_m_s:.2f}; vertical "
+        motion.append(
+            f"speed up to {e.speed_max_m_s:.2f} m/s, rms {e.speed_rms_m_s:.2f}; vertical "
             f"{e.vertical_speed_min_m_s:.2f} to {e.vertical_speed_max_m_s:.2f} m/s{source}"
         )
     if e.altitude_min_m is not None:
-        lines.append(f"  altitude {e.altitude_min_m:.2f} to {e.altitude_max_m:.2f} m")
+        motion.append(f"altitude {e.altitude_min_m:.2f} to {e.altitude_max_m:.2f} m")
     if e.tilt_max_deg is not None:
-        lines.append(f"  tilt up to {e.tilt_max_deg:.1f} deg (from {e.tilt_from})")
+        motion.append(f"tilt up to {e.tilt_max_deg:.1f} deg" + ("" if e.tilt_from == "attitude" else " (from euler)"))
+    forces = []
     if e.body_rate_max_rad_s is not None:
-        lines.append("  body rate up to " + ", ".join(f"{r:.2f}" for r in e.body_rate_max_rad_s) + " rad/s (x, y, z)")
+        forces.append("body rate up to " + ", ".join(f"{r:.2f}" for r in e.body_rate_max_rad_s) + " rad/s (x, y, z)")
     if e.specific_force_max_m_s2 is not None:
-        lines.append(f"  specific force {e.specific_force_min_m_s2:.2f} to {e.specific_force_max_m_s2:.2f} m/s^2")
+        forces.append(f"specific force {e.specific_force_min_m_s2:.2f} to {e.specific_force_max_m_s2:.2f} m/s^2")
     if e.acceleration_max_m_s2 is not None:
-        lines.append(f"  acceleration up to {e.acceleration_max_m_s2:.2f} m/s^2")
+        forces.append(f"acceleration up to {e.acceleration_max_m_s2:.2f} m/s^2")
     if e.voltage_min_V is not None:
-        lines.append(f"  battery {e.voltage_start_V:.2f} to {e.voltage_end_V:.2f} V, lowest {e.voltage_min_V:.2f} V")
+        forces.append(f"battery {e.voltage_start_V:.2f} to {e.voltage_end_V:.2f} V, lowest {e.voltage_min_V:.2f} V")
     if e.motor_command_max is not None and e.motor_saturated_share is not None:
-        lines.append(
-            f"  motor command up to {e.motor_command_max:.3f}; at the limit in {100 * e.motor_saturated_share:.1f} % "
-            "of the samples"
+        forces.append(
+            f"motor command up to {e.motor_command_max:.3f}; at the limit in {percent(e.motor_saturated_share)} of the "
+            "samples"
         )
+    return [*lines, *("  " + "; ".join(part) for part in (motion, forces) if part)]
+
+
+def _verdict_lines(verdicts: tuple[Verdict, ...]) -> list[str]:
+    """What can be identified, a line each; what cannot, a line for each reason."""
+    lines = [verdict.line() for verdict in verdicts if verdict.verdict != "no"]
+    reasons: dict[str, list[Verdict]] = {}
+    for verdict in verdicts:
+        if verdict.verdict == "no":
+            reasons.setdefault(verdict.reason, []).append(verdict)
+    for reason, group in reasons.items():
+        if len(group) == 1:
+            lines.append(group[0].line())
+        else:
+            names = "everything" if len(group) == len(verdicts) else ", ".join(v.name for v in group)
+            lines.append(f"  not {names}: {reason}")
     return lines
+
+
+def _summary_lines(rows: tuple[SignalRow, ...]) -> list[str]:
+    """The signals that something here uses, with their rates, and how many others there are: two lines at most."""
+    used = [row for row in rows if row.quantity]
+    others = len(rows) - len(used)
+    words = [row.name + (f" {row.rate_hz:.0f} Hz" if row.rate_hz else "") for row in used]
+    shown, more = words[:_MOST_SIGNALS], len(words) - _MOST_SIGNALS
+    text = ", ".join(shown) + (f" and {more} more" if more > 0 else "") if used else "none that is known here"
+    rest = f"; {others} others that nothing here uses" if others else ""
+    return [f"signals: {text}{rest} (--all shows everything)"]

@@ -13,7 +13,9 @@ from scipy import stats
 
 from crazyem.doctor.kinematics import GRAVITY, STEP, Grid, Track, grid_of, measurements, track
 from crazyem.doctor.regress import FEW, block_sums, blocks
+from crazyem.doctor.thrust import carried, vehicle_for, weight_objection
 from crazyem.physics.rotors import thrust_from_command, thrust_from_speed
+from crazyem.recordings.airborne import airtime
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle, load_vehicle, preset_names
@@ -45,24 +47,24 @@ class Carried:
 
 
 def check(recording: Recording) -> list[Finding]:
-    """A finding where the publisher claims a mass that no known thrust law carries; nothing without a claim."""
+    """Findings where the publisher claims a mass that no known thrust law carries, or the vehicle does not fit."""
     claim = claimed_mass(recording)
     if claim is None:
+        return _unlike(recording)
+    by_law = {name: found for name in preset_names() if (found := apparent_mass(recording, load_vehicle(name)))}
+    if not by_law:
         return []
-    carried = {name: found for name in preset_names() if (found := apparent_mass(recording, load_vehicle(name)))}
-    if not carried:
-        return []
-    nearest = min(carried, key=lambda name: abs(math.log(carried[name].mass / claim)))
-    best = carried[nearest]
+    nearest = min(by_law, key=lambda name: abs(math.log(by_law[name].mass / claim)))
+    best = by_law[nearest]
     ratio = best.mass / claim
     if abs(math.log(ratio)) < math.log(1.0 + OFF) or best.low <= claim <= best.high:
         return []
     evidence = {"claimed_kg": claim, "ratio": ratio, "ratio_low": best.low / claim, "ratio_high": best.high / claim}
-    for name, one in carried.items():
+    for name, one in by_law.items():
         key = name.replace("-", "_")
         evidence |= {f"mass_{key}_kg": one.mass, f"mass_{key}_low_kg": one.low, f"mass_{key}_high_kg": one.high}
         evidence |= {f"sag_{key}_per_V": one.sag, "seconds": one.seconds}
-    listed = ", ".join(f"{1e3 * one.mass:.1f} g by {name}" for name, one in carried.items())
+    listed = ", ".join(f"{1e3 * one.mass:.1f} g by {name}" for name, one in by_law.items())
     text = (
         f"{1e3 * claim:.1f} g are claimed, but the rotors carry {listed} (thrust laws of known drones): at least "
         f"{ratio:.2f} times the claim. Only the ratio of thrust scale to mass can be observed."
@@ -72,6 +74,18 @@ def check(recording: Recording) -> list[Finding]:
     )
     advice = "Weigh the drone as it flew, or give the vehicle a thrust law of its own."
     return [Finding("weight", Grade.DEGRADES, text, "", (), evidence, advice)]
+
+
+def _unlike(recording: Recording) -> list[Finding]:
+    """Where the rotors carry far more or less than the weight of the vehicle that the commands would take."""
+    vehicle, air = vehicle_for(recording), airtime(recording)
+    why = weight_objection(recording, vehicle, air)
+    if not why:
+        return []
+    text = f"{why[:1].upper()}{why[1:]}"
+    advice = "Name the vehicle that flew (--vehicle), or weigh it and write a vehicle file."
+    evidence = {"ratio": carried(recording, vehicle, air)}
+    return [Finding("weight", Grade.DEGRADES, text, evidence=evidence, advice=advice)]
 
 
 def claimed_mass(recording: Recording) -> float | None:

@@ -41,8 +41,8 @@ class Airtime:
     """When the drone flew.
 
     Attributes:
-        airborne: intervals in the air [s]; all of the recording where nothing tells (`known` is False).
-        flown: the same, without bounces before the climb and after the descent: no force of the floor in it.
+        flown: intervals in the air [s]; all of the recording where nothing tells (`known` is False).
+        airborne: the same with bounces before the climb and after the descent: the floor may push in it.
         lifting: intervals in which the rotors carried about the weight; as `airborne` where no rotors are known.
         judged_by: names of the signals that were used; () if none could tell.
         reason: why nothing was flown, one clause; "" if something was.
@@ -74,11 +74,11 @@ class Airtime:
     @property
     def seconds(self) -> float:
         """Time in the air [s]."""
-        return float(sum(end - start for start, end in self.airborne))
+        return float(sum(end - start for start, end in self.flown))
 
     def covers(self, time: Array) -> Flags:
         """(n,) whether each time is in the air."""
-        return inside(time, self.airborne)
+        return inside(time, self.flown)
 
 
 def airtime(recording: Recording) -> Airtime:

@@ -6,7 +6,7 @@ and take the parameters as keywords. `crazyem/physics/motion.py` puts them toget
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -179,7 +179,8 @@ class Effect:
         needs: at least one of these signals must be recorded, else nothing can be said: "voltage", "rotor_speed",
             "motor_command", "specific_force", "position", "attitude", "body_rate", "velocity".
         without: signals with which it cannot be (sag in time only matters where no voltage is known).
-        separates: what would tell it from its look-alikes, in words.
+        separates: what would tell it from its look-alikes, in words; see `advice`.
+        spared: signal -> the words of `separates` that ask for it.
         alike: correlation of how far its parameters usually are from neutral (`Parameter.usual`).
         nudge: small values at which every parameter matters (a ground effect's height says nothing at strength 0);
             the fit begins with derivatives there. Empty: neutral will do.
@@ -206,12 +207,21 @@ class Effect:
     needs: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     separates: str = ""
+    spared: Mapping[str, str] = field(default_factory=dict)
     alike: float = 0.0
     nudge: Values = field(default_factory=dict)
     amplitude: str = ""
     alternatives: tuple[tuple[str, ...], ...] = ()
     beginnings: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     sizes: tuple[float, ...] = ()
+
+    def advice(self, recorded: Container[str]) -> str:
+        """What would tell it from its look-alikes, without asking for what is recorded."""
+        text = self.separates
+        for signal, words in self.spared.items():
+            if signal in recorded:
+                text = text.replace(words, "")
+        return text
 
     def complete(self, values: Values, own: Values) -> dict[str, Any]:
         """All parameters: those given, else neutral; `own` are the vehicle's values for those whose neutral is NaN."""

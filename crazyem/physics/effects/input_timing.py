@@ -21,7 +21,8 @@ MOTOR_LAG = Effect(
     order=22,
     timing=slow,
     needs=("motor_command",),
-    separates="log rotor speeds; or motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
+    separates="log rotor speeds; or log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
+    spared={"rotor_speed": "log rotor speeds; or "},
 )
 
 INPUT_DELAY = Effect(

@@ -22,4 +22,5 @@ ROTOR_SENSOR = Effect(
     speed=recounted,
     needs=("rotor_speed",),
     separates="log the motor commands beside the speeds, or point an optical tachometer at each rotor in hover",
+    spared={"motor_command": "log the motor commands beside the speeds, or "},
 )

@@ -51,4 +51,5 @@ BATTERY_SAG = Effect(
     needs=("motor_command",),
     alternatives=(("gain_per_volt",), ("gain_per_second",)),
     separates="log pm.vbat, and fly the same battery from full to empty",
+    spared={"voltage": "log pm.vbat, and "},
 )
