@@ -128,7 +128,7 @@ def diagnose(
         after=after,
         effects=effects,
         indistinguishable=told.groups,
-        would_separate=_advice(told.separate, [*recordings, *held_out]),
+        would_separate=_advice(told.separate, [*asked.recordings, *asked.held_out]),
         unexplained=remains,
         selection=selection,
         left_out={n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)},

@@ -77,10 +77,14 @@ def test_everything_is_json_and_text() -> None:
     assert [s["name"] for s in data["signals"]] == list(made.signals)
     assert data["envelope"]["speed_max_m_s"] > 0.0
     assert {v["name"] for v in data["identifiable"]} == set(NAMES)
-    text = found.text()
+    text = found.text(everything=True)
     assert "version 2025.02" in text
     assert "x" * 200 not in text  # whole tables are not for a terminal
     assert all(name in text for name in (*made.signals, *NAMES))
+    short = found.text().splitlines()
+    assert len(short) <= 20
+    assert short[1].startswith("in the air")
+    assert all(name in found.text() for name in NAMES)
 
 
 @pytest.mark.parametrize("names", [(), ("position",), ("specific_force",), ("body_rate", "voltage"), ("attitude",)])
@@ -115,7 +119,7 @@ def test_the_envelope_is_that_of_the_closed_form(
 
     fine = np.arange(0.0, 20.0, 1.0 / 1000.0)
     up = fine[motion.position(fine)[:, 2] > 0.03]
-    (start, end) = air.airborne[0][0], air.airborne[-1][1]
+    (start, end) = air.flown[0][0], air.flown[-1][1]
     assert abs(start - up[0]) < 0.3  # rotors must carry it, and it must be 3 cm up
     assert abs(end - up[-1]) < 0.3
     inside = fine[(fine >= start) & (fine <= end)]
@@ -133,7 +137,7 @@ def test_the_envelope_is_that_of_the_closed_form(
 
 def test_airborne_needs_no_particular_signal() -> None:
     made = made_flight(seconds=20.0, more=("rpm",))
-    whole = airtime(made).airborne[0]
+    whole = airtime(made).flown[0]
     for left, by in (
         (without(made, "rotor_speed", "motor_command", "flying"), ("position",)),
         (without(made, "motor_command", "flying"), ("rotor_speed", "position")),
@@ -142,7 +146,7 @@ def test_airborne_needs_no_particular_signal() -> None:
     ):
         air = airtime(left)
         assert air.judged_by == by
-        assert air.airborne[0] == pytest.approx(whole, abs=0.8)  # rotors turn before it is 3 cm up
+        assert air.flown[0] == pytest.approx(whole, abs=0.8)  # rotors turn before it is 3 cm up
     nothing = airtime(without(made, "position", "motor_command", "rotor_speed", "flying"))
     assert nothing.judged_by == ()
     assert nothing.seconds == pytest.approx(20.0, abs=0.05)
@@ -161,7 +165,7 @@ def test_two_hops_are_two_stretches_and_a_short_dip_of_the_rotors_is_none() -> N
             "motor_command": array_of("motor_command", t, np.tile(duty[:, None], 4), place=1),
         },
     )  # fmt: skip
-    assert [(round(a), round(b)) for a, b in airtime(made).airborne] == [(2, 8), (12, 18)]
+    assert [(round(a), round(b)) for a, b in airtime(made).flown] == [(2, 8), (12, 18)]
 
 
 def test_a_crash_ends_the_flight() -> None:
@@ -170,7 +174,7 @@ def test_a_crash_ends_the_flight() -> None:
     value = force.value.copy()
     value[np.searchsorted(force.time, 17.5)] = [80.0, 60.0, 150.0]
     air = airtime(without(changed(made, "specific_force", value=value), "position", "flying"))
-    assert 17.0 < air.airborne[-1][1] < 17.5
+    assert 17.0 < air.flown[-1][1] < 17.5
 
 
 def test_saturation_is_a_share_of_the_flight() -> None:
