@@ -62,19 +62,22 @@ LIMITS: dict[str, Limit] = {
 
 
 UNCONNECTED = {"voltage": "battery monitor", "rotor_speed": "rotor speed sensor"}  # read 0 where they are not there
-# What else the motors of a drone are told in: (name, lowest, highest) of all samples.
-_UNITS = (("a pulse length in us", 800.0, 2300.0), ("percent", 1.5, 100.0), ("counts of 16 bits", 100.0, 65535.0))
+# What else the motors of a drone are told in: (words, unit in a mapping, lowest and highest of a typical value).
+_UNITS = (
+    ("pulse lengths in us", "us", 900.0, 2100.0),
+    ("percent", "%", 2.0, 100.0),
+    ("counts", "pwm", 3000.0, 65535.0),
+)
 
 
 def _unit_of_motors(array: SignalArray, values: NDArray[np.float64]) -> str:
-    """What unit the numbers look like, as advice; "" for other quantities."""
+    """What unit the numbers look like, as advice; "" for other quantities, and for no unit that is known."""
     if array.quantity not in ("motor_command", "motor_request"):
         return ""
-    low, high = float(values.min()), float(values.max())
-    running = float(np.median(values))
-    for unit, least, most in _UNITS:
-        if least <= running and high <= most and (low >= least or unit != _UNITS[0][0]):
-            return f"The numbers look like {unit}: say so in the mapping; 0 is off and 1 is full."
+    typical = float(np.median(values))
+    for words, unit, low, high in _UNITS:
+        if low <= typical <= high:
+            return f'The numbers look like {words}: unit = "{unit}" in a mapping reads them as 0..1.'
     return ""
 
 

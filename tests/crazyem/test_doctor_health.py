@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_flight import array_of, changed, made_flight, without
 
+from crazyem.doctor.fix import apply_fixes
 from crazyem.recordings.airborne import _off_the_ground, airtime
 from crazyem.recordings.finding import Grade
 from crazyem.recordings.recording import Recording
@@ -241,6 +242,45 @@ def test_a_sensor_that_always_counts_half(good):
     finding = only("rotor_sensor", changed(good, "rotor_speed", value=value))
     assert finding.fix is not None
     assert (finding.fix.kind, finding.fix.factor) == ("scale", (1.0, 1.0, 2.0, 1.0))
+
+
+@given(rotor=st.integers(0, 3), zeros=st.floats(0.07, 0.32), seed=st.integers(0, 50))
+@quick
+def test_a_sensor_that_counts_half_and_drops_to_zero_as_well(good, rotor, zeros, seed):
+    """As on brushed drones: rotors differ, ratio 0.49, dropouts of a few samples; both are found and both repaired."""
+    rng = np.random.default_rng(seed)
+    array = good.signals["rotor_speed"]
+    value = array.value * rng.normal(1.0, 0.03, 4) * rng.normal(1.0, 0.02, array.value.shape)
+    true = value.copy()
+    value[:, rotor] *= 0.49
+    out = np.convolve(rng.random(array.time.size) < zeros / 3.0, np.ones(3), "same") > 0
+    value[out, rotor] = 0.0
+    half, dropped = run("rotor_sensor", changed(good, "rotor_speed", value=value))
+    assert "half" in half.text
+    assert half.evidence["ratio"] == pytest.approx(0.49, abs=0.03)
+    flying = (array.time > 3.0) & (array.time < 17.0)
+    assert dropped.evidence["share"] == pytest.approx(float(out[flying].mean()), abs=0.04)
+    assert dropped.fix is not None
+    repaired, applied = apply_fixes(changed(good, "rotor_speed", value=value), [half, dropped])
+    assert len(applied) == 2
+    fixed = repaired.signals["rotor_speed"].value[flying & ~out]
+    assert np.median(fixed[:, rotor] / true[flying & ~out, rotor]) == pytest.approx(0.98, abs=0.01)
+
+
+def test_a_voltage_frozen_in_flight_degrades_what_needs_it(good):
+    value = np.full_like(good.signals["voltage"].value, 3.7)
+    finding = only("frozen", changed(good, "voltage", value=value))
+    assert finding.grade is Grade.DEGRADES
+    assert "15 %" in finding.text
+    assert only("frozen", without(changed(good, "voltage", value=value), "motor_command")).grade is Grade.HARMLESS
+    moved = value.copy()
+    moved[: value.shape[0] // 2] = 3.8
+    assert not run("frozen", changed(good, "voltage", value=moved))
+
+
+def test_what_never_flew_may_repeat(good):
+    ground = without(with_values(good, "position", slice(None), [0.0, 0.0, 0.01]), "rotor_speed")
+    assert not run("repeated", ground)
 
 
 def test_missing_speeds_are_counted(good):
