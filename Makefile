@@ -2,14 +2,21 @@
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
+FLIES  := $(VENV)/.installed
 READY  := $(VENV)/.ready
 WARM   := $(VENV)/.compiled
 
-.PHONY: fly test slow lint bench concealed paper paper-docs cfclient-test clean setup
+.PHONY: fly test slow lint bench concealed paper paper-docs cfclient-test clean setup oldest
 
-$(READY): pyproject.toml
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable
+
+$(FLIES): pyproject.toml  # what a flight needs; modules are compiled when they are imported
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(INSTALL) .
+	touch $(FLIES)
+
+$(READY): $(FLIES)  # and what developers need
+	$(INSTALL) '.[dev]'
 	touch $(READY)
 
 $(WARM): $(READY)  # once: what is compiled stays on the disk
@@ -18,15 +25,21 @@ $(WARM): $(READY)  # once: what is compiled stays on the disk
 
 setup: $(READY)
 
-fly: $(READY)  ## fly the simulated firmware with wrong constants and watch them being corrected
+oldest:  ## an environment of the lower bounds of pyproject.toml, as continuous integration tests it
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --resolution lowest-direct --editable '.[test]'
+	touch $(FLIES) $(READY)
+
+fly: $(FLIES)  ## fly the simulated firmware with wrong constants and watch them being corrected
 	$(BIN)/crazyem fly --scenario firmware_sim/scenarios/payload.toml --trajectory excite --duration 20 \
 		--record flight.mcap --json flight.json
 
 test: $(WARM)  ## everything that is not marked slow
 	$(BIN)/python -m pytest -q -n 2
 
-slow: $(WARM)  ## the long ones: many seeds, many flights
-	$(BIN)/python -m pytest -q -n 2 -m slow
+slow: $(WARM)  ## the long ones: many seeds, many flights, and made-up examples that are many and new
+	$(BIN)/python -m pytest -q -n 2 -m "slow or hypothesis" --hypothesis-profile deep
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -1,6 +1,13 @@
-"""What holds for all tests: no example fails for its wall-clock time, which a busy machine makes any."""
+"""Made-up examples: few and always the same in `make test`, many and new ones in `make slow`.
+
+No example fails for its wall-clock time, which a busy machine makes any.
+"""
 
 from hypothesis import HealthCheck, settings
 
-settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("any machine")
+settings.register_profile(
+    "steady", derandomize=True, database=None, max_examples=15, deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)  # fmt: skip
+settings.register_profile("deep", settings.get_profile("steady"), derandomize=False, max_examples=100, print_blob=True)
+settings.load_profile("steady")  # --hypothesis-profile deep loads the other

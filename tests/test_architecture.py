@@ -3,6 +3,7 @@
 Read with `ast`, so nothing under test is executed. docs/architecture.md explains the rules."""
 
 import ast
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -59,8 +60,13 @@ ONLY: dict[tuple[str, str], set[str]] = {
 DEBTS: set[tuple[str, str]] = set()  # imports that break the rule and are to go: (file, module)
 
 
-def imports(path: Path) -> Iterator[str]:
+@functools.cache
+def imports(path: Path) -> tuple[str, ...]:
     """Every module a file imports, wherever in it: absolute dotted names; for `from x import y` both x and x.y."""
+    return tuple(_imports(path))
+
+
+def _imports(path: Path) -> Iterator[str]:
     package = path.relative_to(ROOT).with_suffix("").parts
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -189,18 +195,17 @@ def test_only_links_know_cflib() -> None:
     assert guilty == []
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_module_says_first_what_it_is_for(path: Path) -> None:
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    if path.name == "__init__.py" and not tree.body:
-        return  # an empty marker
-    documented = ast.get_docstring(tree)
-    assert documented, "the first statement is not a docstring"
-    assert documented.strip()[0].isalnum() or documented.strip()[0] == "`"
+def test_modules_say_first_what_they_are_for() -> None:
+    guilty = []
+    for path in MODULES:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        documented = (ast.get_docstring(tree) or "").strip()
+        marker = path.name == "__init__.py" and not tree.body
+        if not marker and not (documented[:1].isalnum() or documented[:1] == "`"):
+            guilty.append(name_of(path))
+    assert guilty == []
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_file_is_readable_in_one_sitting(path: Path) -> None:
-    if name_of(path) in LONG:
-        return
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= READABLE
+def test_files_are_readable_in_one_sitting() -> None:
+    lines = {name_of(path): len(path.read_text(encoding="utf-8").splitlines()) for path in MODULES}
+    assert {name: n for name, n in lines.items() if n > READABLE and name not in LONG} == {}

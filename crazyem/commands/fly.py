@@ -160,12 +160,16 @@ def run(arguments: argparse.Namespace) -> int:
     view = wants_view(arguments)
     if arguments.uri and (arguments.scenario or arguments.speed is not None or arguments.seed is not None):
         raise UsageError("--scenario, --seed and --speed belong to the built-in simulator: leave out the URI.")
-    compile_kernels(vehicle)
     with contextlib.ExitStack() as stack:
-        uri = arguments.uri
-        if not uri:
+        simulator = None
+        if not arguments.uri:
             simulator = Simulator(scenario=arguments.scenario, seed=arguments.seed or 0, speed=arguments.speed or 1.0)
-            uri = stack.enter_context(simulator).uri
+            stack.callback(simulator.stop)
+            simulator.launch()  # both may have to compile: side by side
+        compile_kernels(vehicle)
+        uri = arguments.uri
+        if simulator is not None:
+            uri = simulator.start()
             say(f"simulated firmware at {uri}")
         return _fly(arguments, plan=plan, vehicle=vehicle, left_out=left_out, uri=uri, plot=plot, view=view)
 

@@ -62,14 +62,20 @@ class Simulator:
     ) -> None:
         self.stop()
 
-    def start(self) -> str:
-        """Start, wait until it answers, return its URI."""
+    def launch(self) -> None:
+        """Start the process without waiting for it: it may have to compile, which others can do meanwhile."""
         # A session of its own: Ctrl-C in the terminal must land the drone, not kill the firmware under it.
-        process = subprocess.Popen(
+        self._process = subprocess.Popen(
             self._command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
         )
-        self._process = process
         atexit.register(self.stop)
+
+    def start(self) -> str:
+        """Start if it is not launched, wait until it answers, return its URI."""
+        if self._process is None:
+            self.launch()
+        process = self._process
+        assert process is not None
         lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         errors: list[str] = []
 

@@ -2,14 +2,12 @@
 
 import importlib
 
-from hypothesis import settings
 from made_flight import changed
 
 from crazyem.recordings.finding import Finding
 from crazyem.recordings.recording import Recording
 
 CHECKS = ("numbers", "gaps", "interpolated", "repeated", "clocks", "frozen", "saturation", "rotor_sensor", "flight")
-quick = settings(max_examples=15, deadline=None)
 
 
 def run(check: str, recording: Recording) -> list[Finding]:

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -14,7 +13,6 @@ from crazyem.paper.plant import angle_rates, derivative
 GRAVITY = 9.81
 INERTIA = np.array([2.5e-4, 3.1e-4, 2.0e-4])
 GAINS = np.array([4.0, 3.0, 40.0, 20.0])
-quick = hypothesis_settings(max_examples=60, deadline=None)
 weights = st.floats(0.01, 1000.0)
 
 
@@ -31,7 +29,6 @@ def test_gains_are_those_of_python_control(dt, position, velocity):
 
 
 @given(position=weights, velocity=weights, dt=st.floats(0.001, 0.05))
-@quick
 def test_the_closed_loop_is_stable_and_optimal(position, velocity, dt):
     gains = position_gains(dt=dt, position_weight=position, velocity_weight=velocity)
     a, b = double_integrator(dt)
@@ -58,7 +55,6 @@ def test_gains_tend_to_the_continuous_closed_form():
 
 
 @given(acceleration=st.tuples(*[st.floats(-8, 8)] * 3), yaw=st.floats(-3, 3))
-@quick
 def test_flatness_there_and_back(acceleration, yaw):
     """Thrust of the size returned along body z of the angles returned gives the acceleration; x_B lies above x_C."""
     angles = np.empty(3)
@@ -75,7 +71,6 @@ def test_free_fall_asks_for_no_attitude():
 
 
 @given(seed=st.integers(0, 10**6))
-@quick
 def test_the_rate_wanted_moves_the_angles_towards_theirs(seed):
     """Through the plant's own kinematics (eq. 47), which is the inverse of eq. 21."""
     rng = np.random.default_rng(seed)
@@ -105,7 +100,6 @@ def test_at_rest_at_the_reference_it_hovers():
 
 
 @given(seed=st.integers(0, 10**6))
-@quick
 def test_with_the_true_parameters_the_plant_does_what_is_wanted(seed):
     """Vertical acceleration of eq. 82 and angular acceleration K_omega (w_ref - w), whatever the state."""
     rng = np.random.default_rng(seed)

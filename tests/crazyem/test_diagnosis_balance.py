@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
@@ -105,7 +105,6 @@ def test_a_healthy_drone_is_best_explained_by_nothing_and_two_weak_rotors_by_a_l
 
 
 @given(st.floats(0.0, 0.3), st.floats(-0.04, 0.04), st.floats(-0.04, 0.04), st.floats(-3, 3), st.floats(-3, 3))
-@settings(max_examples=25, deadline=None)
 def test_the_nearest_load_is_as_near_as_any_on_a_grid(share, x, y, thrust, twist) -> None:
     shown = balance(loaded(share, x, y) + SD * [thrust, 0.0, 0.0, twist])
     shares, xs, ys = np.meshgrid(np.linspace(0, 0.49, 50), np.linspace(-0.04, 0.04, 41), np.linspace(-0.04, 0.04, 41))
@@ -118,7 +117,6 @@ def test_the_nearest_load_is_as_near_as_any_on_a_grid(share, x, y, thrust, twist
 
 
 @given(st.lists(st.floats(-5, 5), min_size=4, max_size=4))
-@settings(max_examples=50, deadline=None)
 def test_rotors_relabelled_by_a_mirror_weigh_as_the_relabelled(days) -> None:
     """Left and right: torques about x and z change their sign, rotors 1 and 4, 2 and 3 their places."""
     here, there = balance(SD * days), balance(SD * days * [1, -1, 1, -1])

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from made_flight import changed
 from numpy.typing import NDArray
@@ -58,7 +58,6 @@ def test_a_model_that_is_right_is_believed() -> None:
     assert np.abs(found.added[0]).max() < 0.05
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 1000), st.floats(3.0, 9.0))
 def test_nothing_after_a_start_counts(seed: int, start: float) -> None:
     turned = flight(seed, seconds=10.0, weight=0.5, offset=0.0, error=0.1)

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import optimize, stats
@@ -109,7 +109,6 @@ def by_enumeration(a: Array, b: Array, low: Array, high: Array) -> float:
     return best
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 4))
 def test_with_bounds_nothing_better_exists(seed: int, size: int) -> None:
     """Against every combination of bounds; some columns have none, and some begin at theirs."""

@@ -42,7 +42,7 @@ def test_the_voltage_is_the_one_that_the_battery_had(seed):
     assert "cannot be told" in found.notices[0]
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.floats(0.7, 1.4))
 def test_commands_carry_the_vehicle_whatever_its_mass(factor):
     """Thrust over mass is what the flight shows: of a vehicle file that is wrong by any factor, too."""

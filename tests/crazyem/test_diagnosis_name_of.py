@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from closed_loop import DRONE
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.diagnosis.fitting.candidates import Candidate
@@ -131,7 +131,6 @@ def test_the_better_explanation_of_all_flights_leads_whichever_ruins_those_held_
     assert select.compared_again(basis, [linear, unsure], say=lambda text: None)[1][0] is linear
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.lists(st.floats(1e-3, 1.0), min_size=4, max_size=4), st.integers(0, 1000))
 def test_what_tuning_costs_is_the_evidence_of_a_linear_model(known: list[float], seed: int) -> None:
     """Laplace's evidence is exact where the likelihood is Gaussian: log of the integral of likelihood times prior is

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -29,7 +29,6 @@ OWN = np.array([1.66e-5, 1.67e-5, 2.93e-5])
 
 
 @given(st.floats(0.5, 2.0), st.floats(0.001, 0.1), st.floats(0.0, 0.9))
-@settings(max_examples=50, deadline=None)
 def test_one_factor_is_told_as_one_whatever_its_size_and_what_the_axes_share(factor, relative, shared):
     covariance = relative**2 * np.outer(OWN, OWN) * (np.eye(3) * (1 - shared) + shared)
     assert one_factor(factor * OWN, OWN, covariance)

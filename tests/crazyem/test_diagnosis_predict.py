@@ -150,7 +150,7 @@ def inputs_of(stamps: Array, thrust: Array, *, measured: bool = False) -> RotorI
     return RotorInput(stamps, thrust, nothing, stamps - stamps[0], measured=measured)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 0.004, 0.05, 0.3]), st.sampled_from([0.0, 0.013]))
 def test_lagged_thrust_agrees_with_a_solver(seed: int, tau: float, delay: float) -> None:
     rng = np.random.default_rng(seed)
@@ -280,7 +280,7 @@ def commanded(seed: int) -> tuple[Recording, Vehicle]:
     return recording_of(TIMES, states, motor_command=(stamps, duty), voltage=(stamps, volts)), COMMANDED
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 100), st.integers(5, 80), st.integers(1, 30), st.booleans())
 def test_nothing_later_than_a_start_or_its_inputs_is_used(seed: int, i: int, count: int, measured: bool) -> None:
     if measured:

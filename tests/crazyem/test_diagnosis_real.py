@@ -62,7 +62,7 @@ def found(recording: Recording) -> Alignment:
     return alignment
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(delay=st.floats(-0.06, 0.06), seed=st.integers(0, 5))
 def test_the_delay_of_rotor_speeds_is_found_whatever_its_sign(delay: float, seed: int) -> None:
     alignment = found(shaken(delay=delay, seed=seed))

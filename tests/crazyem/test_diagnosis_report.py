@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from made_diagnosis import document, pictures
 
@@ -177,7 +177,6 @@ anything = st.recursive(
 KEYS = ("mismatch", "where", "effects", "indistinguishable", "would_separate", "unexplained", "fit", "not_identifiable")
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.dictionaries(st.sampled_from((*KEYS, "ranking", "notices", "recordings", "vehicle", "against")), anything))
 def test_no_document_breaks_it(found: dict[str, Any]) -> None:
     text = report(found, {})

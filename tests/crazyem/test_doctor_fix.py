@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from made_flight import Motion, changed, made_flight
 
@@ -169,7 +169,6 @@ def test_what_has_no_attitude_becomes_missing() -> None:
     assert np.isfinite(gyro.value[gyro.time < 9.98]).all()
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     power=st.integers(-8, 8), signs=st.tuples(*[st.sampled_from([-1.0, 1.0])] * 3),
     jump=st.integers(1, 4096), at=st.lists(st.integers(1, 4900), min_size=1, max_size=4, unique=True),

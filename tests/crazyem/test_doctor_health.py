@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from doctor_checks import covers, only, quick, run, with_values
+from doctor_checks import covers, only, run, with_values
 from hypothesis import given
 from hypothesis import strategies as st
 from made_flight import array_of, changed, made_flight, without
@@ -30,7 +30,6 @@ def stamped(recording: Recording, stream: str, time: np.ndarray) -> Recording:
 
 
 @given(span=st.sampled_from([2.0**24 / 1e3, 2.0**32 / 1e6, 2.0**32 / 1e3, 65.536]), at=st.floats(0.5, 19.5))
-@quick
 def test_an_overflow_is_found_and_unwrapped(good, span, at):
     time = good.signals["body_rate"].time
     wrapped = (time + span - at) % span
@@ -53,7 +52,6 @@ def test_a_restart_is_no_overflow(good):
 
 
 @given(rows=st.lists(st.integers(10, 3900), min_size=1, max_size=20, unique=True))
-@quick
 def test_records_out_of_order_can_be_sorted(good, rows):
     time = good.signals["body_rate"].time.copy()
     for row in rows:
@@ -95,7 +93,6 @@ def test_a_rate_other_than_claimed(good):
 
 
 @given(ppm=st.sampled_from([-20000.0, -3000.0, 2000.0, 15000.0]), seed=st.integers(0, 100))
-@quick
 def test_drift_against_the_host(good, ppm, seed):
     """Arrivals late by random delays only: 1 ms and an exponential tail of 3 ms."""
     rng = np.random.default_rng(seed)
@@ -128,7 +125,6 @@ def test_a_jump_of_the_clock_against_the_host(good):
     start=st.floats(4.0, 12.0),
     lasting=st.floats(0.7, 3.0),
 )
-@quick
 def test_a_stuck_signal_is_found_where_it_is(good, name, start, lasting):
     array = good.signals[name]
     first, last = np.searchsorted(array.time, [start, start + lasting])
@@ -172,7 +168,6 @@ def test_columns_not_in_use_are_one_note(good):
 
 
 @given(rotor=st.integers(0, 3), start=st.floats(4.0, 14.0), lasting=st.floats(0.03, 2.0))
-@quick
 def test_a_rotor_at_its_limit(good, rotor, start, lasting):
     array = good.signals["motor_command"]
     first, last = np.searchsorted(array.time, [start, start + lasting])
@@ -214,7 +209,6 @@ def test_idle_in_the_air(good):
     fraction=st.sampled_from([1 / 2, 1 / 3, 1 / 4, 2.0]),
     duty=st.booleans(),
 )
-@quick
 def test_a_sensor_that_counts_a_fraction(good, rotor, at, length, fraction, duty):
     recording = good if duty else without(good, "motor_command")
     value = good.signals["rotor_speed"].value.copy()
@@ -227,7 +221,6 @@ def test_a_sensor_that_counts_a_fraction(good, rotor, at, length, fraction, duty
 
 
 @given(rotor=st.integers(0, 3), at=st.integers(500, 1400), length=st.integers(1, 100))
-@quick
 def test_a_sensor_that_drops_to_zero(good, rotor, at, length):
     value = good.signals["rotor_speed"].value.copy()
     value[at : at + length, rotor] = 0.0
@@ -308,7 +301,6 @@ def test_rotors_that_turn_on_the_ground(good):
 
 
 @given(at=st.floats(4.0, 15.0), lasting=st.floats(0.05, 1.0))
-@quick
 def test_upside_down(good, at, lasting):
     array = good.signals["attitude"]
     first, last = np.searchsorted(array.time, [at, at + lasting])

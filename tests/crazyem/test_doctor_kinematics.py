@@ -26,7 +26,7 @@ DEGREES = 180.0 / math.pi
 G = 9.81
 UP = np.array([0.0, 0.0, 1.0])
 EVERYTHING = ("onboard", "mocap", "accelerations", "angles")
-SIZES = settings(max_examples=5, deadline=None)
+SIZES = settings(max_examples=5)
 
 
 def found_in(recording: Recording, *checks: str) -> list[Finding]:
@@ -79,7 +79,7 @@ def test_sound_flights_of_other_kinds_raise_no_finding(flight: Recording) -> Non
 
 
 @given(seed=st.integers(0, 100_000), noise=st.floats(0.2, 4.0), size=st.floats(0.0, 0.8), turn=st.floats(-1.0, 1.0))
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 def test_sound_flights_of_any_size_raise_no_finding(seed: int, noise: float, size: float, turn: float) -> None:
     motion = Motion(seconds=25.0, seed=seed, size=size, turn=turn)
     assert found_in(made_flight(motion, seed=seed, noise=noise, more=EVERYTHING)) == []
@@ -99,7 +99,6 @@ GARBAGE = (*_NAMES.split(), "motor_command", "voltage", "rotor_speed")
 
 
 @given(seed=st.integers(0, 100_000))
-@settings(max_examples=15, deadline=None)
 def test_garbage_is_judged_without_a_word_of_numpy(seed: int) -> None:
     """Whatever the numbers are: no exception, and no warning, which pytest makes one."""
     rng = np.random.default_rng(seed)

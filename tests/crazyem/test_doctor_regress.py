@@ -37,7 +37,6 @@ def test_a_fast_signal_is_averaged_and_a_stamp_far_away_makes_no_huge_grid() -> 
 
 
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=20, deadline=None)
 def test_rotations_agree_with_scipy(seed: int) -> None:
     rng = np.random.default_rng(seed)
     turn = Rotation.from_quat(rng.normal(size=(20, 4)))
@@ -74,7 +73,6 @@ def test_smoothing_both_sides_keeps_a_derivative_a_derivative() -> None:
 
 
 @given(factor=st.floats(0.3, 3.0), noise_x=st.floats(0.0, 0.4), noise_y=st.floats(0.0, 0.4), seed=st.integers(0, 999))
-@settings(max_examples=25, deadline=None)
 def test_a_slope_lies_between_its_two_regressions_whatever_is_noisy(
     factor: float, noise_x: float, noise_y: float, seed: int
 ) -> None:
@@ -126,7 +124,7 @@ def test_hypotheses_that_data_do_not_separate_are_left_standing() -> None:
 
 
 @given(late=st.floats(-0.2, 0.2), seed=st.integers(0, 99))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 def test_a_delay_is_found_to_a_millisecond(late: float, seed: int) -> None:
     grid = Grid(0.0, 4000)
     motion = Motion(seconds=40.0, seed=seed)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from made_flight import Motion, array_of, made_flight, without
 
@@ -70,7 +70,6 @@ def test_a_copy_is_found_whole() -> None:
     json.dumps(found.to_dict())
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     start=st.floats(0.0, 15.0), length=st.floats(6.0, 25.0), shift=st.floats(-1e4, 1e4),
     scale=st.sampled_from([1.0, -1.0, 180.0 / np.pi, 1.0 / 9.81, 1e3]), digits=st.sampled_from([None, 7, 5]),
@@ -108,7 +107,6 @@ def test_the_same_path_flown_again_is_another_flight() -> None:
     assert find_duplicates([fingerprint(flown(seed)) for seed in range(6)]) == []
 
 
-@settings(max_examples=15, deadline=None)
 @given(a=st.integers(0, 10_000), b=st.integers(0, 10_000))
 def test_other_noise_is_another_flight(a: int, b: int) -> None:
     """Bare noise: the hardest case, since every turning point is one of its."""

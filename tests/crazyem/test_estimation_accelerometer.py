@@ -35,7 +35,7 @@ def twin(tape, *, lead=0.5):
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3, 0.8]), st.sampled_from([0.0, 0.5, 1.0]))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_filter_is_that_of_the_state_augmented_by_the_impulse(seed, missing, lead):
     tape = measured_tape(seed, missing=missing)
     value = plain.forward(tape, lead=lead)
@@ -48,7 +48,7 @@ def test_filter_is_that_of_the_state_augmented_by_the_impulse(seed, missing, lea
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3]), st.sampled_from([0.5, 0.0]))
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 def test_smoothed_impulses_and_residuals_are_those_of_the_augmented_smoother(seed, missing, lead):
     tape = measured_tape(seed, missing=missing)
     plain.forward(tape, lead=lead)
@@ -162,7 +162,6 @@ def test_alone_it_tells_of_mass_what_its_noise_and_that_of_the_thrust_leave():
 
 
 @given(st.lists(st.tuples(st.integers(0, 39), st.integers(0, 2)), max_size=60), st.integers(0, 39), st.booleans())
-@settings(max_examples=15, deadline=None)
 def test_missing_readings_breaks_and_unusable_steps_never_spread(holes, special, breaks):
     tape = measured_tape(4, force_missing=0.0)
     for row, axis in holes:

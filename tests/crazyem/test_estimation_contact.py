@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.estimation.contact import CLEARANCE, CONFIRM, CONTACT, OFF_FRACTION, ContactGate
@@ -103,7 +103,6 @@ def test_no_ground_sample_is_ever_let_through(samples):
     assert not any(run((0.0, 0.0), *((h + 0.0, f) for h, f in samples)))
 
 
-@settings(max_examples=200)
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.014))
 def test_a_noisy_height_lets_no_sample_on_the_floor_through(seed, noise):
     """The paper's take-off: one reading at rest, then a second on the floor under rising thrust."""
@@ -111,7 +110,6 @@ def test_a_noisy_height_lets_no_sample_on_the_floor_through(seed, noise):
     assert not any(run(*((h, 0.01 * k) for k, h in enumerate(heights)), thrust_max=math.inf))
 
 
-@settings(max_examples=200)
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.014), st.floats(0.2, 3.0))
 def test_a_noisy_height_hides_no_flight_for_long(seed, noise, climb):
     """Climbing at 0.2 m/s and more, the drone is known to fly before it is a quarter of a metre up, and remains so."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.estimation.aliasing import lagged_noise, white_variance
@@ -18,7 +18,6 @@ def bartlett(terms, lags):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 900))
-@settings(max_examples=20, deadline=None)
 def test_long_run_is_the_bartlett_estimate(seed, n):
     terms = np.random.default_rng(seed).normal(size=(n, 3)).cumsum(0)
     lags = min(n // 8, 100) if n >= MIN_ROWS else 0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import test_estimation_kernels as midpoint
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from test_estimation_kernels import INERTIA, MASS, Q, R, filled_tape, scaled
@@ -71,7 +71,6 @@ def assert_states_close(a: State, b: State, *, atol):
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(1e-3, 2e-2))
-@settings(max_examples=30, deadline=None)
 def test_an_explicit_simulation_is_predicted_exactly(seed, dt):
     rng = np.random.default_rng(seed)
     theirs = upright(rng)

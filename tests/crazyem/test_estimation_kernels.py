@@ -86,7 +86,7 @@ def assert_same_state(row, state):
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3, 0.8]))
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 def test_filter_is_the_textbook_filter(seed, missing):
     """Scalar updates and joint updates agree to rounding, missing data, uneven steps, products of inertia and all."""
     tape = filled_tape(seed, missing=missing, dither=1e-3)  # turns of up to 0.1 rad a step
@@ -109,7 +109,7 @@ def scaled(cov, by=None):
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3, 0.8]))
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 def test_smoother_and_statistics_are_those_of_rauch_tung_striebel(seed, missing):
     """Expected squares of impulses and measurement residuals from the twin's covariances, not from the kernel's."""
     tape = filled_tape(seed, missing=missing)
@@ -173,7 +173,7 @@ def test_statistics_hold_the_expected_squares_of_the_m_step():
 
 
 @given(st.integers(1, 39), st.integers(0, 100))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_going_on_equals_one_pass(split, seed):
     tape, other = filled_tape(seed), filled_tape(seed)
     one = forward(tape)
@@ -221,7 +221,6 @@ def test_a_break_isolates_what_lies_on_both_sides():
 
 
 @given(st.lists(st.tuples(st.integers(0, 39), st.integers(0, 12)), max_size=60), st.booleans())
-@settings(max_examples=30, deadline=None)
 def test_nan_in_any_measurement_never_spreads(holes, starts):
     tape = filled_tape(4, missing=0.0)
     for row, column in holes:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import zhao_flight
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 from test_estimation_scoring import FORCE, TORQUE, put, true_noise, window
@@ -47,7 +47,6 @@ def test_one_node_is_the_plain_interval():
         st.tuples(st.floats(-6, 0), st.floats(-0.05, 0.05), st.floats(0.005, 0.1)), min_size=2, max_size=9
     )
 )  # fmt: skip
-@settings(max_examples=20, deadline=None)
 def test_the_mixture_is_that_of_a_million_draws(rows):
     """Mean, standard deviation and quantiles against random numbers; four standard errors of those."""
     marginal = combine([[node(*row) for row in rows]], information(0.05), scales=(2,))

@@ -80,7 +80,6 @@ def solve(theta, sums, *, free=ALL, centre=TRUTH, precision=None, iterations=60,
 
 
 @given(seeds, st.lists(st.floats(-0.8, 0.8), min_size=N, max_size=N), st.booleans())
-@settings(max_examples=25, deadline=None)
 def test_gradient_and_hessian_are_those_of_finite_differences(seed, where, known):
     sums = statistics(seed)[0]
     sums[kernels.IMPULSE : kernels.IMPULSE + 2] = 0.3, 0.5
@@ -132,7 +131,7 @@ def test_objective_with_known_noise_is_the_expected_log_likelihood_written_out()
 
 
 @given(seeds)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_finds_the_optimum_that_scipy_finds(seed):
     sums = statistics(seed)[0]
     precision = np.full(N, 0.1)
@@ -149,7 +148,6 @@ def test_finds_the_optimum_that_scipy_finds(seed):
 
 
 @given(seeds)
-@settings(max_examples=20, deadline=None)
 def test_mass_without_lag_has_a_closed_form(seed):
     """m = sum F^2 / sum F a, from the joint maximum over mass and noise (noise enters with the acceleration)."""
     sums, acceleration, thrust = statistics(seed, lag=False)
@@ -177,7 +175,6 @@ def test_absurd_starts_lead_to_the_same_place(start):
 
 
 @given(seeds, st.lists(st.floats(-12, 12), min_size=4, max_size=4), st.integers(1, 5))
-@settings(max_examples=40, deadline=None)
 def test_never_negative_never_worse_never_nan(seed, where, iterations):
     sums = statistics(seed)[0]
     start = displaced(TRUTH, np.array([*where, 0, 0, 0, 0, 0]))

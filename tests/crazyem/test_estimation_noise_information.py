@@ -104,7 +104,7 @@ def information_of_all_data_at_once(tape, *, lead):
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.4, 0.8]), st.sampled_from([0.5, 0.0, 1.0]))
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 def test_it_is_the_information_in_the_covariance_of_all_data(seed, missing, lead):
     tape = measured_tape(seed, 15, missing=missing)
     filtered(tape, lead=lead)

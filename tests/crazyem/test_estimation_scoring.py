@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import zhao_flight
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.errors import UsageError
@@ -153,7 +153,6 @@ def test_an_accelerometer_out_of_its_range_is_a_missing_one():
 
 
 @given(st.lists(st.floats(-50, 50), min_size=ALL, max_size=ALL))
-@settings(max_examples=50, deadline=None)
 def test_steps_are_bounded_and_keep_their_direction(step):
     step = np.array(step)
     out = limited(step)

@@ -5,7 +5,7 @@ from functools import cache
 
 import pytest
 from hovering import INERTIA, hover
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.estimation.online import OnlineEstimator
@@ -79,7 +79,6 @@ def plainly(values):
     return None
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(-8, 8), max_size=40))
 def test_it_alarms_when_some_tail_sums_up(values):
     detector, found = CumulativeSum(), None

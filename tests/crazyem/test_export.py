@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from made_flight import made_flight
 
@@ -131,7 +131,6 @@ def slow(path: Path) -> Iterator[tuple[Any, ...]]:
                     yield entry["name"], word(float(time)), values, word(float(host or "nan")), flag == "1"
 
 
-@settings(max_examples=150, deadline=None)
 @given(recordings())
 def test_round_trip_through_csv_loses_nothing(recording: Recording) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -157,7 +156,6 @@ def test_a_stamp_that_is_no_number_is_one_whatever_its_bits(tmp_path: Path) -> N
     assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "out.csv").read_bytes()
 
 
-@settings(max_examples=100, deadline=None)
 @given(recordings())
 def test_parquet_holds_every_sample(recording: Recording) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -384,7 +382,6 @@ def complaint(path: Path) -> str:
     return ""
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.data())
 def test_a_damaged_description_is_one_sentence(exported: Path, data: st.DataObject) -> None:
     """Any value of the description replaced by any other: read, or refused with the file's name."""
@@ -403,7 +400,6 @@ def test_a_damaged_description_is_one_sentence(exported: Path, data: st.DataObje
         assert complaint(path) in ("", "FileFormatError")
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.data())
 def test_damaged_bytes_are_one_sentence(exported: Path, data: st.DataObject) -> None:
     content = bytearray(exported.read_bytes()[: data.draw(st.integers(0, 4000))])

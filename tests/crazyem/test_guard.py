@@ -4,7 +4,7 @@ import itertools
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.errors import UsageError
@@ -121,7 +121,6 @@ def test_damping_rises_first_and_falls_last():
     assert down == ["ctrlLee.J_z", "ctrlLee.KR_z", "ctrlLee.Kw_z"]
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.floats(allow_nan=True, allow_infinity=True), st.floats(0, 1)), min_size=20, max_size=60))
 def test_whatever_comes_in_writes_stay_in_bounds_and_within_slew(stream):
     g = guard(limits=Limits(agreement_time=0.1, interval=0.0))

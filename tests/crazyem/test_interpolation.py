@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.recordings.csv.interpolation import corners, interpolated_rows
@@ -32,7 +32,6 @@ def test_constant_stretches_are_no_evidence():
 # --- streams drawn by straight lines ---------------------------------------------------------------------------------
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(4, 12))
 def test_a_drawn_stream_gets_its_samples_back(seed, every):
     rng = np.random.default_rng(seed)

@@ -104,7 +104,7 @@ def test_nothing_is_needed(names: tuple[str, ...]) -> None:
 # envelope -------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(
     seed=st.integers(0, 1000), size=st.floats(0.1, 0.4), frequency=st.floats(0.15, 0.3), height=st.floats(0.2, 0.6),
     rate=st.sampled_from([100.0, 250.0]),

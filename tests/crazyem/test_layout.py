@@ -5,7 +5,7 @@ import json
 import re
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from test_mcap_signals import flight
 
@@ -122,7 +122,6 @@ def test_topics_of_log_blocks():
 NAMES = st.lists(st.from_regex(r"[A-Za-z0-9_-]{1,12}", fullmatch=True), min_size=1, max_size=6, unique=True)
 
 
-@settings(max_examples=20, deadline=None)
 @given(NAMES)
 def test_every_drone_of_a_swarm_has_every_panel_of_a_single_one(names):
     layout = json.loads(json.dumps(swarm_layout(names), allow_nan=False))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.links.clock import STAMP_MODULUS, ClockRelation, LossCounter, StampUnwrapper
@@ -33,7 +33,6 @@ def firmware_stamps(rng, count, period, jitter):
     return np.maximum.accumulate(stamps)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([10, 20, 100]), st.floats(0.0, 0.3))
 def test_losses_are_counted_exactly_under_jitter(seed, period, share):
     rng = np.random.default_rng(seed)
@@ -48,7 +47,6 @@ def test_losses_are_counted_exactly_under_jitter(seed, period, share):
     assert counter.late == 0
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
     st.sampled_from([10, 20, 100]),

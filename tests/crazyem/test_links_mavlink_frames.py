@@ -4,7 +4,7 @@ import math
 import struct
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -41,7 +41,6 @@ def attitude(ms=1000, roll=0.5):
     return mavlink.MAVLink_attitude_message(ms, roll, 0.25, -0.125, 1.0, 2.0, 3.0)
 
 
-@settings(deadline=None)
 @given(st.binary(max_size=300))
 def test_checksum_is_the_one_of_its_definition(data):
     assert checksum(data) == slow_checksum(data)
@@ -77,7 +76,6 @@ def test_esc_status_by_hand():
     assert found.fields()["rpm"] == (9000, -9100, 9200, 9300)
 
 
-@settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_every_message_as_pymavlink_decodes_it(data):
     number = data.draw(st.sampled_from(sorted(mavlink.mavlink_map)))
@@ -101,7 +99,6 @@ def test_signed_frames_are_read():
     assert found.fields()["roll"] == 0.5
 
 
-@settings(max_examples=50, deadline=None)
 @given(
     messages=st.lists(st.integers(0, 255), min_size=1, max_size=8),
     noise=st.lists(st.binary(max_size=40).filter(lambda b: not set(b) & {0xFD, 0xFE}), min_size=8, max_size=8),
@@ -121,7 +118,6 @@ def test_frames_are_found_between_noise_however_they_are_cut(messages, noise, cu
     assert parser.skipped == len(stream) - sum(map(len, frames))
 
 
-@settings(max_examples=150, deadline=None)
 @given(chunks=st.lists(st.binary(max_size=400), max_size=12))
 def test_any_bytes_are_survived_in_bounded_memory(chunks):
     parser = FrameParser()
@@ -134,7 +130,6 @@ def test_any_bytes_are_survived_in_bounded_memory(chunks):
     assert found[-1].raw == frame(attitude())
 
 
-@settings(deadline=None)
 @given(place=st.integers(0, 50), flip=st.integers(1, 255))
 def test_one_wrong_byte_is_one_frame_lost_and_never_a_wrong_value(place, flip):
     good = [frame(attitude(k), sequence=k) for k in range(4)]
@@ -203,7 +198,6 @@ def test_sequence_numbers_lost_late_repeated():
     assert (count.received, count.lost, count.late, count.repeated) == (6, 1, 1, 1)
 
 
-@settings(deadline=None)
 @given(kept=st.lists(st.booleans(), min_size=2, max_size=400))
 def test_losses_are_counted_exactly_while_fewer_than_128_follow_each_other(kept):
     kept = [True, *kept, True]
@@ -231,7 +225,6 @@ def test_a_repetition_that_comes_too_late_to_be_recognised_cancels_no_loss():
     assert (count.lost, count.late) == (0, 2)
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 120)), min_size=2, max_size=300))
 def test_repetitions_cancel_no_loss(course):
     """Each frame is lost or comes, and comes again some frames later."""

@@ -5,7 +5,7 @@ import dataclasses
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.cli import main
@@ -61,7 +61,6 @@ def decide(guard, mass, until=2.0):
     return decision
 
 
-@settings(deadline=None)
 @given(ratio=st.floats(0.88, 1.12), hover=st.floats(0.2, 0.7))
 def test_hover_thrust_is_the_old_one_times_the_ratio_of_masses(ratio, hover):
     guard = guard_of(Drone(hover))
@@ -85,7 +84,6 @@ def test_beyond_the_bounds_of_hover_thrust_nothing_is_written():
     assert not low.writes
 
 
-@settings(deadline=None)
 @given(hover=st.floats(0.0, 2.0), mass=st.floats(0.001, 0.2))
 def test_whatever_is_believed_what_is_written_is_a_hover_thrust(hover, mass):
     drone = Drone(hover)

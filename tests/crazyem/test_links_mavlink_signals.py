@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from scipy.spatial.transform import Rotation
@@ -38,7 +38,6 @@ def signals(message, kind=PX4, outputs=None):
     return {s.signal: s.value for s in BlockDecoder(blocks[found[0]]).decode(packet)}
 
 
-@settings(deadline=None)
 @given(position=three, velocity=three)
 def test_position_and_velocity_turn_half_about_x(position, velocity):
     found = signals(mavlink.MAVLink_local_position_ned_message(1000, *position, *velocity))
@@ -46,7 +45,6 @@ def test_position_and_velocity_turn_half_about_x(position, velocity):
     assert found["velocity"] == pytest.approx(D @ velocity)
 
 
-@settings(deadline=None)
 @given(angles=st.tuples(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1)), rates=three)
 def test_attitudes_are_the_rotation_matrix_turned_on_both_sides(angles, rates):
     """R_flu_to_nwu = D R_frd_to_ned D; by quaternion and by angles alike."""
@@ -104,7 +102,6 @@ def test_messages_that_say_nothing_are_no_values():
     assert signals(mavlink.MAVLink_battery_status_message(0, 0, 0, 0, [65535] * 10, 0, 0, 0, 0)) is None
 
 
-@settings(max_examples=40, deadline=None)
 @given(data=st.data())
 def test_columns_of_a_recording_and_live_packets_agree_bit_for_bit(data):
     """A replay converts whole columns; the live loop one packet at a time."""
@@ -165,7 +162,6 @@ def test_rotors_of_an_x_quad_are_matched_by_their_places():
     assert len(outputs.assumed) == 3
 
 
-@settings(deadline=None)
 @given(order=st.permutations([1, 2, 3, 4]), functions=st.permutations([101, 102, 103, 104]))
 def test_places_and_functions_are_taken_from_parameters(order, functions):
     parameters = {f"PWM_MAIN_FUNC{n}": float(f) for n, f in enumerate(functions, start=1)}

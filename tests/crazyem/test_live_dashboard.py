@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fake_drone import FakeEstimator, FakeLink
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
@@ -117,7 +117,6 @@ def test_no_drone_is_a_picture_too():
 
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=60))
-@settings(max_examples=200, deadline=None)
 def test_a_sparkline_shows_the_newest_values_in_their_order(values):
     line = sparkline(values, width=24)
     finite = [v for v in values if np.isfinite(v)][-24:]

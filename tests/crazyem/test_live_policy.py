@@ -8,7 +8,7 @@ import tomllib
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.cli import main, parser
@@ -92,7 +92,6 @@ keys = st.sampled_from(sorted(f"{s}.{k}" for s, v in Policy().entries().items() 
 values = st.one_of(st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.lists(st.floats(), max_size=3))
 
 
-@settings(max_examples=150, deadline=None)
 @given(keys, values)
 def test_any_value_is_taken_whole_or_refused_in_a_sentence(key, value):
     section, name = key.split(".")

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import fake_drone as fake
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.errors import LinkError
@@ -195,7 +195,6 @@ def states(start, writes):
         yield dict(values)
 
 
-@settings(max_examples=80, deadline=None)
 @given(st.tuples(factor, factor, factor), st.tuples(factor, factor, factor), factor)
 def test_no_step_of_a_set_or_of_its_way_back_is_less_damped_than_both_ends(first, second, mass):
     believed = dict(NOMINAL)
@@ -215,7 +214,6 @@ def test_no_step_of_a_set_or_of_its_way_back_is_less_damped_than_both_ends(first
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(st.tuples(factor, factor, factor), st.integers(0, 9), st.booleans())
 def test_undoing_half_a_set_is_as_damped_whether_the_lost_write_arrived_or_not(factors, at, arrived):
     changed = {n: NOMINAL[n] * f for n, f in zip(("Ixx", "Iyy", "Izz"), factors)} | {"mass": 0.033}

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.commands import swarm as command
@@ -97,7 +97,6 @@ OFFSETS = st.tuples(*[st.floats(-5, 5, allow_nan=False).map(lambda v: round(v, 3
 
 
 @given(OFFSETS)
-@settings(max_examples=50, deadline=None)
 def test_the_way_to_an_offset_is_smooth_and_joins_the_trajectory(offset):
     make = displaced(lambda p, yaw: figure8(position=p, yaw=yaw, duration=6.0), offset)
     path = make((1.0, 2.0, 3.0), 0.3)

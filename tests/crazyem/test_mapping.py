@@ -7,7 +7,7 @@ from importlib import resources
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -244,7 +244,6 @@ def test_the_publisher_is_believed_on_request(tmp_path):
     assert claimed["body_rate"].value == pytest.approx(turn.inv().apply(rates))
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     q=st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: sum(x * x for x in q) > 1e-3),
     v=st.lists(st.floats(-100, 100), min_size=3, max_size=3),
@@ -324,7 +323,6 @@ def test_mappings_that_do_not_fit_the_file(tmp_path):
         open_recording(tmp_path / "flight.csv", ReadOptions(mapping=str(tmp_path)))
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.recursive(st.one_of(st.integers(), st.floats(), st.booleans(), st.text(max_size=8)), st.lists, max_leaves=5))
 def test_no_value_of_any_key_breaks_the_loader(value):
     source = {"nan": "nan", "inf": "inf", "-inf": "-inf", "True": "true", "False": "false"}

@@ -42,7 +42,6 @@ def test_the_compiled_scan_is_the_plain_one(small):
         assert scan.others.tolist() == [list(o) for o in others]
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.binary(max_size=200))
 def test_random_bytes_in_a_chunk(data):
     try:
@@ -120,7 +119,7 @@ def test_damage_between_chunks_loses_nothing(small, tmp_path):
     assert recording.findings[0].evidence["offset_byte"] == index
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_damage_anywhere_never_invents_a_sample(small, tmp_path, data):
     broken = bytearray(small)
@@ -147,7 +146,7 @@ def test_damage_anywhere_never_invents_a_sample(small, tmp_path, data):
 PIECES = st.sampled_from([b"\xff\xff\xff\xff", b"9999", b"null", b'"}][']) | st.binary(max_size=2)
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_anything_inside_a_sound_chunk_gives_a_recording_or_one_clear_error(small, tmp_path, data):
     """Announcements, metadata and messages of any content, packed again with the right CRC."""

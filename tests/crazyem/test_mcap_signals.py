@@ -130,10 +130,7 @@ def note_of(text, grade, rows):
     return Finding("gaps", grade, text, "position", ((0.5, 1.5),), {"longest_s": 0.25}, "Do.", fix)
 
 
-SETTINGS = {"deadline": None, "suppress_health_check": [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]}
-
-
-@settings(max_examples=80, **SETTINGS)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(recordings())
 @example(Recording("empty", "none", {}))
 def test_every_recording_comes_back_the_same(tmp_path, recording):

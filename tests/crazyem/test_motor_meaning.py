@@ -5,7 +5,7 @@ import gzip
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.errors import UsageError
@@ -173,7 +173,6 @@ def test_the_mixers_arithmetic():
     assert with_commands.evidence["mixer_equal_share"] > 0.99
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32))
 def test_the_mixers_arithmetic_whatever_the_flight(seed):
     request, duty, _, _ = flight(100, seed)

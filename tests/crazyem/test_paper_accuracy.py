@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from crazyem.errors import UsageError
@@ -64,7 +63,6 @@ def test_stretches_of_one_flight_count_as_one():
     st.lists(st.tuples(*[st.floats(-3, 3)] * 4), min_size=2, max_size=20),
     st.floats(-0.5, 0.5),
 )
-@hypothesis_settings(max_examples=30, deadline=None)
 def test_luck_of_the_draw_is_taken_out(draws, waste):
     """An efficient estimator has a paired ratio of 1 with no error; one off by a constant is off by just that."""
     said = summary([made(i, z) for i, z in enumerate(draws)])

@@ -188,7 +188,7 @@ def test_an_efficient_estimator_errs_as_much_as_the_bound_says():
     first=st.integers(0, 700),
     length=st.integers(120, 800),
 )
-@hypothesis_settings(max_examples=8, deadline=None)
+@hypothesis_settings(max_examples=8)
 def test_more_data_and_more_knowledge_never_hurt(seed, sensor, first, length):
     flight = fly(Settings(duration=8.0), seed)
     found = bound(flight, sensor, first, first + length)

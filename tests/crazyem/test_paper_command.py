@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from made_paper import offline
 
@@ -68,7 +68,6 @@ def test_a_stored_task_is_found(tmp_path: Path) -> None:
     assert runner.stored(tmp_path, replace(TASK, seed=1), "f") == (None, "missing")
 
 
-@settings(max_examples=100)
 @given(st.integers(0, 10_000), st.binary(max_size=8))
 def test_damage_is_noticed(tmp_path_factory: pytest.TempPathFactory, at: int, change: bytes) -> None:
     """Whatever is cut or overwritten: the record is whole, or it is made again; never an exception."""

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
@@ -19,14 +18,12 @@ from crazyem.paper.state_filter import filter_step, transition
 GRAVITY = 9.81
 INERTIA = np.array([2.5e-4, 3.1e-4, 2.0e-4])
 tilts = st.floats(-1.3, 1.3)
-quick = hypothesis_settings(max_examples=40, deadline=None)
 
 
 # plant ----------------------------------------------------------------------------------------------------------------
 
 
 @given(roll=tilts, pitch=tilts, yaw=st.floats(-3, 3))
-@quick
 def test_thrust_points_along_body_z(roll, pitch, yaw):
     axis = np.empty(3)
     thrust_axis(np.array([roll, pitch, yaw]), axis)
@@ -34,7 +31,6 @@ def test_thrust_points_along_body_z(roll, pitch, yaw):
 
 
 @given(roll=tilts, pitch=tilts, yaw=st.floats(-3, 3), seed=st.integers(0, 1000))
-@quick
 def test_angle_rates_are_those_of_a_turning_body(roll, pitch, yaw, seed):
     """Euler angles of R exp(w h) by scipy, central difference."""
     rate, angles, h = np.random.default_rng(seed).normal(size=3), np.array([roll, pitch, yaw]), 1e-5
@@ -114,7 +110,6 @@ def printed_motion(x, acceleration, dt):
 
 
 @given(seed=st.integers(0, 10**6))
-@quick
 def test_the_printed_jacobian_is_the_derivative_of_the_prediction(seed):
     x = np.random.default_rng(seed).uniform(-1, 1, 12)
     phi, h = np.empty((12, 12)), 1e-6
@@ -127,7 +122,6 @@ def test_the_printed_jacobian_is_the_derivative_of_the_prediction(seed):
 
 
 @given(seed=st.integers(0, 10**6))
-@quick
 def test_a_filter_step_is_that_of_whole_matrices(seed):
     rng = np.random.default_rng(seed)
     x = rng.uniform(-1, 1, 12)
@@ -155,7 +149,6 @@ def arrays(flight):
 
 
 @given(data=st.data(), ground=st.booleans(), substeps=st.sampled_from([1, 3]))
-@hypothesis_settings(max_examples=15, deadline=None)
 def test_pieces_of_any_size_give_the_same_flight(data, ground, substeps):
     settings = Settings(duration=3.0, substeps=substeps)
     known = {"mass": settings.mass, "inertia": settings.inertia}

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -50,7 +49,6 @@ def random_rows(seed, n=30):
 
 
 @given(mass=st.floats(0.01, 5.0), force=st.floats(0.05, 50.0), dt=st.floats(1e-4, 0.1))
-@hypothesis_settings(deadline=None)  # the first example compiles
 def test_constant_thrust_gives_the_mass_exactly(mass, force, dt):
     x = np.zeros((20, 12))
     x[:, 5] = np.arange(20) * dt * (force / mass - GRAVITY)
@@ -69,7 +67,6 @@ def test_the_true_inertia_is_a_fixed_point_without_noise():
 
 
 @given(seed=st.integers(0, 10**6))
-@hypothesis_settings(max_examples=50, deadline=None)
 def test_mass_and_inertia_are_stationary_points_of_their_own_equations(seed):
     """Eq. 106 and 113 with constant delta: sums of squares of one component, the others' inertia as it was."""
     (x, wrench), dt, theta = random_rows(seed), 0.02, np.array([1.0, 2.0, 3.0, 1.5])
@@ -197,7 +194,6 @@ def test_the_e_step_is_that_of_plain_matrices(flight, sees_angles, first):
 
 
 @given(y=st.lists(st.floats(-1.4, 1.4), min_size=3, max_size=3), q=st.floats(0.01, 10), r=st.floats(0.01, 10))
-@hypothesis_settings(deadline=None)
 def test_scalar_filter_and_smoother_by_hand(y, q, r):
     """Over no time every state is a random walk of its own: three steps written out for each."""
     observed = np.repeat(np.array(y)[:, None], 12, axis=1)

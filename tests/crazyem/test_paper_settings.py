@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.cli import main
@@ -78,7 +78,6 @@ def test_a_flight_that_is_too_long_together() -> None:
         settings_with(["duration=200", "dt=0.001", "substeps=100"])
 
 
-@settings(max_examples=300)
 @given(st.sampled_from([f.name for f in fields(Settings)]), st.text(max_size=40))
 def test_any_text_is_a_value_or_one_sentence(name: str, text: str) -> None:
     try:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from made_paper import BOUND, TRUE, offline, online, results_of, table1, whole_run
 
@@ -147,7 +147,6 @@ def test_efficient_errors_give_one_over_the_bound_and_full_summary() -> None:
     assert results["summary"]["cells"] == 24
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.randoms(use_true_random=False), st.integers(1, 6))
 def test_the_order_of_records_does_not_matter(shuffle, seeds) -> None:
     records = whole_run(seeds, updates=8)
@@ -162,7 +161,6 @@ def test_the_order_of_records_does_not_matter(shuffle, seeds) -> None:
             assert one[method]["bias"] == pytest.approx(other[method]["bias"], rel=1e-4, abs=1e-9)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(-0.5, 0.5), min_size=1, max_size=30))
 def test_statistics_agree_with_each_other(errors) -> None:
     records = [offline("A", "published", k, e) for k, e in enumerate(errors)]

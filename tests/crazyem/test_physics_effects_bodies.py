@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from effects_cases import CF2, G, still, wild
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
@@ -216,7 +216,6 @@ def test_one_step_of_many_is_a_row_of_a_path() -> None:
     np.testing.assert_allclose(steps, path[1:], rtol=1e-9, atol=1e-12)
 
 
-@settings(deadline=None, max_examples=25)
 @given(at=st.integers(1, 199), size=st.floats(-5, 5))
 def test_swing_knows_no_later_row_and_starts_anew_after_a_gap(at: int, size: float) -> None:
     v, _ = pivot(0.01 * np.arange(200))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from effects_cases import CF2, ROTORS, still, wild
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from crazyem.errors import FileFormatError
@@ -160,7 +160,6 @@ def admitted(name: str) -> st.SearchStrategy:
 anything = st.sampled_from(sorted(CATALOGUE)).flatmap(admitted)
 
 
-@settings(deadline=None, max_examples=150)
 @given(one=anything, other=anything, seed=st.integers(0, 5), voltage=st.booleans())
 def test_whatever_is_admitted_is_finite(one: Effects, other: Effects, seed: int, voltage: bool) -> None:
     effects = {**one, **other}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from hanging_load import Array, G, hang, tilted
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.physics.effects.pendulum import HANGING, WANDERING, _slopes, swing_along, swing_on, watched_along
@@ -73,7 +73,6 @@ def test_a_load_that_is_shaken_stays_found_where_its_path_loses_it() -> None:
     assert np.sqrt(np.mean(longer**2)) < 0.2  # a length that is a little wrong loses it no more
 
 
-@settings(deadline=None, max_examples=25)
 @given(at=st.integers(1, 198), size=st.floats(-5, 5))
 def test_no_row_knows_its_own_pull_nor_a_later_one(at: int, size: float) -> None:
     truth = hang(calm, STEP * np.arange(200), drone=DRONE, load=LOAD, length=LENGTH, start=tilted(0.1))

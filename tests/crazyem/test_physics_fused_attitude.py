@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from effects_cases import CF2, still
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
@@ -68,7 +68,6 @@ def test_so_does_the_low_pass_of_a_gyro_that_is_logged() -> None:
     np.testing.assert_allclose(found[later, 6:9], wanted[later], atol=0.02 * np.abs(wanted).max())
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 1000), st.floats(0.001, 0.03), st.integers(5, 60))
 def test_a_stretch_begins_without_an_error_and_knows_nothing_of_the_one_before(seed: int, delay: float, cut: int):
     rng = np.random.default_rng(seed)

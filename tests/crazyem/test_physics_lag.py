@@ -65,7 +65,7 @@ def irregular(seed, *, n=12, m=6):
 
 
 @given(seeds, st.sampled_from([0.0, 0.003, 0.06]), st.sampled_from([0.0, 0.004]), st.booleans())
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 def test_means_are_those_of_a_fine_integration(seed, tau, delay, hold):
     rng, times, commands, nodes = irregular(seed)
     start = commands[0] + rng.normal(size=4) * [0.1, 1e-5, 1e-5, 1e-6]
@@ -78,7 +78,6 @@ def test_means_are_those_of_a_fine_integration(seed, tau, delay, hold):
 
 
 @given(seeds)
-@settings(max_examples=20, deadline=None)
 def test_without_lag_a_linear_command_gives_the_mean_of_the_line(seed):
     _, times, commands, nodes = irregular(seed)
     ours = run(times, commands, nodes, mode=LINEAR, tau=0.0)[0]
@@ -97,7 +96,6 @@ def after_a_while(seed, behind):
 
 
 @given(seeds, st.integers(2, 6), st.floats(-0.012, 0.012), st.floats(-0.003, 0.0019))
-@settings(max_examples=60, deadline=None)
 def test_causal_means_are_blind_to_the_future(seed, k, delay, behind):
     """The mean of step k must not change with anything stamped after the step began.
 
@@ -119,7 +117,6 @@ def test_causal_means_are_blind_to_the_future(seed, k, delay, behind):
 
 @given(seeds, st.floats(-0.012, 0.012), st.floats(-0.003, 0.003))
 @example(0, 0.0, -1e-6)  # stamps at the very end of the microsecond within which they count as known
-@settings(max_examples=60, deadline=None)
 def test_causal_means_do_not_jump_with_the_delay(seed, delay, behind):
     """A delay that is fitted may pass where a shifted step begins at a stamp (it did: by 300 nats)."""
     rng, times, commands, nodes = after_a_while(seed, behind)
@@ -150,7 +147,6 @@ def test_causal_means_carry_the_lag_along_what_came():
 
 
 @given(seeds, st.sampled_from([LINEAR, HOLD, CAUSAL]), st.sampled_from([0.01, 0.06]))
-@settings(max_examples=30, deadline=None)
 def test_derivatives_are_those_of_finite_differences(seed, mode, tau):
     """With respect to tau everywhere; to the delay as the shift of the mean along the lagged curve."""
     _, times, commands, nodes = irregular(seed)
@@ -173,7 +169,6 @@ def test_derivatives_are_those_of_finite_differences(seed, mode, tau):
 
 
 @given(seeds, st.sampled_from([LINEAR, HOLD, CAUSAL]), st.integers(2, 5), st.sampled_from([0.0, 0.05]))
-@settings(max_examples=30, deadline=None)
 def test_incremental_calls_equal_one_call(seed, mode, split, tau):
     rng, times, commands, nodes = irregular(seed)
     predictor = np.concatenate([rng.normal(size=(4, ORDER)) * 0.4, np.zeros((4, 1))], 1)
@@ -230,7 +225,6 @@ def test_predictor_holds_where_there_is_nothing_to_fit():
 
 
 @given(seeds, st.floats(1e-9, 1e9))
-@settings(max_examples=20, deadline=None)
 def test_predictor_does_not_depend_on_units(seed, scale):
     x = np.random.default_rng(seed).normal(size=(300, 4)).cumsum(0)
     a, b = fit_predictor(x), fit_predictor(scale * x)
@@ -241,7 +235,6 @@ def test_predictor_does_not_depend_on_units(seed, scale):
 @given(
     seeds, st.sampled_from([0.0, 0.003, 0.06]), st.sampled_from([0.0, 0.004]), st.sampled_from([LINEAR, HOLD, CAUSAL])
 )
-@settings(max_examples=20)
 def test_without_derivatives_the_means_are_the_same(seed, tau, delay, mode):
     _, times, commands, nodes = irregular(seed)
     mean, _, by_delay, state = run(times, commands, nodes, mode=mode, tau=tau, delay=delay)

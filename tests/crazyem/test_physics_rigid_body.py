@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
@@ -74,7 +74,6 @@ def test_without_gyroscopic_coupling_the_step_is_second_order():
 
 
 @given(seeds)
-@settings(max_examples=25)
 def test_local_error_of_one_step(seed):
     """In one step of 10 ms at flight rates: 1e-5 m and m/s per step, 1e-4 in attitude, 1 % of a rad/s in the rate."""
     rng = np.random.default_rng(seed)
@@ -134,7 +133,6 @@ def displaced(x: State, error: np.ndarray) -> State:
 
 
 @given(seeds)
-@settings(max_examples=30)
 def test_jacobians_are_those_of_finite_differences(seed):
     rng = np.random.default_rng(seed)
     state = some_state(rng)

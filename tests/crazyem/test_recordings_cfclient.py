@@ -8,7 +8,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.errors import CrazyemError, FileFormatError
@@ -69,7 +69,6 @@ def about(recording, check):
 # --- exactness ---
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     st.lists(
         st.tuples(
@@ -275,7 +274,6 @@ def test_an_empty_block_of_a_session_is_mentioned(put):
     assert set(recording.signals) == {"position"}
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.binary(max_size=200), st.integers(0, 80))
 def test_garbage_never_gives_a_traceback(tmp_path_factory, noise, place):
     data = as_cfclient(STATE, rows_of(STATE, count=4)).encode()

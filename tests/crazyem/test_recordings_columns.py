@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.recordings import Recording, SignalArray
@@ -53,7 +53,6 @@ def plain(recording: Recording) -> list[tuple[str, str, list[tuple[str, int]]]]:
     return rows
 
 
-@settings(max_examples=400, deadline=None)
 @given(recordings(), st.integers(1, 6))
 def test_rows_some_at_a_time_are_those_of_a_plain_loop(recording: Recording, count: int) -> None:
     found: list[tuple[str, str, list[tuple[str, int]]]] = []

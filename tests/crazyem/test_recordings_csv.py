@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.errors import CrazyemError, DataError, FileFormatError
@@ -138,7 +138,6 @@ def test_a_cut_gzip_file_is_one_sentence(tmp_path):
         open_recording(path)
 
 
-@settings(max_examples=200, deadline=None)
 @given(content=st.text(alphabet="0123456789.,-enai\n \x00é", max_size=200), head=st.integers(0, 1))
 def test_garbage_rows_never_raise_anything_else(tmp_path_factory, content, head):
     header = ("host_t,block,fw_ms,name,value", ",".join(NANOBENCH))[head]
@@ -151,7 +150,6 @@ def test_garbage_rows_never_raise_anything_else(tmp_path_factory, content, head)
         assert "\n" not in message
 
 
-@settings(max_examples=200, deadline=None)
 @given(content=st.binary(max_size=300), head=st.integers(0, 2), packed=st.booleans())
 def test_random_bytes_never_raise_anything_else(tmp_path_factory, content, head, packed):
     path = tmp_path_factory.getbasetemp() / "bytes.csv"
@@ -162,7 +160,6 @@ def test_random_bytes_never_raise_anything_else(tmp_path_factory, content, head,
         open_recording(path, ReadOptions(mapping="nanobench"))
 
 
-@settings(max_examples=100, deadline=None)
 @given(
     preset=st.sampled_from(["nanobench", "nanodrone_raw", "nanodrone_processed"]),
     values=st.lists(st.floats(), min_size=60, max_size=60),
@@ -185,7 +182,6 @@ def test_any_double_may_stand_in_a_file(tmp_path_factory, preset, values, count,
         same(list(csv_file.read_parts(path, options, seconds)), whole)
 
 
-@settings(max_examples=150, deadline=None)
 @given(data=st.data())
 def test_damage_to_a_sound_file_is_never_a_traceback(tmp_path_factory, data):
     raw = bytearray((text(rows(40)) if data.draw(st.booleans()) else LONG).encode())
@@ -246,7 +242,6 @@ def table_text(count, seed=0, delimiter=",", end="\n"):
     return end.join(lines) + end
 
 
-@settings(max_examples=100, deadline=None)
 @given(
     rows=st.lists(st.lists(st.floats(allow_nan=False), min_size=8, max_size=8), min_size=1, max_size=30),
     seed=st.integers(0, 9),
@@ -369,7 +364,6 @@ def same(parts, whole):
             assert np.array_equal(array, getattr(whole.signals[name], key), equal_nan=array.dtype.kind == "f"), name
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.05, 3.0))
 def test_parts_joined_are_the_whole(tmp_path_factory, seed, seconds):
     rng = np.random.default_rng(seed)

@@ -28,7 +28,7 @@ from bags import (
     status,
     vector,
 )
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
@@ -412,7 +412,6 @@ def test_damage_is_named_by_its_place(tmp_path: Path) -> None:
     assert finding.evidence["offset"] <= len(content) // 3 <= finding.evidence["offset"] + finding.evidence["bytes"]
 
 
-@settings(max_examples=100, deadline=None)
 @given(
     place=st.integers(0, 10**6),
     junk=st.binary(min_size=1, max_size=40),
@@ -467,7 +466,6 @@ def test_definitions_that_lie_are_refused(tmp_path: Path, name: str) -> None:
         opened(tmp_path, output.getvalue())
 
 
-@settings(max_examples=200, deadline=None)
 @given(kind=st.sampled_from(sorted(DEFINITIONS)), data=st.binary(max_size=300))
 def test_any_bytes_as_any_message(tmp_path_factory: pytest.TempPathFactory, kind: str, data: bytes) -> None:
     output = io.BytesIO()

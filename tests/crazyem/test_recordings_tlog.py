@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.generator.mavcrc import x25crc
@@ -386,7 +386,6 @@ def test_a_flipped_bit_costs_one_frame(tmp_path: Path) -> None:
         assert len(recording) > 0.8 * len(whole)
 
 
-@settings(max_examples=150, deadline=None)
 @given(
     place=st.integers(0, 10**6),
     junk=st.binary(min_size=1, max_size=60),
@@ -409,7 +408,6 @@ def test_random_damage_never_ends_in_anything_but_our_error(
     assert str(path) in said
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     identifier=st.sampled_from(sorted(mavlink.mavlink_map)),
     payload=st.binary(max_size=255),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pyulog import ULog
 from scipy.spatial.transform import Rotation
@@ -372,7 +372,6 @@ def test_garbage_in_the_middle_costs_only_itself(tmp_path: Path) -> None:
         assert abs(finding.evidence["offset"] - len(head + first)) <= 3
 
 
-@settings(max_examples=150, deadline=None)
 @given(
     place=st.integers(0, 10**6),
     junk=st.binary(min_size=1, max_size=40),
@@ -397,7 +396,6 @@ def test_random_damage_never_ends_in_anything_but_our_error(
     assert "\n" not in said
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=400))
 def test_random_bytes_after_the_header(tmp_path_factory: pytest.TempPathFactory, junk: bytes) -> None:
     path = save(tmp_path_factory.mktemp("random"), b"ULog\x01\x12\x35" + junk)

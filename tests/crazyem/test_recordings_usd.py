@@ -6,7 +6,7 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.errors import CrazyemError, FileFormatError
@@ -197,7 +197,6 @@ def logs(draw):
     return version, events, [(k, stamp, values_of(letters[k], rng)) for k, stamp in zip(kinds, stamps, strict=True)]
 
 
-@settings(max_examples=100, deadline=None)
 @given(generated=logs())
 def test_any_log_is_exact(tmp_path_factory, generated):
     data = log(*generated)
@@ -345,7 +344,6 @@ def test_headers_that_lie(put, content, words):
         opened(put(content))
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.binary(max_size=300), st.integers(0, 60), st.booleans())
 def test_garbage_never_gives_a_traceback(tmp_path_factory, noise, place, sound):
     _, _, data = small_log()

@@ -6,7 +6,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from test_recordings_usd import FIXED, header, log, logs, record, small_log
 
@@ -57,7 +57,6 @@ def outcome(function, path, *arguments):
         return f"{type(error).__name__}: {error}"
 
 
-@settings(max_examples=100, deadline=None)
 @given(generated=logs(), seconds=st.sampled_from([0.0, 0.01, 0.1, 60.0]), cut=st.integers(0, 60))
 def test_parts_of_any_log_joined_are_the_whole(tmp_path_factory, generated, seconds, cut):
     path = tmp_path_factory.mktemp("usd") / "log"
@@ -85,7 +84,6 @@ def test_truncated_at_every_byte(tmp_path, version):
             assert_joined(parts, whole[0])
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.data())
 def test_damaged_bytes_are_the_same_in_parts(tmp_path_factory, data):
     content = bytearray(small_log(data.draw(st.sampled_from([1, 2])))[2])

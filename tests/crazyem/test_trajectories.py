@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.control.trajectories import EXCITE_X, EXCITE_Y, EXCITE_YAW, EXCITE_Z, excite, figure8, hover, smooth_step
@@ -71,7 +71,6 @@ def test_no_two_axes_share_a_line():
     assert min(np.diff(lines)) > 0.05
 
 
-@settings(max_examples=30)
 @given(st.floats(-2, 2), st.floats(0.5, 40.0))
 def test_hover_and_excite_stay_finite_for_any_duration(yaw, duration):
     for kind in (hover, excite, figure8):

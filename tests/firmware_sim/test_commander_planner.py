@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.polynomial import polynomial as npoly
 
@@ -38,7 +38,6 @@ pieces = st.builds(
 )
 
 
-@settings(max_examples=30)
 @given(pieces, st.floats(0.0, 1.0), st.floats(0.5, 3.0))
 def test_reversing_and_stretching_keep_the_path(piece, fraction, scale):
     there = poly.evaluate(piece, fraction * piece.duration)

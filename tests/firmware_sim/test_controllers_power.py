@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from firmware_sim.controllers import layout as mem
@@ -62,7 +62,6 @@ def reconstruct(board: Board, pwm: np.ndarray) -> tuple[float, float, float, flo
     return f1 + f2 + f3 + f4, d * (-f1 - f2 + f3 + f4), d * (-f1 + f2 + f3 - f4), k * (-f1 + f2 - f3 + f4)
 
 
-@settings(max_examples=200, deadline=None)
 @given(
     platform=st.sampled_from(["cf2", "cf21bl"]),
     volts=st.floats(3.2, 4.2),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.vehicle import Vehicle, load_vehicle
@@ -126,7 +126,6 @@ values = st.one_of(
 parameters = sorted({p.name for e in [*EFFECTS.values(), *HIDDEN.values()] for p in e.parameters} | {"streams"})
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.dictionaries(
         st.sampled_from([*EFFECTS, "x"]), st.dictionaries(st.sampled_from(parameters), values, max_size=5) | values

@@ -72,9 +72,7 @@ def single_effects(draw: st.DrawFn) -> dict:
 
 
 @settings(
-    max_examples=50,
-    deadline=None,
-    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
+    suppress_health_check=[HealthCheck.filter_too_much],
     phases=[Phase.explicit, Phase.reuse, Phase.generate],
 )
 @given(table=single_effects(), controller=st.sampled_from([1, 2, 5, 6]), seed=st.integers(0, 1000))

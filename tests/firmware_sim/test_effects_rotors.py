@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_sim.plant import layout as at
@@ -75,7 +75,6 @@ def test_without_effects_the_plain_rotors_and_these_agree() -> None:
     assert expected(mean) == pytest.approx(u, rel=1e-12)
 
 
-@settings(max_examples=60, deadline=None)
 @given(delay=st.floats(0.0, 0.1), tau=st.sampled_from([0.0, 0.02, 0.3]))
 def test_a_delayed_command_gives_the_delayed_step_response(delay: float, tau: float) -> None:
     truth, x = plant({"input_delay": {"delay": delay}, "motor_lag": {"time_constant": tau}})

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -25,7 +25,6 @@ def turned(roll: float, pitch: float, yaw: float) -> Rotation:
     return Rotation.from_euler("ZYX", [yaw, pitch, roll])
 
 
-@settings(max_examples=50, deadline=None)
 @given(ANGLES, st.floats(-1.5, 1.5), ANGLES, st.floats(-1, 1), st.floats(-1, 1))
 def test_misalignments_are_rotations_of_the_sensor_in_the_body(roll, pitch, yaw, tilt, heading) -> None:
     angles = {"roll": roll, "pitch": pitch, "yaw": yaw}
@@ -69,7 +68,6 @@ def test_magnetic_yaw_depends_on_the_place() -> None:
         assert (yaw, pitch, roll) == pytest.approx((0.5 + extra, 0.1, 0.2), abs=1e-12)
 
 
-@settings(max_examples=50, deadline=None)
 @given(delay=st.floats(0.0, 100.0), seed=st.integers(0, 99))
 def test_delay_is_linear_interpolation_of_the_past(delay: float, seed: int) -> None:
     series = np.random.default_rng(seed).standard_normal((300, 3))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, example, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
 from firmware_sim.commander import setpoint as sp
@@ -218,9 +218,6 @@ scenarios = st.fixed_dictionaries(
 
 
 @settings(
-    max_examples=40,
-    deadline=None,
-    suppress_health_check=[HealthCheck.too_slow],
     phases=[Phase.explicit, Phase.reuse, Phase.generate],  # shrinking flights takes minutes
 )
 @given(table=scenarios, controller=st.sampled_from([1, 2, 5, 6]), seed=st.integers(0, 1000))
@@ -232,9 +229,6 @@ def test_no_scenario_gives_what_is_not_a_number(table: dict, controller: int, se
 
 
 @settings(
-    max_examples=40,
-    deadline=None,
-    suppress_health_check=[HealthCheck.too_slow],
     phases=[Phase.explicit, Phase.reuse, Phase.generate],
 )
 @given(

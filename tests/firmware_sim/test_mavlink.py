@@ -149,7 +149,6 @@ def test_what_is_sent_is_what_is_true_in_frd_and_ned(flown):
     assert sent == pytest.approx([pwm[i] / 65535 for i in (0, 2, 3, 1)], abs=1e-6)
 
 
-@settings(deadline=None)
 @given(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.1))
 def test_quaternions_turn_as_matrices_do(q):
     norm = math.hypot(*q)
@@ -300,7 +299,7 @@ def victim():
     return Station()
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.binary(max_size=300), number=st.sampled_from(sorted(mavlink.mavlink_map)))
 def test_any_bytes_and_any_message_are_survived(victim, data, number):
     """A message of every kind with any content and a right checksum, then plain noise."""

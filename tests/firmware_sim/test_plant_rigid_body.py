@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_sim.controllers.tick import plant_step
@@ -109,7 +109,6 @@ def test_noise_depends_on_seed_and_tick_only() -> None:
     assert np.std(forward) == pytest.approx(1.0, abs=0.01)
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: sum(v * v for v in q) > 0.01))
 def test_compressed_quaternion_comes_back(values: list[float]) -> None:
     q = np.array(values) / np.linalg.norm(values)  # x, y, z, w

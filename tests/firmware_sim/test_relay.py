@@ -11,7 +11,7 @@ import threading
 import time
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_sim.errors import FirmwareSimError
@@ -158,7 +158,6 @@ FAULTS = st.builds(
 )
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(FAULTS, max_size=4), st.integers(0, 2**31), st.lists(st.binary(min_size=1, max_size=40), max_size=60))
 def test_every_packet_is_accounted_for(faults, seed, sent):
     out, engine = through(faults, sent, seed=seed)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_sim.errors import ScenarioError
@@ -92,7 +92,6 @@ def test_a_missing_file_is_a_scenario_error(tmp_path: Path) -> None:
         load_scenario(tmp_path / "none.toml")
 
 
-@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None)
 @given(
     st.dictionaries(
         st.sampled_from(["platform", "vehicle", "noise", "start", "parameters", "ground", "x"]),

@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from service_client import Client, FakeFlight, client_fixture
 
@@ -214,7 +214,6 @@ def test_the_same_seed_is_the_same_flight():
     assert packets(3) != packets(4)
 
 
-@settings(max_examples=300, deadline=None)
 @given(st.integers(0, 15), st.integers(0, 3), st.binary(max_size=30))
 def test_no_packet_breaks_the_firmware(port, channel, data):
     """Whatever arrives, it is answered with packets or ignored; and a request is answered at most once."""
