@@ -38,6 +38,7 @@ class Fitted:
         loglik: of the flights fitted [nats].
         gram: of the free columns at the maximum, nuisances last.
         precision: (columns of `gram`,) of the priors; 0 for the candidates' own.
+        nuisances: what is free beside the candidates, in the order of the columns.
     """
 
     point: Point
@@ -45,6 +46,7 @@ class Fitted:
     loglik: float
     gram: Gram
     precision: NDArray
+    nuisances: tuple[Candidate, ...] = ()
 
 
 class DivergedError(DataError):
@@ -318,4 +320,4 @@ def refine(
                 point, value, gram = better, found, slopes
         if gained < ENOUGH:
             break
-    return Fitted(point, tuple(candidates), value, gram, weight)
+    return Fitted(point, tuple(candidates), value, gram, weight, tuple(c for c, _ in nuisances))

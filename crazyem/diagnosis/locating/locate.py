@@ -13,7 +13,7 @@ from scipy import stats
 
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.gram import bounded
-from crazyem.diagnosis.fitting.model import Column, Model, Point
+from crazyem.diagnosis.fitting.model import Column, Model, Point, Swept
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.rotations import rotation_matrix
@@ -54,9 +54,18 @@ class Finding:
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Disturbances in time: time (b,) s; value and sd (b, 6): force [N] and torque [N m], body axes."""
+    """What is missing in time.
+
+    Attributes:
+        time: (b,) s.
+        names: of k series, signal and axis as findings have them: "force x", "force world x", "attitude z".
+        units: (k,) of them.
+        value, sd: (b, k).
+    """
 
     time: NDArray
+    names: tuple[str, ...]
+    units: tuple[str, ...]
     value: NDArray
     sd: NDArray
 
@@ -156,34 +165,45 @@ def _one(model: Model, point: Point, workers: Workers) -> tuple[list[Finding], D
     swept = model.sweep(point, constant)
     b, a = swept.score, np.einsum("bii->bi", swept.information)
     dispersion = _dispersion(b, a)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        value = np.where(a[:, :6] > 0, b[:, :6] / a[:, :6], 0.0)
-        sd = np.sqrt(dispersion[:6] / np.maximum(a[:, :6], 1e-30))
     times = np.array([flight.time[flight.block == i].mean() for i in range(flight.blocks)])
-    disturbance = Disturbance(times, value * unit[:6], np.minimum(sd * unit[:6], 1e3))
     findings = []
     for i in range(len(constant)):
         if i >= 6 and i not in (9, 10, 11):
             continue
         findings += _constant_and_change(i, b[:, i], a[:, i], dispersion[i], flight, times, unit[i])
     path = model.shown if model.shown is not None else swept.filtered
-    findings += _of_the_world(model, point, path, times, findings)
+    room = model.sweep(point, world_columns(rotation_matrix(path[:, 6:10])))
+    findings += _of_the_world(model, point, room, times, findings)
+    in_time = _in_time(point, times, (b, a), (room.score, np.einsum("bii->bi", room.information)))
     thrust = model.thrusts(point.vehicle, point.effects)[0]
     for found in workers.map(
         lambda regime: _by_regime(model.twin(), point, regime[0], *regime[1], unit),
         regimes(flight, path, thrust).items(),
     ):
         findings += found
-    return findings, disturbance, _whiteness(swept.innovation, swept.variance)
+    return findings, in_time, _whiteness(swept.innovation, swept.variance)
+
+
+def _in_time(
+    point: Point, times: NDArray, body: tuple[NDArray, NDArray], world: tuple[NDArray, NDArray]
+) -> Disturbance:
+    """What every block says of each axis, by scores and informations (b, k) of axes of the body and of the world."""
+    b, a = (np.concatenate(pair, axis=1) for pair in zip(body, world, strict=True))
+    signals = [_signal(i) for i in range(body[0].shape[1])]
+    signals += [("force", f"world {axis}", "N") for axis in AXES[:2]]
+    size = np.array([*units_of(point), *np.ones(len(signals) - 8), *[point.vehicle.mass] * 2])
+    value, sd = np.zeros_like(b), np.sqrt(_dispersion(b, a) / np.maximum(a, 1e-30))
+    np.divide(b, a, out=value, where=a > 0)
+    names, units = tuple(f"{signal} {axis}" for signal, axis, _ in signals), tuple(unit for *_, unit in signals)
+    return Disturbance(times, names, units, value * size, np.minimum(sd * size, 1e3))
 
 
 def _of_the_world(
-    model: Model, point: Point, path: NDArray, times: NDArray, of_the_body: Sequence[Finding]
+    model: Model, point: Point, swept: Swept, times: NDArray, of_the_body: Sequence[Finding]
 ) -> list[Finding]:
     """Forces along horizontal axes of the world, always there or from a moment on, that say more than the same along
     axes of the body: a wind on a drone that turns."""
     flight = model.flight
-    swept = model.sweep(point, world_columns(rotation_matrix(path[:, 6:10])))
     b, a = swept.score, np.einsum("bii->bi", swept.information)
     dispersion = _dispersion(b, a)
     found = []

@@ -23,6 +23,9 @@ from crazyem.vehicle import Vehicle
 HORIZONS = (0.01, 0.1, 0.5)  # s
 SPACING = 0.1  # s between starts
 NEAR = 0.025  # s between two samples, at most, for a truth between them
+BEYOND_CHANCE = 2.0  # standard errors of a mean difference of squared errors, from which a model predicts worse
+VISIBLE = 1.005  # times the rms error before, at least: less is the same in whole per cent
+FEWEST = 5  # windows that do not overlap, to know a standard error by
 UNITS = {"position": "m", "velocity": "m/s", "attitude": "rad", "body_rate": "rad/s"}
 _COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 
@@ -50,6 +53,21 @@ class HorizonErrors:
         for name, unit in UNITS.items():
             found[name] = {"unit": unit, "rms": _plain(self.rms[name]), "mean": _plain(self.mean[name])}
         return found
+
+
+@dataclass(frozen=True)
+class Worse:
+    """A quantity that a model predicts worse than the one before it, by more than chance: at a horizon [s], by so many
+    standard errors (inf where the model left the range of numbers)."""
+
+    quantity: str
+    horizon: float
+    standard_errors: float
+
+    def to_json(self) -> dict[str, Any]:
+        """For the result document."""
+        sigmas = self.standard_errors if math.isfinite(self.standard_errors) else None
+        return {"quantity": self.quantity, "horizon_s": self.horizon, "standard_errors": sigmas}
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,17 +157,59 @@ def open_loop(
     )
 
 
+def error_lengths(prediction: NDArray, at: Windows) -> dict[str, NDArray]:
+    """Quantity -> (n, h) lengths of the errors of predictions (n, h, 13); NaN where nothing was measured, inf where the
+    model left the range of numbers."""
+    found = {}
+    for name, columns in _COLUMNS.items():
+        length = lengths(prediction[..., columns], at.truth[..., columns], attitude=name == "attitude")
+        known = np.isfinite(at.truth[..., columns]).all(axis=2)
+        found[name] = np.where(known, np.where(np.isfinite(length), length, np.inf), np.nan)
+    return found
+
+
 def errors(prediction: NDArray, at: Windows) -> HorizonErrors:
     """Errors of predictions (n, h, 13) against what was recorded."""
     rms: dict[str, tuple[float, ...]] = {}
     mean: dict[str, tuple[float, ...]] = {}
-    for name, columns in _COLUMNS.items():
-        length = lengths(prediction[..., columns], at.truth[..., columns], attitude=name == "attitude")
-        known = np.isfinite(at.truth[..., columns]).all(axis=2)
-        length = np.where(known & ~np.isfinite(length), np.inf, length)
-        rms[name] = tuple(_over(np.square(length[:, k]), known[:, k], root=True) for k in range(length.shape[1]))
-        mean[name] = tuple(_over(length[:, k], known[:, k]) for k in range(length.shape[1]))
+    for name, length in error_lengths(prediction, at).items():
+        rms[name] = tuple(math.sqrt(_mean(np.square(column))) for column in length.T)
+        mean[name] = tuple(_mean(column) for column in length.T)
     return HorizonErrors(at.horizons, len(at.rows), rms, mean)
+
+
+def worse(pairs: Sequence[tuple[Mapping[str, NDArray], Mapping[str, NDArray]]]) -> tuple[Worse, ...]:
+    """What one model predicts worse than another over the same windows of flights, visibly and by more than chance.
+
+    Args:
+        pairs: `error_lengths` (n, h) of the model before and after, one pair a flight, at `HORIZONS` from starts every
+            `SPACING`.
+    """
+    found = []
+    for name in UNITS if pairs else ():
+        for k, horizon in enumerate(HORIZONS):
+            squares = [(np.square(before[name][:, k]), np.square(after[name][:, k])) for before, after in pairs]
+            first, second = (np.concatenate([s[i] for s in squares]) for i in (0, 1))
+            grown = [after - before for before, after in squares]
+            sigmas = _standard_errors(grown, max(1, math.ceil(horizon / SPACING - 1e-9)))
+            if sigmas > BEYOND_CHANCE and _mean(second) > VISIBLE**2 * _mean(first):
+                found.append(Worse(name, horizon, sigmas))
+    return tuple(found)
+
+
+def _standard_errors(differences: Sequence[NDArray], overlapping: int) -> float:
+    """Mean of differences (n,), a part a flight, over its standard error; so many neighbours overlap, and count as
+    one."""
+    means = []
+    for part in differences:
+        known = part[~np.isnan(part)]
+        means += [float(known[i : i + overlapping].mean()) for i in range(0, known.size, overlapping)]
+    if any(math.isinf(m) for m in means):
+        return math.inf
+    if len(means) < FEWEST:
+        return 0.0
+    error = float(np.std(means, ddof=1)) / math.sqrt(len(means))
+    return float(np.mean(means)) / error if error > 0.0 else 0.0
 
 
 def horizon_errors(
@@ -221,12 +281,11 @@ def _common(
     return [(a, b) for a, b in pairs if b > a]
 
 
-def _over(values: NDArray, known: NDArray, *, root: bool = False) -> float:
-    if not known.any():
-        return math.nan
+def _mean(values: NDArray) -> float:
+    """Of those that are known; NaN if none is."""
+    known = values[~np.isnan(values)]
     with np.errstate(over="ignore"):
-        mean = float(values[known].mean())
-    return math.sqrt(mean) if root else mean
+        return float(known.mean()) if known.size else math.nan
 
 
 def _plain(values: Sequence[float]) -> list[float | None]:
