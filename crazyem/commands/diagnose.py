@@ -6,7 +6,6 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 from crazyem.commands.files import read_options
 from crazyem.commands.output import put
@@ -57,19 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     if arguments.json:
         _replace(arguments.json, json.dumps(document, indent=1) + "\n")
-    text = text_of(document)
-    if "against" in document:
-        text += "\n" + "\n".join(_against(document["against"]))
-    put(text)
+    put(text_of(document))
     return 0
-
-
-def _against(compared: Any) -> list[str]:
-    lines = [f"  against {compared['simulated']}: {compared['seconds']:.1f} s of the same mission"]
-    for name, entry in compared["signals"].items():
-        size = f"{entry['rms']:.4g} {entry['unit']}, largest {entry['largest']:.4g}"
-        lines.append(f"    {name:16s} rms difference {size}")
-    return lines
 
 
 def _replace(path: str, text: str) -> None:

@@ -1,6 +1,6 @@
 """From recordings and a vehicle to a diagnosis: nominal model, where it fails, which effects, the fit, what remains."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,8 +21,10 @@ from crazyem.diagnosis.locating.locate import Located, locate
 from crazyem.diagnosis.locating.place import depends_on_place
 from crazyem.diagnosis.naming.balance import by_balance, hidden_by_the_day
 from crazyem.diagnosis.naming.beside import beside_the_regression, late_rotors
+from crazyem.diagnosis.naming.determined import determined, without_undetermined
 from crazyem.diagnosis.naming.exchange import exchanged, named_again
 from crazyem.diagnosis.naming.foretold import with_found, without_what_misleads
+from crazyem.diagnosis.naming.free import Free, left_free
 from crazyem.diagnosis.naming.imitated import by_place
 from crazyem.diagnosis.naming.named import Named
 from crazyem.diagnosis.naming.rotor_response import answers, disobedient
@@ -44,11 +46,18 @@ WEAK_OR_MISREAD = ("rotor_fault", "rotor_sensor")
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All that was found; `document.py` turns it into JSON. Where `swapped`, `recordings` are those that were held out
-    (see `flights/roles.py`)."""
+    """All that was found; `document.py` turns it into JSON.
+
+    Attributes:
+        fitted_vehicle: the drone, with what was found and belongs to it; `as_flown` has what belongs to the recordings
+            as well.
+        free: what was free beside the effects.
+        swapped: `recordings` are those that were held out (see `flights/roles.py`).
+    """
 
     vehicle: Vehicle
     fitted_vehicle: Vehicle
+    as_flown: Vehicle
     recordings: tuple[str, ...]
     held_out: tuple[str, ...]
     mismatch: bool
@@ -61,6 +70,7 @@ class Diagnosis:
     selection: Selection
     left_out: dict[str, str]
     explained: float
+    free: tuple[Free, ...]
     own: tuple[Own, ...]
     swapped: bool = False
 
@@ -97,6 +107,7 @@ def diagnose(
     selection, balance = by_balance(data, with_whole_torques(data, selection))
     judges = asked.held_out or asked.recordings
     selection = without_what_misleads(data, selection, asked.vehicle, judges, withhold=withhold, say=say)
+    selection, balance, unsure = without_undetermined(data, selection, balance, say)
     before, after = _located(data, selection, say)
     place = depends_on_place(data, apart, selection.final)
     remains = unexplained(data, selection, after, apart)
@@ -114,25 +125,29 @@ def diagnose(
     if asked.flights[0].inputs.measured:
         told, late, remains = _late_rotors(asked, vehicle, told, remains, left_out)
         beside += late
-    effects = strongest_first(told.effects, beside)
-    fitted_vehicle = _with_effects(asked.vehicle, selection, beside)
-    fitted_vehicle = with_its_thrust(fitted_vehicle, data, selection.final, selection.accepted)
-    fitted_vehicle = left_as_trim(chosen.asked.flights, fitted_vehicle, remains, workers)
+    effects, impossible = determined(strongest_first(told.effects, beside), selection.final)
+    as_flown = _with_effects(asked.vehicle, selection, [e for e in effects if any(e.name == b.name for b in beside)])
+    as_flown = with_its_thrust(as_flown, data, selection.final, selection.accepted)
+    as_flown = _restored(left_as_trim(chosen.asked.flights, as_flown, remains, workers), asked.vehicle, impossible)
+    of_recordings = {e.fitted_as or e.name for e in effects if e.of_recording}
+    left_out = {**left_out, **unsure, **impossible}
     return Diagnosis(
         vehicle=vehicle,
-        fitted_vehicle=fitted_vehicle,
+        fitted_vehicle=_restored(as_flown, asked.vehicle, of_recordings),
+        as_flown=as_flown,
         recordings=tuple(r.path for r in asked.recordings),
         held_out=tuple(r.path for r in asked.held_out),
         mismatch=bool(effects) or remains.found,
         before=before,
         after=after,
         effects=effects,
-        indistinguishable=told.groups,
+        indistinguishable=tuple(g for g in told.groups if any(e.name in g for e in effects)),
         would_separate=_advice(told.separate, [*asked.recordings, *asked.held_out]),
         unexplained=remains,
         selection=selection,
         left_out={n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)},
         explained=remains.explained,
+        free=left_free(selection.fitted),
         own=owned(chosen.asked.flights, chosen.asked.kept_apart, selection.final.effects.get(STRENGTH)),
         swapped=asked.swapped,
     )
@@ -315,3 +330,9 @@ def _with_effects(vehicle: Vehicle, selection: Selection, beside: Sequence[Named
         fitted,
         effects={**fitted.effects, **{e.name: {n: v.value for n, v in e.parameters.items()} for e in beside}},
     )
+
+
+def _restored(vehicle: Vehicle, before: Vehicle, names: Collection[str]) -> Vehicle:
+    """The vehicle with some effects as they were before, which is nothing for most."""
+    kept = {n: v for n, v in vehicle.effects.items() if n not in names}
+    return replace(vehicle, effects=kept | {n: v for n, v in before.effects.items() if n in names})

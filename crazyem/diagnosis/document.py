@@ -2,26 +2,41 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crazyem.diagnosis.diagnose import Diagnosis
+from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.flights import roles
 from crazyem.diagnosis.flights.flight import without
 from crazyem.diagnosis.flights.own import Own
 from crazyem.diagnosis.locating.locate import Finding, strongest
 from crazyem.diagnosis.naming.named import Named
-from crazyem.diagnosis.prediction.horizon import HorizonErrors, Windows, errors, open_loop, windows
-from crazyem.diagnosis.prediction.predict import NAMES, Recorded, recorded
-from crazyem.diagnosis.report import Series
+from crazyem.diagnosis.prediction.horizon import (
+    UNITS,
+    HorizonErrors,
+    Windows,
+    error_lengths,
+    errors,
+    open_loop,
+    windows,
+    worse,
+)
+from crazyem.diagnosis.prediction.predict import recorded
+from crazyem.diagnosis.report.pictures import Series
+from crazyem.diagnosis.report.quantities import joined, prefixed
+from crazyem.diagnosis.report.text import text_of
 from crazyem.errors import DataError
+from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
-SHOWN = ("position", "velocity", "attitude", "body_rate")
+__all__ = ["document_of", "notices_of", "saved_vehicle", "text_of"]
+MOST_PICTURES = 4  # of what is accused
 
 
 def document_of(
@@ -38,8 +53,13 @@ def document_of(
     """
     if diagnosis.swapped:
         recordings, held_out = held_out, recordings
-    train, pictures = _compared(diagnosis, [without(r, withhold) for r in recordings], draw=True)
-    apart, _ = _compared(diagnosis, [without(r, withhold) for r in held_out], draw=False)
+    vehicle, drone, as_flown = diagnosis.vehicle, diagnosis.fitted_vehicle, diagnosis.as_flown
+    # a recording has its own sensors: what was found of them is of those that were fitted
+    models = [vehicle, as_flown] + ([] if drone == as_flown else [drone])
+    train = _compared([without(r, withhold) for r in recordings], models)
+    fitted, confirmed = (
+        _before_after(c) for c in (train, _compared([without(r, withhold) for r in held_out], [vehicle, drone]))
+    )
     left = diagnosis.unexplained
     where = strongest(diagnosis.before.findings)
     document: dict[str, Any] = {
@@ -61,21 +81,50 @@ def document_of(
             "where": [_finding(f) for f in left.findings],
         },
         "fit": {
-            "train": _before_after(train),
-            "held_out": _before_after(apart) if held_out else {},
+            "train": fitted,
+            "held_out": confirmed,
             "whiteness": {"before": diagnosis.before.whiteness, "after": diagnosis.after.whiteness},
-            "gap_closed": _gap_closed(apart or train),
+            "gap_closed": _gap_closed(confirmed or fitted),
         },
         "not_identifiable": [{"name": n, "reason": r} for n, r in diagnosis.left_out.items()],
         "ranking": _ranking(diagnosis),
         "of_recordings": [own.to_json() for own in diagnosis.own],
-        "notices": [*_roles(diagnosis.swapped, diagnosis.recordings, diagnosis.held_out), *notices_of(diagnosis.own)],
+        "left_free": _left_free(diagnosis),
+        "notices": [
+            *([roles.told(diagnosis.recordings, diagnosis.held_out)] if diagnosis.swapped else []),
+            *_of_recordings(diagnosis.effects),
+            *notices_of(diagnosis.own),
+        ],
     }
-    return document, {**disturbance_pictures(diagnosis), **pictures}
+    return document, pictures_of(diagnosis, train)
 
 
-def _roles(swapped: bool, fitted: Sequence[str], kept_apart: Sequence[str]) -> list[str]:
-    return [roles.told(fitted, kept_apart)] if swapped else []
+def _left_free(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """What was free beside the effects: of the fit, of each recording, and what is written without being told."""
+    found = [free.to_json() for free in diagnosis.free]
+    for own in diagnosis.own:
+        found += own.free()
+    told = {e.fitted_as or e.name for e in diagnosis.effects}
+    for name, values in diagnosis.fitted_vehicle.effects.items():
+        if name not in told and values != diagnosis.vehicle.effects.get(name):
+            effect = CATALOGUE[name]
+            found += [
+                {"name": name, "words": f"{effect.said({})}, written into the vehicle", "parameter": p.said,
+                 "value": values[p.name], "sd": None, "unit": p.unit, "expected": p.neutral, "usual": None}
+                for p in effect.parameters if p.name in values
+            ]  # fmt: skip
+    return [{k: _number(v) if isinstance(v, float) else v for k, v in entry.items()} for entry in found]
+
+
+def _of_recordings(effects: Sequence[Named]) -> list[str]:
+    """That some of what was found is no property of the drone."""
+    names = [e.words for e in effects if e.of_recording]
+    if not names:
+        return []
+    return [
+        f"{joined(names)}: of the recording and not of the drone, so --write-vehicle leaves that out, and so do the "
+        "errors on flight that was held out"
+    ]
 
 
 def notices_of(own: Sequence[Own]) -> list[str]:
@@ -97,6 +146,7 @@ def _effect(effect: Named) -> dict[str, Any]:
     return {
         "name": effect.name,
         "label": effect.label,
+        "words": effect.words,
         "parameters": parameters,
         "evidence": {"held_out_nats": _number(effect.held_out_nats), "p_value": _number(effect.p_value)},
         "confidence": _number(effect.confidence),
@@ -121,35 +171,54 @@ def _ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
             continue
         seen.add(trial.candidate.label)
         found.append({
-            "name": trial.candidate.effect, "label": trial.candidate.label, "gain_nats": _number(trial.gain),
+            "name": trial.candidate.effect, "label": trial.candidate.label, "words": _words(trial.candidate),
+            "gain_nats": _number(trial.gain),
             "held_out_nats": _number(trial.held_out), "p_value": _number(trial.p_value),
             "evidence_nats": _number(trial.evidence), "note": "" if trial.fitted else "not fitted: linear estimate",
         })  # fmt: skip
     return found
 
 
-def _compared(
-    diagnosis: Diagnosis, recordings: Sequence[Recording], *, draw: bool
-) -> tuple[list[tuple[HorizonErrors, HorizonErrors]], dict[str, Series]]:
-    """Open-loop errors before and after, a pair a recording; none where a recording has no whole states."""
-    pairs: list[tuple[HorizonErrors, HorizonErrors]] = []
-    pictures: dict[str, Series] = {}
+def _words(candidate: Candidate) -> str:
+    """A candidate for people, with its choices and with which of its parameters are fitted where there is a choice."""
+    effect = CATALOGUE[candidate.effect]
+    return effect.said({**dict(candidate.fixed), **(dict.fromkeys(candidate.free, 0.0) if effect.alternatives else {})})
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """Open-loop errors of one recording before and after, by the vehicle alone where that is not what flew, and the
+    lengths of errors by window."""
+
+    at: Windows
+    runs: tuple[NDArray, ...]  # before, after, and by the vehicle alone
+
+    @property
+    def errors(self) -> list[HorizonErrors]:
+        return [errors(run, self.at) for run in self.runs]
+
+
+def _compared(recordings: Sequence[Recording], vehicles: Sequence[Vehicle]) -> list[_Compared]:
+    """Of every recording that has whole states, by each of the vehicles over the same windows."""
+    found = []
     for recording in recordings:
         try:
-            before = recorded(recording, diagnosis.vehicle)
-            at = windows(before)
-            after = recorded(recording, diagnosis.fitted_vehicle)
-            first, second = open_loop(before, at), open_loop(after, at)
+            shown = [recorded(recording, vehicle) for vehicle in vehicles]
+            at = windows(shown[0])
+            found.append(_Compared(at, tuple(open_loop(one, at) for one in shown)))
         except DataError:
             continue
-        pairs.append((errors(first, at), errors(second, at)))
-        if draw and not pictures:
-            pictures = overlay_pictures(before, at, first, second)
-    return pairs, pictures
+    return found
 
 
-def _before_after(pairs: Sequence[tuple[HorizonErrors, HorizonErrors]]) -> dict[str, Any]:
-    return {"before": _pooled([p[0] for p in pairs]), "after": _pooled([p[1] for p in pairs])} if pairs else {}
+def _before_after(compared: Sequence[_Compared]) -> dict[str, Any]:
+    """Errors before and after, and what is worse; by the vehicle alone, where that is not what flew."""
+    if not compared:
+        return {}
+    by_model = zip(*(c.errors for c in compared), strict=True)
+    found: dict[str, Any] = dict(zip(("before", "after", "vehicle"), map(_pooled, by_model), strict=False))
+    lengths = [(error_lengths(c.runs[0], c.at), error_lengths(c.runs[1], c.at)) for c in compared]
+    return {**found, "worse": [w.to_json() for w in worse(lengths)]}
 
 
 def _pooled(found: Sequence[HorizonErrors]) -> dict[str, Any]:
@@ -163,103 +232,77 @@ def _pooled(found: Sequence[HorizonErrors]) -> dict[str, Any]:
     return replace(found[0], starts=sum(f.starts for f in found), rms=rms, mean=mean).to_json()
 
 
-def _gap_closed(pairs: Sequence[tuple[HorizonErrors, HorizonErrors]]) -> dict[str, float | None]:
+def _gap_closed(errors_of: Mapping[str, Any]) -> dict[str, float | None]:
     """Share of the mean square error at the longest horizon that the fit took away, by quantity."""
     closed: dict[str, float | None] = {}
-    for name in SHOWN:
-        before = sum(p[0].rms[name][-1] ** 2 * p[0].starts for p in pairs)
-        after = sum(p[1].rms[name][-1] ** 2 * p[1].starts for p in pairs)
-        closed[name] = _number(1.0 - after / before) if pairs and before > 0 else None
+    for name in UNITS:
+        before, after = (errors_of[k][name]["rms"][-1] if errors_of else None for k in ("before", "after"))
+        closed[name] = 1.0 - (after / before) ** 2 if before and after is not None else None
     return closed
 
 
-def disturbance_pictures(diagnosis: Diagnosis) -> dict[str, Series]:
-    """Missing force and torque in time, before and after."""
-    pictures = {}
+def pictures_of(diagnosis: Diagnosis, compared: Sequence[_Compared]) -> dict[str, Series]:
+    """What is accused, in time, and how the errors of open-loop runs change."""
+    found = accused_pictures(diagnosis, compared[0] if compared else None)
+    return found | (error_pictures(compared[0]) if compared else {})
+
+
+def accused_pictures(diagnosis: Diagnosis, compared: _Compared | None) -> dict[str, Series]:
+    """Every signal that is accused, the strongest first, before and after: what the model lacks of it in time.
+
+    Of a rate, whose error is no series of its own, the error a sample ahead, else the torque that turns about its axis.
+    """
+    accused = [*(strongest(diagnosis.before.findings) if diagnosis.mismatch else ()), *diagnosis.unexplained.findings]
+    found: dict[str, Series] = {}
+    for finding in accused:
+        name = f"{finding.signal} {finding.axis}"
+        if name in found or len(found) == MOST_PICTURES:
+            continue
+        series = _missing(diagnosis, name, finding) or _rate_error(compared, finding)
+        series = series or _missing(diagnosis, f"torque {finding.axis}", finding)
+        if series is not None:
+            found[name] = series
+    return found
+
+
+def _missing(diagnosis: Diagnosis, name: str, finding: Finding) -> Series | None:
+    """A series of what the model lacks, with the time that a finding is of; None if there is none of that name."""
     before, after = diagnosis.before.disturbances[0], diagnosis.after.disturbances[0]
-    for i, axis in enumerate("xyz"):
-        for offset, what, unit in ((0, "force", "mN"), (3, "torque", "uN m")):
-            scale = 1e3 if offset == 0 else 1e6
-            lines = {"before": before.value[:, offset + i] * scale}
-            if diagnosis.effects:
-                lines["after"] = after.value[:, offset + i] * scale
-            level = float(np.median(before.sd[:, offset + i]) * scale) * 2
-            pictures[f"{what} {axis}"] = Series(
-                f"Missing {what} along body {axis}", before.time, lines, y_label=f"{unit}", level=level
-            )
-    order = ["force x", "force y", "force z", "torque x", "torque y", "torque z"]
-    return {name: pictures[name] for name in order}
+    if name not in before.names:
+        return None
+    k = before.names.index(name)
+    factor, unit = prefixed(float(np.nanmax(np.abs(before.value[:, k]))), before.units[k])
+    lines = {"before": factor * before.value[:, k]}
+    if diagnosis.effects:
+        lines["after"] = factor * after.value[:, k]
+    here = finding.variable == "time" and len(diagnosis.before.disturbances) == 1
+    return Series(
+        f"Missing from the model: {name.replace('_', ' ')}", before.time, lines, y_label=unit,
+        level=2.0 * factor * float(np.median(before.sd[:, k])), shaded=(finding.interval,) if here else (),
+    )  # fmt: skip
 
 
-def overlay_pictures(shown: Recorded, at: Windows, before: Any, after: Any) -> dict[str, Series]:
-    """What open-loop runs of half a second come to, beside what was recorded then."""
-    time = at.times[:, -1]
-    pictures = {}
-    for column, unit in ((2, "m"), (3, "m/s"), (4, "m/s"), (5, "m/s"), (10, "rad/s"), (11, "rad/s")):
-        truth = at.truth[:, -1, column]
-        pictures[NAMES[column]] = Series(
-            f"{NAMES[column]} after 0.5 s of open loop, error", time,
-            {"before": before[:, -1, column] - truth, "after": after[:, -1, column] - truth},
-            y_label=unit, section="fit",
-        )  # fmt: skip
-    return pictures
+def _rate_error(compared: _Compared | None, finding: Finding) -> Series | None:
+    """The error of a body rate a sample ahead, about one axis."""
+    if compared is None or finding.signal != "body_rate" or finding.axis not in "xyz":
+        return None
+    column = 10 + "xyz".index(finding.axis)
+    before, after = (run[:, 0, column] - compared.at.truth[:, 0, column] for run in compared.runs[:2])
+    title = f"Error of the body rate {finding.axis}, {1e3 * compared.at.horizons[0]:g} ms ahead"
+    return Series(title, compared.at.times[:, 1], {"before": before, "after": after}, y_label="rad/s")
 
 
-def text_of(document: Mapping[str, Any]) -> str:
-    """The diagnosis for a terminal."""
-    from crazyem.diagnosis.report.html import verdict
-
-    lines = [verdict(document)]
-    if not document["mismatch"]:
-        lines += [f"  it could not reveal: {text}" for text in _hidden(document["not_identifiable"])]
-    for f in document["where"][:6]:
-        size = f"{_short(f['effect_size'], '+.3g')} +- {_short(f['sd'], '.2g')} {f['unit']}"
-        lines.append(f"  where: {f['signal']} {f['axis']}, {f['regime']}: {size}")
-    for e in document["effects"]:
-        held = e["evidence"]["held_out_nats"]
-        sure = _short(e["confidence"], ".2f")
-        lines.append(f"  {e['label']}  (confidence {sure}, held out {_short(held, '.1f')} nats)")
-        for name, p in e["parameters"].items():
-            if "ci95" in p:
-                value, low, high = (_short(v, ".5g") for v in (p["value"], *p["ci95"]))
-                lines.append(f"    {name:16s} {value} {p['unit']}  (95 %: {low} to {high})")
-            else:
-                lines.append(f"    {name:16s} {p['value']}")
-    for group in document["indistinguishable"]:
-        lines.append(f"  cannot be told apart: {', '.join(group)}")
-    words = "would separate them" if document["indistinguishable"] else "would tell more"
-    lines += [f"    {words}: {text}" for text in document["would_separate"]]
-    if document["unexplained"]["found"]:
-        for f in document["unexplained"]["where"][:4]:
-            size = f"{_short(f['effect_size'], '+.3g')} {f['unit']}"
-            lines.append(f"  unexplained: {f['signal']} {f['axis']}, {f['regime']}: {size}")
-    swapped = _roles(document["swapped"], document["recordings"], document["held_out_recordings"])
-    lines += [f"  note: {text}" for text in swapped]
-    several = len(document["of_recordings"]) > 1
-    for own in document["of_recordings"]:
-        lines += [f"  note: {_named(own['recording'], text, several)}" for text in own["notices"]]
-    for part, title in (("train", "fitted flight"), ("held_out", "held-out flight")):
-        both = document["fit"][part]
-        if both:
-            for name in SHOWN:
-                one, two = both["before"][name], both["after"][name]
-                pairs = ", ".join(
-                    f"{1e3 * h:.0f} ms {_short(b)} -> {_short(a)}"
-                    for h, b, a in zip(both["before"]["horizon_s"], one["rms"], two["rms"], strict=True)
-                )
-                lines.append(f"  {title}, open-loop rms {name} [{one['unit']}]: {pairs}")
-    return "\n".join(lines)
-
-
-def _hidden(missing: Sequence[Mapping[str, str]]) -> list[str]:
-    """Names and reasons of what is not identifiable, a line for each reason."""
-    reasons = dict.fromkeys(m["reason"] for m in missing)
-    return [f"{', '.join(m['name'] for m in missing if m['reason'] == reason)}: {reason}" for reason in reasons]
-
-
-def _short(value: float | None, how: str = ".3g") -> str:
-    """A number of the document, which has null for what is not finite."""
-    return "-" if value is None else format(value, how)
+def error_pictures(compared: _Compared) -> dict[str, Series]:
+    """How far open-loop runs part from what was recorded, of each quantity."""
+    before, after = (error_lengths(run, compared.at) for run in compared.runs[:2])
+    title = f"error {compared.at.horizons[-1]:g} s ahead"
+    return {
+        f"error {name}": Series(
+            f"{name.replace('_', ' ').capitalize()}, {title}", compared.at.times[:, -1],
+            {"before": before[name][:, -1], "after": after[name][:, -1]}, y_label=unit, section="fit",
+        )
+        for name, unit in UNITS.items()
+    }  # fmt: skip
 
 
 def _number(value: Any) -> float | None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from crazyem.diagnosis.flights.alignment import Alignment
@@ -44,6 +45,18 @@ class Own:
             "notices": list(self.notices),
             "thrust": self.strength and {"scale": self.strength, "unit": ""},
         }  # fmt: skip
+
+    def free(self) -> list[dict[str, Any]]:
+        """Its clock and its frame as what is left free of a fit (`naming/free.py`)."""
+        name, found = Path(self.recording).name, []
+        if self.alignment:
+            found.append(("rotor clock", f"delay, {name}", self.alignment.delay, self.alignment.sd, "s"))
+        if self.frame:
+            angles = (self.frame.roll, self.frame.pitch)
+            for axis, angle, sd in zip(("roll", "pitch"), angles, self.frame.sd, strict=True):
+                found.append(("pose frame", f"{axis}, {name}", angle, sd, "rad"))
+        keys = ("words", "parameter", "value", "sd", "unit")
+        return [{"name": None, **dict(zip(keys, f, strict=True)), "expected": 0.0, "usual": None} for f in found]
 
 
 def owned(

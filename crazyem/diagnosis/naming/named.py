@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from crazyem.diagnosis.naming.unexplained import Unexplained
+from crazyem.physics.effects.catalogue import CATALOGUE
 
 CALIBRATED = 0.95  # of the names that nothing speaks against this share was right (docs/diagnosis.md)
 # Confidence at most beside structure that a name does not outweigh, or where something that shakes explains as much.
@@ -44,6 +45,7 @@ class Named:
         held_out_nats: log-likelihood it brings on flight that it was not fitted to.
         p_value: of its score test, the number of candidates allowed for.
         confidence: probability that this effect is there and not a look-alike.
+        fitted_as: the effect as which it was fitted; "": by its own name.
     """
 
     name: str
@@ -53,6 +55,18 @@ class Named:
     held_out_nats: float
     p_value: float
     confidence: float
+    fitted_as: str = ""
+
+    @property
+    def words(self) -> str:
+        """For people, with its choices."""
+        values = {**self.chosen, **{n: v.value for n, v in self.parameters.items()}}
+        return CATALOGUE[self.name].said(values)
+
+    @property
+    def of_recording(self) -> bool:
+        """Whether it belongs to the recording and not to the drone."""
+        return CATALOGUE[self.name].belongs_to == "recording"
 
 
 def around(value: float, sd: float) -> tuple[float, float]:

@@ -68,16 +68,14 @@ def tell(
     if not selection.accepted:
         return Told()
     point, gram = selection.final, selection.fitted.gram
-    sd, width, all_covariance, used = _uncertainty(selection.fitted)
-    never = unsure(data, point)
-    never |= {
-        name: float(np.hypot(never.get(name, 0.0), off)) for name, off in by_a_wrong_lag(data, selection.fitted).items()
-    }
+    _, _, all_covariance, used = _uncertainty(selection.fitted)
+    numbers = numbers_of(data, selection, balance)
     found: list[tuple[float, Named]] = []
     groups: list[tuple[str, ...]] = []
     separate: list[str] = []
     at = 0
-    for candidate, step in zip(selection.accepted, (s for s in selection.steps if s.taken), strict=True):
+    taken = [s for s in selection.steps if s.taken]
+    for candidate, step, parameters in zip(selection.accepted, taken, numbers, strict=True):
         assert step.taken is not None
         own = slice(at, at + len(candidate.free))
         at = own.stop
@@ -97,8 +95,7 @@ def tell(
         late = candidate.effect == "input_delay" and MEASURED_LATE in witnessed
         name, label = (MEASURED_LATE, MEASURED_LATE) if late else (candidate.effect, candidate.label)
         chosen: dict[str, object] = {"streams": ("state", "gyro")} if late else dict(candidate.fixed)
-        numbers = by_day[0] if by_day else _numbers(candidate, point, sd[own], width[own], never)
-        named = Named(name, label, numbers, chosen, step.taken.held_out, p_value, confidence)
+        named = Named(name, label, parameters, chosen, step.taken.held_out, p_value, confidence, candidate.effect)
         found.append((step.taken.evidence, named))
 
         if doubted:
@@ -120,6 +117,22 @@ def tell(
             separate.append(HEAVIER.format(1.0 / candidate.values(point)["scale"]))
     found.sort(key=lambda entry: -entry[0])
     return Told(tuple(n for _, n in found), tuple(groups), tuple(dict.fromkeys(separate)))
+
+
+def numbers_of(data: Data, selection: Selection, balance: Balance | None) -> list[dict[str, Value]]:
+    """What is told of the free parameters of each effect that was selected, in their order."""
+    sd, width, _, _ = _uncertainty(selection.fitted)
+    never = unsure(data, selection.final)
+    never |= {
+        name: float(np.hypot(never.get(name, 0.0), off)) for name, off in by_a_wrong_lag(data, selection.fitted).items()
+    }
+    found, at = [], 0
+    for candidate in selection.accepted:
+        own = slice(at, at + len(candidate.free))
+        at = own.stop
+        by_day = _by_the_day(candidate, selection.final, balance)
+        found.append(by_day[0] if by_day else _numbers(candidate, selection.final, sd[own], width[own], never))
+    return found
 
 
 def strongest_first(effects: Sequence[Named], beside: Sequence[Named]) -> tuple[Named, ...]:

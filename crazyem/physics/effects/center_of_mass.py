@@ -16,6 +16,7 @@ CENTER_OF_MASS = Effect(
     "center_of_mass",
     tuple(Parameter(axis, "m", 0.0, -0.1, 0.1, 5e-4) for axis in "xyz"),
     order=12,
+    words="shift of the centre of mass",
     body=shifted,
     separates=(
         "balance the drone on an edge, or log the accelerometer and yaw for 5 s at 2 Hz; for z fly hard sideways steps"

@@ -30,6 +30,10 @@ class Parameter:
         among: the value is a list of some of these; `chosen` are the lists that are searched.
         needs, without: as in `Effect`, for this parameter alone.
         usual: how far from neutral it usually is where the effect is there (0: five times `scale`).
+        words: for people; "": the name with spaces.
+        phrase: what it adds to the effect's words where it has a value, "" if nothing: "of rotor {}".
+        spoken: value of a choice -> words for the phrase.
+        remark: what goes with a finding of this parameter alone, as a clause.
     """
 
     name: str
@@ -43,6 +47,22 @@ class Parameter:
     needs: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     usual: float = 0.0
+    words: str = ""
+    phrase: str = ""
+    spoken: Mapping[str, str] = field(default_factory=dict)
+    remark: str = ""
+
+    @property
+    def said(self) -> str:
+        """Its name for people."""
+        return self.words or self.name.replace("_", " ")
+
+    def phrase_of(self, value: Any) -> str:
+        """What a value adds to the effect's words."""
+        if isinstance(value, float):
+            value = f"{value:.2f}"
+        each = value if isinstance(value, list | tuple) else [value]
+        return self.phrase.format(" and ".join(self.spoken.get(str(v), str(v)) for v in each))
 
     @property
     def width(self) -> float:
@@ -188,6 +208,9 @@ class Effect:
         alternatives: sets of parameters that are fitted together, one of which is enough; empty: all of them.
         beginnings: parameter -> values to begin from, where the likelihood may have several maxima.
         sizes: values of the amplitude with which beginnings are compared in full, where a small one says little.
+        words: the effect for people; "": the name with spaces.
+        belongs_to: "vehicle", or "recording" where each recording has its own: what a sensor or a filter on board shows
+            on that day, which no vehicle file is to have.
     """
 
     name: str
@@ -214,6 +237,13 @@ class Effect:
     alternatives: tuple[tuple[str, ...], ...] = ()
     beginnings: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     sizes: tuple[float, ...] = ()
+    words: str = ""
+    belongs_to: str = "vehicle"
+
+    def said(self, values: Values) -> str:
+        """The effect in words, with those of its values that say which: "rotor fault of rotor 3"."""
+        named = [p.phrase_of(values[p.name]) for p in self.parameters if p.phrase and values.get(p.name) is not None]
+        return " ".join([self.words or self.name.replace("_", " "), *named])
 
     def advice(self, recorded: Container[str]) -> str:
         """What would tell it from its look-alikes, without asking for what is recorded."""

@@ -27,6 +27,7 @@ FORCE_BY_PLACE = Effect(
     "force_by_place",
     CONSTANT + SLOPES,
     order=66,
+    words="force that depends on place",
     external=pulling,
     needs=("position",),
     separates="fly the same path elsewhere in the room",

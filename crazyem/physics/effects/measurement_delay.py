@@ -79,11 +79,21 @@ MEASUREMENT_DELAY = Effect(
     (
         Parameter("delay", "s", 0.0, 0.0, 0.1, 1e-3),
         Parameter(
-            "streams", "", ("state",), 0, 0, 0, chosen=(("state",), ("gyro",), ("accelerometer",)), among=tuple(SHOWN)
+            "streams",
+            "",
+            ("state",),
+            0,
+            0,
+            0,
+            chosen=(("state",), ("gyro",), ("accelerometer",)),
+            among=tuple(SHOWN),
+            phrase="of the {}",
+            spoken={"state": "state estimate"},
         ),
     ),
     order=84,
     measured=late,
     needs=("position", "velocity", "attitude", "body_rate", "specific_force"),
+    belongs_to="recording",
     separates="log the gyro and the pose at 100 Hz or more, and turn and stop sharply several times",
 )

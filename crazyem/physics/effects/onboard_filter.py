@@ -35,5 +35,7 @@ ONBOARD_FILTER = Effect(
     order=85,
     measured=filtered,
     needs=("velocity", "body_rate"),
+    words="filters on board",
+    belongs_to="recording",
     separates="log the pose of motion capture beside the onboard estimate",
 )

@@ -15,12 +15,13 @@ def recounted(thrust: NDArray, *, rotor: int, scale: float) -> NDArray:
 ROTOR_SENSOR = Effect(
     "rotor_sensor",
     (
-        Parameter("rotor", "", 1, 1, 4, 1, chosen=(1, 2, 3, 4)),
+        Parameter("rotor", "", 1, 1, 4, 1, chosen=(1, 2, 3, 4), phrase="of rotor {}"),
         Parameter("scale", "", 1.0, 0.1, 3.0, 0.01),
     ),
     order=24,
     speed=recounted,
     needs=("rotor_speed",),
+    words="wrong speed sensor",
     separates="log the motor commands beside the speeds, or point an optical tachometer at each rotor in hover",
     spared={"motor_command": "log the motor commands beside the speeds, or "},
 )

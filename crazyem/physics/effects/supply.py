@@ -43,8 +43,18 @@ THRUST_CURVE = Effect(
 BATTERY_SAG = Effect(
     "battery_sag",
     (
-        Parameter("gain_per_volt", "1/V", 0.0, -2.0, 2.0, 0.02, needs=("voltage",)),
-        Parameter("gain_per_second", "1/s", 0.0, -0.1, 0.1, 2e-4, without=("voltage",)),
+        Parameter("gain_per_volt", "1/V", 0.0, -2.0, 2.0, 0.02, needs=("voltage",), phrase="with the voltage"),
+        Parameter(
+            "gain_per_second",
+            "1/s",
+            0.0,
+            -0.1,
+            0.1,
+            2e-4,
+            without=("voltage",),
+            phrase="with time",
+            remark="no battery voltage was recorded, and every battery that empties looks like this",
+        ),
     ),
     order=21,
     commanded=sagging,

@@ -1,0 +1,136 @@
+"""No impossible answer: a number that is told lies inside its interval, and that inside what is physically possible.
+
+A number at the end of its range stands for something else, and where every interval holds that there is none of it, the
+flights do not say that there is any. Both are "not determined": no finding, no part of the fitted vehicle, and the
+others are fitted again without it. One rule for all effects, whoever found them.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+from crazyem.diagnosis.fitting.always import refine_base
+from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.naming.balance import Balance, by_balance
+from crazyem.diagnosis.naming.named import Named, Value
+from crazyem.diagnosis.naming.prune import left_out
+from crazyem.diagnosis.naming.steady import with_whole_torques
+from crazyem.diagnosis.naming.told import numbers_of
+from crazyem.diagnosis.naming.trials import Selection
+from crazyem.physics.effects.catalogue import CATALOGUE
+
+NEAR = 1e-9  # of a range, or of its larger end: a number that close to an end is at it
+
+
+def determined(effects: Sequence[Named], point: Point) -> tuple[tuple[Named, ...], dict[str, str]]:
+    """The effects that are determined, their intervals cut to what is possible; and of the others name and reason.
+
+    Args:
+        point: a model of the vehicle, whose file says which values are none of an effect.
+    """
+    kept, gone = [], {}
+    for effect in effects:
+        candidate = Candidate(effect.name, tuple(effect.chosen.items()), tuple(effect.parameters))
+        reason = not_determined(candidate, effect.parameters, point)
+        if reason:
+            gone[effect.name] = reason
+        else:
+            possible = {n: _cut(v, *candidate.range_of(n)) for n, v in effect.parameters.items()}
+            kept.append(replace(effect, parameters=possible))
+    return tuple(kept), gone
+
+
+def not_determined(candidate: Candidate, parameters: Mapping[str, Value], point: Point) -> str:
+    """Why an effect with these numbers is not determined; "" if it is."""
+    neutral = candidate.neutral(point)
+    for name, value in parameters.items():
+        low, high = candidate.range_of(name)
+        said = candidate.parameter(name).said
+        if not all(map(math.isfinite, (value.value, value.sd, *value.ci95))):
+            return f"not determined: its {said} has no finite size or interval"
+        if not low <= value.value <= high:
+            return f"not determined: its {said} would be {value.value:.3g}, and {low:.3g} to {high:.3g} is possible"
+        if at_an_end(value.value, (low, high), neutral[name]):
+            return f"not determined: its {said} is at the end of what is possible, {value.value:.3g}"
+        if not value.ci95[0] <= value.value <= value.ci95[1]:
+            return f"not determined: its {said} is outside of its own interval"
+    amplitude = CATALOGUE[candidate.effect].amplitude
+    saying = {n: v for n, v in parameters.items() if n == amplitude} or parameters
+    if saying and all(v.ci95[0] <= neutral[n] <= v.ci95[1] for n, v in saying.items()):
+        which = ", ".join(
+            f"{candidate.parameter(n).said} {v.ci95[0]:.3g} to {v.ci95[1]:.3g} {v.unit}".rstrip()
+            for n, v in saying.items()
+        )
+        return f"not determined: what is found is no surer than that there is none of it (95 %: {which})"
+    return ""
+
+
+def at_an_end(value: float, ends: tuple[float, float], neutral: float) -> bool:
+    """Whether a number is where nothing more of it is admitted; none of it is no end."""
+    near = NEAR * max(abs(e) for e in ends)
+    return min(abs(value - e) for e in ends) <= near and abs(value - neutral) > near
+
+
+def _cut(value: Value, low: float, high: float) -> Value:
+    """With the interval cut to a range that holds the value."""
+    return replace(value, ci95=(max(value.ci95[0], low), min(value.ci95[1], high)))
+
+
+def without_undetermined(
+    data: Data, selection: Selection, balance: Balance | None, say: Callable[[str], None]
+) -> tuple[Selection, Balance | None, dict[str, str]]:
+    """The selection fitted again without what is not determined, the weakest first; the balance then; names and
+    reasons.
+
+    Of an effect of several numbers one that is at its end (how high a load sits) is held at none of it, and the others
+    may be determined.
+    """
+    gone: dict[str, str] = {}
+    while True:
+        numbers = numbers_of(data, selection, balance)
+        evidence = [s.taken.evidence for s in selection.steps if s.taken]
+        doubted = [
+            (nats, candidate, found, reason)
+            for nats, candidate, found in zip(evidence, selection.accepted, numbers, strict=True)
+            if (reason := not_determined(candidate, found, selection.final))
+        ]
+        if not doubted:
+            return selection, balance, gone
+        _, candidate, found, reason = min(doubted, key=lambda entry: entry[0])
+        fewer = _without_ends(candidate, found, selection.final)
+        if fewer is not None:
+            say(f"  held at none, as it is at the end of what is possible: {set(candidate.free) - set(fewer.free)}")
+            selection = _held(data, selection, candidate, fewer)
+        else:
+            say(f"  left out again, {reason}: {candidate.label}")
+            gone[candidate.effect] = reason
+            fitted, accepted, steps = left_out(
+                data, selection.fitted, list(selection.accepted), list(selection.steps), candidate
+            )
+            selection = replace(
+                selection, final=fitted.point, fitted=fitted, accepted=tuple(accepted), steps=tuple(steps)
+            )
+        selection, balance = by_balance(data, with_whole_torques(data, selection))
+
+
+def _without_ends(candidate: Candidate, found: Mapping[str, Value], point: Point) -> Candidate | None:
+    """The candidate without the numbers that are at an end; None where none is, or nothing would be left to say
+    anything."""
+    neutral, amplitude = candidate.neutral(point), CATALOGUE[candidate.effect].amplitude
+    rest = tuple(
+        n for n in candidate.free if not at_an_end(found[n].value, candidate.range_of(n), float(neutral[n]))
+    )  # fmt: skip
+    if rest == candidate.free or not rest or (amplitude in candidate.free and amplitude not in rest):
+        return None
+    return replace(candidate, free=rest)
+
+
+def _held(data: Data, selection: Selection, candidate: Candidate, fewer: Candidate) -> Selection:
+    """The selection fitted again with fewer numbers of an effect free, the others as the vehicle file has them."""
+    point, neutral = selection.final, candidate.neutral(selection.final)
+    values = {n: v if n in fewer.free else neutral[n] for n, v in candidate.values(point).items()}
+    accepted = [fewer if c is candidate else c for c in selection.accepted]
+    fitted = refine_base(data, point.with_effects({candidate.effect: values}), accepted)
+    return replace(selection, final=fitted.point, fitted=fitted, accepted=tuple(accepted))
