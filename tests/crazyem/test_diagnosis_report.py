@@ -14,8 +14,11 @@ from hypothesis import strategies as st
 from made_diagnosis import document, pictures
 
 from crazyem.diagnosis.report import Series, write_report
-from crazyem.diagnosis.report.html import report, verdict
+from crazyem.diagnosis.report.html import report
 from crazyem.diagnosis.report.pictures import data_uri, thinned
+from crazyem.diagnosis.report.quantities import quantity, span
+from crazyem.diagnosis.report.text import text_of
+from crazyem.diagnosis.report.verdict import claim, verdict
 from crazyem.errors import UsageError
 
 VOID = {"meta", "img", "br", "line"}
@@ -64,13 +67,28 @@ def test_a_report_says_everything_that_the_document_has(tmp_path: Path) -> None:
     text, images = checked(path.read_text(encoding="utf-8"))
     assert len(images) == 3
     for wanted in (
-        "The model lacks thrust scale (or payload, which this flight cannot tell from it) (99 % sure) and linear drag",
-        "position error after 0.5 s falls from 0.77 m to 34 mm on flight it has not seen",
-        "0.6123 ± 0.0041", "0.604 to 0.621", "body z", "3.2 to 41 s", "812", "ground effect",
-        "cannot be told apart", "weigh the drone", "mass against thrust", "voltage was withheld", "500 ms",
+        "The model lacks thrust scale (or payload, which this flight cannot tell from it) (0.6123 ± 0.0041; 99 % sure) "
+        "and linear drag (x 11.2, y 10.8, z 2.1 mN s/m; 93 % sure).",
+        "Errors 0.5 s ahead on flight it has not seen: position 0.77 m to 34 mm, -96 %; velocity -96 %; "
+        "attitude ±0 %; body rate ±0 %.",
+        "0.6123 ± 0.0041", "0.6040 to 0.6205", "11.20 ± 0.90 mN s/m", "9.40 to 13.00 mN s/m", "body z", "3.2 to 41 s",
+        "-82 mN", "812", "ground effect", "battery sag with time", "cannot be told apart", "weigh the drone",
+        "mass against thrust", "voltage was withheld", "500 ms", "What was left free",
+        "input delay delay -2.60 ± 0.60 ms", "rotor clock delay, circle_fast_1.csv 12.3 ± 1.1 ms",
     ):  # fmt: skip
         assert wanted in text, wanted
     assert list(tmp_path.iterdir()) == [path]
+    for unwanted in ("nats", "p =", "_", "["):  # words, and numbers that people use
+        assert unwanted not in text.replace("circle_fast_1", "").replace("figure8_2", "").replace(" [", " "), unwanted
+
+
+def test_the_terminal_says_what_the_page_says() -> None:
+    page, _ = checked(report(document(), {}))
+    shown = text_of(document())
+    for line in shown.splitlines():
+        for part in re.split(r"  +|- ", line.strip()):
+            assert part.rstrip(":") in page, part
+    assert "What was left free" not in shown  # of the page alone, as the candidates are
 
 
 def test_every_picture_is_a_picture_with_its_data() -> None:
@@ -83,7 +101,8 @@ def test_every_picture_is_a_picture_with_its_data() -> None:
 
 
 def test_a_document_without_a_mismatch_says_so() -> None:
-    text, _ = checked(report({"mismatch": False, "effects": []}, {}))
+    text, _ = checked(report({**document(), "mismatch": False, "effects": []}, {}))
+    assert "Errors 0.5 s ahead" not in text
     assert "agree as far as this flight can show" in text
     assert "None of the effects of the catalogue is claimed" in text
 
@@ -110,20 +129,79 @@ def test_what_is_improbable_is_not_said_to_be_lacking(
     assert sentence in verdict({"mismatch": True, "effects": effects, "indistinguishable": groups})
 
 
+def test_a_model_that_predicts_something_worse_is_never_said_to_be_lacking() -> None:
+    found = document()
+    found["fit"]["held_out"]["worse"] = [
+        {"quantity": "attitude", "horizon_s": h, "standard_errors": 3.0} for h in (0.1, 0.5)
+    ]
+    said = claim(found)
+    assert said.startswith("Simulation and flight differ; the nearest explanation is thrust scale (or payload,")
+    assert said.endswith("that predicts attitude 0.1 and 0.5 s ahead worse than before on flight it has not seen.")
+    assert "lacks" not in said
+    assert "0.01 → 0.01 (±0 %) worse" in checked(report(found, {}))[0]
+    found["fit"]["held_out"], found["fit"]["train"]["worse"] = {}, [{"quantity": "velocity", "horizon_s": 0.1}]
+    assert "velocity 0.1 s ahead worse than before on the flight it was fitted to." in claim(found)
+    found["fit"]["held_out"] = {**document()["fit"]["held_out"], "worse": []}  # flight held out is what judges
+    assert claim(found).startswith("The model lacks")
+
+
+def test_a_voltage_that_was_not_recorded_is_in_the_sentence_where_that_is_all() -> None:
+    def sag(name: str) -> dict[str, Any]:
+        return {"name": "battery_sag", "confidence": 0.9, "parameters": {name: {"value": -0.004, "unit": "1/s"}}}
+
+    drag = {"name": "linear_drag", "confidence": 0.9, "parameters": {"x": {"value": 0.02, "unit": "N s/m"}}}
+    alone, measured, both = (
+        claim({"mismatch": True, "effects": e})
+        for e in ([sag("gain_per_second")], [sag("gain_per_volt")], [sag("gain_per_second"), drag])
+    )
+    assert alone.startswith(
+        "The model lacks battery sag with time (-0.004 1/s; 90 % sure); no battery voltage was recorded"
+    )
+    assert "no battery voltage" not in measured + both
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "sd", "said", "ends"),
+    [
+        (0.061772, "s", 0.002244, "61.8 ± 2.2 ms", "56.5 to 67.1 ms"),
+        (1.6161e-5, "kg m^2", 1.3e-7, "16.16 ± 0.13 mg m²", "15.90 to 16.40 mg m²"),
+        (0.0051, "kg", None, "5.1 g", "5 to 5.2 g"),
+        (-0.3, "1/V", 0.01, "-0.300 ± 0.010 1/V", "-0.320 to -0.280 1/V"),
+        (0.0, "m", 2e-5, "0 ± 20 µm", "-40 to 40 µm"),
+        (None, "m", None, "–", "– to 0.01 m"),
+        (12.0, "", 0.0, "12", "11 to 13"),
+    ],
+)
+def test_numbers_have_the_prefix_and_the_figures_that_suit_them(
+    value: float | None, unit: str, sd: float | None, said: str, ends: str
+) -> None:
+    both = {
+        "s": (0.056466, 0.067078), "kg m^2": (1.59e-5, 1.64e-5), "kg": (0.005, 0.0052), "1/V": (-0.32, -0.28),
+        "m": (None, 0.01) if value is None else (-4e-5, 4e-5), "": (11.0, 13.0),
+    }[unit]  # fmt: skip
+    assert quantity(value, unit, sd) == said
+    assert span(list(both), value, unit, sd).replace("10 mm", "0.01 m") == ends.replace("10 mm", "0.01 m")
+
+
 def test_a_simulated_flight_is_compared_signal_by_signal() -> None:
     signals = {"body_rate": {"rms": 0.1234, "unit": "rad/s", "largest": 1.5}}
     against = {"simulated": "sim.mcap", "seconds": 12.0, "signals": signals}
     text, _ = checked(report({**document(), "against": against}, {}))
-    assert "against sim.mcap" in text
-    assert "body rate 0.123 rad/s 1.5" in text
+    assert "sim.mcap: 12 s of the same mission" in text
+    assert "body rate 0.123 rad/s 1.5 rad/s" in text
 
 
 def test_what_is_left_over_is_told_by_place_or_as_nothing() -> None:
     nothing = report({**document(), "unexplained": {"found": False, "nats": 1.0, "where": []}}, {})
-    assert "Nothing beyond the noise." in checked(nothing)[0]
-    place = {"signal": "torque", "axis": "body x", "regime": "fast", "interval": [1.0, 2.0], "effect_size": 1e-4}
-    text, _ = checked(report({**document(), "unexplained": {"found": True, "nats": 80.0, "where": [place]}}, {}))
-    assert "nats 80 signal axis regime when size torque body x fast 1 to 2 s 0.0001" in text
+    assert "Nothing is left over after the fit beyond the noise." in checked(nothing)[0]
+    place = {"signal": "torque", "axis": "x", "regime": "fast", "interval": [1.0, 2.0], "effect_size": 9e-5, "sd": 2e-5,
+             "unit": "N m"}  # fmt: skip
+    left = {"found": True, "nats": 80.0, "explained_share": 0.5, "where": [place]}
+    text, _ = checked(report({**document(), "unexplained": left}, {}))
+    assert "signal axis regime when size torque x fast 1 to 2 s 90 ± 20 µN m" in text
+    assert "explain 50 % of the structure" in text
+    nobody = claim({**document(), "unexplained": left, "effects": []})
+    assert nobody.endswith("; the strongest of what is left is torque x, fast: 90 µN m.")
     closed = {**document()["fit"], "gap_closed": {"position": 0.987, "attitude": None}}
     assert "took away: position 99 %." in checked(report({**document(), "fit": closed}, {}))[0]
 
@@ -174,21 +252,32 @@ anything = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=6), inner, max_size=3),
     max_leaves=6,
 )
-KEYS = ("mismatch", "where", "effects", "indistinguishable", "would_separate", "unexplained", "fit", "not_identifiable")
+KEYS = (
+    "left_free",
+    "mismatch",
+    "where",
+    "effects",
+    "indistinguishable",
+    "would_separate",
+    "unexplained",
+    "fit",
+    "not_identifiable",
+)
 
 
 @given(st.dictionaries(st.sampled_from((*KEYS, "ranking", "notices", "recordings", "vehicle", "against")), anything))
 def test_no_document_breaks_it(found: dict[str, Any]) -> None:
     text = report(found, {})
     checked(text)
+    text_of(found)
     assert re.search(r"<h1>.+</h1>", text)
 
 
 @pytest.mark.parametrize(
     ("onset", "said"),
     [
-        (None, "lacks rotor fault of rotor 3 (48 % sure)."),
-        (7.5, "lacks rotor fault of rotor 3 since 7.50 s (48 % sure)."),
+        (None, "lacks rotor fault of rotor 3 (0.9; 48 % sure)."),
+        (7.5, "lacks rotor fault of rotor 3 since 7.50 s (0.9; 48 % sure)."),
     ],
 )
 def test_which_rotor_and_since_when_is_in_the_sentence(onset: float | None, said: str) -> None:

@@ -179,7 +179,7 @@ def candidates_for(
 
 def _impossible(effect: Effect, signals: frozenset[str], measured_speeds: bool) -> str:
     if effect.needs and not any(s in signals for s in effect.needs):
-        return f"needs {' or '.join(effect.needs)}, which the recording does not have"
+        return f"needs {' or '.join(effect.needs).replace('_', ' ')}, which the recording does not have"
     if effect.speed is not None and not measured_speeds:
         return "needs measured rotor speeds"
     if measured_speeds and (effect.commanded is not None or effect.name == "motor_lag"):

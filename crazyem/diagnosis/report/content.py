@@ -17,6 +17,9 @@ LIKELIHOOD = (
     "Gain is log-likelihood beyond the model without it: each unit makes the data e times as probable. Held out is the "
     "same on data that it was not fitted to."
 )
+AXES = (
+    "Axes are of the body (of velocities: of the world). The band in a picture is two standard deviations of nothing."
+)
 FREE = (
     "No file says these exactly, so every fit leaves them free about what is expected, by a usual standard deviation."
 )
@@ -88,7 +91,7 @@ def sections(document: Document) -> list[Section]:
     """All of them; some may have no part."""
     return [
         Section("What is missing from the model", (*_effects(document), *_groups(document))),
-        Section("Where simulation and flight part", tuple(_findings(document.get("where"))), "where"),
+        Section("Where simulation and flight part", tuple(_where(document)), "where"),
         Section("Before and after, open loop", tuple(_fit(document)), "fit"),
         Section("What remains unknown", tuple(_unknown(document))),
         Section("Against the simulated flight", tuple(_against(table(document.get("against"))))),
@@ -153,6 +156,11 @@ def _groups(document: Document) -> list[Items]:
     return [*_listed(groups, warn=True), *_listed(separate, title=title)]
 
 
+def _where(document: Document) -> list[Text | Table]:
+    found = _findings(document.get("where"))
+    return [*found, Text(AXES)] if found else []
+
+
 def _findings(found: Any, title: str = "") -> list[Table]:
     rows = []
     for entry in tables(found):
@@ -171,7 +179,8 @@ def _fit(document: Document) -> Iterable[Text | Table]:
         both = table(fit.get(part))
         before, spoilt = table(both.get("before")), {(e.get("quantity"), e.get("horizon_s")) for e in _plain(both)}
         starts = f", {before['starts']} starts" if number(before.get("starts")) else ""
-        yield from _horizons(before, table(both.get("after")), spoilt, words + starts)
+        after = both.get("after") if tables(document.get("effects")) else None
+        yield from _horizons(before, table(after), spoilt, words + starts)
         if both.get("vehicle"):
             yield from _horizons(before, table(both["vehicle"]), set(), f"{words}, by what belongs to the drone alone")
     closed = [(k, number(v)) for k, v in table(fit.get("gap_closed")).items()]
@@ -186,7 +195,7 @@ def _plain(both: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def _horizons(before: Mapping[str, Any], after: Mapping[str, Any], spoilt: set[Any], title: str) -> list[Table]:
-    """Rms errors at each horizon: before, after and the change."""
+    """Rms errors at each horizon: before, after and the change; those before alone where nothing changed."""
     ahead = [number(h) for h in items(before.get("horizon_s"))]
     rows = []
     for name in QUANTITIES:
@@ -198,7 +207,8 @@ def _horizons(before: Mapping[str, Any], after: Mapping[str, Any], spoilt: set[A
             change = f" ({per_cent(b / a - 1.0)})" if a and b is not None else ""
             bad = (name, horizon) in spoilt
             tone = "worse" if bad else "better" if a is not None and b is not None and b < a else ""
-            cells.append(Cell(f"{short(a)} → {short(b)}{change}{' worse' * bad}", tone))
+            arrow = f" → {short(b)}{change}{' worse' * bad}" if second else ""
+            cells.append(Cell(short(a) + arrow, tone))
         if cells:
             rows.append((f"{spaced(name)} [{one.get('unit', '')}]", *cells, *[""] * (len(ahead) - len(cells))))
     heads = ("rms error after", *(f"{1e3 * h:g} ms" if h is not None else "" for h in ahead))

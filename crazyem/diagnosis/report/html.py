@@ -5,14 +5,15 @@ Nothing in it is fetched from elsewhere, nothing in it runs, and every text of a
 
 import os
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from crazyem.diagnosis.report.content import facts, sections
 from crazyem.diagnosis.report.pictures import Series, data_uri
-from crazyem.diagnosis.report.verdict import Document, verdict
+from crazyem.diagnosis.report.verdict import Document, changes, claim
 from crazyem.errors import UsageError
 
 
@@ -39,15 +40,20 @@ def write_report(path: str | Path, document: Document, pictures: Mapping[str, Se
 
 def report(document: Document, pictures: Mapping[str, Series]) -> str:
     """The report as text."""
+    drawn = [(series.section, series.title, data_uri(series)) for series in pictures.values()]
+    return _template().render(
+        claim=claim(document), changes=changes(document), differs=bool(document.get("mismatch")),
+        facts=facts(document), sections=sections(document), drawn=drawn,
+    )  # fmt: skip
+
+
+@cache
+def _template() -> Template:
     environment = Environment(
         loader=PackageLoader("crazyem.diagnosis.report", "."), autoescape=True, finalize=_printable,
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    drawn = [(series.section, series.title, data_uri(series)) for series in pictures.values()]
-    return environment.get_template("page.html").render(
-        sentence=str(document.get("verdict") or verdict(document)), differs=bool(document.get("mismatch")),
-        facts=facts(document), sections=sections(document), drawn=drawn,
-    )  # fmt: skip
+    return environment.get_template("page.html")
 
 
 def _printable(value: Any) -> Any:

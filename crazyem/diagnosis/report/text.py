@@ -11,7 +11,7 @@ MOST_ROWS = 12  # of a table
 
 def text_of(document: Document) -> str:
     """The diagnosis for a terminal; some parts are left to the page."""
-    lines = [str(document.get("verdict") or verdict(document))]
+    lines = [verdict(document)]
     for section in sections(document):
         if section.page or not section.parts:
             continue

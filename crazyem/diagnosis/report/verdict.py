@@ -25,10 +25,17 @@ Document = Mapping[str, Any]
 
 
 def verdict(document: Document) -> str:
-    """The result: effects with size and probability, and by how much each of the four errors changes.
+    """What is missing, and by how much each of the four errors changes."""
+    return " ".join(filter(None, (claim(document), changes(document))))
 
-    Where the model predicts something worse than before, by more than chance, no effect is said to be missing.
+
+def claim(document: Document) -> str:
+    """Which effects are missing, with size and probability.
+
+    Where the model predicts something worse than before, by more than chance, none is said to be missing.
     """
+    if document.get("verdict"):
+        return str(document["verdict"])
     if not document.get("mismatch"):
         return "Simulation and flight agree as far as this flight can show: nothing is missing that it could reveal."
     effects, groups = tables(document.get("effects")), alike(document)
@@ -36,22 +43,24 @@ def verdict(document: Document) -> str:
         return f"Simulation and flight differ, and none of the known effects explains it{_strongest(document)}."
     hardly = [e for e in effects if _hardly(e, groups)]
     lacks = joined([_named(e, groups) for e in effects if e not in hardly])
-    nearest, changed = joined([_named(e, groups) for e in hardly]), changes(document)
-    spoilt = worse(document)
+    nearest, spoilt = joined([_named(e, groups) for e in hardly]), worse(document)
     if spoilt:
         explanation = joined([_named(e, groups) for e in effects])
         return (
-            f"Simulation and flight differ; the nearest explanation is {explanation}, but it makes the prediction of "
-            f"{spoilt} worse.{changed}"
+            f"Simulation and flight differ; the nearest explanation is {explanation}, but that predicts {spoilt} worse "
+            f"than before {_judge(document)[1]}."
         )
     if not lacks:
-        return f"Simulation and flight differ, and none of the known effects explains it; nearest: {nearest}.{changed}"
+        return f"Simulation and flight differ, and none of the known effects explains it; nearest: {nearest}."
     more = f", and something else, of which the nearest is {nearest}" if nearest else ""
-    return f"The model lacks {lacks}{more}{_remark(effects)}.{changed}"
+    return f"The model lacks {lacks}{more}{_remark(effects)}."
 
 
 def changes(document: Document) -> str:
-    """How the four errors at the longest horizon change, as a sentence; "" where nothing was predicted."""
+    """How the four errors at the longest horizon change, as a sentence; "" where no effect was found or nothing was
+    predicted."""
+    if document.get("verdict") or not document.get("mismatch") or not tables(document.get("effects")):
+        return ""
     part, words = _judge(document)
     before, after = table(part.get("before")), table(part.get("after"))
     said: list[str] = []
@@ -63,12 +72,12 @@ def changes(document: Document) -> str:
         sizes = f" {quantity(one, unit)} to {quantity(two, unit)}," if not said else ""
         said.append(f"{spaced(name)}{sizes} {per_cent(two / one - 1.0)}")
     horizon = _last(before.get("horizon_s"))
-    return f" Errors {short(horizon)} s ahead {words}: {'; '.join(said)}." if said else ""
+    return f"Errors {short(horizon)} s ahead {words}: {'; '.join(said)}." if said else ""
 
 
 def worse(document: Document) -> str:
     """What is predicted worse than before, in words; "" if nothing is."""
-    part, words = _judge(document)
+    part, _ = _judge(document)
     horizons: dict[str, list[str]] = {}
     for entry in tables(part.get("worse")):
         horizons.setdefault(spaced(entry.get("quantity", "")), []).append(short(entry.get("horizon_s")))
@@ -138,7 +147,7 @@ def _named(effect: Mapping[str, Any], groups: Iterable[Sequence[str]]) -> str:
     group = next((g for g in groups if name in g and set(g) != {name}), None)
     if group:
         others = joined([said_of(g) for g in group if g != name], "or")
-        return f"{words_of(effect)}{how} (or {others}, which this flight cannot tell from it)"
+        return f"{words_of(effect)} (or {others}, which this flight cannot tell from it){how}"
     return words_of(effect) + how
 
 
