@@ -186,7 +186,7 @@ def _words(candidate: Candidate) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class _Compared:
+class Compared:
     """Open-loop errors of one recording before and after, by the vehicle alone where that is not what flew, and the
     lengths of errors by window."""
 
@@ -198,20 +198,20 @@ class _Compared:
         return [errors(run, self.at) for run in self.runs]
 
 
-def _compared(recordings: Sequence[Recording], vehicles: Sequence[Vehicle]) -> list[_Compared]:
+def _compared(recordings: Sequence[Recording], vehicles: Sequence[Vehicle]) -> list[Compared]:
     """Of every recording that has whole states, by each of the vehicles over the same windows."""
     found = []
     for recording in recordings:
         try:
             shown = [recorded(recording, vehicle) for vehicle in vehicles]
             at = windows(shown[0])
-            found.append(_Compared(at, tuple(open_loop(one, at) for one in shown)))
+            found.append(Compared(at, tuple(open_loop(one, at) for one in shown)))
         except DataError:
             continue
     return found
 
 
-def _before_after(compared: Sequence[_Compared]) -> dict[str, Any]:
+def _before_after(compared: Sequence[Compared]) -> dict[str, Any]:
     """Errors before and after, and what is worse; by the vehicle alone, where that is not what flew."""
     if not compared:
         return {}
@@ -241,13 +241,13 @@ def _gap_closed(errors_of: Mapping[str, Any]) -> dict[str, float | None]:
     return closed
 
 
-def pictures_of(diagnosis: Diagnosis, compared: Sequence[_Compared]) -> dict[str, Series]:
+def pictures_of(diagnosis: Diagnosis, compared: Sequence[Compared]) -> dict[str, Series]:
     """What is accused, in time, and how the errors of open-loop runs change."""
     found = accused_pictures(diagnosis, compared[0] if compared else None)
     return found | (error_pictures(compared[0]) if compared else {})
 
 
-def accused_pictures(diagnosis: Diagnosis, compared: _Compared | None) -> dict[str, Series]:
+def accused_pictures(diagnosis: Diagnosis, compared: Compared | None) -> dict[str, Series]:
     """Every signal that is accused, the strongest first, before and after: what the model lacks of it in time.
 
     Of a rate, whose error is no series of its own, the error a sample ahead, else the torque that turns about its axis.
@@ -282,7 +282,7 @@ def _missing(diagnosis: Diagnosis, name: str, finding: Finding) -> Series | None
     )  # fmt: skip
 
 
-def _rate_error(compared: _Compared | None, finding: Finding) -> Series | None:
+def _rate_error(compared: Compared | None, finding: Finding) -> Series | None:
     """The error of a body rate a sample ahead, about one axis."""
     if compared is None or finding.signal != "body_rate" or finding.axis not in "xyz":
         return None
@@ -292,7 +292,7 @@ def _rate_error(compared: _Compared | None, finding: Finding) -> Series | None:
     return Series(title, compared.at.times[:, 1], {"before": before, "after": after}, y_label="rad/s")
 
 
-def error_pictures(compared: _Compared) -> dict[str, Series]:
+def error_pictures(compared: Compared) -> dict[str, Series]:
     """How far open-loop runs part from what was recorded, of each quantity."""
     before, after = (error_lengths(run, compared.at) for run in compared.runs[:2])
     title = f"error {compared.at.horizons[-1]:g} s ahead"

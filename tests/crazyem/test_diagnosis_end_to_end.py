@@ -19,7 +19,9 @@ from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, starting_point
 from crazyem.diagnosis.fitting.model import Noise, Point
 from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.prediction.horizon import UNITS
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.motion import own_values
 from crazyem.recordings import open_recording
 from crazyem.recordings.mcap.signals import write_recording
 from crazyem.recordings.recording import Recording
@@ -76,6 +78,7 @@ def schema(document: dict[str, Any], *, held_out: bool) -> None:
                 assert set(parameter) == {"value", "unit", "sd", "ci95"}
                 assert parameter["unit"] == known[name]
                 assert parameter["ci95"][0] <= parameter["value"] <= parameter["ci95"][1]
+        assert possible(effect) == []
     assert all(isinstance(n, TEXT) for group in document["indistinguishable"] for n in group)
     assert all(isinstance(t, TEXT) for t in document["would_separate"])
     for one in document["unexplained"]["where"]:
@@ -85,7 +88,26 @@ def schema(document: dict[str, Any], *, held_out: bool) -> None:
         horizon_errors(document["fit"][part]["before"])
         horizon_errors(document["fit"][part]["after"])
     assert isinstance(document["not_identifiable"], list)
+    assert all({"quantity", "horizon_s"} <= set(w) for part in document["fit"].values() for w in part.get("worse", ()))
+    assert {(e["words"], e["parameter"]) for e in document["left_free"]} >= {("input delay", "delay")}
     finite(document)
+
+
+def possible(effect: dict[str, Any]) -> list[str]:
+    """What is wrong with the numbers of an effect of a document: outside their range, at its end, or perhaps none."""
+    wrong, holds_none = [], []
+    for p in CATALOGUE[effect["name"]].parameters:
+        told = effect["parameters"].get(p.name, {"chosen": True})
+        if told.get("chosen"):
+            continue
+        none = own_values(DRONE).get(effect["name"], {}).get(p.name, 0.0) if p.neutral != p.neutral else p.neutral
+        low, high = told["ci95"]
+        if not p.low <= low <= told["value"] <= high <= p.high:
+            wrong.append(f"{p.name}: {told['value']} ({low} to {high})")
+        if told["value"] in (p.low, p.high) and told["value"] != none:
+            wrong.append(f"{p.name} at its end")
+        holds_none.append(low <= none <= high)
+    return wrong + ["it may be none"] * (bool(holds_none) and all(holds_none))
 
 
 def finite(value: Any) -> None:
@@ -113,7 +135,10 @@ def test_drag_is_named_measured_and_taken_away(dragged: list[Recording]) -> None
     document, pictures = document_of(found, dragged[:1], dragged[1:])
     schema(document, held_out=True)
     json.dumps(document, allow_nan=False)
-    assert pictures
+    accused = {f"{f['signal']} {f['axis']}" for f in document["where"]}
+    assert accused
+    assert {n for n in pictures if not n.startswith("error")} == accused or len(accused) > 4
+    assert {n for n in pictures if n.startswith("error")} == {f"error {q}" for q in UNITS}
     both = document["fit"]["held_out"]
     assert both["after"]["velocity"]["rms"][1] < 0.85 * both["before"]["velocity"]["rms"][1]
 

@@ -10,7 +10,16 @@ from flown import DRONE, START, G, fly, recording_of, smooth_thrust, speeds
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.prediction.horizon import HORIZONS, errors, horizon_errors, lengths, open_loop, windows
+from crazyem.diagnosis.prediction.horizon import (
+    HORIZONS,
+    UNITS,
+    errors,
+    horizon_errors,
+    lengths,
+    open_loop,
+    windows,
+    worse,
+)
 from crazyem.diagnosis.prediction.predict import Recorded, recorded
 from crazyem.errors import DataError
 from crazyem.recordings import open_recording
@@ -124,3 +133,42 @@ def test_the_numbers_of_real_flights(shared_recordings: Path) -> None:
     at = windows(shown)
     found = errors(open_loop(shown, at, measured_attitude=True), at)
     assert found.rms["position"][2] == pytest.approx(0.77, abs=0.05)
+
+
+def lengths_of(length: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """All quantities with errors of these lengths (n,) at every horizon."""
+    return dict.fromkeys(UNITS, np.repeat(length[:, None], len(HORIZONS), axis=1))
+
+
+def test_worse_is_what_grows_by_more_than_chance_and_visibly() -> None:
+    rng = np.random.default_rng(0)
+    before = rng.uniform(0.5, 1.5, 400)
+    grown = before * 1.1
+    assert {(w.quantity, w.horizon) for w in worse([(lengths_of(before), lengths_of(grown))])} == {
+        (n, h) for n in UNITS for h in HORIZONS
+    }
+    assert worse([(lengths_of(grown), lengths_of(before))]) == ()
+    assert worse([(lengths_of(before), lengths_of(before * 1.001))]) == ()  # sure, and nothing that anyone sees
+    assert worse([(lengths_of(before), lengths_of(before + rng.normal(0.0, 0.01, 400)))]) == ()
+    assert worse([(lengths_of(before[:4]), lengths_of(grown[:4]))]) == ()  # too few to know what chance does
+    assert worse([]) == ()
+
+
+def test_windows_that_overlap_count_as_one() -> None:
+    """Starts every 0.1 s: what is 0.5 s ahead of five of them is the same half second."""
+    rng = np.random.default_rng(1)
+    alarms = dict.fromkeys(HORIZONS, 0)
+    for _ in range(300):
+        change = np.repeat(rng.normal(0.0, 0.1, 30), 5)
+        for one in worse([(lengths_of(np.ones(150)), lengths_of(np.sqrt(1.0 + change)))]):
+            alarms[one.horizon] += one.quantity == "position"
+    assert alarms[0.5] < 0.06 * 300 < alarms[0.1]
+
+
+def test_what_leaves_the_range_of_numbers_is_worse_and_what_is_not_measured_is_not() -> None:
+    before, after = lengths_of(np.ones(50)), lengths_of(np.ones(50))
+    after["attitude"] = np.full((50, len(HORIZONS)), np.inf)
+    after["velocity"] = before["velocity"] = np.full((50, len(HORIZONS)), np.nan)
+    found = worse([(before, after)])
+    assert {w.quantity for w in found} == {"attitude"}
+    assert found[0].to_json() == {"quantity": "attitude", "horizon_s": 0.01, "standard_errors": None}

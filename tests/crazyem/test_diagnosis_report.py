@@ -4,6 +4,7 @@ import base64
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -13,6 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_diagnosis import document, pictures
 
+from crazyem.diagnosis.document import Compared, accused_pictures
+from crazyem.diagnosis.locating.locate import Disturbance, Finding, Located
+from crazyem.diagnosis.naming.unexplained import Unexplained
+from crazyem.diagnosis.prediction.horizon import HORIZONS, Windows
 from crazyem.diagnosis.report import Series, write_report
 from crazyem.diagnosis.report.html import report
 from crazyem.diagnosis.report.pictures import data_uri, thinned
@@ -20,6 +25,7 @@ from crazyem.diagnosis.report.quantities import quantity, span
 from crazyem.diagnosis.report.text import text_of
 from crazyem.diagnosis.report.verdict import claim, verdict
 from crazyem.errors import UsageError
+from crazyem.physics.effects.catalogue import CATALOGUE
 
 VOID = {"meta", "img", "br", "line"}
 HOSTILE = "<script>alert('x')</script>\x1b[31m & \"quoted\" $\\frac{1}"
@@ -287,3 +293,54 @@ def test_which_rotor_and_since_when_is_in_the_sentence(onset: float | None, said
     grouped = verdict({"mismatch": True, "effects": [fault], "indistinguishable": [["rotor_fault", "payload"]]})
     assert "of rotor 3" in grouped
     assert "(or payload, which this flight cannot tell from it)" in grouped
+
+
+def finding(signal: str, axis: str, unit: str, variable: str = "") -> Finding:
+    return Finding(signal, axis, "somewhere", variable, (3.0, 5.0), 1e-3, 1e-4, unit, 40.0, 1e-9)
+
+
+def test_whatever_is_accused_is_pictured_the_strongest_first() -> None:
+    """Attitude z was accused once, and six plots showed forces and torques."""
+    names = tuple(f"{s} {a}" for s in ("force", "torque", "velocity", "attitude") for a in "xyz") + ("force world x",)
+    time = np.linspace(0.0, 10.0, 11)
+    series = np.outer(np.sin(time), np.ones(len(names)))
+    missing = Disturbance(time, names, ("rad",) * len(names), series, np.full_like(series, 0.01))
+    accused = [
+        finding("attitude", "z", "rad", "time"), finding("attitude", "z", "rad"), finding("force", "world x", "N"),
+        finding("body_rate", "y", "rad/s", "frequency"), finding("velocity", "x", "m/s"), finding("torque", "x", "N m"),
+    ]  # fmt: skip
+    before = Located((accused[0], accused[2]), (missing,), {})
+    found: Any = SimpleNamespace(
+        before=before, after=before, effects=(), mismatch=True, unexplained=Unexplained(tuple(accused), 0.0)
+    )
+    drawn = accused_pictures(found, None)
+    assert list(drawn) == ["attitude z", "force world x", "body_rate y", "velocity x"]
+    assert drawn["attitude z"].shaded == ((3.0, 5.0),)
+    assert drawn["attitude z"].title == "Missing from the model: attitude z"
+    assert drawn["body_rate y"].title == "Missing from the model: torque y"  # no states, so what turns it is shown
+    assert set(drawn["force world x"].lines) == {"before"}
+    run = np.zeros((4, 3, 13))
+    run[:, 0, 11] = 0.5
+    at = Windows(np.arange(4), np.arange(16.0).reshape(4, 4), np.zeros((4, 3, 13)), HORIZONS)
+    shown = accused_pictures(found, Compared(at, (run, 0.1 * run)))["body_rate y"]
+    assert shown.title == "Error of the body rate y, 10 ms ahead"
+    assert list(shown.lines["before"]) == [0.5] * 4
+    agreeing: Any = SimpleNamespace(**{**vars(found), "mismatch": False, "unexplained": Unexplained((), 0.0)})
+    assert accused_pictures(agreeing, None) == {}
+
+
+def test_effects_and_parameters_have_words_without_program_text() -> None:
+    for effect in CATALOGUE.values():
+        values = {p.name: (p.chosen or (1.0,))[0] for p in effect.parameters}
+        for text in (effect.said({}), effect.said(values), *(p.said for p in effect.parameters)):
+            assert re.fullmatch(r"[a-zA-Z0-9. ]+", text), text
+    assert CATALOGUE["measurement_delay"].said({"delay": 0.01, "streams": ("state", "gyro")}) == (
+        "measurement delay of the state estimate and gyro"
+    )
+
+
+def test_the_report_names_no_effect() -> None:
+    for path in (Path(__file__).parents[2] / "crazyem" / "diagnosis" / "report").iterdir():
+        if path.suffix in (".py", ".html"):
+            text = path.read_text(encoding="utf-8")
+            assert not [n for n in CATALOGUE if "_" in n and re.search(rf"\b({n}|{n.replace('_', ' ')})\b", text)]

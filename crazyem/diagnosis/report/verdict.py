@@ -81,9 +81,7 @@ def worse(document: Document) -> str:
     horizons: dict[str, list[str]] = {}
     for entry in tables(part.get("worse")):
         horizons.setdefault(spaced(entry.get("quantity", "")), []).append(short(entry.get("horizon_s")))
-    return joined([f"{name} {joined(ahead)} s ahead" for name, ahead in horizons.items()]) + f" {words}" * bool(
-        horizons
-    )
+    return joined([f"{name} {joined(ahead)} s ahead" for name, ahead in horizons.items()])
 
 
 def alike(document: Document) -> list[list[str]]:
