@@ -301,7 +301,7 @@ def finding(signal: str, axis: str, unit: str, variable: str = "") -> Finding:
 
 def test_whatever_is_accused_is_pictured_the_strongest_first() -> None:
     """Attitude z was accused once, and six plots showed forces and torques."""
-    names = tuple(f"{s} {a}" for s in ("force", "torque", "velocity", "attitude") for a in "xyz") + ("force world x",)
+    names = (*(f"{s} {a}" for s in ("force", "torque", "velocity", "attitude") for a in "xyz"), "force world x")
     time = np.linspace(0.0, 10.0, 11)
     series = np.outer(np.sin(time), np.ones(len(names)))
     missing = Disturbance(time, names, ("rad",) * len(names), series, np.full_like(series, 0.01))
