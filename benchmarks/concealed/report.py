@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.vehicle import load_vehicle
 
 from .ideal import held_out_error, ideal_nats, ideal_nats_of_each
@@ -61,7 +62,8 @@ def _know(study: Study, case: str, truth: Mapping[str, Any], *, held_out: bool) 
 
 
 def _with_effects(vehicle: str, effects: dict[str, dict[str, Any]]) -> str:
-    """A vehicle file with the effects of the truth."""
+    """A vehicle file with the effects of the truth, as far as these belong to a vehicle."""
+    effects = {n: t for n, t in effects.items() if CATALOGUE[n].belongs_to == "vehicle"}
     tables = [
         f"\n[effects.{n}]\n" + "".join(f"{k} = {json.dumps(v)}\n" for k, v in t.items()) for n, t in effects.items()
     ]

@@ -107,7 +107,8 @@ def diagnose(
     selection, balance = by_balance(data, with_whole_torques(data, selection))
     judges = asked.held_out or asked.recordings
     selection = without_what_misleads(data, selection, asked.vehicle, judges, withhold=withhold, say=say)
-    selection, balance, unsure = without_undetermined(data, selection, balance, say)
+    besides = {c.effect for c in asked.besides}
+    selection, balance, unsure = without_undetermined(data, selection, balance, say, besides=besides)
     before, after = _located(data, selection, say)
     place = depends_on_place(data, apart, selection.final)
     remains = unexplained(data, selection, after, apart)
@@ -128,7 +129,9 @@ def diagnose(
     effects, impossible = determined(strongest_first(told.effects, beside), selection.final)
     as_flown = _with_effects(asked.vehicle, selection, [e for e in effects if any(e.name == b.name for b in beside)])
     as_flown = with_its_thrust(as_flown, data, selection.final, selection.accepted)
-    as_flown = _restored(left_as_trim(chosen.asked.flights, as_flown, remains, workers), asked.vehicle, impossible)
+    as_flown = _restored(
+        left_as_trim(chosen.asked.flights, as_flown, remains, workers), asked.vehicle, impossible.keys() - besides
+    )
     of_recordings = {e.fitted_as or e.name for e in effects if e.of_recording}
     left_out = {**left_out, **unsure, **impossible}
     return Diagnosis(

@@ -6,7 +6,7 @@ others are fitted again without it. One rule for all effects, whoever found them
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 from crazyem.diagnosis.fitting.always import refine_base
@@ -79,13 +79,18 @@ def _cut(value: Value, low: float, high: float) -> Value:
 
 
 def without_undetermined(
-    data: Data, selection: Selection, balance: Balance | None, say: Callable[[str], None]
+    data: Data,
+    selection: Selection,
+    balance: Balance | None,
+    say: Callable[[str], None],
+    *,
+    besides: Collection[str] = (),
 ) -> tuple[Selection, Balance | None, dict[str, str]]:
     """The selection fitted again without what is not determined, the weakest first; the balance then; names and
     reasons.
 
     Of an effect of several numbers one that is at its end (how high a load sits) is held at none of it, and the others
-    may be determined.
+    may be determined. What was looked for `besides`, to be written whatever it is (a trim), stays in the selection.
     """
     gone: dict[str, str] = {}
     while True:
@@ -94,7 +99,7 @@ def without_undetermined(
         doubted = [
             (nats, candidate, found, reason)
             for nats, candidate, found in zip(evidence, selection.accepted, numbers, strict=True)
-            if (reason := not_determined(candidate, found, selection.final))
+            if candidate.effect not in besides and (reason := not_determined(candidate, found, selection.final))
         ]
         if not doubted:
             return selection, balance, gone
