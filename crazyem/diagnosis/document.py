@@ -276,8 +276,9 @@ def _missing(diagnosis: Diagnosis, name: str, finding: Finding) -> Series | None
     if diagnosis.effects:
         lines["after"] = factor * after.value[:, k]
     here = finding.variable == "time" and len(diagnosis.before.disturbances) == 1
+    title = f"Missing from the model: {name.replace('_', ' ')} (band: two standard deviations)"
     return Series(
-        f"Missing from the model: {name.replace('_', ' ')}", before.time, lines, y_label=unit,
+        title, before.time, lines, y_label=unit,
         level=2.0 * factor * float(np.median(before.sd[:, k])), shaded=(finding.interval,) if here else (),
     )  # fmt: skip
 

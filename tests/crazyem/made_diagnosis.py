@@ -116,8 +116,6 @@ def pictures() -> dict[str, Series]:
     force["z"] = force["z"] - 0.08
     short = time[(time > 10) & (time < 15)]
     measured = np.sin(2 * short)
-    regimes = ["slow", "1 to 2 m/s", "low", "high", "full battery", "empty battery"]
-    sizes = {"x": np.array([-1, -11, 1, 0, -1, 2]) / 1e3, "z": np.array([-80, -82, -70, -81, -60, -100]) / 1e3}
     ahead = {
         "measured": measured,
         "before": measured + 0.4 * np.sin(5 * short),
@@ -125,9 +123,7 @@ def pictures() -> dict[str, Series]:
     }
     return {
         "force": Series("Force that the model lacks", time, force, y_label="force [N], body", shaded=[(3.2, 41.0)]),
-        "regime": Series(
-            "Size of the force by regime", regimes, sizes, y_label="mean force [N]", kind="bar", level=0.004
-        ),
+        "turning": Series("Torque that the model lacks", time, {"x": force["x"]}, y_label="torque", level=0.004),
         "overlay": Series(
             "x, half a second ahead, on flight kept apart", short, ahead, y_label="position x [m]", section="fit"
         ),

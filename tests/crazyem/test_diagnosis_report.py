@@ -223,8 +223,7 @@ def test_text_of_recordings_is_escaped() -> None:
         return HOSTILE if isinstance(value, str) else value
 
     series = Series(HOSTILE, np.arange(5.0), {HOSTILE: np.arange(5.0), "b": np.ones(5)}, HOSTILE, HOSTILE)
-    bars = Series(HOSTILE, [HOSTILE, "b"], {HOSTILE: np.ones(2)}, kind="bar")
-    text = report(poisoned(document()), {HOSTILE: series, "bars": bars})
+    text = report(poisoned(document()), {HOSTILE: series, "again": series})
     assert "<script" not in text
     assert "\x1b" not in text
     shown, images = checked(text)
@@ -316,8 +315,10 @@ def test_whatever_is_accused_is_pictured_the_strongest_first() -> None:
     drawn = accused_pictures(found, None)
     assert list(drawn) == ["attitude z", "force world x", "body_rate y", "velocity x"]
     assert drawn["attitude z"].shaded == ((3.0, 5.0),)
-    assert drawn["attitude z"].title == "Missing from the model: attitude z"
-    assert drawn["body_rate y"].title == "Missing from the model: torque y"  # no states, so what turns it is shown
+    assert drawn["attitude z"].title == "Missing from the model: attitude z (band: two standard deviations)"
+    assert drawn["body_rate y"].title.startswith(
+        "Missing from the model: torque y"
+    )  # no states, so what turns it is shown
     assert set(drawn["force world x"].lines) == {"before"}
     run = np.zeros((4, 3, 13))
     run[:, 0, 11] = 0.5

@@ -1,4 +1,4 @@
-"""Pictures of a report: series as lines or bars, drawn by matplotlib (imported on first use) into data URIs."""
+"""Pictures of a report: series as lines, drawn by matplotlib (imported on first use) into data URIs."""
 
 import base64
 import io
@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_POINTS = 1500  # of a line; more cannot be seen
-MOST_BARS = 40
 COLORS = ("#2f6f9f", "#d1603d", "#5a9367", "#8a6bbf", "#b58b00", "#4a4a4a")
 ROLES = {"measured": "#222222", "recorded": "#222222", "before": "#d1603d", "after": "#2f6f9f"}
 
@@ -23,11 +22,10 @@ class Series:
 
     Attributes:
         title: what is to be seen.
-        x: (n,) numbers, or n names for bars.
+        x: (n,) numbers.
         lines: label -> (n,) values. Labels "measured", "before" and "after" have colours of their own.
         x_label, y_label: with the unit.
         section: "where" (the mismatch) or "fit" (before and after).
-        kind: "line" or "bar".
         shaded: intervals of x to be marked.
         level: a value that counts as nothing (drawn as a band around 0), 0 for none.
     """
@@ -38,7 +36,6 @@ class Series:
     x_label: str = "time [s]"
     y_label: str = ""
     section: str = "where"
-    kind: str = "line"
     shaded: Sequence[tuple[float, float]] = field(default_factory=tuple)
     level: float = 0.0
 
@@ -63,15 +60,10 @@ def data_uri(series: Series) -> str:
     }  # fmt: skip
     with warnings.catch_warnings(), context(style):
         warnings.simplefilter("ignore")  # letters that the font has not
-        bars = series.kind == "bar"
-        height = 0.7 + 0.26 * min(len(series.x), MOST_BARS) if bars else 2.3
-        figure = Figure(figsize=(7.4, max(1.6, height)), layout="constrained")
+        figure = Figure(figsize=(7.4, 2.3), layout="constrained")
         canvas = FigureCanvasSVG(figure)
         axes = figure.add_subplot()
-        if bars:
-            _bars(axes, series, lines)
-        else:
-            _lines(axes, series, lines)
+        _lines(axes, series, lines)
         if len(lines) > 1:
             axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.02), frameon=False, handlelength=1.2)
         buffer = io.BytesIO()
@@ -93,24 +85,6 @@ def _lines(axes: Any, series: Series, lines: Mapping[str, NDArray]) -> None:
     axes.set_xlabel(_text(series.x_label))
     axes.set_ylabel(_text(series.y_label))
     axes.margins(x=0.01)
-
-
-def _bars(axes: Any, series: Series, lines: Mapping[str, NDArray]) -> None:
-    names = [_text(str(name)) for name in series.x][:MOST_BARS]
-    place = np.arange(len(names))
-    thick = 0.8 / max(len(lines), 1)
-    for k, (label, values) in enumerate(lines.items()):
-        kept = np.where(np.isfinite(values), values, 0.0)[:MOST_BARS]
-        axes.barh(
-            place + (k - (len(lines) - 1) / 2) * thick, kept, thick * 0.9, color=_color(label, k), label=_text(label)
-        )
-    if series.level > 0:
-        axes.axvspan(-series.level, series.level, color="#e9eef2", linewidth=0, zorder=0)
-    axes.set_yticks(place, names)
-    axes.invert_yaxis()
-    axes.grid(axis="y", visible=False)
-    axes.axvline(0.0, color="#999999", linewidth=0.8)
-    axes.set_xlabel(_text(series.y_label))
 
 
 def _color(label: str, k: int) -> str:
