@@ -133,7 +133,8 @@ def diagnose(
         left_as_trim(chosen.asked.flights, as_flown, remains, workers), asked.vehicle, impossible.keys() - besides
     )
     of_recordings = {e.fitted_as or e.name for e in effects if e.of_recording}
-    left_out = {**left_out, **unsure, **impossible}
+    for name, reason in {**unsure, **impossible}.items():
+        left_out[name] = "; ".join(filter(None, (reason, left_out.get(name))))
     return Diagnosis(
         vehicle=vehicle,
         fitted_vehicle=_restored(as_flown, asked.vehicle, of_recordings),

@@ -281,8 +281,8 @@ def test_no_document_breaks_it(found: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("onset", "said"),
     [
-        (None, "lacks rotor fault of rotor 3 (0.9; 48 % sure)."),
-        (7.5, "lacks rotor fault of rotor 3 since 7.50 s (0.9; 48 % sure)."),
+        (None, "lacks rotor fault of rotor 3 (thrust 0.9; 48 % sure)."),
+        (7.5, "lacks rotor fault of rotor 3 since 7.50 s (thrust 0.9; 48 % sure)."),
     ],
 )
 def test_which_rotor_and_since_when_is_in_the_sentence(onset: float | None, said: str) -> None:

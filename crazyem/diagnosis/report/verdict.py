@@ -15,6 +15,7 @@ from crazyem.diagnosis.report.quantities import (
     tables,
 )
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.effect import Parameter
 
 # Confidence below which a name that stands for no group is said to be the nearest, not what is lacking. Of 18 such
 # names in 1899 simulated drones (seeds 2038 to 2043) two were right.
@@ -114,8 +115,9 @@ def sizes_of(effect: Mapping[str, Any]) -> str:
     found = {str(n): v for n, v in table(effect.get("parameters")).items() if isinstance(v, Mapping)}
     fitted = {n: v for n, v in found.items() if not v.get("chosen") and number(v.get("value")) is not None}
     if len(fitted) == 1:
-        (only,) = fitted.values()
-        return quantity(only["value"], only.get("unit", ""), only.get("sd"))
+        ((name, only),) = fitted.items()
+        words = next((p.words for p in _parameters(effect) if p.name == name), "")
+        return f"{words} {quantity(only['value'], only.get('unit', ''), only.get('sd'))}".lstrip()
     parts = []
     for unit in dict.fromkeys(str(v.get("unit", "")) for v in fitted.values()):
         mine = {n: number(v["value"]) or 0.0 for n, v in fitted.items() if str(v.get("unit", "")) == unit}
@@ -153,12 +155,17 @@ def _remark(effects: Sequence[Mapping[str, Any]]) -> str:
     """What goes with these findings where they are all there is."""
     remarks = []
     for effect in effects:
-        known = CATALOGUE.get(str(effect.get("name")))
-        fitted = [p for p in known.parameters if p.name in table(effect.get("parameters"))] if known else []
+        fitted = [p for p in _parameters(effect) if p.name in table(effect.get("parameters"))]
         if not fitted or not all(p.remark for p in fitted):
             return ""
         remarks += [p.remark for p in fitted]
     return "; " + joined(list(dict.fromkeys(remarks)))
+
+
+def _parameters(effect: Mapping[str, Any]) -> tuple[Parameter, ...]:
+    """Of an effect of a document, as the catalogue has them; none where it does not know the effect."""
+    known = CATALOGUE.get(str(effect.get("name")))
+    return known.parameters if known else ()
 
 
 def _strongest(document: Document) -> str:

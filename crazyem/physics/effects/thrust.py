@@ -42,7 +42,7 @@ ROTOR_FAULT = Effect(
     "rotor_fault",
     (
         Parameter("rotor", "", 1, 1, 4, 1, chosen=(1, 2, 3, 4), phrase="of rotor {}"),
-        Parameter("scale", "", 1.0, 0.0, 2.0, 0.02),
+        Parameter("scale", "", 1.0, 0.0, 2.0, 0.02, words="thrust"),
         Parameter("onset_time", "s", None, -1e9, 1e9, 0.1, phrase="since {} s"),
     ),
     order=31,
