@@ -1,5 +1,6 @@
 """What was left free beside the effects: the numbers that no vehicle file says exactly, as they came out."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,7 +49,8 @@ def left_free(fitted: Fitted) -> tuple[Free, ...]:
         values, expected = candidate.values(fitted.point), candidate.neutral(fitted.point)
         words = CATALOGUE[candidate.effect].said({}) if candidate.effect in CATALOGUE else candidate.label
         for name in candidate.free:
-            p, sd, usual = candidate.parameter(name), max(variance[at], 0.0) ** 0.5, fitted.precision[at] ** -0.5
+            p, sd = candidate.parameter(name), max(variance[at], 0.0) ** 0.5
+            usual = fitted.precision[at] ** -0.5 if fitted.precision[at] > 0.0 else math.inf
             numbers = [float(x) for x in (values[name], sd, expected[name], usual)]
             found.append(Free(candidate.effect, words, p.said, p.unit, *numbers))
             at += 1
