@@ -17,9 +17,7 @@ LIKELIHOOD = (
     "Gain is log-likelihood beyond the model without it: each unit makes the data e times as probable. Held out is the "
     "same on data that it was not fitted to."
 )
-AXES = (
-    "Axes are of the body (of velocities: of the world). The band in a picture is two standard deviations of nothing."
-)
+AXES = "Axes are those of the body; of velocities those of the world."
 FREE = (
     "No file says these exactly, so every fit leaves them free about what is expected, by a usual standard deviation."
 )
