@@ -238,7 +238,6 @@ def test_a_sensor_that_always_counts_half(good):
 
 
 @given(rotor=st.integers(0, 3), zeros=st.floats(0.07, 0.32), seed=st.integers(0, 50))
-@quick
 def test_a_sensor_that_counts_half_and_drops_to_zero_as_well(good, rotor, zeros, seed):
     """As on brushed drones: rotors differ, ratio 0.49, dropouts of a few samples; both are found and both repaired."""
     rng = np.random.default_rng(seed)

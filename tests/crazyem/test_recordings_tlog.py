@@ -490,7 +490,6 @@ def test_an_autopilot_that_was_started_again_makes_two_parts_on_one_axis(tmp_pat
     assert last.signals["attitude"].time.size == 150
 
 
-@settings(max_examples=25, deadline=None)
 @given(rows=st.sets(st.integers(1, 28), max_size=8), wild=st.sampled_from([0, 0xFFFFFFFF]))
 def test_boot_times_that_cannot_be_are_placed_by_arrival(
     tmp_path_factory: pytest.TempPathFactory, rows: set[int], wild: int

@@ -467,7 +467,6 @@ def as_stamped(topic: str, row: int, stamp: int) -> int:
     return stamp
 
 
-@settings(max_examples=25, deadline=None)
 @given(bad=st.dictionaries(st.integers(0, 59), st.sampled_from([0, 4 * 10**18, 2**64 - 1, 10**15]), max_size=9))
 def test_messages_with_stamps_that_cannot_be_cost_only_themselves(
     tmp_path_factory: pytest.TempPathFactory, bad: dict[int, int]
@@ -481,7 +480,6 @@ def test_messages_with_stamps_that_cannot_be_cost_only_themselves(
     assert [f.evidence["records"] for f in odd.findings if f.check == "stamps"] == [len(bad)] * bool(bad)
 
 
-@settings(max_examples=10, deadline=None)
 @given(topic=st.sampled_from(TOPICS), ahead=st.sampled_from([1_700_000_000_000_000, 10**12]))
 def test_a_topic_of_another_clock_comes_back(tmp_path_factory: pytest.TempPathFactory, topic: str, ahead: int) -> None:
     folder = tmp_path_factory.mktemp("clock")

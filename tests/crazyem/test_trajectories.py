@@ -81,7 +81,6 @@ def test_hover_and_excite_stay_finite_for_any_duration(yaw, duration):
             assert np.linalg.norm(r.quaternion) == pytest.approx(1)
 
 
-@settings(max_examples=60)
 @given(st.floats(0.5, 60.0), st.floats(1.0, 8.0), st.floats(0.2, 5.0))
 def test_a_figure_8_is_whole_and_ends_at_rest_where_it_began(duration, period, ramp):
     trajectory = figure8(position=HOME, yaw=0.3, duration=duration, period=period, ramp=ramp)
@@ -94,7 +93,6 @@ def test_a_figure_8_is_whole_and_ends_at_rest_where_it_began(duration, period, r
     assert sum(v > 1e-3 for v in x) == pytest.approx(sum(v < -1e-3 for v in x), rel=0.02)
 
 
-@settings(max_examples=30)
 @given(st.floats(1.0, 40.0))
 def test_the_excitation_ends_where_it_began(duration):
     trajectory = excite(position=HOME, duration=duration)
