@@ -23,6 +23,7 @@ from crazyem.commands.common import (
     new_estimator,
     say,
 )
+from crazyem.commands.flights import HEIGHT, duration_note, follow, interrupts, trajectory_maker, write_rules
 from crazyem.commands.output import put
 from crazyem.commands.view import Everyone, Shown, Streams, landing, live_view, wants_view
 from crazyem.errors import CrazyemError, LinkError, UsageError
@@ -111,8 +112,6 @@ def members(arguments: argparse.Namespace, trajectory: Sequence[str] = ("hover",
 
 def fly(arguments: argparse.Namespace) -> int:
     """Fly all drones; returns the exit code, that of the first error."""
-    from crazyem.commands.fly import HEIGHT, duration_note, trajectory_maker, write_rules
-
     if arguments.scenario or arguments.speed is not None or arguments.seed is not None:
         raise UsageError("--scenario, --seed and --speed belong to one drone in the built-in simulator.")
     drones = _drones(arguments, members(arguments, arguments.trajectory))
@@ -165,8 +164,6 @@ def _run(
     settle_interpreter()
     with contextlib.ExitStack() as stack:
         everyone = Everyone([d.interrupts for d in drones])
-        from crazyem.commands.fly import interrupts
-
         stack.enter_context(interrupts(everyone))
         streams = stack.enter_context(Streams(arguments.foxglove))
         crew = Crew()
@@ -287,8 +284,6 @@ def _fly(drone: Drone) -> None:
 
 
 def _watch(drone: Drone, *, duration: float | None) -> None:
-    from crazyem.commands.watch import follow
-
     assert drone.session is not None
     assert drone.line is not None
     follow(drone.session, drone.interrupts, duration, drone.line)

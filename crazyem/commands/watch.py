@@ -7,7 +7,6 @@ these the guard of such a drone runs dry: it tells what it would write.
 import argparse
 import contextlib
 import math
-import time
 
 from crazyem.commands.common import (
     LiveLine,
@@ -19,7 +18,7 @@ from crazyem.commands.common import (
     report,
     say,
 )
-from crazyem.commands.fly import ask_terminal, interrupts
+from crazyem.commands.flights import ask_terminal, follow, interrupts
 from crazyem.commands.view import Shown, Streams, live_view, wants_view
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
@@ -139,22 +138,3 @@ def _outcome(session: Session, error: BaseException | None) -> str:
     if error is not None:
         return "failed"
     return "interrupted" if session.telemetry.has(FLYING) else "landed"
-
-
-def follow(session: Session, stop: object, duration: float | None, line: LiveLine) -> None:
-    """Until Ctrl-C, or `duration` [s] of the drone's clock; a line a second.
-
-    Raises:
-        CrazyemError: what went wrong in the session.
-    """
-    begun, shown = math.nan, time.monotonic()
-    while not getattr(stop, "count", 0):
-        session.raise_if_failed()
-        now = session.clock.newest
-        begun = now if math.isnan(begun) else begun
-        if duration is not None and now - begun >= duration:
-            return
-        if time.monotonic() - shown >= 1.0:
-            shown = time.monotonic()
-            line("flying" if session.pipeline.estimator.airborne else "on the ground", now - begun)
-        time.sleep(0.01)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.cli import main, parser
-from crazyem.commands.fly import ask_terminal, simulated, write_rules
+from crazyem.commands.flights import ask_terminal, simulated, write_rules
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.live.guard import Limits
 from crazyem.live.policy import LARGEST_FILE, EndRules, Policy, default_text, load_policy, parse_policy
