@@ -19,6 +19,10 @@ class FileFormatError(CrazyemError):
     exit_code = 3
 
 
+class KnownFileError(FileFormatError):
+    """A file that is known not to be a recording, but to stand for one: what it is and what to do."""
+
+
 class LinkError(CrazyemError):
     """No drone, a drone lost, a reply that never came."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from crazyem.commands.output import complain
-from crazyem.errors import FileFormatError, UsageError
+from crazyem.errors import FileFormatError, KnownFileError, UsageError
 from crazyem.recordings import ReadOptions
 from crazyem.recordings.csv.file import has_mapping
 from crazyem.recordings.registry import READERS, reader_of
@@ -155,6 +155,9 @@ def _is(entry: os.DirEntry[str], kind: Any) -> bool:
 def _is_recording(path: Path, *, mapped: bool) -> bool:
     try:
         reader = reader_of(path)
+    except KnownFileError:
+        # what stands for a recording should not vanish; pictures may be Git LFS pointers, too
+        return path.name.lower().endswith(_SUFFIXES)
     except FileFormatError:
         # of no known format; but a damaged gzip file called .csv.gz should not vanish without a word
         return path.name.lower().endswith(".csv.gz")

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from crazyem.errors import FileFormatError, UsageError
+from crazyem.errors import FileFormatError, KnownFileError, UsageError
 from crazyem.recordings.cut import cut, cut_parts
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
@@ -110,7 +110,7 @@ def reader_of(path: Path) -> Reader:
             return reader
     refusal = next((why for start, why in _REFUSALS if head.startswith(start)), None)
     if refusal is not None:
-        raise FileFormatError(f"{path} {refusal}")
+        raise KnownFileError(f"{path} {refusal}")
     what = "is empty" if not head else f"is not a recording in a format known here ({known})"
     raise FileFormatError(f"{path} {what}.")
 

@@ -92,3 +92,13 @@ def test_a_lower_case_column_of_stamps_is_read() -> None:
 def test_refusals_say_what_the_file_is_and_what_to_do(name: str, words: str) -> None:
     with pytest.raises(FileFormatError, match=words):
         open_recording(CASES / name)
+
+
+def test_a_folder_of_pointers_is_not_empty_without_a_word(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pointer = (CASES / "lfs_pointer" / "flight.mcap").read_bytes()
+    for name in ("a.mcap", "b.ulg", "picture.png"):
+        (tmp_path / name).write_bytes(pointer)
+    assert main(["info", str(tmp_path)]) == FileFormatError.exit_code
+    said = capsys.readouterr().err
+    assert said.count("git lfs pull") == 2
+    assert "picture.png" not in said
