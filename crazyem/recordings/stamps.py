@@ -230,14 +230,53 @@ def screened(recording: Recording) -> Recording:
 
 
 def screened_parts(parts: Iterator[Recording]) -> Iterator[Recording]:
-    """As `screened`, of a recording in parts; a stamp is judged beside its neighbours in the parts before and after."""
+    """As `screened`, of a recording in parts; the finding, which counts all of them, comes with the last.
+
+    A stamp is judged beside its neighbours in the parts before and after.
+    """
     before: dict[str, Column] = {}
+    faults: dict[str, Fault] = {}
+    totals: dict[str, int] = {}
+    names: list[str] = []
     current = next(parts, None)
     while current is not None:
         after = next(parts, None)
-        yield _screened(current, before, after)
+        kept = _kept(current, before, after)
+        streams = {}
+        for stream, array in _streams(current):
+            streams.setdefault(stream, array)
+        for stream, array in streams.items():
+            totals[stream] = totals.get(stream, 0) + array.time.size
+            lost = array.time.size - kept[id(array.time)].size if id(array.time) in kept else 0
+            if lost:
+                example = float(np.delete(array.time, kept[id(array.time)])[0]) + current.origin
+                known = faults.get(stream, Fault(stream, 0, 0, "left out", example))
+                faults[stream] = replace(known, count=known.count + lost)
+        screened_one = _without(current, kept, whole=after is None and not before)
+        names += [n for n, a in current.signals.items() if id(a.time) in kept and n in screened_one.signals]
+        if after is None and faults:
+            counted = [replace(fault, total=totals[stream]) for stream, fault in faults.items()]
+            findings = _together(screened_one.findings, finding(counted, names))
+            screened_one = replace(screened_one, findings=findings)
+        yield screened_one
         before = {s: np.concatenate([before.get(s, np.empty(0)), a.time])[-_REACH:] for s, a in _streams(current)}
         current = after
+
+
+def _together(found: tuple[Finding, ...], more: Sequence[Finding]) -> tuple[Finding, ...]:
+    """The findings with one more about stamps; one sentence with that of the reader, if it has one."""
+    said = next((i for i, f in enumerate(found) if f.check == CHECK and "records" in f.evidence), None)
+    if said is None:
+        return (*found, *more)
+    first, (second,) = found[said], more
+    fixes = [f.fix.signals for f in (first, second) if f.fix is not None]
+    both = replace(
+        second if second.grade is Grade.DEGRADES else first,
+        text=f"{first.text[:-1]}; {second.text.partition(': ')[2]}",
+        evidence={**first.evidence, **{k: first.evidence[k] + v for k, v in second.evidence.items()}},
+        fix=Fix(CHECK, tuple(dict.fromkeys(sum(fixes, ())))) if fixes else None,
+    )
+    return (*found[:said], both, *found[said + 1 :])
 
 
 def _streams(recording: Recording) -> Iterator[tuple[str, SignalArray]]:
@@ -249,33 +288,35 @@ def _streams(recording: Recording) -> Iterator[tuple[str, SignalArray]]:
             yield array.stream or name, array
 
 
-def _screened(recording: Recording, before: Mapping[str, Column], after: Recording | None) -> Recording:
+def _kept(recording: Recording, before: Mapping[str, Column], after: Recording | None) -> dict[int, NDArray[np.int64]]:
+    """Rows that stay, by the id of the array of stamps; only of streams that lose some."""
     later = {s: a.time[:_REACH] for s, a in _streams(after)} if after is not None else {}
     streams = list(_streams(recording))
     times = [np.concatenate([before.get(s, np.empty(0)), a.time, later.get(s, np.empty(0))]) for s, a in streams]
     if all(_sound(time) for time in times) and _close(times):
-        return recording
+        return {}
     pooled = np.concatenate(times)
-    centre = float(np.median(pooled[np.isfinite(pooled)])) if np.isfinite(pooled).any() else None
-    rows: dict[int, NDArray[np.int64]] = {}  # id of an array of stamps -> rows that stay
-    faults = []
+    pooled = pooled[np.isfinite(pooled)]
+    centre = float(np.median(pooled)) if pooled.size else None
+    kept: dict[int, NDArray[np.int64]] = {}
     for (stream, array), time in zip(streams, times, strict=True):
-        start = min(before[stream].size, time.size) if stream in before else 0
+        start = before[stream].size if stream in before else 0
         bad = impossible(time, centre=centre)[start : start + array.time.size]
         if bad.any():
-            rows[id(array.time)] = np.flatnonzero(~bad)
-            example = float(array.time[int(np.argmax(bad))]) + recording.origin
-            fault = Fault(stream, int(bad.sum()), bad.size, "left out", example)
-            faults += [fault] if fault not in faults else []
-    if not faults:
+            kept[id(array.time)] = np.flatnonzero(~bad)
+    return kept
+
+
+def _without(recording: Recording, kept: Mapping[int, NDArray[np.int64]], *, whole: bool) -> Recording:
+    """The recording with these rows alone; of a whole one, without signals of which no row is left."""
+    if not kept:
         return recording
-    signals = {
-        name: array.rows(rows[id(array.time)]) if id(array.time) in rows else array
-        for name, array in recording.signals.items()
-    }
-    names = [name for name, array in recording.signals.items() if id(array.time) in rows and signals[name].time.size]
-    left = {name: array for name, array in signals.items() if array.time.size or after is not None or before}
-    return replace(recording, signals=left, findings=(*recording.findings, *finding(faults, names)))
+    signals = {}
+    for name, array in recording.signals.items():
+        rows = kept.get(id(array.time))
+        if rows is None or rows.size or not whole:
+            signals[name] = array if rows is None else array.rows(rows)
+    return replace(recording, signals=signals)
 
 
 def _close(times: Sequence[Column]) -> bool:

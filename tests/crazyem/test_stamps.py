@@ -111,8 +111,10 @@ def test_parts_are_screened_as_the_whole(time: Column, bad: dict[int, float], cu
         replace(whole, signals={"a": whole.signals["a"].rows(np.arange(a, b))})
         for a, b in ((0, cut), (cut, longer.size))
     ]
-    joined = np.concatenate([p.signals["a"].time for p in screened_parts(iter(pieces))])
-    np.testing.assert_array_equal(joined, screened(whole).signals["a"].time)
+    parts, expected = list(screened_parts(iter(pieces))), screened(whole)
+    joined = np.concatenate([p.signals["a"].time for p in parts])
+    np.testing.assert_array_equal(joined, expected.signals["a"].time)
+    assert [f.text for p in parts for f in p.findings] == [f.text for f in expected.findings]
 
 
 @given(clocks(), st.sampled_from([1.7e9, -1.7e9, 4e5]))
@@ -163,3 +165,15 @@ def test_csv_rows_with_wild_stamps_are_left_out(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.signals["position"].time, expected.signals["position"].time, atol=1e-12)
     np.testing.assert_array_equal(found.signals["position"].value, expected.signals["position"].value)
     assert [f.evidence["records"] for f in found.findings if f.check == "stamps"] == [2]
+
+
+def test_what_the_reader_found_and_what_the_rule_finds_are_one_finding() -> None:
+    time = np.arange(0.0, 5.0, 0.01)
+    time[[20, 300]] = 4e12
+    first = finding([Fault("block", 2, 9, "left out", 4e7)], ["b"])
+    (told,) = screened(Recording("f", "test", {"a": array(time)}, findings=tuple(first))).findings
+    assert told.evidence == {"records": 4.0, "streams": 2.0}
+    assert "2 of 9 records of block" in told.text
+    assert "2 of 500 records of s" in told.text
+    assert told.fix is not None
+    assert told.fix.signals == ("b", "a")
