@@ -242,7 +242,7 @@ def screened_parts(parts: Iterator[Recording]) -> Iterator[Recording]:
     while current is not None:
         after = next(parts, None)
         kept = _kept(current, before, after)
-        streams = {}
+        streams: dict[str, SignalArray] = {}
         for stream, array in _streams(current):
             streams.setdefault(stream, array)
         for stream, array in streams.items():
