@@ -27,7 +27,9 @@ FRACTIONS: dict[str, float] = {
 CONSTANT: dict[str, float] = {**FRACTIONS, "two thirds": 2 / 3, "three quarters": 3 / 4, "one and a half times": 3 / 2}
 LEAP = 0.15  # relative deviation of a leap from the fraction
 NEAR = 0.35  # relative deviation from the expected speed meanwhile: rotors lag, and rotors differ
-EXACT = 0.07  # the same for a whole flight
+# The same for a whole flight: rotors of one drone differ by some 3 %; and no nearer to another fraction than this share
+# of the way to it.
+EXACT, NEARER = 0.1, 0.4
 SLOWEST = 0.025  # s between samples, from which a real change may look like a leap
 NOTED = 0.01  # share of the flight
 ZERO = 0.1  # of what is expected: standing still
@@ -63,7 +65,7 @@ def _signal(recording: Recording, name: str, array: SignalArray, rows: NDArray[n
         own = ratio[:, rotor]
         turning = own[rows & (own >= ZERO)]
         whole = _whole_flight(turning)
-        usual = float(np.median(turning)) if whole else 1.0
+        usual = float(np.median(turning)) if turning.size else 1.0
         if whole:
             found.append(_constant(name, array, rotor, whole, usual))
         zero = _stopped(own / usual, rows)
@@ -202,10 +204,12 @@ def _whole_flight(ratio: NDArray[np.float64]) -> str:
     if sound.size < 50:
         return ""
     middle = float(np.median(sound))
-    for words, fraction in CONSTANT.items():
-        if abs(middle / fraction - 1.0) < EXACT and (np.abs(sound / middle - 1.0) < 0.2).mean() > 0.8:
-            return words
-    return ""
+    known = {**CONSTANT, "": 1.0}
+    off = sorted((abs(float(np.log(middle / fraction))), words) for words, fraction in known.items())
+    (nearest, words), (_, second) = off[:2]
+    apart = abs(float(np.log(known[words] / known[second])))
+    steady = (np.abs(sound / middle - 1.0) < 0.2).mean() > 0.8
+    return words if steady and nearest < min(np.log1p(EXACT), NEARER * apart) else ""
 
 
 def _constant(name: str, array: SignalArray, rotor: int, words: str, ratio: float) -> Finding:
