@@ -20,6 +20,7 @@ LONGEST_FALL = 0.6  # s without lift that a manoeuvre may have
 SPLIT = 1.0  # s without a sample (or five periods) after which nobody knows whether the drone still flew
 LIFTED, CLEAR = 0.03, 0.1  # m above the ground: in the air; and surely so,
 BOUNCE = 0.25  # or this share of the greatest height: a hard landing throws a drone up by 0.12 m, from 1 m
+FLOOR = 1.0  # s at rest, just before and after a flight, that show the floor: the height of an onboard filter drifts
 LEAST_CLIMB = 0.15  # m of height that a flight told by its height alone must show
 # A drone rests where means of 0.25 s stay within 2 mm for 1 s. In 43 recorded flights they stay within 1 mm on the
 # ground (motion capture, Lighthouse, onboard filters) and move by 3 mm or more in hover. Three standard errors of a
@@ -87,9 +88,11 @@ def airtime(recording: Recording) -> Airtime:
     rotors = _rotors(recording, moved=place is not None)
     found = None
     if rotors is not None:
-        found = _from_rotors(*rotors, None if place is None else (place[0], place[1][:, 2]))
+        found = _from_rotors(*rotors)
         if place is None:
             found = _without_impacts(found, recording)
+        else:
+            found = _beyond_rotors(_above_ground(found, place[0], place[1][:, 2]), *place)
     elif place is not None:
         found = _from_height(*place)
     return _flagged(found, recording) or Airtime(_whole(recording), _whole(recording), (), ())
@@ -119,7 +122,7 @@ def _rotors(recording: Recording, *, moved: bool) -> tuple[str, Array, Array] | 
     return None
 
 
-def _from_rotors(name: str, time: Array, value: Array, height: tuple[Array, Array] | None) -> Airtime:
+def _from_rotors(name: str, time: Array, value: Array) -> Airtime:
     possible = np.abs(value).max(axis=1) <= POSSIBLE.get(name, math.inf)
     if possible.sum() > _FEWEST:  # a wild sample is no flight
         time, value = time[possible], value[possible]
@@ -134,14 +137,13 @@ def _from_rotors(name: str, time: Array, value: Array, height: tuple[Array, Arra
         level = float(np.median(high)) if high.size else peak  # near hover: most of a flight is
         lifting = _closed(time, thrust > 0.3 * level)
     why = "" if lifting else "its rotors never carried it"
-    found = Airtime(lifting, lifting, lifting, (name,), why, begin=float(time[0]), end=float(time[-1]))
-    return found if height is None else _above_ground(found, time, *height)
+    return Airtime(lifting, lifting, lifting, (name,), why, begin=float(time[0]), end=float(time[-1]))
 
 
-def _above_ground(found: Airtime, time: Array, when: Array, z: Array) -> Airtime:
+def _above_ground(found: Airtime, when: Array, z: Array) -> Airtime:
     """Less the time on the ground, where the rotors rest long enough for the height (n,) of the ground to show."""
     found = replace(found, climbed=float(np.ptp(z)))
-    known = (when >= time[0]) & (when <= time[-1] + 0.5)
+    known = (when >= found.begin) & (when <= found.end + 0.5)
     resting = known & ~inside(when, tuple((a - 0.1, b + 0.5) for a, b in found.lifting))
     if resting.sum() < 5:
         return found
@@ -153,7 +155,16 @@ def _above_ground(found: Airtime, time: Array, when: Array, z: Array) -> Airtime
         if not within.size:
             airborne.append((start, end))
             flown.append((start, end))
-        for spans, up in ((airborne, z[within] - ground > LIFTED), (flown, _off_the_ground(z[within] - ground))):
+            continue
+        # each flight rises from the floor as it was just before, and comes down to that just after
+        top = when[within[np.argmax(z[within])]]
+        sides = [
+            resting & (when >= start - FLOOR) & (when < start),
+            resting & (when > end) & (when <= end + 0.5 + FLOOR),
+        ]
+        before, after = (float(np.median(z[rows])) if rows.sum() >= 5 else ground for rows in sides)
+        above = z[within] - np.where(when[within] <= top, before, after)
+        for spans, up in ((airborne, above > LIFTED), (flown, _off_the_ground(above))):
             if up.any():
                 spans.append((float(when[within[up][0]]), float(when[within[up][-1]])))
     why = found.reason or ("" if airborne else "its rotors turned, but it did not leave the ground")
@@ -161,6 +172,26 @@ def _above_ground(found: Airtime, time: Array, when: Array, z: Array) -> Airtime
         why += f" (its height changes by {found.climbed:.2f} m)"
     judged = (*found.judged_by, "position")
     return replace(found, airborne=tuple(airborne), flown=tuple(flown), ground=ground, judged_by=judged, reason=why)
+
+
+def _beyond_rotors(found: Airtime, time: Array, position: Array) -> Airtime:
+    """With the flight before and after what is known of the rotors, by the height, where they were at work there."""
+    ahead = bool(found.flown) and found.flown[0][0] <= found.begin + SHORTEST_FLIGHT
+    behind = bool(found.flown) and found.flown[-1][1] >= found.end - SHORTEST_FLIGHT
+    alone = _from_height(time, position).flown
+    first = next((a for a, b in alone if a < found.begin - SPLIT and b > found.begin), None) if ahead else None
+    last = next((b for a, b in alone if a < found.end and b > found.end + SPLIT), None) if behind else None
+
+    def wider(spans: Intervals) -> Intervals:
+        edges = [list(span) for span in spans]
+        edges[0][0] = edges[0][0] if first is None else first
+        edges[-1][1] = edges[-1][1] if last is None else last
+        return tuple((a, b) for a, b in edges)
+
+    if first is None and last is None:
+        return found
+    judged = tuple(dict.fromkeys((*found.judged_by, "position")))
+    return replace(found, airborne=wider(found.airborne), flown=wider(found.flown), judged_by=judged)
 
 
 def _off_the_ground(height: Array) -> Flags:
