@@ -317,7 +317,7 @@ def test_bad_input_is_one_sentence(
     (tmp_path / "text.csv").write_text("hello\n")
     cases: list[tuple[tuple[object, ...], int, str]] = [
         ((tmp_path / "short.mcap", *drone), 5, "too short"),
-        ((tmp_path / "inputs.mcap", *drone), 5, "no rotor speeds, motor commands or commanded thrust"),
+        ((tmp_path / "inputs.mcap", *drone), 5, "no motor commands, rotor speeds or commanded thrust"),
         ((tmp_path / "empty.mcap", *drone), 3, "empty"),
         ((tmp_path / "text.csv", *drone), 3, "text.csv"),
         ((tmp_path / "none.mcap", *drone), 2, "none.mcap"),
