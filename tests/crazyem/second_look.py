@@ -274,8 +274,11 @@ def nanobench(path: Path) -> Facts:
     air = on & ((z > z[0] + 0.02) if working[0] < 0.05 else True) & (time < time[-1] - facts["silent_s"] + 0.1)
     volts = d["pwr_pm_vbat"].to_numpy()
     facts |= limits(duty, air & real)
-    facts["voltage_min_V"] = float(volts[air & (z > z.min() + 0.08)].min())
-    facts["airborne_s"] = float((air & (z > z.min() + 0.05)).sum()) * float(np.median(np.diff(time)))
+    off = air & (z > z.min() + 0.03)
+    for a, b in stretches(off):  # a hard landing throws it up once more; that is no flight
+        off[a : b + 1] &= z[a : b + 1].max() > z.min() + 0.25 * np.ptp(z)
+    facts["voltage_min_V"] = float(volts[off].min())
+    facts["airborne_s"] = float(off.sum()) * float(np.median(np.diff(time)))
     facts["still_columns"] = float((np.ptp(value["controller"], axis=0) == 0).sum())
     facts |= polygon(time, volts)
     quaternion = Rotation.from_quat(columns(d, "qx qy qz qw"))
