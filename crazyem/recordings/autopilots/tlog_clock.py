@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from crazyem.recordings.autopilots.tlog_frames import MESSAGES, Frames, Frameset, columns_of
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.stamps import CHECK, Fault, impossible, restarts
+from crazyem.recordings.stamps import CHECK, RESTART, Fault, impossible, restarts
 from crazyem.recordings.topics import seconds
 
 _EPOCH = 10**15  # us; a `time_usec` beyond is since 1970, below since boot
@@ -127,10 +127,17 @@ def _joined(columns: list[NDArray[np.float64]], own: list[_Own]) -> NDArray[np.f
 
 
 def _starts(own: list[_Own]) -> NDArray[np.int64]:
-    """Places (k,) of the first message of each start of an autopilot but the first."""
-    place = np.concatenate([o.place[~o.bad] for o in own])
-    order = np.argsort(place)
-    return place[order][restarts(_joined([o.time for o in own], own)[order])]
+    """Places (k,) of the first message of each start of an autopilot but the first.
+
+    The message that came most often tells where the clock goes back; others may have come since the message before.
+    """
+    most = max(own, key=lambda o: int((~o.bad).sum()))
+    time, place = most.time[~most.bad], most.place[~most.bad]
+    first = []
+    for row in restarts(time).tolist():
+        since = [o.place[~o.bad & (o.place > place[row - 1]) & (o.time < time[row - 1] - RESTART)] for o in own]
+        first.append(min(int(p.min()) for p in since if p.size))
+    return np.array(first, np.int64)
 
 
 def _offsets(own: list[_Own], starts: NDArray[np.int64]) -> NDArray[np.float64]:
