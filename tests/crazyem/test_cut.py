@@ -87,14 +87,14 @@ def test_a_piece_is_the_file_that_was_cut_beforehand(tmp_path: Path, capsys: pyt
     whole, beforehand = tmp_path / "whole.csv", tmp_path / "cut.csv"
     export(made_flight(), whole)
     header, *rows = whole.read_text().splitlines()
-    kept = [row for row in rows if 2.0 <= float(row.split(",")[0]) <= 6.0]
+    kept = [row for row in rows if 3.0 <= float(row.split(",")[0]) <= 5.0]
     beforehand.write_text("\n".join([header, *kept]) + "\n")
     Path(f"{beforehand}{METADATA_SUFFIX}").write_bytes(Path(f"{whole}{METADATA_SUFFIX}").read_bytes())
-    limits = ["--from", "2", "--to", "6"]
+    limits = ["--from", "3", "--to", "5"]
     imported = tmp_path / "piece.mcap"
     assert main(["import", str(whole), "-o", str(imported), *limits]) == 0
-    pieces = [open_recording(beforehand), open_recording(imported), open_recording(whole, ReadOptions(start=2, end=6))]
-    pieces.append(_joined(list(open_parts(whole, ReadOptions(start=2.0, end=6.0), seconds=1.0))))
+    pieces = [open_recording(beforehand), open_recording(imported), open_recording(whole, ReadOptions(start=3, end=5))]
+    pieces.append(_joined(list(open_parts(whole, ReadOptions(start=3.0, end=5.0), seconds=1.0))))
     for piece in pieces[1:]:
         for name, signal in pieces[0].signals.items():
             np.testing.assert_array_equal(piece.signals[name].time, signal.time)
@@ -102,7 +102,7 @@ def test_a_piece_is_the_file_that_was_cut_beforehand(tmp_path: Path, capsys: pyt
     capsys.readouterr()
     results = []
     for command in ([str(beforehand)], [str(whole), *limits]):
-        plot = ["--plot", str(tmp_path / "p.png"), "--window", "200", "--every", "150"]
+        plot = ["--plot", str(tmp_path / "p.png"), "--window", "150", "--every", "100"]
         assert main(["replay", *command, "--vehicle", "cf2", "--json", "-", *plot]) == 0
         results.append(json.loads(capsys.readouterr().out))
     assert results[0]["updates"] > 0
