@@ -26,7 +26,7 @@ def check(recording: Recording) -> list[Finding]:
         if array is None or array.time.size < 20:
             continue
         time, value = ordered(array)
-        if not np.mean((value >= 0.0) & (value <= 1.0 + 1e-6)) > 0.8:
+        if not time.size or not np.mean((value >= 0.0) & (value <= 1.0 + 1e-6)) > 0.8:
             continue  # another unit: `numbers` says so
         airborne = flight.airborne if flight.known else ()
         rows = inside(time, airborne)
