@@ -8,7 +8,7 @@ from crazyem.diagnosis.fitting.always import abstained, differing, steadied, unl
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.fit import nominal as nominal_of
-from crazyem.diagnosis.fitting.model import STRENGTH, Point
+from crazyem.diagnosis.fitting.model import Point, deviations
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.sampling import of_a_real_drone
 from crazyem.diagnosis.flights import roles
@@ -152,7 +152,7 @@ def diagnose(
         left_out={n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)},
         explained=remains.explained,
         free=left_free(selection.fitted),
-        own=owned(chosen.asked.flights, chosen.asked.kept_apart, selection.final.effects.get(STRENGTH)),
+        own=owned(chosen.asked.flights, chosen.asked.kept_apart, _strengths(selection)),
         swapped=asked.swapped,
     )
 
@@ -325,6 +325,13 @@ def _misread_or_weak(
     if weak:
         return nats, Candidate("rotor_sensor", fixed, ("scale",)), reading
     return None if nats is None else -nats, Candidate("rotor_fault", fixed, ("scale",)), reading**-2
+
+
+def _strengths(selection: Selection) -> dict[str, float]:
+    """Name of the recording -> its thrust over what the fitted vehicle says; none where each has not its own."""
+    shared = float(selection.final.effects.get("thrust_scale", {}).get("scale", 1.0))
+    found = deviations(selection.final.effects, "thrust_scale")
+    return {name: 1.0 + own["scale"] / shared for name, own in found.items()}
 
 
 def _with_effects(vehicle: Vehicle, selection: Selection, beside: Sequence[Named]) -> Vehicle:

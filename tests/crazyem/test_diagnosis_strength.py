@@ -8,9 +8,9 @@ from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fitting.always import SEVERAL, THRUST_SD, differing, nuisances, refine_base
-from crazyem.diagnosis.fitting.candidates import Candidate, Strengths, strengths_of
+from crazyem.diagnosis.fitting.candidates import Candidate, OfRecordings, of_recordings
 from crazyem.diagnosis.fitting.fit import Data, nominal
-from crazyem.diagnosis.fitting.model import STRENGTH, Point, of_recording
+from crazyem.diagnosis.fitting.model import OWN, Point, deviations, of_recording
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import Flight, flight_of
 
@@ -31,33 +31,42 @@ def test_each_is_found_and_the_mean_is_left_to_the_thrust_scale() -> None:
     point = nominal(data, Point(DRONE, {}, first_guess()))
     scale = Candidate("thrust_scale", (), ("scale",))
     found = refine_base(data, point.with_effects({"thrust_scale": {"scale": 1.0}}), [scale]).point
-    own = np.array([found.effects[STRENGTH][f"{k}.csv"] for k in range(4)])
-    assert own * found.effects["thrust_scale"]["scale"] == pytest.approx(STRONG, abs=4e-3)
-    assert own.mean() == pytest.approx(1.0, abs=2e-3)  # priors
+    own = deviations(found.effects, "thrust_scale")
+    away = np.array([own[f"{k}.csv"]["scale"] for k in range(4)])
+    assert away + found.effects["thrust_scale"]["scale"] == pytest.approx(STRONG, abs=4e-3)
+    assert away.mean() == pytest.approx(0.0, abs=2e-3)  # priors
 
 
 @pytest.mark.slow
 def test_a_recording_hears_of_its_own_strength_only() -> None:
     """Derivatives by the strength of one recording, against differences of the log-likelihood of each."""
     data = Data(flights()[:3])
-    own = strengths_of(data.flights)
-    point = nominal(data, Point(DRONE, {STRENGTH: own.neutral(Point(DRONE, {}, first_guess()))}, first_guess()))
+    own = of_recordings("thrust_scale", ("scale",), data.flights)
+    point = nominal(
+        data, Point(DRONE, {OWN + "thrust_scale": own.neutral(Point(DRONE, {}, first_guess()))}, first_guess())
+    )
     gram = data.gram(point, own.columns(point))
     score = np.stack([gram.score[gram.flight == k].sum(0) for k in range(3)])
     assert np.count_nonzero(score) == 3
     assert (np.diag(score) != 0).all()
     for k, name in enumerate(own.free):
-        up, down = (point.with_effects({STRENGTH: {name: 1.0 + d}}) for d in (1e-4, -1e-4))
+        up, down = (point.with_effects({OWN + "thrust_scale": {name: d}}) for d in (1e-4, -1e-4))
         slope = [(a.sweep(up).loglik - b.sweep(down).loglik) / 2e-4
                  for a, b in zip(data.twin().models, data.twin().models, strict=True)]  # fmt: skip
         assert slope[k] == pytest.approx(score[k, k], rel=0.02)
         assert np.delete(slope, k) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_it_is_a_factor_on_the_thrust_scale_and_nothing_of_the_vehicle() -> None:
-    effects = {"thrust_scale": {"scale": 0.9}, STRENGTH: {"a": 1.1}}
-    assert of_recording(effects, "a") == {"thrust_scale": {"scale": pytest.approx(0.99)}}
-    assert of_recording(effects, "b") == {"thrust_scale": {"scale": 0.9}}
+def test_it_is_added_to_what_all_recordings_share_and_nothing_of_the_vehicle() -> None:
+    effects = {
+        "thrust_scale": {"scale": 0.9},
+        OWN + "thrust_scale": {"a/scale": 0.1},
+        OWN + "gyro_bias": {"/b/x": 0.01},
+    }
+    assert of_recording(effects, "a") == {"thrust_scale": {"scale": pytest.approx(1.0)}}
+    assert of_recording(effects, "c") == {"thrust_scale": {"scale": 0.9}}
+    there = {"thrust_scale": {"scale": 0.9}, "gyro_bias": {"x": 0.01, "y": 0.0, "z": 0.0}}
+    assert of_recording(effects, "/b") == there
     assert of_recording({}, "a") == {}
 
 
@@ -73,9 +82,9 @@ def test_it_is_free_only_among_several_recordings_of_commands() -> None:
     assert not differing(some, [], trimmed)[0][0].differs
     data = Data(some)
     free = {c.effect: (c, p) for c, p in nuisances(data, Point(DRONE, {}, first_guess()), ())}
-    strengths, precisions = free[STRENGTH]
-    assert isinstance(strengths, Strengths)
-    assert strengths.free == ("0.csv", "1.csv", "2.csv", "3.csv")
+    strengths, precisions = free[OWN + "thrust_scale"]
+    assert isinstance(strengths, OfRecordings)
+    assert strengths.free == ("0.csv/scale", "1.csv/scale", "2.csv/scale", "3.csv/scale")
     assert precisions == (THRUST_SD**-2,) * 4
 
 

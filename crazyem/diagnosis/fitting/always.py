@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, strengths_of
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, of_recordings
 from crazyem.diagnosis.fitting.fit import Data, Fitted, refine, remembering, remembering_anew
 from crazyem.diagnosis.fitting.gram import Solution, used
 from crazyem.diagnosis.fitting.model import Point
@@ -33,6 +33,9 @@ AT_ONCE_SD = 0.25
 # N m s: and as if it were damped, by 1e-5 to 1.9e-4 in 11 flights that shake of drones with such rotors and no damping.
 AT_ONCE_DAMPING_SD = 1e-4
 CENTRE_SD = (2e-5, 2e-5, 7e-4)  # m; a height of -0.4 to -0.8 mm is what velocities of onboard filters look like
+# rad/s: what a gyro shows of itself in one recording. Mean rates by gyro and by motion capture differ by 0.16 deg/s
+# (rms about x and y of eight slow and medium flights of NanoBench, arXiv 2603.09908).
+GYRO_SD = 2.8e-3
 VELOCITY_SD, JITTER = 2e-3, 3e-3  # relative: no onboard filter is better; m/s, see `jittery`
 # s: rates behind the attitude, velocities behind the position, by the filters of the firmware; in 80 flights with
 # nothing hidden 0.0 to 2.4 and 0.0 to 1.6 ms, most in quick ones.
@@ -132,8 +135,11 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
         found.append((Candidate("velocity_scale", (), ("x", "y", "z")), tuple((VELOCITY_SD + jittery(data)) ** -2.0)))
         if "attitude" in data.signals and "body_rate" in data.signals:
             found.append((Candidate("onboard_filter", FILTER, tuple(n for n, _ in FILTER)), (FILTER_SD**-2,) * 2))
+    if "body_rate" in data.signals:
+        offsets = of_recordings("gyro_bias", ("x", "y", "z"), data.flights)
+        found.append((offsets, (GYRO_SD**-2,) * len(offsets.free)))
     if data.differ:
-        own = strengths_of(data.flights)
+        own = of_recordings("thrust_scale", ("scale",), data.flights)
         found.append((own, (THRUST_SD**-2,) * len(own.free)))
     if daily:
         found.append((Candidate(TRIM, (), ("x", "y", "z")), tuple(sd**-2 for sd in TRIM_SD)))

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
-from crazyem.diagnosis.fitting.model import STRENGTH, Column, Point
+from crazyem.diagnosis.fitting.model import OWN, Column, Point
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.errors import UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -127,26 +127,31 @@ class Candidate:
         return found
 
 
-class Strengths(Candidate):
-    """The thrust of each recording over what the vehicle says of it (`model.STRENGTH`): always free, never named."""
+class OfRecordings(Candidate):
+    """How far an effect is in each recording from what all share (`model.OWN`): always free, never named."""
 
     @property
     def label(self) -> str:
         """For people."""
-        return "strength of each recording"
+        return f"{self.effect.removeprefix(OWN)} of each recording"
 
     def parameter(self, name: str) -> Parameter:
-        """Of the recording of that name."""
-        return Parameter(name, "", 1.0, 0.5, 1.5, 0.01)
+        """The deviation of one parameter in one recording."""
+        shared = next(
+            p for p in CATALOGUE[self.effect.removeprefix(OWN)].parameters if p.name == name.rpartition("/")[2]
+        )
+        middle = float(shared.neutral)
+        return replace(shared, name=name, neutral=0.0, low=shared.low - middle, high=shared.high - middle)
 
     def neutral(self, point: Point) -> dict[str, Any]:
-        """As the vehicle says."""
-        return dict.fromkeys(self.free, 1.0)
+        """As all recordings are."""
+        return dict.fromkeys(self.free, 0.0)
 
 
-def strengths_of(flights: Sequence[Flight]) -> Strengths:
-    """Those of some recordings; two of one name are one."""
-    return Strengths(STRENGTH, (), tuple(dict.fromkeys(f.name for f in flights)))
+def of_recordings(effect: str, parameters: Sequence[str], flights: Sequence[Flight]) -> OfRecordings:
+    """The deviations of some parameters in each flight; two flights of one name are one."""
+    names = dict.fromkeys(f.name for f in flights)
+    return OfRecordings(OWN + effect, (), tuple(f"{name}/{p}" for name in names for p in parameters))
 
 
 def candidates_for(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.gram import Gram
-from crazyem.diagnosis.fitting.model import STRENGTH, Column, Model, Point, Swept
+from crazyem.diagnosis.fitting.model import OWN, Column, Model, Point, Swept
 from crazyem.diagnosis.fitting.noise import first_guess, fit_noise
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.workers import Workers
@@ -179,7 +179,7 @@ class Data:
 
 def strongly_shown(name: str, values: Mapping[str, Any]) -> bool:
     """Whether an effect moves what sensors show so far from the state that one pass does not find it."""
-    if name == STRENGTH or CATALOGUE[name].measured is None:
+    if name.startswith(OWN) or CATALOGUE[name].measured is None:
         return False
     return name != "velocity_scale" or any(abs(values.get(a, 1.0) - 1.0) > SLIGHT for a in "xyz")
 

@@ -27,9 +27,9 @@ from crazyem.physics.motion import measured, motion
 from crazyem.vehicle import Vehicle
 
 RECENT = 0.5  # s, over which what a model lacks is averaged: long enough that the noise of one sample is nothing
-# The thrust of one recording over what the vehicle file and its effects say: batteries and propellers of another day.
-# No effect of the catalogue, since it belongs to no drone: name of the flight -> factor.
-STRENGTH = "strength"
+# Prefix of what belongs to one recording and to no drone: "own:gyro_bias" -> {"FLIGHT/x": deviation}, added to what all
+# recordings share of that effect. Batteries and sensors are not the same on another day.
+OWN = "own:"
 WIDE = np.array([1.0] * 3 + [2.0] * 3 + [0.5] * 3 + [3.0] * 3) ** 2  # variances at a start of what is not measured
 
 
@@ -141,14 +141,26 @@ def lacking(impulse: NDArray, step: NDArray, known: NDArray) -> NDArray:
 
 
 def of_recording(effects: Effects, name: str) -> Effects:
-    """The effects as they act in the recording of that name: with its own strength, where there is one."""
-    if STRENGTH not in effects:
+    """The effects as they act in the recording of that name: with its own deviations, where there are some."""
+    own = [key for key in effects if key.startswith(OWN)]
+    if not own:
         return effects
-    own: dict[str, Mapping[str, Any]] = {n: v for n, v in effects.items() if n != STRENGTH}
-    factor = effects[STRENGTH].get(name, 1.0)
-    if factor != 1.0:
-        own["thrust_scale"] = {"scale": factor * own.get("thrust_scale", {}).get("scale", 1.0)}
-    return own
+    found: dict[str, Mapping[str, Any]] = {n: v for n, v in effects.items() if n not in own}
+    for key in own:
+        here = deviations(effects, key.removeprefix(OWN)).get(name, {})
+        if any(here.values()):
+            shared = CATALOGUE[key.removeprefix(OWN)].complete(found.get(key.removeprefix(OWN), {}), {})
+            found[key.removeprefix(OWN)] = {n: v + here.get(n, 0.0) for n, v in shared.items()}
+    return found
+
+
+def deviations(effects: Effects, effect: str) -> dict[str, dict[str, float]]:
+    """Name of the recording -> parameter -> how far it is there from what all recordings share of the effect."""
+    found: dict[str, dict[str, float]] = {}
+    for place, value in effects.get(OWN + effect, {}).items():
+        recording, _, parameter = place.rpartition("/")
+        found.setdefault(recording, {})[parameter] = float(value)
+    return found
 
 
 @dataclass
@@ -258,7 +270,7 @@ class Model:
         if self._is_felt():
             swept = self._felt(swept, acceleration, acting)
         if order is not None:
-            swept = replace(swept, score=swept.score[:, order], information=swept.information[:, order][:, :, order])
+            swept = _in_order(swept, order)
         self._there = self._as_shown = None
         self._offsets = {}
         if not np.isfinite(swept.filtered).all():  # a model that left the range of numbers must not spoil the next one
@@ -299,22 +311,22 @@ class Model:
     ) -> tuple[NDArray, NDArray, NDArray | None]:
         """Derivatives of accelerations (n, 6, c) and offsets (n, 12, d), and where each column went (None: no columns).
 
-        A column changes either accelerations or what is shown.
+        A column changes either accelerations or what is shown, or nothing here (-1): what belongs to another recording.
         """
         n = self.flight.time.size
         if not columns:
             return np.zeros((n, 6, 0)), np.zeros((n, 12, 0)), None
         acting: list[NDArray] = []
         showing: list[NDArray] = []
-        where: list[tuple[bool, int]] = []
+        where: list[tuple[list[NDArray] | None, int]] = []
         for d_acting, d_showing in workers.map(lambda c: self._derivative(point, c, acceleration, offset), columns):
-            if d_showing is not None:
-                where.append((True, len(showing)))
-                showing.append(d_showing)
+            kind, change = (acting, d_acting) if d_showing is None else (showing, d_showing)
+            if change is None:
+                where.append((None, -1))
             else:
-                where.append((False, len(acting)))
-                acting.append(np.zeros((n, 6)) if d_acting is None else d_acting)
-        order = np.array([len(acting) + at if shown else at for shown, at in where])
+                where.append((kind, len(kind)))
+                kind.append(change)
+        order = np.array([len(acting) + at if kind is showing else at for kind, at in where])
         stack = (np.stack(acting, 2) if acting else np.zeros((n, 6, 0)),
                  np.stack(showing, 2) if showing else np.zeros((n, 12, 0)))  # fmt: skip
         return np.ascontiguousarray(stack[0]), np.ascontiguousarray(stack[1]), order
@@ -323,23 +335,34 @@ class Model:
         self, point: Point, column: Column, acceleration: NDArray, offset: NDArray
     ) -> tuple[NDArray | None, NDArray | None]:
         """What a column changes: accelerations (n, 6), what is shown (n, 12); None: nothing."""
-        d_acting, d_showing = column.acting, column.showing
+        if column.plus is None:
+            return column.acting, column.showing
         here = of_recording(point.effects, self.flight.name)
-        plus = None if column.plus is None else of_recording(column.plus, self.flight.name)
-        if plus is None or (STRENGTH in point.effects and column.minus is None and plus == here):
-            return d_acting, d_showing
-        shows = any(_shows(name) for name in plus)
-        moves = any(not _shows(name) for name in plus)
-        up = self.accelerations(point, plus)[0] if moves else acceleration
-        down = acceleration if column.minus is None or not moves else self.accelerations(point, column.minus)[0]
-        d_acting = (up - down) / column.width
-        if shows:
+        plus = of_recording(column.plus, self.flight.name)
+        minus = here if column.minus is None else of_recording(column.minus, self.flight.name)
+        changed = [n for n in {**minus, **plus} if plus.get(n) != minus.get(n)]
+        d_acting = d_showing = None
+        if any(not _shows(name) for name in changed):
+            up = self.accelerations(point, plus)[0]
+            down = acceleration if column.minus is None else self.accelerations(point, column.minus)[0]
+            d_acting = (up - down) / column.width
+        if any(_shows(name) for name in changed):
             up = self.offsets(point, acceleration, plus)
             down = offset if column.minus is None else self.offsets(point, acceleration, column.minus)
             d_showing = (up - down) / column.width
-            if not d_showing.any():
-                d_showing = None
         return d_acting, d_showing
+
+
+def _in_order(swept: Swept, order: NDArray) -> Swept:
+    """The pass with its columns put where they were asked for; -1: a column of zeros."""
+    known = order >= 0
+    if known.all():
+        return replace(swept, score=swept.score[:, order], information=swept.information[:, order][:, :, order])
+    score = np.zeros((len(swept.score), order.size))
+    information = np.zeros((len(swept.score), order.size, order.size))
+    score[:, known] = swept.score[:, order[known]]
+    information[np.ix_(np.arange(len(score)), known, known)] = swept.information[:, order[known]][:, :, order[known]]
+    return replace(swept, score=score, information=information)
 
 
 def _before_rotors(name: str) -> bool:

@@ -59,14 +59,10 @@ class Own:
         return [{"name": None, **dict(zip(keys, f, strict=True)), "expected": 0.0, "usual": None} for f in found]
 
 
-def owned(
-    flights: Sequence[Flight], kept_apart: Sequence[Flight], strengths: Mapping[str, float] | None = None
-) -> tuple[Own, ...]:
+def owned(flights: Sequence[Flight], kept_apart: Sequence[Flight], strengths: Mapping[str, float]) -> tuple[Own, ...]:
     """Of all flights, those kept apart last; `strengths` by name."""
     return tuple(
-        _own(f, apart, None if strengths is None else strengths.get(f.name))
-        for part, apart in ((flights, False), (kept_apart, True))
-        for f in part
+        _own(f, apart, strengths.get(f.name)) for part, apart in ((flights, False), (kept_apart, True)) for f in part
     )
 
 
