@@ -15,6 +15,7 @@ from crazyem.diagnosis.fitting.situation import (
     causal_middle,
     impulses,
     initial_path,
+    integrated_path,
     situation_of,
     thrust_of,
     with_rotors,
@@ -243,10 +244,10 @@ class Model:
         path = initial_path(self.flight) if self.shown is None else self.shown
         accelerations = accelerations if self.moved is None else self.moved
         situation = situation_of(self.flight, path, point.vehicle, self.thrusts(point.vehicle, {}))
-        turned = np.cumsum(accelerations[:, 3:] * situation.step[:, None], axis=0)
         self._as_shown = replace(
-            situation, specific_force=accelerations[:, :3], angular_acceleration=accelerations[:, 3:], turned=turned
-        )
+            situation, specific_force=accelerations[:, :3], angular_acceleration=accelerations[:, 3:],
+            integrated=integrated_path(situation, accelerations),
+        )  # fmt: skip
         return self._as_shown
 
     def sweep(

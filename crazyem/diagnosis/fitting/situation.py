@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from crazyem.compiled import compiled
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.estimation.kernels.algebra import matrix
-from crazyem.physics.effects.effect import Effects, Situation
+from crazyem.physics.effects.effect import Effects, Path, Situation
 from crazyem.physics.motion import rotor_thrust
-from crazyem.physics.rotations import rotation_matrix
-from crazyem.vehicle import Vehicle
+from crazyem.physics.rotations import quaternion_from_rotation_vector, rotation_matrix
+from crazyem.vehicle import GRAVITY, Vehicle
 
 
 def initial_path(flight: Flight) -> NDArray:
@@ -49,6 +49,39 @@ def situation_of(flight: Flight, path: NDArray, vehicle: Vehicle, thrusts: tuple
         angular_acceleration=np.zeros((n, 3)), thrust=thrust, thrust_rate=rate, voltage=flight.voltage,
         rotor_constant=_rotor_constant(vehicle), air=np.zeros((n, 3)), fused=flight.attitude is not None,
     )  # fmt: skip
+
+
+def integrated_path(situation: Situation, accelerations: NDArray) -> Path:
+    """The path by integration of rates and accelerations, from row to row by the trapezoidal rule.
+
+    Args:
+        accelerations: (n, 6) specific force [m/s^2] and angular acceleration [rad/s^2], body axes, over the steps.
+    """
+    step = situation.step[:, None]
+    before = np.maximum(np.arange(situation.size) - 1, 0)
+    middle = 0.5 * (situation.rotation + situation.rotation[before])
+    force = np.einsum("nij,nj->ni", middle, accelerations[:, :3]) - np.array([0.0, 0.0, GRAVITY])
+    velocity = 0.5 * (situation.velocity + situation.velocity[before])
+    rate = 0.5 * (situation.body_rate + situation.body_rate[before])
+    rotation = np.empty((situation.size, 3, 3))
+    _chained(rotation_matrix(quaternion_from_rotation_vector(rate * step)), rotation)
+    return Path(
+        position=np.cumsum(velocity * step, axis=0), velocity=np.cumsum(force * step, axis=0), rotation=rotation,
+        body_rate=np.cumsum(accelerations[:, 3:] * step, axis=0),
+    )  # fmt: skip
+
+
+@compiled
+def _chained(turns, out):
+    """Products of rotations turns (n, 3, 3) up to each row, into out (n, 3, 3)."""
+    out[0] = turns[0]
+    for k in range(1, len(turns)):
+        for i in range(3):
+            for j in range(3):
+                total = 0.0
+                for m in range(3):
+                    total += out[k - 1, i, m] * turns[k, m, j]
+                out[k, i, j] = total
 
 
 def with_rotors(situation: Situation, vehicle: Vehicle, thrusts: tuple[NDArray, NDArray]) -> Situation:

@@ -83,6 +83,17 @@ class Body:
 
 
 @dataclass(frozen=True)
+class Path:
+    """A path at n moments: position (n, 3) m, velocity (n, 3) m/s, world; rotation (n, 3, 3) body to world; body rate
+    (n, 3) rad/s. Each is known but for a constant: only what changes from row to row has a meaning."""
+
+    position: NDArray
+    velocity: NDArray
+    rotation: NDArray
+    body_rate: NDArray
+
+
+@dataclass(frozen=True)
 class Situation:
     """Where the drone is and what it does, at n moments; the means over the steps that end there.
 
@@ -105,8 +116,8 @@ class Situation:
         shaken: whether some effect couples the air to the body (a drag); without, wind is a constant force.
         lagged: (n, 4) N after the lag, before what changes thrust at the same rotor speed; None: as `thrust`.
         swing: (n, 6) direction of a load's string (unit, world) and its derivative [1/s]; None: found along the rows.
-        turned: (n, 3) rad/s, body: the rate but for a constant, as motion alone changes it from row to row; None: as
-            `body_rate`, which a filter has mixed with the noise of what was measured.
+        integrated: the path that motion alone makes of rates and accelerations; None: the rows themselves. Rows of a
+            filter hold the noise of the very sample that a late stream would explain.
         seen: (n, 3) m/s^2, body: specific force that the drone was seen to have in each step, NaN where it was not;
             None: not known. An effect may go by rows before its own only.
         unrest: (3,) m/s^2 sqrt(s): how much of it comes and goes at random.
@@ -131,7 +142,7 @@ class Situation:
     shaken: bool = False
     lagged: NDArray | None = None
     swing: NDArray | None = None
-    turned: NDArray | None = None
+    integrated: "Path | None" = None
     seen: NDArray | None = None
     unrest: NDArray | None = None
     fused: bool = False

@@ -32,16 +32,17 @@ def late(situation: Situation, *, delay: float, streams: str | Sequence[str]) ->
     names = [streams] if isinstance(streams, str) else streams
     shown = {quantity for name in names for quantity in SHOWN[name]}
     row, part, before = _looked_up(situation, delay)
+    path = situation.integrated or situation
     if "position" in shown:
-        offset.state[:, 0:3] = _past(situation.position, row, part) - before * situation.velocity.take(row, axis=0)
-        offset.state[:, 0:3] -= situation.position
+        offset.state[:, 0:3] = _past(path.position, row, part) - path.position
+        offset.state[:, 0:3] -= before * situation.velocity.take(row, axis=0)
     if "velocity" in shown:
-        offset.state[:, 3:6] = _past(situation.velocity, row, part) - situation.velocity
+        offset.state[:, 3:6] = _past(path.velocity, row, part) - path.velocity
     if "attitude" in shown:
-        offset.state[:, 6:9] = _turned(situation, row, part, before)
+        offset.state[:, 6:9] = _past_attitude(path.rotation, row, part)
+        offset.state[:, 6:9] -= before * situation.body_rate.take(row, axis=0)
     if "body_rate" in shown:
-        rate = situation.body_rate if situation.turned is None else situation.turned
-        offset.state[:, 9:12] = _past(rate, row, part) - rate
+        offset.state[:, 9:12] = _past(path.body_rate, row, part) - path.body_rate
         offset.state[:, 6:9] += led_astray(situation, offset.state[:, 9:12], delay=delay)
     if "specific_force" in shown:
         offset.specific_force[:] = _past(situation.specific_force, row, part) - situation.specific_force
@@ -67,11 +68,10 @@ def _past(values: NDArray, row: NDArray, part: NDArray) -> NDArray:
     return shown + part * (values.take(np.minimum(row + 1, len(values) - 1), axis=0) - shown)
 
 
-def _turned(situation: Situation, row: NDArray, part: NDArray, before: NDArray) -> NDArray:
+def _past_attitude(rotation: NDArray, row: NDArray, part: NDArray) -> NDArray:
     """(n, 3) rad: rotation from the attitude now to the one shown, body axes; between rows along the chord."""
-    rotation = situation.rotation
     shown = _past(rotation.reshape(-1, 9), row, part).reshape(-1, 3, 3)
-    return rotation_between(rotation, shown) - before * situation.body_rate.take(row, axis=0)
+    return rotation_between(rotation, shown)
 
 
 MEASUREMENT_DELAY = Effect(
