@@ -204,6 +204,7 @@ def swept(
     loglik = sweep(
         given.time, given.starts, given.y, given.specific, given.angular, given.offset, acting, showing, given.q,
         given.r, given.disturbance, given.memory, given.p0, block, predicted, filtered, e, s, rows, score, information,
+        np.zeros((0, 12, 12)), np.zeros((0, 18, 12)),
     )  # fmt: skip
     return Result(filtered, e, s, rows, loglik, score, information)
 

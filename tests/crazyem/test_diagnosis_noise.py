@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.fitting.model import Noise
+from crazyem.diagnosis.fitting.model import Noise, run_sweep, scored_sweep
 from crazyem.diagnosis.fitting.noise import LEANING_FLOOR, ROWS, fit_noise, logs_of, noise_of, sample_rows
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.motion import RotorInput
@@ -117,3 +117,24 @@ def test_logarithms_and_back() -> None:
     np.testing.assert_allclose(again.impulse, TRUE.impulse)
     np.testing.assert_allclose(again.measurement, TRUE.measurement)
     assert not again.disturbance.any()
+
+
+@pytest.mark.parametrize("memories", [(), (3, 4, 5), (0, 1, 2, 3, 4, 5)])
+def test_the_score_is_the_slope_of_the_likelihood(memories: tuple[int, ...]) -> None:
+    """By central differences; measurements missing and starts within. The filter is linear but for its attitude."""
+    flight, acceleration, offset = drawn(7, TRUE, rows=300)
+    y, starts = flight.y.copy(), flight.starts.copy()
+    y[::3, 6:10], y[1::4, 3:6] = np.nan, np.nan
+    starts[[100, 101, 200]] = True
+    flight = replace(flight, y=y, starts=starts)
+    disturbance = np.where(np.isin(np.arange(6), memories), [0.1, 0.1, 0.2, 1.0, 2.0, 0.5], 0.0)
+    noise = replace(TRUE, disturbance=disturbance, memory=0.3)
+    score = scored_sweep(flight, acceleration, offset, noise)[1]
+    nothing = np.zeros((300, 6, 0)), np.zeros((300, 12, 0))
+    for i in np.flatnonzero(np.isfinite(logs_of(noise))):
+        up, down = (
+            run_sweep(flight, acceleration, offset, *nothing, noise_of(logs_of(noise) + d * np.eye(16)[i], 0.3)).loglik
+            for d in (1e-4, -1e-4)
+        )
+        assert score[i] == pytest.approx((up - down) / 2e-4, rel=2e-3, abs=0.05)
+    assert not score[np.isinf(logs_of(noise))].any()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import OWN, Column, Model, Point, Swept
-from crazyem.diagnosis.fitting.noise import first_guess, fit_noise
+from crazyem.diagnosis.fitting.noise import Informed, first_guess, fit_noise
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.workers import Workers
 from crazyem.errors import DataError
@@ -63,11 +63,13 @@ class Data:
     def __init__(self, flights: Sequence[Flight], workers: Workers | None = None) -> None:
         self.models = [Model(f) for f in flights]
         self.workers = workers or Workers(1)
+        self.informed = Informed()
 
     def twin(self) -> "Data":
         """The same flights, with the paths of the last pass: what is done to the twin leaves this one as it is."""
         twin = Data((), self.workers)
         twin.models = [m.twin() for m in self.models]
+        twin.informed = self.informed.copy()
         return twin
 
     def together_with(self, other: "Data | None") -> "Data":
@@ -136,7 +138,8 @@ class Data:
         for model in self.models:
             acceleration, _ = model.accelerations(point)
             parts.append((model.flight, acceleration, model.offsets(point, acceleration)))
-        return replace(point, noise=fit_noise(parts, point.noise, iterations=iterations, workers=self.workers))
+        found = fit_noise(parts, point.noise, iterations=iterations, workers=self.workers, informed=self.informed)
+        return replace(point, noise=found)
 
     def leave_out_wild(self, point: Point) -> int:
         """Begin anew where a step fits nothing (a stalled link, pulses of command between samples); returns how many.

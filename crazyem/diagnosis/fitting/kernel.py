@@ -98,7 +98,7 @@ def _add_products(shown, total):
 
 @compiled
 def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, disturbance, memory, p0, block,
-          xp, xf, e, s, loglik, score, information):  # fmt: skip
+          xp, xf, e, s, loglik, score, information, gains, steps):  # fmt: skip
     """One pass; returns the log-likelihood.
 
     Args:
@@ -120,6 +120,8 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
         loglik: (n,) receives log-likelihoods.
         score: (b, c + d) sums of derivative times innovation over variance are added here, by block.
         information: (b, c + d, c + d) likewise, products of derivatives over variance.
+        gains, steps: (n, 12, size), (n, size + 6, size) receive the gain of each scalar, the transition of each step
+            and below that `middle` and `jr` in the first three columns, for `noise_score`; with 0 rows they do not.
     """
     n = len(time)
     c, d = acting.shape[2], showing.shape[2]
@@ -149,6 +151,7 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
     rate_turn = np.empty((3, 3))
     jr = np.empty((3, 3))
     phi = np.empty(3)
+    unit = np.eye(size)
     gain = np.zeros(wide)
     correction = np.zeros(STATES)
     innov = np.empty(12)
@@ -235,6 +238,12 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
             for j in range(size):
                 tra[i, j] = tmp[j, i]
         _transition(dt, decay, turned, rate_turn, middle, by_rate, jr, tra, cov)
+        if len(steps):
+            _transition(dt, decay, turned, rate_turn, middle, by_rate, jr, unit, steps[k])
+            for i in range(3):
+                for j in range(3):
+                    steps[k, size + i, j] = middle[i, j]
+                    steps[k, size + 3 + i, j] = jr[i, j]
         bridge = h * h + dt * dt / 12.0
         for i in range(3):
             for j in range(3):
@@ -303,6 +312,8 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
                 gain[j] = cov[i, j] * inv
             for j in range(size):
                 correction[j] += gain[j] * err
+                if len(gains):
+                    gains[k, i, j] = gain[j]
             _take_away(cov, var, gain, gain)
             if m:
                 for j in range(broad):

@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 from crazyem.diagnosis.fitting import felt
 from crazyem.diagnosis.fitting.astray import strays
 from crazyem.diagnosis.fitting.kernel import sweep
+from crazyem.diagnosis.fitting.noise_score import noise_score
 from crazyem.diagnosis.fitting.situation import (
     causal_middle,
     impulses,
@@ -386,6 +387,33 @@ def run_sweep(
 
     Noise scales so far apart that the covariance lost its sign seem likely without end, and fits ran away to them.
     """
+    return _run(flight, acceleration, offset, acting, showing, noise, np.zeros((0, 12, 12)), np.zeros((0, 18, 12)))
+
+
+def scored_sweep(flight: Flight, acceleration: NDArray, offset: NDArray, noise: Noise) -> tuple[Swept, NDArray]:
+    """A pass without columns, and the derivatives of its log-likelihood by the logarithms of the noise scales (16,)."""
+    n, size = flight.time.size, 18 if noise.disturbance[:3].any() else 15 if noise.disturbance[3:].any() else 12
+    gains, steps = np.zeros((n, 12, size)), np.zeros((n, size + 6, size))
+    nothing = np.zeros((n, 6, 0)), np.zeros((n, 12, 0))
+    swept = _run(flight, acceleration, offset, *nothing, noise, gains, steps)
+    measured = np.isfinite(np.delete(flight.y, 9, axis=1))
+    by_variance = np.zeros(24)
+    noise_score(
+        flight.time, flight.starts, measured, np.square(noise.disturbance), _memory(noise), swept.innovation,
+        swept.variance, gains, steps, by_variance,
+    )  # fmt: skip
+    by_scale = np.concatenate([by_variance[:6], by_variance[6:18].reshape(4, 3).sum(1), by_variance[18:]])
+    return swept, 2.0 * by_scale * np.square(np.concatenate([noise.impulse, noise.measurement, noise.disturbance]))
+
+
+def _memory(noise: Noise) -> NDArray:
+    return np.broadcast_to(np.asarray(noise.memory, float), (6,)).copy()
+
+
+def _run(
+    flight: Flight, acceleration: NDArray, offset: NDArray, acting: NDArray, showing: NDArray, noise: Noise,
+    gains: NDArray, steps: NDArray,
+) -> Swept:  # fmt: skip
     n, m = flight.time.size, acting.shape[2] + showing.shape[2]
     predicted, filtered = np.zeros((n, 19)), np.zeros((n, 19))
     innovation, variance, rows = np.zeros((n, 12)), np.zeros((n, 12)), np.zeros(n)
@@ -394,10 +422,9 @@ def run_sweep(
     loglik = sweep(
         flight.time, flight.starts, flight.y, np.ascontiguousarray(acceleration[:, :3]),
         np.ascontiguousarray(acceleration[:, 3:]), offset, acting, showing, np.square(noise.impulse),
-        np.repeat(np.square(noise.measurement), 3), np.square(noise.disturbance),
-        np.broadcast_to(np.asarray(noise.memory, float), (6,)).copy(), WIDE,
+        np.repeat(np.square(noise.measurement), 3), np.square(noise.disturbance), _memory(noise), WIDE,
         flight.block if m else np.zeros(n, np.int64), predicted, filtered, innovation, variance, rows, score,
-        information,
+        information, gains, steps,
     )  # fmt: skip
     if not np.all(variance >= 0.0):
         loglik = -np.inf

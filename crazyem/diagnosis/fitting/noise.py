@@ -1,13 +1,16 @@
-"""Noise scales of a model: Fisher scoring on the innovations of the flight, derivatives by differences.
+"""Noise scales of a model: Fisher scoring on the innovations of the flight.
 
-The log-likelihood is sum -1/2 (log s + e^2/s). With de, ds by a scale, the score is sum 1/2 (e^2/s - 1) ds/s - e de/s
-and the information sum 1/2 (ds/s)^2 + de^2/s (Cavanaugh and Shumway 1996, for a Gaussian innovations form).
+The score is exact (`noise_score.py`). The information is sum 1/2 (ds/s)^2 + de^2/s, with de, ds by differences
+(Cavanaugh and Shumway 1996, for a Gaussian innovations form). It costs a pass of the filter for each scale and changes
+slowly with the scales, so that of a point nearby serves as well.
 """
+
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting.model import Noise, Swept, run_sweep
+from crazyem.diagnosis.fitting.model import Noise, Swept, run_sweep, scored_sweep
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.workers import Workers
 
@@ -18,6 +21,7 @@ PRIOR_SD = 2.0  # of the logarithm of a scale about its typical value
 FROM_AFAR = 8  # iterations
 STEP = 0.02  # in the logarithm, for differences
 LARGEST = 1.5  # step of scoring in the logarithm
+NEARBY = 0.7  # in the logarithm of every scale: a factor of two, within which information serves as well
 TYPICAL = Noise(np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), np.array([1e-3, 1e-2, 3e-3, 1e-2]))
 FLOOR = np.log(np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2, 1e-5, 1e-4, 1e-4, 1e-4, *[1e-4] * 3, *[1e-3] * 3]))
 # rad: no attitude made from an acceleration is better; in quiet flights 4 to 5 mrad. Believed to 0.5 mrad, every tremor
@@ -54,28 +58,44 @@ def first_guess() -> Noise:
     return Noise(np.array([0.3, 0.3, 0.5, 5.0, 5.0, 5.0]), np.array([3e-3, 3e-2, 1e-2, 3e-2]))
 
 
+@dataclass
+class Informed:
+    """What is known of the information about noise scales: by flights and free scales, where (16,) and how much."""
+
+    known: dict[tuple[object, ...], tuple[NDArray, NDArray]] = field(default_factory=dict)
+
+    def copy(self) -> "Informed":
+        """One that learns by itself from here on."""
+        return Informed(dict(self.known))
+
+
+Part = tuple[Flight, NDArray, NDArray]  # a flight, its accelerations (n, 6) and offsets (n, 12)
+
+
 def fit_noise(
-    parts: list[tuple[Flight, NDArray, NDArray]],
+    parts: list[Part],
     start: Noise,
     *,
     iterations: int = 8,
     tolerance: float = 0.2,
     workers: Workers | None = None,
+    informed: Informed | None = None,
 ) -> Noise:
     """Noise scales of highest posterior density, the accelerations (n, 6) and offsets (n, 12) of each flight given.
 
     Scales of quantities that nothing measures stay. Disturbances are fitted where they start above 0. From far away,
     most of the way is gone on few rows.
     """
+    workers, informed = workers or Workers(1), informed or Informed()
     if iterations >= FROM_AFAR and any(f.time.size > FEW for f, _, _ in parts):
         few = [(f.rows(k), a[k], o[k]) for f, a, o in parts for k in (sample_rows(f, rows=FEW, stretch=SHORT),)]
-        start = _scored(few, start, iterations, 5 * tolerance, workers or Workers(1))
+        start = _scored(few, start, iterations, 5 * tolerance, workers, Informed())
     chosen = [(f.rows(keep), a[keep], o[keep]) for f, a, o in parts for keep in (sample_rows(f),)]
-    return _scored(chosen, start, iterations, tolerance, workers or Workers(1))
+    return _scored(chosen, start, iterations, tolerance, workers, informed)
 
 
 def _scored(
-    chosen: list[tuple[Flight, NDArray, NDArray]], start: Noise, iterations: int, tolerance: float, workers: Workers
+    chosen: list[Part], start: Noise, iterations: int, tolerance: float, workers: Workers, informed: Informed
 ) -> Noise:
     measured = np.zeros(4, bool)
     for flight, _, _ in chosen:
@@ -87,6 +107,48 @@ def _scored(
     logs = np.maximum(logs, np.where(free, floor, -np.inf))
     typical = logs_of(Noise(TYPICAL.impulse, TYPICAL.measurement, TYPICAL_DISTURBANCE))
     index = np.flatnonzero(free)
+    key = (*(f.time.size for f, _, _ in chosen), *index.tolist(), *np.atleast_1d(memory).tolist())
+
+    def look(at: NDArray) -> tuple[float, NDArray, list[Swept]]:
+        """Log posterior density, its score and the passes of the flights."""
+        found = workers.map(lambda part: scored_sweep(*part, noise_of(at, memory)), chosen)
+        away = (at - typical)[index]
+        value = sum(swept.loglik for swept, _ in found) - 0.5 * float(away @ away) / PRIOR_SD**2
+        slope = np.sum([score[index] for _, score in found], axis=0) - away / PRIOR_SD**2
+        return value, slope, [swept for swept, _ in found]
+
+    value, score, swept = look(logs)
+    for _ in range(iterations):
+        where, information = informed.known.get(key, (np.full(logs.size, np.inf), np.zeros((0, 0))))
+        fresh = not np.all(np.abs(logs[index] - where[index]) < NEARBY)
+        if fresh:
+            information = _information(chosen, swept, logs, memory, index, workers)
+            informed.known[key] = logs, information
+        prior = np.eye(index.size) / PRIOR_SD**2
+        step = np.clip(np.linalg.solve(information + prior, score), -LARGEST, LARGEST)
+        for _ in range(5):
+            there = logs.copy()
+            there[index] = np.maximum(logs[index] + step, floor[index])
+            found, slope, passes = look(there)
+            if found > value - 1e-9:
+                break
+            step = step / 3
+        else:
+            if fresh:
+                break
+            del informed.known[key]  # that of a point nearby led nowhere
+            continue
+        done = found - value < tolerance
+        logs, value, score, swept = there, found, slope, passes
+        if done:
+            break
+    return noise_of(logs, memory)
+
+
+def _information(
+    chosen: list[Part], here: list[Swept], logs: NDArray, memory: float | NDArray, index: NDArray, workers: Workers
+) -> NDArray:
+    """About the scales `index` (k,) of all flights together: (k, k), by differences from the passes `here`."""
 
     def sweep(at: NDArray) -> list[Swept]:
         noise = noise_of(at, memory)
@@ -95,36 +157,12 @@ def _scored(
             for f, a, o in chosen
         ]
 
-    def posterior(swept: list[Swept], at: NDArray) -> float:
-        return sum(s.loglik for s in swept) - 0.5 * float(np.sum(((at - typical)[free] / PRIOR_SD) ** 2))
-
-    here = sweep(logs)
-    value = posterior(here, logs)
-    for _ in range(iterations):
-        slopes = workers.map(sweep, logs + STEP * np.eye(logs.size)[index])
-        score, information = np.zeros(index.size), np.zeros((index.size, index.size))
-        for part, base in enumerate(here):
-            seen = base.variance > 0
-            s, e = base.variance[seen], base.innovation[seen]
-            ds = np.stack([(m[part].variance[seen] - s) / STEP for m in slopes]) / s
-            de = np.stack([(m[part].innovation[seen] - e) / STEP for m in slopes]) / np.sqrt(s)
-            score += 0.5 * ds @ (e * e / s - 1.0) - de @ (e / np.sqrt(s))
-            information += 0.5 * ds @ ds.T + de @ de.T
-        score -= (logs - typical)[index] / PRIOR_SD**2
-        information += np.eye(index.size) / PRIOR_SD**2
-        step = np.clip(np.linalg.solve(information, score), -LARGEST, LARGEST)
-        for _ in range(5):
-            there = logs.copy()
-            there[index] = np.maximum(logs[index] + step, floor[index])
-            swept = sweep(there)
-            gained = posterior(swept, there)
-            if gained > value - 1e-9:
-                break
-            step = step / 3
-        else:
-            break
-        done = gained - value < tolerance
-        logs, here, value = there, swept, gained
-        if done:
-            break
-    return noise_of(logs, memory)
+    moved = workers.map(sweep, logs + STEP * np.eye(logs.size)[index])
+    information = np.zeros((index.size, index.size))
+    for part, base in enumerate(here):
+        seen = base.variance > 0
+        s, e = base.variance[seen], base.innovation[seen]
+        ds = np.stack([(m[part].variance[seen] - s) / STEP for m in moved]) / s
+        de = np.stack([(m[part].innovation[seen] - e) / STEP for m in moved]) / np.sqrt(s)
+        information += 0.5 * ds @ ds.T + de @ de.T
+    return information
