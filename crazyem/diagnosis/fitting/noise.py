@@ -1,8 +1,9 @@
 """Noise scales of a model: Fisher scoring on the innovations of the flight.
 
 The score is exact (`noise_score.py`). The information is sum 1/2 (ds/s)^2 + de^2/s, with de, ds by differences
-(Cavanaugh and Shumway 1996, for a Gaussian innovations form). It costs a pass of the filter for each scale and changes
-slowly with the scales, so that of a point nearby serves as well.
+(Cavanaugh and Shumway 1996, for a Gaussian innovations form). It costs a pass of the filter for each scale, so it is
+made once, and what steps tell of the curvature is added to it (BFGS; Nocedal and Wright, Numerical Optimization,
+ch. 6).
 """
 
 from dataclasses import dataclass, field
@@ -21,7 +22,6 @@ PRIOR_SD = 2.0  # of the logarithm of a scale about its typical value
 FROM_AFAR = 8  # iterations
 STEP = 0.02  # in the logarithm, for differences
 LARGEST = 1.5  # step of scoring in the logarithm
-NEARBY = 0.7  # in the logarithm of every scale: a factor of two, within which information serves as well
 TYPICAL = Noise(np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), np.array([1e-3, 1e-2, 3e-3, 1e-2]))
 FLOOR = np.log(np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2, 1e-5, 1e-4, 1e-4, 1e-4, *[1e-4] * 3, *[1e-3] * 3]))
 # rad: no attitude made from an acceleration is better; in quiet flights 4 to 5 mrad. Believed to 0.5 mrad, every tremor
@@ -60,9 +60,9 @@ def first_guess() -> Noise:
 
 @dataclass
 class Informed:
-    """What is known of the information about noise scales: by flights and free scales, where (16,) and how much."""
+    """What is known of the curvature (k, k) by the noise scales, by flights and free scales."""
 
-    known: dict[tuple[object, ...], tuple[NDArray, NDArray]] = field(default_factory=dict)
+    known: dict[tuple[object, ...], NDArray] = field(default_factory=dict)
 
     def copy(self) -> "Informed":
         """One that learns by itself from here on."""
@@ -119,13 +119,12 @@ def _scored(
 
     value, score, swept = look(logs)
     for _ in range(iterations):
-        where, information = informed.known.get(key, (np.full(logs.size, np.inf), np.zeros((0, 0))))
-        fresh = not np.all(np.abs(logs[index] - where[index]) < NEARBY)
+        fresh = key not in informed.known
         if fresh:
             information = _information(chosen, swept, logs, memory, index, workers)
-            informed.known[key] = logs, information
-        prior = np.eye(index.size) / PRIOR_SD**2
-        step = np.clip(np.linalg.solve(information + prior, score), -LARGEST, LARGEST)
+            informed.known[key] = information + np.eye(index.size) / PRIOR_SD**2
+        curvature = informed.known[key]
+        step = np.clip(np.linalg.solve(curvature, score), -LARGEST, LARGEST)
         for _ in range(5):
             there = logs.copy()
             there[index] = np.maximum(logs[index] + step, floor[index])
@@ -136,13 +135,23 @@ def _scored(
         else:
             if fresh:
                 break
-            del informed.known[key]  # that of a point nearby led nowhere
+            del informed.known[key]
             continue
-        done = found - value < tolerance
+        gain, way = found - value, there[index] - logs[index]
+        informed.known[key] = _learnt(curvature, way, score - slope)
+        promised = 0.5 * float(score @ way)
         logs, value, score, swept = there, found, slope, passes
-        if done:
+        if max(gain, promised) < tolerance:
             break
     return noise_of(logs, memory)
+
+
+def _learnt(curvature: NDArray, way: NDArray, change: NDArray) -> NDArray:
+    """The curvature (k, k) with what a step tells of it: along `way` (k,) the score fell by `change` (k,)."""
+    along, before = float(way @ change), curvature @ way
+    if along <= 1e-3 * float(way @ before):
+        return curvature
+    return curvature + np.outer(change, change) / along - np.outer(before, before) / float(way @ before)
 
 
 def _information(
