@@ -37,7 +37,7 @@ def survivors(monkeypatch, *, p_value, held, gained=50.0, held_out=True):
     monkeypatch.setattr(prune, "refine_base", lambda *a, **k: fitted)
     monkeypatch.setattr(prune, "significance", significance)
     monkeypatch.setattr(prune, "held_gain", lambda *a: held)
-    apart = SimpleNamespace(fit_noise=lambda point, iterations: point, loglik=lambda point, passes: gained)
+    apart = SimpleNamespace(fit_noise=lambda point: point, loglik=lambda point, passes: gained)
     data = SimpleNamespace(twin=lambda: apart, loglik=lambda point, passes: 0.0)  # what wanders is fitted on a twin
     _, accepted, steps = prune.survive(
         data, fitted, [DRAG], [TAKEN], SimpleNamespace() if held_out else None, lambda text: None

@@ -132,13 +132,13 @@ class Data:
                 break
             before = now
 
-    def fit_noise(self, point: Point, *, iterations: int = 8) -> Point:
-        """The same model with noise scales that fit."""
+    def fit_noise(self, point: Point, *, near: bool = False) -> Point:
+        """The same model with noise scales that fit; `near`: they begin near."""
         parts = []
         for model in self.models:
             acceleration, _ = model.accelerations(point)
             parts.append((model.flight, acceleration, model.offsets(point, acceleration)))
-        found = fit_noise(parts, point.noise, iterations=iterations, workers=self.workers, informed=self.informed)
+        found = fit_noise(parts, point.noise, near=near, workers=self.workers, informed=self.informed)
         return replace(point, noise=found)
 
     def leave_out_wild(self, point: Point) -> int:
@@ -213,7 +213,7 @@ def remembering(data: Data, point: Point) -> Point:
         if memory > 0:
             start = np.concatenate([point.noise.disturbance[:3], TORQUES])
             noise = replace(point.noise, disturbance=start, memory=memory)
-            there = data.fit_noise(replace(point, noise=noise), iterations=5)
+            there = data.fit_noise(replace(point, noise=noise), near=True)
             data.settle(there)
             found = data.loglik(there)
             if found > value + needed:
@@ -226,7 +226,7 @@ def remembering_anew(data: Data, point: Point) -> Point:
     if not point.noise.disturbance[3:].any():
         return remembering(data, point)
     forces = np.concatenate([point.noise.disturbance[:3], np.zeros(3)])
-    white = data.fit_noise(replace(point, noise=replace(point.noise, disturbance=forces)), iterations=5)
+    white = data.fit_noise(replace(point, noise=replace(point.noise, disturbance=forces)), near=True)
     data.settle(white)
     chosen = remembering(data, white)
     data.settle(chosen)
@@ -317,7 +317,7 @@ def refine(
                 break
         gained = value - before
         if noise and (turn < 1 or gained > 2.0):
-            better = data.fit_noise(point, iterations=4)
+            better = data.fit_noise(point, near=True)
             found, slopes = look(better)
             if found > value:
                 point, value, gram = better, found, slopes

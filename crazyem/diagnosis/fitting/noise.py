@@ -19,7 +19,7 @@ ROWS = 1500  # of each flight, in a few stretches, from which the scales are tak
 STRETCH = 750  # rows each: short ones begin too often at what was measured, and velocities seem better than they are
 FEW, SHORT = 900, 150  # the same for the way there
 PRIOR_SD = 2.0  # of the logarithm of a scale about its typical value
-FROM_AFAR = 8  # iterations
+MOST_STEPS = 40
 STEP = 0.02  # in the logarithm, for differences
 LARGEST = 1.5  # step of scoring in the logarithm
 TYPICAL = Noise(np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), np.array([1e-3, 1e-2, 3e-3, 1e-2]))
@@ -76,27 +76,25 @@ def fit_noise(
     parts: list[Part],
     start: Noise,
     *,
-    iterations: int = 8,
+    near: bool = False,
     tolerance: float = 0.2,
     workers: Workers | None = None,
     informed: Informed | None = None,
 ) -> Noise:
     """Noise scales of highest posterior density, the accelerations (n, 6) and offsets (n, 12) of each flight given.
 
-    Scales of quantities that nothing measures stay. Disturbances are fitted where they start above 0. From far away,
-    most of the way is gone on few rows.
+    Scales of quantities that nothing measures stay. Disturbances are fitted where they start above 0. Unless the start
+    is near, most of the way is gone on few rows.
     """
     workers, informed = workers or Workers(1), informed or Informed()
-    if iterations >= FROM_AFAR and any(f.time.size > FEW for f, _, _ in parts):
+    if not near and any(f.time.size > FEW for f, _, _ in parts):
         few = [(f.rows(k), a[k], o[k]) for f, a, o in parts for k in (sample_rows(f, rows=FEW, stretch=SHORT),)]
-        start = _scored(few, start, iterations, 5 * tolerance, workers, Informed())
+        start = _scored(few, start, 5 * tolerance, workers, Informed())
     chosen = [(f.rows(keep), a[keep], o[keep]) for f, a, o in parts for keep in (sample_rows(f),)]
-    return _scored(chosen, start, iterations, tolerance, workers, informed)
+    return _scored(chosen, start, tolerance, workers, informed)
 
 
-def _scored(
-    chosen: list[Part], start: Noise, iterations: int, tolerance: float, workers: Workers, informed: Informed
-) -> Noise:
+def _scored(chosen: list[Part], start: Noise, tolerance: float, workers: Workers, informed: Informed) -> Noise:
     measured = np.zeros(4, bool)
     for flight, _, _ in chosen:
         measured |= np.array([np.isfinite(flight.y[:, c]).any() for c in (0, 3, 6, 10)])
@@ -118,7 +116,7 @@ def _scored(
         return value, slope, [swept for swept, _ in found]
 
     value, score, swept = look(logs)
-    for _ in range(iterations):
+    for _ in range(MOST_STEPS):
         fresh = key not in informed.known
         if fresh:
             information = _information(chosen, swept, logs, memory, index, workers)

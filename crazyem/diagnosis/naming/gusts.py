@@ -16,7 +16,6 @@ from crazyem.diagnosis.fitting.model import Noise, Point
 MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)  # s
 GAINED = 40.0  # nats
 SHARE_SD = 0.2  # relative: of the spread, for the memory that goes with it and what else is wrong in the forces
-FAR = 25  # iterations of the first fit
 # Of the memory's logarithm: some ten memories fit into a flight, and a loop that leans into the wind shortens them. In
 # 21 simulated drones with gusts of 0.5 to 2 s (seeds 2038 and 2039) it was off by 0.55 (rms), when 0.2 was said.
 MEMORY_SD = 0.5
@@ -51,23 +50,21 @@ def find_gusts(data: Data, point: Point) -> Gusts | None:
     """Whether a disturbing force with memory is there; None if the likelihood gains nothing by it."""
     white = data.loglik(point, passes=2)
 
-    def fitted(memory: float, start: Noise, spread: NDArray, iterations: int) -> tuple[float, Point]:
+    def fitted(memory: float, start: Noise, spread: NDArray) -> tuple[float, Point]:
         torques = point.noise.disturbance[3:], np.broadcast_to(np.asarray(point.noise.memory, float), (6,))[3:]
         noise = replace(start, disturbance=np.concatenate([spread, torques[0]]),
                         memory=np.concatenate([np.full(3, memory), torques[1]]))  # fmt: skip
-        found = data.fit_noise(replace(point, noise=noise), iterations=iterations)
+        found = data.fit_noise(replace(point, noise=noise))
         return data.loglik(found, passes=2), found
 
-    first = fitted(1.0, point.noise, np.full(3, 0.1), 5)
+    first = fitted(1.0, point.noise, np.full(3, 0.1))
     if first[0] - white < 0.5 * GAINED or first[1].noise.disturbance[:3].max() < 0.7 * SMALLEST:
         return None
-    # what was white until now stood in all scales: short of the maximum, 250 nats of them pass for a longer memory
-    first = fitted(1.0, first[1].noise, first[1].noise.disturbance[:3], FAR)
     reached = first[1].noise
     tried = {1.0: first}
     for m in MEMORIES:
         if m != 1.0:
-            tried[m] = fitted(m, reached, np.sqrt(m) * reached.disturbance[:3], 8)
+            tried[m] = fitted(m, reached, np.sqrt(m) * reached.disturbance[:3])
     best = max(tried, key=lambda m: tried[m][0])
     gain = tried[best][0] - white
     spread = tried[best][1].noise.disturbance[:3]

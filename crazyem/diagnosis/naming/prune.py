@@ -133,7 +133,7 @@ def survive(
     while accepted:
         apart = data.twin()
         noise = replace(fitted.point.noise, disturbance=np.concatenate([FORCES, TORQUES]), memory=1.0)
-        point = apart.fit_noise(replace(fitted.point, noise=noise), iterations=20)  # far from where white noise was
+        point = apart.fit_noise(replace(fitted.point, noise=noise))
         if apart.loglik(point, passes=2) < data.loglik(fitted.point, passes=2) + WANDERING:
             break
         wandering = refine_base(apart, point, accepted, rounds=2, noise=False)
