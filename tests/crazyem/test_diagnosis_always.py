@@ -40,7 +40,7 @@ def flown(*, speed: float, measured: bool = False) -> SimpleNamespace:
     """Flights that swing at these rms speeds [m/s] along x, y, z: 1, 2 and 4 times `speed`."""
     y = np.zeros((400, 13))
     y[:, 3:6] = np.sqrt(2) * speed * np.array([1, 2, 4]) * np.sin(np.arange(400) * np.pi / 20)[:, None]
-    flight = SimpleNamespace(y=y, inputs=SimpleNamespace(measured=measured), coarse=False)
+    flight = SimpleNamespace(name="flight", y=y, inputs=SimpleNamespace(measured=measured), coarse=False)
     signals = frozenset({"position", "velocity", "attitude", "body_rate"})
     return SimpleNamespace(flights=[flight], coarse=False, differ=False, signals=signals)
 
