@@ -62,7 +62,9 @@ class Own:
 def owned(flights: Sequence[Flight], kept_apart: Sequence[Flight], strengths: Mapping[str, float]) -> tuple[Own, ...]:
     """Of all flights, those kept apart last; `strengths` by name."""
     return tuple(
-        _own(f, apart, strengths.get(f.name)) for part, apart in ((flights, False), (kept_apart, True)) for f in part
+        _own(f, apart, (strengths or {}).get(f.name))
+        for part, apart in ((flights, False), (kept_apart, True))
+        for f in part
     )
 
 
