@@ -133,15 +133,18 @@ class OfRecordings(Candidate):
     @property
     def label(self) -> str:
         """For people."""
-        return f"{self.effect.removeprefix(OWN)} of each recording"
+        return f"{self._shared.said({})} of each recording"
+
+    @property
+    def _shared(self) -> Effect:
+        return CATALOGUE[self.effect.removeprefix(OWN)]
 
     def parameter(self, name: str) -> Parameter:
         """The deviation of one parameter in one recording."""
-        shared = next(
-            p for p in CATALOGUE[self.effect.removeprefix(OWN)].parameters if p.name == name.rpartition("/")[2]
-        )
-        middle = float(shared.neutral)
-        return replace(shared, name=name, neutral=0.0, low=shared.low - middle, high=shared.high - middle)
+        recording, _, own = name.rpartition("/")
+        p = next(p for p in self._shared.parameters if p.name == own)
+        words, middle = f"{p.said} of {recording.rpartition('/')[2]}", float(p.neutral)
+        return replace(p, name=name, words=words, neutral=0.0, low=p.low - middle, high=p.high - middle)
 
     def neutral(self, point: Point) -> dict[str, Any]:
         """As all recordings are."""
