@@ -75,7 +75,7 @@ def test_a_body_without_thrust_falls_and_one_that_spins_about_an_axis_of_inertia
     states[:, 3:6] = [1.0, -2.0, 0.5] - G * t * [0, 0, 1]
     states[:, 6:10] = (Rotation.from_rotvec([0.4, 0.2, 0]) * Rotation.from_rotvec(t * spin)).as_quat()
     states[:, 10:13] = spin
-    recording = recording_of(TIMES, states, rotor_speed=(TIMES, np.zeros((TIMES.size, 4))))
+    recording = recording_of(TIMES, states, rotor_speed=(TIMES, np.full((TIMES.size, 4), 1e-3)))
     found = predicted(recording, drone)
     assert found.prediction.shape == (TIMES.size - 50, 50, 13)
     truth = along(states, found.start_index, 50)

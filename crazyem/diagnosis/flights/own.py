@@ -59,7 +59,9 @@ class Own:
         return [{"name": None, **dict(zip(keys, f, strict=True)), "expected": 0.0, "usual": None} for f in found]
 
 
-def owned(flights: Sequence[Flight], kept_apart: Sequence[Flight], strengths: Mapping[str, float]) -> tuple[Own, ...]:
+def owned(
+    flights: Sequence[Flight], kept_apart: Sequence[Flight], strengths: Mapping[str, float] | None = None
+) -> tuple[Own, ...]:
     """Of all flights, those kept apart last; `strengths` by name."""
     return tuple(
         _own(f, apart, (strengths or {}).get(f.name))
