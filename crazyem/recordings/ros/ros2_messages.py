@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 LARGEST_MESSAGE = 1 << 16  # bytes; larger ones are images, maps and point clouds
 _LARGEST_DEFINITION = 1 << 18  # characters
@@ -106,15 +107,20 @@ def _decoder(name: str, text: str) -> Callable[[bytes], Any]:
 
 def standard_definition(name: str) -> str | None:
     """The definition of a type that bags from before 2023 do not carry; None if it is not known here."""
-    store = get_typestore(Stores.ROS2_HUMBLE)
     try:
-        own = {kind: text for kind, text in CRAZYFLIE.items() if kind not in store.fielddefs}
-        for kind, text in own.items():
-            store.register({k: v for k, v in get_types_from_msg(text, kind).items() if k not in store.fielddefs})
         package, _, kind = _short(name).partition("/")
-        return store.generate_msgdef(f"{package}/msg/{kind}", ros_version=2)[0]
+        return _standard().generate_msgdef(f"{package}/msg/{kind}", ros_version=2)[0]
     except (KeyError, ValueError, TypesysError):
         return None
+
+
+@functools.cache
+def _standard() -> Typestore:
+    """The types of ROS 2 Humble and of crazyswarm2."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for kind, text in CRAZYFLIE.items():
+        store.register(get_types_from_msg(text, kind))
+    return store
 
 
 # Sources: IMRCLab/crazyswarm2 (crazyflie_interfaces/msg), IMRCLab/motion_capture_tracking.
