@@ -342,6 +342,7 @@ class Session:
     def _receiving_failed(self, error: Exception) -> None:
         """A fault of ours must reach the flight as well: it has to land."""
         self._deaf = True
+        self.telemetry.heard = -math.inf
         self.stop_pushing()
         self.failure = error if isinstance(error, CrazyemError) else CrazyemError(f"receiving failed: {error!r}")
 
@@ -357,6 +358,7 @@ class Session:
 
     def _come_back(self, lost: LinkLost) -> bool:
         """Bring the link back; there is nothing to receive meanwhile. False: lost for good."""
+        self.telemetry.heard = -math.inf
         reconnect = getattr(self.link, "reconnect", None)
         if reconnect is None or not getattr(self.link, "can_reconnect", True) or self.reconnect_within <= 0.0:
             self._gone(lost)

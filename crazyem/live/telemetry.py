@@ -16,7 +16,8 @@ class Telemetry:
 
     Attributes:
         info: bits of supervisor.info, None until seen.
-        heard: s since the epoch, host time at which the newest `info` arrived; -inf before any.
+        heard: s since the epoch, host time at which the newest `info` arrived; -inf before any, and once the
+            link is lost.
         position: m, world. yaw: rad. voltage: V. setpoint: m, world.
     """
 

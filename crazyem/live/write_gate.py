@@ -3,6 +3,7 @@
 Nothing but the newest telemetry counts here, because everything else may be late: an estimate, a decision, a queue.
 """
 
+import math
 import time
 from collections.abc import Callable
 
@@ -29,6 +30,8 @@ class WriteGate:
 
     def stale(self) -> str:
         """Why telemetry says nothing about the present, one clause; "" while it is fresh."""
+        if self.telemetry.heard == -math.inf:
+            return "no telemetry comes"
         age = abs(self.now() - self.telemetry.heard) * self.rate()  # abs: somebody may set the host's clock
         return "" if age <= FRESH else f"the newest telemetry is {age:.1f} s old"
 
