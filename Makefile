@@ -36,10 +36,10 @@ fly: $(FLIES)  ## fly the simulated firmware with wrong constants and watch them
 		--record flight.mcap --json flight.json
 
 test: $(WARM)  ## everything that is not marked slow
-	$(BIN)/python -m pytest -q -n 2
+	$(BIN)/python -m pytest -q -n 3
 
 slow: $(WARM)  ## the long ones: many seeds, many flights, and made-up examples that are many and new
-	$(BIN)/python -m pytest -q -n 2 -m "slow or hypothesis" --hypothesis-profile deep
+	$(BIN)/python -m pytest -q -n 3 -m "slow or hypothesis" --hypothesis-profile deep
 
 lint: $(READY)
 	$(BIN)/ruff check .

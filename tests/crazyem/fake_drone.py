@@ -16,7 +16,7 @@ from crazyem.signals.vocabulary import MOTOR_BLOCK, compress_quaternion
 LEVEL = float(compress_quaternion((0.0, 0.0, 0.0, 1.0)))
 WAITING = 10  # packets of a block that a session may be behind
 AHEAD = 0.1  # s of the drone's clock that a flight may be behind
-PATIENCE = 5.0  # s; who does not catch up for so long is not waited for any more
+PATIENCE = 4000  # looks, a millisecond apart: a busy machine slows the looks as well as who is waited for
 SAG = 0.3  # m below the wanted height until the believed mass is right
 TRUTH = {"mass": 0.036, "Ixx": 2.0e-5, "Iyy": 2.1e-5, "Izz": 3.6e-5, "motor_time_constant": 0.06}
 
@@ -151,11 +151,11 @@ class FakeLink:
         return seen >= 0.0 and self.fm / 1000.0 - seen > AHEAD  # not while it has seen nothing at all
 
     def _wait(self):
-        end = time.monotonic() + PATIENCE
-        while self._outruns() and not self._stop.is_set():
+        for _ in range(PATIENCE):
+            if self._stop.is_set() or not self._outruns():
+                return
             time.sleep(0.001)
-            if time.monotonic() > end:
-                self._session = None  # it does not catch up, perhaps because it waits for the drone
+        self._session = None  # it does not catch up, perhaps because it waits for the drone
 
     def _run(self):
         while not self._stop.is_set():

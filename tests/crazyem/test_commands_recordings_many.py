@@ -49,7 +49,7 @@ def test_a_name_that_is_no_text(tmp_path: Path, flight: Path) -> None:
 
 def crazyem(*argv: object, **more: Any) -> subprocess.CompletedProcess[bytes]:
     arguments = [sys.executable, "-m", "crazyem", *(a if isinstance(a, bytes) else str(a) for a in argv)]
-    return subprocess.run(arguments, capture_output=True, timeout=120, check=False, **more)
+    return subprocess.run(arguments, capture_output=True, timeout=600, check=False, **more)
 
 
 def test_a_reader_that_has_seen_enough(flight: Path) -> None:
@@ -61,7 +61,7 @@ def test_a_reader_that_has_seen_enough(flight: Path) -> None:
     process.stdout.close()
     said = process.stderr.read()
     process.stderr.close()
-    assert process.wait(60) == 141
+    assert process.wait(600) == 141
     assert said == b""
 
 
@@ -76,7 +76,7 @@ def test_interrupted_among_many(tmp_path: Path, flight: Path) -> None:
     assert process.stdout is not None
     process.stdout.readline()  # it has begun
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all of its processes
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=600)
     assert process.returncode == 130
     assert b"Traceback" not in err
     assert err.rstrip().endswith(b"crazyem: interrupted.")

@@ -7,7 +7,6 @@ beside two weak rotors, a day's differences; on flights of `closed_loop.py`.
 from dataclasses import replace
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
@@ -25,10 +24,9 @@ from crazyem.diagnosis.locating.restless import AT_RANDOM
 from crazyem.diagnosis.naming import select as selecting
 from crazyem.diagnosis.naming import told
 from crazyem.diagnosis.naming.named import DOUBTFUL, trust
-from crazyem.diagnosis.naming.prune import left_out
 from crazyem.diagnosis.naming.select import select
 from crazyem.diagnosis.naming.told import BY_FORCE
-from crazyem.diagnosis.naming.trials import Selection, Step, Trial
+from crazyem.diagnosis.naming.trials import Selection
 from crazyem.diagnosis.naming.unexplained import Unexplained, notable
 from crazyem.physics.effects.catalogue import CATALOGUE
 
@@ -60,25 +58,6 @@ def test_an_inertia_that_no_body_has_leaves_open_what_turns_the_drone(slow_to_tu
 
 
 @pytest.mark.slow
-def test_a_selection_goes_on_from_where_another_began(monkeypatch):
-    data = Data([flight_of(fly(Hidden(thrust=(0.9,) * 4, drag=(0.02, 0.02, 0.02)), seconds=20.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, first_guess()))
-    base = refine_base(data, point, ())
-    first = refine_base(data, base.point.with_effects({"thrust_scale": {"scale": 0.95}}), [THRUST])
-    taken = Trial(THRUST, first.loglik - base.loglik, 0.0, 1.0, 1e-9, 100.0, fitted=first)
-    begun = Selection(base.point, first.point, (Step((taken,), taken), Step((), None)), (THRUST,), first, 2)
-    found = select(data, base.point, [THRUST, DRAG], begun=begun)
-    assert [c.effect for c in found.accepted] == ["thrust_scale", "linear_drag"]
-    assert [s.taken.candidate.effect for s in found.steps if s.taken] == ["thrust_scale", "linear_drag"]
-    monkeypatch.setattr(selecting, "may_join", lambda effect, present: present != {"thrust_scale"})
-    alone = select(data, base.point, [THRUST, DRAG], begun=begun)
-    assert [c.effect for c in alone.accepted] == ["thrust_scale"]
-    assert found.nominal is begun.nominal
-    assert found.final.effects["thrust_scale"]["scale"] == pytest.approx(0.9, abs=0.01)
-    assert found.final.effects["linear_drag"]["x"] == pytest.approx(0.02, abs=0.004)
-
-
-@pytest.mark.slow
 def test_what_went_on_to_its_end_is_taken_back_and_the_selection_goes_on(monkeypatch):
     """As a slope of the thrust curve did, in the fit with all that is free: a thrust that does not heed its command."""
     data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02), thrust=(0.9,) * 4), seconds=20.0), DRONE)])
@@ -101,23 +80,6 @@ def test_what_went_on_to_its_end_is_taken_back_and_the_selection_goes_on(monkeyp
 
 
 @pytest.mark.slow
-def test_where_there_was_room_for_no_more_it_goes_on_after_something_is_left_out(monkeypatch):
-    data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02), thrust=(0.9,) * 4), seconds=20.0), DRONE)])
-    point = nominal(data, Point(DRONE, {}, first_guess()))
-    real = selecting.drop
-
-    def without_the_first(data, fitted, accepted, steps, *more):
-        if [c.effect for c in accepted] == ["thrust_scale"]:
-            return left_out(data, fitted, accepted, steps, accepted[0])
-        return real(data, fitted, accepted, steps, *more)
-
-    monkeypatch.setattr(selecting, "drop", without_the_first)
-    for most, names in ((1, ["linear_drag"]), (2, ["thrust_scale", "linear_drag"])):
-        monkeypatch.setattr(selecting, "MOST", most)
-        assert [c.effect for c in select(data, point, [THRUST, DRAG]).accepted] == names
-
-
-@pytest.mark.slow
 def test_after_an_exchange_the_selection_goes_on(slow_to_turn, monkeypatch):
     """Made to exchange what it found for nothing, it finds it again; where nothing is exchanged, it is not asked."""
     calls = []
@@ -137,33 +99,6 @@ def test_after_an_exchange_the_selection_goes_on(slow_to_turn, monkeypatch):
     assert [e.name for e in diagnose([slow_to_turn], DRONE, wanted=["linear_drag"]).effects] == ["linear_drag"]
     assert len(calls) == 3
     assert calls[2].accepted == ()
-
-
-@pytest.mark.slow
-def test_what_may_as_well_be_none_is_not_sure(slow_to_turn, monkeypatch):
-    sure = diagnose([slow_to_turn], DRONE, wanted=["linear_drag", "inertia"])
-    assert max(e.confidence for e in sure.effects) > DOUBTFUL
-    asked = []
-    monkeypatch.setattr(told, "wald", lambda away, *rest: asked.append(away) or 0.06)
-    unsure = diagnose([slow_to_turn], DRONE, wanted=["linear_drag", "inertia"])
-    assert {e.name for e in unsure.effects} == {e.name for e in sure.effects}
-    assert all(e.confidence <= DOUBTFUL for e in unsure.effects)
-    own = {e.name: np.array([v.value for v in e.parameters.values()]) for e in sure.effects}
-    away = {"linear_drag": own["linear_drag"], "inertia": own["inertia"] - np.array(DRONE.inertia)}
-    for e in sure.effects:  # what is asked is how far it is from neutral
-        assert any(np.allclose(away[e.name], a) for a in asked)
-
-
-@pytest.mark.slow
-def test_what_a_wrong_lag_does_is_part_of_an_interval(slow_to_turn, monkeypatch):
-    asked = {"wanted": ["linear_drag", "inertia"]}
-    before = {e.name: e.parameters for e in diagnose([slow_to_turn], DRONE, **asked).effects}
-    monkeypatch.setattr(told, "by_a_wrong_lag", lambda data, fitted: {("inertia", "xx"): 1e-5})
-    after = {e.name: e.parameters for e in diagnose([slow_to_turn], DRONE, **asked).effects}
-    assert before["inertia"]["xx"].sd < 5e-6
-    assert 1e-5 < after["inertia"]["xx"].sd <= np.hypot(1e-5, before["inertia"]["xx"].sd)
-    assert after["inertia"]["yy"].sd < before["inertia"]["yy"].sd  # what the lag does to it was there before
-    assert after["linear_drag"] == before["linear_drag"]
 
 
 @pytest.mark.slow

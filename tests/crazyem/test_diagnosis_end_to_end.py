@@ -144,9 +144,8 @@ def test_drag_is_named_measured_and_taken_away(dragged: list[Recording]) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_nothing_hidden_is_nothing_found(seed: int) -> None:
-    recording = fly(seed=seed)
+def test_nothing_hidden_is_nothing_found() -> None:
+    recording = fly()
     found = diagnose([recording], DRONE)
     assert not found.mismatch
     assert found.effects == ()
@@ -157,13 +156,12 @@ def test_nothing_hidden_is_nothing_found(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 2])
-def test_ten_seconds_are_enough_for_what_is_plain(seed: int) -> None:
+def test_ten_seconds_are_enough_for_what_is_plain() -> None:
     """Ten blocks of a second told too little of their own scatter, and everything was left out again."""
-    found = diagnose([fly(Hidden(thrust=(0.9,) * 4, drag=(0.02, 0.02, 0.02)), seed=seed, seconds=10.0)], DRONE)
+    found = diagnose([fly(Hidden(thrust=(0.9,) * 4, drag=(0.02, 0.02, 0.02)), seconds=10.0)], DRONE)
     assert {"thrust_scale", "linear_drag"} <= {*first(found), *(e.name for e in found.effects)}
     assert any("weigh the drone" in text for text in found.would_separate)
-    assert not diagnose([fly(seed=seed, seconds=10.0)], DRONE).mismatch
+    assert not diagnose([fly(seconds=10.0)], DRONE).mismatch
 
 
 @pytest.mark.slow
@@ -176,9 +174,8 @@ def test_weak_thrust_is_named_or_declared_alike() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_rotor_that_fails_in_flight_is_named_with_its_moment(seed: int) -> None:
-    found = diagnose([fly(Hidden(thrust=(1, 1, 0.9, 1), onset=8.37), seed=seed)], DRONE)
+def test_a_rotor_that_fails_in_flight_is_named_with_its_moment() -> None:
+    found = diagnose([fly(Hidden(thrust=(1, 1, 0.9, 1), onset=8.37))], DRONE)
     assert found.effects[0].name == "rotor_fault"
     holds(found, "rotor_fault", scale=0.9)
     chosen: Any = found.effects[0].chosen

@@ -73,13 +73,6 @@ def test_a_steady_torque_that_nothing_explains_is_written_as_a_trim() -> None:
 
 
 @pytest.mark.slow
-def test_what_a_file_explains_leaves_no_trim() -> None:
-    assert (
-        TRIM not in diagnose([fly(Hidden(drag=(0.02, 0.02, 0.0)), seconds=12.0, seed=7)], DRONE).fitted_vehicle.effects
-    )
-
-
-@pytest.mark.slow
 def test_a_drone_whose_commands_shake_has_a_trim_first() -> None:
     """As those of real drones with a deck, logged at 100 Hz; judged by a file that knows no trim, then by its own."""
     strong = 1.04  # within what any drone may have, and part of its file all the same

@@ -22,12 +22,12 @@ def test_results_come_in_order(jobs):
 
 
 def test_two_items_are_worked_on_at_a_time():
-    meet = threading.Barrier(2, timeout=20.0)
+    meet = threading.Barrier(2, timeout=60.0)
     assert sorted(Workers(2).map(lambda _: meet.wait(), range(2))) == [0, 1]
 
 
 def test_who_is_idle_helps_a_worker_that_shares_work():
-    meet = threading.Barrier(2, timeout=20.0)
+    meet = threading.Barrier(2, timeout=60.0)
     workers = Workers(2)
     done = workers.map(lambda shares: workers.map(lambda _: meet.wait(), range(2)) if shares else [], [False, True])
     assert [sorted(row) for row in done] == [[], [0, 1]]
@@ -44,7 +44,7 @@ def test_nobody_waits_for_work_that_is_not_begun(jobs):
 
 
 def test_helpers_say_of_overflow_what_the_asker_says():
-    meet = threading.Barrier(2, timeout=20.0)
+    meet = threading.Barrier(2, timeout=60.0)
     with np.errstate(over="ignore"):
         there = Workers(2).map(lambda _: (meet.wait(), np.geterr()["over"])[1], range(2))
     assert there == ["ignore", "ignore"]
@@ -57,7 +57,7 @@ def test_a_failure_comes_out():
 
 
 def test_of_several_failures_the_first_comes_out():
-    meet = threading.Barrier(2, timeout=20.0)
+    meet = threading.Barrier(2, timeout=60.0)
 
     def fail(number):
         meet.wait()
@@ -75,7 +75,7 @@ def test_after_an_interruption_nobody_goes_on():
         if threading.current_thread() is threading.main_thread():
             begun.set()
             raise KeyboardInterrupt
-        begun.wait(20.0)
+        begun.wait(60.0)
 
     with pytest.raises(KeyboardInterrupt):
         Workers(2).map(interrupted, range(1_000_000))

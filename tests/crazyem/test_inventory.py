@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_flight import Motion, array_of, changed, made_flight, without
@@ -270,7 +269,7 @@ def test_drag_and_mass_are_those_of_the_flight() -> None:
 
 
 def test_the_shipped_flight_identifies_all() -> None:
-    found = verdicts(inventory(open_recording(REPOSITORY / "logs" / "payload_excite.mcap")))
+    found = verdicts(inventory(open_recording(Path(__file__).parents[2] / "logs" / "payload_excite.mcap")))
     for name in ("mass", "Ixx", "Iyy", "Izz", "motor_time_constant", "input_delay", "torque_offsets"):
         assert found[name].verdict == "yes", found[name]
     # 36 g, J = (20, 21, 36)e-6, lag 60 ms; the scenario's file says so

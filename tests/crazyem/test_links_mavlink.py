@@ -38,7 +38,7 @@ def linked(kind=PX4, *, query="", **options):
     """A connected link and the autopilot at its other end."""
     port = free_port()
     with MavlinkUdp(f"mavlink:udpin:127.0.0.1:{port}{query}") as link, FakeAutopilot(port, kind, **options) as drone:
-        link.connect(10.0)
+        link.connect(60.0)
         yield link, drone
 
 
@@ -80,7 +80,7 @@ def of(found, signal):
     return [s for s in found if s.signal == signal]
 
 
-def wait(condition, seconds=5.0):
+def wait(condition, seconds=60.0):
     until = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < until
@@ -126,7 +126,7 @@ def test_our_simulator_says_so_itself_and_an_address_does_not():
     port = free_port()
     with MavlinkUdp(f"mavlink:udpin:127.0.0.1:{port}") as link, FakeAutopilot(port) as drone:
         drone.uid = b"crazyem firmware"
-        link.connect(10.0)
+        link.connect(60.0)
         assert link.simulated
     with linked() as (link, _):
         assert not link.simulated
@@ -260,7 +260,7 @@ def test_a_write_is_verified_by_its_echo():
 def test_a_lost_echo_is_asked_for_again_and_a_wrong_one_is_no_confirmation():
     with linked() as (link, drone):
         drone.drop_replies = 2
-        assert link.write_parameter("MPC_THR_HOVER", 0.55, timeout=2.0).verified
+        assert link.write_parameter("MPC_THR_HOVER", 0.55, timeout=30.0).verified
         assert len(drone.writes) == 3
         drone.wrong_echo = True
         write = link.write_parameter("MPC_THR_HOVER", 0.6, timeout=0.5)
@@ -301,7 +301,7 @@ def test_silence_is_told_once_and_the_link_comes_back(monkeypatch):
             link.reconnect(0.2)
         drone.mute = False
         drone.intervals.clear()
-        outage = link.reconnect(5.0)
+        outage = link.reconnect(60.0)
         assert "nothing has come" in outage.reason
         assert number_of("LOCAL_POSITION_NED") in drone.intervals  # asked for again
         drone.stream(0.05)
@@ -348,7 +348,7 @@ def test_a_serial_port_that_is_pulled_out_is_a_lost_drone(monkeypatch):
     thread = threading.Thread(target=talk)
     thread.start()
     with MavlinkUdp(f"mavlink:{os.ttyname(slave)}:57600") as link:
-        link.connect(5.0)
+        link.connect(60.0)
         link.start_streams(100.0)
         wait(lambda: link.packets.qsize() > 5)
         stop.set()

@@ -146,5 +146,5 @@ def test_the_terminal_is_as_before_when_the_process_has_ended(terminal, end):
             assert modes(slave) == termios.ISIG
             time.sleep(0.1)
             child.send_signal(signal.SIGINT)
-        assert child.wait(30) != 0
+        assert child.wait(120) != 0
     assert termios.tcgetattr(slave) == before

@@ -40,7 +40,7 @@ def start(*arguments, cwd):
     )  # fmt: skip
 
 
-def wait_for(process, word, seconds=90.0):
+def wait_for(process, word, seconds=600.0):
     """Read standard error until a line holds `word`; the lines so far."""
     lines = []
     until = time.monotonic() + seconds
@@ -102,7 +102,7 @@ def test_drone_lost_in_flight_leaves_a_readable_recording(tmp_path, simulator):
     process = start("fly", drone.uri, "--duration", "30", "--record", "lost.mcap", "--json", "lost.json", cwd=tmp_path)
     wait_for(process, "hover ")
     drone.kill()
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=600)
     assert process.returncode == 4
     assert "Traceback" not in errors
     assert "was lost" in errors.strip().splitlines()[-1]
@@ -117,7 +117,7 @@ def test_interrupt_lands_and_still_reports(tmp_path, simulator):
     process = start("fly", drone.uri, "--duration", "60", "--json", "cut.json", cwd=tmp_path)
     wait_for(process, "hover ")
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=600)
     assert process.returncode == 130
     assert "landed on request" in errors
     assert json.loads((tmp_path / "cut.json").read_text())["updates"] > 0
@@ -152,7 +152,7 @@ def test_three_lines_give_an_existing_cflib_script_estimates(simulator):
         with crazyem.attach(scf.cf, vehicle="cf2") as drone_estimates:
             scf.cf.commander.send_notify_setpoint_stop()
             scf.cf.high_level_commander.takeoff(1.0, 2.0)
-            estimate = drone_estimates.wait(["mass"], timeout=20.0)
+            estimate = drone_estimates.wait(["mass"], timeout=120.0)
             assert estimate["mass"].value == pytest.approx(0.029, rel=0.03)
             assert drone_estimates.session.history.pushes == []
         assert scf.cf.is_connected()

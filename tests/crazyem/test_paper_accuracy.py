@@ -200,7 +200,7 @@ def test_the_page_says_what_the_results_say():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("part", "sensor"), [(p, s) for p in PARTS for s in PARTS[p].sensors])
+@pytest.mark.parametrize(("part", "sensor"), [(p, PARTS[p].sensors[-1]) for p in PARTS])
 def test_results_have_not_drifted(part, sensor):
     """The first flight again: every estimate within a twentieth of its bound of the one in the results."""
     found = json.loads(benchmark.RESULTS.read_text())

@@ -114,7 +114,7 @@ def main(name: str, folder: Path) -> None:
     with open("/proc/self/statm") as statm:
         used = int(statm.read().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
-    print(campaign(made, folder, seed=2, count=1500))
+    print(campaign(made, folder, seed=2, count=500))
 
 
 if __name__ == "__main__":

@@ -369,7 +369,7 @@ def test_the_command_relays_and_counts(drone):
                 sock.send(datagram)
             assert sock.recv(64) == ECHO
         process.send_signal(signal.SIGINT)
-        out, errors = process.communicate(timeout=20)
+        out, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
     counts = json.loads(out)
     assert counts["seed"] == 4
@@ -384,7 +384,7 @@ def test_the_command_relays_and_counts(drone):
 )
 def test_the_command_refuses_in_one_sentence(arguments):
     with run(*arguments) as process:
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=120)
     assert process.returncode == 2
     assert len(errors.strip().splitlines()) == 1
     assert errors.startswith("relay: ")

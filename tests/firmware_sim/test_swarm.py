@@ -114,7 +114,7 @@ def running(number):
             yield many, [s.getsockname()[1] for s in many._sockets]
         finally:
             many.stopping = True
-            thread.join(10)
+            thread.join(60)
             assert not thread.is_alive()
 
 
@@ -191,5 +191,5 @@ def test_the_command_announces_all_and_ends_when_told():
         assert [line.split()[5] for line in lines[:3]] == ["5", "6", "7"]
         assert lines[3] == "firmware_sim: 3 drones are ready\n"
         process.terminate()
-        assert process.wait(30) == 0
+        assert process.wait(120) == 0
         assert process.stderr.read() == ""
