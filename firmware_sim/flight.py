@@ -18,6 +18,7 @@ from firmware_sim.controllers.tick_with_effects import tick_step_with_effects
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.drive import present_wrench
 from firmware_sim.plant.effects.motion import origin
+from firmware_sim.plant.effects.sensing import seen_pose
 from firmware_sim.plant.noise import NoiseSource
 from firmware_sim.plant.rotors import wrench
 from firmware_sim.plant.sensors import ACC_CUTOFF, settle
@@ -126,6 +127,13 @@ class Flight:
         if self._estimate[at.E_EXT] > 0.0 and np.isfinite(norm) and norm > 1e-3:
             self._estimate[at.E_EXT] = 2.0
             self._estimate[at.E_EXT_QUAT : at.E_EXT_QUAT + 4] = np.roll(q / norm, 1)
+
+    def seen_pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """What a positioning system without noise sees now: m, world; quaternion x, y, z, w, body to world."""
+        p: Any = np.empty(3)
+        q: Any = np.empty(4)
+        seen_pose(self._truth, self.state, self._sensor, self.tick, p, q)
+        return p, np.roll(q, -1)
 
     def step(self) -> None:
         """One millisecond."""

@@ -75,6 +75,13 @@ class Sensors:
 
 
 @dataclass(frozen=True)
+class Integration:
+    """How the plant is integrated; the firmware's own clock always ticks in milliseconds."""
+
+    step: float = key(1e-3, 1e-3, 4e-3)  # s, rounded to whole milliseconds
+
+
+@dataclass(frozen=True)
 class Estimator:
     """Position (and attitude) fixes that reach the onboard estimate without a host."""
 
@@ -114,6 +121,7 @@ _SECTIONS: dict[str, type] = {
     "noise": Noise,
     "battery": Battery,
     "sensors": Sensors,
+    "integration": Integration,
     "estimator": Estimator,
     "start": Start,
     "ground": Ground,
@@ -131,6 +139,7 @@ class Scenario:
     noise: Noise = field(default_factory=Noise)
     battery: Battery = field(default_factory=Battery)
     sensors: Sensors = field(default_factory=Sensors)
+    integration: Integration = field(default_factory=Integration)
     estimator: Estimator = field(default_factory=Estimator)
     start: Start = field(default_factory=Start)
     ground: Ground = field(default_factory=Ground)
@@ -185,7 +194,10 @@ class Scenario:
             c[[at.EFFECT_ROTORS, at.EFFECT_BODY, at.EFFECT_SENSING]] = 1.0
         arm = max(c[at.ARM], c[at.ARM_Y])
         c[at.FEET_REACH] = 1.5 * arm
-        c[at.CONTACT_FREQUENCY : at.CONTACT_FREQUENCY + 3] = _contact(c[at.STANDING_MASS], arm, J)
+        c[at.CONTACT_FREQUENCY : at.CONTACT_FREQUENCY + 3] = _contact(
+            c[at.STANDING_MASS], arm, J, self.integration.step
+        )
+        c[at.INTEGRATION_STEP] = max(1.0, round(1000.0 * self.integration.step))
         c[at.GYRO_NOISE] = self.sensors.gyro_noise
         c[at.GYRO_BIAS : at.GYRO_BIAS + 3] = self.sensors.gyro_bias
         c[at.GYRO_WALK] = self.sensors.gyro_bias_walk
@@ -241,14 +253,15 @@ def _or(value: Any, default: Any) -> Any:
     return default if value is None else value
 
 
-def _contact(mass: float, arm: float, J: np.ndarray) -> tuple[float, float, float]:
-    """The floor's stiffness [rad/s], damping ratio and stick [1/s], no faster than 1 ms steps can follow.
+def _contact(mass: float, arm: float, J: np.ndarray, step: float) -> tuple[float, float, float]:
+    """The floor's stiffness [rad/s], damping ratio and stick [1/s], no faster than steps of `step` s follow.
 
     A foot feels the body's inertia about the opposite edge, so rocking is faster than heaving by `rocking`.
     """
     rocking = max(1.0, mass * arm * arm / float(np.linalg.eigvalsh(J)[0]))
-    frequency = min(120.0, 400.0 / math.sqrt(rocking))
-    return frequency, min(0.7, 250.0 / (frequency * rocking)), min(frequency, 400.0 / rocking)
+    fast, damped = 0.4 / step, 0.25 / step
+    frequency = min(120.0, fast / math.sqrt(rocking))
+    return frequency, min(0.7, damped / (frequency * rocking)), min(frequency, fast / rocking)
 
 
 def load_scenario(path: Path | None) -> Scenario:

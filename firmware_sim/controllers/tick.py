@@ -65,16 +65,22 @@ def control_step(setpoint, estimate, sensor, param, memory, log, tick):
 
 
 @kernel
-def plant_step(truth, state, noise):
-    """Move rotors, battery and body on by one millisecond under the present PWM."""
+def moves(truth, tick):
+    """Whether the plant moves at the end of this tick: with an integration step of n ms at the end of every n-th."""
+    return (tick + 1) % int(truth[at.INTEGRATION_STEP]) == 0
+
+
+@kernel
+def plant_step(truth, state, noise, dt):
+    """Move rotors, battery and body on by dt under the present PWM."""
     mean, u, force, torque = np.empty(4), np.empty(4), np.empty(3), np.empty(3)
-    lag(truth, state, DT, mean)
+    lag(truth, state, dt, mean)
     wrench(truth, mean, 0, u)
     for i in range(3):
         force[i] = 0.0
         torque[i] = 0.0
-    body_step(truth, state, u, force, torque, noise, DT)
-    battery_step(truth, state, DT)
+    body_step(truth, state, u, force, torque, noise, dt)
+    battery_step(truth, state, dt)
 
 
 @kernel
@@ -86,7 +92,8 @@ def tick_step(
     estimate_step(truth, state, sensor, estimate, P, param, noise, tick)
     control_step(setpoint, estimate, sensor, param, memory, log, tick)
     motors_step(board, state, sensor, param, memory, log, (flags & 1) != 0, (flags & 2) != 0)
-    plant_step(truth, state, noise)
+    if moves(truth, tick):
+        plant_step(truth, state, noise, DT * truth[at.INTEGRATION_STEP])
     log_estimate(sensor, estimate, P, log)
     log_inertial(sensor, log)
     log_battery(sensor, log)

@@ -10,11 +10,12 @@ from firmware_sim.controllers.externalise import (
     log_setpoint,
 )
 from firmware_sim.controllers.power_distribution import motors_step
-from firmware_sim.controllers.tick import DT, control_step
+from firmware_sim.controllers.tick import DT, control_step, moves
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
+from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.sensing import be_honest, claim_velocity, go_back, sense_late
-from firmware_sim.plant.effects.step import plant_step_with_effects
+from firmware_sim.plant.effects.step import hold_still, plant_step_with_effects
 from firmware_sim.plant.onboard_estimate import estimate_step
 from firmware_sim.plant.sensors import sensors_step
 
@@ -30,7 +31,10 @@ def tick_step_with_effects(
     claim_velocity(truth, sensor, estimate)
     control_step(setpoint, estimate, sensor, param, memory, log, tick)
     motors_step(board, state, sensor, param, memory, log, (flags & 1) != 0, (flags & 2) != 0)
-    plant_step_with_effects(truth, state, noise, DT)
+    if moves(truth, tick):
+        plant_step_with_effects(truth, state, noise, DT * truth[at.INTEGRATION_STEP])
+    else:
+        hold_still(truth, state)
     go_back(truth, sensor, estimate, tick)
     log_estimate(sensor, estimate, P, log)
     be_honest(sensor, estimate)

@@ -113,7 +113,8 @@ CABLE_POINT = 128  # m, world
 FEET_REACH = 131  # m, no foot touches while the origin is higher than that
 TRIM = 132  # m, steady torque of the rotors over their thrust, body x y z (an effect of the catalogue)
 RPM_INVALID = 135  # a standard normal number above it makes a report of rotor speed unreadable
-TRUTH_SIZE = 136
+INTEGRATION_STEP = 136  # ms, whole: the plant moves once in so many ticks
+TRUTH_SIZE = 137
 
 # board: compile-time constants of the firmware (platform_defaults_*.h)
 B_ARM = 0  # m, rotor offset along x and y: 0.707106781 ARM_LENGTH

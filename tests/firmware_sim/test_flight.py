@@ -63,6 +63,29 @@ def test_holds_position(platform: str, controller: int) -> None:
     assert end[:, ROTOR].sum(axis=1).mean() == pytest.approx(weight, rel=0.01)
 
 
+@pytest.mark.parametrize("effects", [{}, {"linear_drag": {"x": 0.01}, "input_delay": {"delay": 0.005}}])
+def test_a_longer_integration_step_moves_the_plant_less_often_and_flies_the_same(effects: dict) -> None:
+    fine = boot({"effects": effects}, stabilizer__controller=5)
+    coarse = boot({"effects": effects, "integration": {"step": 0.004}}, stabilizer__controller=5)
+    near, far = (hold(flight, (0.3, -0.2, 1.0), 5.0)[-100:] for flight in (fine, coarse))
+    assert far[:, POSITION].mean(axis=0) == pytest.approx(near[:, POSITION].mean(axis=0), abs=0.005)
+    moved = []
+    for _ in range(40):
+        before = coarse.state[at.OMEGA]
+        coarse.step()
+        moved.append(coarse.state[at.OMEGA] != before)
+    assert sum(moved) == 10
+
+
+def test_the_seen_pose_is_that_of_the_origin_turned_as_the_pose_frame_is() -> None:
+    turned = {"attitude_misalignment": {"yaw": 0.1}, "center_of_mass": {"x": 0.01}}
+    flight = boot({"effects": turned, "start": {"position": [0.2, -0.1, 0.0]}})
+    flight.step()
+    position, quaternion = flight.seen_pose()
+    assert position[:2] == pytest.approx([0.2, -0.1], abs=1e-6)
+    assert quaternion == pytest.approx([0.0, 0.0, np.sin(0.05), np.cos(0.05)], abs=1e-6)
+
+
 def test_motors_hover_at_the_voltage_of_the_thrust_curve() -> None:
     flight = boot(stabilizer__controller=5)
     end = hold(flight, (0, 0, 1.0), 8.0)[-400:]

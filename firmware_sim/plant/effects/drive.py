@@ -25,6 +25,12 @@ def drive(truth, state, dt, mean, u):
         after = angular_momentum(truth, state, at.ROTOR)
         u[3] -= (after - before) / dt
         state[at.SPIN] = 0.5 * (before + after)
+    age(state)
+
+
+@kernel
+def age(state):
+    """One millisecond more since the feet left the floor."""
     if state[at.AIRBORNE] > 0.0 or state[at.FEET] == 0.0:
         state[at.AIRBORNE] += 1.0
 

@@ -11,7 +11,8 @@ from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.battery import battery_step
 from firmware_sim.plant.effects.air import blow
-from firmware_sim.plant.effects.drive import drive
+from firmware_sim.plant.effects.command import remember
+from firmware_sim.plant.effects.drive import age, drive
 from firmware_sim.plant.effects.hidden import vibrate
 from firmware_sim.plant.effects.motion import act, newton_euler, origin, still_forces, surroundings
 from firmware_sim.plant.effects.suspended_load import hang_still, pull_load, share_kick, straighten
@@ -39,6 +40,15 @@ def plant_step_with_effects(truth, state, noise, dt):
     else:
         body_step(truth, state, u, force, torque, noise, dt)
     battery_step(truth, state, dt)
+    state[at.CLOCK] += 1.0
+
+
+@kernel
+def hold_still(truth, state):
+    """A tick in which the plant does not move, because its integration step is longer: commands and clocks go on."""
+    if truth[at.EFFECT_ROTORS] > 0.0:
+        remember(truth, state)
+        age(state)
     state[at.CLOCK] += 1.0
 
 
