@@ -13,6 +13,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("step", choices=("draw", "fly", "diagnose", "score"))
     parser.add_argument("--cases", type=int, default=320, help="to draw (default %(default)s)")
     parser.add_argument("--seed", type=int, default=2048, help="of the draw (default %(default)s)")
+    parser.add_argument(
+        "--world", choices=("home", "random", "foreign"), default="home",
+        help="to draw: what differs beside what is hidden: nothing, everything, or the simulator (default %(default)s)",
+    )  # fmt: skip
     parser.add_argument("--out", type=Path, required=True, help="folder of the study")
     parser.add_argument(
         "--speed", type=float, default=10.0, help="of the flights at most, times real time (default %(default)s)"
@@ -41,7 +45,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.step == "draw":
         from .draw import write_cases
 
-        print(f"{write_cases(study, cases=arguments.cases, seed=arguments.seed)} cases written to {study.folder}")
+        written = write_cases(study, cases=arguments.cases, seed=arguments.seed, world=arguments.world)
+        print(f"{written} cases written to {study.folder}")
     elif arguments.step == "fly":
         from .fly import fly_all
 

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +22,26 @@ DIAGNOSE = (sys.executable, "-m", "crazyem", "diagnose")
 TIME_LIMIT = 900.0  # s; an answer later than that counts as none
 
 
-def diagnose_one(study: Study, case: str, vehicle: str, command: Sequence[str]) -> dict[str, Any]:
+def diagnose_one(study: Study, case: str, truth: Mapping[str, Any], command: Sequence[str]) -> dict[str, Any]:
     """The answer file of a case: case, seconds, code, said (last line on standard error), result (the JSON or None)."""
     with tempfile.TemporaryDirectory() as folder:
         link = os.link if _same_disk(study, folder) else os.symlink
+        names = []
         for flight in study.given:
-            link(study.recording(case, flight), Path(folder) / f"{flight}.mcap")
-        apart = [] if study.alone else ["--held-out", "held_out.mcap"]
+            file = study.recording(case, flight)
+            names.append(f"{flight}{file.suffix}")
+            link(file, Path(folder) / names[-1])
+        vehicle, more = truth["platform"], []
+        if truth.get("world", "home") != "home":
+            vehicle = "drone.toml"
+            link(study.vehicle(case), Path(folder) / vehicle)
+        mapping = study.mapping(case)
+        if mapping is not None:
+            link(mapping, Path(folder) / mapping.name)
+            more = ["--map", mapping.name]
+        apart = [] if study.alone else ["--held-out", names[1]]
         words = [
-            *command, "recording.mcap", "--vehicle", vehicle, *apart, "--json", "answer.json", "--write-vehicle",
+            *command, names[0], "--vehicle", vehicle, *apart, *more, "--json", "answer.json", "--write-vehicle",
             "fitted.toml",
         ]  # fmt: skip
         begun = time.monotonic()
@@ -75,7 +86,7 @@ def diagnose_all(
             continue
         if time.monotonic() - begun > 60.0 * minutes:
             break
-        answer = diagnose_one(study, case, read(study.truth(case))["platform"], command or DIAGNOSE)
+        answer = diagnose_one(study, case, read(study.truth(case)), command or DIAGNOSE)
         write(study.answer(case), answer)
         asked += 1
         named = [e["name"] for e in (answer["result"] or {}).get("effects", [])]

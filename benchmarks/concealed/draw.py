@@ -10,40 +10,46 @@ import numpy as np
 
 from crazyem.vehicle import load_vehicle
 
-from .paths import Study, write
+from .paths import FLIGHTS, Study, write
+from .random_world import nominal, random_case
 from .sizes import ALIKE, CATALOGUE, OUTSIDE, Concealed, Random
 
 NOTHING, PAIRS, OUTSIDERS = 0.20, 0.15, 0.10  # shares; the rest are single effects, each equally often
 BRUSHLESS = 0.12  # share of cf21bl where either drone would do
 FAVOURABLE = 0.75  # share of flights in which the effect can be seen well; the others are of any style
 STYLES = ("hover", "excite", "figure8", "fast")
-FLIGHTS = ("recording", "held_out")
 DURATION = 20.0  # s of trajectory, after take-off and 3 s of hover
 Case = dict[str, Any]
 
 
-def draw(*, cases: int, seed: int) -> list[Case]:
+def draw(*, cases: int, seed: int, world: str = "home") -> list[Case]:
     """`cases` of them, in an order that tells nothing. The same seed gives the same cases.
 
     Each: case (its name), kind (nothing, single, pair, outside), platform, effects and hidden (tables of the scenario),
     strength (name -> 0 weak to 1 strong), flights (style, seed, waypoints or None, for "recording" and "held_out").
+
+    world: "home", in which nothing but what is hidden and how it is flown differs; "random", see `random_case`;
+    "foreign", see `foreign_case`.
     """
+    make, catalogue, outside = WORLDS[world]
     random = np.random.default_rng([seed, 0])
-    contents = _contents(cases, random)
+    contents = _contents(cases, random, catalogue, outside)
     order = random.permutation(len(contents))
-    return [_case(f"{i:04d}", *contents[j], np.random.default_rng([seed, 1, i])) for i, j in enumerate(order, start=1)]
+    return [make(f"{i:04d}", *contents[j], np.random.default_rng([seed, 1, i])) for i, j in enumerate(order, start=1)]
 
 
-def _contents(cases: int, random: Random) -> list[tuple[str, dict[str, float]]]:
-    """Kind and strengths of every case."""
+def _contents(
+    cases: int, random: Random, catalogue: Sequence[str], others: Sequence[str]
+) -> list[tuple[str, dict[str, float]]]:
+    """Kind and strengths of every case, of what a world can hide."""
     nothing = math.ceil(NOTHING * cases)
     pairs, outside = round(PAIRS * cases), round(OUTSIDERS * cases)
     singles = cases - nothing - pairs - outside
     found: list[tuple[str, dict[str, float]]] = [("nothing", {})] * nothing
-    found += [("single", one) for one in _evenly(list(CATALOGUE), singles, random)]
-    found += [("outside", one) for one in _evenly(list(OUTSIDE), outside, random)]
-    possible = [p for p in combinations(CATALOGUE, 2) if not any(set(p) <= family for family in ALIKE)]
-    for pair in _rare_first(possible, pairs, random):
+    found += [("single", one) for one in _evenly(list(catalogue), singles, random)]
+    found += [("outside", one) for one in _evenly(list(others), outside, random)]
+    possible = [p for p in combinations(catalogue, 2) if not any(set(p) <= family for family in ALIKE)]
+    for pair in _rare_first(possible, pairs, random, catalogue):
         found.append(("pair", {name: float(random.uniform(0.2, 1.0)) for name in pair}))
     return found
 
@@ -59,9 +65,11 @@ def _evenly(names: Sequence[str], count: int, random: Random) -> list[dict[str, 
     return out
 
 
-def _rare_first(pairs: Sequence[tuple[str, str]], count: int, random: Random) -> list[tuple[str, str]]:
+def _rare_first(
+    pairs: Sequence[tuple[str, str]], count: int, random: Random, catalogue: Sequence[str]
+) -> list[tuple[str, str]]:
     """Pairs such that every effect takes part about equally often."""
-    used = dict.fromkeys(CATALOGUE, 0)
+    used = dict.fromkeys(catalogue, 0)
     out: list[tuple[str, str]] = []
     while len(out) < count:
         fresh = [p for p in pairs if p not in out] or list(pairs)
@@ -137,18 +145,27 @@ def scenario(case: Case, vehicle_file: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write_cases(study: Study, *, cases: int, seed: int) -> int:
+WORLDS: dict[str, tuple[Any, Sequence[str], Sequence[str]]] = {
+    "home": (_case, tuple(CATALOGUE), tuple(OUTSIDE)),
+    "random": (random_case, tuple(CATALOGUE), tuple(OUTSIDE)),
+}
+
+
+def write_cases(study: Study, *, cases: int, seed: int, world: str = "home") -> int:
     """Truth and scenario files of a drawn study; those that exist stay as they are."""
     written = 0
     for name in ("cf2", "cf21bl"):
         file = study.folder / "vehicles" / f"{name}.toml"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(load_vehicle(name).to_toml())
-    for case in draw(cases=cases, seed=seed):
+    for case in draw(cases=cases, seed=seed, world=world):
         if study.truth(case["case"]).is_file():
             continue
-        study.scenario(case["case"]).parent.mkdir(parents=True, exist_ok=True)
-        study.scenario(case["case"]).write_text(scenario(case, f"../vehicles/{case['platform']}.toml"))
+        if world == "home":
+            study.scenario(case["case"]).parent.mkdir(parents=True, exist_ok=True)
+            study.scenario(case["case"]).write_text(scenario(case, f"../vehicles/{case['platform']}.toml"))
+        else:
+            study.vehicle(case["case"]).write_text(nominal(case).to_toml())
         write(study.truth(case["case"]), {**case, "study_seed": seed})
         written += 1
     return written

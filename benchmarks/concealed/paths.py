@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+FLIGHTS = ("recording", "held_out")
+
 
 @dataclass(frozen=True)
 class Study:
@@ -24,8 +26,18 @@ class Study:
         return self.folder / "truth" / f"{case}.toml"
 
     def recording(self, case: str, flight: str) -> Path:
-        """flight: "recording" or "held_out"."""
-        return self.folder / "cases" / case / f"{flight}.mcap"
+        """flight: "recording" or "held_out"; a table (.csv) where there is one, with the mapping beside it."""
+        table = self.folder / "cases" / case / f"{flight}.csv"
+        return table if table.is_file() else table.with_suffix(".mcap")
+
+    def mapping(self, case: str) -> Path | None:
+        """What the columns of the case's tables are; None where it has none."""
+        file = self.folder / "cases" / case / "mapping.toml"
+        return file if file.is_file() else None
+
+    def vehicle(self, case: str) -> Path:
+        """The vehicle file that a case of a drawn world is judged by."""
+        return self.folder / "vehicles" / f"{case}.toml"
 
     @property
     def given(self) -> tuple[str, ...]:

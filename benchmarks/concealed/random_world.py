@@ -1,0 +1,97 @@
+"""A case of a random world: what is hidden as in the home world, everything else drawn too (`conditions`).
+
+From a case to what each side is told: the vehicle file of the diagnosis, and each flight's scenario of the simulator.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+from crazyem.vehicle import Vehicle, load_vehicle
+from firmware_sim.controllers import parameters
+
+from . import conditions
+from .paths import FLIGHTS
+from .sizes import CATALOGUE, OUTSIDE, Random
+
+Table = dict[str, Any]
+DRAGS = ("linear_drag", "quadratic_drag", "velocity_moment")  # one word for what a drone has as built
+BLOWN = ("gusts", "wind")
+
+
+def random_case(name: str, kind: str, strength: dict[str, float], random: Random) -> Table:
+    """As `draw` describes a case, with "world", "aside", "own" (effects of the vehicle file), "built" (effects that
+    every flight has, whoever knows), "conditions" (of both flights), and in each flight its day."""
+    from .draw import waypoints
+
+    hidden = {n: (CATALOGUE.get(n) or OUTSIDE[n]) for n in strength}
+    wanted = {h.platform for h in hidden.values() if h.platform}
+    platform = wanted.pop() if wanted else ("cf21bl" if random.random() < conditions.BRUSHLESS else "cf2")
+    vehicle = load_vehicle(platform)
+    tables = {n: h.draw(strength[n], random, vehicle) for n, h in hidden.items()}
+    kind_of_air, built = conditions.air(random, hidden)
+    trimmed = bool(random.random() < 0.5)
+    own = conditions.trim(random, conditions.OWN_TRIM, heavy=False) if trimmed else None
+    flights = {
+        flight: conditions.flight(style, waypoints(style, random), random, own)
+        for flight, style in zip(FLIGHTS, conditions.styles(hidden, random))
+    }
+    draught = any("gusts" in f for f in flights.values())
+    return {
+        "case": name,
+        "world": "random",
+        "kind": kind,
+        "platform": platform,
+        "effects": {n: t for n, t in tables.items() if n in CATALOGUE},
+        "hidden": {n: t for n, t in tables.items() if n in OUTSIDE},
+        "strength": {n: round(u, 4) for n, u in strength.items()},
+        "air": kind_of_air,
+        "aside": [*(DRAGS if kind_of_air == "free" else ()), *(BLOWN if draught else ())],
+        "own": {**({"trim": own} if own is not None else {}), **(built if kind_of_air == "right" else {})},
+        "built": built,
+        "conditions": {
+            "scenario": conditions.sensors(random, hidden),
+            **conditions.controller(random, platform),
+            "log": conditions.log(random, platform, hidden),
+        },
+        "flights": flights,
+    }
+
+
+def nominal(case: Table) -> Vehicle:
+    """The vehicle file that the diagnosis gets: the platform's constants, and what the drone's owner knows of it."""
+    known = load_vehicle(case["platform"])
+    return replace(known, name="drone", effects={**known.effects, **case["own"]})
+
+
+def true_vehicle(case: Table) -> Vehicle:
+    """The nominal vehicle with all that is hidden, and the air that it does not know; a day's own trim is none of it."""
+    known = nominal(case)
+    return replace(known, effects={**known.effects, **case["built"], **case["effects"]})
+
+
+def scenario_of(case: Table, flight: str) -> Table:
+    """The simulator's scenario of one flight, but for the vehicle file."""
+    drawn, mine = case["conditions"], case["flights"][flight]
+    today = mine["day"]
+    effects = {**case["built"], **case["effects"]}
+    if "trim" in today:
+        own = case["own"]["trim"]
+        effects["trim"] = {a: own[a] + today["trim"][a] for a in "xyz"}
+        scale = effects.get("thrust_scale", {}).get("scale", 1.0)
+        effects["thrust_scale"] = {"scale": scale * today["thrust"]}
+        lag = effects.get("motor_lag", {}).get("time_constant", load_vehicle(case["platform"]).motor_time_constant)
+        effects["motor_lag"] = {"time_constant": lag * today["lag"]}
+    if "gusts" in mine:
+        effects["gusts"] = mine["gusts"]
+    scenario: Table = {"platform": case["platform"], "effects": effects, "hidden": case["hidden"]}
+    scenario.update({section: dict(table) for section, table in drawn["scenario"].items()})
+    scenario["battery"]["charge"] = today["charge"]
+    scenario["parameters"] = {**drawn["parameters"], **drawn["filter"], **gains(case)}
+    return scenario
+
+
+def gains(case: Table) -> dict[str, float]:
+    """The controller's gains: the platform's, each times its factor; of a cost's weights (LQG) times its square."""
+    usual = parameters.defaults(case["platform"])
+    power = 2 if case["conditions"]["controller"] == "lqg" else 1
+    return {name: usual[name] * by**power for name, by in case["conditions"]["gains"].items()}
