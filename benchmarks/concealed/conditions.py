@@ -141,7 +141,10 @@ def log(random: Random, platform: str, hidden: Iterable[str]) -> Table:
         "burst": rounded(float(random.uniform(1.0, 4.0))),
     }
     if not onboard:  # errors of motion capture that hang together: markers, calibration
-        out["drift"] = {"share": rounded(float(random.uniform(0.0, 1.0))), "time": rounded(float(random.uniform(0.05, 1.0)))}
+        out["drift"] = {
+            "share": rounded(float(random.uniform(0.0, 1.0))),
+            "time": rounded(float(random.uniform(0.05, 1.0))),
+        }
     return out
 
 
@@ -178,15 +181,17 @@ def day(random: Random, own: Table | None) -> Table:
     }
 
 
-def styles(hidden: dict[str, Concealed], random: Random) -> tuple[str, str]:
+def styles(hidden: dict[str, Concealed], random: Random, *, among: tuple[str, ...] = STYLES) -> tuple[str, str]:
     """Of the flight and of the one held out: unlike ones where the effect leaves a choice."""
     suited = [set(h.trajectories).union(*(LIKE.get(s, ()) for s in h.trajectories)) for h in hidden.values()]
     if any("low" in s for s in suited):
         return "low", "low"
-    possible = [s for s in STYLES if s != "draught" or not AIRY & set(hidden)]
+    possible = [s for s in among if s != "draught" or not AIRY & set(hidden)]
     good = [s for s in possible if all(s in fit for fit in suited)] or possible
     first = str(random.choice(good if hidden and random.random() < FAVOURABLE else possible))
-    second = str(random.choice([s for s in (good if random.random() < FAVOURABLE else possible) if s != first] or possible))
+    second = str(
+        random.choice([s for s in (good if random.random() < FAVOURABLE else possible) if s != first] or possible)
+    )
     return first, second
 
 

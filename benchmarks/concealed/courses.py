@@ -1,4 +1,4 @@
-"""What a drone of a drawn world is asked to fly: take-off, 3 s of hover, 20 s of a style, landing, as setpoints at 100 Hz.
+"""What a drone of a drawn world is asked to fly: take-off, hover, 20 s of a style, landing, at 100 Hz.
 
 Styles of `crazyem fly` are those of the command; helix, vertical, oval, star and multisine are made here, in sizes and
 speeds drawn for each flight. Pure: from a table of numbers to arrays.

@@ -10,8 +10,9 @@ import numpy as np
 
 from crazyem.vehicle import load_vehicle
 
+from .foreign_world import ABROAD, HIDEABLE, foreign_case
 from .paths import FLIGHTS, Study, write
-from .random_world import nominal, random_case
+from .random_world import random_case
 from .sizes import ALIKE, CATALOGUE, OUTSIDE, Concealed, Random
 
 NOTHING, PAIRS, OUTSIDERS = 0.20, 0.15, 0.10  # shares; the rest are single effects, each equally often
@@ -148,6 +149,7 @@ def scenario(case: Case, vehicle_file: str) -> str:
 WORLDS: dict[str, tuple[Any, Sequence[str], Sequence[str]]] = {
     "home": (_case, tuple(CATALOGUE), tuple(OUTSIDE)),
     "random": (random_case, tuple(CATALOGUE), tuple(OUTSIDE)),
+    "foreign": (foreign_case, HIDEABLE, tuple(ABROAD)),
 }
 
 
@@ -165,7 +167,7 @@ def write_cases(study: Study, *, cases: int, seed: int, world: str = "home") -> 
             study.scenario(case["case"]).parent.mkdir(parents=True, exist_ok=True)
             study.scenario(case["case"]).write_text(scenario(case, f"../vehicles/{case['platform']}.toml"))
         else:
-            study.vehicle(case["case"]).write_text(nominal(case).to_toml())
+            study.vehicle(case["case"]).write_text(case["vehicle"])
         write(study.truth(case["case"]), {**case, "study_seed": seed})
         written += 1
     return written

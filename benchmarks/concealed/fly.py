@@ -33,6 +33,7 @@ from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle
 
 from .draw import DURATION
+from .foreign import fly as fly_abroad
 from .hangar import Drone, Hangar
 from .paths import FLIGHTS, Study, read, write
 from .simulate import fly as simulate
@@ -220,7 +221,8 @@ def fly_all(study: Study, *, speed: float = SPEED, minutes: float = math.inf, pa
                 hangar = hangar or stack.enter_context(Hangar())
                 done = fly_one(study, case, flight, hangar, speed=speed)
             else:
-                done = {"tries": 1, **simulate(case, flight, study.folder / "cases" / name, duration=DURATION)}
+                fly_here = simulate if case["world"] == "random" else fly_abroad
+                done = {"tries": 1, **fly_here(case, flight, study.folder / "cases" / name, duration=DURATION)}
             write(study.truth(name), {**case, "quality": {**case.get("quality", {}), flight: done}})
             flown += 1
             told = f"speed {done.get('speed', 0):g}" if done["flown"] else f"not flown: {done['reason']}"

@@ -20,6 +20,7 @@ from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, remembering_ane
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording
 from crazyem.vehicle import Vehicle
@@ -30,31 +31,35 @@ HORIZON = 50  # steps of the recording's 100 Hz: 0.5 s
 EVERY = 10  # samples between starts
 
 
-def ideal_nats(recording: Path, vehicle: Vehicle, effects: Mapping[str, Mapping[str, Any]]) -> float | None:
+def ideal_nats(
+    recording: Path, vehicle: Vehicle, effects: Mapping[str, Mapping[str, Any]], *, mapping: Path | None = None
+) -> float | None:
     """Log-likelihood of the recording under the true effects less that under the nominal vehicle; None: not available.
+
+    `vehicle` has what the drone has and is not hidden, whether the diagnosis is told so or not.
 
     Either model gets what suits it best, as an observer must who does not know them: noise scales, with a memory of the
     torques or without, and what is always free. None where the likelihood of the flight is not what shows the effect:
     an accelerometer, gusts, and what acts before rotors whose speeds are measured.
     """
-    seen = open_recording(str(recording))
+    seen = open_recording(str(recording), options_of(mapping))
     if _beyond(effects, seen):
         return None
     data = Data([flight_of(seen, vehicle)])
-    without = _best(data, nominal(data, Point(vehicle, {}, first_guess())))
+    without = _best(data, nominal(data, Point(vehicle, known_effects(vehicle), first_guess())))
     return _under(data, without.point, effects) - without.loglik
 
 
 def ideal_nats_of_each(
-    recording: Path, vehicle: Vehicle, effects: Mapping[str, Mapping[str, Any]]
+    recording: Path, vehicle: Vehicle, effects: Mapping[str, Mapping[str, Any]], *, mapping: Path | None = None
 ) -> dict[str, float | None]:
     """By effect: log-likelihood of the recording under all true effects less that under all but this one, as above;
     None: not available. Of a pair an ideal observer may see that something is there and still only one of the two."""
-    seen = open_recording(str(recording))
+    seen = open_recording(str(recording), options_of(mapping))
     if _beyond(effects, seen):
         return dict.fromkeys(effects)
     data = Data([flight_of(seen, vehicle)])
-    start = _best(data, nominal(data, Point(vehicle, {}, first_guess()))).point
+    start = _best(data, nominal(data, Point(vehicle, known_effects(vehicle), first_guess()))).point
     whole = _under(data, start, effects)
     return {
         name: whole - _under(data, start, {other: table for other, table in effects.items() if other != name})
@@ -69,9 +74,19 @@ def _beyond(effects: Mapping[str, Mapping[str, Any]], seen: Recording) -> bool:
 
 def _under(data: Data, start: Point, effects: Mapping[str, Mapping[str, Any]]) -> float:
     """Log-likelihood under known effects."""
-    point = replace(start, effects={name: dict(table) for name, table in effects.items()})
+    point = replace(start, effects={**known_effects(start.vehicle), **{n: dict(table) for n, table in effects.items()}})
     data.settle(point)
     return _best(data, point).loglik
+
+
+def known_effects(vehicle: Vehicle) -> dict[str, dict[str, Any]]:
+    """What the vehicle has beside what is hidden, as a model's effects."""
+    return {name: dict(table) for name, table in vehicle.effects.items()}
+
+
+def options_of(mapping: Path | None) -> ReadOptions:
+    """How to read a recording that comes with a mapping."""
+    return ReadOptions(None if mapping is None else str(mapping))
 
 
 def _best(data: Data, point: Point) -> Fitted:
@@ -82,12 +97,13 @@ def _best(data: Data, point: Point) -> Fitted:
     return max(once, again, key=lambda f: f.loglik)
 
 
-def held_out_error(recording: Path, vehicle_file: str) -> dict[str, float] | None:
+def held_out_error(recording: Path, vehicle_file: str, *, mapping: Path | None = None) -> dict[str, float] | None:
     """RMS error of `crazyem predict` after 0.5 s, between lift-off and landing: position m, velocity m/s, attitude rad,
     body_rate rad/s; None while the command does not exist or refuses."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "prediction.npz"
         words = ["predict", str(recording), "--vehicle", vehicle_file, "--horizon", str(HORIZON), "--every", str(EVERY)]
+        words += [] if mapping is None else ["--map", str(mapping)]
         done = subprocess.run(
             [sys.executable, "-m", "crazyem", *words, "-o", str(out)], capture_output=True, text=True, check=False
         )
@@ -95,18 +111,22 @@ def held_out_error(recording: Path, vehicle_file: str) -> dict[str, float] | Non
             return None
         with np.load(out) as file:
             prediction, start, step = file["prediction"], file["start_time"], float(file["step"])
-    return errors_of(recording, np.asarray(prediction)[:, -1], np.asarray(start) + HORIZON * step)
+    return errors_of(recording, np.asarray(prediction)[:, -1], np.asarray(start) + HORIZON * step, mapping=mapping)
 
 
-def errors_of(recording: Path, predicted: np.ndarray, time: np.ndarray) -> dict[str, float]:
+def errors_of(
+    recording: Path, predicted: np.ndarray, time: np.ndarray, *, mapping: Path | None = None
+) -> dict[str, float]:
     """RMS of predicted states (n, 13) against what was recorded nearest to each time (n,), in the air only."""
-    signals = open_recording(str(recording)).signals
+    signals = open_recording(str(recording), options_of(mapping)).signals
     columns = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
     heights = signals["position"]
     up = np.interp(time, heights.time, np.asarray(heights.value)[:, 2])
     flying = (up > 0.15) & np.all(np.isfinite(predicted), axis=1)
     out = {}
     for name, where in columns.items():
+        if name not in signals:
+            continue
         signal = signals[name]
         nearest = np.clip(np.searchsorted(signal.time, time), 1, len(signal.time) - 1)
         nearest -= (time - signal.time[nearest - 1]) < (signal.time[nearest] - time)

@@ -1,19 +1,33 @@
 """One answer against one truth: what was right about it. All definitions of the score are here, in small functions."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from crazyem.vehicle import Vehicle
 from firmware_sim.plant.effects.catalogue import EFFECTS
 
-from .sizes import OUTSIDE
+from .sizes import FOREIGN_OUTSIDE, OUTSIDE
 
 CONFIDENT = 0.5  # a name given with more than this is a claim
 DETECTABLE = 10.0  # nats of an ideal observer
 STRONG = 2.0 / 3.0  # strength from which an effect counts as strong
 DISCRETE = ("rotor", "streams")
 Document = Mapping[str, Any]
+
+
+def without(result: Document, aside: Collection[str]) -> dict[str, Any]:
+    """An answer without the names of which nothing that is said is judged: neither an alarm nor a find.
+
+    A mismatch that was these alone, with nothing left unexplained, is none.
+    """
+    effects = [e for e in result.get("effects") or [] if e.get("name") not in aside]
+    groups = [[n for n in group if n not in aside] for group in result.get("indistinguishable") or []]
+    unexplained = bool(result.get("unexplained"))
+    removed = len(effects) < len(result.get("effects") or [])
+    mismatch = bool(result.get("mismatch")) and (bool(effects) or unexplained or not removed)
+    kept = [g for g in groups if len(g) > 1]
+    return {**result, "effects": effects, "indistinguishable": kept, "mismatch": mismatch}
 
 
 def named(result: Document | None) -> list[str]:
@@ -158,7 +172,7 @@ def places(document: Any) -> list[tuple[str, str]]:
 
 def outside(name: str, result: Document | None) -> dict[str, bool]:
     """What is right about an answer to something outside the catalogue: unexplained, axis, regime, wrong name."""
-    wanted = OUTSIDE[name]
+    wanted = (OUTSIDE | FOREIGN_OUTSIDE)[name]
     said = bool(result and result.get("mismatch") and result.get("unexplained"))
     found = places((result or {}).get("unexplained")) or places((result or {}).get("where"))
     right = [regime for axis, regime in found if axis in wanted.axes]

@@ -5,6 +5,7 @@ Blocks are sampled by timers of their own, as the firmware's are: phases apart, 
 
 import csv
 import json
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -115,12 +116,19 @@ SIGNALS: dict[str, tuple[tuple[str, ...], str]] = {
 }
 
 
-def mapping_of(signals: Iterable[str], *, onboard: bool) -> str:
-    """The mapping (docs/formats/csv.md) of a table with these signals; onboard: a filter on board made the attitude."""
+ROTORS_OF = ("motor_command", "rotor_speed")
+
+
+def mapping_of(signals: Iterable[str], *, onboard: bool, rotors: Sequence[int] = ()) -> str:
+    """The mapping (docs/formats/csv.md) of a table with these signals.
+
+    onboard: a filter on board made the attitude. rotors: which rotor each column of the four is.
+    """
     lines = ["[time]", 'column = "t"', 'unit = "s"', 'clock = "drone"']
     for name in signals:
         columns, more = SIGNALS[name]
         lines += ["", f"[signals.{name}]", f"columns = {json.dumps(list(columns))}", more]
+        lines += [f"rotors = {json.dumps(list(rotors))}"] if rotors and name in ROTORS_OF else []
     if onboard:
         lines += ["", "[claims]", 'attitude = "onboard"']
     return "\n".join(lines) + "\n"
@@ -133,4 +141,4 @@ def write_table(file: Path, time: Sequence[float], signals: dict[str, np.ndarray
         rows.writerow(["t", *(c for name in signals for c in SIGNALS[name][0])])
         table = np.column_stack([np.asarray(v, float).reshape(len(time), -1) for v in signals.values()])
         for t, values in zip(time, table.tolist()):
-            rows.writerow([f"{t:.6f}", *("" if v != v else f"{v:.7g}" for v in values)])
+            rows.writerow([f"{t:.6f}", *("" if math.isnan(v) else f"{v:.7g}" for v in values)])

@@ -6,7 +6,7 @@ From a case to what each side is told: the vehicle file of the diagnosis, and ea
 from dataclasses import replace
 from typing import Any
 
-from crazyem.vehicle import Vehicle, load_vehicle
+from crazyem.vehicle import load_vehicle, parse_vehicle
 from firmware_sim.controllers import parameters
 
 from . import conditions
@@ -19,8 +19,11 @@ BLOWN = ("gusts", "wind")
 
 
 def random_case(name: str, kind: str, strength: dict[str, float], random: Random) -> Table:
-    """As `draw` describes a case, with "world", "aside", "own" (effects of the vehicle file), "built" (effects that
-    every flight has, whoever knows), "conditions" (of both flights), and in each flight its day."""
+    """As `draw` describes a case, with what is not hidden.
+
+    More keys: world, aside, vehicle (the file's text), own (effects of that file), built (effects that every flight
+    has, whoever knows), conditions (of both flights), and in each flight its day.
+    """
     from .draw import waypoints
 
     hidden = {n: (CATALOGUE.get(n) or OUTSIDE[n]) for n in strength}
@@ -35,6 +38,7 @@ def random_case(name: str, kind: str, strength: dict[str, float], random: Random
         flight: conditions.flight(style, waypoints(style, random), random, own)
         for flight, style in zip(FLIGHTS, conditions.styles(hidden, random))
     }
+    filed = {**({"trim": own} if own is not None else {}), **(built if kind_of_air == "right" else {})}
     draught = any("gusts" in f for f in flights.values())
     return {
         "case": name,
@@ -46,7 +50,8 @@ def random_case(name: str, kind: str, strength: dict[str, float], random: Random
         "strength": {n: round(u, 4) for n, u in strength.items()},
         "air": kind_of_air,
         "aside": [*(DRAGS if kind_of_air == "free" else ()), *(BLOWN if draught else ())],
-        "own": {**({"trim": own} if own is not None else {}), **(built if kind_of_air == "right" else {})},
+        "own": filed,
+        "vehicle": replace(vehicle, name="drone", effects={**vehicle.effects, **filed}).to_toml(),
         "built": built,
         "conditions": {
             "scenario": conditions.sensors(random, hidden),
@@ -55,18 +60,6 @@ def random_case(name: str, kind: str, strength: dict[str, float], random: Random
         },
         "flights": flights,
     }
-
-
-def nominal(case: Table) -> Vehicle:
-    """The vehicle file that the diagnosis gets: the platform's constants, and what the drone's owner knows of it."""
-    known = load_vehicle(case["platform"])
-    return replace(known, name="drone", effects={**known.effects, **case["own"]})
-
-
-def true_vehicle(case: Table) -> Vehicle:
-    """The nominal vehicle with all that is hidden, and the air that it does not know; a day's own trim is none of it."""
-    known = nominal(case)
-    return replace(known, effects={**known.effects, **case["built"], **case["effects"]})
 
 
 def scenario_of(case: Table, flight: str) -> Table:
@@ -79,7 +72,7 @@ def scenario_of(case: Table, flight: str) -> Table:
         effects["trim"] = {a: own[a] + today["trim"][a] for a in "xyz"}
         scale = effects.get("thrust_scale", {}).get("scale", 1.0)
         effects["thrust_scale"] = {"scale": scale * today["thrust"]}
-        lag = effects.get("motor_lag", {}).get("time_constant", load_vehicle(case["platform"]).motor_time_constant)
+        lag = effects.get("motor_lag", {}).get("time_constant", parse_vehicle(case["vehicle"]).motor_time_constant)
         effects["motor_lag"] = {"time_constant": lag * today["lag"]}
     if "gusts" in mine:
         effects["gusts"] = mine["gusts"]

@@ -1,12 +1,12 @@
 """Collects a study from its files, scores it, writes the table that is published."""
 
-import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 from crazyem.physics.effects.catalogue import CATALOGUE
-from crazyem.vehicle import load_vehicle
+from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
 
 from .ideal import held_out_error, ideal_nats, ideal_nats_of_each
 from .paths import Study, read, write
@@ -35,7 +35,23 @@ def outcomes(study: Study, *, ideal: Ideal = "all") -> list[Outcome]:
 def _outcome(study: Study, case: str) -> Outcome:
     answer, truth, known = read(study.answer(case)), read(study.truth(case)), read(_known(study, case)) or {}
     held_out = {} if study.alone else known.get("held_out", {})  # of the vehicle that both flights gave
-    return Outcome(truth, answer["result"], answer["seconds"], known.get("nats"), held_out, known.get("of_each") or {})
+    return Outcome(
+        truth, answer["result"], answer["seconds"], known.get("nats"), held_out, known.get("of_each") or {},
+        vehicle=_given(study, truth),
+    )  # fmt: skip
+
+
+def _given(study: Study, truth: Mapping[str, Any]) -> Vehicle:
+    """The vehicle that the diagnosis was given."""
+    if truth.get("world", "home") == "home":
+        return load_vehicle(truth["platform"])
+    return parse_vehicle(study.vehicle(truth["case"]).read_text())
+
+
+def _unhidden(study: Study, truth: Mapping[str, Any]) -> Vehicle:
+    """The same with the drag that the drone has as built, where its file leaves that out."""
+    given = _given(study, truth)
+    return replace(given, effects={**given.effects, **truth.get("built", {})})
 
 
 def _known(study: Study, case: str) -> Path:
@@ -45,34 +61,33 @@ def _known(study: Study, case: str) -> Path:
 def _know(study: Study, case: str, truth: Mapping[str, Any], *, held_out: bool) -> None:
     """Keep nats of the truth on the flight and, if asked, held-out errors of nominal, fitted and true model."""
     known: dict[str, Any] = read(_known(study, case)) or {"held_out": {}}
-    vehicle = load_vehicle(truth["platform"])
+    vehicle, mapping = _unhidden(study, truth), study.mapping(case)
     if known.get("nats") is None and truth["kind"] in ("single", "pair"):
-        known["nats"] = ideal_nats(study.recording(case, "recording"), vehicle, truth["effects"])
+        known["nats"] = ideal_nats(study.recording(case, "recording"), vehicle, truth["effects"], mapping=mapping)
     if known.get("of_each") is None and truth["kind"] == "pair":
-        known["of_each"] = ideal_nats_of_each(study.recording(case, "recording"), vehicle, truth["effects"])
-    folder = study.folder / "vehicles"
-    models = {"nominal": folder / f"{truth['platform']}.toml", "fitted": study.fitted(case)} if held_out else {}
+        known["of_each"] = ideal_nats_of_each(
+            study.recording(case, "recording"), vehicle, truth["effects"], mapping=mapping
+        )
+    home = truth.get("world", "home") == "home"
+    file = study.folder / "vehicles" / f"{truth['platform']}.toml" if home else study.vehicle(case)
+    models = {"nominal": file, "fitted": study.fitted(case)} if held_out else {}
     if held_out and truth["effects"] and not truth["hidden"]:
         models["true"] = study.truth(case).with_name(f"{case}_vehicle.toml")
-        models["true"].write_text(_with_effects(vehicle.to_toml(), truth["effects"]))
+        own = {n: t for n, t in truth["effects"].items() if CATALOGUE[n].belongs_to == "vehicle"}
+        models["true"].write_text(replace(vehicle, effects={**vehicle.effects, **own}).to_toml())
     for name, model in models.items():
         if known["held_out"].get(name) is None and model.is_file():
-            known["held_out"][name] = held_out_error(study.recording(case, "held_out"), str(model))
+            known["held_out"][name] = held_out_error(study.recording(case, "held_out"), str(model), mapping=mapping)
     write(_known(study, case), known)
-
-
-def _with_effects(vehicle: str, effects: dict[str, dict[str, Any]]) -> str:
-    """A vehicle file with the effects of the truth, as far as these belong to a vehicle."""
-    effects = {n: t for n, t in effects.items() if CATALOGUE[n].belongs_to == "vehicle"}
-    tables = [
-        f"\n[effects.{n}]\n" + "".join(f"{k} = {json.dumps(v)}\n" for k, v in t.items()) for n, t in effects.items()
-    ]
-    return vehicle + "".join(tables)
 
 
 def percent(share: dict[str, Any]) -> str:
     """A share with the number of cases behind it."""
-    return "not measured" if share["share"] is None else f"{100 * share['share']:.1f} % of {share['n']}"
+    if share["share"] is None:
+        return "not measured"
+    low, high = share.get("interval", (None, None))
+    between = "" if low is None else f" ({100 * low:.0f} to {100 * high:.0f})"
+    return f"{100 * share['share']:.1f} % of {share['n']}{between}"
 
 
 def _number(value: float | None, text: str) -> str:
@@ -108,7 +123,8 @@ def table(f: dict[str, Any]) -> str:
         f"{sum(cases.values())} cases: {cases['nothing']} with nothing hidden, {cases['single']} single effects "
         f"({s['detectable']['n']} detectable), {cases['pair']} pairs, {cases['outside']} outside the catalogue; "
         f"{f['no_answer']} without an answer; {f.get('not_flown', 0)} more could not be flown. The ideal observer is "
-        f"known in {f['ideal_observer_known']}; where it is not, a case counts as detectable.",
+        f"known in {f['ideal_observer_known']}; where it is not, a case counts as detectable. In brackets: 95 % "
+        "intervals (Wilson).",
         "",
         "| figure | measured | aim |",
         "|---|---|---|",

@@ -1,5 +1,6 @@
 """The figures of issue 5 from truths and answers: plain counting, every definition stated, every failure listed."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -13,6 +14,7 @@ from . import judge
 from .judge import DETECTABLE, STRONG, Document
 
 QUANTITIES = ("position", "velocity", "attitude", "body_rate")
+Z = 1.959964  # standard normal quantile of 97.5 %
 WITHIN = 1.1  # held-out error over that of the true model
 EDGES = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 1.0 + 1e-9)  # of confidence
 
@@ -22,9 +24,11 @@ class Outcome:
     """One case, all that the score needs.
 
     Attributes:
-        truth: see draw.draw. result: the answer's JSON, None if there was none. seconds: it took.
+        truth: see draw.draw. result: the answer's JSON without what is set `aside`, None if there was none.
+        seconds: it took.
         nats: of an ideal observer, None where not known. held_out: "nominal", "fitted", "true" -> quantity -> error.
         of_each: of a pair, effect -> nats of an ideal observer for it beside the other; None or absent: not known.
+        vehicle: the nominal one that the diagnosis was given; None: the platform's.
     """
 
     truth: Document
@@ -33,6 +37,11 @@ class Outcome:
     nats: float | None = None
     held_out: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     of_each: Mapping[str, float | None] = field(default_factory=dict)
+    vehicle: Vehicle | None = None
+
+    def __post_init__(self) -> None:
+        if self.result is not None and self.truth.get("aside"):
+            object.__setattr__(self, "result", judge.without(self.result, self.truth["aside"]))
 
     @property
     def kind(self) -> str:
@@ -58,7 +67,17 @@ class Outcome:
 
 
 def _share(values: Sequence[float]) -> dict[str, Any]:
-    return {"n": len(values), "share": float(np.mean(values)) if len(values) else None}
+    if not len(values):
+        return {"n": 0, "share": None}
+    share = float(np.mean(values))
+    return {"n": len(values), "share": share, "interval": wilson(share, len(values))}
+
+
+def wilson(share: float, n: int) -> tuple[float, float]:
+    """95 % interval of a share of n cases (Wilson's score interval; half credits count as half a case)."""
+    middle = (share + Z * Z / (2 * n)) / (1 + Z * Z / n)
+    half = Z / (1 + Z * Z / n) * math.sqrt(share * (1 - share) / n + Z * Z / (4 * n * n))
+    return max(0.0, middle - half), min(1.0, middle + half)
 
 
 def figures(outcomes: Iterable[Outcome]) -> dict[str, Any]:
@@ -109,7 +128,7 @@ def _loose(case: Outcome) -> bool:
 
 
 def _vehicle(case: Outcome) -> Vehicle:
-    return load_vehicle(case.truth["platform"])
+    return case.vehicle or load_vehicle(case.truth["platform"])
 
 
 def _rotors(cases: Iterable[Outcome]) -> list[float]:

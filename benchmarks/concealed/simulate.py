@@ -1,4 +1,4 @@
-"""Flies a case of a random world in this process, without link and clock: the same case gives the same file, bit by bit.
+"""Flies a case of a random world in this process, without link and clock: the same case gives the same file.
 
 Firmware, controllers and plant are those of `python -m firmware_sim`; setpoints enter where packets of the link would
 be decoded. What is logged is drawn with the case (`conditions.log`).
@@ -20,12 +20,13 @@ from firmware_sim.scenario import parse_scenario
 
 from .courses import STOPPED, Course, course
 from .logs import BlockLog, mapping_of, write_table
-from .random_world import nominal, scenario_of
+from .random_world import scenario_of
 
 Table = dict[str, Any]
 BOOT = 1.5  # s of the clock before the motors start
 SETPOINT = 10  # ms
 LOWEST, STEEPEST, FARTHEST = 0.06, math.radians(70), 1.5  # m, tilt, m off the course: beyond, the drone is not flying
+UNREADABLE = 65535.0  # reported rpm of a telegram that did not pass its check
 RPM = 2.0 * math.pi / 60.0
 
 
@@ -59,7 +60,9 @@ class PoseLog:
         self._due += self._period
         drift, white = self._log["drift"], self._random.standard_normal(6)
         keep = math.exp(-1e-3 * self._period / drift["time"])
-        self._drift = keep * self._drift + math.sqrt(1.0 - keep * keep) * drift["share"] * self._random.standard_normal(6)
+        self._drift = keep * self._drift + math.sqrt(1.0 - keep * keep) * drift["share"] * self._random.standard_normal(
+            6
+        )
         size = np.repeat([self._noise["position_noise"], self._noise["attitude_noise"]], 3)
         error = size * (white + self._drift)
         if self._random.random() < self._log["loss"]:
@@ -74,7 +77,8 @@ class PoseLog:
             row += self._read("acc.x", "acc.y", "acc.z", by=9.81)
         row += self._read("motor.m1", "motor.m2", "motor.m3", "motor.m4", by=1.0 / 65535.0)
         if self._log["rotor_speed"]:
-            row += self._read(*(f"motor.m{i}_rpm" for i in range(1, 5)), by=RPM)
+            speeds = self._read(*(f"motor.m{i}_rpm" for i in range(1, 5)))
+            row += [math.nan if rpm >= UNREADABLE else RPM * rpm for rpm in speeds]
         if self._log["voltage"]:
             row += self._read("pm.vbat")
         self._rows.append(row)
@@ -127,7 +131,7 @@ def boot(case: Table, flight: str) -> Firmware:
     """The firmware of one flight of a case, just booted."""
     seed = int(case["flights"][flight]["seed"])
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "vehicle.toml").write_text(nominal(case).to_toml())
+        (Path(folder) / "vehicle.toml").write_text(case["vehicle"])
         table = {**scenario_of(case, flight), "vehicle_file": "vehicle.toml"}
         scenario = parse_scenario(table, case["case"], folder=Path(folder))
     return Firmware(Flight(scenario, seed), platform=scenario.platform, seed=seed, parameters=scenario.parameters)
@@ -145,9 +149,7 @@ def fly(case: Table, flight: str, folder: Path, *, duration: float) -> Table:
     folder.mkdir(parents=True, exist_ok=True)
     onboard = log["estimate"] == "kalman"
     part = folder / f"{flight}.part"
-    recorder: Any = (
-        BlockLog(part, firmware.log.table, log, seed) if onboard else PoseLog(firmware, drone, case, seed)
-    )
+    recorder: Any = BlockLog(part, firmware.log.table, log, seed) if onboard else PoseLog(firmware, drone, case, seed)
     begin = round(1000 * BOOT)
     end = begin + SETPOINT * len(path.time)
     reason, worst = "", 0.0
@@ -182,7 +184,7 @@ def fly(case: Table, flight: str, folder: Path, *, duration: float) -> Table:
 def astray(drone: Flight, wanted: NDArray) -> str:
     """Empty, or why this is no flight any more."""
     row = np.array(drone.truth_row())
-    w, x, y, z = row[7:11]
+    x, y = row[8:10]
     tilt = math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y))))
     if row[3] < LOWEST:
         return f"came down to {row[3]:.2f} m"

@@ -212,6 +212,10 @@ def _cable_spring(u: float, random: Random, vehicle: Vehicle) -> Table:
     return _table(stiffness=stiffness, length=0.4, x=float(x), y=float(y), z=0.0)
 
 
+def _lift(u: float, random: Random, vehicle: Vehicle) -> Table:
+    return _table(lift=between(u, SIZES["translational_lift"]["lift"]))
+
+
 SIZES: dict[str, dict[str, tuple[float, float]]] = {
     "payload": {"mass": (0.02, 0.15)},  # share of the drone's; within 12 mm of the middle on every axis
     "thrust_scale": {"change": (0.02, 0.15)},
@@ -243,6 +247,7 @@ SIZES: dict[str, dict[str, tuple[float, float]]] = {
     "magnetic_yaw": {"amplitude": (1.5 * DEGREE, 15 * DEGREE)},
     "sticky_rotor": {"deadband": (0.01, 0.06)},
     "cable_spring": {"stiffness": (0.01, 0.1)},
+    "translational_lift": {"lift": (0.001, 0.006)},  # N s^2/m^2 of each rotor
 }
 
 
@@ -298,6 +303,10 @@ OUTSIDE: dict[str, Concealed] = dict(
         _of("cable_spring", _cable_spring, *QUICK, axes=("x", "y", "z"), regimes=PLACES),
     )
 )  # fmt: skip
+# What only a foreign simulator does: thrust that grows with the square of the speed across the rotors.
+FOREIGN_OUTSIDE: dict[str, Concealed] = dict(
+    (_of("translational_lift", _lift, *QUICK, axes=("z",), regimes=("speed", "velocity", "airspeed", "fast")),)
+)
 # Pairs that no flight could tell from one of the two alone, or only by luck, are not drawn.
 ALIKE: tuple[frozenset[str], ...] = (
     frozenset({"payload", "thrust_scale", "suspended_load", "center_of_mass", "inertia", "inertia_products"}),
