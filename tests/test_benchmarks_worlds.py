@@ -290,10 +290,10 @@ def test_a_plain_foreign_flight_is_what_its_vehicle_file_predicts(tmp_path: Path
     )
     case["conditions"]["step"] = 5
     case["conditions"]["log"].update(
-        period=10, velocity=True, attitude=True, specific_force=False, rotor_speed=False, voltage=True, loss=0.0
+        period=5, velocity=True, attitude=True, specific_force=False, rotor_speed=False, voltage=True, loss=0.0
     )
     noise = case["conditions"]["noise"]
-    noise.update(position=1e-4, attitude=1e-4, velocity=1e-3, body_rate=1e-3, gyro_offset=0.0, motor=0.05, share=0.0)
+    noise.update(position=1e-5, attitude=1e-5, velocity=1e-4, body_rate=1e-4, gyro_offset=0.0, motor=0.02, share=0.0)
     assert fly(case, "recording", tmp_path, duration=5.0)["flown"]
     (tmp_path / "drone.toml").write_text(case["vehicle"])
     error = held_out_error(tmp_path / "recording.csv", str(tmp_path / "drone.toml"), mapping=tmp_path / "mapping.toml")

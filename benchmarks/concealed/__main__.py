@@ -26,6 +26,7 @@ def _parser() -> argparse.ArgumentParser:
         "--part", type=int, nargs=2, default=(0, 1), metavar=("K", "N"), help="fly, diagnose: share K of N"
     )
     parser.add_argument("--command", nargs="+", help="diagnose: instead of `crazyem diagnose`")
+    parser.add_argument("--limit", type=float, default=900.0, help="diagnose: s after which an answer counts as none")
     parser.add_argument("--alone", action="store_true", help="diagnose, score: by one flight, with none held out")
     parser.add_argument("--write-docs", action="store_true", help="score: docs/concealed.md and docs/concealed.json")
     parser.add_argument(
@@ -54,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     elif arguments.step == "diagnose":
         from .diagnose import diagnose_all
 
-        diagnose_all(study, command=arguments.command, minutes=arguments.minutes, part=part)
+        diagnose_all(study, command=arguments.command, minutes=arguments.minutes, part=part, limit=arguments.limit)
     else:
         from .report import report
 

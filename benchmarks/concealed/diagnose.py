@@ -19,10 +19,12 @@ from typing import Any
 from .paths import Study, read, write
 
 DIAGNOSE = (sys.executable, "-m", "crazyem", "diagnose")
-TIME_LIMIT = 900.0  # s; an answer later than that counts as none
+TIME_LIMIT = 900.0  # s; an answer later than that counts as none; more on a machine that is busy otherwise
 
 
-def diagnose_one(study: Study, case: str, truth: Mapping[str, Any], command: Sequence[str]) -> dict[str, Any]:
+def diagnose_one(
+    study: Study, case: str, truth: Mapping[str, Any], command: Sequence[str], limit: float = TIME_LIMIT
+) -> dict[str, Any]:
     """The answer file of a case: case, seconds, code, said (last line on standard error), result (the JSON or None)."""
     with tempfile.TemporaryDirectory() as folder:
         link = os.link if _same_disk(study, folder) else os.symlink
@@ -46,10 +48,10 @@ def diagnose_one(study: Study, case: str, truth: Mapping[str, Any], command: Seq
         ]  # fmt: skip
         begun = time.monotonic()
         try:
-            done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=TIME_LIMIT, check=False)
+            done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=limit, check=False)
             code, said = done.returncode, done.stderr.strip().splitlines()[-1:]
         except subprocess.TimeoutExpired:
-            code, said = -1, [f"no answer after {TIME_LIMIT:g} s"]
+            code, said = -1, [f"no answer after {limit:g} s"]
         seconds = time.monotonic() - begun
         fitted = Path(folder) / "fitted.toml"
         if fitted.is_file():
@@ -78,6 +80,7 @@ def diagnose_all(
     command: Sequence[str] | None = None,
     minutes: float = math.inf,
     part: tuple[int, int] = (0, 1),
+    limit: float = TIME_LIMIT,
 ) -> int:
     """Diagnose what has no answer yet; returns how many. Answers are kept: delete them to ask again."""
     begun, asked = time.monotonic(), 0
@@ -86,7 +89,7 @@ def diagnose_all(
             continue
         if time.monotonic() - begun > 60.0 * minutes:
             break
-        answer = diagnose_one(study, case, read(study.truth(case)), command or DIAGNOSE)
+        answer = diagnose_one(study, case, read(study.truth(case)), command or DIAGNOSE, limit)
         write(study.answer(case), answer)
         asked += 1
         named = [e["name"] for e in (answer["result"] or {}).get("effects", [])]
