@@ -13,7 +13,12 @@ from .paths import Study, read, write
 from .score import Outcome, failures, figures
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-MARKS = ("<!-- concealed: table -->", "<!-- /concealed -->")
+# Where the table of a world stands in docs/concealed.md, and its figures beside it.
+MARKS = {
+    "home": ("<!-- concealed: table -->", "<!-- /concealed -->", "concealed.json"),
+    "random": ("<!-- random: table -->", "<!-- /random -->", "concealed_random.json"),
+    "foreign": ("<!-- foreign: table -->", "<!-- /foreign -->", "concealed_foreign.json"),
+}
 Ideal = Literal["all", "failures", "kept"]
 
 
@@ -94,8 +99,8 @@ def _number(value: float | None, text: str) -> str:
     return "not measured" if value is None else text.format(value)
 
 
-def table(f: dict[str, Any]) -> str:
-    """The figures as Markdown."""
+def table(f: dict[str, Any], *, brief: bool = False) -> str:
+    """The figures as Markdown; brief: without the tables of effects, confidence and cases."""
     cases, p, s, o = f["cases"], f["parameters"], f["single"], f["outside"]
     calibration = f["confidence"]["expected_calibration_error"]
     rows = [
@@ -129,10 +134,10 @@ def table(f: dict[str, Any]) -> str:
         "| figure | measured | aim |",
         "|---|---|---|",
         *(f"| {name} | {value} | {aim} |" for name, value, aim in rows),
-        "",
-        "| effect | named first | median error |",
-        "|---|---|---|",
     ]
+    if brief:
+        return "\n".join(lines)
+    lines += ["", "| effect | named first | median error |", "|---|---|---|"]
     for name, share in f["by_effect"].items():
         error = p["error_by_effect"].get(name, {}).get("median")
         lines.append(f"| {name} | {percent(share)} | {_number(error, '{:.1%}')} |")
@@ -164,12 +169,15 @@ def report(study: Study, *, write_docs: bool = False, ideal: Ideal = "all") -> s
     truths = [read(study.truth(c)) for c in study.cases()]
     found["not_flown"] = sum(any(not q["flown"] for q in t.get("quality", {}).values()) for t in truths)
     found["study_seed"] = truths[0].get("study_seed") if truths else None
+    world = truths[0].get("world", "home") if truths else "home"
     write(study.folder / "score.json", found)
     text = table(found)
     if write_docs:
-        write(DOCS / "concealed.json", found)
+        begin, end, file = MARKS[world]
+        write(DOCS / file, found)
+        shown = text if world == "home" else f"Seed {found['study_seed']}. {table(found, brief=True)}"
         page = (DOCS / "concealed.md").read_text()
-        before, _, rest = page.partition(MARKS[0])
-        _, _, after = rest.partition(MARKS[1])
-        (DOCS / "concealed.md").write_text(f"{before}{MARKS[0]}\n\n{text}\n\n{MARKS[1]}{after}")
+        before, _, rest = page.partition(begin)
+        _, _, after = rest.partition(end)
+        (DOCS / "concealed.md").write_text(f"{before}{begin}\n\n{shown}\n\n{end}{after}")
     return text
