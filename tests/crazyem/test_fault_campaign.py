@@ -111,3 +111,29 @@ def test_the_table(benches, tmp_path):
     assert table["unguarded"]["hangs"] == 1
     assert table["unguarded"]["unrecorded_writes"] == 1
     assert table["none"]["faults"] == {"stall": 2}
+
+
+# --- scripts that leave their attachment ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def attached(benches):
+    return importlib.import_module("benchmarks.attached_flight")
+
+
+def test_an_attached_flight_draws_every_way_out(attached):
+    cases = [attached.draw(seed) for seed in range(1, 201)]
+    assert repr(cases) == repr([attached.draw(seed) for seed in range(1, 201)])
+    assert {c.way for c in cases} == set(attached.WAYS)
+    assert {k for c in cases for k in c.kinds} >= {"slow estimator", "stalled estimator", "deaf", "lost echoes"}
+    assert min(c.left - c.land for c in cases) < 0 < max(c.left - c.land - c.lasts for c in cases)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 17, 27, 75])
+def test_a_script_that_leaves_around_its_landing_writes_nothing_on_the_ground(attached, seed):
+    """Ctrl-C, exception, by itself, link lost, the estimator seconds behind."""
+    result = attached.fly(seed)
+    assert result.fault_of_ours == ""
+    assert result.landed
+    assert result.on_ground == 0
