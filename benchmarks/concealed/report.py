@@ -10,7 +10,7 @@ from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
 
 from .ideal import held_out_error, ideal_nats, ideal_nats_of_each
 from .paths import Study, read, write
-from .score import Outcome, failures, figures
+from .score import Outcome, failures, figures, wilson
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 # Where the table of a world stands in docs/concealed.md, and its figures beside it.
@@ -90,9 +90,8 @@ def percent(share: dict[str, Any]) -> str:
     """A share with the number of cases behind it."""
     if share["share"] is None:
         return "not measured"
-    low, high = share.get("interval", (None, None))
-    between = "" if low is None else f" ({100 * low:.0f} to {100 * high:.0f})"
-    return f"{100 * share['share']:.1f} % of {share['n']}{between}"
+    low, high = wilson(share["share"], share["n"])
+    return f"{100 * share['share']:.1f} % of {share['n']} ({100 * low:.0f} to {100 * high:.0f})"
 
 
 def _number(value: float | None, text: str) -> str:

@@ -67,10 +67,7 @@ class Outcome:
 
 
 def _share(values: Sequence[float]) -> dict[str, Any]:
-    if not len(values):
-        return {"n": 0, "share": None}
-    share = float(np.mean(values))
-    return {"n": len(values), "share": share, "interval": wilson(share, len(values))}
+    return {"n": len(values), "share": float(np.mean(values)) if len(values) else None}
 
 
 def wilson(share: float, n: int) -> tuple[float, float]:

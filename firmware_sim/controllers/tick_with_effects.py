@@ -13,7 +13,6 @@ from firmware_sim.controllers.power_distribution import motors_step
 from firmware_sim.controllers.tick import DT, control_step, moves
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
-from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.sensing import be_honest, claim_velocity, go_back, sense_late
 from firmware_sim.plant.effects.step import hold_still, plant_step_with_effects
 from firmware_sim.plant.onboard_estimate import estimate_step
