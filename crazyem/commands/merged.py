@@ -47,6 +47,10 @@ def _add(a: Inventory, b: Inventory) -> Inventory:
         events={kind: a.events.get(kind, 0) + b.events.get(kind, 0) for kind in (*a.events, *b.events)},
         envelope=_add_envelopes(a.envelope, b.envelope),
         verdicts=_best(a.verdicts, b.verdicts),
+        # what stands against a part stands against the whole only if no part is free of it
+        on_the_ground=a.on_the_ground and b.on_the_ground,
+        no_replay=a.no_replay and b.no_replay,
+        unlike=a.unlike and b.unlike,
     )
 
 
