@@ -6,6 +6,9 @@ FLIES  := $(VENV)/.installed
 READY  := $(VENV)/.ready
 WARM   := $(VENV)/.compiled
 
+# Modules are compiled once: the tests start some hundred processes, each of which would compile all of them again.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: fly test slow lint bench concealed paper paper-docs cfclient-test clean setup oldest
 
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable

@@ -44,7 +44,7 @@ class Estimator(fake.FakeEstimator):
 
     def feed(self, sample):
         if self.stall_at is not None and self.n >= self.stall_at:
-            self.released.wait(20.0)
+            self.released.wait(600.0)
         if self.fail_at is not None and self.n >= self.fail_at:
             raise ValueError("boom")
         return super().feed(sample)

@@ -136,8 +136,9 @@ def test_watch_estimates_what_somebody_else_flies(tmp_path, simulator):
     assert summary["pushes"] == []
 
 
-def test_three_lines_give_an_existing_cflib_script_estimates(simulator):
+def test_three_lines_give_an_existing_cflib_script_estimates(simulator, monkeypatch):
     """The script owns the Crazyflie object and the flight; we ride along and leave it open."""
+    monkeypatch.setattr("crazyem.links.crazyflie.SILENT_AFTER", 60.0)  # s; a busy machine is no lost drone
     import cflib.crtp
     from cflib.crazyflie import Crazyflie
     from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
