@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.diagnosis.diagnose import Diagnosis, diagnose
@@ -82,7 +82,6 @@ def anything(draw: st.DrawFn) -> Named:
     return named(effect, values)
 
 
-@settings(max_examples=300, deadline=None)
 @given(anything())
 def test_nothing_impossible_is_told(found: Named) -> None:
     kept, gone = determined([found], POINT)
@@ -92,7 +91,6 @@ def test_nothing_impossible_is_told(found: Named) -> None:
     assert all(reason.startswith("not determined: ") for reason in gone.values())
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.sampled_from(sorted(CONTINUOUS)), st.floats(0.3, 0.9), st.floats(0.01, 0.2))
 def test_what_is_clearly_there_and_possible_is_told(effect: str, share: float, relative: float) -> None:
     values = {}
