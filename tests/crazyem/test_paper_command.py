@@ -153,9 +153,11 @@ def test_results_are_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monk
 # the command --------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def run_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A whole tiny run in this process."""
+    """A whole tiny run in this process, with one figure of 33 (test_paper_figures.py draws all)."""
     out = tmp_path_factory.mktemp("paper") / "one"
-    assert main(command(out, "--jobs", "1")) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "FIGURES", figures.FIGURES[:1])
+        assert main(command(out, "--jobs", "1")) == 0
     return out
 
 
@@ -165,8 +167,8 @@ def test_a_run_leaves_everything(run_once: Path) -> None:
     assert len(content["tasks"]) == 16
     assert len(content["cells"]) == 24
     assert all(c["published"] and c["crazyem"] and c["bound"] for c in content["cells"])
-    assert len(content["figures"]) == 33
-    assert len(list((run_once / "figures").iterdir())) == 66
+    assert len(content["figures"]) == 1
+    assert len(list((run_once / "figures").iterdir())) == 2
     assert "Table V" in (run_once / "tables.md").read_text()
     page = (run_once / "index.html").read_text()
     assert all(f"figure_{f['number']:02d}.png" in page for f in content["figures"])
