@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.kernel_cache import kernel
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle, load_vehicle
-from kernel_cache import kernel
 
 LOG_RATE = 100.0  # Hz
 VOLTAGE = 3.9  # V, constant

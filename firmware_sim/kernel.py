@@ -4,14 +4,15 @@ Numba stamps a cached function with the content of the file it is written in. Ou
 other files and read index constants of other files, so an edit there would silently leave old machine code in use.
 """
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
-import kernel_cache
+from numba import njit
 
 _ROOT = Path(__file__).parent
 _FOLDERS = ("plant", "controllers", "commander")
-_SOURCES = [Path(__file__), Path(kernel_cache.__file__), _ROOT / "contents.py"]  # the first two say how to compile
+_SOURCES = [Path(__file__), _ROOT / "contents.py"]
 _SOURCES += sorted(p for folder in _FOLDERS for p in (_ROOT / folder).rglob("*.py"))
 _STAMP = tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in _SOURCES)
 
@@ -21,4 +22,7 @@ def kernel(function: Any) -> Any:
 
     Division by zero gives infinity as in C, not an exception.
     """
-    return kernel_cache.kernel(function, stamp=_STAMP)
+    dispatcher: Any = njit(cache=True, nogil=True, error_model="numpy")(function)
+    with contextlib.suppress(AttributeError):  # private to numba; without it caching works, only less watchful
+        dispatcher._cache._cache_file._source_stamp = _STAMP
+    return dispatcher

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import kernel_cache
+from crazyem import kernel_cache
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TOY = """
 import sys
 import numpy as np
-from kernel_cache import compilations, kernel
+from crazyem.kernel_cache import compilations, kernel
 
 @kernel
 def inner(x, n):
@@ -97,7 +97,7 @@ def test_processes_that_compile_at_once_leave_a_whole_cache(toy: Path, tmp_path:
 
 BACKWARDS = """
 import sys
-import kernel_cache
+from crazyem import kernel_cache
 import crazyem.commands.replay, crazyem.estimation.online, crazyem.estimation.steps
 from crazyem.cli import main
 

@@ -5,9 +5,9 @@ import time
 
 from crazyem.errors import CrazyemError
 from crazyem.estimation.online import OnlineEstimator
+from crazyem.kernel_cache import compilations
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle
-from kernel_cache import compilations
 
 
 def warm_up(vehicle: Vehicle) -> float:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from crazyem.kernel_cache import kernel as compiled
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
-from kernel_cache import kernel as compiled
 
 Array = NDArray[np.float64]
 G = 9.81
