@@ -3,6 +3,7 @@
 Owns the arrays that the compiled tick works on and shows them by name. Knows no packets and no real time.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -73,8 +74,10 @@ class Flight:
 
     def _start_up(self, scenario: Scenario) -> None:
         """Sensors settled and calibrated, estimate at its place: as after a boot on level ground."""
-        biases = self._noise.boot(3)
-        self._sensor[at.BIAS : at.BIAS + 3] = biases * self._truth[at.GYRO_BIAS : at.GYRO_BIAS + 3]
+        biases = self._noise.boot(4)
+        share = 0.5 * math.erfc(-biases[3] / math.sqrt(2.0))  # a number from 0 to 1: fixes keep a beat of their own
+        self._truth[at.FIX_PHASE] = math.floor(share * self._truth[at.FIX_PERIOD])
+        self._sensor[at.BIAS : at.BIAS + 3] = biases[:3] * self._truth[at.GYRO_BIAS : at.GYRO_BIAS + 3]
         if "gyro_bias" in scenario.effects:
             self._sensor[at.BIAS : at.BIAS + 3] += [scenario.effects["gyro_bias"][axis] for axis in "xyz"]
         for i in range(3):

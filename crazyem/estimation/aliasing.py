@@ -7,15 +7,17 @@ constant and delay, which are told from the same commands, wrong with it. The bi
 counted as uncertainty: the data cannot remove it.
 """
 
+import math
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from crazyem.physics.lag import CAUSAL, hold_predictor, lagged_means
 
 _DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])  # third difference: blind to what is smooth, 20 times white variance
-_STEPS = 1000
+_STEPS, _BEGIN = 1000, 10  # rows of an impulse response, and where the impulse is
 
 
 def white_variance(command: NDArray, rate: NDArray, *, rate_variance: float) -> float:
@@ -41,29 +43,44 @@ def white_variance(command: NDArray, rate: NDArray, *, rate_variance: float) -> 
     return gain**2 * rate_variance + unexplained
 
 
-def lagged_noise(*, period: float, tau: float) -> tuple[float, float, float]:
-    """What white command samples of unit variance leave in a step's mean torque, and how it leans on its derivatives.
+def innovation_noise(*, period: float, tau: float, gain: float) -> tuple[float, float, float]:
+    """What white command samples of unit variance leave in the innovations, and how it leans on their derivatives.
+
+    A filter that trusts its model remembers: the torque of one step is in the innovations of the steps after it, until
+    measurements have corrected the rate. With the steady gain K of the rate, the innovations' share of the means m is
+    x[k] = (1 - K) x[k-1] + m[k], and likewise that of their derivatives.
 
     Args:
         period: between samples [s].
         tau: rotor time constant [s].
+        gain: K, from 0 to 1.
 
     Returns:
-        E[m^2], E[m dm/dtau] [1/s], E[m dm/ddelay] [1/s] for the mean m of the lagged noise over a step.
+        E[x^2], E[x dx/dtau] [1/s], E[x dx/ddelay] [1/s].
     """
     # quantised, so that a slowly moving time constant does not ask for it anew each time
-    return _lagged_noise(float(f"{period:.2g}"), float(f"{max(tau, 1e-3):.2g}"))
+    return _innovation_noise(float(f"{period:.2g}"), float(f"{max(tau, 1e-3):.2g}"), float(f"{gain:.2g}"))
 
 
-@lru_cache(maxsize=256)
-def _lagged_noise(period: float, tau: float) -> tuple[float, float, float]:
+@lru_cache(maxsize=1024)
+def _innovation_noise(period: float, tau: float, gain: float) -> tuple[float, float, float]:
     times = np.arange(_STEPS) * period
-    noise = np.random.default_rng(0).standard_normal((_STEPS, 4))
-    mean, by_tau, by_delay = np.zeros((_STEPS, 4)), np.zeros((_STEPS, 4)), np.zeros((_STEPS, 4))
-    state = np.zeros(13)
+    impulse = np.zeros((_STEPS, 4))
+    impulse[_BEGIN] = 1.0
+    responses = np.zeros((3, _STEPS, 4))
     lagged_means(
-        times, noise, 0, _STEPS, hold_predictor(), times, 1, _STEPS, CAUSAL, tau, 0.0, state, mean, by_tau, by_delay
+        times, impulse, 0, _STEPS, hold_predictor(), times, 1, _STEPS, CAUSAL, tau, 0.0, np.zeros(13), *responses
     )
-    settled = slice(_STEPS // 10, None)
-    m = mean[settled]
-    return float(np.mean(m * m)), float(np.mean(m * by_tau[settled])), float(np.mean(m * by_delay[settled]))
+    x, by_tau, by_delay = lfilter([1.0], [1.0, gain - 1.0], responses[:, :, 0])
+    return float(x @ x), float(x @ by_tau), float(x @ by_delay)
+
+
+def steady_gain(process: float, measurement: float) -> tuple[float, float]:
+    """Kalman gain of a random walk measured at every step, and the variance of its innovations.
+
+    Args:
+        process, measurement: variances of a step of the walk and of a measurement, in the same unit.
+    """
+    predicted = 0.5 * (process + math.sqrt(process**2 + 4.0 * process * measurement))
+    innovation = predicted + measurement
+    return predicted / innovation, innovation

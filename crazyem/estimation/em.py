@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.estimation import kernels
-from crazyem.estimation.aliasing import lagged_noise, white_variance
+from crazyem.estimation.aliasing import innovation_noise, steady_gain, white_variance
 from crazyem.estimation.inputs import InputHistory
 from crazyem.estimation.model import Noise, Parameters, Setup
 from crazyem.estimation.mstep import maximise
@@ -241,9 +241,7 @@ class WindowEM:
         factors[free] = inflation
         bias = np.zeros(9)
         if setup.free[4]:
-            # added as squares: the sizes are known well, but not so well that parts could be trusted to cancel
-            bias[free] = np.sqrt(covariance**2 @ self.command_noise_score(first, last)[free] ** 2)
-        full += np.diag(bias**2)
+            bias[free] = covariance @ self.command_noise_score(first, last)[free]
         return Information(matrix, full, step, decrement, factors, bias, noise_sd, noise_step)
 
     def _carried_information(self, first: int, last: int, of_noise: NDArray | None) -> NDArray:
@@ -271,15 +269,15 @@ class WindowEM:
         nearest = np.clip(np.searchsorted(nodes, stamps), 1, len(nodes) - 1)
         nearest -= stamps - nodes[nearest - 1] < nodes[nearest] - stamps
         rates = tape.y[first:last][nearest, 10:13]
-        m2, m_tau, m_delay = lagged_noise(period=float(np.median(np.diff(stamps))), tau=float(p.theta[4]))
+        period = float(np.median(np.diff(stamps)))
         rate_variance = float(p.noise.measurement[3] ** 2)
         steps = int(np.count_nonzero(tape.usable[first + 1 : last]))
         dt = float(np.median(np.diff(nodes)))
         for axis in range(3):
             white = white_variance(wrenches[:, 1 + axis], rates[:, axis], rate_variance=rate_variance)
-            # variance of a step's mean torque as the filter sees it: process noise, and rates measured at both ends
-            spread = (p.noise.impulse[3 + axis] ** 2 / dt + 2 * rate_variance / dt**2) * p.theta[1 + axis] ** 2
-            weight = steps * white / spread
+            gain, variance = steady_gain(p.noise.impulse[3 + axis] ** 2 * dt, rate_variance)
+            m2, m_tau, m_delay = innovation_noise(period=period, tau=float(p.theta[4]), gain=gain)
+            weight = steps * white * dt**2 / (p.theta[1 + axis] ** 2 * variance)
             score[1 + axis] += weight * m2
             score[4] -= weight * m_tau * p.theta[4]
             score[5] -= weight * m_delay * unit[5]

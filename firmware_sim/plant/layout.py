@@ -114,7 +114,12 @@ FEET_REACH = 131  # m, no foot touches while the origin is higher than that
 TRIM = 132  # m, steady torque of the rotors over their thrust, body x y z (an effect of the catalogue)
 RPM_INVALID = 135  # a standard normal number above it makes a report of rotor speed unreadable
 INTEGRATION_STEP = 136  # ms, whole: the plant moves once in so many ticks
-TRUTH_SIZE = 137
+GYRO_STEP = 137  # rad/s, of the sensor's counts
+ACC_STEP = 138  # m/s^2
+PREDICT_PERIOD = 139  # ms between predictions of the onboard estimate
+PREDICT_SLIP = 140  # a standard normal number above it makes a prediction 1 ms late, and with it all that follow
+FIX_PHASE = 141  # ms after a multiple of FIX_PERIOD at which built-in fixes come
+TRUTH_SIZE = 142
 
 # board: compile-time constants of the firmware (platform_defaults_*.h)
 B_ARM = 0  # m, rotor offset along x and y: 0.707106781 ARM_LENGTH
@@ -149,9 +154,12 @@ E_EXT = 10  # 0 nothing waiting, 1 external position, 2 external pose
 E_EXT_POS = 11
 E_EXT_QUAT = 14  # w, x, y, z
 E_RESET = 18  # 1: start again at the next step
-E_GYRO = 19  # rad/s used last
-E_ACC = 22  # m/s^2 used last
-ESTIMATE_SIZE = 25
+E_GYRO = 19  # rad/s, mean over the time of the last prediction
+E_ACC = 22  # m/s^2, likewise
+E_SUM = 25  # gyro and accelerometer added up since then
+E_COUNT = 31  # how many of each
+E_DUE = 32  # ms of the next prediction
+ESTIMATE_SIZE = 33
 
 # columns of one row of standard normal numbers, one row a millisecond
 N_THRUST = 0
@@ -163,6 +171,7 @@ N_FIX_POSITION = 13
 N_FIX_ATTITUDE = 16
 N_VBAT = 19
 N_GUST = 20
+N_SLIP = 26
 N_RPM = 27
 N_BARO = 31
 NOISE_WIDTH = 32  # the rest is kept for effects, so that adding one does not change the others' noise

@@ -1,8 +1,10 @@
 """The onboard state estimate: an error-state Kalman filter on position, velocity and attitude, tuned by `kalman.*`.
 
-Fed as the firmware's own filter is: gyro and accelerometer at 1 kHz (filtered, so late by a few ms), covariance at
-100 Hz with the process noise of kalman_core.c, position fixes (and attitude fixes) weighted by locSrv.extPosStdDev and
-locSrv.extQuatStdDev. Its error is therefore correlated in time, as on a real drone.
+Fed as the firmware's own filter is: gyro and accelerometer at 1 kHz (filtered, so late by a few ms), averaged between
+predictions; state and covariance are predicted 100 times a second only (PREDICT_RATE of estimator_kalman.c) with the
+process noise of kalman_core.c; position fixes (and attitude fixes) weighted by locSrv.extPosStdDev and
+locSrv.extQuatStdDev. Between predictions the state stands still, so what controllers and log get is up to 10 ms old: its
+error grows with speed, and is correlated in time, as on a real drone.
 Error state: position (world, m), velocity (world, m/s), attitude (body, rad).
 """
 
@@ -18,21 +20,24 @@ from firmware_sim.plant.effects.sensing import seen_pose
 from firmware_sim.plant.ground import GRAVITY
 from firmware_sim.plant.quaternion import matrix, turn
 
-PREDICT_EVERY = 10  # ms
-
 
 @kernel
 def estimate_step(truth, state, sensor, estimate, P, param, noise, tick):
-    """One millisecond: integrate the sensors, every 10th the covariance, and take the fixes that are due."""
+    """One millisecond: add up the sensors, predict when it is time, and take the fixes that are due."""
     if estimate[at.E_RESET] > 0.0 or not healthy(estimate, P):
         estimate[at.E_RESET] = 0.0
         restart(truth, state, estimate, P)
-    integrate(sensor, estimate, 1e-3)
-    drag(estimate, param, 1e-3)
-    if tick % PREDICT_EVERY == 0:
-        predict(estimate, P, param, 1e-3 * PREDICT_EVERY)
+    add_up(sensor, estimate)
+    if tick >= estimate[at.E_DUE]:
+        estimate[at.E_DUE] = tick + truth[at.PREDICT_PERIOD]
+        if noise[at.N_SLIP] > truth[at.PREDICT_SLIP]:
+            estimate[at.E_DUE] += 1.0  # as the firmware counts: from when it came to the next
+        dt = 1e-3 * estimate[at.E_COUNT]
+        integrate(estimate, dt)
+        drag(estimate, param, dt)
+        predict(estimate, P, param, dt)
     kind = truth[at.FIX_KIND]
-    if kind > 0.0 and tick % int(truth[at.FIX_PERIOD]) == 0:
+    if kind > 0.0 and (tick - int(truth[at.FIX_PHASE])) % int(truth[at.FIX_PERIOD]) == 0:
         p, q = np.empty(3), np.empty(4)
         seen_pose(truth, state, sensor, tick, p, q)
         sd = param[pm.EXT_POS_SD]
@@ -62,6 +67,8 @@ def healthy(estimate, P):
         total += P[i, i]
     for i in range(at.E_QUAT + 4):
         total += estimate[i]
+    for i in range(at.E_SUM, at.E_DUE):
+        total += estimate[i]
     return math.isfinite(total)
 
 
@@ -77,6 +84,8 @@ def restart(truth, state, estimate, P):
         estimate[at.E_VEL + i] = 0.0
     for i in range(4):
         estimate[at.E_QUAT + i] = state[at.QUAT + i]
+    for i in range(at.E_SUM, at.E_DUE):
+        estimate[i] = 0.0
     for i in range(9):
         for j in range(9):
             P[i, j] = 0.0
@@ -84,20 +93,33 @@ def restart(truth, state, estimate, P):
 
 
 @kernel
-def integrate(sensor, estimate, dt):
-    """Strapdown integration of the filtered gyro and accelerometer over dt."""
+def add_up(sensor, estimate):
+    """Gyro and accelerometer of this millisecond, for the mean that the next prediction uses."""
+    for i in range(3):
+        estimate[at.E_SUM + i] += sensor[at.GYRO + i]
+        estimate[at.E_SUM + 3 + i] += sensor[at.ACCEL + i]
+    estimate[at.E_COUNT] += 1.0
+
+
+@kernel
+def integrate(estimate, dt):
+    """Strapdown integration over dt of the filtered gyro and accelerometer, by their mean since the last time."""
     R = np.empty((3, 3))
     matrix(estimate, at.E_QUAT, R)
-    a, g = at.ACCEL, at.GYRO
+    a, g = at.E_ACC, at.E_GYRO
     for i in range(3):
-        acc = R[i, 0] * sensor[a] + R[i, 1] * sensor[a + 1] + R[i, 2] * sensor[a + 2]
+        estimate[g + i] = estimate[at.E_SUM + i] / estimate[at.E_COUNT]
+        estimate[a + i] = estimate[at.E_SUM + 3 + i] / estimate[at.E_COUNT]
+        estimate[at.E_SUM + i] = 0.0
+        estimate[at.E_SUM + 3 + i] = 0.0
+    estimate[at.E_COUNT] = 0.0
+    for i in range(3):
+        acc = R[i, 0] * estimate[a] + R[i, 1] * estimate[a + 1] + R[i, 2] * estimate[a + 2]
         if i == 2:
             acc -= GRAVITY
         estimate[at.E_POS + i] += dt * estimate[at.E_VEL + i] + 0.5 * dt * dt * acc
         estimate[at.E_VEL + i] += dt * acc
-        estimate[at.E_GYRO + i] = sensor[g + i]
-        estimate[at.E_ACC + i] = sensor[a + i]
-    turn(estimate, at.E_QUAT, dt * sensor[g], dt * sensor[g + 1], dt * sensor[g + 2])
+    turn(estimate, at.E_QUAT, dt * estimate[g], dt * estimate[g + 1], dt * estimate[g + 2])
 
 
 @kernel
