@@ -30,7 +30,7 @@ BASELINE = 2.0  # s of hover before the trajectory, as `crazyem fly` has it
 # Setpoints as `crazyem fly` sends them; with the jitter seen in its recordings (one in ten 0.9 ms late, one in ten early).
 # At the rate of the log their steps would keep their place between two log samples (crazyem/live/stream.py).
 SETPOINT_PERIOD, SETPOINT_JITTER = 7.0, 0.8  # ms
-LOG_PERIOD = 10  # ms
+LOG_PERIOD = 11  # ms
 LEE = 5  # stabilizer.controller
 _CTYPES = {1: "uint8_t", 2: "uint16_t", 3: "uint32_t", 4: "int8_t", 5: "int16_t", 6: "int32_t", 7: "float", 8: "FP16"}
 _FORMATS = {1: "B", 2: "H", 3: "I", 4: "b", 5: "h", 6: "i", 7: "f", 8: "e"}

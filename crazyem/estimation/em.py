@@ -241,7 +241,9 @@ class WindowEM:
         factors[free] = inflation
         bias = np.zeros(9)
         if setup.free[4]:
-            bias[free] = covariance @ self.command_noise_score(first, last)[free]
+            # added as squares: the sizes are known well, but not so well that parts could be trusted to cancel
+            bias[free] = np.sqrt(covariance**2 @ self.command_noise_score(first, last)[free] ** 2)
+        full += np.diag(bias**2)
         return Information(matrix, full, step, decrement, factors, bias, noise_sd, noise_step)
 
     def _carried_information(self, first: int, last: int, of_noise: NDArray | None) -> NDArray:
