@@ -104,10 +104,10 @@ def fly_all(cases: Iterable[Case], folder: Path) -> None:
         (folder / "part.npz").rename(folder / case.file)
 
 
-def lines(case: Case, log: Log) -> list[dict[str, Any]]:
+def lines(case: Case, log: Log, *, every: int = 4) -> list[dict[str, Any]]:
     """What the estimator says once a second of the trajectory."""
     vehicle = replace(load_vehicle(VEHICLES[case.vehicle][0]), motor_time_constant=FILE_LAG)
-    estimator = OnlineEstimator(vehicle, attitude_period=ATTITUDE_PERIOD)
+    estimator = OnlineEstimator(vehicle, attitude_period=ATTITUDE_PERIOD, every=every)
     said: list[dict[str, Any]] = []
     due = log.start + SETTLING + 2.0
     values = truth(case)
@@ -191,6 +191,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--flights", type=int, default=216, metavar="N", help="18 cells in turn (default: 216)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the draw (default: 1)")
     parser.add_argument("--out", type=Path, default=Path("out/intervals"), metavar="DIR", help="of the logs")
+    parser.add_argument("--every", type=int, default=4, metavar="N", help="samples between updates (default: 4)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="tables, for programs")
     given = parser.parse_args(argv)
     cases, begun = draw(given.flights, given.seed), time.monotonic()
@@ -199,7 +200,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     said: list[dict[str, Any]] = []
     for case in cases:
-        said += lines(case, Log.load(given.out / case.file))
+        said += lines(case, Log.load(given.out / case.file), every=given.every)
     print(f"{given.flights} flights, seed {given.seed}, {time.monotonic() - begun:.0f} s")
     groups = report(said)
     if given.json:

@@ -115,7 +115,10 @@ def _pushing(p: argparse.ArgumentParser, push: str) -> None:
 def _logging(p: argparse.ArgumentParser, *, reconnect: float) -> None:
     """What a session asks of its link."""
     hertz, seconds = _number(1, 1000, " Hz"), _number(0, 3600, " seconds")
-    p.add_argument("--rate", type=hertz, default=100.0, metavar="HZ", help="of the log, to 1000 (default: 100)")
+    p.add_argument(
+        "--rate", type=hertz, default=1000.0 / 11.0, metavar="HZ",
+        help="of the log, to 1000 (default: every 11 ms, no multiple of the onboard estimate's 10)",
+    )  # fmt: skip
     p.add_argument(
         "--reconnect", type=seconds, default=reconnect, metavar="S",
         help=f"how long a lost link is tried again; 0: never (default: {reconnect:g})",

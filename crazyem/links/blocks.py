@@ -15,7 +15,7 @@ from crazyem.links.asking import Asker
 from crazyem.links.base import LinkLost, LinkStatistics
 from crazyem.links.clock import ClockFit, ClockRelation, LossCounter, StampUnwrapper
 from crazyem.links.log_control import LogControl
-from crazyem.links.packing import pack, period_of
+from crazyem.links.packing import PERIOD_UNIT_MS, pack, period_of
 from crazyem.signals.packet import Block, Packet
 
 LATE_AFTER = 0.1  # s behind the least-delayed packets after which a packet counts as late
@@ -97,8 +97,25 @@ class LogBlocks:
             self._delays[block.identifier] = deque(maxlen=_DELAYS)
             self.last_packet = time.monotonic()
             self._running[block.identifier] = (block, config, receive)
-            self._start(block, config, lost)
+            try:
+                self._start(block, config, lost)
+            except UsageError:
+                if block.period_ms <= PERIOD_UNIT_MS or not block.period_ms % PERIOD_UNIT_MS:
+                    raise
+                return self._restart_in_tens(variables, block, groups, lost)
         return blocks
+
+    def _restart_in_tens(
+        self, variables: Sequence[str], block: Block, groups: Sequence[Sequence[str]] | None, lost: Callable[[], str]
+    ) -> tuple[Block, ...]:
+        """The first block of a subscription was refused, as older firmware knows no single milliseconds: the next tens."""
+        _, config, receive = self._running.pop(block.identifier)
+        config.data_received_cb.remove_callback(receive)
+        self._control.delete(config.id)
+        self._cf.log.log_blocks.remove(config)
+        del self._counters[block.identifier]
+        tens = max(1, round(block.period_ms / PERIOD_UNIT_MS)) * PERIOD_UNIT_MS
+        return self.subscribe(variables, 1000.0 / tens, groups, lost)
 
     def _configuration(self, block: Block) -> Any:
         """cflib's object for the block: it numbers blocks and takes packets apart."""

@@ -1,5 +1,6 @@
 """Packing log variables into blocks: 26 bytes a packet, 16 blocks, 128 variables; users never count bytes."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 from crazyem.errors import UsageError
@@ -17,13 +18,16 @@ FASTEST = 1000.0  # Hz; the firmware's timers count milliseconds
 def period_of(rate_hz: float) -> int:
     """Log period [ms] for a rate [Hz].
 
-    Up to 100 Hz a multiple of 10 ms, at most 2540, which every firmware can. Beyond, whole milliseconds, for which the
-    firmware needs the start by milliseconds (protocol 4 knows only tens). Raises UsageError outside 0.394..1000 Hz.
+    Up to 100 Hz a multiple of 10 ms, at most 2540, which every firmware can, unless the rate is that of another whole
+    number of milliseconds. Beyond, whole milliseconds. For these the firmware needs the start by milliseconds (protocol
+    4 knows only tens). Raises UsageError outside 0.394..1000 Hz.
     """
     if not rate_hz > 0:
         raise UsageError(f"A log rate of {rate_hz:g} Hz makes no sense; choose 0.4 to 100 Hz, or up to {FASTEST:g} Hz.")
-    unit = PERIOD_UNIT_MS if rate_hz <= 1000.0 / PERIOD_UNIT_MS else 1
-    period = round(1000.0 / rate_hz / unit) * unit
+    exact = 1000.0 / rate_hz
+    whole = math.isfinite(exact) and abs(exact - round(exact)) < 1e-6
+    unit = PERIOD_UNIT_MS if rate_hz <= 1000.0 / PERIOD_UNIT_MS and not whole else 1
+    period = round(exact / unit) * unit
     if period < 1 or period > MAX_PERIOD_MS or rate_hz > FASTEST:
         raise UsageError(f"The firmware logs at 0.4 to {FASTEST:g} Hz, not {rate_hz:g} Hz.")
     return period

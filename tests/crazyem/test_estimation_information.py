@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crazyem.estimation.aliasing import lagged_noise, white_variance
+from crazyem.estimation.aliasing import innovation_noise, steady_gain, white_variance
 from crazyem.estimation.spectra import MIN_ROWS, long_run
 
 
@@ -75,7 +75,7 @@ def test_lagged_white_samples_keep_the_variance_of_theory():
     for value in u:
         y = value + (y - value) * decay
         out.append(y)
-    mean_square, _, _ = lagged_noise(period=period, tau=tau)
+    mean_square, _, _ = innovation_noise(period=period, tau=tau, gain=1.0)
     assert np.var(out) == pytest.approx(period / (2 * tau + period), rel=0.1)
     assert mean_square == pytest.approx(np.var(out), rel=0.3)  # held for the step, joined by lines before it
 
@@ -83,11 +83,38 @@ def test_lagged_white_samples_keep_the_variance_of_theory():
 def test_noise_leans_on_its_own_derivative_by_the_time_constant():
     """E[m dm/dtau] is half the derivative of E[m^2]."""
     period = 0.01
-    low, high = lagged_noise(period=period, tau=0.055)[0], lagged_noise(period=period, tau=0.065)[0]
-    _, by_tau, by_delay = lagged_noise(period=period, tau=0.06)
+    low, high = innovation_noise(period=period, tau=0.055, gain=1.0)[0], innovation_noise(period=period, tau=0.065, gain=1.0)[0]
+    _, by_tau, by_delay = innovation_noise(period=period, tau=0.06, gain=1.0)
     assert by_tau == pytest.approx(0.5 * (high - low) / 0.010, rel=0.1)
     assert by_tau < 0  # more lag lets less through
     assert abs(by_delay) > 0
+
+
+def test_the_gain_of_a_random_walk_is_that_of_its_filter_run_to_the_end():
+    process, measurement, variance = 3e-4, 2e-3, 1.0
+    for _ in range(2000):
+        predicted = variance + process
+        gain = predicted / (predicted + measurement)
+        variance = (1.0 - gain) * predicted
+    assert steady_gain(process, measurement) == pytest.approx((gain, predicted + measurement), rel=1e-9)
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.3, 0.05])
+def test_noise_of_commands_stays_in_the_innovations_until_measurements_correct_it(gain):
+    """Simulated: white samples, held, through the lag, then through a filter that forgets by its gain only."""
+    rng = np.random.default_rng(5)
+    period, tau, fine = 0.01, 0.05, 10
+    y, x, out = 0.0, 0.0, []
+    decay = np.exp(-period / fine / tau)
+    for value in rng.normal(size=60000):
+        mean = 0.0
+        for _ in range(fine):
+            y = value + (y - value) * decay
+            mean += y / fine
+        x = (1.0 - gain) * x + mean
+        out.append(x)
+    found, _, _ = innovation_noise(period=period, tau=tau, gain=gain)
+    assert found == pytest.approx(np.var(out[1000:]), rel=0.35)  # there joined by lines before the step
 
 
 def test_attenuated_slope_of_a_noisy_regressor():
