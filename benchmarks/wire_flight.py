@@ -173,7 +173,9 @@ def fly(
     client.wait(2500)
     path = after_hover(trajectory, seconds=BASELINE)
     begin = client.firmware.flight.tick
-    late = np.random.default_rng([seed, 0x5E7]).normal(0.0, SETPOINT_JITTER, math.ceil(1000 * path.duration / SETPOINT_PERIOD))
+    late = np.random.default_rng([seed, 0x5E7]).normal(
+        0.0, SETPOINT_JITTER, math.ceil(1000 * path.duration / SETPOINT_PERIOD)
+    )
     corrected = False
     for count, jitter in enumerate(late.tolist()):
         client.wait(max(0, begin + round(count * SETPOINT_PERIOD + jitter) - client.firmware.flight.tick))
@@ -189,9 +191,7 @@ def fly(
     return _log_of(plan, types, client.packets, begin, client.firmware.flight.tick)
 
 
-def _log_of(
-    plan: list[tuple[str, ...]], types: list[list[int]], packets: list[bytes], begin: int, end: int
-) -> Log:
+def _log_of(plan: list[tuple[str, ...]], types: list[list[int]], packets: list[bytes], begin: int, end: int) -> Log:
     order, stamps, values = [], [[] for _ in plan], [[] for _ in plan]  # type: ignore[var-annotated]
     formats = [struct.Struct("<" + "".join(_FORMATS[t] for t in kinds)) for kinds in types]
     for data in packets:

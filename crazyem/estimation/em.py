@@ -38,6 +38,7 @@ class Information:
             coordinates; counted as one more standard deviation in the covariance.
         noise_sd: (11,) standard deviations of the logarithms of the noise scales, zero where known.
         noise_step: (11,) scoring step of these logarithms.
+        shift: (9,) by which the values are corrected before they are told (`in_step.py`); None: not at all.
     """
 
     matrix: NDArray
@@ -48,6 +49,7 @@ class Information:
     bias: NDArray
     noise_sd: NDArray
     noise_step: NDArray
+    shift: NDArray | None = None
 
     @cached_property
     def sd(self) -> NDArray:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from crazyem.errors import DataError, UsageError
 from crazyem.estimation.contact import ContactGate
 from crazyem.estimation.em import Information, WindowEM, offset
+from crazyem.estimation.in_step import corrected, in_step
 from crazyem.estimation.inputs import MAX_GAP, SETTLE, InputHistory
 from crazyem.estimation.marginal import Marginal, Refreshed
 from crazyem.estimation.model import INTEGRATION, KnownNoise, Parameters, Setup, setup_for
@@ -238,7 +239,8 @@ class OnlineEstimator:
                 self._em.incremental(first, self._fresh, self._tape.size, lookback=LOOKBACK)
                 self._fresh = self._tape.size
             self.settled = settle(self._em, first, self._tape.size)
-            self._information, self._marginal = self.settled.information, self.settled.marginal
+            self._information = self._with_ages(self._em, first, self._tape.size, self.settled.information)
+            self._marginal = self.settled.marginal
             self._converged = self.settled.converged
             self._updates += 1
         return self._estimate()
@@ -410,10 +412,16 @@ class OnlineEstimator:
         first = max(0, last - self.window)
         passes = 12 if last - first < NEWBORN else 4 if last - first < min(YOUNG, self.window) else 2
         self.full_updates += 1
-        self._information = em.converge(first, last, passes=passes, tolerance=CLOSE)
+        self._information = self._with_ages(em, first, last, em.converge(first, last, passes=passes, tolerance=CLOSE))
         self._reference = em.parameters
         self._converged = self._information.decrement < PASSED and self._information.noise_length < PASSED_NOISE
         self._marginal = self._refreshed.refresh(em, first, last, self._information)
+
+    def _with_ages(self, em: WindowEM, first: int, last: int, information: Information) -> Information:
+        """With what commands that are sampled in step with an onboard estimate may hide."""
+        stamps, _ = self._inputs.between(self._tape.time[first], self._tape.time[last - 1])
+        onboard = self._attitude_period > 0.0 and em.setup.free[4]
+        return corrected(em, first, last, information) if onboard and in_step(stamps) else information
 
     def _moved(self, em: WindowEM) -> bool:
         """Whether a parameter has moved since the last full passes by more than older rows' expectations can bear."""

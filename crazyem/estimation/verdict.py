@@ -48,6 +48,8 @@ def estimate_of(
     else:
         theta, sd = displaced(parameters.theta, marginal.shift, unit), marginal.sd
         below, above = marginal.low - marginal.shift, marginal.high - marginal.shift
+    if information.shift is not None:
+        theta = displaced(theta, information.shift, unit)
     # An inertia that the prior all but excludes says that the model does not hold here, not that the drone is odd.
     deviation = np.abs(offset(theta, prior.centre, unit))
     implausible = deviation > IMPLAUSIBLE * prior.sd

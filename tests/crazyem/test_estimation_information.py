@@ -83,7 +83,10 @@ def test_lagged_white_samples_keep_the_variance_of_theory():
 def test_noise_leans_on_its_own_derivative_by_the_time_constant():
     """E[m dm/dtau] is half the derivative of E[m^2]."""
     period = 0.01
-    low, high = innovation_noise(period=period, tau=0.055, gain=1.0)[0], innovation_noise(period=period, tau=0.065, gain=1.0)[0]
+    low, high = (
+        innovation_noise(period=period, tau=0.055, gain=1.0)[0],
+        innovation_noise(period=period, tau=0.065, gain=1.0)[0],
+    )
     _, by_tau, by_delay = innovation_noise(period=period, tau=0.06, gain=1.0)
     assert by_tau == pytest.approx(0.5 * (high - low) / 0.010, rel=0.1)
     assert by_tau < 0  # more lag lets less through
