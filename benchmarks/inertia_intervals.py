@@ -1,12 +1,12 @@
 """Intervals of mass and inertia over many simulated flights: how often they hold the truth, and on which side they err.
 
-    python -m benchmarks.inertia_intervals fly --flights 216 --seed 1 --out out/intervals     # once; goes on where it stopped
-    python -m benchmarks.inertia_intervals score --out out/intervals --json intervals.json    # the estimator, any time
+    python -m benchmarks.inertia_intervals fly --flights 216 --seed 1 --out out/intervals   # once; goes on
+    python -m benchmarks.inertia_intervals score --out out/intervals --json intervals.json  # the estimator, any time
 
-Flights: three vehicles, each hovering, in figure 8 and excited, quiet (no disturbance, exact poses) and noisy, rotor lag
-30 to 70 ms where the vehicle file says 50. They go through the wire format in one process (`wire_flight.py`), are kept as
-log packets, and the estimator sees nothing else. A line is what is said once a second of firmware time. Truth is here
-only.
+Flights: three vehicles, each hovering, in figure 8 and excited, quiet (no disturbance, exact poses) and noisy, rotor
+lag 30 to 70 ms where the vehicle file says 50. They go through the wire format in one process (`wire_flight.py`), are
+kept as log packets, and the estimator sees nothing else. A line is what is said once a second of firmware time. Truth
+is here only.
 """
 
 import argparse

@@ -90,9 +90,9 @@ class Integration:
 class Estimator:
     """The onboard estimate: its predictions, and the fixes of position (and attitude) that reach it without a host.
 
-    PREDICT_RATE is that of estimator_kalman.c. Slip and rate of fixes: with these the logged attitude wanders against the
-    gyro (0.2 ms/s), and the estimator finds as much noise in the logged velocity (6 mm/s in figure 8), as in flights of
-    the real firmware.
+    PREDICT_RATE is that of estimator_kalman.c. Slip and rate of fixes: with these the logged attitude wanders against
+    the gyro (0.2 ms/s), and the estimator finds as much noise in the logged velocity (6 mm/s in figure 8), as in
+    flights of the real firmware.
     """
 
     prediction_rate: float = key(100.0, 1.0, 1000.0)  # Hz, PREDICT_RATE of estimator_kalman.c

@@ -108,7 +108,7 @@ class LogBlocks:
     def _restart_in_tens(
         self, variables: Sequence[str], block: Block, groups: Sequence[Sequence[str]] | None, lost: Callable[[], str]
     ) -> tuple[Block, ...]:
-        """The first block of a subscription was refused, as older firmware knows no single milliseconds: the next tens."""
+        """The first block was refused, as older firmware knows no single milliseconds: the nearest tens."""
         _, config, receive = self._running.pop(block.identifier)
         config.data_received_cb.remove_callback(receive)
         self._control.delete(config.id)

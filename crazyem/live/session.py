@@ -30,9 +30,8 @@ from crazyem.signals.sample import Sample
 from crazyem.signals.vocabulary import MOTOR_BLOCK, ROTOR_SPEED_BLOCK, STATE_BLOCK, decoders
 from crazyem.vehicle import Vehicle
 
-# Every 11 ms, not 10: the onboard estimate is predicted every 10 ms and stands still in between, so commands that answer
-# to it are as old as the log happens to find them. Logged every 10 ms they are off by the same part of a step for
-# seconds: inertia in figure 8 came out up to 40 % wrong (docs/estimator.md). Eleven visit every age within 110 ms.
+# Every 11 ms: in step with the onboard estimate, predicted every 10 ms, logged commands are off by the same part of a
+# step for seconds (docs/estimator.md, In step).
 RATE = 1000.0 / 11.0  # Hz
 LINK_EVERY = 1.0  # s between notes on the link's health
 # A drone under low-level setpoints levels out after 0.5 s without them and cuts its motors after 2 s; one that hovers

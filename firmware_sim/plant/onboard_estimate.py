@@ -3,8 +3,8 @@
 Fed as the firmware's own filter is: gyro and accelerometer at 1 kHz (filtered, so late by a few ms), averaged between
 predictions; state and covariance are predicted 100 times a second only (PREDICT_RATE of estimator_kalman.c) with the
 process noise of kalman_core.c; position fixes (and attitude fixes) weighted by locSrv.extPosStdDev and
-locSrv.extQuatStdDev. Between predictions the state stands still, so what controllers and log get is up to 10 ms old: its
-error grows with speed, and is correlated in time, as on a real drone.
+locSrv.extQuatStdDev. Between predictions the state stands still, so what controllers and log get is up to 10 ms old:
+its error grows with speed, and is correlated in time, as on a real drone.
 Error state: position (world, m), velocity (world, m/s), attitude (body, rad).
 """
 
