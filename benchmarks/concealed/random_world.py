@@ -62,18 +62,25 @@ def random_case(name: str, kind: str, strength: dict[str, float], random: Random
     }
 
 
+def of_the_day(case: Table, flight: str, hidden: Table) -> Table:
+    """Trim, thrust and lag of one flight's day as effects, on top of what is hidden; or nothing."""
+    today = case["flights"][flight]["day"]
+    if "trim" not in today:
+        return {}
+    own, scale = case["own"]["trim"], hidden.get("thrust_scale", {}).get("scale", 1.0)
+    lag = hidden.get("motor_lag", {}).get("time_constant", parse_vehicle(case["vehicle"]).motor_time_constant)
+    return {
+        "trim": {a: own[a] + today["trim"][a] for a in "xyz"},
+        "thrust_scale": {"scale": scale * today["thrust"]},
+        "motor_lag": {"time_constant": lag * today["lag"]},
+    }
+
+
 def scenario_of(case: Table, flight: str) -> Table:
     """The simulator's scenario of one flight, but for the vehicle file."""
     drawn, mine = case["conditions"], case["flights"][flight]
     today = mine["day"]
-    effects = {**case["built"], **case["effects"]}
-    if "trim" in today:
-        own = case["own"]["trim"]
-        effects["trim"] = {a: own[a] + today["trim"][a] for a in "xyz"}
-        scale = effects.get("thrust_scale", {}).get("scale", 1.0)
-        effects["thrust_scale"] = {"scale": scale * today["thrust"]}
-        lag = effects.get("motor_lag", {}).get("time_constant", parse_vehicle(case["vehicle"]).motor_time_constant)
-        effects["motor_lag"] = {"time_constant": lag * today["lag"]}
+    effects = {**case["built"], **case["effects"], **of_the_day(case, flight, case["effects"])}
     if "gusts" in mine:
         effects["gusts"] = mine["gusts"]
     scenario: Table = {"platform": case["platform"], "effects": effects, "hidden": case["hidden"]}

@@ -10,6 +10,7 @@ from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
 
 from .ideal import held_out_error, ideal_nats, ideal_nats_of_each
 from .paths import Study, read, write
+from .random_world import of_the_day
 from .score import Outcome, failures, figures, wilson
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -54,9 +55,14 @@ def _given(study: Study, truth: Mapping[str, Any]) -> Vehicle:
 
 
 def _unhidden(study: Study, truth: Mapping[str, Any]) -> Vehicle:
-    """The same with the drag that the drone has as built, where its file leaves that out."""
+    """The same with the drag that the drone has as built, where its file leaves that out, on the day of its flight."""
     given = _given(study, truth)
-    return replace(given, effects={**given.effects, **truth.get("built", {})})
+    return replace(given, effects={**given.effects, **truth.get("built", {}), **_day(truth, {})})
+
+
+def _day(truth: Mapping[str, Any], hidden: dict[str, Any]) -> dict[str, Any]:
+    """What the day of the fitted flight does, on top of what is hidden."""
+    return of_the_day(dict(truth), "recording", hidden) if "own" in truth else {}
 
 
 def _known(study: Study, case: str) -> Path:
@@ -67,19 +73,19 @@ def _know(study: Study, case: str, truth: Mapping[str, Any], *, held_out: bool) 
     """Keep nats of the truth on the flight and, if asked, held-out errors of nominal, fitted and true model."""
     known: dict[str, Any] = read(_known(study, case)) or {"held_out": {}}
     vehicle, mapping = _unhidden(study, truth), study.mapping(case)
+    hidden = {n: _day(truth, truth["effects"]).get(n, t) for n, t in truth["effects"].items()}
     if known.get("nats") is None and truth["kind"] in ("single", "pair"):
-        known["nats"] = ideal_nats(study.recording(case, "recording"), vehicle, truth["effects"], mapping=mapping)
+        known["nats"] = ideal_nats(study.recording(case, "recording"), vehicle, hidden, mapping=mapping)
     if known.get("of_each") is None and truth["kind"] == "pair":
-        known["of_each"] = ideal_nats_of_each(
-            study.recording(case, "recording"), vehicle, truth["effects"], mapping=mapping
-        )
+        known["of_each"] = ideal_nats_of_each(study.recording(case, "recording"), vehicle, hidden, mapping=mapping)
     home = truth.get("world", "home") == "home"
     file = study.folder / "vehicles" / f"{truth['platform']}.toml" if home else study.vehicle(case)
     models = {"nominal": file, "fitted": study.fitted(case)} if held_out else {}
     if held_out and truth["effects"] and not truth["hidden"]:
         models["true"] = study.truth(case).with_name(f"{case}_vehicle.toml")
         own = {n: t for n, t in truth["effects"].items() if CATALOGUE[n].belongs_to == "vehicle"}
-        models["true"].write_text(replace(vehicle, effects={**vehicle.effects, **own}).to_toml())
+        any_day = {**_given(study, truth).effects, **truth.get("built", {}), **own}
+        models["true"].write_text(replace(vehicle, effects=any_day).to_toml())
     for name, model in models.items():
         if known["held_out"].get(name) is None and model.is_file():
             known["held_out"][name] = held_out_error(study.recording(case, "held_out"), str(model), mapping=mapping)
