@@ -28,7 +28,7 @@ def test_leaves_the_floor_when_thrust_exceeds_weight(fraction: float, leaves: bo
     truth, x = drone(fraction * 0.029 * 9.81 / 4, height=1.5)
     rng = np.random.default_rng(0)
     for _ in range(1000):
-        plant_step(truth, x, rng.standard_normal(at.NOISE_WIDTH))
+        plant_step(truth, x, rng.standard_normal(at.NOISE_WIDTH), 1e-3)
     if leaves:
         assert x[at.POS + 2] - 1.5 == pytest.approx(0.5 * 0.05 * 9.81, rel=0.2)
     else:
@@ -40,7 +40,7 @@ def test_leaves_the_floor_when_thrust_exceeds_weight(fraction: float, leaves: bo
 def test_resting_reads_one_g() -> None:
     truth, x = drone(0.0)
     for _ in range(10):
-        plant_step(truth, x, STILL)
+        plant_step(truth, x, STILL, 1e-3)
     assert x[at.ASLEEP] == 1.0
     assert x[at.ACC : at.ACC + 3] == pytest.approx([0, 0, 9.81])
 
@@ -49,7 +49,7 @@ def test_resting_reads_one_g() -> None:
 def test_a_fall_ends_at_rest_on_the_floor(speed: float) -> None:
     truth, x = drone(0.0, {"position": [0.0, 0.0, 0.5], "velocity": [speed, 0.0, -speed]})
     for _ in range(4000):
-        plant_step(truth, x, STILL)
+        plant_step(truth, x, STILL, 1e-3)
     assert x[at.ASLEEP] == 1.0
     assert abs(x[at.POS + 2]) < 1e-3
     up = 1 - 2 * (x[at.QUAT + 1] ** 2 + x[at.QUAT + 2] ** 2)
@@ -60,6 +60,6 @@ def test_gentle_landing_stays_below_four_g() -> None:
     truth, x = drone(0.0, {"position": [0.0, 0.0, 0.001], "velocity": [0.0, 0.0, -0.3]})
     peak = 0.0
     for _ in range(500):
-        plant_step(truth, x, STILL)
+        plant_step(truth, x, STILL, 1e-3)
         peak = max(peak, x[at.ACC + 2] / 9.81)
     assert 1.0 < peak < 6.0

@@ -33,7 +33,7 @@ def test_free_fall_is_a_parabola() -> None:
     truth, x, _ = airborne()
     x[at.VEL : at.VEL + 3] = 1.0, -2.0, 3.0
     for _ in range(1000):
-        plant_step(truth, x, STILL)
+        plant_step(truth, x, STILL, 1e-3)
     assert x[at.POS : at.POS + 3] == pytest.approx([1.0, -2.0, 3.0 - 0.5 * 9.81], abs=1e-9)
     assert x[at.ACC : at.ACC + 3] == pytest.approx([0, 0, 0], abs=1e-9)
 
@@ -45,7 +45,7 @@ def test_free_rotation_conserves_energy_and_angular_momentum() -> None:
     omega = x[at.OMEGA : at.OMEGA + 3]
     energy, momentum = omega @ J @ omega, rotation(x[at.QUAT : at.QUAT + 4]) @ J @ omega
     for _ in range(3000):
-        plant_step(truth, x, STILL)
+        plant_step(truth, x, STILL, 1e-3)
     assert omega @ J @ omega == pytest.approx(energy, rel=1e-6)
     assert rotation(x[at.QUAT : at.QUAT + 4]) @ J @ omega == pytest.approx(momentum, rel=1e-6)
     assert np.linalg.norm(x[at.QUAT : at.QUAT + 4]) == pytest.approx(1.0, abs=1e-12)
@@ -91,7 +91,7 @@ def test_process_noise_has_the_stated_intensity() -> None:
     for n in range(runs):
         y = x.copy()
         for _ in range(int(seconds * 1000)):
-            plant_step(truth, y, rng.standard_normal(at.NOISE_WIDTH))
+            plant_step(truth, y, rng.standard_normal(at.NOISE_WIDTH), 1e-3)
         end[n] = [y[at.VEL + 2], *y[at.OMEGA : at.OMEGA + 3]]
     J = truth[[at.INERTIA, at.INERTIA + 4, at.INERTIA + 8]]
     sd = np.array([2e-3 / truth[at.MASS], *(np.array([1e-6, 2e-6, 3e-6]) / J)]) * np.sqrt(seconds)
