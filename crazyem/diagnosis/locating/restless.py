@@ -169,12 +169,14 @@ def reach_of(frequency: NDArray, power: NDArray, k: int, ratio: float) -> float:
 def beside_peaks(data: Data, point: Point, columns: Sequence[Column], found: Sequence[Sequence[Peak]]) -> Gram:
     """Score and information of columns by what is outside the humps of each flight.
 
-    A torque at the frequencies of the humps, its amplitude and phase free in every block, is profiled out.
+    A torque at the frequencies of the humps, its amplitude and phase free in every second, is profiled out.
     """
     score, information, flight = [], [], []
     m = len(columns)
     for k, (model, here) in enumerate(zip(data.models, found, strict=True)):
-        swept = model.sweep(point, [*columns, *(w for p in here for w in waves(model, p))])
+        seconds = np.unique(np.floor(model.flight.time - model.flight.time[0]), return_inverse=True)[1]
+        by_seconds = replace(model, flight=replace(model.flight, block=seconds.astype(np.int64)))
+        swept = by_seconds.sweep(point, [*columns, *(w for p in here for w in waves(model, p))])
         b, a = swept.score, swept.information
         if here:
             own = np.einsum("bii->bi", a[:, m:, m:])

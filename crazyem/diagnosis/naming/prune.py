@@ -9,6 +9,7 @@ import numpy as np
 from crazyem.diagnosis.fitting.always import nuisances, on_held_out, refine_base, without
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import TORQUES, Data, Fitted
+from crazyem.diagnosis.fitting.gram import used
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.locating.restless import beside_peaks, peaks
 from crazyem.diagnosis.naming.least import at_the_end
@@ -175,9 +176,11 @@ def shaken(
     here = np.array([c.values(fitted.point)[n] - c.neutral(fitted.point)[n] for c in free for n in c.free])
     away = np.where(fitted.precision > 0, here, 0.0)
     whole, beside = (
-        (g, g.solve(range(g.size), precision=fitted.precision, prior=-away))
+        (g, g.solve(range(g.size), precision=fitted.precision, prior=-away, effective=True))
         for g in (data.gram(fitted.point, columns), beside_peaks(data, fitted.point, columns, found))
     )
+    information = beside[0].total(range(beside[0].size))[1]
+    taken = used(information, information + np.diag(fitted.precision))  # what priors say takes no block
     doubted, offset = [], 0
     for c in accepted:
         at = slice(offset, offset + len(c.free))
@@ -185,7 +188,7 @@ def shaken(
         covariance = beside[1].covariance[at, at]
         size, apart = here[at] + whole[1].theta[at], beside[1].theta[at] - whole[1].theta[at]
         share = float(apart @ np.linalg.pinv(covariance) @ apart) / float(size @ np.linalg.pinv(covariance) @ size)
-        if share > APART**2 and wald(apart, covariance, beside[0], beside[0].size) < OTHERWISE:
+        if share > APART**2 and wald(apart, covariance, beside[0], taken) < OTHERWISE:
             say(f"  it is another size beside what shakes: {c.label}")
             doubted.append(c.effect)
     return frozenset(doubted)
