@@ -22,6 +22,7 @@ from crazyem.estimation.spectra import long_run
 from crazyem.estimation.tape import START_VARIANCE, Tape
 
 TOLERANCE = 0.02  # converged when the next scoring step is shorter than this many standard deviations
+NOISY = 1.0  # standard deviations that a noise scale seems off, from which its information is computed, not guessed
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,8 @@ class WindowEM:
         self.parameters = setup.start
         self._sums = np.zeros(kernels.SIZE)
         self._squares = np.ones(4)
+        self._damping = np.ones(11)  # of the steps of noise scales: one whose steps swing back takes shorter ones,
+        self._step_before = np.zeros(11)  # also from one update to the next
 
     # E-step -------------------------------------------------------------------------------------------------
 
@@ -294,22 +297,24 @@ class WindowEM:
 
         The tape is left filtered and smoothed with the parameters that the returned information belongs to.
         """
-        damping, before = np.ones(11), np.zeros(11)  # a noise scale whose steps swing back takes shorter ones
         for count in range(passes):
             self.refill_inputs(first, last)
             self.forward(first, last, restart=True)
             self.backward(first, last)
             info = self.information(first, last)
+            if info.noise_length > NOISY:  # the guess is too sure of a scale that others can stand for
+                info = self.information(first, last, of_noise=self.noise_information(first, last))
             noise_step = info.noise_step
-            damping = np.where(noise_step * before < 0, 0.5 * damping, np.minimum(1.3 * damping, 1.0))
-            before = noise_step
+            longer = np.minimum(1.3 * self._damping, 1.0)
+            self._damping = np.where(noise_step * self._step_before < 0, 0.5 * self._damping, longer)
+            self._step_before = noise_step
             if max(info.decrement, info.noise_length) < tolerance or count == passes - 1:
                 break
             after = self.maximise(first, last)
             em_step = np.max(np.abs(offset(after.theta, self.parameters.theta, self.setup.unit)[:4]))
             if info.decrement < 10.0 and em_step < 0.1:
                 theta = displaced(self.parameters.theta, np.clip(info.step, -0.2, 0.2), self.setup.unit)
-                noise = self.setup.noise_at(theta, self.parameters.noise.logs + damping * noise_step)
+                noise = self.setup.noise_at(theta, self.parameters.noise.logs + self._damping * noise_step)
                 self.parameters = Parameters(theta, noise, after.inertia_products)
             else:
                 self.parameters = after
