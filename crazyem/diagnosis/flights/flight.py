@@ -19,8 +19,8 @@ from crazyem.vehicle import GRAVITY, Vehicle
 
 SAME_NODE = 1.5e-3  # s: measurements closer than this belong to one node
 MAX_GAP = 0.1  # s between nodes, or between inputs, beyond which a step cannot be trusted
-# s: unit of resampling and held-out blocks; shorter in a short flight, so that there are `BLOCKS` of them, twice as many
-# as things that are always free. Scores hang together for tenths of a second.
+# s: unit of resampling and held-out blocks; shorter in a short flight, so that there are `BLOCKS` of them, twice as
+# many as things that are always free. Scores hang together for tenths of a second.
 BLOCK, SHORT, BLOCKS = 1.0, 0.5, 40
 NEAR = 0.03  # s between samples of the accelerometer, at most, for a value between them
 SHORTEST = 4.0  # s of flight below which nothing is said
