@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from crazyem import kernel_cache
+from crazyem.kernel_cache import kernel
 
 FASTMATH = {"contract", "reassoc", "nsz"}  # lets dot products use vector registers; NaN keeps its meaning
 
@@ -30,7 +30,7 @@ def _has_kernels(path: Path) -> bool:
 
 def _stamp(folders: tuple[str, ...]) -> tuple[tuple[str, int, int], ...]:
     kernels = (p for folder in folders for p in sorted((_ROOT / folder).rglob("*.py")) if _has_kernels(p))
-    how = (Path(__file__), Path(kernel_cache.__file__))  # these say how to compile
+    how = (Path(__file__), Path(__file__).with_name("kernel_cache.py"))  # these say how to compile
     return tuple((p.name, p.stat().st_mtime_ns, p.stat().st_size) for p in (*how, *kernels))
 
 
@@ -46,4 +46,4 @@ def compiled(function: Callable[..., Any]) -> Any:
     path = Path(function.__code__.co_filename)
     folder = path.relative_to(_ROOT).parts[0] if path.is_relative_to(_ROOT) else ""
     # a kernel elsewhere uses its own file only, which numba checks itself
-    return kernel_cache.kernel(function, stamp=_STAMPS.get(folder), fastmath=FASTMATH)
+    return kernel(function, stamp=_STAMPS.get(folder), fastmath=FASTMATH)

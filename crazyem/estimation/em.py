@@ -332,7 +332,8 @@ def offset(theta: NDArray, origin: NDArray, unit: NDArray) -> NDArray:
 
 def displaced(theta: NDArray, step: NDArray, unit: NDArray) -> NDArray:
     """Inverse of `offset`: theta moved by a step in those coordinates."""
-    moved = theta * np.exp(step)
+    with np.errstate(over="ignore"):  # an interval without an end
+        moved = theta * np.exp(step)
     moved[kernels.DELAY :] = (theta + unit * step)[kernels.DELAY :]
     return moved
 

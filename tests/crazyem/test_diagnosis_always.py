@@ -151,8 +151,8 @@ def test_a_draft_of_a_room_is_a_finding_only_of_a_drone_whose_trim_does_not_chan
     assert usual_wind(DRONE) < 0.5 < usual_wind(replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}}))
 
 
-def test_short_flights_have_shorter_blocks_so_that_there_are_twenty():
-    for seconds, blocks in ((5.0, 10), (10.0, 20), (19.0, 20), (60.0, 60)):
+def test_short_flights_have_shorter_blocks_so_that_there_are_forty():
+    for seconds, blocks in ((5.0, 10), (10.0, 20), (19.0, 38), (30.0, 40), (60.0, 60)):
         block = _blocks(np.arange(0.0, seconds - 1e-6, 0.01) + 3.0)
         assert block[0] == 0
         assert abs(int(block[-1]) + 1 - blocks) <= 1

@@ -93,8 +93,8 @@ def test_what_a_prior_says_is_no_weaker_because_residuals_scatter(recording):
     data, point = fitted(with_values(recording, "specific_force", lambda value: value @ axes))
     instead = 0.5 * (0.03**2 + 0.02**2) * (9.81 / accelerometer.BIAS_SD) ** 2
     assert instead > 60
-    for model in data.models:  # from block to block, on the whole nothing
-        model.flight.force[:] += 0.2 * (-1.0) ** model.flight.block[:, None]
+    for model in data.models:  # from second to second, on the whole nothing
+        model.flight.force[:] += 0.2 * (-1.0) ** np.floor(model.flight.time)[:, None]
     assert accelerometer.gram_dispersion(data, point) > 3
     assert accelerometer.held_out_gain(data, point, np.array([0.03, -0.02, 0.0]), yaw_sd=0.3) > 0.5 * instead
 
