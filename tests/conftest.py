@@ -11,3 +11,8 @@ settings.register_profile(
 )  # fmt: skip
 settings.register_profile("deep", settings.get_profile("steady"), derandomize=False, max_examples=50, print_blob=True)
 settings.load_profile("steady")  # --hypothesis-profile deep loads the other
+
+
+def pytest_collection_modifyitems(items: list) -> None:
+    """Flights in real time begin first: they take minutes, and hardly any processor time."""
+    items.sort(key=lambda item: "test_live_first_flight" not in item.nodeid)
