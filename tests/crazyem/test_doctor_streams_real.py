@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from doctor_checks import everything, only, run
+from doctor_checks import only, run
 
 from crazyem.doctor.streams import runs
 from crazyem.recordings.airborne import airtime
-from crazyem.recordings.finding import Grade
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.registry import open_recording
 
@@ -97,50 +96,3 @@ def test_the_real_firmware_on_a_slow_computer(shared_recordings):
     finding = next(f for f in run("clocks", recording) if "host" in f.text)
     assert finding.evidence["apart_s"] == pytest.approx(behind, rel=0.3)
     assert behind > 0.2
-
-
-# What of each real flight is worse than harmless: reviewed one by one against the numbers (docs/doctor_streams.md).
-REAL: dict[str, set[str]] = {
-    "motor__add_weight_W1_near_M3_M4__E8_log00": {"saturation"},
-    "motor__cut_M2_2.5mm_2.0mm_42.5mm_M1_2.0mm_2.0mm_43mm__E9_log00": {"saturation"},
-    "motor__cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00": {"saturation"},
-    "motor__cut_propeller_M3_3.5mm_3.5mm_40mm__E8_log00": {"saturation"},
-    "B2_circle_fast_rep1.csv.gz": {"saturation"},
-    "B2_circle_fast_rep3.csv.gz": {"saturation"},
-    "B3_figure8_fast_rep2.csv.gz": {"saturation"},
-    "B3_figure8_medium_rep1.csv.gz": {"saturation"},
-    "B6_linear_ramp_rep2.csv.gz": {"saturation"},
-    "B9_trefoil_fast_rep1.csv.gz": {"saturation", "gaps"},
-    "raw/chirp_run1.csv.gz": {"saturation", "repeated", "numbers"},
-    "raw/chirp_run2.csv.gz": {"saturation", "repeated"},
-    "raw/chirp_run3.csv.gz": {"saturation"},
-    "raw/chirp_run4.csv.gz": {"saturation", "repeated", "numbers", "flight"},
-    "raw/random_run1.csv.gz": {"saturation", "repeated"},
-    "raw/random_run2.csv.gz": {"saturation", "repeated"},
-    "raw/random_run3.csv.gz": {"saturation", "repeated"},
-    "raw/random_run4.csv.gz": {"saturation", "repeated"},
-    "raw/square_run1.csv.gz": {"saturation", "repeated", "frozen"},
-    "raw/square_run2.csv.gz": {"saturation", "repeated"},
-    "raw/square_run3.csv.gz": {"saturation", "repeated"},
-    "raw/square_run4.csv.gz": {"saturation", "repeated"},
-    "processed/chirp_run2.csv.gz": {"repeated"},
-    "processed/random_run1.csv.gz": {"repeated"},
-    "processed/random_run3.csv.gz": {"repeated"},
-    "processed/random_run4.csv.gz": {"repeated"},
-    "processed/square_run2.csv.gz": {"repeated"},
-    "processed/square_run4.csv.gz": {"repeated"},
-    "log10": {"saturation", "flight"},
-}
-
-
-@pytest.mark.slow
-def test_every_real_flight_as_reviewed(shared_recordings):
-    files = sorted(p for p in shared_recordings.rglob("*") if p.is_file() and "truth" not in p.name)
-    differences = {}
-    for path in files:
-        name = f"{path.parent.name}/{path.name}" if "nanodrone" in str(path) else path.name
-        recording = open_recording(path, ReadOptions(motor="duty" if path.parent.name == "sysid" else None))
-        found = {f.check for f in everything(recording) if f.grade is not Grade.HARMLESS}
-        if found != REAL.get(name, set()):
-            differences[name] = (sorted(found), sorted(REAL.get(name, set())))
-    assert differences == {}
