@@ -2,7 +2,7 @@
 
 A kernel's library holds a copy of every kernel that it calls. LLVM leaves these copies as weak symbols: where another
 library of the process has a function of the same name, the linker calls that one instead, and both are optimised
-differently. So numbers differed in the last bit by which kernel a process had compiled or loaded first. Here a
+differently. Numbers would then differ in the last bit by which kernel a process compiled or loaded first. Here a
 library keeps its copies to itself. Compiling is deterministic, so code compiled now is the code loaded later.
 """
 
