@@ -6,7 +6,7 @@ from typing import Any
 
 from crazyem.commands.output import put
 from crazyem.errors import UsageError
-from crazyem.links.scanning import UDP_PORTS, Interface, scan
+from crazyem.links.scan import UDP_PORTS, Interface, scan
 from crazyem.live.summary import check_writable, write_json
 
 _TITLES = {

@@ -11,19 +11,22 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from crazyem.errors import LinkError, UsageError
-from crazyem.links.asking import Asker
 from crazyem.links.base import LinkLost, LinkStatistics
 from crazyem.links.clock import ClockFit, ClockRelation, LossCounter, StampUnwrapper
 from crazyem.links.log_control import LogControl
 from crazyem.links.packing import PERIOD_UNIT_MS, pack, period_of
+from crazyem.links.requests import RequestClient
 from crazyem.signals.packet import Block, Packet
 
 LATE_AFTER = 0.1  # s behind the least-delayed packets after which a packet counts as late
 _START_ATTEMPT = 0.5  # s to wait for a block's first packet beyond its period, before asking again
 _START_ATTEMPTS = 4
-_DELAYS = 500  # newest packets of a block whose delays make its median and 99th percentile
+_DELAY_SAMPLES = 500  # newest packets of a block whose delays make its median and 99th percentile
 _BACKWARDS_MS = 200  # a clock that is further behind than that was reset
-_AHEAD, _FASTER = 2.0, 3.0  # s, and times what the clocks' relation allows: simulators that were starved catch up
+_AHEAD_SECONDS, _FASTEST_CLOCK_RATIO = (
+    2.0,
+    3.0,
+)  # s, and times what the clocks' relation allows: simulators that were starved catch up
 
 
 class LogBlocks:
@@ -37,7 +40,7 @@ class LogBlocks:
     def __init__(self, uri: str, packets: "queue.SimpleQueue[Packet | LinkLost]") -> None:
         self._uri, self._packets = uri, packets
         self._cf: Any = None
-        self._asker: Asker | None = None
+        self._requests: RequestClient | None = None
         self._running: dict[int, tuple[Block, Any, Callable[..., None]]] = {}
         self._counters: dict[int, LossCounter] = {}
         self._delays: dict[int, deque[float]] = {}
@@ -53,15 +56,15 @@ class LogBlocks:
     def attach(self, crazyflie: Any) -> None:
         """Work with this connected Crazyflie object."""
         self._cf = crazyflie
-        self._asker = Asker(crazyflie)
-        self._control = LogControl(self._asker, self._uri)
+        self._requests = RequestClient(crazyflie)
+        self._control = LogControl(self._requests, self._uri)
         self.last_packet = time.monotonic()
 
     @property
-    def asker(self) -> Asker:
+    def requests(self) -> RequestClient:
         """For other requests over the same link."""
-        assert self._asker is not None
-        return self._asker
+        assert self._requests is not None
+        return self._requests
 
     @property
     def periods(self) -> list[float]:
@@ -94,7 +97,7 @@ class LogBlocks:
             receive = self._receiver(block)
             config.data_received_cb.add_callback(receive)
             self._counters[block.identifier] = LossCounter(block.period_ms)
-            self._delays[block.identifier] = deque(maxlen=_DELAYS)
+            self._delays[block.identifier] = deque(maxlen=_DELAY_SAMPLES)
             self.last_packet = time.monotonic()
             self._running[block.identifier] = (block, config, receive)
             try:
@@ -163,9 +166,9 @@ class LogBlocks:
             with contextlib.suppress(ValueError):
                 self._cf.log.log_blocks.remove(config)
         self._running.clear()
-        if self._asker is not None:
+        if self._requests is not None:
             with contextlib.suppress(ValueError):
-                self._asker.close()
+                self._requests.close()
 
     # --- receiving --------------------------------------------------------------------------------------------------
 
@@ -267,7 +270,7 @@ class LogBlocks:
             fit = self._clock.fit()
             if fit is None or fit.packets < 300:
                 return False
-            allowed = (time.time() - fit.to_host(self._newest)) / fit.rate * _FASTER + _AHEAD
+            allowed = (time.time() - fit.to_host(self._newest)) / fit.rate * _FASTEST_CLOCK_RATIO + _AHEAD_SECONDS
             return (now - self._newest) / 1000.0 > allowed
 
     def release(self) -> float:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 STAMP_MODULUS = 1 << 24  # ms; the firmware sends the low 24 bits of its millisecond counter: wraps at 16777.216 s
-_HALF = STAMP_MODULUS // 2
-_STALL = 0.4  # s of host time by which all packets come later than before, after a clock stood still
-_STALL_SEEN = 5  # bins (seconds of firmware time) in which not one packet was as early as before
+_HALF_MODULUS = STAMP_MODULUS // 2
+_STALL_SECONDS = 0.4  # s of host time by which all packets come later than before, after a clock stood still
+_STALL_BINS = 5  # bins (seconds of firmware time) in which not one packet was as early as before
 
 
 class StampUnwrapper:
@@ -32,7 +32,7 @@ class StampUnwrapper:
         """As `unwrap`, without taking note of the stamp."""
         if self._newest is None:
             return int(stamp)
-        return self._newest + (int(stamp) - self._newest + _HALF) % STAMP_MODULUS - _HALF
+        return self._newest + (int(stamp) - self._newest + _HALF_MODULUS) % STAMP_MODULUS - _HALF_MODULUS
 
 
 class LossCounter:
@@ -161,7 +161,7 @@ class ClockRelation:
         Seen as a step up by more than any delay worth the name, from which not one packet in seconds comes back.
         """
         points = list(self._bins.values())
-        if len(points) < 2 * _STALL_SEEN:
+        if len(points) < 2 * _STALL_BINS:
             return
         slopes = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(points) if b[0] > a[0]]
         rate = statistics.median(slopes) if slopes else 1.0
@@ -169,7 +169,7 @@ class ClockRelation:
         lowest = math.inf  # of what follows
         for i in range(len(points) - 2, -1, -1):
             lowest = min(lowest, level[i + 1])
-            if len(points) - 1 - i >= _STALL_SEEN and lowest - level[i] > _STALL:
+            if len(points) - 1 - i >= _STALL_BINS and lowest - level[i] > _STALL_SECONDS:
                 for key in list(self._bins)[: i + 1]:
                     del self._bins[key]
                 return

@@ -16,10 +16,10 @@ from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import AnotherDroneError, LinkLost, LinkStatistics, Outage, ParameterWrite
 from crazyem.links.blocks import LogBlocks
 from crazyem.links.clock import ClockFit
-from crazyem.links.connecting import connect, quiet_cflib, shut
-from crazyem.links.high_level import confirmed, land_command
+from crazyem.links.connection import connect, quiet_cflib, shut
+from crazyem.links.high_level import land_command, send_until_confirmed
 from crazyem.links.parameters import ParameterClient
-from crazyem.links.reconnecting import Reviver
+from crazyem.links.reconnection import Reconnector
 from crazyem.signals.packet import Block, Packet
 
 SILENT_AFTER = 2.0  # s without log data, while blocks run, after which the drone counts as lost
@@ -44,11 +44,11 @@ class CrazyflieLink:
         self._commanded = False
         self._parameters: ParameterClient | None = None
         self._blocks = LogBlocks(uri, self.packets)
-        self._reviver: Reviver | None = None
+        self._reconnector: Reconnector | None = None
         self._lock = threading.Lock()
         self._lost = ""
-        self._hopeless = False
-        self._returning = False
+        self._unrecoverable = False
+        self._reconnecting = False
         self._stop = threading.Event()
         self._watcher: threading.Thread | None = None
         self._last_packet = time.monotonic()
@@ -90,8 +90,8 @@ class CrazyflieLink:
         self._cf = crazyflie
         self._parameters = ParameterClient(crazyflie, self.uri)
         self._blocks.attach(crazyflie)
-        self._reviver = Reviver(crazyflie, self.uri) if self._owned else None
-        self._lost, self._hopeless = "", False
+        self._reconnector = Reconnector(crazyflie, self.uri) if self._owned else None
+        self._lost, self._unrecoverable = "", False
         self._last_echo = None
         crazyflie.connection_lost.add_callback(self._on_connection_lost)
         crazyflie.disconnected.add_callback(self._on_disconnected)
@@ -105,7 +105,7 @@ class CrazyflieLink:
         """Remove our log blocks and, on a link of our own, disconnect; returns within a few seconds, always.
 
         A session that commanded the drone ends with motors off and "notify stop", so that the next client can use the
-        high-level commander (see `connecting.shut`); one that only watched sends no setpoint at all.
+        high-level commander (see `connection.shut`); one that only watched sends no setpoint at all.
         """
         crazyflie, self._cf = self._cf, None
         if crazyflie is None:
@@ -212,7 +212,7 @@ class CrazyflieLink:
     @property
     def can_reconnect(self) -> bool:
         """Whether `reconnect` may bring a lost link back: it is ours, and nothing speaks against it."""
-        return self._reviver is not None and not self._hopeless
+        return self._reconnector is not None and not self._unrecoverable
 
     def reconnect(self, timeout: float = 5.0, abort: threading.Event | None = None) -> Outage:
         """After a `LinkLost`: bring the same drone's link back, blocks and all; packets then go on under their numbers.
@@ -227,18 +227,18 @@ class CrazyflieLink:
         """
         if not self._lost or self._cf is None:
             raise LinkError(f"The link to {self.uri} is not lost.")
-        if self._reviver is None or self._hopeless:
+        if self._reconnector is None or self._unrecoverable:
             raise LinkError(self._lost)
         before, since, reason = self._blocks.newest_ms, self._blocks.last_packet, self._lost
-        self._returning = True
+        self._reconnecting = True
         self._blocks.hold()
         try:
-            created = self._reviver.revive(self._blocks, timeout, abort or threading.Event())
+            created = self._reconnector.reconnect(self._blocks, timeout, abort or threading.Event())
         except AnotherDroneError:
-            self._hopeless = True
+            self._unrecoverable = True
             raise
         finally:
-            self._returning = False
+            self._reconnecting = False
         self._last_echo = None  # to be heard again first
         now = time.monotonic()
         after = self._blocks.release()
@@ -304,7 +304,7 @@ class CrazyflieLink:
     # --- flying -------------------------------------------------------------------------------------------------
 
     def _command(self) -> Any:
-        crazyflie = self._cf if self._returning and self._cf is not None else self._connected()
+        crazyflie = self._cf if self._reconnecting and self._cf is not None else self._connected()
         if crazyflie.link is None:
             raise LinkError(self._lost or f"The link to {self.uri} is closed.")
         self._commanded = True
@@ -328,7 +328,7 @@ class CrazyflieLink:
     def land_and_confirm(self, height: float, duration: float, *, timeout: float) -> bool:
         """As `land`, sent until the drone says that it has the command; False if it did not within `timeout` [s]."""
         command = land_command(height, duration)
-        return confirmed(self._command(), command, timeout=timeout, repeat_after=0.04)
+        return send_until_confirmed(self._command(), command, timeout=timeout, repeat_after=0.04)
 
     def go_to(self, x: float, y: float, z: float, yaw: float, duration: float, relative: bool = False) -> None:
         """High-level move to x, y, z [m, world] and yaw [rad] in `duration` [s]."""

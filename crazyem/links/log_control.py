@@ -8,7 +8,7 @@ import struct
 from collections.abc import Sequence
 
 from crazyem.errors import LinkError, UsageError
-from crazyem.links.asking import Asker
+from crazyem.links.requests import RequestClient
 
 _PORT, _CONTROL = 5, 1
 _DELETE, _START, _CREATE, _APPEND, _START_MS = 2, 3, 6, 7, 8
@@ -22,7 +22,7 @@ _REASONS = {
 }
 _ITEMS_A_PACKET = 9  # of 3 bytes, in 28
 REPLY_WITHIN, REPEAT_AFTER = 0.5, 0.15  # s
-ATTEMPTS = 5
+INSTALL_ATTEMPTS = 5
 
 Items = Sequence[tuple[int, int]]  # type byte, index in the table
 
@@ -30,15 +30,15 @@ Items = Sequence[tuple[int, int]]  # type byte, index in the table
 class LogControl:
     """The log port's commands for one Crazyflie."""
 
-    def __init__(self, asker: Asker, uri: str) -> None:
-        self._asker, self._uri = asker, uri
+    def __init__(self, requests: RequestClient, uri: str) -> None:
+        self._requests, self._uri = requests, uri
 
     def install(self, identifier: int, items: Items) -> None:
         """Make the block exist with exactly these variables, whatever was there under its number.
 
         Raises: LinkError: no answer, or refused.
         """
-        for attempt in range(ATTEMPTS):
+        for attempt in range(INSTALL_ATTEMPTS):
             if attempt:
                 self._command(bytes((_DELETE, identifier)))
             packets = [items[i : i + _ITEMS_A_PACKET] for i in range(0, len(items), _ITEMS_A_PACKET)]
@@ -82,7 +82,7 @@ class LogControl:
     def _command(self, data: bytes, *, repeat: bool = True) -> int | None:
         """Status of a command, None if it was not answered."""
         after = REPEAT_AFTER if repeat else None
-        reply = self._asker.ask(_PORT, _CONTROL, data, timeout=REPLY_WITHIN, repeat_after=after)
+        reply = self._requests.request(_PORT, _CONTROL, data, timeout=REPLY_WITHIN, repeat_after=after)
         return reply[2] if reply is not None and len(reply) > 2 else None
 
 

@@ -12,7 +12,7 @@ MAX_BLOCKS = 16
 MAX_VARIABLES = 128
 PERIOD_UNIT_MS = 10  # START_BLOCK counts in 10 ms, in one byte
 MAX_PERIOD_MS = 2540
-FASTEST = 1000.0  # Hz; the firmware's timers count milliseconds
+HIGHEST_RATE = 1000.0  # Hz; the firmware's timers count milliseconds
 
 
 def period_of(rate_hz: float) -> int:
@@ -23,13 +23,15 @@ def period_of(rate_hz: float) -> int:
     4 knows only tens). Raises UsageError outside 0.394..1000 Hz.
     """
     if not rate_hz > 0:
-        raise UsageError(f"A log rate of {rate_hz:g} Hz makes no sense; choose 0.4 to 100 Hz, or up to {FASTEST:g} Hz.")
+        raise UsageError(
+            f"A log rate of {rate_hz:g} Hz makes no sense; choose 0.4 to 100 Hz, or up to {HIGHEST_RATE:g} Hz."
+        )
     exact = 1000.0 / rate_hz
     whole = math.isfinite(exact) and abs(exact - round(exact)) < 1e-6
     unit = PERIOD_UNIT_MS if rate_hz <= 1000.0 / PERIOD_UNIT_MS and not whole else 1
     period = round(exact / unit) * unit
-    if period < 1 or period > MAX_PERIOD_MS or rate_hz > FASTEST:
-        raise UsageError(f"The firmware logs at 0.4 to {FASTEST:g} Hz, not {rate_hz:g} Hz.")
+    if period < 1 or period > MAX_PERIOD_MS or rate_hz > HIGHEST_RATE:
+        raise UsageError(f"The firmware logs at 0.4 to {HIGHEST_RATE:g} Hz, not {rate_hz:g} Hz.")
     return period
 
 

@@ -54,7 +54,7 @@ class ParameterClient:
         identifier = struct.pack("<H", element.ident)
         with self._lock:
             deadline = time.monotonic() + timeout
-            for reply in self._exchange(_READ_CHANNEL, identifier, identifier, deadline):
+            for reply in self._replies_until(_READ_CHANNEL, identifier, identifier, deadline):
                 value = _decode(element.pytype, reply[3:])
                 if reply[2] == 0 and value is not None:
                     self.fault = ""
@@ -76,7 +76,7 @@ class ParameterClient:
         echoed: float | None = None
         with self._lock:
             deadline = time.monotonic() + timeout
-            for reply in self._exchange(_WRITE_CHANNEL, identifier, payload, deadline):
+            for reply in self._replies_until(_WRITE_CHANNEL, identifier, payload, deadline):
                 echoed = _decode(element.pytype, reply[2:])
                 # An echo with another value belongs to an earlier write: keep waiting for ours.
                 if reply == payload:
@@ -90,7 +90,7 @@ class ParameterClient:
         )
         return ParameterWrite(name, value, echoed, False, time.time())
 
-    def _exchange(self, channel: int, identifier: bytes, payload: bytes, deadline: float) -> Any:
+    def _replies_until(self, channel: int, identifier: bytes, payload: bytes, deadline: float) -> Any:
         """Send until the deadline, yielding each reply on the channel that carries the identifier."""
         from cflib.crtp.crtpstack import CRTPPacket
 

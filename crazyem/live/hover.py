@@ -36,8 +36,8 @@ def hover_target(link: Any, vehicle: Vehicle) -> tuple[Controller | None, str]:
     if not LEAST <= value <= MOST:
         return None, f"{name} is {value:g}, outside {LEAST:g} to {MOST:g}: estimates are not pushed."
     note = f"{name} = {value:.4g} is taken for right at {vehicle.mass:.4g} kg, and thrust for proportional to it."
-    if link.own_hover_estimate:
-        note += f" {link.own_hover_estimate}: what is written may have no effect, or be overwritten."
+    if link.onboard_hover_estimator:
+        note += f" {link.onboard_hover_estimator}: what is written may have no effect, or be overwritten."
     scale = vehicle.mass / value
     return Controller("hover thrust", _NUMBER, mass=name, mass_scale=scale, persistent=True, note=note), note
 

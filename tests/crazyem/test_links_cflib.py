@@ -13,7 +13,7 @@ from cflib.crazyflie.log import LogConfig
 from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 from relayed import down, now_on, relayed
 
-from crazyem.links.connecting import shut
+from crazyem.links.connection import shut
 from crazyem.links.crazyflie import CrazyflieLink
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")

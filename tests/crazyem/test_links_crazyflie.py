@@ -10,7 +10,7 @@ import pytest
 from crazyem.errors import LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.links.base import LinkLost, Packet
-from crazyem.links.connecting import new_crazyflie
+from crazyem.links.connection import new_crazyflie
 from crazyem.links.crazyflie import CrazyflieLink
 
 NAMES = ("stateEstimateZ.x", "stateEstimateZ.y", "stateEstimateZ.z", "pm.vbat")
@@ -137,7 +137,7 @@ LOSSES = [
 @pytest.mark.parametrize(("prefix", "message"), LOSSES)
 def test_a_reply_lost_while_connecting_is_an_error_not_a_hang(fake_peer, monkeypatch, prefix, message):
     # Long enough that a busy host's pause is not taken for the drone's silence.
-    monkeypatch.setattr("crazyem.links.connecting.SILENCE_LIMIT", 0.8)
+    monkeypatch.setattr("crazyem.links.connection.SILENCE_LIMIT", 0.8)
     fake_peer.lose = lambda request: bytes([request[0] | 0x0C]) + request[1 : len(prefix)] == prefix
     link = CrazyflieLink(fake_peer.uri)
     with pytest.raises(LinkError, match=message) as caught:

@@ -12,7 +12,7 @@ from relayed import down, now_on, relayed, up
 
 from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import LinkLost, Packet
-from crazyem.links.connecting import _Progress, new_crazyflie
+from crazyem.links.connection import _Progress, new_crazyflie
 from crazyem.links.crazyflie import CrazyflieLink
 from crazyem.live.session import STATE
 from crazyem.signals.vocabulary import standard_variables
@@ -390,9 +390,9 @@ def test_setpoints_go_on_when_only_the_way_down_is_lost(clock_peer, monkeypatch)
                 sent += 1
             time.sleep(0.005)
         back.join(60)
-        heard = sum(r[0] >> 4 == 7 for r in clock_peer.requests)
+        received = sum(r[0] >> 4 == 7 for r in clock_peer.requests)
     assert sent > 10
-    assert heard > 0.8 * sent
+    assert received > 0.8 * sent
 
 
 def test_an_answer_that_comes_again_and_again_is_no_progress():

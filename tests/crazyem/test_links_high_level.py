@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from crazyem.links.high_level import confirmed, land_command
+from crazyem.links.high_level import land_command, send_until_confirmed
 
 
 class Drone:
@@ -40,7 +40,7 @@ def test_the_command_is_the_firmwares():
 @pytest.mark.parametrize("lost", [0, 1, 5])
 def test_it_is_sent_until_it_is_confirmed(lost):
     drone = Drone(answers=lost + 1)
-    assert confirmed(drone, land_command(0.0, 2.0), timeout=5.0, repeat_after=0.001)
+    assert send_until_confirmed(drone, land_command(0.0, 2.0), timeout=5.0, repeat_after=0.001)
     assert drone.sent == [(8, 0, land_command(0.0, 2.0))] * (lost + 1)
     assert drone.callbacks == []
 
@@ -54,12 +54,12 @@ def test_it_is_sent_until_it_is_confirmed(lost):
     ],
 )
 def test_silence_refusals_and_other_answers_are_no_confirmation(drone):
-    assert not confirmed(drone, land_command(0.0, 2.0), timeout=0.05, repeat_after=0.01)
+    assert not send_until_confirmed(drone, land_command(0.0, 2.0), timeout=0.05, repeat_after=0.01)
     assert drone.callbacks == []
 
 
 def test_a_lost_link_ends_it_at_once():
     drone = Drone(answers=1)
     drone.link = None
-    assert not confirmed(drone, land_command(0.0, 2.0), timeout=60.0, repeat_after=1.0)
+    assert not send_until_confirmed(drone, land_command(0.0, 2.0), timeout=60.0, repeat_after=1.0)
     assert drone.sent == []

@@ -30,7 +30,7 @@ def free_port():
 @pytest.fixture(autouse=True)
 def no_long_listening(monkeypatch):
     """This autopilot answers at once."""
-    monkeypatch.setattr("crazyem.links.mavlink.link._SETTLE", 0.15)
+    monkeypatch.setattr("crazyem.links.mavlink.link._LISTEN_SECONDS", 0.15)
 
 
 @contextlib.contextmanager
@@ -119,7 +119,7 @@ def test_an_ardupilot_without_intervals_is_asked_the_older_way():
         assert of(found, "voltage")[0].value == pytest.approx((12.03,))
         assert link.hover_parameter == "MOT_THST_HOVER"
         assert link.read_parameter("MOT_PWM_MIN") == 1100.0
-        assert "MOT_HOVER_LEARN" in link.own_hover_estimate
+        assert "MOT_HOVER_LEARN" in link.onboard_hover_estimator
 
 
 def test_our_simulator_says_so_itself_and_an_address_does_not():
@@ -213,7 +213,7 @@ def test_a_port_in_use_and_a_device_that_is_not_there_are_sentences():
 
 
 def test_a_drone_without_position_is_a_sentence(monkeypatch):
-    monkeypatch.setattr("crazyem.links.mavlink.link._SETTLE_MOST", 0.2)
+    monkeypatch.setattr("crazyem.links.mavlink.link._LONGEST_LISTEN_SECONDS", 0.2)
     with linked() as (link, _), pytest.raises(LinkError, match=r"sends no LOCAL_POSITION_NED.*no attitude"):
         link.start_streams(100.0)
 
@@ -292,9 +292,9 @@ def test_silence_is_told_once_and_the_link_comes_back(monkeypatch):
     monkeypatch.setattr("crazyem.links.mavlink.receiver.SILENT_AFTER", 0.3)
     with streaming() as (link, drone, blocks):
         drone.mute = True
-        heard = []
-        wait(lambda: heard.extend(drain(link)) or any(isinstance(p, LinkLost) for p in heard))
-        (lost,) = (p for p in heard + drain(link) if isinstance(p, LinkLost))
+        received = []
+        wait(lambda: received.extend(drain(link)) or any(isinstance(p, LinkLost) for p in received))
+        (lost,) = (p for p in received + drain(link) if isinstance(p, LinkLost))
         assert "nothing has come" in lost.reason
         with pytest.raises(LinkError, match="was lost"):
             link.read_parameter("MPC_THR_HOVER")
@@ -324,7 +324,7 @@ def test_a_restarted_drone_is_not_gone_on_with():
 
 def test_a_serial_port_that_is_pulled_out_is_a_lost_drone(monkeypatch):
     """A pseudo-terminal as the port; closing its other end is what unplugging looks like."""
-    monkeypatch.setattr("crazyem.links.mavlink.link._SETTLE", 0.05)
+    monkeypatch.setattr("crazyem.links.mavlink.link._LISTEN_SECONDS", 0.05)
     master, slave = os.openpty()
     tty.setraw(slave)
     packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -356,9 +356,9 @@ def test_a_serial_port_that_is_pulled_out_is_a_lost_drone(monkeypatch):
         thread.join()
         os.close(slave)
         os.close(master)
-        heard = []
-        wait(lambda: heard.extend(drain(link)) or any(isinstance(p, LinkLost) for p in heard))
-        (lost,) = (p for p in heard if isinstance(p, LinkLost))
+        received = []
+        wait(lambda: received.extend(drain(link)) or any(isinstance(p, LinkLost) for p in received))
+        (lost,) = (p for p in received if isinstance(p, LinkLost))
         assert "is gone" in lost.reason
         with pytest.raises(LinkError, match="did not come back"):
             link.reconnect(0.2)

@@ -28,7 +28,7 @@ class Drone:
     uri = "mavlink:udpin:127.0.0.1:1"
 
     def __init__(self, hover=0.5, *, name="MPC_THR_HOVER", own="", cells=1, silent=False):
-        self.hover_parameter, self.own_hover_estimate, self.cells = name, own, cells
+        self.hover_parameter, self.onboard_hover_estimator, self.cells = name, own, cells
         self._hover, self._silent = hover, silent
 
     def read_parameter(self, name):

@@ -262,7 +262,7 @@ def test_a_brushless_drone_needs_arming(tmp_path):
 
 
 # What unmodified cflib can bear: late packets of every kind, log data that is lost, doubled or out of order. A single
-# lost reply hangs it for ever (crtp.md 7), which is why crazyem puts a courier between (tests/crazyem/test_links_*).
+# lost reply hangs it for ever (crtp.md 7), which is why crazyem retries (tests/crazyem/test_links_*).
 LIGHT_FAULTS = """
 seed = 7
 [[fault]]

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from crazyem.errors import UsageError
 
 SCHEME = "mavlink:"
-EXAMPLES = "mavlink:udpin:0.0.0.0:14550, mavlink:udpout:192.168.0.7:14540 or mavlink:/dev/ttyACM0:57600"
-_BAUD = range(300, 12_000_001)
+ADDRESS_EXAMPLES = "mavlink:udpin:0.0.0.0:14550, mavlink:udpout:192.168.0.7:14540 or mavlink:/dev/ttyACM0:57600"
+_BAUD_RATES = range(300, 12_000_001)
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Address:
 def parse(uri: str) -> Address:
     """The address of a URI. Raises UsageError, naming the URI and what is wrong with it."""
     if not uri.startswith(SCHEME) or not uri.isprintable() or len(uri) > 500:
-        raise UsageError(f'"{uri[:100]!s}" is no MAVLink URI; it should look like {EXAMPLES}.')
+        raise UsageError(f'"{uri[:100]!s}" is no MAVLink URI; it should look like {ADDRESS_EXAMPLES}.')
     place, _, query = uri[len(SCHEME) :].partition("?")
     system = _system(uri, query)
     kind, separator, rest = place.partition(":")
@@ -40,10 +40,10 @@ def parse(uri: str) -> Address:
         device, separator, baud = place.rpartition(":")
         if not separator:
             device, baud = place, "57600"
-        if not device or not _digits(baud) or int(baud) not in _BAUD:
+        if not device or not _digits(baud) or int(baud) not in _BAUD_RATES:
             raise UsageError(f'"{uri}" needs a device and a baud rate, such as mavlink:/dev/ttyACM0:57600.')
         return Address("serial", device=device, baud=int(baud), system=system)
-    raise UsageError(f'"{uri}" is no MAVLink URI; it should look like {EXAMPLES}.')
+    raise UsageError(f'"{uri}" is no MAVLink URI; it should look like {ADDRESS_EXAMPLES}.')
 
 
 def _system(uri: str, query: str) -> int | None:

@@ -15,8 +15,8 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 _V1, _V2 = 0xFE, 0xFD
 _SIGNED, _SIGNATURE = 1, 13
-_KEPT = 4096  # bytes that may wait for the rest of their frame; a frame has at most 280
-_REVERSED = bytes(int(f"{i:08b}"[::-1], 2) for i in range(256))
+_LARGEST_BUFFER = 4096  # bytes that may wait for the rest of their frame; a frame has at most 280
+_REVERSED_BITS = bytes(int(f"{i:08b}"[::-1], 2) for i in range(256))
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +69,8 @@ def number_of(name: str) -> int:
 
 def checksum(data: bytes) -> int:
     """CRC-16/MCRF4XX: the reflected twin of the CCITT polynomial that binascii has in C."""
-    straight = binascii.crc_hqx(data.translate(_REVERSED), 0xFFFF)
-    return _REVERSED[straight & 0xFF] << 8 | _REVERSED[straight >> 8]
+    straight = binascii.crc_hqx(data.translate(_REVERSED_BITS), 0xFFFF)
+    return _REVERSED_BITS[straight & 0xFF] << 8 | _REVERSED_BITS[straight >> 8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,7 @@ class FrameParser:
             if step == 0:
                 break  # more is to come
             at += step
-        self._buffer = data[at:][-_KEPT:]
+        self._buffer = data[at:][-_LARGEST_BUFFER:]
         return found
 
     def _take(self, data: bytes, at: int, found: list[Frame]) -> int:

@@ -15,15 +15,18 @@ from crazyem.links.mavlink import motors, streams
 from crazyem.links.mavlink.address import parse
 from crazyem.links.mavlink.frames import number_of
 from crazyem.links.mavlink.parameters import ParameterClient
-from crazyem.links.mavlink.radio import ACCEPTED, Radio
 from crazyem.links.mavlink.receiver import Receiver
-from crazyem.links.mavlink.wires import open_wire
+from crazyem.links.mavlink.sender import ACCEPTED, MessageSender
+from crazyem.links.mavlink.transport import open_transport
 from crazyem.signals.packet import Block, Packet
 
-_SETTLE, _SETTLE_MOST = 0.7, 5.0  # s of listening after streams were asked for; at most, if something is missing
+_LISTEN_SECONDS, _LONGEST_LISTEN_SECONDS = (
+    0.7,
+    5.0,
+)  # s of listening after streams were asked for; at most, if something is missing
 HOVER_PARAMETERS = {motors.PX4: "MPC_THR_HOVER", motors.ARDUPILOT: "MOT_THST_HOVER"}
 # another estimator on board that writes the same: parameter, the value that means it is on, what it does
-OWN_HOVER = {
+ONBOARD_HOVER_ESTIMATORS = {
     motors.PX4: ("MPC_USE_HTE", 1.0, "PX4 flies with its own estimate of hover thrust"),
     motors.ARDUPILOT: ("MOT_HOVER_LEARN", 2.0, "ArduPilot learns and saves hover thrust itself"),
 }
@@ -48,8 +51,8 @@ class MavlinkLink:
         self.address = parse(uri)
         self.packets: queue.SimpleQueue[Packet | LinkLost] = queue.SimpleQueue()
         self.outputs = motors.Outputs()
-        self._ears: Receiver | None = None
-        self._returning = False
+        self._receiver: Receiver | None = None
+        self._reconnecting = False
         self._rate = 0.0
         self._parameters = ParameterClient(
             uri,
@@ -62,55 +65,55 @@ class MavlinkLink:
 
     def connect(self, timeout: float = 30.0) -> None:
         """Wait for the heartbeat of a vehicle, then ask what its outputs mean. Raises LinkError."""
-        if self._ears is not None:
+        if self._receiver is not None:
             return
-        self._ears = ears = Receiver(
+        self._receiver = receiver = Receiver(
             self.uri,
-            Radio(open_wire(self.address)),
+            MessageSender(open_transport(self.address)),
             system=self.address.system,
             packets=self.packets,
-            on_parameter=self._parameters.heard,
+            on_parameter=self._parameters.on_value,
         )
         try:
-            if not self._wait(lambda: ears.autopilot >= 0, timeout):
-                raise LinkError(self._nobody(ears, timeout))
-            self._identify(ears)
+            if not self._wait(lambda: receiver.autopilot >= 0, timeout):
+                raise LinkError(self._silence_message(receiver, timeout))
+            self._identify(receiver)
         except BaseException:
             self.close()
             raise
 
-    def _nobody(self, ears: Receiver, timeout: float) -> str:
-        others = f" Systems {', '.join(map(str, sorted(ears.foreign)))} were heard." if ears.foreign else ""
-        noise = f" {ears.parser.skipped} bytes came that are not MAVLink." if ears.parser.skipped else ""
+    def _silence_message(self, receiver: Receiver, timeout: float) -> str:
+        others = f" Systems {', '.join(map(str, sorted(receiver.foreign)))} were heard." if receiver.foreign else ""
+        noise = f" {receiver.parser.skipped} bytes came that are not MAVLink." if receiver.parser.skipped else ""
         chosen = f"system {self.address.system}" if self.address.system else "a vehicle"
         return f"no heartbeat of {chosen} came at {self.uri} within {timeout:g} s.{others}{noise}"
 
-    def _identify(self, ears: Receiver) -> None:
-        wanted = [*motors.wanted(ears.autopilot), *self._hover_names()]
+    def _identify(self, receiver: Receiver) -> None:
+        wanted = [*motors.wanted(receiver.autopilot), *self._hover_names()]
 
-        def told() -> bool:
-            version = attempt > 0 or "AUTOPILOT_VERSION" in ears.seen  # not all have one
+        def complete() -> bool:
+            version = attempt > 0 or "AUTOPILOT_VERSION" in receiver.seen  # not all have one
             return version and not set(wanted) - self._parameters.known.keys()
 
         for attempt in range(3):
-            ears.radio.request_message(number_of("AUTOPILOT_VERSION"))
+            receiver.sender.request_message(number_of("AUTOPILOT_VERSION"))
             for name in wanted:
                 if name not in self._parameters.known:
-                    ears.radio.ask_parameter(name)
-            if self._wait(told, 0.3 * (attempt + 1)):
+                    receiver.sender.ask_parameter(name)
+            if self._wait(complete, 0.3 * (attempt + 1)):
                 break
-        self.outputs = ears.streams.outputs = motors.Outputs.of(ears.autopilot, self._parameters.known)
+        self.outputs = receiver.streams.outputs = motors.Outputs.of(receiver.autopilot, self._parameters.known)
 
     def _hover_names(self) -> list[str]:
-        name, own = HOVER_PARAMETERS.get(self.autopilot), OWN_HOVER.get(self.autopilot)
+        name, own = HOVER_PARAMETERS.get(self.autopilot), ONBOARD_HOVER_ESTIMATORS.get(self.autopilot)
         return [n for n in (name, own[0] if own else None) if n]
 
     def close(self) -> None:
         """Stop listening and close the wire. What streams were asked for goes on."""
-        ears, self._ears = self._ears, None
-        if ears is not None:
-            ears.close()
-            ears.radio.wire.close()
+        receiver, self._receiver = self._receiver, None
+        if receiver is not None:
+            receiver.close()
+            receiver.sender.transport.close()
 
     def __enter__(self) -> "MavlinkLink":
         self.connect()
@@ -120,15 +123,15 @@ class MavlinkLink:
         self.close()
 
     def _open(self) -> Receiver:
-        if self._ears is None:
+        if self._receiver is None:
             raise LinkError(f"The link to {self.uri} is not open.")
-        return self._ears
+        return self._receiver
 
-    def _talk(self) -> Radio:
-        ears = self._open()
-        if ears.lost and not self._returning:
-            raise LinkError(ears.lost)
-        return ears.radio
+    def _talk(self) -> MessageSender:
+        receiver = self._open()
+        if receiver.lost and not self._reconnecting:
+            raise LinkError(receiver.lost)
+        return receiver.sender
 
     def _wait(self, done: Callable[[], bool], seconds: float) -> bool:
         until = time.monotonic() + seconds
@@ -142,12 +145,12 @@ class MavlinkLink:
     @property
     def autopilot(self) -> int:
         """MAV_AUTOPILOT of the drone, -1 before it is known."""
-        return self._ears.autopilot if self._ears is not None else -1
+        return self._receiver.autopilot if self._receiver is not None else -1
 
     @property
     def simulated(self) -> bool:
         """Whether it calls itself our simulator. An address says nothing: real drones are relayed to this host too."""
-        return self._ears is not None and self._ears.simulated
+        return self._receiver is not None and self._receiver.simulated
 
     @property
     def on_frame(self) -> Callable[[float, bytes], None] | None:
@@ -169,18 +172,19 @@ class MavlinkLink:
 
         Raises: LinkError: position, attitude or the work of the motors does not come.
         """
-        ears = self._open()
+        receiver = self._open()
         self._rate = rate_hz
         self._ask_streams(rate_hz)
-        ready = time.monotonic() + max(_SETTLE, 2.5 / rate_hz)
+        ready = time.monotonic() + max(_LISTEN_SECONDS, 2.5 / rate_hz)
         self._wait(
-            lambda: time.monotonic() > ready and not _missing(ears.seen), ready + _SETTLE_MOST - time.monotonic()
+            lambda: time.monotonic() > ready and not _missing(receiver.seen),
+            ready + _LONGEST_LISTEN_SECONDS - time.monotonic(),
         )
-        if missing := _missing(ears.seen):
+        if missing := _missing(receiver.seen):
             raise LinkError(f"the drone at {self.uri} sends no {' and no '.join(missing)}.")
-        names = ears.streams.choose(set(ears.seen), raw_imu=ears.autopilot == motors.ARDUPILOT)
+        names = receiver.streams.choose(set(receiver.seen), raw_imu=receiver.autopilot == motors.ARDUPILOT)
         blocks = streams.blocks_of(names, rate_hz)
-        ears.use(blocks)
+        receiver.use(blocks)
         return tuple(blocks.values())
 
     def subscribe(self, variables: Sequence[str], rate_hz: float) -> tuple[Block, ...]:
@@ -191,17 +195,17 @@ class MavlinkLink:
         return self.start_streams(rate_hz)
 
     def _ask_streams(self, rate_hz: float) -> None:
-        radio = self._talk()
+        sender = self._talk()
         answers = 0
-        for names, hertz in ((streams.FAST, rate_hz), (streams.SLOW, min(streams.SLOW_HZ, rate_hz))):
+        for names, hertz in ((streams.FAST_MESSAGES, rate_hz), (streams.SLOW_MESSAGES, min(streams.SLOW_HZ, rate_hz))):
             for name in names:
-                result = radio.set_interval(number_of(name), hertz)
+                result = sender.set_interval(number_of(name), hertz)
                 answers += result == ACCEPTED
                 if result is None and not answers:
                     break  # it does not know the command; do not ask twelve times
         if not answers:
             for group, fast in streams.STREAM_GROUPS:
-                radio.request_stream(group, rate_hz if fast else min(streams.SLOW_HZ, rate_hz))
+                sender.request_stream(group, rate_hz if fast else min(streams.SLOW_HZ, rate_hz))
 
     def statistics(self) -> LinkStatistics:
         """Messages of this drone by fate: lost by their sequence numbers, repeated ones not counted."""
@@ -220,42 +224,42 @@ class MavlinkLink:
     @property
     def can_reconnect(self) -> bool:
         """Whether `reconnect` may bring a lost link back."""
-        return self._ears is not None and not self._ears.hopeless
+        return self._receiver is not None and not self._receiver.unrecoverable
 
     def reconnect(self, timeout: float = 5.0, abort: threading.Event | None = None) -> Outage:
         """After a `LinkLost`: wait for the same drone, whose clock must have gone on; ask for its streams again.
 
         Raises: LinkError: not in time, or restarted.
         """
-        ears = self._open()
-        if not ears.lost:
+        receiver = self._open()
+        if not receiver.lost:
             raise LinkError(f"The link to {self.uri} is not lost.")
-        before, since, reason = ears.drone_clock.newest_ms, ears.last, ears.lost
+        before, since, reason = receiver.drone_clock.newest_ms, receiver.last, receiver.lost
         until = time.monotonic() + timeout
-        self._returning = True
+        self._reconnecting = True
         try:
-            while ears.last <= since:
-                if ears.hopeless:
+            while receiver.last <= since:
+                if receiver.unrecoverable:
                     raise AnotherDroneError(f"The drone at {self.uri} was restarted.")
                 if time.monotonic() > until or (abort is not None and abort.is_set()):
                     raise LinkError(f"The drone at {self.uri} did not come back within {timeout:g} s.")
-                if ears.unplugged:
-                    self._reopen(ears)
+                if receiver.unplugged:
+                    self._reopen(receiver)
                 time.sleep(0.05)
             self._ask_streams(self._rate)
         finally:
-            self._returning = False
-        ears.came_back()
-        return Outage(reason, ears.last - since, before, ears.drone_clock.newest_ms, 0)
+            self._reconnecting = False
+        receiver.end_outage()
+        return Outage(reason, receiver.last - since, before, receiver.drone_clock.newest_ms, 0)
 
-    def _reopen(self, ears: Receiver) -> None:
+    def _reopen(self, receiver: Receiver) -> None:
         """A serial port that was unplugged has to be opened anew."""
         try:
-            wire = open_wire(self.address)
+            transport = open_transport(self.address)
         except LinkError:
             return
-        old, ears.radio.wire = ears.radio.wire, wire
-        ears.unplugged = False
+        old, receiver.sender.transport = receiver.sender.transport, transport
+        receiver.unplugged = False
         old.close()
 
     # --- parameters ---------------------------------------------------------------------------------------------
@@ -276,9 +280,9 @@ class MavlinkLink:
         return HOVER_PARAMETERS.get(self.autopilot, "")
 
     @property
-    def own_hover_estimate(self) -> str:
+    def onboard_hover_estimator(self) -> str:
         """What on board writes or replaces the same parameter, one clause; "" if nothing does."""
-        name, value, what = OWN_HOVER.get(self.autopilot, ("", 0.0, ""))
+        name, value, what = ONBOARD_HOVER_ESTIMATORS.get(self.autopilot, ("", 0.0, ""))
         return f"{what} ({name} = {value:g})" if self._parameters.known.get(name) == value else ""
 
     @property
@@ -289,18 +293,18 @@ class MavlinkLink:
     @property
     def about(self) -> Mapping[str, Mapping[str, str]]:
         """For recordings: sections "mavlink" and "parameter_values" (those read)."""
-        ears = self._open()
-        told = {
-            "system": str(ears.system),
-            "component": str(ears.component),
-            "autopilot": str(ears.autopilot),
-            "vehicle_type": str(ears.kind),
-            "our_simulator": str(ears.simulated).lower(),
+        receiver = self._open()
+        link = {
+            "system": str(receiver.system),
+            "component": str(receiver.component),
+            "autopilot": str(receiver.autopilot),
+            "vehicle_type": str(receiver.kind),
+            "our_simulator": str(receiver.simulated).lower(),
             "assumed": "; ".join(self.outputs.assumed),
             "outputs.channels": " ".join(str(c + 1) for c in self.outputs.channels),
             "outputs.motors": " ".join(str(m + 1) for m in self.outputs.motors),
         }
-        return {"mavlink": told, "parameter_values": {n: repr(v) for n, v in self._parameters.known.items()}}
+        return {"mavlink": link, "parameter_values": {n: repr(v) for n, v in self._parameters.known.items()}}
 
     def read_parameter(self, name: str, timeout: float = 2.0) -> float:
         """The value in the drone now. Raises LinkError or UsageError."""

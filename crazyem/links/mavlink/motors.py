@@ -9,8 +9,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-OURS = (0, 3, 1, 2)  # of our rotors 1..4: index of the autopilot's motor
-LEAST, MOST = 1000.0, 2000.0  # us, the usual range of pulses
+OUR_ROTOR_PLACES = (0, 3, 1, 2)  # of our rotors 1..4: index of the autopilot's motor
+SHORTEST_PULSE, LONGEST_PULSE = 1000.0, 2000.0  # us, the usual range of pulses
 _PX4_MOTOR, _ARDUPILOT_MOTOR = 101, 33  # value of a channel's function for motor 1
 PX4, ARDUPILOT = 12, 3  # MAV_AUTOPILOT
 
@@ -35,10 +35,10 @@ class Outputs:
         assumed: what was assumed because no parameter said so.
     """
 
-    channels: tuple[int, int, int, int] = OURS
-    motors: tuple[int, int, int, int] = OURS
-    least: tuple[float, ...] = (LEAST,) * 4
-    most: tuple[float, ...] = (MOST,) * 4
+    channels: tuple[int, int, int, int] = OUR_ROTOR_PLACES
+    motors: tuple[int, int, int, int] = OUR_ROTOR_PLACES
+    least: tuple[float, ...] = (SHORTEST_PULSE,) * 4
+    most: tuple[float, ...] = (LONGEST_PULSE,) * 4
     assumed: tuple[str, ...] = field(default=())
 
     @classmethod
@@ -47,7 +47,7 @@ class Outputs:
         assumed = []
         motors = _by_place(parameters)
         if motors is None:
-            motors = OURS
+            motors = OUR_ROTOR_PLACES
             assumed.append("motors are where an X quad has them")
         first, pattern = (_PX4_MOTOR, "PWM_MAIN_FUNC") if autopilot == PX4 else (_ARDUPILOT_MOTOR, "SERVO{}_FUNCTION")
         names = [pattern.format(n) if "{}" in pattern else f"{pattern}{n}" for n in range(1, 5)]
@@ -60,7 +60,7 @@ class Outputs:
         low = [parameters.get(f"PWM_MAIN_MIN{n}", parameters.get("MOT_PWM_MIN", math.nan)) for n in range(1, 5)]
         high = [parameters.get(f"PWM_MAIN_MAX{n}", parameters.get("MOT_PWM_MAX", math.nan)) for n in range(1, 5)]
         if not all(500.0 <= a < b <= 2500.0 for a, b in zip(low, high)):
-            low, high = [LEAST] * 4, [MOST] * 4
+            low, high = [SHORTEST_PULSE] * 4, [LONGEST_PULSE] * 4
             assumed.append("pulses go from 1000 to 2000 us")
         a, b, c, d = (channel[m] for m in motors)
         return cls((a, b, c, d), motors, tuple(low), tuple(high), tuple(assumed))

@@ -16,24 +16,24 @@ from crazyem.links.base import ParameterWrite
 
 RESEND_AFTER = 0.3  # s
 # MAV_PARAM_TYPE -> name, struct format
-TYPES = {1: ("uint8_t", "B"), 2: ("int8_t", "b"), 3: ("uint16_t", "H"), 4: ("int16_t", "h"), 5: ("uint32_t", "I"),
-         6: ("int32_t", "i"), 9: ("float", "f")}  # fmt: skip
+PARAMETER_TYPES = {1: ("uint8_t", "B"), 2: ("int8_t", "b"), 3: ("uint16_t", "H"), 4: ("int16_t", "h"),
+                   5: ("uint32_t", "I"), 6: ("int32_t", "i"), 9: ("float", "f")}  # fmt: skip
 _REAL32 = 9
 
 
 def decode(value: float, kind: int, *, bitwise: bool) -> float:
     """What a PARAM_VALUE means; NaN for a type that does not fit into a float."""
-    if kind not in TYPES:
+    if kind not in PARAMETER_TYPES:
         return float("nan")
     if kind == _REAL32 or not bitwise:
         return value
-    form = TYPES[kind][1]
+    form = PARAMETER_TYPES[kind][1]
     return float(struct.unpack_from("<" + form, struct.pack("<f", value))[0])
 
 
 def encode(value: float, kind: int, *, bitwise: bool) -> float:
     """The float that carries a value in a PARAM_SET. Raises UsageError if the type cannot hold it."""
-    name, form = TYPES.get(kind, ("unknown", ""))
+    name, form = PARAMETER_TYPES.get(kind, ("unknown", ""))
     try:
         if kind == _REAL32:
             return float(struct.unpack("<f", struct.pack("<f", value))[0])
@@ -46,7 +46,7 @@ def encode(value: float, kind: int, *, bitwise: bool) -> float:
 
 
 class ParameterClient:
-    """Asks through `read` and `write` (which send a request), hears through `heard` (called by the receiving thread).
+    """`read` and `write` send requests; the receiving thread hands in answers through `on_value`.
 
     Args:
         uri: for messages.
@@ -76,9 +76,11 @@ class ParameterClient:
 
     def types(self) -> Mapping[str, str]:
         """C type of every parameter heard of."""
-        return {name: TYPES[kind][0] for name, (_, kind) in dict(self._known).items() if kind in TYPES}
+        return {
+            name: PARAMETER_TYPES[kind][0] for name, (_, kind) in dict(self._known).items() if kind in PARAMETER_TYPES
+        }
 
-    def heard(self, fields: Mapping[str, Any]) -> None:
+    def on_value(self, fields: Mapping[str, Any]) -> None:
         """A PARAM_VALUE has come."""
         name = bytes(fields["param_id"]).split(b"\0")[0].decode("ascii", "replace")
         value, kind = float(fields["param_value"]), int(fields["param_type"])
@@ -90,7 +92,7 @@ class ParameterClient:
     def read(self, name: str, timeout: float) -> float:
         """The value in the drone now. Raises LinkError: no answer (some autopilots do not answer for unknown names)."""
         with self._lock:
-            for value, kind in self._exchange(name, lambda: self._ask_read(name), timeout):
+            for value, kind in self._replies_until(name, lambda: self._ask_read(name), timeout):
                 self.fault = ""
                 return decode(value, kind, bitwise=self._bitwise())
         self.fault = f"The drone at {self._uri} did not answer a read of {name} within {timeout:g} s."
@@ -111,17 +113,17 @@ class ParameterClient:
         wire = encode(value, kind, bitwise=bitwise)
         echoed: float | None = None
         with self._lock:
-            for heard, heard_kind in self._exchange(name, lambda: self._ask_write(name, wire, kind), timeout):
-                echoed = decode(heard, heard_kind, bitwise=bitwise)
+            for echo, echo_kind in self._replies_until(name, lambda: self._ask_write(name, wire, kind), timeout):
+                echoed = decode(echo, echo_kind, bitwise=bitwise)
                 # An echo with another value belongs to an earlier write: keep waiting for ours.
-                if heard_kind == kind and struct.pack("<f", heard) == struct.pack("<f", wire):
+                if echo_kind == kind and struct.pack("<f", echo) == struct.pack("<f", wire):
                     self.fault = ""
                     return ParameterWrite(name, value, echoed, True, time.time())
         said = f"answered {name} = {value:g} with {echoed:g}" if echoed is not None else f"did not confirm {name}"
         self.fault = f"The drone at {self._uri} {said} within {timeout:g} s."
         return ParameterWrite(name, value, echoed, False, time.time())
 
-    def _exchange(self, name: str, ask: Callable[[], None], timeout: float) -> Any:
+    def _replies_until(self, name: str, request: Callable[[], None], timeout: float) -> Any:
         """Ask until the deadline, yielding each answer for the name."""
         if not name or len(name) > 16 or not name.isascii():
             raise UsageError(f'"{name[:40]}" is no name of a MAVLink parameter.')
@@ -133,7 +135,7 @@ class ParameterClient:
         try:
             while (now := time.monotonic()) < deadline:
                 if now >= again:
-                    ask()
+                    request()
                     again = now + RESEND_AFTER
                 try:
                     yield self._replies.get(timeout=max(0.001, min(deadline, again) - now))

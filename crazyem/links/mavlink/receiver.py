@@ -17,10 +17,10 @@ from crazyem.links.base import LinkLost, LinkStatistics
 from crazyem.links.clock import ClockFit, ClockRelation
 from crazyem.links.mavlink import streams
 from crazyem.links.mavlink.frames import Frame, FrameParser, number_of
-from crazyem.links.mavlink.radio import Radio
+from crazyem.links.mavlink.sender import MessageSender
 from crazyem.links.mavlink.sequence import SequenceCounter
 from crazyem.links.mavlink.stamps import DroneClock, RestartedError
-from crazyem.links.mavlink.wires import Sender
+from crazyem.links.mavlink.transport import Peer
 from crazyem.signals.packet import Block, Packet
 
 SILENT_AFTER = 2.0  # s
@@ -36,7 +36,7 @@ class Receiver:
     """Everything that is heard.
 
     Args:
-        uri: for messages. radio: its wire is listened to. system: the one to choose, None: the first heard.
+        uri: for messages. sender: its transport is listened to. system: the one to choose, None: the first heard.
         packets: where packets of blocks go, and `LinkLost` at the end.
         on_parameter: told each PARAM_VALUE.
 
@@ -46,21 +46,21 @@ class Receiver:
         seen: messages of it so far, by name. foreign: frames of other systems, by number.
         refused: values that were none: NaN, masked, out of range.
         on_frame: called with (host time [s], frame) for every sound frame of the chosen one.
-        blocks: what becomes packets. lost: why the link counts as lost, "". hopeless: there is no coming back.
-        unplugged: the wire is gone and has to be opened anew.
+        blocks: what becomes packets. lost: why the link counts as lost, "". unrecoverable: there is no coming back.
+        unplugged: the transport is gone and has to be opened anew.
         last: when it was last heard, of time.monotonic().
     """
 
     def __init__(
         self,
         uri: str,
-        radio: Radio,
+        sender: MessageSender,
         *,
         system: int | None,
         packets: "queue.SimpleQueue[Packet | LinkLost]",
         on_parameter: Callable[[Mapping[str, Any]], None],
     ) -> None:
-        self.uri, self.radio, self._wanted, self._packets = uri, radio, system, packets
+        self.uri, self.sender, self._wanted, self._packets = uri, sender, system, packets
         self._on_parameter = on_parameter
         self.on_frame: Callable[[float, bytes], None] | None = None
         self.autopilot = self.kind = -1
@@ -70,7 +70,7 @@ class Receiver:
         self.foreign: dict[int, int] = {}
         self.refused = self.outages = 0
         self.lost = ""
-        self.hopeless = self.unplugged = False
+        self.unrecoverable = self.unplugged = False
         self.last = time.monotonic()
         self.parser, self.sequence = FrameParser(), SequenceCounter()
         self.drone_clock, self.relation = DroneClock(), ClockRelation()
@@ -81,7 +81,7 @@ class Receiver:
         self._round_trips: deque[float] = deque(maxlen=50)
         self._edge: ClockFit | None = None
         self._late = 0
-        self._peer: Sender = None
+        self._peer: Peer = None
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="crazyem-mavlink", daemon=True)
@@ -99,7 +99,7 @@ class Receiver:
         if self._thread is not threading.current_thread():
             self._thread.join(timeout=2.0)
 
-    def came_back(self) -> None:
+    def end_outage(self) -> None:
         """The link is there again."""
         with self._lock:
             self.lost = ""
@@ -148,14 +148,14 @@ class Receiver:
     def _listen(self) -> None:
         beat = asked = refreshed = 0.0
         while not self._stop.is_set():
-            radio = self.radio
+            sender = self.sender
             now = time.monotonic()
             if now - beat >= _BEAT_EVERY:
                 beat = now
-                radio.heartbeat()
+                sender.heartbeat()
             if self.autopilot >= 0 and now - asked >= _TIME_EVERY:
                 asked = now
-                radio.ask_time()
+                sender.ask_time()
             if now - refreshed >= 0.2:
                 refreshed = now
                 with self._lock:
@@ -163,20 +163,20 @@ class Receiver:
             if self.blocks and not self.lost and now - self.last > SILENT_AFTER:
                 self._report_lost(f"The drone at {self.uri} was lost: nothing has come for {SILENT_AFTER:g} s.")
             try:
-                data, sender = radio.wire.receive(0.02)
+                data, peer = sender.transport.receive(0.02)
             except LinkError as error:
                 self.unplugged = True
                 self._report_lost(f"The drone at {self.uri} was lost: {error}")
                 self._stop.wait(0.1)
                 continue
-            if self._peer is not None and sender is not None and sender != self._peer:
+            if self._peer is not None and peer is not None and peer != self._peer:
                 continue  # somebody else: whoever began is whom we talk to
             for frame in self.parser.feed(data) if data else ():
-                self._frame(radio, frame, sender)
+                self._frame(sender, frame, peer)
 
-    def _frame(self, radio: Radio, frame: Frame, sender: Sender) -> None:
+    def _frame(self, sender: MessageSender, frame: Frame, peer: Peer) -> None:
         if self.autopilot < 0:
-            self._consider(radio, frame, sender)
+            self._consider(sender, frame, peer)
             if self.autopilot < 0:
                 return
         if frame.system != self.system:
@@ -190,9 +190,9 @@ class Receiver:
         host_time = time.time()
         if self.on_frame is not None:
             self.on_frame(host_time, frame.raw)
-        self._message(radio, frame, host_time)
+        self._message(sender, frame, host_time)
 
-    def _consider(self, radio: Radio, frame: Frame, sender: Sender) -> None:
+    def _consider(self, sender: MessageSender, frame: Frame, peer: Peer) -> None:
         """Whether this is the heartbeat of the vehicle that is to be watched."""
         fields = frame.fields() if frame.name == "HEARTBEAT" else None
         wanted = self._wanted
@@ -204,27 +204,27 @@ class Receiver:
         self.system, self.component = frame.system, frame.component
         self.foreign.pop(frame.system, None)
         self.kind, self.autopilot = int(fields["type"]), int(fields["autopilot"])
-        self._peer = sender
-        radio.wire.answer(sender)
-        radio.target = (frame.system, frame.component)
+        self._peer = peer
+        sender.transport.answer(peer)
+        sender.target = (frame.system, frame.component)
 
-    def _message(self, radio: Radio, frame: Frame, host_time: float) -> None:
+    def _message(self, sender: MessageSender, frame: Frame, host_time: float) -> None:
         name = frame.name
         self.seen[name] = self.seen.get(name, 0) + 1
         if name == "PARAM_VALUE":
             self._on_parameter(frame.fields())
         elif name == "COMMAND_ACK":
-            radio.acknowledged(frame.fields())
+            sender.acknowledged(frame.fields())
         elif name == "TIMESYNC":
-            self._time(radio, frame.fields())
+            self._time(sender, frame.fields())
         elif name == "AUTOPILOT_VERSION":
             self.simulated = bytes(frame.fields()["uid2"]).startswith(OUR_SIMULATOR)
         if frame.message in self._numbers:
             self._values(name, frame.fields(), host_time)
 
-    def _time(self, radio: Radio, fields: Mapping[str, Any]) -> None:
+    def _time(self, sender: MessageSender, fields: Mapping[str, Any]) -> None:
         if fields["tc1"] == 0:
-            radio.answer_time(int(fields["ts1"]))
+            sender.answer_time(int(fields["ts1"]))
             return
         took = (time.monotonic_ns() - int(fields["ts1"])) / 1e9
         if 0.0 <= took < 10.0:  # else it is somebody else's
@@ -235,7 +235,7 @@ class Receiver:
         try:
             stamp = self.drone_clock.place(fields, now)
         except RestartedError:
-            self.hopeless = True
+            self.unrecoverable = True
             self._report_lost(f"The drone at {self.uri} was restarted: its clock has begun anew.", restarted=True)
             return
         if stamp is None or not self.streams.uses(name):

@@ -10,8 +10,11 @@ from typing import Any
 
 EPOCH_US = 10**15  # a time_usec beyond is since 1970
 _BEHIND_MS = 2000.0  # stamps older than the newest by more are of another life
-_AHEAD_MS, _FASTER = 2000.0, 100.0  # stamps may run ahead by that much, and be that many times faster than the host
-_RESTARTED = 20  # stamps out of place in a row that make a restart
+_AHEAD_MS, _FASTEST_CLOCK_RATIO = (
+    2000.0,
+    100.0,
+)  # stamps may run ahead by that much, and be that many times faster than the host
+_RESTART_REFUSALS = 20  # stamps out of place in a row that make a restart
 _WRAP32 = 1 << 32
 
 
@@ -32,7 +35,7 @@ class DroneClock:
         self.refused = 0
         self._newest_host = math.nan
         self._utc_ms: int | None = None  # 1970 on the drone's clock
-        self._strange = 0
+        self._refused_in_row = 0
 
     def place(self, fields: Mapping[str, Any], host: float) -> int | None:
         """Stamp [ms] of a message that arrived at `host` [s, any steady clock]; None: not believed, or not known yet.
@@ -41,23 +44,23 @@ class DroneClock:
 
         Raises: RestartedError after many stamps in a row that are far from those before.
         """
-        stamp = self._own(fields)
+        stamp = self._stamp_of(fields)
         if stamp is None:
             return None if math.isnan(self.newest_ms) else int(self.newest_ms)
         if not math.isnan(self.newest_ms):
-            allowed = _AHEAD_MS + _FASTER * 1000.0 * max(host - self._newest_host, 0.0)
+            allowed = _AHEAD_MS + _FASTEST_CLOCK_RATIO * 1000.0 * max(host - self._newest_host, 0.0)
             if not -_BEHIND_MS <= stamp - self.newest_ms <= allowed:
                 self.refused += 1
-                self._strange += 1
-                if self._strange >= _RESTARTED:
+                self._refused_in_row += 1
+                if self._refused_in_row >= _RESTART_REFUSALS:
                     raise RestartedError
                 return None
-        self._strange = 0
+        self._refused_in_row = 0
         if not stamp <= self.newest_ms:
             self.newest_ms, self._newest_host = float(stamp), host
         return stamp
 
-    def _own(self, fields: Mapping[str, Any]) -> int | None:
+    def _stamp_of(self, fields: Mapping[str, Any]) -> int | None:
         if "time_boot_ms" in fields:
             return self._unwrapped(int(fields["time_boot_ms"]), _WRAP32)
         if "time_usec" not in fields or fields["time_usec"] <= 0:
@@ -85,4 +88,4 @@ class DroneClock:
     def restart(self) -> None:
         """Forget what was: the next stamp is believed."""
         self.newest_ms = self._newest_host = math.nan
-        self._utc_ms, self._strange = None, 0
+        self._utc_ms, self._refused_in_row = None, 0

@@ -20,17 +20,17 @@ _IN_AIR = {2, 3, 4}  # MAV_LANDED_STATE: in air, taking off, landing
 NO_CELL = 65535
 
 # Asked for at the rate of the log; the state of battery and drone comes slower.
-FAST = ("LOCAL_POSITION_NED", "ATTITUDE_QUATERNION", "ATTITUDE", "HIGHRES_IMU", "ACTUATOR_OUTPUT_STATUS",
+FAST_MESSAGES = ("LOCAL_POSITION_NED", "ATTITUDE_QUATERNION", "ATTITUDE", "HIGHRES_IMU", "ACTUATOR_OUTPUT_STATUS",
         "SERVO_OUTPUT_RAW", "ESC_STATUS", "ESC_TELEMETRY_1_TO_4", "POSITION_TARGET_LOCAL_NED")  # fmt: skip
-SLOW = ("BATTERY_STATUS", "SYS_STATUS", "EXTENDED_SYS_STATE")
+SLOW_MESSAGES = ("BATTERY_STATUS", "SYS_STATUS", "EXTENDED_SYS_STATE")
 SLOW_HZ = 10.0
 # The older request: MAV_DATA_STREAM raw sensors, extended status, RC channels (servos), position, extra 1, extra 2.
 STREAM_GROUPS = ((1, True), (2, False), (3, True), (6, True), (10, True), (11, True))
 
-_TYPES = {"outputs": "float", "rotors": "float", "battery": "uint32_t"}
-_INTEGERS = {"SCALED_IMU": "int16_t", "RAW_IMU": "int16_t"}
+_BLOCK_TYPES = {"outputs": "float", "rotors": "float", "battery": "uint32_t"}
+_INTEGER_TYPES = {"SCALED_IMU": "int16_t", "RAW_IMU": "int16_t"}
 # Of several messages with the same, only one is taken: the first of these that comes.
-CHOICES: tuple[tuple[str, ...], ...] = (
+ALTERNATIVE_MESSAGES: tuple[tuple[str, ...], ...] = (
     ("ATTITUDE_QUATERNION", "ATTITUDE"),
     ("HIGHRES_IMU", "SCALED_IMU", "RAW_IMU"),
     ("ACTUATOR_OUTPUT_STATUS", "SERVO_OUTPUT_RAW"),
@@ -49,7 +49,7 @@ def variables_of(name: str) -> tuple[Variable, ...]:
     """Variables of a block: each field once, in the order of the table."""
     if name == INFO:
         return (Variable(f"{INFO}.info", "uint16_t"),)
-    ctype = _TYPES.get(name) or _INTEGERS.get(name, "float")
+    ctype = _BLOCK_TYPES.get(name) or _INTEGER_TYPES.get(name, "float")
     found = dict.fromkeys(v for m in MAPPINGS if m.message == name for v in m.variables)
     return tuple(Variable(v, ctype) for v in found)
 
@@ -93,7 +93,7 @@ class Streams:
     def choose(self, seen: set[str], *, raw_imu: bool) -> set[str]:
         """Settle which messages are used, of those `seen`; returns the names of the blocks that follow."""
         dropped: set[str] = set() if raw_imu else {"RAW_IMU"}
-        for group in CHOICES:
+        for group in ALTERNATIVE_MESSAGES:
             present = [m for m in group if m in seen and m not in dropped]
             # what has not come yet may still come, as long as nothing else serves
             dropped |= set(group) - set(present[:1]) if present else set()

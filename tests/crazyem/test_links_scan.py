@@ -8,9 +8,9 @@ import pytest
 
 from crazyem.cli import main
 from crazyem.commands.links import drones, text
-from crazyem.links.scanning import PROBE, RULES, answering_ports, scan, udev_vendors, usb_devices
+from crazyem.links.scan import PROBE_PACKET, UDEV_RULES, answering_ports, scan, udev_vendors, usb_devices
 
-BITCRAZE = "# permissions\n" + "\n".join(RULES) + "\n"
+BITCRAZE = "# permissions\n" + "\n".join(UDEV_RULES) + "\n"
 
 
 def plug(root, name, vendor, product, *, serial="", usable=True):
@@ -74,7 +74,7 @@ def test_a_radio_without_rights_is_not_asked_and_the_rule_is_shown(tmp_path):
     assert "no udev rule" in found["radio"].found[0].problem
     shown = text(list(found.values()))
     assert "99-bitcraze.rules" in shown
-    assert RULES[0] in shown
+    assert UDEV_RULES[0] in shown
     assert "udevadm" in shown
 
 
@@ -114,7 +114,7 @@ def test_nothing_answers_on_the_air_or_the_air_cannot_be_searched(tmp_path):
     ("content", "vendors"),
     [
         (BITCRAZE, {"1915", "0483"}),
-        ("#" + RULES[0], set()),
+        ("#" + UDEV_RULES[0], set()),
         ('ATTRS{idVendor}=="1915"\n', set()),
         ('ATTRS{idVendor} == "1915", TAG+="uaccess"\n', {"1915"}),
         ("\xff\x00", set()),
@@ -175,7 +175,7 @@ def test_udp_ports_are_asked_together(fake_peer, peers):
     peers[1].close()
     fake_peer._answer = lambda request: [request]
     assert answering_ports("127.0.0.1", [closed, silent, alive], wait=2.0) == [alive]
-    assert fake_peer.requests == [PROBE]
+    assert fake_peer.requests == [PROBE_PACKET]
 
 
 def test_a_host_that_does_not_exist(tmp_path):

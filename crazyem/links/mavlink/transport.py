@@ -8,24 +8,24 @@ from typing import Any, Protocol
 from crazyem.errors import LinkError
 from crazyem.links.mavlink.address import Address
 
-_BUFFER = 1 << 20  # bytes
-_LARGEST = 65536  # bytes taken at once
+_SOCKET_BUFFER = 1 << 20  # bytes
+_LARGEST_READ = 65536  # bytes taken at once
 
-Sender = tuple[str, int] | None
+Peer = tuple[str, int] | None
 
 
-class Wire(Protocol):
+class Transport(Protocol):
     """`receive` gives what has come within a time, and from whom; `send` never blocks for long and never raises."""
 
     where: str
 
-    def receive(self, timeout: float) -> tuple[bytes, Sender]: ...  # raises LinkError if the wire is gone
+    def receive(self, timeout: float) -> tuple[bytes, Peer]: ...  # raises LinkError if the wire is gone
     def send(self, data: bytes) -> bool: ...
-    def answer(self, sender: Sender) -> None: ...
+    def answer(self, sender: Peer) -> None: ...
     def close(self) -> None: ...
 
 
-class UdpWire:
+class UdpTransport:
     """UDP. "in": bound, sends to whomever `answer` named. "out": sends to the address, hears nobody else."""
 
     def __init__(self, address: Address) -> None:
@@ -33,7 +33,7 @@ class UdpWire:
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._peer: Any = None
         for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
-            self._socket.setsockopt(socket.SOL_SOCKET, option, _BUFFER)
+            self._socket.setsockopt(socket.SOL_SOCKET, option, _SOCKET_BUFFER)
         try:
             if address.kind == "udpin":
                 self._socket.bind((address.host, address.port))
@@ -47,11 +47,11 @@ class UdpWire:
         self._socket.setblocking(False)
         self.where = "{}:{}".format(*self._socket.getsockname()[:2])
 
-    def receive(self, timeout: float) -> tuple[bytes, Sender]:
+    def receive(self, timeout: float) -> tuple[bytes, Peer]:
         try:
             if not select.select([self._socket], [], [], timeout)[0]:
                 return b"", None
-            data, sender = self._socket.recvfrom(_LARGEST)
+            data, sender = self._socket.recvfrom(_LARGEST_READ)
         except BlockingIOError:
             return b"", None
         except ValueError:
@@ -72,14 +72,14 @@ class UdpWire:
             return False
         return True
 
-    def answer(self, sender: Sender) -> None:
+    def answer(self, sender: Peer) -> None:
         self._peer = sender
 
     def close(self) -> None:
         self._socket.close()
 
 
-class SerialWire:
+class SerialTransport:
     """A serial port, by pyserial."""
 
     def __init__(self, address: Address) -> None:
@@ -93,11 +93,11 @@ class SerialWire:
             raise LinkError(f"cannot open the serial port {address.device}: {reason}.") from None
         self._errors = (serial.SerialException, OSError, TypeError, ValueError)
 
-    def receive(self, timeout: float) -> tuple[bytes, Sender]:
+    def receive(self, timeout: float) -> tuple[bytes, Peer]:
         try:
             if not select.select([self._port.fileno()], [], [], timeout)[0]:
                 return b"", None
-            data = bytes(self._port.read(_LARGEST))
+            data = bytes(self._port.read(_LARGEST_READ))
         except self._errors as error:
             raise LinkError(f"the serial port {self.where} is gone: {error}.") from None
         if not data:  # readable and empty: unplugged
@@ -110,7 +110,7 @@ class SerialWire:
         except self._errors:
             return False
 
-    def answer(self, sender: Sender) -> None:
+    def answer(self, sender: Peer) -> None:
         """There is only one at the other end."""
 
     def close(self) -> None:
@@ -118,6 +118,6 @@ class SerialWire:
             self._port.close()
 
 
-def open_wire(address: Address) -> Wire:
+def open_transport(address: Address) -> Transport:
     """Raises LinkError if it cannot be opened."""
-    return SerialWire(address) if address.kind == "serial" else UdpWire(address)
+    return SerialTransport(address) if address.kind == "serial" else UdpTransport(address)

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-PROBE = b"\xff"
+PROBE_PACKET = b"\xff"
 UDP_PORTS = tuple(range(19850, 19860))  # where cflib looks for simulated drones
 UDP_WAIT = 0.2  # s for all ports together
 _LARGEST_RULE = 1 << 20  # bytes of a file with udev rules that are looked at
@@ -29,8 +29,8 @@ USB_DEVICES: dict[tuple[str, str], tuple[str, str]] = {
     ("0483", "5740"): ("usb", "Crazyflie on USB"),
     ("0483", "df11"): ("bootloader", "Crazyflie in DFU mode (restart it to use it)"),
 }
-RULES_FILE = "/etc/udev/rules.d/99-bitcraze.rules"
-RULES = tuple(
+UDEV_RULES_FILE = "/etc/udev/rules.d/99-bitcraze.rules"
+UDEV_RULES = tuple(
     f'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{vendor}", ATTRS{{idProduct}}=="{product}", MODE="0664", GROUP="plugdev"'
     for vendor, product in (("1915", "7777"), ("0483", "5740"))
 )
@@ -148,16 +148,16 @@ def udev_vendors(root: Path = Path("/")) -> set[str]:
 
 def _no_rights(device: Device, rules: set[str]) -> str:
     if device.vendor not in rules:
-        return f"no udev rule gives you the right to use it (see below for {RULES_FILE})"
+        return f"no udev rule gives you the right to use it (see below for {UDEV_RULES_FILE})"
     return "you have no right to use it: plug it in again, and be in the group that its udev rule names"
 
 
 def _rule_advice(rules: set[str]) -> list[str]:
-    lines = [rule for rule in RULES if not any(vendor in rule for vendor in rules)]
+    lines = [rule for rule in UDEV_RULES if not any(vendor in rule for vendor in rules)]
     if not lines:
         return []
     return [
-        f"udev rules: write into {RULES_FILE}\n" + "\n".join(lines) + "\n"
+        f"udev rules: write into {UDEV_RULES_FILE}\n" + "\n".join(lines) + "\n"
         "then: sudo udevadm control --reload-rules && sudo udevadm trigger, and plug the device in again"
     ]
 
@@ -177,7 +177,7 @@ def _radio(devices: list[Device], rules: set[str], search: Callable[[], list[str
     loaders = [d for d in devices if d.kind == "bootloader" and "radio" in d.name]
     _plugged(interface, radios, loaders, rules)
     if not radios and not loaders:
-        rule = "" if "1915" in rules else f" (nor is there a udev rule for one; it would go into {RULES_FILE})"
+        rule = "" if "1915" in rules else f" (nor is there a udev rule for one; it would go into {UDEV_RULES_FILE})"
         interface.missing.append(f"no Crazyradio dongle is plugged in{rule}")
     if any(not d.usable for d in radios):
         interface.missing += _rule_advice(rules)
@@ -209,7 +209,7 @@ def _search_air() -> list[str]:
     """URIs of drones on their default address, every channel and rate, with the first radio (cflib, some seconds)."""
     import io
 
-    from crazyem.links.connecting import quiet_cflib
+    from crazyem.links.connection import quiet_cflib
 
     quiet_cflib()
     from cflib.crtp.radiodriver import RadioDriver
@@ -239,7 +239,7 @@ def answering_ports(host: str, ports: Sequence[int], wait: float = UDP_WAIT) -> 
             asked[sock] = port
             with contextlib.suppress(OSError):
                 sock.connect((address, port))
-                sock.send(PROBE)
+                sock.send(PROBE_PACKET)
         waiting, deadline = set(asked), time.monotonic() + wait
         while waiting and (left := deadline - time.monotonic()) > 0:
             for sock in select.select(list(waiting), [], [], left)[0]:

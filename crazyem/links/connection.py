@@ -1,6 +1,6 @@
 """Opening and closing a cflib link within bounded time: cflib waits for ever for any reply that is lost.
 
-Three nets, one below the other: a request without an answer is sent again (`courier.py`); a connection that stands
+Three nets, one below the other: a request without an answer is sent again (`requests.py`); a connection that stands
 still nevertheless is given up and begun anew, a little later each time; and all of it ends at the caller's timeout.
 """
 
@@ -11,11 +11,11 @@ import time
 from typing import Any
 
 from crazyem.errors import LinkError
-from crazyem.links.courier import Courier
+from crazyem.links.requests import RetryTransport
 
 SILENCE_LIMIT = 3.0  # s without a new answer before a connection attempt is given up
-ATTEMPTS = 3  # at a drone that does answer, but not everything
-_BACKOFF = 0.2  # s before the second attempt, twice that before the third
+CONNECT_ATTEMPTS = 3  # at a drone that does answer, but not everything
+_FIRST_PAUSE = 0.2  # s before the second attempt, twice that before the third
 _LOG_DATA = (5, 2)
 _CONSOLE_PORT = 0
 _LINK_PORT = 15
@@ -123,9 +123,9 @@ def connect(uri: str, timeout: float) -> Any:
     Raises: LinkError with one sentence that tells "nothing answers" from "a reply was lost". Nothing stays open.
     """
     deadline = time.monotonic() + timeout
-    pause = _BACKOFF
-    told: LinkError | None = None  # what was missing at a drone that did answer
-    for attempt in range(ATTEMPTS):
+    pause = _FIRST_PAUSE
+    earlier_error: LinkError | None = None  # what was missing at a drone that did answer
+    for attempt in range(CONNECT_ATTEMPTS):
         crazyflie = new_crazyflie(uri)
         progress = _Progress(crazyflie)
         try:
@@ -133,11 +133,11 @@ def connect(uri: str, timeout: float) -> Any:
             return crazyflie
         except LinkError as error:
             # A later silence says less than what an earlier attempt missed.
-            told = error if progress.answers or told is None else told
+            earlier_error = error if progress.answers or earlier_error is None else earlier_error
             # Where nobody ever answers, or time is up, there is nothing to try again.
-            answered = progress.answers or told is not error
-            if not answered or attempt == ATTEMPTS - 1 or time.monotonic() + pause >= deadline:
-                raise told from None
+            answered = progress.answers or earlier_error is not error
+            if not answered or attempt == CONNECT_ATTEMPTS - 1 or time.monotonic() + pause >= deadline:
+                raise earlier_error from None
         finally:
             progress.detach()
         time.sleep(pause)
@@ -150,21 +150,21 @@ def _open(crazyflie: Any, progress: _Progress, uri: str, deadline: float, timeou
     try:
         _begin(crazyflie, uri)
         while not progress.wake.wait(0.01):
-            shorten_naps(crazyflie)
+            shorten_socket_timeout(crazyflie)
             now = time.monotonic()
             if now > deadline or now - progress.last_answer > min(SILENCE_LIMIT, timeout):
                 raise LinkError(_why(progress, uri, timeout, late=now > deadline))
-            _repeat_if_overdue(crazyflie)
+            _retry_if_due(crazyflie)
         if not progress.done:
             raise LinkError(_why_failed(progress, uri))
-        shorten_naps(crazyflie)
+        shorten_socket_timeout(crazyflie)
     except BaseException:
         shut(crazyflie)
         raise
 
 
 def _begin(crazyflie: Any, uri: str) -> None:
-    """What `Crazyflie.open_link` does (cflib 0.1.34), with a courier around its driver from the first packet on."""
+    """What `Crazyflie.open_link` does (cflib 0.1.34), with a `RetryTransport` around its driver from the start."""
     from cflib.crazyflie import State
 
     crazyflie.connection_requested.call(uri)
@@ -184,17 +184,17 @@ def _begin(crazyflie: Any, uri: str) -> None:
 
 
 def new_driver(crazyflie: Any, uri: str) -> Any:
-    """A driver for the URI in a courier, None if there is none; raises whatever the driver raises."""
+    """A driver for the URI in a `RetryTransport`, None if there is none; raises whatever the driver raises."""
     import cflib.crtp
 
     statistics = crazyflie.link_statistics.radio_link_statistics_callback
     driver = cflib.crtp.get_link_driver(uri, statistics, crazyflie._link_error_cb)
-    return Courier(driver) if driver else None
+    return RetryTransport(driver) if driver else None
 
 
-def _repeat_if_overdue(crazyflie: Any) -> None:
+def _retry_if_due(crazyflie: Any) -> None:
     link = crazyflie.link
-    packet = link.overdue() if isinstance(link, Courier) else None
+    packet = link.due_retry() if isinstance(link, RetryTransport) else None
     if packet is not None:
         crazyflie.send_packet(packet)
 
@@ -241,7 +241,7 @@ def shut(crazyflie: Any, *, hand_back: bool = False, cut_motors: bool = False) -
                 crazyflie.commander.send_setpoint(0, 0, 0, 0)
             if hand_back:
                 crazyflie.commander.send_notify_setpoint_stop()
-            shorten_naps(crazyflie)
+            shorten_socket_timeout(crazyflie)
             crazyflie.link_statistics.latency.ping()  # its echo ends the receiver's present nap
     link = take_link(crazyflie)  # sending may have failed and closed it
     if link is not None:
@@ -264,7 +264,7 @@ def take_link(crazyflie: Any) -> Any:
     return link
 
 
-def shorten_naps(crazyflie: Any) -> None:
+def shorten_socket_timeout(crazyflie: Any) -> None:
     """Let cflib's udp receiver look every 0.1 s, not every second, whether it should stop: closing waits for it."""
     with contextlib.suppress(Exception):
         if crazyflie.link.socket.gettimeout() is not None:

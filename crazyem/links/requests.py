@@ -1,18 +1,21 @@
-"""Between cflib and its driver: asks again for what was not answered, and lets every answer through once.
+"""Requests to a Crazyflie and their replies: repeated while unanswered, each reply passed on once.
 
 cflib asks once and waits for ever, and over UDP nobody below it asks again. Asking again is not enough: two of its
 answers act whenever they come (the link's name and the protocol version begin the whole connection anew, and with it
 reset the log), so an answer that nobody waits for any more, as a link that repeats packets brings too, stops here.
 """
 
+import queue
 import threading
 import time
 from typing import Any
 
-_FIRST_PATIENCE = 0.15  # s until the first repetition, while nothing is known about the round trip
-_LEAST_PATIENCE, _MOST_PATIENCE = 0.03, 0.5  # s
-_ROUND_TRIPS = 4.0  # patience, in smoothed round trips
-_BACKOFF = 1.7  # each repetition waits that much longer
+from crazyem.errors import UsageError
+
+_FIRST_TIMEOUT = 0.15  # s until the first repetition, while nothing is known about the round trip
+_SHORTEST_TIMEOUT, _LONGEST_TIMEOUT = 0.03, 0.5  # s
+_TIMEOUT_DEVIATIONS = 4.0  # deviations of the round trip that a timeout adds to its mean
+_TIMEOUT_GROWTH = 1.7  # each repetition waits that much longer
 
 _ITEM_V1, _ITEM, _INFO = 0, 2, 3
 _LOG_RESET = 5
@@ -34,13 +37,13 @@ def key_of(port: int, channel: int, data: bytes) -> Key | None:
     return None if length is None else (port, channel, bytes(data[:length]))
 
 
-def _acts_whenever(key: Key) -> bool:
+def _acts_unrequested(key: Key) -> bool:
     """Whether cflib acts on such an answer even if it comes unasked."""
     port, channel, head = key
     return (port, channel) in ((15, 1), (13, 1), (4, 0), *_TOCS) or (port, channel, head) == (5, 1, b"\x05")
 
 
-class Courier:
+class RetryTransport:
     """A cflib driver that keeps account of requests; everything else is the driver's own.
 
     Attributes:
@@ -69,7 +72,7 @@ class Courier:
                 again = self._latest is not None and self._latest[1] is packet
                 self._repeated = self._repeated + 1 if again else 0
                 self._latest, self._sent_at = (key, packet), time.monotonic()
-                if _acts_whenever(key):
+                if _acts_unrequested(key):
                     self._awaited = key
         return self._driver.send_packet(packet)
 
@@ -86,7 +89,7 @@ class Courier:
         if key is None:
             return True
         with self._lock:
-            if _acts_whenever(key):
+            if _acts_unrequested(key):
                 if key != self._awaited:
                     return False
                 self._awaited = None
@@ -104,13 +107,71 @@ class Courier:
             self._deviation += 0.25 * (abs(round_trip - self._round_trip) - self._deviation)
             self._round_trip += 0.125 * (round_trip - self._round_trip)
 
-    def overdue(self) -> Any:
+    def due_retry(self) -> Any:
         """The newest request if it is time to send it again (through the same Crazyflie object), else None."""
         with self._lock:
             if self._latest is None:
                 return None
-            patience = _FIRST_PATIENCE
+            timeout = _FIRST_TIMEOUT
             if self._round_trip > 0.0:
-                patience = max(_LEAST_PATIENCE, self._round_trip + _ROUND_TRIPS * self._deviation)
-            patience = min(_MOST_PATIENCE, patience * _BACKOFF**self._repeated)
-            return self._latest[1] if time.monotonic() - self._sent_at > patience else None
+                timeout = max(_SHORTEST_TIMEOUT, self._round_trip + _TIMEOUT_DEVIATIONS * self._deviation)
+            timeout = min(_LONGEST_TIMEOUT, timeout * _TIMEOUT_GROWTH**self._repeated)
+            return self._latest[1] if time.monotonic() - self._sent_at > timeout else None
+
+
+class RequestClient:
+    """Asks one thing at a time; safe to use from any thread but cflib's own."""
+
+    def __init__(self, crazyflie: Any) -> None:
+        self._cf = crazyflie
+        self._lock = threading.Lock()
+        self._waiting: Key | None = None
+        self._replies: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        crazyflie.packet_received.add_callback(self._on_packet)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._cf.packet_received.remove_callback(self._on_packet)
+
+    def request(
+        self, port: int, channel: int, data: bytes, *, timeout: float, repeat_after: float | None
+    ) -> bytes | None:
+        """The data of the reply that begins as its request does (`requests.key_of`), None if none came in time.
+
+        Args:
+            timeout: s.
+            repeat_after: s without a reply after which to ask again; None for what must not be done twice.
+        """
+        from cflib.crtp.crtpstack import CRTPPacket
+
+        if self._cf.is_called_by_incoming_handler_thread():
+            raise UsageError("The drone cannot be asked from inside a cflib callback.")
+        with self._lock:
+            while not self._replies.empty():
+                self._replies.get_nowait()
+            self._waiting = key_of(port, channel, data)
+            deadline, send_at = time.monotonic() + timeout, 0.0
+            try:
+                while (now := time.monotonic()) < deadline:
+                    if now >= send_at:
+                        if self._cf.link is None:
+                            return None
+                        packet = CRTPPacket()
+                        packet.set_header(port, channel)
+                        packet.data = data
+                        self._cf.send_packet(packet)
+                        send_at = deadline if repeat_after is None else now + repeat_after
+                    try:
+                        return self._replies.get(timeout=max(0.0, min(deadline, send_at) - now))
+                    except queue.Empty:
+                        continue
+            finally:
+                self._waiting = None
+        return None
+
+    def _on_packet(self, packet: Any) -> None:
+        waiting = self._waiting
+        if waiting is not None and (packet.port, packet.channel) == waiting[:2]:
+            data = bytes(packet.data)
+            if key_of(packet.port, packet.channel, data) == waiting:
+                self._replies.put(data)

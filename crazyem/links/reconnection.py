@@ -9,21 +9,21 @@ from typing import Any
 from crazyem.errors import LinkError
 from crazyem.links.base import AnotherDroneError
 from crazyem.links.blocks import LogBlocks
-from crazyem.links.connecting import new_driver, shorten_naps, take_link
-from crazyem.links.courier import Courier
+from crazyem.links.connection import new_driver, shorten_socket_timeout, take_link
+from crazyem.links.requests import RetryTransport
 
-_TABLES = (5, 2)  # ports: log, parameters
+_TABLE_PORTS = (5, 2)  # ports: log, parameters
 _INFO = b"\x03"
 _ANSWER_WITHIN, _REPEAT_AFTER = 0.4, 0.1  # s
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.05, 0.8  # s between attempts
-_OWN_SOCKET = 2  # attempts with the driver that is still there, before another takes its place
+_SAME_DRIVER_ATTEMPTS = 2  # attempts with the driver that is still there, before another takes its place
 
 
-class Reviver:
+class Reconnector:
     """Keeps what is needed to go on with a drone after its link was lost.
 
     Args:
-        crazyflie: connected through `connecting.connect`.
+        crazyflie: connected through `connection.connect`.
         uri: where.
     """
 
@@ -31,9 +31,9 @@ class Reviver:
         self._cf, self._uri = crazyflie, uri
         # cflib forgets these when a driver reports an error
         self._table, self._values = crazyflie.param.toc, crazyflie.param.values
-        self._described = dict(crazyflie.link.tables) if isinstance(crazyflie.link, Courier) else {}
+        self._described = dict(crazyflie.link.tables) if isinstance(crazyflie.link, RetryTransport) else {}
 
-    def revive(self, blocks: LogBlocks, timeout: float, abort: threading.Event) -> int:
+    def reconnect(self, blocks: LogBlocks, timeout: float, abort: threading.Event) -> int:
         """Log data flows again when this returns, held back by `blocks`; returns how many blocks were created anew.
 
         Raises: LinkError: not within `timeout` [s], or `abort` was set. AnotherDroneError: never will.
@@ -42,7 +42,7 @@ class Reviver:
         pause, attempt, why = _FIRST_PAUSE, 0, "nothing answers"
         while not abort.is_set():
             try:
-                return self._attempt(blocks, deadline, another=attempt >= _OWN_SOCKET)
+                return self._attempt(blocks, deadline, another=attempt >= _SAME_DRIVER_ATTEMPTS)
             except AnotherDroneError:
                 raise
             except LinkError as error:
@@ -85,12 +85,12 @@ class Reviver:
             cf.link = new_driver(cf, self._uri)
         except Exception as error:  # a driver may raise anything: the dongle may be out
             raise LinkError(str(error) or type(error).__name__) from None
-        shorten_naps(cf)
+        shorten_socket_timeout(cf)
         cf.incoming.start()
 
     def _check_tables(self, blocks: LogBlocks) -> None:
-        for port in _TABLES:
-            reply = blocks.asker.ask(port, 0, _INFO, timeout=_ANSWER_WITHIN, repeat_after=_REPEAT_AFTER)
+        for port in _TABLE_PORTS:
+            reply = blocks.requests.request(port, 0, _INFO, timeout=_ANSWER_WITHIN, repeat_after=_REPEAT_AFTER)
             if reply is None:
                 raise LinkError("nothing answers")
             if reply != self._described.get(port, reply):

@@ -8,22 +8,22 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from crazyem.links.mavlink.wires import Wire
+from crazyem.links.mavlink.transport import Transport
 
 OUR_SYSTEM, OUR_COMPONENT = 255, 190  # a ground station, as is the custom
-_ATTEMPTS, _PATIENCE = 4, 0.3  # of a command, s each
+_COMMAND_ATTEMPTS, _COMMAND_TIMEOUT = 4, 0.3  # of a command, s each
 ACCEPTED, IN_PROGRESS = 0, 5  # MAV_RESULT
 
 
-class Radio:
+class MessageSender:
     """Sends to one system; may be used from several threads.
 
     Attributes:
         target: system and component spoken to; (0, 0), everybody, until it is known.
     """
 
-    def __init__(self, wire: Wire) -> None:
-        self.wire = wire
+    def __init__(self, transport: Transport) -> None:
+        self.transport = transport
         self.target = (0, 0)
         self._packer = mavlink.MAVLink(None, srcSystem=OUR_SYSTEM, srcComponent=OUR_COMPONENT)
         self._lock = threading.Lock()
@@ -35,7 +35,7 @@ class Radio:
         with self._lock:
             data = bytes(message.pack(self._packer))
             self._packer.seq = (self._packer.seq + 1) % 256
-            return self.wire.send(data)
+            return self.transport.send(data)
 
     def heartbeat(self) -> bool:
         """We are a ground station."""
@@ -67,9 +67,9 @@ class Radio:
         with self._commanding:
             while not self._acks.empty():
                 self._acks.get_nowait()
-            for attempt in range(_ATTEMPTS):
+            for attempt in range(_COMMAND_ATTEMPTS):
                 self.send(mavlink.MAVLink_command_long_message(*self.target, number, attempt, *values))
-                until = time.monotonic() + _PATIENCE
+                until = time.monotonic() + _COMMAND_TIMEOUT
                 while (left := until - time.monotonic()) > 0:
                     try:
                         command, result = self._acks.get(timeout=left)
