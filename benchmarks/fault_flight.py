@@ -27,11 +27,11 @@ from crazyem.links import open_link
 from crazyem.links.base import Packet
 from crazyem.live.controllers import LEE, writes_for
 from crazyem.live.flight import Flight, FlightPlan
-from crazyem.live.guard import INERTIA, Decision
+from crazyem.live.guard import INERTIA_NAMES, Decision
 from crazyem.live.mcap_recorder import open_recorder
-from crazyem.live.oversight import Rules
 from crazyem.live.session import Session
 from crazyem.live.warm_up import warm_up
+from crazyem.live.write_supervisor import WriteRules
 from crazyem.recordings import open_recording
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle, load_vehicle
@@ -236,7 +236,7 @@ class NoGuard:
     def __init__(self, originals: dict[str, float]) -> None:
         self.controller, self.originals, self.stopped = LEE, originals, ""
         names = (LEE.mass, *LEE.inertia)
-        self.beliefs = dict(zip(("mass", *INERTIA), (originals[n] for n in names)))
+        self.beliefs = dict(zip(("mass", *INERTIA_NAMES), (originals[n] for n in names)))
         self._last = -math.inf
 
     def stop(self, reason: str) -> None:
@@ -334,7 +334,7 @@ def _fly(case: Case, arm: str, link: Any, vehicle: Vehicle, file: Path, result: 
     assert recorder is not None
     session = Session(bad, vehicle=vehicle, estimator=estimator, recorder=recorder)
     bad.session = estimator.session = session
-    rules = Rules(dry_run=arm == "unguarded")  # the raw writer takes the guard's place below
+    rules = WriteRules(dry_run=arm == "unguarded")  # the raw writer takes the guard's place below
     plan = FlightPlan(trajectory_maker(["excite"], DURATION), LEE, push=arm != "none", rules=rules, baseline=BASELINE)
     flight = Flight(session, plan)
     if arm == "unguarded":
@@ -370,7 +370,7 @@ def _without_guard(session: Session, note: str) -> str:
     guard: Any = NoGuard(originals)
     on_write = session.recorder.parameter_write if session.recorder else None
     session.pusher = Pusher(session.link, guard, gate=OPEN_GATE, history=session.history, on_write=on_write)
-    session.oversight, session.pipeline.guard, session.pipeline.push = None, guard, session.pusher.submit
+    session.write_supervisor, session.pipeline.guard, session.pipeline.push = None, guard, session.pusher.submit
     return note
 
 

@@ -56,10 +56,10 @@ def simulator(scenario: Path, *, seed: int, truth: Path, pace: Pace) -> Iterator
         firmware.advance(1)
         advance = firmware.advance
 
-        def paced(milliseconds: int) -> None:
+        def throttle(milliseconds: int) -> None:
             pace.wait()
             advance(milliseconds)
 
-        firmware.advance = paced  # type: ignore[method-assign]
+        firmware.advance = throttle  # type: ignore[method-assign]
         stack.enter_context(in_a_thread(Server(firmware, sock, speed=pace.speed, truth=file)))
         yield sock.getsockname()

@@ -28,12 +28,12 @@ from crazyem.estimation.steps import StepAwareEstimator
 from crazyem.live.controllers import LEE
 from crazyem.live.guard import Decision, Guard
 from crazyem.live.history import History, Push
-from crazyem.live.oversight import Oversight, Rules
 from crazyem.live.pipeline import Pipeline
 from crazyem.live.policy import load_policy
-from crazyem.live.session import STATE
+from crazyem.live.session import STATE_VARIABLES
 from crazyem.live.telemetry import CAN_FLY, FLYING, Telemetry
 from crazyem.live.write_gate import WriteGate
+from crazyem.live.write_supervisor import WriteRules, WriteSupervisor
 from crazyem.signals.packet import Block, Packet, Variable
 from crazyem.signals.sample import Sample
 from crazyem.signals.vocabulary import decoders
@@ -118,7 +118,7 @@ class Drone:
         self.path = case.trajectory()
         self.blocks = [
             Block(n, tuple(Variable(v, _type(v)) for v in names), 10)
-            for n, names in enumerate((STATE, MOTORS, SETPOINT))
+            for n, names in enumerate((STATE_VARIABLES, MOTORS, SETPOINT))
         ]
         self._phase = [r.randrange(10) for _ in self.blocks]
         self._decoders = decoders(self.blocks)
@@ -175,8 +175,8 @@ def _type(name: str) -> str:
 class Now:
     """The pusher without a thread and without a link: what is decided is written at once."""
 
-    def __init__(self, drone: Drone, oversight: Oversight, history: History) -> None:
-        self.drone, self.oversight, self.history = drone, oversight, history
+    def __init__(self, drone: Drone, write_supervisor: WriteSupervisor, history: History) -> None:
+        self.drone, self.write_supervisor, self.history = drone, write_supervisor, history
         self.known = {p: drone.read(p) for p in LEE.parameters}
         self.busy = False
         self.masses: list[tuple[float, float]] = []
@@ -189,7 +189,7 @@ class Now:
             self.history.pushes.append(Push(decision.time, name, value, True, decision.kind))
             if name == LEE.mass:
                 self.masses.append((decision.time, value))
-        self.oversight.done(decision, "")
+        self.write_supervisor.on_written(decision, "")
 
 
 def fly(case: Case, seed: int, *, aware: bool = True, push: bool = True) -> dict[str, Any]:
@@ -203,18 +203,18 @@ def fly(case: Case, seed: int, *, aware: bool = True, push: bool = True) -> dict
     originals = {p: drone.read(p) for p in LEE.parameters}
     policy = load_policy()
     nominal = dict(zip(("mass", "Ixx", "Iyy", "Izz"), (vehicle.mass, *vehicle.inertia)))
-    oversight = Oversight(
+    write_supervisor = WriteSupervisor(
         Guard(LEE, nominal=nominal, originals=originals, limits=policy.limits),
-        Rules(policy),
+        WriteRules(policy),
         originals=originals,
         history=history,
         gate=gate,
         now=lambda: newest[0],
         residual=lambda: inner.residual,
     )
-    pusher: Any = Now(drone, oversight, history)
-    oversight.pusher = pusher
-    pipeline = Pipeline(estimator, history=history, guard=oversight if push else None, push=pusher.submit)
+    pusher: Any = Now(drone, write_supervisor, history)
+    write_supervisor.pusher = pusher
+    pipeline = Pipeline(estimator, history=history, guard=write_supervisor if push else None, push=pusher.submit)
     pipeline.push_from = PUSH_FROM
     heights = []
     begun = time.process_time()
@@ -222,7 +222,7 @@ def fly(case: Case, seed: int, *, aware: bool = True, push: bool = True) -> dict
         for sample in samples:
             newest[0] = sample.time
             if push:
-                oversight.take([sample])
+                write_supervisor.take([sample])
             pipeline.sample(sample)
         heights.append((newest[0], float(drone.flight.state[2])))
     steps = getattr(estimator, "steps", [])
@@ -232,7 +232,7 @@ def fly(case: Case, seed: int, *, aware: bool = True, push: bool = True) -> dict
         "steps": [(s.time, s.found, s.before, s.after, s.real) for s in steps],
         "called_real": sum(s.real is True for s in steps),
         "reverts": sum(p.purpose == "revert" for p in history.pushes),
-        "stopped": oversight.guard.stopped,
+        "stopped": write_supervisor.guard.stopped,
         "writes": len(history.pushes),
     }  # fmt: skip
     if case.size:

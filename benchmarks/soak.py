@@ -35,12 +35,12 @@ from crazyem.live.controllers import LEE
 from crazyem.live.flight import Flight, FlightPlan
 from crazyem.live.history import History
 from crazyem.live.mcap_recorder import open_recorder
-from crazyem.live.oversight import Rules
 from crazyem.live.policy import load_policy
 from crazyem.live.push import Pusher
 from crazyem.live.session import Session
 from crazyem.live.simulator import Simulator
 from crazyem.live.warm_up import warm_up
+from crazyem.live.write_supervisor import WriteRules
 from crazyem.recordings import open_recording
 from crazyem.vehicle import load_vehicle
 
@@ -129,7 +129,7 @@ class Writer:
         self._pusher = Pusher(session.link, self, gate=OPEN_GATE,  # type: ignore[arg-type]
                               history=History(), on_write=self._attempted,
                               wait_for_link=session.wait_for_link,
-                              outages=lambda: len(session.outages) + session.returning)  # fmt: skip
+                              outages=lambda: len(session.outages) + session.reconnecting)  # fmt: skip
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -236,7 +236,9 @@ def run(minutes: float, speed: float, seed: int, folder: Path) -> dict[str, Any]
         session.start()
         watcher = Watcher(session, max(1.0, 60.0 * wall / ROWS), simulator._process.pid, relay.process.pid)
         writer = Writer(session, seed)
-        plan = FlightPlan(trajectory_maker(["excite"], 60.0 * minutes), LEE, push=True, rules=Rules(load_policy(None)))
+        plan = FlightPlan(
+            trajectory_maker(["excite"], 60.0 * minutes), LEE, push=True, rules=WriteRules(load_policy(None))
+        )
         error = ""
         try:
             Flight(session, plan).fly()

@@ -41,13 +41,13 @@ class StreamLink:
     def __init__(self, seed: int, seconds: float) -> None:
         from flight import VOLTAGE, simulate
 
-        from crazyem.live.session import STATE
+        from crazyem.live.session import STATE_VARIABLES
         from crazyem.live.telemetry import FLYING
         from crazyem.signals.vocabulary import MOTOR_BLOCK, compress_quaternion
 
         self.uri = f"stream://{seed}"
         self.packets: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self.log_variables = dict.fromkeys((*STATE, *MOTOR_BLOCK), "float")
+        self.log_variables = dict.fromkeys((*STATE_VARIABLES, *MOTOR_BLOCK), "float")
         self.parameters: dict[str, str] = {}
         self.count = 0
         flown = simulate(seed=seed, seconds=seconds)
@@ -80,10 +80,10 @@ class StreamLink:
 class Watched:
     """A session whose latencies are taken."""
 
-    def __init__(self, link: Any, *, number: int, of: int, crew: Any, folder: str | None, window: int) -> None:
+    def __init__(self, link: Any, *, number: int, of: int, scheduler: Any, folder: str | None, window: int) -> None:
         from crazyem.estimation.online import OnlineEstimator
-        from crazyem.live.crew import Paced
         from crazyem.live.mcap_recorder import open_recorder
+        from crazyem.live.scheduler import UpdateThrottle
         from crazyem.live.session import Session
         from crazyem.vehicle import load_vehicle
 
@@ -93,13 +93,18 @@ class Watched:
         path = None if folder is None else str(Path(folder) / f"{number}.mcap")
         recorder = open_recorder(path, configuration={}, vehicle=vehicle, link=link)
         estimator: Any = OnlineEstimator(vehicle, window=window)
-        if crew is not None:
-            estimator = Paced(estimator, number=number, of=of)
+        if scheduler is not None:
+            estimator = UpdateThrottle(estimator, number=number, of=of)
         self.session = Session(
-            link, vehicle=vehicle, estimator=estimator, recorder=recorder, on_estimate=self._estimated, crew=crew
+            link,
+            vehicle=vehicle,
+            estimator=estimator,
+            recorder=recorder,
+            on_estimate=self._estimated,
+            scheduler=scheduler,
         )
         self.estimator = estimator
-        if isinstance(estimator, Paced):
+        if isinstance(estimator, UpdateThrottle):
             estimator.newest = lambda: self.session.clock.newest
         take = self.session._packet
 
@@ -148,14 +153,14 @@ def prefeed(link: StreamLink, watched: Watched) -> None:
 
 def run_streams(count: int, *, seconds: float, workers: int | None, record: bool, window: int, cold: bool) -> Any:
     """One number of drones; raw numbers."""
-    from crazyem.live.crew import Crew
-    from crazyem.live.swarm import settle_interpreter
+    from crazyem.live.scheduler import Scheduler
+    from crazyem.live.swarm import shorten_switch_interval
     from crazyem.live.warm_up import warm_up
     from crazyem.vehicle import load_vehicle
 
     warm_up(load_vehicle("cf2"))
-    settle_interpreter()
-    crew = Crew(workers) if workers != 0 else None
+    shorten_switch_interval()
+    scheduler = Scheduler(workers) if workers != 0 else None
     skip = 0 if cold else PREFED
     flown = min(count, 5)  # different flights; making one takes a second
     links = [StreamLink(1 + i % flown, seconds + skip / 100 + SETTLING + 2.0) for i in range(flown)]
@@ -163,7 +168,9 @@ def run_streams(count: int, *, seconds: float, workers: int | None, record: bool
         watched = []
         for i in range(count):
             link = links[i] if i < flown else _twin(links[i % flown], i)
-            one = Watched(link, number=i, of=count, crew=crew, folder=scratch if record else None, window=window)
+            one = Watched(
+                link, number=i, of=count, scheduler=scheduler, folder=scratch if record else None, window=window
+            )
             one.session.start()
             if not cold:
                 prefeed(link, one)
@@ -210,8 +217,8 @@ def _twin(link: StreamLink, number: int) -> StreamLink:
 def run_simulator(count: int, *, seconds: float, workers: int | None, record: bool, window: int) -> Any:
     """The same over UDP and cflib: the swarm simulator beside us on the same cores, each drone hovering."""
     from crazyem.links import open_link
-    from crazyem.live.crew import Crew
-    from crazyem.live.swarm import settle_interpreter
+    from crazyem.live.scheduler import Scheduler
+    from crazyem.live.swarm import shorten_switch_interval
     from crazyem.live.warm_up import warm_up
     from crazyem.vehicle import load_vehicle
 
@@ -223,13 +230,15 @@ def run_simulator(count: int, *, seconds: float, workers: int | None, record: bo
             for line in simulator.stdout or ():
                 if "ready" in line:
                     break
-            settle_interpreter()
-            crew = Crew(workers) if workers != 0 else None
+            shorten_switch_interval()
+            scheduler = Scheduler(workers) if workers != 0 else None
             watched = []
             for i in range(count):
                 link = open_link(f"udp://127.0.0.1:{port + i}")
                 link.connect(timeout=60.0)
-                one = Watched(link, number=i, of=count, crew=crew, folder=f if record else None, window=window)
+                one = Watched(
+                    link, number=i, of=count, scheduler=scheduler, folder=f if record else None, window=window
+                )
                 one.session.start()
                 watched.append(one)
             for one in watched:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.control.trajectories import Reference, Trajectory, after_hover
-from crazyem.live.session import RATE, block_plan
+from crazyem.live.session import LOG_RATE, block_plan
 from crazyem.signals.packet import Block, Packet, Variable
 from crazyem.signals.sample import Sample
 from crazyem.signals.vocabulary import compress_quaternion, decoders
@@ -30,7 +30,7 @@ BASELINE = 2.0  # s of hover before the trajectory, as `crazyem fly` has it
 # Setpoints as `crazyem fly` sends them, with the jitter seen in its recordings (a tenth 0.9 ms late, a tenth early). At
 # the rate of the log their steps would keep their place between two log samples (crazyem/live/stream.py).
 SETPOINT_PERIOD, SETPOINT_JITTER = 7.0, 0.8  # ms
-LOG_PERIOD = round(1000.0 / RATE)  # ms
+LOG_PERIOD = round(1000.0 / LOG_RATE)  # ms
 LEE = 5  # stabilizer.controller
 _CTYPES = {1: "uint8_t", 2: "uint16_t", 3: "uint32_t", 4: "int8_t", 5: "int16_t", 6: "int32_t", 7: "float", 8: "FP16"}
 _FORMATS = {1: "B", 2: "H", 3: "I", 4: "b", 5: "h", 6: "i", 7: "f", 8: "e"}

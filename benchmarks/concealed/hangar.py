@@ -38,7 +38,7 @@ def _serve(pipe: Connection, seen: Any) -> None:
     from firmware_sim.scenario import load_scenario
     from firmware_sim.server import Server, bind
 
-    class Paced(Server):
+    class UpdateThrottle(Server):
         """A server that waits for its host; `seen`: ms stamp of the newest log packet that the host has read."""
 
         owed: int | None = None  # tick of the newest setpoint, None while none are streamed
@@ -79,11 +79,11 @@ def _serve(pipe: Connection, seen: Any) -> None:
             with bind("127.0.0.1", 0) as sock:
                 air = Air(scenario.link.loss, scenario.link.burst, drone.seed)
                 seen.value = -1
-                server = Paced(firmware, sock, speed=1.0, air=air)
+                server = UpdateThrottle(firmware, sock, speed=1.0, air=air)
                 server.pace = drone.speed
                 firmware.receive = server.heard(firmware.receive)  # type: ignore[method-assign]
 
-                def watch(server: Paced = server) -> None:
+                def watch(server: UpdateThrottle = server) -> None:
                     pipe.recv()
                     server.stopping = True
 
@@ -103,7 +103,7 @@ class Hangar:
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
-        self.seen = context.Value("q", -1, lock=False)  # ms; written by the host, see `Paced`
+        self.seen = context.Value("q", -1, lock=False)  # ms; written by the host, see `UpdateThrottle`
         self._process = context.Process(target=_serve, args=(other, self.seen), daemon=True)
         self._process.start()
         other.close()

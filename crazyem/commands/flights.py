@@ -17,9 +17,9 @@ from crazyem.control.trajectories import Trajectory, Vector, excite, figure8, ho
 from crazyem.control.waypoints import read_waypoints, waypoints
 from crazyem.errors import UsageError
 from crazyem.live.flight import Interrupts
-from crazyem.live.oversight import Rules
 from crazyem.live.policy import load_policy
 from crazyem.live.session import Session
+from crazyem.live.write_supervisor import WriteRules
 
 HEIGHT = 1.0  # m
 SIMPLE = {"hover": hover, "figure8": figure8, "excite": excite}
@@ -78,7 +78,7 @@ def simulated(uri: str) -> bool:
         return False
 
 
-def write_rules(arguments: argparse.Namespace, uri: str | None = None, *, name: str = "this drone") -> Rules:
+def write_rules(arguments: argparse.Namespace, uri: str | None = None, *, name: str = "this drone") -> WriteRules:
     """Policy and mode of the guard: simulators are written to, drones only after --push or --confirm.
 
     Args:
@@ -93,23 +93,25 @@ def write_rules(arguments: argparse.Namespace, uri: str | None = None, *, name: 
     dry_run = arguments.dry_run or not meant
     if dry_run and not arguments.dry_run and not arguments.no_push:
         say(f"dry run: nothing is written to {name} until --push (or --confirm) is given")
-    return Rules(policy, dry_run=dry_run, ask=asker(name) if arguments.confirm and not dry_run else None)
+    return WriteRules(
+        policy, dry_run=dry_run, confirm=confirmation_by(name) if arguments.confirm and not dry_run else None
+    )
 
 
-_ASKING = threading.Lock()  # one question at a time, whoever asks
+_TERMINAL_LOCK = threading.Lock()  # one question at a time, whoever asks
 
 
-def asker(name: str) -> Callable[[str, threading.Event], bool]:
+def confirmation_by(name: str) -> Callable[[str, threading.Event], bool]:
     """Asks on the terminal about a drone of that name."""
 
-    def ask(question: str, ended: threading.Event) -> bool:
-        with _ASKING:
-            return ask_terminal(question if name == "this drone" else f"{name}: {question}", ended)
+    def confirm(question: str, ended: threading.Event) -> bool:
+        with _TERMINAL_LOCK:
+            return confirm_in_terminal(question if name == "this drone" else f"{name}: {question}", ended)
 
-    return ask
+    return confirm
 
 
-def ask_terminal(question: str, ended: threading.Event) -> bool:
+def confirm_in_terminal(question: str, ended: threading.Event) -> bool:
     """Yes or no from standard input; no where there is none, or once `ended` is set."""
     say(f"{question}\n  push it, and what follows under the policy? [y/N]")
     while not ended.is_set():

@@ -29,12 +29,20 @@ from crazyem.commands.view import Everyone, Shown, Streams, landing, live_view, 
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.live.controllers import controller_named
-from crazyem.live.crew import Crew, Paced
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
 from crazyem.live.mcap_recorder import open_recorder
+from crazyem.live.scheduler import Scheduler, UpdateThrottle
 from crazyem.live.session import Session
 from crazyem.live.summary import build_summary, check_writable, write_json
-from crazyem.live.swarm import Course, Member, check_distances, displaced, members_of, read_swarm, settle_interpreter
+from crazyem.live.swarm import (
+    Course,
+    Member,
+    check_distances,
+    members_of,
+    read_swarm,
+    shorten_switch_interval,
+    with_offset,
+)
 from crazyem.physics import folding
 
 AT_ONCE, CLOSING = 3, 8  # connections being made and closed; more only steal each other's time
@@ -58,7 +66,7 @@ class Drone:
     plan: FlightPlan | None = None
     link: Any = None
     session: Session | None = None
-    estimator: Paced | None = None
+    estimator: UpdateThrottle | None = None
     recorder: Any = None
     line: LiveLine | None = None
     shown: Shown | None = None
@@ -123,7 +131,7 @@ def fly(arguments: argparse.Namespace) -> int:
         m = drone.member
         if m.uri.startswith("mavlink:"):
             raise UsageError(f"{m.name}: a MAVLink drone is flown by its own ground station: use crazyem watch.")
-        make = displaced(trajectory_maker(list(m.trajectory), arguments.duration), m.offset)
+        make = with_offset(trajectory_maker(list(m.trajectory), arguments.duration), m.offset)
         rules = write_rules(arguments, m.uri, name=m.name)
         drone.plan = FlightPlan(make, controller, height=HEIGHT, push=not arguments.no_push, rules=rules)
     return _run(arguments, drones, wrench="", work=_fly, before=_keep_apart)
@@ -161,15 +169,15 @@ def _run(
 ) -> int:
     view = wants_view(arguments)
     compile_kernels(drones[0].vehicle)
-    settle_interpreter()
+    shorten_switch_interval()
     with contextlib.ExitStack() as stack:
         everyone = Everyone([d.interrupts for d in drones])
         stack.enter_context(interrupts(everyone))
         streams = stack.enter_context(Streams(arguments.foxglove))
-        crew = Crew()
-        stack.callback(crew.close)
+        scheduler = Scheduler()
+        stack.callback(scheduler.close)
         try:
-            _connect(arguments, drones, wrench=wrench, streams=streams, crew=crew, everyone=everyone)
+            _connect(arguments, drones, wrench=wrench, streams=streams, scheduler=scheduler, everyone=everyone)
             before([d for d in drones if d.error is None])
             with live_view(view, lambda: [d.shown for d in drones if d.shown is not None]) as showing:
                 _together(drones, work, quiet=showing)
@@ -185,7 +193,7 @@ def _connect(
     *,
     wrench: str,
     streams: Streams,
-    crew: Crew,
+    scheduler: Scheduler,
     everyone: Interrupts,
 ) -> None:
     """Links, recordings and sessions; a drone that cannot be reached is left behind."""
@@ -198,7 +206,7 @@ def _connect(
         try:
             drone.link = open_link(drone.member.uri)
             drone.link.connect()
-            _begin(arguments, drone, number, len(drones), wrench=wrench, streams=streams, crew=crew)
+            _begin(arguments, drone, number, len(drones), wrench=wrench, streams=streams, scheduler=scheduler)
             say(f"{drone.name}: connected to {drone.member.uri}")
         except CrazyemError as error:
             drone.failed(error)
@@ -210,7 +218,14 @@ def _connect(
 
 
 def _begin(
-    arguments: argparse.Namespace, drone: Drone, number: int, of: int, *, wrench: str, streams: Streams, crew: Crew
+    arguments: argparse.Namespace,
+    drone: Drone,
+    number: int,
+    of: int,
+    *,
+    wrench: str,
+    streams: Streams,
+    scheduler: Scheduler,
 ) -> None:
     m, plan = drone.member, drone.plan
     configuration = {
@@ -227,7 +242,7 @@ def _begin(
         drone.log, configuration=configuration, vehicle=drone.vehicle, link=drone.link, append=arguments.append
     )
     drone.recorder = streams.beside(recorder, m.name)
-    drone.estimator = estimator = Paced(
+    drone.estimator = estimator = UpdateThrottle(
         new_estimator(drone.vehicle, arguments),
         number=number,
         of=of,
@@ -241,7 +256,7 @@ def _begin(
         wrench=wrench,
         rate=arguments.rate,
         reconnect_within=arguments.reconnect,
-        crew=crew,
+        scheduler=scheduler,
     )
     estimator.newest = lambda: session.clock.newest
     drone.session = session
@@ -361,7 +376,7 @@ def _error(drone: Drone) -> dict[str, Any]:
 
 
 def _summary(drone: Drone) -> dict[str, Any]:
-    """As of a single flight, and what the crew left out.
+    """As of a single flight, and what the scheduler left out.
 
     Raises:
         DataError: nothing was flown that could be estimated from.

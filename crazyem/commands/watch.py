@@ -18,17 +18,17 @@ from crazyem.commands.common import (
     report,
     say,
 )
-from crazyem.commands.flights import ask_terminal, follow, interrupts
+from crazyem.commands.flights import confirm_in_terminal, follow, interrupts
 from crazyem.commands.view import Shown, Streams, live_view, wants_view
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
-from crazyem.live.hover import hover_afterwards
+from crazyem.live.hover_thrust import hover_afterwards
 from crazyem.live.mcap_recorder import open_recorder
-from crazyem.live.oversight import Rules
 from crazyem.live.policy import load_policy
 from crazyem.live.session import Session
 from crazyem.live.summary import check_writable
 from crazyem.live.telemetry import FLYING
+from crazyem.live.write_supervisor import WriteRules
 from crazyem.physics import folding
 
 
@@ -90,9 +90,11 @@ def run(arguments: argparse.Namespace) -> int:
             session.history.notice(str(e))
         session.end_pushing(_outcome(session, error))
         session.close()
-        if session.oversight is not None and session.pusher is not None:
-            known, before = session.pusher.known, session.oversight.originals
-            session.history.notice(hover_afterwards(session.oversight.guard.controller, now=known, before=before))
+        if session.write_supervisor is not None and session.pusher is not None:
+            known, before = session.pusher.known, session.write_supervisor.originals
+            session.history.notice(
+                hover_afterwards(session.write_supervisor.guard.controller, now=known, before=before)
+            )
         statistics = link.statistics()
         if recorder is not None:
             close_recorder(recorder, statistics, session.history)
@@ -114,7 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def write_rules(arguments: argparse.Namespace) -> Rules | None:
+def write_rules(arguments: argparse.Namespace) -> WriteRules | None:
     """Policy and mode of the guard, None where nothing is to be written or said about it.
 
     Raises:
@@ -127,8 +129,8 @@ def write_rules(arguments: argparse.Namespace) -> Rules | None:
     if not mavlink or arguments.no_push:
         return None
     open_link(arguments.uri)  # a wrong address is refused here, before anything is compiled
-    ask = ask_terminal if arguments.confirm else None
-    return Rules(load_policy(arguments.policy), dry_run=not writes, ask=ask)
+    confirm = confirm_in_terminal if arguments.confirm else None
+    return WriteRules(load_policy(arguments.policy), dry_run=not writes, confirm=confirm)
 
 
 def _outcome(session: Session, error: BaseException | None) -> str:

@@ -8,9 +8,9 @@ from typing import Any
 
 from crazyem.errors import DataError
 from crazyem.estimation.result import Estimate
-from crazyem.live.oversight import Rules
 from crazyem.live.policy import Policy, load_policy
 from crazyem.live.session import Session
+from crazyem.live.write_supervisor import WriteRules
 from crazyem.physics import folding
 from crazyem.vehicle import Vehicle
 
@@ -101,7 +101,7 @@ def attach(
     from crazyem.links.crazyflie import CrazyflieLink
     from crazyem.live.warm_up import warm_up
 
-    rules = Rules(policy if isinstance(policy, Policy) else load_policy(policy), dry_run=dry_run)
+    rules = WriteRules(policy if isinstance(policy, Policy) else load_policy(policy), dry_run=dry_run)
     model, left_out = folding.fold(vehicle if isinstance(vehicle, Vehicle) else folding.load(vehicle))
     warm_up(model)
     link = CrazyflieLink.from_crazyflie(cf)

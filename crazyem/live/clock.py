@@ -10,7 +10,7 @@ SEGMENT = 0.5  # s of host time; the rate is the median slope of the newest SEGM
 SEGMENTS = 8
 OFFSET_SPAN = 0.5  # s over which the promptest packet is looked for
 SLEW = 0.2  # largest relative departure from the measured rate while catching up
-JUMP = 3.0  # s of firmware time beyond which catching up is given up
+LARGEST_CATCH_UP = 3.0  # s of firmware time beyond which catching up is given up
 
 
 class FirmwareClock:
@@ -80,7 +80,7 @@ class FirmwareClock:
             if self._shown is not None:
                 before, shown = self._shown
                 elapsed = max(host - before, 0.0)
-                if abs(value - shown - self._rate * elapsed) < JUMP and host - self._line[0] <= 1.0:
+                if abs(value - shown - self._rate * elapsed) < LARGEST_CATCH_UP and host - self._line[0] <= 1.0:
                     slowest, fastest = ((1.0 + s) * self._rate * elapsed for s in (-SLEW, SLEW))
                     value = shown + min(max(value - shown, slowest), fastest)
                 value = max(value, shown)

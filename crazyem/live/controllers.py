@@ -31,7 +31,7 @@ class Controller:
     attitude_gains: tuple[tuple[str, str], ...] = ()
     wrench: str = ""
     note: str = ""
-    mass_scale: float = 1.0  # kg a unit of the mass parameter, where that is not a mass (see crazyem.live.hover)
+    mass_scale: float = 1.0  # kg a unit of the mass parameter, where that is not a mass (see crazyem.live.hover_thrust)
     persistent: bool = False  # whether parameters outlive a restart of the firmware
 
     def scale(self, parameter: str) -> float:
@@ -63,7 +63,7 @@ MELLINGER = Controller(
     note="the Mellinger controller takes a mass but no inertia, and its mass is one only if ctrlMel.massThrust fits",
 )
 CONTROLLERS = {c.number: c for c in (LEE, LQG, MELLINGER)}
-NAMES = {0: "auto", 1: "PID", 2: "Mellinger", 3: "INDI", 4: "Brescianini", 5: "Lee", 6: "LQG"}
+CONTROLLER_NAMES = {0: "auto", 1: "PID", 2: "Mellinger", 3: "INDI", 4: "Brescianini", 5: "Lee", 6: "LQG"}
 
 
 def controller_named(name: str) -> Controller:
@@ -81,8 +81,8 @@ def controller_named(name: str) -> Controller:
 def without_target(number: int) -> str:
     """One sentence for a controller that takes no mass."""
     return (
-        f"the {NAMES.get(number, f'number {number}')} controller takes no mass or inertia: estimates are not pushed "
-        "(select Lee, LQG or Mellinger)."
+        f"the {CONTROLLER_NAMES.get(number, f'number {number}')} controller takes no mass or inertia: "
+        "estimates are not pushed (select Lee, LQG or Mellinger)."
     )
 
 
@@ -129,7 +129,7 @@ def writes_for(
     return tuple(writes)
 
 
-EQUAL = 1e-6  # relative difference of values that is none: sixteen steps of the firmware's floats
+EQUAL_WITHIN = 1e-6  # relative difference of values that is none: sixteen steps of the firmware's floats
 
 
 def writes_back(
@@ -149,7 +149,7 @@ def writes_back(
 
     def differs(name: str) -> bool:
         value = now.get(name, math.nan)
-        return name in target and (name in uncertain or not math.isclose(value, target[name], rel_tol=EQUAL))
+        return name in target and (name in uncertain or not math.isclose(value, target[name], rel_tol=EQUAL_WITHIN))
 
     names = [n for n in ((controller.mass,) if controller.mass else ()) + controller.inertia if differs(n)]
     for stiffness, damping in controller.attitude_gains:

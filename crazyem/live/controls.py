@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 
 from crazyem.live.session import Session
-from crazyem.live.views import MARK
+from crazyem.live.views import USER_MARK
 
 
 class SessionControls:
@@ -23,27 +23,27 @@ class SessionControls:
     def toggle_push(self) -> str:
         """Nothing new is written from now on, or again; what was written is still watched."""
         pipeline = self.session.pipeline
-        if self.session.oversight is None:
+        if self.session.write_supervisor is None:
             return f"{self.name}: nothing is pushed in this session."
         pipeline.paused = not pipeline.paused
         state = "off" if pipeline.paused else "on"
-        self._tell(f"guard: pushing switched {state} by the user")
+        self._record_event(f"guard: pushing switched {state} by the user")
         return f"{self.name}: pushing is {state}."
 
     def revert(self) -> str:
-        """See `Oversight.take_back`."""
-        if self.session.oversight is None:
+        """See `WriteSupervisor.take_back`."""
+        if self.session.write_supervisor is None:
             return f"{self.name}: nothing was written in this session."
-        return f"{self.name}: {self.session.oversight.take_back()}"
+        return f"{self.name}: {self.session.write_supervisor.revert_on_request()}"
 
     def mark(self) -> str:
         """An event in the recording, and a mark in the summary."""
         time, marks = self.session.clock.newest, self.session.history.marks
         if not math.isfinite(time):
             return f"{self.name}: nothing was received yet."
-        number = 1 + sum(name.startswith(MARK) for name in tuple(marks))
-        marks[f"{MARK}{number}"] = time
-        self._tell(f"mark {MARK}{number} {time!r}")
+        number = 1 + sum(name.startswith(USER_MARK) for name in tuple(marks))
+        marks[f"{USER_MARK}{number}"] = time
+        self._record_event(f"mark {USER_MARK}{number} {time!r}")
         where = "" if self.session.recorder is not None else " (there is no recording)"
         return f"{self.name}: mark {number} at {time:.2f} s{where}."
 
@@ -54,6 +54,6 @@ class SessionControls:
         self._land()
         return f"{self.name}: landing."
 
-    def _tell(self, text: str) -> None:
+    def _record_event(self, text: str) -> None:
         if self.session.recorder is not None:
             self.session.recorder.event(text)

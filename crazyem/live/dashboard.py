@@ -19,7 +19,8 @@ from rich.text import Text
 from crazyem.live.keys import Keys
 from crazyem.live.views import NOT_PUSHED, ParameterView, Snapshot
 
-FRAME, FRAME_OF_MANY, MANY = 0.25, 1.0, 8  # s between pictures; drones from which they are rarer: each costs some ms
+# s between pictures; drones from which they are rarer: each costs some ms
+FRAME_PERIOD, FRAME_PERIOD_OF_MANY, MANY_DRONES = 0.25, 1.0, 8
 BARS = "▁▂▃▄▅▆▇█"
 HELP = "p push on/off   r revert   m mark   l land   q quit view   Ctrl-C land all, twice: cut"
 CHOOSE = "↹ next drone   "
@@ -263,8 +264,8 @@ class Dashboard:
                 redirect_stderr=False,
             ) as live:  # fmt: skip
                 while not self._stop.is_set():
-                    many = self._draw(live) >= MANY
-                    self._wait(FRAME_OF_MANY if many else FRAME)
+                    many = self._draw(live) >= MANY_DRONES
+                    self._wait(FRAME_PERIOD_OF_MANY if many else FRAME_PERIOD)
         except Exception as error:  # a view that fails must not take a flight with it
             self.failure = f"the live view ended: {error!r}."
         finally:

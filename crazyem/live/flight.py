@@ -10,16 +10,16 @@ from crazyem.control.trajectories import Trajectory, Vector, after_hover
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links.base import Link
 from crazyem.live.controllers import Controller
-from crazyem.live.oversight import Rules
 from crazyem.live.session import Session
 from crazyem.live.stream import SetpointStream
 from crazyem.live.telemetry import ARMED, CAN_FLY, FLYING, Telemetry
+from crazyem.live.write_supervisor import WriteRules
 
-BASELINE = 3.0  # s of hover before anything is pushed: shows what the drone does with what it believes now
+BASELINE_SECONDS = 3.0  # s of hover before anything is pushed: shows what the drone does with what it believes now
 CONFIRMED_WITHIN = 0.25  # s; without setpoints the drone levels out after 0.5 s
-OVERTAKEN = 0.15  # s of host time by which packets may overtake one another
+PACKET_REORDER_SECONDS = 0.15  # s of host time by which packets may overtake one another
 HAND_OVERS, HAND_OVER_EVERY = 3, 0.04  # times that the drone is handed back to land, s between them
-SILENCE = 3.0  # s of host time without a packet after which the drone counts as lost
+LOST_AFTER_SILENCE = 3.0  # s of host time without a packet after which the drone counts as lost
 REPORT_EVERY = 1.0  # s of host time between reports of progress
 
 
@@ -58,8 +58,8 @@ class FlightPlan:
     controller: Controller
     height: float = 1.0
     push: bool = True
-    rules: Rules | None = None
-    baseline: float = BASELINE
+    rules: WriteRules | None = None
+    baseline: float = BASELINE_SECONDS
 
 
 def select_controller(link: Link, controller: Controller) -> None:
@@ -195,7 +195,7 @@ class Flight:
         path = after_hover(self.path, seconds=self.plan.baseline)
         record = self.session.recorder.setpoint if self.session.recorder is not None else None
         self._stream = stream = SetpointStream(
-            self.link, path, self.session.clock, on_setpoint=record, returning=lambda: self.session.returning
+            self.link, path, self.session.clock, on_setpoint=record, reconnecting=lambda: self.session.reconnecting
         )
         self._enter("hovering")
         stream.start()
@@ -213,7 +213,7 @@ class Flight:
         self.session.stop_pushing()
         self._enter("landing")
         # What is sent into an outage is lost, and a second Ctrl-C still cuts.
-        self._wait(lambda: not self.session.returning, math.inf)
+        self._wait(lambda: not self.session.reconnecting, math.inf)
         self.session.pipeline.push_until = -math.inf  # the watch on the writes ends, too
         self.session.end_estimates()
         if self._stream is not None:
@@ -240,7 +240,7 @@ class Flight:
     def _let_setpoints_arrive(self) -> None:
         """One that came after the plan to land would make the drone forget it, and the release then stop the motors."""
         # an accelerated simulator's drone levels out after 0.5 s of its own time without setpoints
-        until = time.monotonic() + OVERTAKEN / max(1.0, self.session.clock.rate / 3.0)
+        until = time.monotonic() + PACKET_REORDER_SECONDS / max(1.0, self.session.clock.rate / 3.0)
         self._wait(lambda: time.monotonic() >= until, math.inf)
 
     def _hand_over(self, duration: float) -> None:
@@ -338,9 +338,9 @@ class Flight:
             raise FlightInterruptedError
         newest = self.session.clock.newest
         newest = newest if math.isfinite(newest) else -1.0
-        if newest != self._moved[0] or self.session.returning:
+        if newest != self._moved[0] or self.session.reconnecting:
             self._moved = (newest, now)
-        elif now - self._moved[1] > SILENCE and self.session.lost is None:
+        elif now - self._moved[1] > LOST_AFTER_SILENCE and self.session.lost is None:
             raise LinkError(self._silent())
         if self.session.lost is not None or (self.session.failure is not None and self.phase != "landing"):
             self.session.raise_if_failed()
@@ -353,7 +353,7 @@ class Flight:
             self.progress(self.phase, clock_seconds(self.session.clock.newest, self._phase_start))
 
     def _silent(self) -> str:
-        return f"the drone at {self.link.uri} was lost: nothing was received for {SILENCE:g} s."
+        return f"the drone at {self.link.uri} was lost: nothing was received for {LOST_AFTER_SILENCE:g} s."
 
 
 def clock_seconds(now: float, start: float) -> float:

@@ -14,9 +14,9 @@ from crazyem.errors import UsageError
 from crazyem.live.recorder import Recorder
 from crazyem.recordings.mcap.writer import RecordingWriter
 
-PORT = 8765  # what viewers propose
-HOST = "127.0.0.1"  # anybody who reaches the port sees the flight
-FRAME = "foxglove.FrameTransform"
+FOXGLOVE_PORT = 8765  # what viewers propose
+FOXGLOVE_HOST = "127.0.0.1"  # anybody who reaches the port sees the flight
+FRAME_SCHEMA = "foxglove.FrameTransform"
 
 
 def sdk() -> ModuleType:
@@ -37,13 +37,15 @@ class FoxgloveServer:
     Raises: UsageError: foxglove-sdk is missing, or the port is not to be had.
     """
 
-    def __init__(self, port: int = PORT) -> None:
+    def __init__(self, port: int = FOXGLOVE_PORT) -> None:
         module = sdk()
         self._context = module.Context()
         try:
-            self._server: Any = module.start_server(name="crazyem", host=HOST, port=port, context=self._context)
+            self._server: Any = module.start_server(
+                name="crazyem", host=FOXGLOVE_HOST, port=port, context=self._context
+            )
         except (OSError, RuntimeError, ValueError) as error:
-            raise UsageError(f"the live stream cannot listen on {HOST}:{port}: {error}.") from None
+            raise UsageError(f"the live stream cannot listen on {FOXGLOVE_HOST}:{port}: {error}.") from None
         self.port = int(self._server.port)
 
     def __enter__(self) -> "FoxgloveServer":
@@ -55,7 +57,7 @@ class FoxgloveServer:
     @property
     def url(self) -> str:
         """Where a viewer connects to."""
-        return f"ws://{HOST}:{self.port}"
+        return f"ws://{FOXGLOVE_HOST}:{self.port}"
 
     def recorder(self, name: str = "", metadata: Mapping[str, Mapping[str, str]] | None = None) -> RecordingWriter:
         """What a session streams through.
@@ -95,14 +97,14 @@ class Topics:
     def channel(self, topic: str, encoding: str, schema: int, metadata: Mapping[str, str] | None = None) -> int:
         """Number of a new topic."""
         kind = self._schemas[schema - 1]
-        prefix = f"/{self._name}" if self._name and kind.name != FRAME else ""  # frames have names of their own
+        prefix = f"/{self._name}" if self._name and kind.name != FRAME_SCHEMA else ""  # frames have names of their own
         self._channels.append(
             self._foxglove.Channel(
                 f"{prefix}{topic}", schema=kind, message_encoding=encoding, context=self._context,
                 metadata=dict(metadata or {}),
             )
         )  # fmt: skip
-        if kind.name == FRAME:
+        if kind.name == FRAME_SCHEMA:
             self._frames.add(len(self._channels))
         return len(self._channels)
 
@@ -116,7 +118,7 @@ class Topics:
         """A transform of this drone's frame instead of every drone's."""
         from crazyem.recordings.mcap.schemas import message_class
 
-        message = message_class(FRAME).FromString(data)
+        message = message_class(FRAME_SCHEMA).FromString(data)
         message.child_frame_id = self._name
         return bytes(message.SerializeToString())
 

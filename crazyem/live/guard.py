@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from crazyem.estimation.result import Estimate, Step
 from crazyem.live.controllers import Controller, writes_for
 
-INERTIA = ("Ixx", "Iyy", "Izz")
+INERTIA_NAMES = ("Ixx", "Iyy", "Izz")
 # After a change of mass its new value has to agree for this share of the agreement time, and may follow the last write
 # after this share of the interval: what is known is that the old value is wrong.
 STEP_SHARE = 0.4
@@ -32,7 +32,7 @@ class Limits:
         mass_deadband, inertia_deadband: relative changes smaller than this are not worth a write.
     """
 
-    parameters: tuple[str, ...] = ("mass", *INERTIA)
+    parameters: tuple[str, ...] = ("mass", *INERTIA_NAMES)
     mass_bounds: tuple[float, float] = (0.5, 2.0)
     inertia_bounds: tuple[float, float] = (0.33, 3.0)
     mass_absolute: tuple[float, float] = (0.010, 0.250)
@@ -125,7 +125,7 @@ class Guard:
 
     def _beliefs(self) -> dict[str, float]:
         parameters = ((self.controller.mass,) if self.controller.mass else ()) + self.controller.inertia
-        names = (("mass",) if self.controller.mass else ()) + (INERTIA if self.controller.inertia else ())
+        names = (("mass",) if self.controller.mass else ()) + (INERTIA_NAMES if self.controller.inertia else ())
         return {n: self.originals[p] * self.controller.scale(p) for n, p in zip(names, parameters)}
 
     def withdraw(self) -> None:
@@ -142,7 +142,7 @@ class Guard:
         """Never write again in this flight (a write was not confirmed: what the drone believes is not known)."""
         self.stopped = self.stopped or reason
 
-    def stepped(self, step: Step) -> None:
+    def on_mass_step(self, step: Step) -> None:
         """A change of mass was noticed, or it is known by now what it was: what was estimated before is of no use."""
         if step.jumped:
             self.stop(f"{step}; nothing more is pushed.")

@@ -7,9 +7,9 @@ from crazyem.live.policy import HealthLimits
 from crazyem.live.telemetry import CRASHED, FLYING, LOCKED, TUMBLED, Telemetry
 from crazyem.signals.sample import Sample
 
-AVERAGE = 1.0  # s over which the voltage is averaged: a rotor that speeds up pulls it down for a moment
-RECOVERED = 0.05  # V over the threshold before writes are allowed again
-BAD = {TUMBLED: "has tumbled", LOCKED: "is locked", CRASHED: "has crashed"}
+VOLTAGE_AVERAGE_SECONDS = 1.0  # s over which the voltage is averaged: a rotor that speeds up pulls it down for a moment
+VOLTAGE_HYSTERESIS = 0.05  # V over the threshold before writes are allowed again
+FAULT_STATES = {TUMBLED: "has tumbled", LOCKED: "is locked", CRASHED: "has crashed"}
 
 
 class Health:
@@ -31,7 +31,7 @@ class Health:
         """One sample of the flight."""
         if sample.signal == "voltage":
             self._voltages.append((sample.time, sample.value[0]))
-            while sample.time - self._voltages[0][0] > AVERAGE:
+            while sample.time - self._voltages[0][0] > VOLTAGE_AVERAGE_SECONDS:
                 self._voltages.popleft()
         elif sample.signal == "attitude":
             x, y = sample.value[0], sample.value[1]
@@ -56,7 +56,7 @@ class Health:
             return ""
         if self.telemetry.info is None:
             return "the supervisor has said nothing yet"
-        for bit, what in BAD.items():
+        for bit, what in FAULT_STATES.items():
             if self.telemetry.has(bit):
                 return f"the drone {what}"
         return "" if self.telemetry.has(FLYING) else "the supervisor does not say that the drone flies"
@@ -68,7 +68,7 @@ class Health:
         volts = self.voltage
         if math.isnan(volts):
             return "the battery's voltage is not known"
-        self._low = volts < (least + RECOVERED if self._low else least)
+        self._low = volts < (least + VOLTAGE_HYSTERESIS if self._low else least)
         return f"the battery is at {volts:.2f} V, below {least:g} V" if self._low else ""
 
     def _motion(self, age: float) -> str:

@@ -10,10 +10,10 @@ import numpy as np
 from crazyem.estimation.result import Estimate, Step
 from crazyem.signals.sample import Sample
 
-NAMES = ("mass", "Ixx", "Iyy", "Izz", "motor_time_constant")
-KEPT = 6000  # estimates; four minutes at 25 a second. The recording has them all
-ROWS = 60_000  # of a track; ten minutes at 100 Hz
-SETTLE = 4.0  # s after the first push before a tracking error counts as "after": the height loop takes 2 to 3 s
+PARAMETER_NAMES = ("mass", "Ixx", "Iyy", "Izz", "motor_time_constant")
+MOST_ESTIMATES = 6000  # estimates; four minutes at 25 a second. The recording has them all
+TRACK_ROWS = 60_000  # of a track; ten minutes at 100 Hz
+SETTLE_SECONDS = 4.0  # s after the first push before a tracking error counts as "after": the height loop takes 2 to 3 s
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Push:
 class Track:
     """Rows of time [s] and xyz [m], evenly thinned so that memory is bounded: once full, every second one goes."""
 
-    def __init__(self, rows: int = ROWS) -> None:
+    def __init__(self, rows: int = TRACK_ROWS) -> None:
         self._values, self._most = array("d"), 4 * rows
         self._every, self._seen = 1, 0
 
@@ -63,12 +63,12 @@ class History:
     Attributes:
         track: position in the world.
         setpoints: active setpoint, likewise.
-        estimates: in order; of old ones, where they are more than `KEPT`, every second (again and again).
+        estimates: in order; of old ones, where they are more than `MOST_ESTIMATES`, every second (again and again).
         pushes: every parameter write by the guard.
         marks: phase -> time on the drone's clock [s]: trajectory_start, trajectory_end, push_enabled.
         notices: sentences for the user.
         steps: changes of mass that were noticed, the newest perhaps undecided.
-        guard: what the guard was told and did, empty where there was none (`Oversight.account`).
+        guard: what the guard was told and did, empty where there was none (`WriteSupervisor.account`).
     """
 
     track: Track = field(default_factory=Track)
@@ -96,8 +96,8 @@ class History:
     def keep(self, estimate: Estimate) -> None:
         """Add an estimate. Whoever reads the list meanwhile keeps the one it has: a thinned list is another one."""
         self.estimates.append(estimate)
-        if len(self.estimates) > KEPT:
-            half = KEPT // 2
+        if len(self.estimates) > MOST_ESTIMATES:
+            half = MOST_ESTIMATES // 2
             self.estimates = self.estimates[:half:2] + self.estimates[half:]
 
     def track_array(self) -> np.ndarray:
@@ -129,7 +129,7 @@ class History:
         first = min(verified, default=math.inf)
         rms: dict[str, float | None] = {}
         height: dict[str, float | None] = {}
-        for name, keep in (("before_push", t < first), ("after_push", t >= first + SETTLE)):
+        for name, keep in (("before_push", t < first), ("after_push", t >= first + SETTLE_SECONDS)):
             e = error[keep]
             enough = len(e) >= 10
             rms[name] = float(np.sqrt((e**2).sum(axis=1).mean())) if enough else None

@@ -27,7 +27,7 @@ class Estimator(Protocol):
 
 
 class Gate(Protocol):
-    """What decides over writes (crazyem.live.guard.Guard, or crazyem.live.oversight.Oversight around it)."""
+    """What decides over writes: a `Guard`, or a `WriteSupervisor` around it."""
 
     def consider(self, estimate: Estimate, time: float, *, airborne: bool, enabled: bool = True) -> Decision: ...
 
@@ -108,9 +108,9 @@ class Pipeline:
         for step in steps[max(len(known) - 1, 0) :]:
             if step in known:
                 continue
-            stepped = getattr(self.guard, "stepped", None)
-            if stepped is not None:
-                stepped(step, time)
+            on_mass_step = getattr(self.guard, "stepped", None)
+            if on_mass_step is not None:
+                on_mass_step(step, time)
             if self.on_step is not None:
                 self.on_step(step)
 

@@ -8,7 +8,7 @@ from crazyem.errors import UsageError
 from crazyem.live.history import History
 from crazyem.vehicle import Vehicle
 
-MOST = 2000  # points per curve
+MOST_POINTS = 2000  # points per curve
 
 
 def write_plot(path: str | Path, history: History, vehicle: Vehicle, *, title: str) -> None:
@@ -22,7 +22,7 @@ def write_plot(path: str | Path, history: History, vehicle: Vehicle, *, title: s
     from matplotlib.figure import Figure
 
     track = history.track_array()
-    estimates = history.estimates[:: max(1, len(history.estimates) // MOST)] + history.estimates[-1:]
+    estimates = history.estimates[:: max(1, len(history.estimates) // MOST_POINTS)] + history.estimates[-1:]
     t0 = track[0, 0] if len(track) else (estimates[0].time if estimates else 0.0)
     time = np.array([e.time for e in estimates]) - t0
     nominal = dict(zip(("mass", "Ixx", "Iyy", "Izz"), (vehicle.mass, *vehicle.inertia)))
@@ -64,7 +64,7 @@ def write_plot(path: str | Path, history: History, vehicle: Vehicle, *, title: s
                 axis.axvline(push.time - t0, color="0.5" if push.verified else "red", linewidth=0.6, alpha=0.6)
         last = axes[4]
         if len(track):
-            thin = track[:: max(1, len(track) // MOST)]
+            thin = track[:: max(1, len(track) // MOST_POINTS)]
             last.plot(thin[:, 0] - t0, thin[:, 3], "C0", label="height")
             if np.isfinite(thin[:, 6]).any():
                 last.plot(thin[:, 0] - t0, thin[:, 6], "k:", label="height wanted")

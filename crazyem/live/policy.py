@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.live.guard import INERTIA, Limits
+from crazyem.live.guard import INERTIA_NAMES, Limits
 
-LARGEST_FILE = 65536  # bytes
-NAMES = ("mass", *INERTIA)
-ENDS = ("keep", "good", "restore")
+LARGEST_POLICY_FILE = 65536  # bytes
+WRITABLE_PARAMETERS = ("mass", *INERTIA_NAMES)
+END_RULES = ("keep", "good", "restore")
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class HealthLimits:
 
 
 @dataclass(frozen=True)
-class WatchLimits:
+class MonitorLimits:
     """What counts as worse after a write than before.
 
     Attributes:
@@ -65,7 +65,7 @@ class WatchLimits:
 
 @dataclass(frozen=True)
 class EndRules:
-    """What is left in the drone after a flight that landed, was interrupted, failed, lost its link: one of `ENDS`."""
+    """What is left in the drone after a flight that landed, was interrupted, failed, lost its link: of `END_RULES`."""
 
     landed: str = "keep"
     interrupted: str = "keep"
@@ -80,13 +80,13 @@ class Policy:
     name: str = "default"
     limits: Limits = field(default_factory=Limits)
     health: HealthLimits = field(default_factory=HealthLimits)
-    watch: WatchLimits = field(default_factory=WatchLimits)
+    watch: MonitorLimits = field(default_factory=MonitorLimits)
     end: EndRules = field(default_factory=EndRules)
 
     def entries(self) -> dict[str, dict[str, Any]]:
         """Section -> key -> value, in the units of the file."""
         table: dict[str, dict[str, Any]] = {}
-        for section, key, part, name, kind in _KEYS:
+        for section, key, part, name, kind in _POLICY_KEYS:
             table.setdefault(section, {})[key] = kind.shown(getattr(getattr(self, part), name))
         return table
 
@@ -139,7 +139,7 @@ def _range(low: float, high: float) -> _Kind:
     return _Kind(read, list)
 
 
-def _whole(low: int, high: int) -> _Kind:
+def _integer(low: int, high: int) -> _Kind:
     def read(value: Any) -> int:
         if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
             raise ValueError(f"a whole number in [{low}, {high}]")
@@ -155,16 +155,16 @@ def _read_flag(value: Any) -> bool:
 
 
 def _read_names(value: Any) -> tuple[str, ...]:
-    if not isinstance(value, list) or not all(isinstance(v, str) and v in NAMES for v in value):
-        raise ValueError(f"a list of {', '.join(NAMES)}")
+    if not isinstance(value, list) or not all(isinstance(v, str) and v in WRITABLE_PARAMETERS for v in value):
+        raise ValueError(f"a list of {', '.join(WRITABLE_PARAMETERS)}")
     if ("Ixx" in value) != ("Iyy" in value):
         raise ValueError("without Ixx or with Iyy, too: roll and pitch share their scale of gains")
-    return tuple(n for n in NAMES if n in value)
+    return tuple(n for n in WRITABLE_PARAMETERS if n in value)
 
 
 def _read_end(value: Any) -> str:
-    if value not in ENDS:
-        raise ValueError(f"one of {', '.join(ENDS)}")
+    if value not in END_RULES:
+        raise ValueError(f"one of {', '.join(END_RULES)}")
     return str(value)
 
 
@@ -173,7 +173,7 @@ _SECONDS, _SHARE, _RATIO = _number(0.0, 60.0), _number(0.0, 1.0), _number(1.0, 1
 _DEGREE = math.radians(1.0)
 
 # section, key, part of the policy, its field, kind
-_KEYS: tuple[tuple[str, str, str, str, _Kind], ...] = (
+_POLICY_KEYS: tuple[tuple[str, str, str, str, _Kind], ...] = (
     ("push", "parameters", "limits", "parameters", _PARAMETERS),
     ("push", "interval_s", "limits", "interval", _number(0.05, 600.0)),
     ("push", "slew", "limits", "slew", _number(0.001, 0.5)),
@@ -197,7 +197,7 @@ _KEYS: tuple[tuple[str, str, str, str, _Kind], ...] = (
     ("watch", "before_s", "watch", "before", _number(0.5, 60.0)),
     ("watch", "settle_s", "watch", "settle", _SECONDS),
     ("watch", "after_s", "watch", "after", _number(0.5, 60.0)),
-    ("watch", "unjudged_writes", "watch", "unjudged", _whole(1, 1000)),
+    ("watch", "unjudged_writes", "watch", "unjudged", _integer(1, 1000)),
     ("watch", "tracking_ratio", "watch", "tracking_ratio", _RATIO),
     ("watch", "tracking_m", "watch", "tracking", _number(0.0, 100.0)),
     ("watch", "tracking_alarm_m", "watch", "tracking_alarm", _number(0.0, 100.0)),
@@ -212,7 +212,7 @@ _KEYS: tuple[tuple[str, str, str, str, _Kind], ...] = (
     ("end", "failed", "end", "failed", _END),
     ("end", "link_lost", "end", "link_lost", _END),
 )  # fmt: skip
-_PARTS = ("limits", "health", "watch", "end")
+_POLICY_PARTS = ("limits", "health", "watch", "end")
 
 
 def default_text() -> str:
@@ -230,12 +230,12 @@ def load_policy(path: str | Path | None = None) -> Policy:
         return parse_policy(default_text(), where="the default policy")
     try:
         with Path(path).open("rb") as file:
-            data = file.read(LARGEST_FILE + 1)
+            data = file.read(LARGEST_POLICY_FILE + 1)
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
         raise UsageError(f"cannot read the policy {path}: {why}.") from None
-    if len(data) > LARGEST_FILE:
-        raise FileFormatError(f"{path}: not a policy file: larger than {LARGEST_FILE} bytes.")
+    if len(data) > LARGEST_POLICY_FILE:
+        raise FileFormatError(f"{path}: not a policy file: larger than {LARGEST_POLICY_FILE} bytes.")
     try:
         source = data.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -254,8 +254,8 @@ def parse_policy(source: str, *, where: str = "policy") -> Policy:
         raise FileFormatError(f"{where}: key 'name' must be a short text")
     _check_names(data, where)
     policy = Policy(name=name)
-    changes: dict[str, dict[str, Any]] = {part: {} for part in _PARTS}
-    for section, key, part, attribute, kind in _KEYS:
+    changes: dict[str, dict[str, Any]] = {part: {} for part in _POLICY_PARTS}
+    for section, key, part, attribute, kind in _POLICY_KEYS:
         if key not in data.get(section, {}):
             continue
         value = data[section][key]
@@ -268,7 +268,7 @@ def parse_policy(source: str, *, where: str = "policy") -> Policy:
 
 def _check_names(data: Mapping[str, Any], where: str) -> None:
     known: dict[str, list[str]] = {}
-    for section, key, *_ in _KEYS:
+    for section, key, *_ in _POLICY_KEYS:
         known.setdefault(section, []).append(key)
     for section, values in data.items():
         if section not in known:

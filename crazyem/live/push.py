@@ -17,9 +17,9 @@ from crazyem.live.history import History, Push
 from crazyem.live.write_gate import WriteGate
 
 WRITE_TIMEOUT = 0.3  # s; an echo takes 2 to 30 ms on a working link, and the link does not send again so soon
-MOMENT = 0.1  # s before the next attempt: a link that refuses at once is known as lost a little later
-ATTEMPTS = 9  # of a write, 3.6 s in all: an outage is noticed within 2 s, and attempts during it do not count
-LOOK_AGAIN = 0.01  # s between looks for fresh telemetry
+RETRY_PAUSE = 0.1  # s before the next attempt: a link that refuses at once is known as lost a little later
+WRITE_ATTEMPTS = 9  # of a write, 3.6 s in all: an outage is noticed within 2 s, and attempts during it do not count
+TELEMETRY_POLL = 0.01  # s between looks for fresh telemetry
 
 
 def running_controller(link: Link) -> int:
@@ -109,7 +109,7 @@ class Pusher:
         """Finish the set that is being written and a restore that is queued, then end; bounded by the time that one
         write and its undoing may take."""
         self._queue.put(None)
-        self._thread.join(timeout=2 * ATTEMPTS * (self.timeout + 2 * MOMENT) + 1.0)
+        self._thread.join(timeout=2 * WRITE_ATTEMPTS * (self.timeout + 2 * RETRY_PAUSE) + 1.0)
         if self._thread.is_alive():
             self.history.notice("parameter writes were still waiting for the drone when the session ended.")
 
@@ -187,9 +187,9 @@ class Pusher:
         `patient`: wait for telemetry that is not fresh; else such a write is not begun.
         """
         why, sent, failed = "no echo came", False, 0
-        for attempt in range(2 * ATTEMPTS):
+        for attempt in range(2 * WRITE_ATTEMPTS):
             if attempt:
-                clock.sleep(MOMENT)
+                clock.sleep(RETRY_PAUSE)
                 if not self.wait_for_link():
                     break
             outages = self.outages()
@@ -203,7 +203,7 @@ class Pusher:
                 why = self._attempt(name, value)
             # One during which the link was lost was none: an outage is noticed two seconds after its last packet.
             failed += self.outages() == outages
-            if not why or failed == ATTEMPTS:
+            if not why or failed == WRITE_ATTEMPTS:
                 break
         if sent:
             self.history.pushes.append(Push(time, name, value, not why, purpose))
@@ -215,7 +215,7 @@ class Pusher:
         """Why the gate does not let a write pass, "" if it does, and whether that is final."""
         until = clock.monotonic() + self.timeout
         while (why := self.gate.stale()) and patient and clock.monotonic() < until:
-            clock.sleep(LOOK_AGAIN)
+            clock.sleep(TELEMETRY_POLL)
         if why:
             return why, not patient
         why = self.gate.misplaced(purpose)

@@ -2,7 +2,7 @@
 
 Threads: one receives (records, keeps clock and telemetry; cheap, so flying is never blind), one estimates, one writes
 parameters. Setpoints have a thread of their own (stream.py). None of them waits for another. Where one process has many
-sessions, a crew receives and estimates for all of them (crew.py).
+sessions, a scheduler receives and estimates for all of them (scheduler.py).
 """
 
 import math
@@ -15,31 +15,31 @@ from crazyem.errors import CrazyemError, DataError, LinkError, UsageError
 from crazyem.estimation.result import Estimate, Step
 from crazyem.links.base import AnotherDroneError, Block, Link, LinkLost, Outage, Packet, link_account
 from crazyem.live.clock import FirmwareClock
-from crazyem.live.crew import Crew, Mailbox
 from crazyem.live.guard import Guard
 from crazyem.live.history import History
-from crazyem.live.hover import hover_rules, hover_target
-from crazyem.live.oversight import Oversight, Rules
+from crazyem.live.hover_thrust import hover_rules, hover_target
 from crazyem.live.pipeline import Estimator, Pipeline
 from crazyem.live.policy import load_policy
 from crazyem.live.push import Pusher, push_target, read_originals
 from crazyem.live.recorder import Recorder
+from crazyem.live.scheduler import Mailbox, Scheduler
 from crazyem.live.telemetry import Telemetry
 from crazyem.live.write_gate import WriteGate
+from crazyem.live.write_supervisor import WriteRules, WriteSupervisor
 from crazyem.signals.sample import Sample
 from crazyem.signals.vocabulary import MOTOR_BLOCK, ROTOR_SPEED_BLOCK, STATE_BLOCK, decoders
 from crazyem.vehicle import Vehicle
 
 # Every 11 ms: in step with the onboard estimate, predicted every 10 ms, logged commands are off by the same part of a
 # step for seconds (docs/estimator.md, In step).
-RATE = 1000.0 / 11.0  # Hz
-LINK_EVERY = 1.0  # s between notes on the link's health
+LOG_RATE = 1000.0 / 11.0  # Hz
+LINK_RECORD_PERIOD = 1.0  # s between notes on the link's health
 # A drone under low-level setpoints levels out after 0.5 s without them and cuts its motors after 2 s; one that hovers
 # by itself goes on. So a link is worth waiting for, but not for long.
 RECONNECT_WITHIN = 8.0  # s
-STATE = STATE_BLOCK + tuple(f"stateEstimateZ.rate{a}" for a in ("Roll", "Pitch", "Yaw"))
-EXTRA = tuple(f"acc.{a}" for a in "xyz") + tuple(f"ctrltargetZ.{a}" for a in "xyz")
-WRENCH = ("thrustSi", "torquex", "torquey", "torquez")
+STATE_VARIABLES = STATE_BLOCK + tuple(f"stateEstimateZ.rate{a}" for a in ("Roll", "Pitch", "Yaw"))
+EXTRA_VARIABLES = tuple(f"acc.{a}" for a in "xyz") + tuple(f"ctrltargetZ.{a}" for a in "xyz")
+WRENCH_VARIABLES = ("thrustSi", "torquex", "torquey", "torquez")
 
 
 def block_plan(available: Sequence[str], *, wrench: str = "ctrlLee") -> list[tuple[str, ...]]:
@@ -54,13 +54,13 @@ def block_plan(available: Sequence[str], *, wrench: str = "ctrlLee") -> list[tup
         UsageError: naming a variable the estimator cannot do without.
     """
     names = set(available)
-    for needed in (*STATE, *MOTOR_BLOCK):
+    for needed in (*STATE_VARIABLES, *MOTOR_BLOCK):
         if needed not in names:
             raise UsageError(f"the drone has no log variable {needed}, which the estimator needs.")
     motors = MOTOR_BLOCK + (ROTOR_SPEED_BLOCK if names.issuperset(ROTOR_SPEED_BLOCK) else ())
-    commanded = tuple(f"{wrench}.{n}" for n in WRENCH)
-    optional = (tuple(v for v in extra if v in names) for extra in (EXTRA, commanded))
-    return [STATE, motors, *(extra for extra in optional if extra)]
+    commanded = tuple(f"{wrench}.{n}" for n in WRENCH_VARIABLES)
+    optional = (tuple(v for v in extra if v in names) for extra in (EXTRA_VARIABLES, commanded))
+    return [STATE_VARIABLES, motors, *(extra for extra in optional if extra)]
 
 
 class Session:
@@ -76,7 +76,7 @@ class Session:
         rate: of the log, Hz; beyond 100 the firmware must start blocks by the millisecond.
         reconnect_within: s for which a lost link is tried again, 0 = never. The window is kept: the estimator sees the
             gap in the stamps and begins a new stretch after it.
-        crew: whose threads receive and estimate, where one process has many sessions; None: threads of its own.
+        scheduler: whose threads receive and estimate, where one process has many sessions; None: threads of its own.
     """
 
     def __init__(
@@ -88,9 +88,9 @@ class Session:
         recorder: Recorder | None = None,
         wrench: str = "ctrlLee",
         on_estimate: Callable[[Estimate], None] | None = None,
-        rate: float = RATE,
+        rate: float = LOG_RATE,
         reconnect_within: float = RECONNECT_WITHIN,
-        crew: Crew | None = None,
+        scheduler: Scheduler | None = None,
     ) -> None:
         self.link = link
         self.vehicle = vehicle
@@ -106,18 +106,20 @@ class Session:
         self._linked.set()
         self.failure: CrazyemError | None = None
         self.pusher: Pusher | None = None
-        self.oversight: Oversight | None = None
+        self.write_supervisor: WriteSupervisor | None = None
         self._wrench = wrench
         self._on_estimate = on_estimate
         self.pipeline = Pipeline(estimator, history=self.history, on_estimate=self._estimated)
-        self.pipeline.on_step = self._stepped
+        self.pipeline.on_step = self._record_step
         self.blocks: tuple[Block, ...] = ()
         self._samples: queue.SimpleQueue[list[Sample] | None] = queue.SimpleQueue()
-        self._crew = crew
-        self._mailbox: Mailbox | None = crew.mailbox(self._feed, self._estimating_failed) if crew is not None else None
-        self._deaf = False  # nothing is received any more
-        self._bringing_back: threading.Thread | None = None  # a lost link, for a crew: its thread must not wait
-        self._link_told = -math.inf
+        self._scheduler = scheduler
+        self._mailbox: Mailbox | None = (
+            scheduler.mailbox(self._feed, self._estimating_failed) if scheduler is not None else None
+        )
+        self._receiving_ended = False  # nothing is received any more
+        self._reconnection: threading.Thread | None = None  # a lost link, for a scheduler: its thread must not wait
+        self._link_recorded = -math.inf
         self._end_wanted = False
         self._stop = threading.Event()
         self._closed = False
@@ -144,8 +146,8 @@ class Session:
             self.recorder.blocks(self.blocks)
         self._decoders = decoders(self.blocks)
         self._names = {b.identifier: tuple(v.name for v in b.variables) for b in self.blocks}
-        if self._crew is not None:
-            self._crew.rounds.add(self._take_in)
+        if self._scheduler is not None:
+            self._scheduler.poller.add(self._take_in)
             return
         for target, name in ((self._receive, "crazyem-receive"), (self._estimate, "crazyem-estimate")):
             thread = threading.Thread(target=target, name=name, daemon=True)
@@ -158,13 +160,13 @@ class Session:
         if keep is not None:
             self.link.on_frame = keep  # type: ignore[attr-defined]
 
-    def push_to_controller(self, rules: Rules | None = None) -> str:
+    def push_to_controller(self, rules: WriteRules | None = None) -> str:
         """Let the guard push to the controller that runs now; returns a sentence if there is anything to say.
 
         Args:
             rules: policy, dry run, confirmation; the shipped policy without.
         """
-        rules = rules or Rules(load_policy())
+        rules = rules or WriteRules(load_policy())
         if getattr(self.link, "hover_parameter", None) is not None:
             controller, note = hover_target(self.link, self.vehicle)
             rules = hover_rules(rules, self.link, controller)
@@ -183,7 +185,7 @@ class Session:
             self.recorder.metadata("guard", {"mode": rules.mode, "policy": rules.policy.to_toml()})
         host_clock = getattr(self.link, "host_clock", time.time)  # that of `Packet.host_time`
         gate = WriteGate(self.telemetry, rate=lambda: self.clock.rate, now=host_clock)
-        oversight = Oversight(
+        write_supervisor = WriteSupervisor(
             guard,
             rules,
             originals=originals,
@@ -192,33 +194,33 @@ class Session:
             now=lambda: self.clock.newest,
             residual=lambda: getattr(self.pipeline.estimator, "residual", None),
             enabled=lambda time: self.pipeline.push_from <= time <= self.pipeline.push_until,
-            tell=self._tell,
+            record=self._record_event,
         )
         if not rules.dry_run:
-            self.pusher = oversight.pusher = Pusher(
+            self.pusher = write_supervisor.pusher = Pusher(
                 self.link,
                 guard,
                 gate=gate,
                 history=self.history,
                 on_write=on_write,
                 wait_for_link=self.wait_for_link,
-                outages=lambda: len(self.outages) + self.returning,
+                outages=lambda: len(self.outages) + self.reconnecting,
                 known=originals,
-                on_done=oversight.done,
+                on_done=write_supervisor.on_written,
             )
             self.pipeline.push = self.pusher.submit
-        self.pipeline.guard = self.oversight = oversight
+        self.pipeline.guard = self.write_supervisor = write_supervisor
         return note
 
     def stop_pushing(self) -> None:
         """Begin no new set of writes from now on: the first step of every way out."""
-        if self.oversight is not None:
-            self.oversight.stop()
+        if self.write_supervisor is not None:
+            self.write_supervisor.stop()
 
     def end_pushing(self, outcome: str) -> None:
         """The flight is over, `landed`, `interrupted`, `failed` or `link_lost`: keep or restore, as the policy says."""
-        if self.oversight is not None:
-            self.oversight.end(outcome)
+        if self.write_supervisor is not None:
+            self.write_supervisor.end(outcome)
 
     def end_estimates(self) -> None:
         """Keep what comes from now on out of the estimate: a landing excites little and ends near the ground.
@@ -268,13 +270,13 @@ class Session:
         self._stop.set()
         for thread in self._threads:
             thread.join(timeout=30.0)
-        if self._crew is not None and self._mailbox is not None:
-            self._crew.rounds.remove(self._take_in)
-            if self._bringing_back is not None:
-                self._bringing_back.join(timeout=30.0)
+        if self._scheduler is not None and self._mailbox is not None:
+            self._scheduler.poller.remove(self._take_in)
+            if self._reconnection is not None:
+                self._reconnection.join(timeout=30.0)
             self._mailbox.wait(30.0)
-        if self.oversight is not None:
-            self.oversight.close()
+        if self.write_supervisor is not None:
+            self.write_supervisor.close()
         if self.recorder is not None and self.blocks:
             account: dict[str, str] = dict(getattr(self.link, "account", dict)())
             self.recorder.metadata("link", {**link_account(self.link.statistics(), self.outages), **account})
@@ -288,8 +290,8 @@ class Session:
         if self._on_estimate is not None:
             self._on_estimate(estimate)
 
-    def _stepped(self, step: Step) -> None:
-        self._tell(str(step))
+    def _record_step(self, step: Step) -> None:
+        self._record_event(str(step))
 
     def _receive(self) -> None:
         try:
@@ -299,7 +301,7 @@ class Session:
                 except queue.Empty:
                     continue
                 if isinstance(item, LinkLost):
-                    if self._come_back(item):
+                    if self._reconnect(item):
                         continue
                     break
                 self._packet(item)
@@ -309,22 +311,22 @@ class Session:
             self._samples.put(None)
 
     def _take_in(self) -> bool:
-        """What has arrived, for a crew's thread; whether there was anything. Never waits."""
-        if self._bringing_back is not None:
-            if self._bringing_back.is_alive():
+        """What has arrived, for a scheduler's thread; whether there was anything. Never waits."""
+        if self._reconnection is not None:
+            if self._reconnection.is_alive():
                 return False
-            self._bringing_back = None
+            self._reconnection = None
         some = False
         try:
-            while not self._deaf and not self._stop.is_set():
+            while not self._receiving_ended and not self._stop.is_set():
                 item = self.link.packets.get_nowait()
                 some = True
                 if isinstance(item, LinkLost):
                     self._linked.clear()
-                    self._bringing_back = threading.Thread(
-                        target=self._try_to_come_back, args=(item,), name="crazyem-reconnect", daemon=True
+                    self._reconnection = threading.Thread(
+                        target=self._reconnect_in_background, args=(item,), name="crazyem-reconnect", daemon=True
                     )
-                    self._bringing_back.start()
+                    self._reconnection.start()
                     break
                 self._packet(item)
         except queue.Empty:
@@ -333,9 +335,9 @@ class Session:
             self._receiving_failed(error)
         return some
 
-    def _try_to_come_back(self, lost: LinkLost) -> None:
+    def _reconnect_in_background(self, lost: LinkLost) -> None:
         try:
-            self._deaf = not self._come_back(lost)
+            self._receiving_ended = not self._reconnect(lost)
         except Exception as error:
             self._receiving_failed(error)
         finally:
@@ -343,13 +345,13 @@ class Session:
 
     def _receiving_failed(self, error: Exception) -> None:
         """A fault of ours must reach the flight as well: it has to land."""
-        self._deaf = True
+        self._receiving_ended = True
         self.telemetry.heard = -math.inf
         self.stop_pushing()
         self.failure = error if isinstance(error, CrazyemError) else CrazyemError(f"receiving failed: {error!r}")
 
     @property
-    def returning(self) -> bool:
+    def reconnecting(self) -> bool:
         """Whether the link is lost and being brought back."""
         return not self._linked.is_set()
 
@@ -358,20 +360,20 @@ class Session:
         self._linked.wait(self.reconnect_within + 5.0)
         return self._linked.is_set() and self.lost is None
 
-    def _come_back(self, lost: LinkLost) -> bool:
+    def _reconnect(self, lost: LinkLost) -> bool:
         """Bring the link back; there is nothing to receive meanwhile. False: lost for good."""
         self.telemetry.heard = -math.inf
         reconnect = getattr(self.link, "reconnect", None)
         if reconnect is None or not getattr(self.link, "can_reconnect", True) or self.reconnect_within <= 0.0:
-            self._gone(lost)
+            self._give_up(lost)
             return False
         self._linked.clear()
-        self._tell(f"the link was lost, trying again: {lost.reason}")
+        self._record_event(f"the link was lost, trying again: {lost.reason}")
         try:
             outage: Outage = reconnect(self.reconnect_within, self._stop)
         except LinkError as error:
             reason = f"{lost.reason.rstrip('.')}; {str(error)[:1].lower()}{str(error)[1:]}"
-            self._gone(LinkLost(reason, lost.host_time, restarted=isinstance(error, AnotherDroneError)))
+            self._give_up(LinkLost(reason, lost.host_time, restarted=isinstance(error, AnotherDroneError)))
             return False
         else:
             self.outages.append(outage)
@@ -382,16 +384,16 @@ class Session:
             f"{outage.after_ms / 1000:.3f} s of the drone's clock) and came back."
         )
         self.history.notice(sentence)
-        self._tell(sentence)
+        self._record_event(sentence)
         return True
 
-    def _gone(self, lost: LinkLost) -> None:
+    def _give_up(self, lost: LinkLost) -> None:
         self.stop_pushing()
-        if lost.restarted and self.oversight is not None:
-            self.oversight.restarted()
+        if lost.restarted and self.write_supervisor is not None:
+            self.write_supervisor.on_restart()
         self.lost = lost
 
-    def _tell(self, sentence: str) -> None:
+    def _record_event(self, sentence: str) -> None:
         if self.recorder is not None:
             self.recorder.event(sentence)
 
@@ -404,9 +406,9 @@ class Session:
             return  # a block of somebody else's
         if self.recorder is not None:
             self.recorder.packet(packet)
-            if packet.host_time - self._link_told >= LINK_EVERY:
-                self._link_told = packet.host_time
-                self._tell_link(packet)
+            if packet.host_time - self._link_recorded >= LINK_RECORD_PERIOD:
+                self._link_recorded = packet.host_time
+                self._record_link(packet)
         if "supervisor.info" in names:
             info = packet.values[names.index("supervisor.info")]
             self.telemetry.info = int(info) if math.isfinite(info) else None
@@ -422,11 +424,11 @@ class Session:
         samples = self._decoders[packet.block].decode(packet)
         for sample in samples:
             self.telemetry.take(sample)
-        if self.oversight is not None:
-            self.oversight.take(samples)
+        if self.write_supervisor is not None:
+            self.write_supervisor.take(samples)
         (self._samples if self._mailbox is None else self._mailbox).put(samples)
 
-    def _tell_link(self, packet: Packet) -> None:
+    def _record_link(self, packet: Packet) -> None:
         """The link's health, into the recording; latency against the promptest packets, where the link knows them."""
         assert self.recorder is not None
         clock = getattr(self.link, "clock", None)

@@ -13,7 +13,7 @@ from types import TracebackType
 
 from crazyem.errors import CrazyemError, FileFormatError
 
-READY = re.compile(r"(udp://\S+)")
+READY_LINE = re.compile(r"(udp://\S+)")
 START_TIMEOUT = 180.0  # s; the first start on a machine compiles the plant's kernels
 
 
@@ -104,7 +104,7 @@ class Simulator:
                 if self._scenario is not None and Path(str(self._scenario)).name in reason:
                     raise FileFormatError(reason)
                 raise CrazyemError(f"the simulator did not start: {reason}")
-            found = READY.search(line)
+            found = READY_LINE.search(line)
             if found:
                 self.uri = found.group(1)
                 return self.uri

@@ -12,10 +12,10 @@ from crazyem.live.clock import FirmwareClock
 # Each setpoint makes a step in the commanded torques. Sent at the rate of the log (100 Hz), the steps would keep their
 # place between two log samples and the logged motor commands would be off by a constant part of every step: measured,
 # 6 % of the yaw torque, which goes straight into Izz. Seven milliseconds visit every place within 70 ms.
-PERIOD = 0.007  # s of firmware time
-LEAP = 0.5  # s of the trajectory from one setpoint to the next after an outage that are too many
-NOTICED_WITHIN = 0.3  # s from the loss of a link until the session knows of it
-SHORTEST = 0.0005  # s of host time; below this a fast simulator gets setpoints further apart
+SETPOINT_PERIOD = 0.007  # s of firmware time
+LARGEST_LEAP = 0.5  # s of the trajectory from one setpoint to the next after an outage that are too many
+OUTAGE_NOTICE_SECONDS = 0.3  # s from the loss of a link until the session knows of it
+SHORTEST_PERIOD = 0.0005  # s of host time; below this a fast simulator gets setpoints further apart
 
 
 class SetpointStream:
@@ -33,13 +33,13 @@ class SetpointStream:
         clock: FirmwareClock,
         *,
         on_setpoint: Callable[[float, Reference], None] | None = None,
-        returning: Callable[[], bool] | None = None,
+        reconnecting: Callable[[], bool] | None = None,
     ) -> None:
         self.link = link
         self.trajectory = trajectory
         self.clock = clock
         self.on_setpoint = on_setpoint
-        self.returning = returning or (lambda: False)
+        self.reconnecting = reconnecting or (lambda: False)
         self.left_out = 0
         self._reached = 0.0
         self._after_outage = False
@@ -75,7 +75,9 @@ class SetpointStream:
                     self.sent += 1
                     if self.on_setpoint is not None:
                         self.on_setpoint(firmware, r)
-                due = max(due + max(PERIOD / max(self.clock.rate, 1e-3), SHORTEST), time.monotonic() - 0.05)
+                due = max(
+                    due + max(SETPOINT_PERIOD / max(self.clock.rate, 1e-3), SHORTEST_PERIOD), time.monotonic() - 0.05
+                )
                 self._stop.wait(max(due - time.monotonic(), 0.0))
         except Exception as error:
             self.failure = error
@@ -83,9 +85,9 @@ class SetpointStream:
     def _progress(self, firmware: float) -> float:
         """The trajectory's time [s]; after an outage it goes on where it stood: a leap shakes the drone."""
         progress = firmware - self.began
-        if self.returning():
+        if self.reconnecting():
             self._after_outage = True
-        elif self._after_outage and progress - self._reached > LEAP:
+        elif self._after_outage and progress - self._reached > LARGEST_LEAP:
             self.began += progress - self._reached
             self._after_outage, progress = False, self._reached
         self._reached = progress
@@ -97,8 +99,8 @@ class SetpointStream:
             self.link.send_full_state(r.position, r.velocity, r.acceleration, r.quaternion, (0.0, 0.0, r.yaw_rate))
         except LinkError as error:
             # The link reports its loss through the queue of packets: give whoever reads it a moment to act on it.
-            until = time.monotonic() + NOTICED_WITHIN
-            while not self.returning():
+            until = time.monotonic() + OUTAGE_NOTICE_SECONDS
+            while not self.reconnecting():
                 if time.monotonic() > until or self._stop.is_set():
                     raise error
                 time.sleep(0.005)

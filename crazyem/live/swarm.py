@@ -25,15 +25,16 @@ import numpy as np
 from crazyem.control.trajectories import Reference, Trajectory, Vector, smooth_step
 from crazyem.errors import FileFormatError, UsageError
 
-MOST = 100  # drones
-LARGEST_FILE = 1 << 18  # bytes
-CLOSEST = 0.3  # m between two drones: three times the width of a Crazyflie, and out of the worst of its downwash
-FARTHEST = 20.0  # m of an offset
-SPEED = 0.5  # m/s, mean, on the way to an offset
-STEP, LOOKS = 0.1, 2000  # s between looks at distances along trajectories, and how many at most
+MOST_DRONES = 100  # drones
+LARGEST_SWARM_FILE = 1 << 18  # bytes
+# m between two drones: three times the width of a Crazyflie, and out of the worst of its downwash
+CLOSEST_DISTANCE = 0.3
+LARGEST_OFFSET = 20.0  # m of an offset
+TRANSIT_SPEED = 0.5  # m/s, mean, on the way to an offset
+DISTANCE_STEP, MOST_DISTANCE_STEPS = 0.1, 2000  # s between looks at distances along trajectories, and how many at most
 SWITCH_INTERVAL = 0.0005  # s; the interpreter's 5 ms would be an eighth of an update's budget at every hand-over
-_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
-_KEYS = ("name", "uri", "vehicle", "trajectory", "offset")
+_DRONE_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
+_DRONE_KEYS = ("name", "uri", "vehicle", "trajectory", "offset")
 
 Maker = Callable[[Vector, float], Trajectory]
 
@@ -58,15 +59,15 @@ class Course:
     path: Trajectory
 
 
-def settle_interpreter() -> None:
+def shorten_switch_interval() -> None:
     """Let threads hand over the interpreter ten times as often as usual: many of them wait for each other here."""
     sys.setswitchinterval(SWITCH_INTERVAL)
 
 
 def members_of(uris: Sequence[str], *, vehicle: str, trajectory: Sequence[str]) -> list[Member]:
     """Drones named on the command line. Raises UsageError: too many, or one twice."""
-    if len(uris) > MOST:
-        raise UsageError(f"at most {MOST} drones can be flown or watched at once, not {len(uris)}.")
+    if len(uris) > MOST_DRONES:
+        raise UsageError(f"at most {MOST_DRONES} drones can be flown or watched at once, not {len(uris)}.")
     double = next((u for i, u in enumerate(uris) if u in uris[:i]), None)
     if double is not None:
         raise UsageError(f"{double} is given twice.")
@@ -84,11 +85,11 @@ def read_swarm(path: str | Path, *, vehicle: str, trajectory: Sequence[str]) -> 
     """
     try:
         with open(path, "rb") as file:
-            data = file.read(LARGEST_FILE + 1)
+            data = file.read(LARGEST_SWARM_FILE + 1)
     except (OSError, ValueError) as error:
         raise UsageError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}.") from None
-    if len(data) > LARGEST_FILE:
-        raise FileFormatError(f"{path}: larger than {LARGEST_FILE} bytes, not a swarm file.")
+    if len(data) > LARGEST_SWARM_FILE:
+        raise FileFormatError(f"{path}: larger than {LARGEST_SWARM_FILE} bytes, not a swarm file.")
     try:
         table = tomllib.loads(data.decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -98,8 +99,8 @@ def read_swarm(path: str | Path, *, vehicle: str, trajectory: Sequence[str]) -> 
         raise FileFormatError(f"{path}: {next(iter(table))} is not part of a swarm (only [[drone]] is).")
     if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
         raise FileFormatError(f"{path}: a swarm needs at least one [[drone]].")
-    if len(entries) > MOST:
-        raise FileFormatError(f"{path}: a swarm has at most {MOST} drones, not {len(entries)}.")
+    if len(entries) > MOST_DRONES:
+        raise FileFormatError(f"{path}: a swarm has at most {MOST_DRONES} drones, not {len(entries)}.")
     members = [
         _member(entry, f"{path}: drone {i}", Member(f"drone{i}", "", vehicle, tuple(trajectory)), Path(path).parent)
         for i, entry in enumerate(entries)
@@ -113,9 +114,9 @@ def read_swarm(path: str | Path, *, vehicle: str, trajectory: Sequence[str]) -> 
 
 
 def _member(entry: Mapping[str, Any], where: str, base: Member, folder: Path) -> Member:
-    unknown = next((key for key in entry if key not in _KEYS), None)
+    unknown = next((key for key in entry if key not in _DRONE_KEYS), None)
     if unknown is not None:
-        raise FileFormatError(f"{where}: {unknown} is not a key of a drone (known: {', '.join(_KEYS)}).")
+        raise FileFormatError(f"{where}: {unknown} is not a key of a drone (known: {', '.join(_DRONE_KEYS)}).")
     values: dict[str, Any] = {}
     for key in ("uri", "vehicle", "name"):
         if key in entry:
@@ -124,7 +125,7 @@ def _member(entry: Mapping[str, Any], where: str, base: Member, folder: Path) ->
             values[key] = entry[key]
     if "uri" not in values:
         raise FileFormatError(f"{where}: uri is missing.")
-    if not _NAME.fullmatch(values.get("name", "a")):
+    if not _DRONE_NAME.fullmatch(values.get("name", "a")):
         raise FileFormatError(f"{where}: name must be 1 to 40 letters, digits, - or _, not {values['name']!r}.")
     if "vehicle" in values and (folder / values["vehicle"]).is_file():
         values["vehicle"] = str(folder / values["vehicle"])
@@ -148,18 +149,18 @@ def _vector(value: Any, where: str) -> Vector:
     if not isinstance(value, list) or len(value) != 3:
         raise FileFormatError(f"{where} must be 3 numbers, not {value!r}.")
     for v in value:
-        if isinstance(v, bool) or not isinstance(v, int | float) or not -FARTHEST <= v <= FARTHEST:
-            raise FileFormatError(f"{where} must lie between {-FARTHEST:g} and {FARTHEST:g} m, not {v!r}.")
+        if isinstance(v, bool) or not isinstance(v, int | float) or not -LARGEST_OFFSET <= v <= LARGEST_OFFSET:
+            raise FileFormatError(f"{where} must lie between {-LARGEST_OFFSET:g} and {LARGEST_OFFSET:g} m, not {v!r}.")
     return float(value[0]), float(value[1]), float(value[2])
 
 
-def displaced(make: Maker, offset: Vector) -> Maker:
+def with_offset(make: Maker, offset: Vector) -> Maker:
     """Trajectories that begin `offset` [m, world] away: the way there first, at rest at both of its ends."""
     distance = math.hypot(*offset)
     if distance == 0.0:
         return make
     # The polynomial's top speed is 35/16 of its mean.
-    duration = max(2.0, distance / SPEED)
+    duration = max(2.0, distance / TRANSIT_SPEED)
 
     def maker(position: Vector, yaw: float) -> Trajectory:
         goal = (position[0] + offset[0], position[1] + offset[1], position[2] + offset[2])
@@ -183,21 +184,24 @@ def check_distances(courses: Mapping[str, Course]) -> None:
     """Refuse drones that would come too close. All are taken to begin together, as far as that is known before.
 
     Raises:
-        UsageError: two stand, begin, or fly at the same time, closer than `CLOSEST`; names them, the distance and when.
+        UsageError: two stand, begin, or fly at the same time, closer than `CLOSEST_DISTANCE`; the sentence
+            names them, the distance and when.
     """
     for a, b in itertools.combinations(courses, 2):
         for what in ("stand", "begin"):
             distance = math.dist(getattr(courses[a], what), getattr(courses[b], what))
-            if not distance >= CLOSEST:  # also where a position is not known
-                raise UsageError(f"{a} and {b} {what} {distance:.2f} m apart, less than {CLOSEST:g} m: not flown.")
+            if not distance >= CLOSEST_DISTANCE:  # also where a position is not known
+                raise UsageError(
+                    f"{a} and {b} {what} {distance:.2f} m apart, less than {CLOSEST_DISTANCE:g} m: not flown."
+                )
     longest = max((c.path.duration for c in courses.values()), default=0.0)
-    times = np.linspace(0.0, longest, 2 + min(math.ceil(longest / STEP), LOOKS))
+    times = np.linspace(0.0, longest, 2 + min(math.ceil(longest / DISTANCE_STEP), MOST_DISTANCE_STEPS))
     tracks = {name: np.array([c.path.at(float(t)).position for t in times]) for name, c in courses.items()}
     for a, b in itertools.combinations(tracks, 2):
         distances = np.linalg.norm(tracks[a] - tracks[b], axis=1)
         worst = int(np.argmin(distances))
-        if distances[worst] < CLOSEST:
+        if distances[worst] < CLOSEST_DISTANCE:
             raise UsageError(
                 f"{a} and {b} would come within {distances[worst]:.2f} m of each other {times[worst]:.1f} s into their "
-                f"trajectories, less than {CLOSEST:g} m: not flown."
+                f"trajectories, less than {CLOSEST_DISTANCE:g} m: not flown."
             )

@@ -8,13 +8,13 @@ from typing import Any
 
 from crazyem.live.session import Session
 
-TREND = 60.0  # s of estimates in a trend
-POINTS = 24  # of a trend
+TREND_SECONDS = 60.0  # s of estimates in a trend
+TREND_POINTS = 24  # of a trend
 NOT_PUSHED = "no guard: nothing is written"
-MARK = "user_"  # of marks by the user, a number after it
+USER_MARK = "user_"  # of marks by the user, a number after it
 
 # parameter -> label, unit, factor
-SHOWN = (
+SHOWN_PARAMETERS = (
     ("mass", "mass", "g", 1e3),
     ("Ixx", "Ixx", "10⁻⁶ kg m²", 1e6),
     ("Iyy", "Iyy", "10⁻⁶ kg m²", 1e6),
@@ -119,7 +119,7 @@ class Observer:
         phase, seconds = self._phase()
         account: Any = history.guard
         pushes = history.pushes[-3:]
-        guard = getattr(session.oversight, "guard", None)
+        guard = getattr(session.write_supervisor, "guard", None)
         decision = session.pipeline.decision
         return Snapshot(
             name=self.name,
@@ -143,7 +143,7 @@ class Observer:
             height=session.telemetry.height,
             behind=float(getattr(session.pipeline.estimator, "behind", 0.0)),
             skipped=int(getattr(session.pipeline.estimator, "skipped", 0)),
-            marks=sum(name.startswith(MARK) for name in tuple(history.marks)),
+            marks=sum(name.startswith(USER_MARK) for name in tuple(history.marks)),
         )
 
     def _parameters(self) -> tuple[ParameterView, ...]:
@@ -153,11 +153,11 @@ class Observer:
             return ()
         newest = estimates[count - 1]
         # Evenly over the minute; the list only grows, so what is read here stays.
-        span = min(count, round(TREND * 25))
+        span = min(count, round(TREND_SECONDS * 25))
         first = count - span
-        chosen = sorted({first + (span - 1) * i // max(POINTS - 1, 1) for i in range(POINTS)})
+        chosen = sorted({first + (span - 1) * i // max(TREND_POINTS - 1, 1) for i in range(TREND_POINTS)})
         views = []
-        for name, label, unit, factor in SHOWN:
+        for name, label, unit, factor in SHOWN_PARAMETERS:
             p = newest.parameters.get(name)
             if p is None:
                 continue
@@ -183,7 +183,7 @@ class Observer:
             loss = lost / (received + lost) if received + lost > 0 else math.nan
         self._counted = (now, s.received, s.lost)
         delay = max((median for median, _ in s.delays.values()), default=math.nan)
-        gone = self.session.returning or self.session.lost is not None
+        gone = self.session.reconnecting or self.session.lost is not None
         self._link = LinkView(rate, loss, s.lost, s.late, s.round_trip, delay, s.outages, gone)
         return self._link
 
@@ -194,7 +194,7 @@ class Observer:
             alarms.append(str(session.failure))
         if session.lost is not None:
             alarms.append(session.lost_sentence())
-        elif session.returning:
+        elif session.reconnecting:
             alarms.append("the link is lost and being brought back")
         grounded = session.telemetry.grounded_reason()
         if grounded:

@@ -9,7 +9,8 @@ from collections.abc import Callable
 
 from crazyem.live.telemetry import FLYING, Telemetry
 
-FRESH = 0.3  # s on the drone's clock: what was heard longer ago says nothing about where the drone is now
+# s on the drone's clock: what was heard longer ago says nothing about where the drone is now
+FRESH_TELEMETRY_SECONDS = 0.3
 
 
 class WriteGate:
@@ -33,7 +34,7 @@ class WriteGate:
         if self.telemetry.heard == -math.inf:
             return "no telemetry comes"
         age = abs(self.now() - self.telemetry.heard) * self.rate()  # abs: somebody may set the host's clock
-        return "" if age <= FRESH else f"the newest telemetry is {age:.1f} s old"
+        return "" if age <= FRESH_TELEMETRY_SECONDS else f"the newest telemetry is {age:.1f} s old"
 
     def misplaced(self, purpose: str) -> str:
         """Why a write for this purpose (`Push.purpose`) does not belong where the drone is, one clause; else ""."""

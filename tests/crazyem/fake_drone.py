@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from crazyem.errors import LinkError
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
 from crazyem.links.base import Block, LinkLost, LinkStatistics, Packet, ParameterWrite, Variable
-from crazyem.live.session import EXTRA, STATE, WRENCH
+from crazyem.live.session import EXTRA_VARIABLES, STATE_VARIABLES, WRENCH_VARIABLES
 from crazyem.live.telemetry import ARMED, AUTO_ARM, CAN_ARM, CAN_FLY, FLYING
 from crazyem.signals.vocabulary import MOTOR_BLOCK, compress_quaternion
 
@@ -39,7 +39,9 @@ class FakeLink:
         self.lose_echo_after = lose_echo_after
         self.lost_at = lost_at
         self.nan_at = nan_at
-        self.log_variables = dict.fromkeys((*STATE, *MOTOR_BLOCK, *EXTRA, *(f"ctrlLee.{n}" for n in WRENCH)), "float")
+        self.log_variables = dict.fromkeys(
+            (*STATE_VARIABLES, *MOTOR_BLOCK, *EXTRA_VARIABLES, *(f"ctrlLee.{n}" for n in WRENCH_VARIABLES)), "float"
+        )
         self.values = {
             "stabilizer.controller": 1.0, "stabilizer.estimator": 2.0, "ctrlLee.mass": 0.029,
             "ctrlLee.J_x": 1.657e-5, "ctrlLee.J_y": 1.666e-5, "ctrlLee.J_z": 2.926e-5,

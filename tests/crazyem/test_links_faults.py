@@ -14,7 +14,7 @@ from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import LinkLost, Packet
 from crazyem.links.connection import _Progress, new_crazyflie
 from crazyem.links.crazyflie import CrazyflieLink
-from crazyem.live.session import STATE
+from crazyem.live.session import STATE_VARIABLES
 from crazyem.signals.vocabulary import standard_variables
 
 NAMES = ("stateEstimateZ.x", "stateEstimateZ.y", "stateEstimateZ.z", "pm.vbat")
@@ -187,7 +187,7 @@ def test_blocks_of_two_packets_are_whole_whatever_is_lost(simulator):
         for k in range(6):
             direction = up if k % 2 else down
             relay.engine.replace([direction("drop", kinds=["log.control"], skip=k // 2, count=1)])
-            (block, *_) = link.subscribe(STATE, 100.0)
+            (block, *_) = link.subscribe(STATE_VARIABLES, 100.0)
             assert len(block.variables) == 10
             assert relay.engine.strikes[0][1] == 1
             packet = wait_for(link, Packet)

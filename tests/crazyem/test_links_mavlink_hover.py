@@ -14,9 +14,15 @@ from crazyem.errors import LinkError, UsageError
 from crazyem.estimation.result import Estimate, ParameterEstimate
 from crazyem.live.controllers import writes_back
 from crazyem.live.guard import Guard
-from crazyem.live.hover import LEAST, MOST, hover_afterwards, hover_rules, hover_target
-from crazyem.live.oversight import Rules
+from crazyem.live.hover_thrust import (
+    HIGHEST_HOVER_THRUST,
+    LOWEST_HOVER_THRUST,
+    hover_afterwards,
+    hover_rules,
+    hover_target,
+)
 from crazyem.live.policy import load_policy
+from crazyem.live.write_supervisor import WriteRules
 from crazyem.vehicle import load_vehicle
 
 CF2 = load_vehicle("cf2")
@@ -46,7 +52,7 @@ def estimate(mass, half=0.0001):
 
 def guard_of(drone, vehicle=CF2):
     controller, _ = hover_target(drone, vehicle)
-    rules = hover_rules(Rules(load_policy()), drone, controller)
+    rules = hover_rules(WriteRules(load_policy()), drone, controller)
     originals = {controller.mass: drone.read_parameter(controller.mass)}
     nominal = {"mass": vehicle.mass, "Ixx": 1e-5, "Iyy": 1e-5, "Izz": 1e-5}
     return Guard(controller, nominal=nominal, originals=originals, limits=rules.policy.limits)
@@ -88,11 +94,11 @@ def test_beyond_the_bounds_of_hover_thrust_nothing_is_written():
 def test_whatever_is_believed_what_is_written_is_a_hover_thrust(hover, mass):
     drone = Drone(hover)
     if hover_target(drone, CF2)[0] is None:
-        assert not LEAST <= hover <= MOST
+        assert not LOWEST_HOVER_THRUST <= hover <= HIGHEST_HOVER_THRUST
         return
     guard = guard_of(drone)
     for _, value in decide(guard, mass).writes:
-        assert LEAST * (1 - 1e-9) <= value <= MOST * (1 + 1e-9)
+        assert LOWEST_HOVER_THRUST * (1 - 1e-9) <= value <= HIGHEST_HOVER_THRUST * (1 + 1e-9)
         assert abs(value / hover - 1.0) <= 0.15 + 1e-9
 
 
@@ -133,7 +139,7 @@ def test_the_same_correction_is_not_made_twice_without_a_word():
 
 
 def test_the_battery_threshold_holds_for_every_cell():
-    rules = Rules(load_policy())
+    rules = WriteRules(load_policy())
     one = hover_rules(rules, Drone(cells=1), None).policy.health.battery
     assert hover_rules(rules, Drone(cells=4), None).policy.health.battery == pytest.approx(4 * one)
     assert hover_rules(rules, Drone(cells=0), None).policy.health.battery == one

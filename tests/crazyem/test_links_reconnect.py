@@ -16,9 +16,9 @@ from crazyem.estimation.online import OnlineEstimator
 from crazyem.links.base import AnotherDroneError, LinkLost, LinkStatistics, Outage, ParameterWrite, link_account
 from crazyem.links.crazyflie import CrazyflieLink
 from crazyem.live.controllers import LEE
-from crazyem.live.crew import Crew
 from crazyem.live.flight import Flight, FlightPlan
 from crazyem.live.mcap_recorder import open_recorder
+from crazyem.live.scheduler import Scheduler
 from crazyem.live.session import Session
 from crazyem.recordings import open_recording
 from crazyem.vehicle import load_vehicle
@@ -85,17 +85,19 @@ class _Filter:
         return self.link._passed.get_nowait()
 
 
-@pytest.fixture(params=["a session's own threads", "a crew's"])
-def crew(request):
+@pytest.fixture(params=["a session's own threads", "a scheduler's"])
+def scheduler(request):
     """One drone among others is received by the thread that receives for all; it must outlive an outage as well."""
-    one = Crew(2) if request.param == "a crew's" else None
+    one = Scheduler(2) if request.param == "a scheduler's" else None
     yield one
     if one is not None:
         one.close()
 
 
-def fly(link, kind=excite, duration=8.0, recorder=None, crew=None):
-    session = Session(link, vehicle=load_vehicle("cf2"), estimator=fake.FakeEstimator(), recorder=recorder, crew=crew)
+def fly(link, kind=excite, duration=8.0, recorder=None, scheduler=None):
+    session = Session(
+        link, vehicle=load_vehicle("cf2"), estimator=fake.FakeEstimator(), recorder=recorder, scheduler=scheduler
+    )
     plan = FlightPlan(
         trajectory=lambda position, yaw: kind(position=position, yaw=yaw, duration=duration), controller=LEE
     )
@@ -108,9 +110,9 @@ def fly(link, kind=excite, duration=8.0, recorder=None, crew=None):
     return session
 
 
-def test_a_flight_goes_on_after_an_outage(crew):
+def test_a_flight_goes_on_after_an_outage(scheduler):
     link = LosingLink(speed=5.0)
-    session = fly(link, crew=crew)
+    session = fly(link, scheduler=scheduler)
     assert [o.reason for o in session.outages] == ["it was away."]
     assert session.lost is None
     assert any("was gone for 0.1 s" in n for n in session.history.notices)
@@ -121,15 +123,15 @@ def test_a_flight_goes_on_after_an_outage(crew):
     assert [e.samples for e in session.history.estimates] == sorted(e.samples for e in session.history.estimates)
 
 
-def test_an_outage_that_lasts_ends_the_flight_in_one_sentence(crew):
+def test_an_outage_that_lasts_ends_the_flight_in_one_sentence(scheduler):
     link = LosingLink(speed=5.0, comes_back=False)
     with pytest.raises(
         LinkError, match=r"^the drone at fake://0 was lost: it was away; the drone did not come back\.$"
     ):
-        fly(link, crew=crew)
+        fly(link, scheduler=scheduler)
 
 
-def test_after_a_restart_of_the_firmware_the_notes_agree(crew):
+def test_after_a_restart_of_the_firmware_the_notes_agree(scheduler):
     """What was pushed is gone with the firmware that had it: nothing is called kept, put back or not put back."""
     link = LosingLink(speed=5.0, gone_at=None)
     write = link.write_parameter
@@ -143,7 +145,7 @@ def test_after_a_restart_of_the_firmware_the_notes_agree(crew):
         raise AnotherDroneError("The drone was restarted: what it knew of the flight is gone.")
 
     link.write_parameter, link.reconnect = write_and_restart, another
-    session = Session(link, vehicle=load_vehicle("cf2"), estimator=fake.FakeEstimator(), crew=crew)
+    session = Session(link, vehicle=load_vehicle("cf2"), estimator=fake.FakeEstimator(), scheduler=scheduler)
     plan = FlightPlan(lambda position, yaw: hover(position=position, yaw=yaw, duration=60.0), LEE)
     session.start()
     with pytest.raises(LinkError, match="was restarted"):
@@ -156,14 +158,14 @@ def test_after_a_restart_of_the_firmware_the_notes_agree(crew):
     assert all(math.isnan(v) for v in session.history.guard["in_drone"].values())
 
 
-def test_a_link_that_cannot_come_back_is_not_asked(crew):
+def test_a_link_that_cannot_come_back_is_not_asked(scheduler):
     link = LosingLink(speed=5.0)
     link.can_reconnect = False
     with pytest.raises(LinkError, match="was lost: it was away"):
-        fly(link, crew=crew)
+        fly(link, scheduler=scheduler)
 
 
-def test_a_write_that_falls_into_an_outage_is_made_up_for(crew):
+def test_a_write_that_falls_into_an_outage_is_made_up_for(scheduler):
     """The first push finds the link gone; it is written when the link is back, and pushing goes on."""
     link = LosingLink(speed=5.0, gone_at=None)
     write = link.write_parameter
@@ -176,7 +178,7 @@ def test_a_write_that_falls_into_an_outage_is_made_up_for(crew):
         return write(name, value, timeout)
 
     link.write_parameter = lost_with_the_first_push
-    session = fly(link, hover, crew=crew)
+    session = fly(link, hover, scheduler=scheduler)
     assert link.refused
     assert session.history.pushes
     assert all(p.verified for p in session.history.pushes)
@@ -186,7 +188,7 @@ def test_a_write_that_falls_into_an_outage_is_made_up_for(crew):
 def test_every_attempt_of_a_write_is_recorded():
     from crazyem.live.guard import Decision, Guard
     from crazyem.live.history import History
-    from crazyem.live.push import ATTEMPTS, Pusher
+    from crazyem.live.push import WRITE_ATTEMPTS, Pusher
 
     link = fake.FakeLink(lose_echo_after=0)
     nominal = {"mass": 0.03, "Ixx": 1e-5, "Iyy": 1e-5, "Izz": 1e-5}
@@ -196,7 +198,7 @@ def test_every_attempt_of_a_write_is_recorded():
     pusher = Pusher(link, guard, gate=fake.OPEN, history=history, on_write=written.append)
     pusher.submit(Decision(1.0, writes=(("ctrlLee.mass", 0.03),)))
     pusher.close()
-    assert len(written) == ATTEMPTS
+    assert len(written) == WRITE_ATTEMPTS
     assert [p.verified for p in history.pushes] == [False]
     assert guard.stopped
 

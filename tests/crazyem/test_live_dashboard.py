@@ -140,13 +140,13 @@ class Recorded:
         self.asked = []
 
     def __getattr__(self, name):
-        def ask():
+        def confirm():
             self.asked.append(name)
             if name == "revert":
                 raise RuntimeError("no")
             return f"did {name}"
 
-        return ask
+        return confirm
 
 
 @pytest.fixture

@@ -12,10 +12,10 @@ from crazyem.links import open_link
 from crazyem.live.controllers import LEE
 from crazyem.live.flight import Flight, FlightPlan
 from crazyem.live.mcap_recorder import open_recorder
-from crazyem.live.oversight import Rules
-from crazyem.live.policy import Policy, WatchLimits
+from crazyem.live.policy import MonitorLimits, Policy
 from crazyem.live.session import Session
 from crazyem.live.warm_up import warm_up
+from crazyem.live.write_supervisor import WriteRules
 from crazyem.recordings import open_recording
 from crazyem.vehicle import load_vehicle
 
@@ -71,7 +71,7 @@ def fly(uri, path, rules, factor=1.3):
 
 
 def test_a_lie_about_the_mass_is_taken_back_in_flight(tmp_path, simulator):
-    session, mass = fly(simulator("--speed", "2").uri, tmp_path / "f.mcap", Rules())
+    session, mass = fly(simulator("--speed", "2").uri, tmp_path / "f.mcap", WriteRules())
     history = session.history
     pushed = [p.value for p in history.pushes if p.parameter == "ctrlLee.mass" and p.purpose == "push"]
     assert pushed, history.guard["decisions"]
@@ -89,7 +89,7 @@ def test_a_lie_about_the_mass_is_taken_back_in_flight(tmp_path, simulator):
 
 
 def test_without_the_watch_the_lie_stays(tmp_path, simulator):
-    rules = Rules(Policy(watch=WatchLimits(enabled=False)))
+    rules = WriteRules(Policy(watch=MonitorLimits(enabled=False)))
     session, mass = fly(simulator("--speed", "2").uri, tmp_path / "f.mcap", rules)
     assert mass == pytest.approx(1.3 * 0.029, rel=0.02)
     assert not any("flew worse" in n for n in session.history.notices)

@@ -15,7 +15,7 @@ from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
 from crazyem.live.clock import FirmwareClock
 from crazyem.live.guard import Decision
-from crazyem.live.history import KEPT, SETTLE, History, Push, Track
+from crazyem.live.history import MOST_ESTIMATES, SETTLE_SECONDS, History, Push, Track
 from crazyem.live.pipeline import Pipeline
 from crazyem.live.plot import write_plot
 from crazyem.live.push import Pusher
@@ -75,7 +75,7 @@ def test_tracking_before_and_after_the_push():
 
 def test_tracking_is_unknown_without_marks_and_without_enough_flight_after():
     assert set(flown(marks=False).before_and_after()[0].values()) == {None}
-    assert flown(push_at=19.0 - SETTLE / 2).before_and_after()[0]["after_push"] is None
+    assert flown(push_at=19.0 - SETTLE_SECONDS / 2).before_and_after()[0]["after_push"] is None
 
 
 def test_unverified_pushes_do_not_count():
@@ -126,14 +126,14 @@ def test_plot_is_written_even_with_next_to_nothing(tmp_path):
 
 
 def test_a_long_flight_keeps_the_newest_estimates_and_fewer_of_the_old_ones():
-    history, count = History(), 5 * KEPT
+    history, count = History(), 5 * MOST_ESTIMATES
     for k in range(count):
         history.keep(replace(estimate(), time=float(k)))
     times = [e.time for e in history.estimates]
-    assert len(times) <= KEPT
+    assert len(times) <= MOST_ESTIMATES
     assert times == sorted(times)
     assert times[0] == 0.0
-    assert times[-KEPT // 2 :] == list(range(count - KEPT // 2, count))
+    assert times[-MOST_ESTIMATES // 2 :] == list(range(count - MOST_ESTIMATES // 2, count))
 
 
 def test_pipeline_needs_nothing_but_samples():

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.cli import main, parser
-from crazyem.commands.flights import ask_terminal, simulated, write_rules
+from crazyem.commands.flights import confirm_in_terminal, simulated, write_rules
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.live.guard import Limits
-from crazyem.live.policy import LARGEST_FILE, EndRules, Policy, default_text, load_policy, parse_policy
+from crazyem.live.policy import LARGEST_POLICY_FILE, EndRules, Policy, default_text, load_policy, parse_policy
 
 
 def test_the_shipped_file_says_what_the_code_assumes():
@@ -78,7 +78,7 @@ def test_hostile_files(tmp_path):
     with pytest.raises(UsageError, match="cannot read"):
         load_policy("a\0b")
     for content, says in (
-        (b"#" * (LARGEST_FILE + 1), "larger than"),
+        (b"#" * (LARGEST_POLICY_FILE + 1), "larger than"),
         (b"\xff\xfe", "not UTF-8 at byte 0"),
         (b"x = " + b"[" * 20000, "not valid TOML"),
         (b"[push]\nslew = 1" + b"0" * 5000, "not valid TOML|must be a number"),
@@ -174,11 +174,11 @@ def test_the_question_is_answered_on_the_terminal(tmp_path, monkeypatch, capsys,
     path.write_text(answer)
     with path.open() as typed:
         monkeypatch.setattr("sys.stdin", typed)
-        assert ask_terminal("first write to the drone: ctrlLee.mass = 0.03", threading.Event()) is agreed
+        assert confirm_in_terminal("first write to the drone: ctrlLee.mass = 0.03", threading.Event()) is agreed
     assert "ctrlLee.mass = 0.03" in capsys.readouterr().err
 
 
 def test_a_question_nobody_waits_for_is_a_no():
     ended = threading.Event()
     ended.set()
-    assert not ask_terminal("?", ended)
+    assert not confirm_in_terminal("?", ended)

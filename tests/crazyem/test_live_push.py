@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from crazyem.errors import LinkError
 from crazyem.links.base import ParameterWrite
-from crazyem.live.controllers import EQUAL, LEE, writes_back, writes_for
+from crazyem.live.controllers import EQUAL_WITHIN, LEE, writes_back, writes_for
 from crazyem.live.guard import Decision, Guard
 from crazyem.live.history import History
-from crazyem.live.push import ATTEMPTS, Pusher
+from crazyem.live.push import WRITE_ATTEMPTS, Pusher
 
 NOMINAL = {"mass": 0.029, "Ixx": 1.66e-5, "Iyy": 1.67e-5, "Izz": 2.93e-5}
 ORIGINALS = {
@@ -46,7 +46,7 @@ class Drone:
 
 @pytest.fixture(autouse=True)
 def _at_once(monkeypatch):
-    monkeypatch.setattr("crazyem.live.push.MOMENT", 0.001)
+    monkeypatch.setattr("crazyem.live.push.RETRY_PAUSE", 0.001)
 
 
 def a_set(changed=None):
@@ -79,7 +79,7 @@ def test_a_whole_set():
 @pytest.mark.parametrize("at", range(10))
 def test_a_set_that_breaks_anywhere_is_undone_completely(at, applied):
     """All attempts at write `at` go unanswered, whether it arrived or not; then the drone answers again."""
-    drone = Drone(lambda n: at < n <= at + ATTEMPTS, applied)
+    drone = Drone(lambda n: at < n <= at + WRITE_ATTEMPTS, applied)
     guard, history, done, pusher = run(drone, a_set(), a_set())
     assert drone.values == ORIGINALS
     assert pusher.known == ORIGINALS
@@ -87,7 +87,7 @@ def test_a_set_that_breaks_anywhere_is_undone_completely(at, applied):
     assert "not confirmed" in guard.stopped
     assert any("undone" in n for n in history.notices)
     assert [p for p in history.pushes if not p.verified] == [history.pushes[at]]  # and no write went unaccounted
-    assert sum(p.verified for p in history.pushes) == len(drone.log) - (ATTEMPTS if applied else 0)
+    assert sum(p.verified for p in history.pushes) == len(drone.log) - (WRITE_ATTEMPTS if applied else 0)
 
 
 def test_one_lost_echo_is_tried_again():
@@ -111,7 +111,7 @@ def test_a_link_that_keeps_going_does_not_keep_a_write_for_ever():
     drone = Drone(lambda n: True)
     guard, _, _, _ = run(drone, a_set(), outages=lambda: drone.attempts)
     assert guard.stopped
-    assert drone.attempts == 2 * 2 * ATTEMPTS  # the write, and its undoing
+    assert drone.attempts == 2 * 2 * WRITE_ATTEMPTS  # the write, and its undoing
 
 
 def test_what_cannot_be_undone_is_said():
@@ -120,7 +120,7 @@ def test_what_cannot_be_undone_is_said():
     assert guard.stopped
     assert any("could not be written back" in n for n in history.notices)
     assert math.isnan(pusher.known["ctrlLee.mass"])
-    assert drone.attempts == 4 + 2 * ATTEMPTS
+    assert drone.attempts == 4 + 2 * WRITE_ATTEMPTS
 
 
 def test_a_link_that_is_gone_costs_one_attempt_each():
@@ -209,7 +209,7 @@ def test_no_step_of_a_set_or_of_its_way_back_is_less_damped_than_both_ends(first
             for axis, state in itertools.product("xyz", course):
                 least = min(damping(course[0], axis), damping(course[-1], axis))
                 assert damping(state, axis) >= least * (1 - 1e-9)
-        assert list(states(end, back))[-1] == pytest.approx(values, rel=1.01 * EQUAL)
+        assert list(states(end, back))[-1] == pytest.approx(values, rel=1.01 * EQUAL_WITHIN)
         believed, values = {**believed, **changed}, end
 
 
@@ -219,9 +219,9 @@ def test_undoing_half_a_set_is_as_damped_whether_the_lost_write_arrived_or_not(f
     changed = {n: NOMINAL[n] * f for n, f in zip(("Ixx", "Iyy", "Izz"), factors)} | {"mass": 0.033}
     writes = writes_for(LEE, changed, beliefs=NOMINAL, originals=ORIGINALS)
     at = min(at, len(writes) - 1)
-    drone = Drone(lambda n: at < n <= at + ATTEMPTS, arrived)
+    drone = Drone(lambda n: at < n <= at + WRITE_ATTEMPTS, arrived)
     run(drone, replace(a_set(), writes=writes))
-    assert drone.values == pytest.approx(ORIGINALS, rel=1.01 * EQUAL)
+    assert drone.values == pytest.approx(ORIGINALS, rel=1.01 * EQUAL_WITHIN)
     full = list(states(ORIGINALS, writes))[-1]
     for axis, state in itertools.product("xyz", states(ORIGINALS, drone.log)):
         assert damping(state, axis) >= min(damping(ORIGINALS, axis), damping(full, axis)) * (1 - 1e-9)

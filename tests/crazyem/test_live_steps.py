@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hovering import INERTIA, hover
 from test_guard import NOMINAL, ORIGINALS, estimate
-from test_live_watchdog import LIMITS, WRITE, fly, written
+from test_live_post_write_monitor import LIMITS, WRITE, fly, written
 
 from crazyem.cli import main
 from crazyem.errors import LinkError
@@ -17,11 +17,11 @@ from crazyem.estimation.online import OnlineEstimator
 from crazyem.estimation.result import Step
 from crazyem.estimation.steps import StepAwareEstimator, largest_jump
 from crazyem.live.controllers import LEE
-from crazyem.live.crew import Paced
 from crazyem.live.guard import Decision, Guard, Limits
 from crazyem.live.history import History
 from crazyem.live.pipeline import Pipeline, steps_of
 from crazyem.live.push import Pusher
+from crazyem.live.scheduler import UpdateThrottle
 from crazyem.live.summary import build_summary, text_summary
 from crazyem.recordings import open_recording
 from crazyem.vehicle import Vehicle
@@ -55,9 +55,9 @@ def writes(guard, start, seconds, mass):
 
 def test_a_real_step_is_written_at_once_and_whole():
     guard = settled()
-    guard.stepped(NOTICED)
+    guard.on_mass_step(NOTICED)
     assert writes(guard, 10.2, 0.4, 0.0355) == []
-    guard.stepped(REAL)
+    guard.on_mass_step(REAL)
     written_ = writes(guard, 10.6, 1.0, 0.0355)
     assert written_[0] == (pytest.approx(10.6), pytest.approx(0.0355))  # 22 %, where a write may move by 15 %
     assert len(written_) == 1
@@ -71,25 +71,25 @@ def test_without_a_step_the_same_takes_longer():
 
 def test_a_gust_is_waited_for_and_changes_nothing():
     guard = settled()
-    guard.stepped(NOTICED)
+    guard.on_mass_step(NOTICED)
     d = guard.consider(estimate(10.4, **{**NOMINAL, "mass": 0.033}), 10.4, airborne=True)
     assert "may have changed" in d.why
-    guard.stepped(GUST)
+    guard.on_mass_step(GUST)
     assert writes(guard, 11.2, 0.4, 0.029) == []
 
 
 @pytest.mark.parametrize("mass", [0.075, 0.012])
 def test_a_step_stays_within_the_bounds(mass):
     guard = settled()
-    guard.stepped(NOTICED)
-    guard.stepped(Step(10.0, 10.2, 0.029, mass, True))
+    guard.on_mass_step(NOTICED)
+    guard.on_mass_step(Step(10.0, 10.2, 0.029, mass, True))
     assert writes(guard, 10.6, 2.0, mass) == []
 
 
 def test_thrust_that_jumps_in_the_log_alone_ends_the_pushing():
     guard = settled()
-    guard.stepped(NOTICED)
-    guard.stepped(Step(10.0, 10.2, 0.029, 0.046, False, True))
+    guard.on_mass_step(NOTICED)
+    guard.on_mass_step(Step(10.0, 10.2, 0.029, 0.046, False, True))
     assert writes(guard, 10.6, 5.0, 0.046) == []
     assert "jumped" in guard.stopped
 
@@ -130,8 +130,8 @@ def test_jumps_of_thrust_that_last_are_told_from_spikes_ramps_and_noise():
 
 def test_a_step_lifts_no_other_limit():
     guard = settled()
-    guard.stepped(NOTICED)
-    guard.stepped(REAL)
+    guard.on_mass_step(NOTICED)
+    guard.on_mass_step(REAL)
     for k in range(50):
         t = 10.6 + 0.04 * k
         wide = guard.consider(estimate(t, relative_sd=0.02, **{**NOMINAL, "mass": 0.0355}), t, airborne=True)
@@ -143,8 +143,8 @@ def test_a_step_lifts_no_other_limit():
 
 def test_estimates_that_move_are_not_pushed_after_a_step_either():
     guard = settled()
-    guard.stepped(NOTICED)
-    guard.stepped(REAL)
+    guard.on_mass_step(NOTICED)
+    guard.on_mass_step(REAL)
     for k in range(60):
         t = 10.6 + 0.04 * k
         moving = 0.0355 * (1.0 + 0.02 * (-1) ** k)
@@ -166,12 +166,12 @@ def told(watch, *, mass_written=True):
     """The flight from WRITE on, with the step told as the pipeline tells it; the verdict."""
     verdict = fly(watch, WRITE, 1.2, error=falls)
     assert verdict[0] == ""
-    watch.stepped(began=6.0, now=6.2, real=None)
+    watch.on_mass_step(began=6.0, now=6.2, real=None)
     assert fly(watch, 6.2, 0.4, error=falls)[0] == ""
-    watch.stepped(began=6.0, now=6.6, real=True)
+    watch.on_mass_step(began=6.0, now=6.6, real=True)
     assert fly(watch, 6.6, 0.2, error=falls)[0] == ""
     if mass_written:
-        watch.wrote(6.8, 6.83)
+        watch.on_write(6.8, 6.83)
         return fly(watch, 6.8, 8.0, error=falls)
     return fly(watch, 6.8, 8.0, error=lambda t: falls(min(t, 6.8)))
 
@@ -196,9 +196,9 @@ def test_a_wrong_mass_after_a_step_is_noticed_when_the_drone_should_be_back():
     watch = written()
     watch.forget()
     assert fly(watch, WRITE, 1.2, error=falls)[0] == ""
-    watch.stepped(began=6.0, now=6.2, real=None)
-    watch.stepped(began=6.0, now=6.6, real=True)
-    watch.wrote(6.6, 6.63)
+    watch.on_mass_step(began=6.0, now=6.2, real=None)
+    watch.on_mass_step(began=6.0, now=6.6, real=True)
+    watch.on_write(6.6, 6.63)
     verdict, why, t = fly(watch, 6.6, 8.0, error=0.30)
     assert verdict == "worse"
     assert "0.050 m before" in why  # against the flight before the step
@@ -209,23 +209,23 @@ def test_oscillation_and_great_distance_alarm_at_any_time():
     for what in ({"tremble": 12.0}, {"error": 1.2}):
         watch = written()
         assert fly(watch, WRITE, 1.0)[0] == ""
-        watch.stepped(began=6.0, now=6.1, real=None)
+        watch.on_mass_step(began=6.0, now=6.1, real=None)
         assert fly(watch, 6.1, 1.0, **what)[0] == "worse"
 
 
 def test_an_estimator_that_stalls_in_a_step_does_not_blind_the_watch():
     watch = written()
     assert fly(watch, WRITE, 1.0)[0] == ""
-    watch.stepped(began=6.0, now=6.1, real=None)
+    watch.on_mass_step(began=6.0, now=6.1, real=None)
     assert fly(watch, 6.1, 8.0, error=0.4)[0] == "worse"
 
 
 def test_after_a_gust_it_is_judged_again():
     watch = written()
     assert fly(watch, WRITE, 1.0)[0] == ""
-    watch.stepped(began=6.0, now=6.1, real=None)
+    watch.on_mass_step(began=6.0, now=6.1, real=None)
     assert fly(watch, 6.1, 1.0, error=0.35)[0] == ""
-    watch.stepped(began=6.0, now=7.1, real=False)
+    watch.on_mass_step(began=6.0, now=7.1, real=False)
     verdict, _, t = fly(watch, 7.1, 8.0, error=lambda t: 0.35 if t < 7.5 else 0.05)
     assert verdict == "good"
     assert t == pytest.approx(7.1 + 1.0 + LIMITS.after, abs=0.1)
@@ -234,9 +234,9 @@ def test_after_a_gust_it_is_judged_again():
 def test_a_full_account_leaves_room_for_the_new_mass():
     watch = written()
     for k in range(LIMITS.unjudged - 1):
-        watch.wrote(WRITE + 0.5 * k, WRITE + 0.5 * k)
+        watch.on_write(WRITE + 0.5 * k, WRITE + 0.5 * k)
     assert watch.full
-    watch.stepped(began=6.0, now=6.1, real=None)
+    watch.on_mass_step(began=6.0, now=6.1, real=None)
     assert not watch.full
 
 
@@ -252,7 +252,7 @@ def flown(masses, *, wrap=lambda e: e, seed=0):
     return pipeline, history, events
 
 
-@pytest.mark.parametrize("wrap", [lambda e: e, Paced])
+@pytest.mark.parametrize("wrap", [lambda e: e, UpdateThrottle])
 def test_a_step_is_told_when_noticed_and_when_decided(wrap):
     pipeline, history, events = flown([(0.0, 0.029), (4.0, 0.034)], wrap=wrap)
     assert events == [None, True]
@@ -280,7 +280,7 @@ def test_the_same_samples_give_the_same_steps_and_estimates():
 def test_an_estimator_that_looks_for_none_has_none():
     assert steps_of(OnlineEstimator(VEHICLE)) == ()
     aware = StepAwareEstimator(OnlineEstimator(VEHICLE))
-    aware.every = 9  # Paced sets it
+    aware.every = 9  # UpdateThrottle sets it
     assert aware.inner.every == 9
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from crazyem.commands import swarm as command
 from crazyem.control.trajectories import Reference, Trajectory, figure8, hover
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.live.swarm import CLOSEST, Course, check_distances, displaced, members_of, read_swarm
+from crazyem.live.swarm import CLOSEST_DISTANCE, Course, check_distances, members_of, read_swarm, with_offset
 
 
 # files
@@ -98,7 +98,7 @@ OFFSETS = st.tuples(*[st.floats(-5, 5, allow_nan=False).map(lambda v: round(v, 3
 
 @given(OFFSETS)
 def test_the_way_to_an_offset_is_smooth_and_joins_the_trajectory(offset):
-    make = displaced(lambda p, yaw: figure8(position=p, yaw=yaw, duration=6.0), offset)
+    make = with_offset(lambda p, yaw: figure8(position=p, yaw=yaw, duration=6.0), offset)
     path = make((1.0, 2.0, 3.0), 0.3)
     extra = path.duration - figure8(position=(0.0, 0.0, 0.0), duration=6.0).duration
     assert path.at(0.0).position == pytest.approx((1.0, 2.0, 3.0))
@@ -118,7 +118,7 @@ def test_no_offset_changes_nothing():
     def make(position, yaw):
         return hover(position=position, yaw=yaw)
 
-    assert displaced(make, (0.0, 0.0, 0.0)) is make
+    assert with_offset(make, (0.0, 0.0, 0.0)) is make
 
 
 def course(x, y=0.0, path=None, begin=None):
@@ -127,7 +127,7 @@ def course(x, y=0.0, path=None, begin=None):
 
 
 def test_drones_that_are_far_enough_apart_may_fly():
-    check_distances({"a": course(0.0), "b": course(CLOSEST + 0.01), "c": course(0.0, 1.0)})
+    check_distances({"a": course(0.0), "b": course(CLOSEST_DISTANCE + 0.01), "c": course(0.0, 1.0)})
     check_distances({"a": course(0.0)})
     check_distances({})
 

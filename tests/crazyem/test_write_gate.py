@@ -17,12 +17,13 @@ from crazyem.live.controllers import LEE
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
 from crazyem.live.guard import Decision, Guard
 from crazyem.live.history import History
-from crazyem.live.oversight import Rules
 from crazyem.live.policy import EndRules, Policy
 from crazyem.live.push import Pusher
 from crazyem.live.session import Session
 from crazyem.live.telemetry import FLYING, Telemetry
-from crazyem.live.write_gate import FRESH, WriteGate
+from crazyem.live.write_gate import FRESH_TELEMETRY_SECONDS as FRESH
+from crazyem.live.write_gate import WriteGate
+from crazyem.live.write_supervisor import WriteRules
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle
 
@@ -93,7 +94,7 @@ def test_rotors_that_stop_in_a_fall_do_not_make_that_height_the_ground():
 
 def written_through(gate, drone, monkeypatch, decision=None):
     """What became of one set: guard, history, reasons."""
-    for name, seconds in (("MOMENT", 0.001), ("LOOK_AGAIN", 0.001)):
+    for name, seconds in (("RETRY_PAUSE", 0.001), ("TELEMETRY_POLL", 0.001)):
         monkeypatch.setattr(f"crazyem.live.push.{name}", seconds)
     guard, history, said = Guard(LEE, nominal=NOMINAL, originals=ORIGINALS), History(), []
     pusher = Pusher(drone, guard, gate=gate, history=history, timeout=0.005, known=ORIGINALS,
@@ -236,7 +237,7 @@ def test_an_attachment_whose_estimator_is_behind_writes_nothing_once_it_is_left(
             elif way == "lost link":
                 link.packets.put(fake.LinkLost("gone.", link.host_clock()))
                 link.until(lambda: session.lost is not None)
-                assert session.oversight.gate.objection("push")  # at once, also within a set
+                assert session.write_supervisor.gate.objection("push")  # at once, also within a set
             before = len(link.sent)
             if way in errors:
                 raise errors[way]
@@ -290,7 +291,7 @@ class Watched(fake.FakeLink):
 def test_a_flight_writes_in_the_air_only_and_restores_on_the_ground(way):
     link = Watched(speed=40.0, lost_at=9000 if way == "link lost" else None)
     session = Session(link, vehicle=load_vehicle("cf2"), estimator=fake.FakeEstimator())
-    rules = Rules(Policy(end=EndRules(*["restore"] * 4)))
+    rules = WriteRules(Policy(end=EndRules(*["restore"] * 4)))
     plan = FlightPlan(lambda position, yaw: hover(position=position, yaw=yaw, duration=4.0), LEE, rules=rules)
     interrupts = Interrupts()
     flight = Flight(session, plan, interrupts=interrupts)

@@ -13,11 +13,11 @@ from typing import Any
 
 from crazyem.errors import CrazyemError
 from crazyem.live.controllers import Controller
-from crazyem.live.oversight import Rules
+from crazyem.live.write_supervisor import WriteRules
 from crazyem.vehicle import Vehicle
 
-LEAST, MOST = 0.1, 0.8  # of full thrust: PX4's own bounds on MPC_THR_HOVER
-_NUMBER = -1  # there is no stabilizer.controller
+LOWEST_HOVER_THRUST, HIGHEST_HOVER_THRUST = 0.1, 0.8  # of full thrust: PX4's own bounds on MPC_THR_HOVER
+_NO_CONTROLLER = -1  # there is no stabilizer.controller
 
 
 def hover_target(link: Any, vehicle: Vehicle) -> tuple[Controller | None, str]:
@@ -33,21 +33,25 @@ def hover_target(link: Any, vehicle: Vehicle) -> tuple[Controller | None, str]:
         value = link.read_parameter(name)
     except CrazyemError as error:
         return None, f"{str(error).rstrip('.')}: estimates are not pushed."
-    if not LEAST <= value <= MOST:
-        return None, f"{name} is {value:g}, outside {LEAST:g} to {MOST:g}: estimates are not pushed."
+    if not LOWEST_HOVER_THRUST <= value <= HIGHEST_HOVER_THRUST:
+        bounds = f"{LOWEST_HOVER_THRUST:g} to {HIGHEST_HOVER_THRUST:g}"
+        return None, f"{name} is {value:g}, outside {bounds}: estimates are not pushed."
     note = f"{name} = {value:.4g} is taken for right at {vehicle.mass:.4g} kg, and thrust for proportional to it."
     if link.onboard_hover_estimator:
         note += f" {link.onboard_hover_estimator}: what is written may have no effect, or be overwritten."
     scale = vehicle.mass / value
-    return Controller("hover thrust", _NUMBER, mass=name, mass_scale=scale, persistent=True, note=note), note
+    return Controller("hover thrust", _NO_CONTROLLER, mass=name, mass_scale=scale, persistent=True, note=note), note
 
 
-def hover_rules(rules: Rules, link: Any, controller: Controller | None) -> Rules:
+def hover_rules(rules: WriteRules, link: Any, controller: Controller | None) -> WriteRules:
     """The policy's bounds and those of hover thrust, whichever are narrower; its battery threshold for every cell."""
     policy = rules.policy
     if controller is not None:
         least, most = policy.limits.mass_absolute
-        inside = max(least, LEAST * controller.mass_scale), min(most, MOST * controller.mass_scale)
+        inside = (
+            max(least, LOWEST_HOVER_THRUST * controller.mass_scale),
+            min(most, HIGHEST_HOVER_THRUST * controller.mass_scale),
+        )
         policy = replace(policy, limits=replace(policy.limits, mass_absolute=inside))
     cells = max(int(getattr(link, "cells", 0)), 1)
     if math.isfinite(policy.health.battery):

@@ -9,20 +9,21 @@ import threading
 from collections import deque
 from dataclasses import dataclass, replace
 
-from crazyem.live.policy import WatchLimits
+from crazyem.live.policy import MonitorLimits
 from crazyem.signals.sample import Sample
 
-FAST = 0.1  # s, time constant of the high-pass on body rates: 1.6 Hz, above what trajectories ask for
-ALARM = 0.3  # s over which an alarm is taken
-LEAD = 0.1  # s by which a drone may follow a moving setpoint late without that being an error
-SPEED_OVER = 0.1  # s over which the setpoint's speed is taken: logged positions come in whole millimetres
-FEWEST = 20  # values without which a stretch says nothing
-KEPT = 4096  # values of each series: bounded memory, whatever the rates
-OFF = 1.0  # m; a drone that far from its setpoint before any write is not following it
-RETURN = 2.5  # s that a drone may take to its setpoint after its mass has changed, and after the new mass was written
-AFTER_GUST = 1.0  # s, the same after a gust that looked like one
+HIGH_PASS_SECONDS = 0.1  # s, time constant of the high-pass on body rates: 1.6 Hz, above what trajectories ask for
+ALARM_SECONDS = 0.3  # s over which an alarm is taken
+LEAD_SECONDS = 0.1  # s by which a drone may follow a moving setpoint late without that being an error
+SPEED_SPAN = 0.1  # s over which the setpoint's speed is taken: logged positions come in whole millimetres
+FEWEST_VALUES = 20  # values without which a stretch says nothing
+SERIES_LENGTH = 4096  # values of each series: bounded memory, whatever the rates
+LOST_TRACKING_DISTANCE = 1.0  # m; a drone that far from its setpoint before any write is not following it
+# s that a drone may take to its setpoint after its mass has changed, and after the new mass was written
+RETURN_SECONDS = 2.5
+GUST_RETURN_SECONDS = 1.0  # s, the same after a gust that looked like one
 EXCUSED_ALARM = 0.5  # m by which it may be further away than the alarm meanwhile
-GAP = 0.5  # s without a sample after which the high-pass begins anew
+HIGH_PASS_GAP = 0.5  # s without a sample after which the high-pass begins anew
 
 
 @dataclass(frozen=True)
@@ -41,10 +42,10 @@ class Figures:
 
 
 class _Series:
-    """Squares over time, the newest `KEPT`."""
+    """Squares over time, the newest `SERIES_LENGTH`."""
 
     def __init__(self) -> None:
-        self._items: deque[tuple[float, float]] = deque(maxlen=KEPT)
+        self._items: deque[tuple[float, float]] = deque(maxlen=SERIES_LENGTH)
 
     def add(self, time: float, square: float) -> None:
         if math.isfinite(square):
@@ -52,9 +53,9 @@ class _Series:
 
     def forget(self, since: float) -> None:
         """What was added of a time after `since` [s]."""
-        self._items = deque((i for i in self._items if i[0] <= since), maxlen=KEPT)
+        self._items = deque((i for i in self._items if i[0] <= since), maxlen=SERIES_LENGTH)
 
-    def rms(self, start: float, end: float, fewest: int = FEWEST) -> float:
+    def rms(self, start: float, end: float, fewest: int = FEWEST_VALUES) -> float:
         """Over [start, end], NaN with fewer than `fewest` values."""
         total, count = 0.0, 0
         for time, square in reversed(tuple(self._items)):  # a copy: another thread adds to it
@@ -66,15 +67,15 @@ class _Series:
         return math.sqrt(total / count) if count >= fewest else math.nan
 
 
-class Watchdog:
+class PostWriteMonitor:
     """Judges writes by what comes after them.
 
     Several writes that follow each other closely are judged together, against the stretch before the first. Samples,
     innovations and writes may come from three threads.
     """
 
-    def __init__(self, limits: WatchLimits | None = None) -> None:
-        self.limits = limits or WatchLimits()
+    def __init__(self, limits: MonitorLimits | None = None) -> None:
+        self.limits = limits or MonitorLimits()
         self._lock = threading.RLock()
         self._tracking, self._speed = _Series(), _Series()
         self._innovation, self._oscillation = _Series(), _Series()
@@ -109,10 +110,10 @@ class Watchdog:
     def innovation(self, time: float, mean_square: float) -> None:
         """Mean square of the normalised innovations of a sample at `time` [s]."""
         with self._lock:
-            if not self._excuses(time):
+            if not self._is_excused(time):
                 self._innovation.add(time, mean_square)
 
-    def stepped(self, *, began: float, now: float, real: bool | None) -> None:
+    def on_mass_step(self, *, began: float, now: float, real: bool | None) -> None:
         """The mass changed at `began` [s], or may have (None), or has not after all (False).
 
         How far the drone is from its setpoint then says nothing about what was written, neither before nor after. Its
@@ -120,41 +121,44 @@ class Watchdog:
         """
         with self._lock:
             if real is None:
-                self._excused = (began, now + RETURN)  # not for ever: the estimator that has to decide may stall
+                self._excused = (
+                    began,
+                    now + RETURN_SECONDS,
+                )  # not for ever: the estimator that has to decide may stall
                 self._tracking.forget(began)
                 self._innovation.forget(began)
                 self.unjudged = min(self.unjudged, self.limits.unjudged - 1)  # the new mass does not wait for verdicts
             elif began == self._excused[0]:
-                self._excused = (began, now + (RETURN if real else AFTER_GUST))
+                self._excused = (began, now + (RETURN_SECONDS if real else GUST_RETURN_SECONDS))
                 self._unwritten = real
 
-    def _excuses(self, time: float) -> bool:
+    def _is_excused(self, time: float) -> bool:
         return self._excused[0] < time < self._excused[1]
 
     def _setpoint(self, time: float, wanted: tuple[float, ...]) -> None:
         self._setpoints.append((time, wanted))
         for before, value in tuple(self._setpoints):
-            if 0.0 < time - before <= SPEED_OVER + 1e-6:
+            if 0.0 < time - before <= SPEED_SPAN + 1e-6:
                 self._speed.add(time, math.dist(wanted, value) ** 2 / (time - before) ** 2)
                 break
 
     def _position(self, time: float, position: tuple[float, ...]) -> None:
-        if self._setpoints and abs(time - self._setpoints[-1][0]) <= SPEED_OVER:
+        if self._setpoints and abs(time - self._setpoints[-1][0]) <= SPEED_SPAN:
             square = math.dist(position, self._setpoints[-1][1]) ** 2
             self._raw.add(time, square)
-            if not self._excuses(time):
+            if not self._is_excused(time):
                 self._tracking.add(time, square)
 
     def _body_rate(self, time: float, rate: tuple[float, ...]) -> None:
         before, self._rate = self._rate, (time, rate)
-        if before is None or not 0.0 < time - before[0] < GAP:
+        if before is None or not 0.0 < time - before[0] < HIGH_PASS_GAP:
             self._slow = rate
             return
-        share = 1.0 - math.exp(-(time - before[0]) / FAST)
+        share = 1.0 - math.exp(-(time - before[0]) / HIGH_PASS_SECONDS)
         self._slow = tuple(s + share * (r - s) for s, r in zip(self._slow, rate))
         self._oscillation.add(time, math.dist(rate, self._slow) ** 2)
 
-    def figures(self, start: float, end: float, fewest: int = FEWEST) -> Figures:
+    def figures(self, start: float, end: float, fewest: int = FEWEST_VALUES) -> Figures:
         """What was seen between two times [s]."""
         return Figures(
             tracking=self._tracking.rms(start, end, fewest),
@@ -175,14 +179,14 @@ class Watchdog:
         """Whether what was written has to be judged before more is."""
         return self.limits.enabled and self.unjudged >= self.limits.unjudged
 
-    def wrote(self, begun: float, ended: float) -> None:
+    def on_write(self, begun: float, ended: float) -> None:
         """A set of parameters was written between `begun` and `ended` [s]."""
         with self._lock:
-            if self._excuses(begun):
-                self._excused = (self._excused[0], max(self._excused[1], ended + RETURN))
+            if self._is_excused(begun):
+                self._excused = (self._excused[0], max(self._excused[1], ended + RETURN_SECONDS))
             self._unwritten = False
             if self._reference is None:
-                until = self._excused[0] if self._excuses(begun) else begun
+                until = self._excused[0] if self._is_excused(begun) else begun
                 self._reference = self.figures(until - self.limits.before, until)
                 self._first = begun
             self._last = max(self._last, ended)
@@ -224,12 +228,16 @@ class Watchdog:
         return "good", f"{_said(before)} before, {_said(after)} after"
 
     def _alarm(self, before: Figures, time: float) -> str:
-        limits, now = self.limits, self.figures(time - ALARM, time, 5)
+        limits, now = self.limits, self.figures(time - ALARM_SECONDS, time, 5)
         if self._tilt > limits.tilt_alarm:
             return f"the drone leans {math.degrees(self._tilt):.0f} degrees"
-        base, distance = _or(before.tracking, 0.0), self._raw.rms(time - ALARM, time, 5)
-        alarm = limits.tracking_alarm + (EXCUSED_ALARM if self._excuses(time) or self._unwritten else 0.0)
-        if base < OFF and time - self._first > 0 and distance > base + alarm + LEAD * now.speed:
+        base, distance = _or(before.tracking, 0.0), self._raw.rms(time - ALARM_SECONDS, time, 5)
+        alarm = limits.tracking_alarm + (EXCUSED_ALARM if self._is_excused(time) or self._unwritten else 0.0)
+        if (
+            base < LOST_TRACKING_DISTANCE
+            and time - self._first > 0
+            and distance > base + alarm + LEAD_SECONDS * now.speed
+        ):
             return f"{distance:.2f} m from the setpoint, {base:.2f} m before"
         if now.oscillation > _or(before.oscillation, 0.0) + limits.oscillation_alarm:
             return f"body rates oscillate by {now.oscillation:.1f} rad/s"
@@ -238,9 +246,9 @@ class Watchdog:
     def _worse(self, before: Figures, after: Figures) -> str:
         """Comparisons with NaN are false: what is not known is not worse."""
         limits = self.limits
-        moving = LEAD * max(_or(after.speed, 0.0) - _or(before.speed, 0.0), 0.0)
+        moving = LEAD_SECONDS * max(_or(after.speed, 0.0) - _or(before.speed, 0.0), 0.0)
         allowed = max(limits.tracking_ratio * before.tracking, before.tracking + limits.tracking) + moving
-        if before.tracking < OFF and after.tracking > allowed:
+        if before.tracking < LOST_TRACKING_DISTANCE and after.tracking > allowed:
             return f"{after.tracking:.3f} m rms from the setpoint, {before.tracking:.3f} m before"
         if after.innovation > max(limits.innovation_ratio * before.innovation, limits.innovation):
             return f"innovations of {after.innovation:.1f} standard deviations, {before.innovation:.1f} before"

@@ -13,26 +13,26 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from crazyem.estimation.result import Estimate, Step
-from crazyem.live.controllers import EQUAL, writes_back
+from crazyem.live.controllers import EQUAL_WITHIN, writes_back
 from crazyem.live.guard import Decision, Guard
 from crazyem.live.health import Health
 from crazyem.live.history import History
 from crazyem.live.policy import Policy
+from crazyem.live.post_write_monitor import PostWriteMonitor
 from crazyem.live.push import Pusher
-from crazyem.live.watchdog import Watchdog
 from crazyem.live.write_gate import WriteGate
 from crazyem.signals.sample import Sample
 
-LOOK_EVERY = 0.04  # s between looks of the watch
+MONITOR_PERIOD = 0.04  # s between looks of the watch
 GROUNDED_WITHIN = 3.0  # s; the firmware says that it flies for 2 s after its motors stopped
-HOLD_EVERY = 1.0  # s between notes on why nothing is written; only when the reason is another one
-MOST_ENTRIES = 5000  # in the account: bounded, however long the flight
+HOLD_NOTE_PERIOD = 1.0  # s between notes on why nothing is written; only when the reason is another one
+MOST_ACCOUNT_ENTRIES = 5000  # in the account: bounded, however long the flight
 
-Ask = Callable[[str, threading.Event], bool]
+Confirm = Callable[[str, threading.Event], bool]
 
 
 @dataclass(frozen=True)
-class Rules:
+class WriteRules:
     """How estimates may reach the drone.
 
     Attributes:
@@ -44,15 +44,15 @@ class Rules:
 
     policy: Policy = field(default_factory=Policy)
     dry_run: bool = False
-    ask: Ask | None = None
+    confirm: Confirm | None = None
 
     @property
     def mode(self) -> str:
         """For the summary."""
-        return "dry run" if self.dry_run else "push after confirmation" if self.ask else "push"
+        return "dry run" if self.dry_run else "push after confirmation" if self.confirm else "push"
 
 
-class Oversight:
+class WriteSupervisor:
     """See the module. `take` is called from the receiving thread, `consider` from the estimating one.
 
     Args:
@@ -70,7 +70,7 @@ class Oversight:
     def __init__(
         self,
         guard: Guard,
-        rules: Rules,
+        rules: WriteRules,
         *,
         originals: Mapping[str, float],
         history: History,
@@ -78,30 +78,30 @@ class Oversight:
         now: Callable[[], float],
         residual: Callable[[], Any] = lambda: None,
         enabled: Callable[[float], bool] = lambda time: True,
-        tell: Callable[[str], None] = lambda line: None,
+        record: Callable[[str], None] = lambda line: None,
     ) -> None:
         self.guard, self.rules = guard, rules
         self.originals, self.good = dict(originals), dict(originals)
-        self.history, self.now, self.tell = history, now, tell
+        self.history, self.now, self.record = history, now, record
         self.gate = gate
         self.health = Health(rules.policy.health, gate.telemetry)
-        self.watch = Watchdog(rules.policy.watch)
+        self.watch = PostWriteMonitor(rules.policy.watch)
         guard.capped = rules.policy.watch.enabled and not rules.dry_run
         self.pusher: Pusher | None = None
         self._residual, self._enabled = residual, enabled
         self._airborne = self._reverted = self._owed = self._restarted = False
-        self._looked = -math.inf
+        self._monitor_time = -math.inf
         self._residual_time = -math.inf
         self._held = ("", -math.inf)
-        self._allowed = rules.ask is None or rules.dry_run
-        self._asking: threading.Thread | None = None
+        self._allowed = rules.confirm is None or rules.dry_run
+        self._confirmation: threading.Thread | None = None
         self._ended = threading.Event()
         self._reported_stop = ""
         self._stopped: str | None = None
         self._lock = threading.Lock()
         self.entries: list[dict[str, Any]] = []
         history.guard = {"mode": rules.mode, "policy": rules.policy.name, "decisions": self.entries}
-        tell(f"guard: {rules.mode}, policy {rules.policy.name}")
+        record(f"guard: {rules.mode}, policy {rules.policy.name}")
 
     def take(self, samples: Iterable[Sample]) -> None:
         """Samples of the flight as they arrive; takes back what made it worse."""
@@ -109,8 +109,8 @@ class Oversight:
             self.health.take(sample)
             self.watch.take(sample)
         newest = self.watch.newest
-        if self.watch.judging and newest - self._looked >= LOOK_EVERY:
-            self._looked = newest
+        if self.watch.judging and newest - self._monitor_time >= MONITOR_PERIOD:
+            self._monitor_time = newest
             if self._airborne and self._enabled(newest):
                 self._judge(newest)
 
@@ -123,11 +123,11 @@ class Oversight:
             self._reported_stop = self.guard.stopped
             self._enter("stopped", time, reason=self.guard.stopped)
         if not decision.writes:
-            self._held_back(decision)
+            self._note_hold(decision)
             return decision
         if not self._allowed:
             self.guard.withdraw()
-            self._begin_asking(decision)
+            self._start_confirmation(decision)
             return Decision(time, reason="waits for confirmation")
         if self.rules.dry_run:
             self._enter("would write", time, writes=decision.writes, reason=decision.why)
@@ -135,20 +135,20 @@ class Oversight:
         self._enter("write", time, writes=decision.writes, reason=decision.why)
         return decision
 
-    def stepped(self, step: Step, time: float) -> None:
+    def on_mass_step(self, step: Step, time: float) -> None:
         """A change of mass was noticed, or it was decided what it was, at `time` [s] (the estimating thread)."""
-        self.guard.stepped(step)
-        self.watch.stepped(began=step.time, now=time, real=step.real)
+        self.guard.on_mass_step(step)
+        self.watch.on_mass_step(began=step.time, now=time, real=step.real)
 
-    def done(self, decision: Decision, why: str) -> None:
+    def on_written(self, decision: Decision, why: str) -> None:
         """The pusher is through with a decision (its thread); `why` not all of it is in the drone, "" if it is."""
         if decision.kind == "push" and not why:
-            self.watch.wrote(decision.time, max(self.now(), decision.time))
+            self.watch.on_write(decision.time, max(self.now(), decision.time))
         self._owed = bool(why) if decision.kind == "revert" else self._owed
         reason = f"{decision.kind}: {why}" if why else decision.kind
         self._enter("not written" if why else "written", self.now(), reason=reason)
 
-    def take_back(self) -> str:
+    def revert_on_request(self) -> str:
         """A person wants the last good values back: those at connect, where the last good ones are in the drone.
 
         Nothing more is pushed in this flight. Returns one sentence on what is done.
@@ -158,7 +158,7 @@ class Oversight:
         if self._reverted:
             return "it was taken back already."
         known = self.pusher.known
-        if all(math.isclose(known[name], value, rel_tol=EQUAL) for name, value in self.good.items()):
+        if all(math.isclose(known[name], value, rel_tol=EQUAL_WITHIN) for name, value in self.good.items()):
             self.good = dict(self.originals)
         return self._revert(self.now(), "asked for by the user", asked=True)
 
@@ -170,7 +170,7 @@ class Oversight:
         self.guard.stop("the flight is over")
         self._reported_stop = self.guard.stopped
 
-    def restarted(self) -> None:
+    def on_restart(self) -> None:
         """The firmware has started anew: what was written is gone with it, unless such parameters are kept."""
         if self.pusher is None or not self.history.pushes or self.guard.controller.persistent:
             return
@@ -236,7 +236,7 @@ class Oversight:
     def _hold(self, time: float) -> str:
         if self.pusher is not None and self.pusher.busy:
             return "the last set is still being written"
-        if self._asking is not None and not self._allowed:
+        if self._confirmation is not None and not self._allowed:
             return "waits for confirmation"
         if self.watch.full:
             return "what was written is still being judged"
@@ -273,16 +273,18 @@ class Oversight:
         self.pusher.submit(Decision(time, writes=tuple(self.good.items()), reason=sentence, kind=kind))
         return sentence
 
-    def _begin_asking(self, decision: Decision) -> None:
+    def _start_confirmation(self, decision: Decision) -> None:
         question = f"first write to the drone: {decision}"
         self._enter("asked", decision.time, writes=decision.writes)
-        self._asking = threading.Thread(target=self._ask, args=(question,), name="crazyem-confirm", daemon=True)
-        self._asking.start()
+        self._confirmation = threading.Thread(
+            target=self._await_confirmation, args=(question,), name="crazyem-confirm", daemon=True
+        )
+        self._confirmation.start()
 
-    def _ask(self, question: str) -> None:
-        assert self.rules.ask is not None
+    def _await_confirmation(self, question: str) -> None:
+        assert self.rules.confirm is not None
         try:
-            agreed = self.rules.ask(question, self._ended)
+            agreed = self.rules.confirm(question, self._ended)
         except Exception as error:  # nobody could be asked: that is no agreement
             agreed = False
             self.history.notice(f"the confirmation of the first write could not be asked for: {error!r}.")
@@ -295,15 +297,15 @@ class Oversight:
             self.guard.stop("the first write was not confirmed by the user")
             self.history.notice("the first write was not confirmed by the user: nothing was pushed.")
 
-    def _held_back(self, decision: Decision) -> None:
+    def _note_hold(self, decision: Decision) -> None:
         kind = re.sub(r"[-+\d.,e]+", "#", decision.why)
-        if kind != self._held[0] and decision.time - self._held[1] >= HOLD_EVERY:
+        if kind != self._held[0] and decision.time - self._held[1] >= HOLD_NOTE_PERIOD:
             self._held = (kind, decision.time)
             self._enter("hold", decision.time, reason=decision.why)
 
     def _say(self, sentence: str) -> None:
         self.history.notice(sentence)
-        self.tell(f"guard: {sentence}")
+        self.record(f"guard: {sentence}")
 
     def _enter(self, action: str, time: float, *, writes: tuple[tuple[str, float], ...] = (), reason: str = "") -> None:
         """Into the account and the recording."""
@@ -311,9 +313,9 @@ class Oversight:
         if writes:
             entry["writes"] = [list(w) for w in writes]
         with self._lock:
-            if len(self.entries) < MOST_ENTRIES or action not in ("hold", "would write"):
+            if len(self.entries) < MOST_ACCOUNT_ENTRIES or action not in ("hold", "would write"):
                 self.entries.append(entry)
         text = ", ".join(f"{n} = {v:.6g}" for n, v in writes)
-        self.tell(
+        self.record(
             f"guard {action} at {time:.3f} s" + (f": {text}" if text else "") + (f" ({reason})" if reason else "")
         )

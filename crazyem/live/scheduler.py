@@ -19,12 +19,13 @@ from crazyem.estimation.result import Estimate
 from crazyem.live.pipeline import Estimator
 from crazyem.signals.sample import Sample
 
-PAUSE = 0.002  # s between two rounds of receiving: a twentieth of an update's budget
-TURN = 0.01  # s a worker stays with one drone while others wait
-OLDEST = 1.0  # s of the drone's clock after which an update is made however late it comes
-NEVER = 1 << 30  # samples between updates: none
+POLL_PAUSE = 0.002  # s between two rounds of receiving: a twentieth of an update's budget
+TIME_SLICE = 0.01  # s a worker stays with one drone while others wait
+LONGEST_DEFERRAL = 1.0  # s of the drone's clock after which an update is made however late it comes
+NO_UPDATE = 1 << 30  # samples between updates: none
 FULL_PASSES_EVERY = 12  # updates; the costly ones of several drones should not fall together,
-MANY, RARELY = 5, 100  # and beyond so many drones they come every so many updates, unless something moves
+MANY_DRONES = 5  # beyond so many they come more rarely, unless something moves,
+MANY_DRONES_FULL_PASSES_EVERY = 100  # updates
 
 
 class Mailbox:
@@ -34,8 +35,10 @@ class Mailbox:
         work: takes an item; an exception ends the mailbox, and goes to `failed`.
     """
 
-    def __init__(self, crew: "Crew", work: Callable[[Any], None], failed: Callable[[Exception], None]) -> None:
-        self._crew, self._work, self._failed = crew, work, failed
+    def __init__(
+        self, scheduler: "Scheduler", work: Callable[[Any], None], failed: Callable[[Exception], None]
+    ) -> None:
+        self._scheduler, self._work, self._failed = scheduler, work, failed
         self._items: deque[Any] = deque()
         self._lock = threading.Lock()
         self._queued = False
@@ -53,15 +56,15 @@ class Mailbox:
             if self._queued:
                 return
             self._queued = True
-        self._crew.enqueue(self)
+        self._scheduler.enqueue(self)
 
     def wait(self, timeout: float) -> bool:
         """Until everything was worked off, at most `timeout` [s]; whether it was."""
         return self._idle.wait(timeout)
 
-    def turn(self) -> None:
+    def run_slice(self) -> None:
         """Work off items for a while (a worker's thread)."""
-        until = time.monotonic() + TURN
+        until = time.monotonic() + TIME_SLICE
         while True:
             with self._lock:
                 if not self._items:
@@ -80,10 +83,10 @@ class Mailbox:
                 return
             if time.monotonic() >= until:
                 break
-        self._crew.enqueue(self)  # behind those that wait
+        self._scheduler.enqueue(self)  # behind those that wait
 
 
-class Rounds:
+class PacketPoller:
     """One thread that goes round all drones and takes in what has arrived for each."""
 
     def __init__(self) -> None:
@@ -119,10 +122,10 @@ class Rounds:
             with self._lock:
                 some = [take_in() for take_in in self._sources]
             # also a pause where there was something: packets that come singly would each cost a round
-            time.sleep(PAUSE if any(some) else 2 * PAUSE)
+            time.sleep(POLL_PAUSE if any(some) else 2 * POLL_PAUSE)
 
 
-class Crew:
+class Scheduler:
     """Threads that work for all mailboxes, first come, first served, and the one that receives for all (`rounds`).
 
     Args:
@@ -137,7 +140,7 @@ class Crew:
         ]
         for thread in self._threads:
             thread.start()
-        self.rounds = Rounds()
+        self.poller = PacketPoller()
 
     def mailbox(self, work: Callable[[Any], None], failed: Callable[[Exception], None]) -> Mailbox:
         """A new one; see `Mailbox`."""
@@ -149,7 +152,7 @@ class Crew:
 
     def close(self) -> None:
         """End the threads; what is in mailboxes by then stays there."""
-        self.rounds.close()
+        self.poller.close()
         for _ in self._threads:
             self._ready.put(None)
         for thread in self._threads:
@@ -157,10 +160,10 @@ class Crew:
 
     def _run(self) -> None:
         while (mailbox := self._ready.get()) is not None:
-            mailbox.turn()
+            mailbox.run_slice()
 
 
-class Paced:
+class UpdateThrottle:
     """An estimator that leaves updates out while it is late, and whose updates are out of step with the others'.
 
     Args:
@@ -179,9 +182,11 @@ class Paced:
         self.skipped = 0
         self._every = int(inner.every)
         self._late = late if late is not None else 0.01 * self._every
-        if of > MANY:
-            inner.share_computer(RARELY)
-        self._phase = round(number * self._every * (RARELY if of > MANY else FULL_PASSES_EVERY) / of)
+        if of > MANY_DRONES:
+            inner.share_computer(MANY_DRONES_FULL_PASSES_EVERY)
+        self._phase = round(
+            number * self._every * (MANY_DRONES_FULL_PASSES_EVERY if of > MANY_DRONES else FULL_PASSES_EVERY) / of
+        )
         self._held = 0  # samples of one signal for which an update was due and none was made
         self._last = math.nan
         self._time = math.nan
@@ -228,8 +233,8 @@ class Paced:
         if math.isnan(self._last):
             self._last = time
         self.behind = self.newest() - time
-        self._hold = self.behind > self._late and time - self._last <= OLDEST
-        self.inner.every = NEVER if self._hold else self._every + self._phase
+        self._hold = self.behind > self._late and time - self._last <= LONGEST_DEFERRAL
+        self.inner.every = NO_UPDATE if self._hold else self._every + self._phase
 
     def finish(self) -> Estimate:
         """The final estimate, whatever it takes."""
@@ -238,6 +243,6 @@ class Paced:
         return estimate
 
 
-def paced(inner: Estimator, *, number: int, of: int) -> Paced:
+def throttle(inner: Estimator, *, number: int, of: int) -> UpdateThrottle:
     """The estimator of drone `number` among `of`."""
-    return Paced(inner, number=number, of=of)
+    return UpdateThrottle(inner, number=number, of=of)
