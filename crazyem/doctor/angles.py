@@ -20,18 +20,18 @@ from crazyem.doctor.kinematics import (
     track,
     width_for,
 )
-from crazyem.doctor.regress import blocks, choose, slope
+from crazyem.doctor.regression import blocks, choose, slope
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
 Array = NDArray[np.float64]
 
 DEGREES = 180.0 / math.pi
-UNITS = {"degrees": DEGREES, "converted": 1.0 / DEGREES}
-ENOUGH = math.radians(0.1)  # rms of an angle, below which nothing is said of it
-ALIKE = 0.8  # correlation that an angle must have with one of the quaternion's to be judged
-HIGHEST = (math.radians(80.0), math.radians(65.0))  # roll and pitch up to which Euler angles are judged
-NAMES = ("roll", "pitch", "yaw")
+ANGLE_UNITS = {"degrees": DEGREES, "converted": 1.0 / DEGREES}
+LEAST_ANGLE_RMS = math.radians(0.1)  # rms of an angle, below which nothing is said of it
+LEAST_CORRELATION = 0.8  # correlation that an angle must have with one of the quaternion's to be judged
+LARGEST_ANGLES = (math.radians(80.0), math.radians(65.0))  # roll and pitch up to which Euler angles are judged
+ANGLE_NAMES = ("roll", "pitch", "yaw")
 # ways to read four numbers as an attitude: name -> (how far-fetched, columns in the order x y z w, conjugated)
 READINGS: dict[str, tuple[int, tuple[int, ...], bool]] = {
     "x y z w, body to world": (0, (0, 1, 2, 3), False),
@@ -171,9 +171,9 @@ def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -
     block = blocks(grid.time[rows])
     straight_x, straight_y = _unit_variance(x.value[rows]), _unit_variance(y.value[rows])
     # an angle that hardly moves is noise: it speaks neither for nor against
-    excited = x.value[rows].std(axis=0) >= ENOUGH
+    excited = x.value[rows].std(axis=0) >= LEAST_ANGLE_RMS
     alike = np.abs(straight_x.T @ straight_y) / rows.size
-    told: NDArray[np.bool_] = np.any(alike > ALIKE, axis=0)
+    told: NDArray[np.bool_] = np.any(alike > LEAST_CORRELATION, axis=0)
     if not (excited & told).any():
         return None, False
     ways = _orders(straight_x, told)
@@ -183,10 +183,10 @@ def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -
     if choice.denied and choice.name:
         # each angle must bear it out by itself: noise has a sign, too
         match = (ways[choice.name][1] * straight_y).mean(axis=0)
-        if not (match[told] > ALIKE).all():
+        if not (match[told] > LEAST_CORRELATION).all():
             return None, False
     known = [i for i in range(3) if excited[i] and told[i]]
-    parts = {NAMES[i]: slope(x.value[rows, i], y.value[rows, i], block) for i in known}
+    parts = {ANGLE_NAMES[i]: slope(x.value[rows, i], y.value[rows, i], block) for i in known}
     evidence = {
         "explained": choice.explained[choice.name or choice.best],
         "explained_as_declared": choice.explained["as declared"],
@@ -197,12 +197,12 @@ def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -
     head = f"{name} against {other}: "
     if choice.denied:
         what = choice.name.removeprefix("as declared ")
-        factor = axes.sign_factor(what, NAMES) if choice.name else None
+        factor = axes.sign_factor(what, ANGLE_NAMES) if choice.name else None
         if factor is not None:
-            turned = " and ".join(NAMES[i] for i in range(3) if factor[i] < 0)
+            turned = " and ".join(ANGLE_NAMES[i] for i in range(3) if factor[i] < 0)
             text = f"{head}the sign of {turned} is inverted."
-            unit = _unit_of([s.value * factor[NAMES.index(k)] for k, s in parts.items() if s is not None])
-            scale = 1.0 / UNITS[unit] if unit else 1.0
+            unit = _unit_of([s.value * factor[ANGLE_NAMES.index(k)] for k, s in parts.items() if s is not None])
+            scale = 1.0 / ANGLE_UNITS[unit] if unit else 1.0
             text = text if not unit else text[:-1] + f", and it is {_unit_said(unit)}."
             fix = Fix("scale", (name,), tuple(f * scale for f in factor))
             return Finding("angles", Grade.UNUSABLE, text, name, (), evidence, "Correct its sign.", fix), True
@@ -213,14 +213,14 @@ def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -
     if not unit:
         return None, True
     text = f"{head}it is {_unit_said(unit)}."
-    fix = Fix("scale", (name,), (1.0 / UNITS[unit],) * 3)
+    fix = Fix("scale", (name,), (1.0 / ANGLE_UNITS[unit],) * 3)
     return Finding("angles", Grade.UNUSABLE, text, name, (), evidence, "Correct its unit.", fix), True
 
 
 def _upright(attitude: Track, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The longest stretch in which roll and pitch are far from where Euler angles jump."""
     angles = np.abs(euler_of_quaternion(attitude.value))
-    far = (angles[:, 0] < HIGHEST[0]) & (angles[:, 1] < HIGHEST[1]) | ~attitude.valid
+    far = (angles[:, 0] < LARGEST_ANGLES[0]) & (angles[:, 1] < LARGEST_ANGLES[1]) | ~attitude.valid
     edges = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]]).astype(np.int8)))
     out = np.zeros(valid.size, bool)
     if edges.size:
@@ -237,18 +237,18 @@ def _unit_variance(value: Array) -> Array:
 def _orders(x: Array, told: NDArray[np.bool_]) -> dict[str, tuple[int, Array]]:
     """Signs of the angles, and the order yaw, pitch, roll."""
     out = {}
-    for key, (cost, value) in axes.signed("as declared", x, NAMES).items():
+    for key, (cost, value) in axes.signed("as declared", x, ANGLE_NAMES).items():
         if cost <= 2 or [part.lstrip("-") for part in key.split(" ")[-3:]] == ["yaw,", "pitch,", "roll"]:
             out[key] = (cost, value * told)
     return out
 
 
 def _unit_of(slopes: list[float]) -> str:
-    """Key of `UNITS` that the slopes point to, "" for radians or where they disagree."""
+    """Key of `ANGLE_UNITS` that the slopes point to, "" for radians or where they disagree."""
     if not slopes or min(slopes) <= 0.0:
         return ""
     middle = math.exp(float(np.mean(np.log(slopes))))
-    return next((name for name, factor in UNITS.items() if abs(math.log(middle / factor)) < 0.3), "")
+    return next((name for name, factor in ANGLE_UNITS.items() if abs(math.log(middle / factor)) < 0.3), "")
 
 
 def _unit_said(unit: str) -> str:

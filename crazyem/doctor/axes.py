@@ -8,17 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.regress import Slope
+from crazyem.doctor.regression import Slope
 
 Array = NDArray[np.float64]
 
-SLACK = 0.02  # sensors and filters in good order differ by so much
-MANY = 5.0  # blocks (of 1.5 s or more) of motion that a scale must have been seen over
-_NAMES = "xyz"
-_NEAR = math.log(1.2)  # how far a slope may be from a known factor
+SCALE_TOLERANCE = 0.02  # sensors and filters in good order differ by so much
+FEWEST_SCALE_BLOCKS = 5.0  # blocks (of 1.5 s or more) of motion that a scale must have been seen over
+_AXIS_NAMES = "xyz"
+_FACTOR_TOLERANCE = math.log(1.2)  # how far a slope may be from a known factor
 
 
-def signed(label: str, vector: Array, names: Sequence[str] = _NAMES) -> dict[str, tuple[int, Array]]:
+def signed(label: str, vector: Array, names: Sequence[str] = _AXIS_NAMES) -> dict[str, tuple[int, Array]]:
     """All 48 signed orders of the components of (n, 3): name -> (how far-fetched, values); the plain one first.
 
     A sign costs 1 (all three together: 2), another order 2 more. Names: "body", "body x, -y, z", "body y, x, z".
@@ -34,7 +34,7 @@ def signed(label: str, vector: Array, names: Sequence[str] = _NAMES) -> dict[str
     return out
 
 
-def sign_factor(name: str, names: Sequence[str] = _NAMES) -> tuple[float, ...] | None:
+def sign_factor(name: str, names: Sequence[str] = _AXIS_NAMES) -> tuple[float, ...] | None:
     """Factors that undo signs named by `signed` ("x, -y, z"), None if the order changed."""
     parts = name.split(", ")
     if [part.lstrip("-") for part in parts] != list(names):
@@ -47,7 +47,7 @@ def known_factor(found: Slope, known: Mapping[str, float]) -> tuple[str, float] 
     if found.value <= 0.0:
         return None
     for name, factor in known.items():
-        if abs(math.log(found.value / factor)) < _NEAR:
+        if abs(math.log(found.value / factor)) < _FACTOR_TOLERANCE:
             return name, factor
     return None
 
@@ -79,7 +79,7 @@ def scale_fault(whole: Slope | None, single: Sequence[Slope | None], least: floa
         return ScaleFault(f"its scale is {_said(whole)}", (1.0 / whole.value,) * len(single))
     if not any(off):
         return None
-    said = [f"{_NAMES[i]} {_said(s)}" for i, s in enumerate(single) if off[i] and s is not None]
+    said = [f"{_AXIS_NAMES[i]} {_said(s)}" for i, s in enumerate(single) if off[i] and s is not None]
     repair = tuple(1.0 / s.value if o and s is not None else 1.0 for o, s in zip(off, single, strict=True))
     return ScaleFault("its scale is " + ", ".join(said), repair)
 
@@ -87,15 +87,15 @@ def scale_fault(whole: Slope | None, single: Sequence[Slope | None], least: floa
 def numbers(single: Sequence[Slope | None]) -> dict[str, float]:
     """Slopes of the components with their intervals, as evidence."""
     out: dict[str, float] = {}
-    for axis, s in zip(_NAMES, single, strict=False):
+    for axis, s in zip(_AXIS_NAMES, single, strict=False):
         if s is not None:
             out |= {f"slope_{axis}": s.value, f"slope_{axis}_low": s.low, f"slope_{axis}_high": s.high}
     return out
 
 
 def _off(s: Slope, least: float) -> bool:
-    certain = s.far_low > 1.0 + SLACK or s.far_high < 1.0 - SLACK
-    return abs(s.value - 1.0) >= least and certain and s.explained > 0.8 and s.blocks >= MANY
+    certain = s.far_low > 1.0 + SCALE_TOLERANCE or s.far_high < 1.0 - SCALE_TOLERANCE
+    return abs(s.value - 1.0) >= least and certain and s.explained > 0.8 and s.blocks >= FEWEST_SCALE_BLOCKS
 
 
 def _said(s: Slope) -> str:

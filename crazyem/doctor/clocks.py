@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import QUIET, Cadence, Stream, cadence, listed, longest, streams
+from crazyem.doctor.streams import NO_FLOAT_WARNINGS, Cadence, Stream, cadence, listed, longest, streams
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.stamps import RESTART
@@ -15,19 +15,45 @@ from crazyem.recordings.stamps import RESTART
 Column = NDArray[np.float64]
 
 # Counters that overflow: name -> seconds until they start again
-WRAPS: dict[str, float] = {
+CLOCK_WRAPS: dict[str, float] = {
     "24 bits of milliseconds": 2.0**24 * 1e-3,
     "32 bits of milliseconds": 2.0**32 * 1e-3,
     "32 bits of microseconds": 2.0**32 * 1e-6,
     "16 bits of milliseconds": 2.0**16 * 1e-3,
 }
-OFF_NOMINAL = 0.002  # relative deviation of the rate worth a word
-WRONG_NOMINAL = 0.1  # from which a claimed rate is wrong
-_NICE = (1, 2, 4, 5, 8, 10, 12.5, 20, 25, 30, 40, 50, 60, 100, 120, 125, 200, 240, 250, 300, 400, 500, 800, 1000, 2000)
-JUMP = 0.3  # s by which two clocks may part from one packet to the next: a radio link stalls for less
+RATE_DEVIATION = 0.002  # relative deviation of the rate worth a word
+WRONG_RATE_DEVIATION = 0.1  # from which a claimed rate is wrong
+_USUAL_RATES = (
+    1,
+    2,
+    4,
+    5,
+    8,
+    10,
+    12.5,
+    20,
+    25,
+    30,
+    40,
+    50,
+    60,
+    100,
+    120,
+    125,
+    200,
+    240,
+    250,
+    300,
+    400,
+    500,
+    800,
+    1000,
+    2000,
+)
+CLOCK_JUMP = 0.3  # s by which two clocks may part from one packet to the next: a radio link stalls for less
 
 
-@QUIET
+@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """Findings per stream, and for the drone's clock against the host's."""
     found = []
@@ -59,7 +85,7 @@ def _order(stream: Stream) -> list[Finding]:
         rhythm = cadence(stream.time)
         period = rhythm.period if rhythm.period > 0 else float(np.median(np.abs(steps)))
         wrapped = np.zeros(steps.size, bool)
-        for words, span in WRAPS.items():
+        for words, span in CLOCK_WRAPS.items():
             # the next stamp comes a period or a gap after the one before, modulo the counter
             rows = np.flatnonzero((steps < -0.5 * span) & (steps >= -span) & ~wrapped)
             if rows.size:
@@ -159,10 +185,10 @@ def _rate(
         return
     real = 1.0 / rhythm.period
     claimed = _claimed(metadata, stream.name, real)
-    nominal = claimed if claimed is not None else min(_NICE, key=lambda rate: abs(math.log(real / rate)))
+    nominal = claimed if claimed is not None else min(_USUAL_RATES, key=lambda rate: abs(math.log(real / rate)))
     deviation = real / nominal - 1.0
-    limit = WRONG_NOMINAL if claimed is None else math.inf
-    if max(OFF_NOMINAL, 4.0 * _uncertainty(time, rhythm)) < abs(deviation) < limit:
+    limit = WRONG_RATE_DEVIATION if claimed is None else math.inf
+    if max(RATE_DEVIATION, 4.0 * _uncertainty(time, rhythm)) < abs(deviation) < limit:
         key = next((k for k in rates if k[0] == nominal and abs(k[1] / real - 1.0) < 5e-4), (nominal, real))
         rates.setdefault(key, []).append(stream.name)
 
@@ -187,7 +213,7 @@ def _claimed(metadata: Mapping[str, Mapping[str, str]], stream: str, real: float
 
 def _rate_finding(nominal: float, real: float, names: list[str]) -> Finding:
     percent = 100.0 * (real / nominal - 1.0)
-    wrong = abs(percent) > 100.0 * WRONG_NOMINAL
+    wrong = abs(percent) > 100.0 * WRONG_RATE_DEVIATION
     return Finding(
         "clocks",
         Grade.DEGRADES if wrong else Grade.HARMLESS,
@@ -216,13 +242,13 @@ def _arrivals(stream: Stream) -> tuple[Column, Column, NDArray[np.int64]] | None
 
 def _jumps(stream: Stream, time: Column, offset: Column, rows: NDArray[np.int64]) -> list[Finding]:
     # a late packet leaves the line and comes back; a jump stays: compare the medians of what is around
-    candidates = np.flatnonzero(np.abs(np.diff(offset)) > JUMP)
+    candidates = np.flatnonzero(np.abs(np.diff(offset)) > CLOCK_JUMP)
     sizes = []
     for i in candidates[:1000]:
         before, after = offset[max(0, i - 20) : i + 1], offset[i + 1 : i + 41]
         # packets that queued up arrive late, never early: the earliest arrivals show the clocks
         size = float(after.min() - before.min())
-        if abs(size) > JUMP:
+        if abs(size) > CLOCK_JUMP:
             sizes.append((int(i), size))
     if not sizes:
         return []
@@ -250,7 +276,7 @@ def _jumps(stream: Stream, time: Column, offset: Column, rows: NDArray[np.int64]
 def _drift(time: Column, offset: Column, *, several: bool) -> list[Finding]:
     """Slope of the earliest arrivals of each of twenty spans: delays only ever add."""
     duration = float(time[-1] - time[0])
-    if duration < 5.0 or np.abs(np.diff(offset)).max() > JUMP:
+    if duration < 5.0 or np.abs(np.diff(offset)).max() > CLOCK_JUMP:
         return []
     edges = np.searchsorted(time, np.linspace(time[0], time[-1], 21))
     picks = [a + int(np.argmin(offset[a:b])) for a, b in itertools.pairwise(edges.tolist()) if b > a]

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.kinematics import STEP, Track
+from crazyem.doctor.kinematics import GRID_STEP, Track
 
 Array = NDArray[np.float64]
 
-REACH = 0.3  # s, lags looked for on either side
-COARSE = 3  # grid steps between lags tried at first
-ROWS = 4000  # of the grid that a correlation is made of, at most
-NEAR = 6  # grid steps about a lag within which it may move when a block is left out
-LEAST = 45  # and at least
+LARGEST_LAG = 0.3  # s, lags looked for on either side
+COARSE_LAG_STEP = 3  # grid steps between lags tried at first
+MOST_CORRELATION_ROWS = 4000  # of the grid that a correlation is made of, at most
+JACKKNIFE_REACH = 6  # grid steps about a lag within which it may move when a block is left out
+FEWEST_CORRELATION_ROWS = 45  # and at least
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Delay:
     at_edge: bool
 
 
-def delay(first: Track, second: Track, *, reach: float = REACH, mixed: bool = True) -> Delay | None:
+def delay(first: Track, second: Track, *, reach: float = LARGEST_LAG, mixed: bool = True) -> Delay | None:
     """Lag of `second` behind `first`, (m, c) each; None if they share too little.
 
     Args:
@@ -41,23 +41,23 @@ def delay(first: Track, second: Track, *, reach: float = REACH, mixed: bool = Tr
         mixed: explain each component of the second by all of the first (any axes, signs and units); else by the same
             component only, with a free factor.
     """
-    most = round(reach / STEP)
+    most = round(reach / GRID_STEP)
     steps = np.arange(-most, most + 1)
     curve = np.full(steps.size, np.nan)
     # what was smoothed has no peak narrower than the window: every third lag finds it, its neighbours refine it
-    for k in range(0, steps.size, COARSE):
+    for k in range(0, steps.size, COARSE_LAG_STEP):
         curve[k] = _explained(first, second, int(steps[k]), mixed)
     if not np.isfinite(curve).any():
         return None
     near = int(np.nanargmax(curve))
-    for k in range(max(near - COARSE, 0), min(near + COARSE + 1, steps.size)):
+    for k in range(max(near - COARSE_LAG_STEP, 0), min(near + COARSE_LAG_STEP + 1, steps.size)):
         curve[k] = _explained(first, second, int(steps[k]), mixed)
     top = int(np.nanargmax(curve))
     edge = top in (0, steps.size - 1) or not np.isfinite(curve[top - 1 : top + 2]).all()
     if edge:
-        return Delay(float(steps[top]) * STEP, float(curve[top]), True)
+        return Delay(float(steps[top]) * GRID_STEP, float(curve[top]), True)
     place = float(steps[top]) - 1.0 + _peak(curve[top - 1 : top + 2])
-    return Delay(place * STEP, float(curve[top]), False)
+    return Delay(place * GRID_STEP, float(curve[top]), False)
 
 
 def _explained(first: Track, second: Track, steps: int, mixed: bool) -> float:
@@ -65,10 +65,10 @@ def _explained(first: Track, second: Track, steps: int, mixed: bool) -> float:
     m = len(first.value)
     a, b = max(0, -steps), max(0, steps)
     n = m - abs(steps)
-    stride = max(2, n // ROWS)
+    stride = max(2, n // MOST_CORRELATION_ROWS)
     good = first.valid[a : a + n : stride] & second.valid[b : b + n : stride]
     count = int(np.count_nonzero(good))
-    if count < LEAST:
+    if count < FEWEST_CORRELATION_ROWS:
         return math.nan
     x = first.value[a : a + n : stride][good]
     y = second.value[b : b + n : stride][good]
@@ -95,8 +95,8 @@ def spread(first: Track, second: Track, found: Delay, block_rows: int) -> tuple[
         first, second, found: what `delay` was given and gave.
         block_rows: grid steps of a block.
     """
-    middle = round(found.value / STEP)
-    steps = np.arange(middle - NEAR, middle + NEAR + 1)
+    middle = round(found.value / GRID_STEP)
+    steps = np.arange(middle - JACKKNIFE_REACH, middle + JACKKNIFE_REACH + 1)
     sums = np.array([_block_sums(first, second, int(k), block_rows) for k in steps])
     used = sums[:, :, 0, 0].min(axis=0) > 0
     sums = sums[:, used]
@@ -104,8 +104,8 @@ def spread(first: Track, second: Track, found: Delay, block_rows: int) -> tuple[
     if count < 3:
         return math.inf, count
     total = sums.sum(axis=1)
-    peaks = np.array([_peak(_share(total - sums[:, b])) for b in range(count)]) * STEP
-    if peaks.min() <= 0.0 or peaks.max() >= 2 * NEAR * STEP:
+    peaks = np.array([_peak(_share(total - sums[:, b])) for b in range(count)]) * GRID_STEP
+    if peaks.min() <= 0.0 or peaks.max() >= 2 * JACKKNIFE_REACH * GRID_STEP:
         return math.inf, count
     return float(np.sqrt((count - 1) / count * np.square(peaks - peaks.mean()).sum())), count
 
@@ -115,7 +115,7 @@ def _block_sums(first: Track, second: Track, steps: int, block_rows: int) -> Arr
     m = len(first.value)
     a, b = max(0, -steps), max(0, steps)
     n = m - abs(steps)
-    stride = max(2, n // ROWS)
+    stride = max(2, n // MOST_CORRELATION_ROWS)
     at = np.arange(b, b + n, stride)
     good = first.valid[a : a + n : stride] & second.valid[at]
     x, y, block = first.value[a : a + n : stride][good], second.value[at][good], (at // block_rows)[good]

@@ -23,23 +23,23 @@ from crazyem.recordings.recording import Recording, SignalArray
 Array = NDArray[np.float64]
 Hashes = NDArray[np.uint32]
 
-NEIGHBOURS = 6  # samples on each side that a turning point stands out from
+TURNING_POINT_NEIGHBOURS = 6  # samples on each side that a turning point stands out from
 SPAN_STEP = 0.005  # s, rounding of the spans
 RATIO_STEP = 0.1  # rounding of the logarithm of the ratio; there are two roundings, half a step apart
-PER_SECOND = 40.0  # numbers kept, of those there are, chosen by their own value so that copies choose alike
-MOST = 60_000  # numbers kept of a very long flight
+HASHES_PER_SECOND = 40.0  # numbers kept, of those there are, chosen by their own value so that copies choose alike
+MOST_HASHES = 60_000  # numbers kept of a very long flight
 LARGE_GROUP = 16  # files that share a number, from which on not every pair of them is looked at
-TOLERANCE = 0.02  # s within which distances in time agree
-FEWEST = 20  # numbers in common at one distance
-SHARE = 0.15  # of the numbers in the common stretch that must be in common
+TIME_TOLERANCE = 0.02  # s within which distances in time agree
+FEWEST_COMMON_HASHES = 20  # numbers in common at one distance
+LEAST_COMMON_SHARE = 0.15  # of the numbers in the common stretch that must be in common
 _CHANNELS = 12
-_CHANNELS_LARGE = 5  # for recordings with more than _LARGE rows a channel
-_LARGE = 150_000
-_PREFERRED = (
+_CHANNELS_LARGE = 5  # for recordings with more than _LARGE_CHANNEL_ROWS rows a channel
+_LARGE_CHANNEL_ROWS = 150_000
+_PREFERRED_SIGNALS = (
     "body_rate", "specific_force", "motor_command", "velocity", "position", "rotor_speed", "attitude", "motor_request",
     "mixer_command", "acceleration", "euler",
 )  # fmt: skip
-_NEVER = ("setpoint", "sp_", "ctrltarget", "ref")
+_IGNORED_SIGNALS = ("setpoint", "sp_", "ctrltarget", "ref")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,8 +141,8 @@ def fingerprint(recording: Recording) -> Fingerprint:
     end = max((float(t.max()) for t in stamps), default=0.0)
     if at.size:
         rate = at.size / max(end - start, 1.0)
-        thin = max(0, math.ceil(math.log2(rate / PER_SECOND))) if rate > PER_SECOND else 0
-        while hashed.size * 2.0**-thin > MOST:
+        thin = max(0, math.ceil(math.log2(rate / HASHES_PER_SECOND))) if rate > HASHES_PER_SECOND else 0
+        while hashed.size * 2.0**-thin > MOST_HASHES:
             thin += 1
         keep = hashed < np.uint32(min(2.0 ** (32 - thin), 2.0**32 - 1))
         hashed, at = hashed[keep], at[keep]
@@ -175,13 +175,15 @@ def _channels(recording: Recording) -> list[tuple[Array, Array]]:
     for name in names:
         array = recording.signals[name]
         low = name.lower()
-        if any(low.startswith(word) or f".{word}" in low for word in _NEVER) or array.quantity.startswith("setpoint"):
+        if any(low.startswith(word) or f".{word}" in low for word in _IGNORED_SIGNALS) or array.quantity.startswith(
+            "setpoint"
+        ):
             continue
         found = sound_samples(array)
-        if found is None or found[0].size < 8 * NEIGHBOURS:
+        if found is None or found[0].size < 8 * TURNING_POINT_NEIGHBOURS:
             continue
         for column in found[1].T:
-            if len(chosen) >= (_CHANNELS_LARGE if found[0].size > _LARGE else _CHANNELS):
+            if len(chosen) >= (_CHANNELS_LARGE if found[0].size > _LARGE_CHANNEL_ROWS else _CHANNELS):
                 return chosen
             chosen.append((found[0], column))
     return chosen
@@ -189,7 +191,7 @@ def _channels(recording: Recording) -> list[tuple[Array, Array]]:
 
 def _rank(name: str, array: SignalArray) -> tuple[int, str]:
     quantity = array.quantity
-    place = _PREFERRED.index(quantity) if quantity in _PREFERRED else len(_PREFERRED)
+    place = _PREFERRED_SIGNALS.index(quantity) if quantity in _PREFERRED_SIGNALS else len(_PREFERRED_SIGNALS)
     return (2 * place + ("@" in name), name)
 
 
@@ -197,11 +199,13 @@ def _numbers(time: Array, value: Array) -> tuple[Hashes, Array]:
     """The numbers (n,) of one channel and their times (n,)."""
     fresh = np.append(True, value[1:] != value[:-1])  # held values are one sample
     time, value = time[fresh], value[fresh]
-    if value.size < 4 * NEIGHBOURS:
+    if value.size < 4 * TURNING_POINT_NEIGHBOURS:
         return np.zeros(0, np.uint32), np.zeros(0)
-    size = 2 * NEIGHBOURS + 1
+    size = 2 * TURNING_POINT_NEIGHBOURS + 1
     turning = (value == maximum_filter1d(value, size)) | (value == minimum_filter1d(value, size))
-    turning[:NEIGHBOURS] = turning[-NEIGHBOURS:] = False  # what stands out at an end may be nothing in a longer copy
+    turning[:TURNING_POINT_NEIGHBOURS] = turning[-TURNING_POINT_NEIGHBOURS:] = (
+        False  # what stands out at an end may be nothing in a longer copy
+    )
     t, v = time[turning], value[turning]
     if t.size < 3:
         return np.zeros(0, np.uint32), np.zeros(0)
@@ -261,15 +265,19 @@ def _votes(prints: Sequence[Fingerprint]) -> dict[tuple[int, int], Array]:
     pair, distance = pair[place], distance[place]
     edges = np.flatnonzero(np.append(True, pair[1:] != pair[:-1])) if pair.size else np.zeros(0, int)
     ends = np.append(edges[1:], pair.size)
-    return {divmod(int(pair[i]), len(prints)): np.sort(distance[i:j]) for i, j in zip(edges, ends) if j - i >= FEWEST}
+    return {
+        divmod(int(pair[i]), len(prints)): np.sort(distance[i:j])
+        for i, j in zip(edges, ends)
+        if j - i >= FEWEST_COMMON_HASHES
+    }
 
 
 def _judge(first: Fingerprint, second: Fingerprint, distances: Array) -> Duplicate | None:
     """Whether so many numbers are in common at one distance that it is one flight."""
-    upper = np.searchsorted(distances, distances + TOLERANCE, "right")
+    upper = np.searchsorted(distances, distances + TIME_TOLERANCE, "right")
     counts = upper - np.arange(distances.size)
     best = int(np.argmax(counts))
-    if counts[best] < FEWEST:
+    if counts[best] < FEWEST_COMMON_HASHES:
         return None
     offset = float(np.median(distances[best : upper[best]]))
     start = max(first.start_s, second.start_s - offset)
@@ -277,14 +285,14 @@ def _judge(first: Fingerprint, second: Fingerprint, distances: Array) -> Duplica
     if not end > start:
         return None
     matched, seen = _matches(first, second, offset)
-    if matched.size < FEWEST:
+    if matched.size < FEWEST_COMMON_HASHES:
         return None
     # the stretch reaches to the ends of the files unless the numbers in common end long before
     reach = 5.0 * max(float(np.median(np.diff(np.sort(matched)))), 0.2)
     low = start if matched.min() - start < max(reach, 2.0) else float(matched.min())
     high = end if end - matched.max() < max(reach, 2.0) else float(matched.max())
     inside = (seen >= low) & (seen <= high)
-    if not high > low or matched.size < SHARE * inside.sum():
+    if not high > low or matched.size < LEAST_COMMON_SHARE * inside.sum():
         return None
     length = high - low
     return Duplicate(
@@ -314,7 +322,7 @@ def _matches(first: Fingerprint, second: Fingerprint, offset: float) -> tuple[Ar
     hit = np.zeros(first.times.size, bool)
     for side in (near - 1, near):
         at = np.clip(side, 0, max(hashes.size - 1, 0))
-        hit |= (hashes[at] == keys[0]) & (np.abs(times[at] - first.times) < TOLERANCE)
+        hit |= (hashes[at] == keys[0]) & (np.abs(times[at] - first.times) < TIME_TOLERANCE)
     poorer = first.times if first.times.size / max(first.end_s - first.start_s, 1.0) <= second.times.size / max(
         second.end_s - second.start_s, 1.0
     ) else second.times - offset  # fmt: skip

@@ -9,7 +9,7 @@ from crazyem.recordings.airborne import Airtime
 from crazyem.recordings.ordering import Array, sound_samples
 from crazyem.recordings.recording import Recording
 
-SATURATED = 0.999  # duty from which a rotor is at its limit
+SATURATED_DUTY = 0.999  # duty from which a rotor is at its limit
 _SPEED_SPAN = 0.1  # s over which position is differenced where there is no velocity
 
 
@@ -88,7 +88,7 @@ def envelope(recording: Recording, air: Airtime) -> Envelope:
     command = inside_of(recording, "motor_command", air)
     if command is not None:
         found["motor_command_max"] = float(command.max())
-        found["motor_saturated_share"] = float((command >= SATURATED).any(axis=1).mean())
+        found["motor_saturated_share"] = float((command >= SATURATED_DUTY).any(axis=1).mean())
     return Envelope(air.seconds, air.judged_by, airborne_intervals_s=air.flown, **found)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording
 
-_RANK = {Grade.UNUSABLE: 0, Grade.DEGRADES: 1, Grade.HARMLESS: 2}
+_GRADE_RANK = {Grade.UNUSABLE: 0, Grade.DEGRADES: 1, Grade.HARMLESS: 2}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,4 +53,4 @@ def examine(recording: Recording) -> tuple[Finding, ...]:
 
 
 def _rank(finding: Finding) -> int:
-    return _RANK[finding.grade]
+    return _GRADE_RANK[finding.grade]

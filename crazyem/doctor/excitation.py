@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor.thrust import Inputs
-from crazyem.doctor.whitening import ORDER, Fit, autoregression, filtered, long_run
+from crazyem.doctor.whitening import AUTOREGRESSION_ORDER, Fit, autoregression, filtered, long_run
 from crazyem.physics.lag import CAUSAL, LINEAR, fit_predictor, hold_predictor, lagged_means
 from crazyem.physics.rotations import quaternion_conjugate, quaternion_product, rotation_vector_from_quaternion
 from crazyem.recordings.airborne import Airtime
@@ -24,17 +24,17 @@ from crazyem.vehicle import GRAVITY, Vehicle
 
 Array = NDArray[np.float64]
 
-FINEST = 4e-3  # s; faster streams are averaged into steps of 5 ms
-COARSE = 5e-3
+FINEST_STEP = 4e-3  # s; faster streams are averaged into steps of 5 ms
+AVERAGED_STEP = 5e-3
 LONGEST_STEP = 0.05  # s; a longer hole between two samples parts two stretches
 MOST_STEPS = 6_000  # more are sampled in blocks, and the information scaled
-BLOCK = 1_000
+BLOCK_STEPS = 1_000
 DELAY, DELAY_SD = 3.5e-3, 2e-3  # s, prior of the estimator for commands
 SPEED_DELAY_SD = 10e-3  # s, and for measured rotor speeds
 LAG_SD = 0.7  # of the logarithm
 INERTIA_SD = 0.5
-TRIM = 0.05  # shift of the centre of mass over the arm: prior of the torque offsets
-_DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])
+TRIM_SD = 0.05  # shift of the centre of mass over the arm: prior of the torque offsets
+_THIRD_DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])
 # of one iteration: logarithms of inertia and lag, delay [ms], offsets as far as they like
 _LONGEST_MOVE = np.array([0.4, 0.4, 0.4, 0.4, 5.0, np.inf, np.inf, np.inf])
 
@@ -57,7 +57,7 @@ def steps_of(time: Array, value: Array, air: Airtime) -> Steps | None:
     """Stretches of samples (n, c) in the air, thinned to steps of at least 4 ms by averaging; None with too few."""
     inside = air.covers(time)
     time, value = time[inside], value[inside]
-    if time.size < 4 * ORDER:
+    if time.size < 4 * AUTOREGRESSION_ORDER:
         return None
     time, value = thinned(time, value)
     # a row that repeats the one before was not measured (a slower stream put onto a faster grid)
@@ -65,7 +65,7 @@ def steps_of(time: Array, value: Array, air: Airtime) -> Steps | None:
     time, value = time[keep], value[keep]
     period = float(np.median(np.diff(time))) if time.size > 1 else math.nan
     cuts = np.flatnonzero(np.diff(time) > max(LONGEST_STEP, 3.5 * period)) + 1
-    pieces = [p for p in zip(np.split(time, cuts), np.split(value, cuts)) if p[0].size > 3 * ORDER]
+    pieces = [p for p in zip(np.split(time, cuts), np.split(value, cuts)) if p[0].size > 3 * AUTOREGRESSION_ORDER]
     total = sum(t.size for t, _ in pieces)
     if total > MOST_STEPS:
         pieces = _sampled(pieces, total)
@@ -129,7 +129,9 @@ def quarters(steps: Steps) -> list[Steps]:
     parts = []
     for low, high in pairwise(edges):
         inside = [(t >= low) & (t <= high) for t in steps.nodes]
-        kept = [(t[i], v[i]) for t, v, i in zip(steps.nodes, steps.values, inside) if i.sum() > 3 * ORDER]
+        kept = [
+            (t[i], v[i]) for t, v, i in zip(steps.nodes, steps.values, inside) if i.sum() > 3 * AUTOREGRESSION_ORDER
+        ]
         if kept:
             parts.append(Steps(tuple(t for t, _ in kept), tuple(v for _, v in kept), steps.period, steps.share))
     return parts
@@ -146,7 +148,7 @@ def rotation_fit_once(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | N
     Returns: None with too few steps.
     """
     nominal = np.array(vehicle.inertia)
-    unit = max(TRIM * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
+    unit = max(TRIM_SD * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
     delay_sd = (DELAY_SD if inputs.lagged else SPEED_DELAY_SD) * 1e3
     timed = inputs.lagged
     centre = np.array([*np.log(nominal), math.log(max(vehicle.motor_time_constant, 1e-4)), 0.0, 0.0, 0.0, 0.0])
@@ -159,7 +161,7 @@ def rotation_fit_once(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | N
         tau, delay = (math.exp(theta[3]) if timed else 0.0), theta[4] * 1e-3
         rows = lagged(inputs, steps, tau=tau, delay=delay, predictor=predictor)
         system = _RotationSystem(response, rows, theta, tau)
-        if system.count < 10 * ORDER:
+        if system.count < 10 * AUTOREGRESSION_ORDER:
             return None
         step = np.linalg.solve(system.matrix + np.diag(prior), system.score + prior * (centre - theta))
         theta = theta + np.clip(step, -_LONGEST_MOVE, _LONGEST_MOVE)
@@ -270,7 +272,7 @@ def _command_noise_score(inputs: Inputs, steps: Steps, system: _RotationSystem, 
 
 def _white_variance(command: Array, rate: Array, *, rate_variance: float) -> float:
     """Variance of what in command samples (n,) does not persist: see crazyem.estimation.aliasing, same arithmetic."""
-    du, dw = np.convolve(command, _DIFFERENCE, "valid"), np.convolve(rate, _DIFFERENCE, "valid")
+    du, dw = np.convolve(command, _THIRD_DIFFERENCE, "valid"), np.convolve(rate, _THIRD_DIFFERENCE, "valid")
     power = float(dw @ dw)
     gain = float(du @ dw) / power if power > 0.0 else 0.0
     return gain**2 * rate_variance + float(np.mean((du - gain * dw) ** 2)) / 20.0
@@ -292,9 +294,9 @@ def _first_covariance(parts: list[Array]) -> float:
 
 def thinned(time: Array, value: Array) -> tuple[Array, Array]:
     """A stream (n,), (n, c) as it is, or as means over bins of 5 ms (those at least half full) if it is faster."""
-    if time.size < 2 or np.median(np.diff(time)) >= FINEST:
+    if time.size < 2 or np.median(np.diff(time)) >= FINEST_STEP:
         return time, value
-    bins = np.floor((time - time[0]) / COARSE).astype(np.int64)
+    bins = np.floor((time - time[0]) / AVERAGED_STEP).astype(np.int64)
     starts = np.flatnonzero(np.append(True, np.diff(bins) > 0))
     counts = np.diff(np.append(starts, time.size))
     good = counts >= 0.5 * float(np.median(counts))
@@ -305,14 +307,14 @@ def thinned(time: Array, value: Array) -> tuple[Array, Array]:
 
 
 def _sampled(pieces: list[tuple[Array, Array]], total: int) -> list[tuple[Array, Array]]:
-    """Blocks of BLOCK samples, evenly spread over the flight, of about MOST_STEPS in all."""
+    """Blocks of BLOCK_STEPS samples, evenly spread over the flight, of about MOST_STEPS in all."""
     blocks = [
-        (t[i : i + BLOCK], v[i : i + BLOCK])
+        (t[i : i + BLOCK_STEPS], v[i : i + BLOCK_STEPS])
         for t, v in pieces
-        for i in range(0, t.size, BLOCK)
-        if t[i : i + BLOCK].size > 3 * ORDER
+        for i in range(0, t.size, BLOCK_STEPS)
+        if t[i : i + BLOCK_STEPS].size > 3 * AUTOREGRESSION_ORDER
     ]
-    wanted = np.linspace(0, len(blocks) - 1, min(len(blocks), max(MOST_STEPS // BLOCK, 1))).round().astype(int)
+    wanted = np.linspace(0, len(blocks) - 1, min(len(blocks), max(MOST_STEPS // BLOCK_STEPS, 1))).round().astype(int)
     return [blocks[i] for i in np.unique(wanted)]
 
 

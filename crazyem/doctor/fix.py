@@ -22,8 +22,8 @@ Signals = dict[str, SignalArray]
 
 # Times first, since what compares signals needs them; then units, since a rate in deg/s reads as impossible samples in
 # rad/s and those must not be thrown away; then frames, which need an attitude in order; what is left is marked.
-ORDER = ("unwrap", "sort", "shift", "scale", "world_to_body", "mark")
-_TIMES = ("unwrap", "sort", "shift")
+FIX_ORDER = ("unwrap", "sort", "shift", "scale", "world_to_body", "mark")
+_TIME_FIXES = ("unwrap", "sort", "shift")
 _ATTITUDE_REACH = 0.1  # s between an attitude and what it rotates
 
 
@@ -60,7 +60,7 @@ def apply_fixes(recording: Recording, findings: Iterable[Finding]) -> tuple[Reco
 def _place(finding: Finding) -> int:
     """When a repair's turn comes: rows that a reader named first, while they are still where it found them."""
     assert finding.fix is not None
-    return ORDER.index(finding.fix.kind) if _checkable(finding) else -1
+    return FIX_ORDER.index(finding.fix.kind) if _checkable(finding) else -1
 
 
 def repair(recording: Recording, finding: Finding) -> Recording:
@@ -69,9 +69,9 @@ def repair(recording: Recording, finding: Finding) -> Recording:
     assert fix is not None
     signals: Signals = dict(recording.signals)
     for name in fix.signals:
-        signals[name] = _KINDS[fix.kind](signals[name], fix, recording)
-    if fix.kind in _TIMES:
-        signals = _merged(_own_streams(signals, recording.signals, fix))
+        signals[name] = _REPAIRS[fix.kind](signals[name], fix, recording)
+    if fix.kind in _TIME_FIXES:
+        signals = _merged(_separate_streams(signals, recording.signals, fix))
     return replace(recording, signals=signals, metadata=_noted(recording.metadata, finding))
 
 
@@ -97,7 +97,7 @@ def _same(one: Finding, other: Finding) -> bool:
 
 def _possible(recording: Recording, fix: Fix | None) -> bool:
     """Whether a fix is well formed and can be undone."""
-    if fix is None or fix.kind not in _KINDS or not fix.signals:
+    if fix is None or fix.kind not in _REPAIRS or not fix.signals:
         return False
     arrays = [recording.signals.get(name) for name in fix.signals]
     if any(a is None for a in arrays) or not all(math.isfinite(f) for f in fix.factor):
@@ -163,7 +163,7 @@ def _world_to_body(array: SignalArray, fix: Fix, recording: Recording) -> Signal
     return replace(array, value=_on_rows(array.value, turned, fix.rows), marked=array.marked | lost)
 
 
-_KINDS: dict[str, Callable[[SignalArray, Fix, Recording], SignalArray]] = {
+_REPAIRS: dict[str, Callable[[SignalArray, Fix, Recording], SignalArray]] = {
     "scale": _scale,
     "shift": _shift,
     "unwrap": _unwrap,
@@ -198,7 +198,7 @@ def _attitude_at(stamps: Array, attitude: Array, time: Array) -> Array:
 # after times have changed ----------------------------------------------------------------------------------------
 
 
-def _own_streams(signals: Signals, before: Mapping[str, SignalArray], fix: Fix) -> Signals:
+def _separate_streams(signals: Signals, before: Mapping[str, SignalArray], fix: Fix) -> Signals:
     """Signals that no longer share the stamps of their stream get a stream of their own."""
     changed = set(fix.signals)
     for stream in {before[name].stream for name in changed}:

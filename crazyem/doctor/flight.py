@@ -9,23 +9,23 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import QUIET, longest, runs
+from crazyem.doctor.streams import NO_FLOAT_WARNINGS, longest, runs
 from crazyem.doctor.thrust import is_rotorcraft, kind_objection
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.ordering import Intervals, inside, ordered
 from crazyem.recordings.recording import Recording
 
-UPSET = 90.0  # degrees of tilt
-LYING = 60.0  # degrees of tilt at rest
-FAST = 1.5  # m/s into the ground; a controller lands at up to 0.8, a drop from 10 cm ends at 1.4
-IMPOSSIBLE = 50.0  # m/s: a wrong position, not a fall
-APPROACH = 0.05  # s before the ground, over which that speed is taken
-CARRIED = 0.3  # m of height that a drone changes whose rotors do not turn: by hand
-DROPPED = 0.4  # m above ground at which rotors stop
+UPSET_TILT = 90.0  # degrees of tilt
+LYING_TILT = 60.0  # degrees of tilt at rest
+HARD_LANDING_SPEED = 1.5  # m/s into the ground; a controller lands at up to 0.8, a drop from 10 cm ends at 1.4
+IMPOSSIBLE_SPEED = 50.0  # m/s: a wrong position, not a fall
+APPROACH_SECONDS = 0.05  # s before the ground, over which that speed is taken
+CARRIED_HEIGHT = 0.3  # m of height that a drone changes whose rotors do not turn: by hand
+DROP_HEIGHT = 0.4  # m above ground at which rotors stop
 
 
-@QUIET
+@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """No flight, a recording that is cut, upsets and crashes."""
     flight = airtime(recording)
@@ -58,7 +58,7 @@ def _kind(recording: Recording) -> list[Finding]:
 def _no_flight(flight: Airtime) -> Finding:
     evidence = {"climbed_m": flight.climbed} if math.isfinite(flight.climbed) else {}
     text = f"The drone never flew: {flight.reason}."
-    if not flight.lifting and flight.climbed > CARRIED and not flight.by_height_alone:
+    if not flight.lifting and flight.climbed > CARRIED_HEIGHT and not flight.by_height_alone:
         text += " Somebody carried it, or the motor signal is not what it says."
     return Finding(
         "flight",
@@ -124,7 +124,7 @@ def _upsets(flight: Airtime, tilt: tuple[NDArray[np.float64], NDArray[np.float64
     if tilt is None:
         return []
     time, angle = tilt
-    rows = inside(time, flight.airborne) & (angle > UPSET)
+    rows = inside(time, flight.airborne) & (angle > UPSET_TILT)
     # one wild sample is a bad number, not a roll-over
     for first, last in runs(rows):
         if last - first < 3:
@@ -167,9 +167,9 @@ def _lying(
     for time, angle, words in angles:
         after = angle[time > end + 0.3]
         # the rest must last: a fifth of a second and half of what is left
-        if after.size >= 10 and float(np.median(after)) > LYING:
+        if after.size >= 10 and float(np.median(after)) > LYING_TILT:
             last = float(np.median(after[after.size // 2 :]))
-            if last < LYING:
+            if last < LYING_TILT:
                 continue
             moment = float(time[np.searchsorted(time, end)])
             return [
@@ -226,12 +226,12 @@ def _impacts(recording: Recording, flight: Airtime) -> list[Finding]:
         low = np.flatnonzero((z[1:] < 0.06) & (z[:-1] >= 0.06))
         for k in low:
             i = rows[k]
-            j = min(int(np.searchsorted(time, time[i] - APPROACH)), int(i) - 1)
+            j = min(int(np.searchsorted(time, time[i] - APPROACH_SECONDS)), int(i) - 1)
             lasting = float(time[i] - time[j])
-            if 0.0 < lasting < 3.0 * APPROACH:
+            if 0.0 < lasting < 3.0 * APPROACH_SECONDS:
                 speed = float(np.linalg.norm(position[i] - position[j])) / lasting
                 down = float(position[j, 2] - position[i, 2]) / lasting
-                if FAST < speed < IMPOSSIBLE and down > 0.5 * FAST:
+                if HARD_LANDING_SPEED < speed < IMPOSSIBLE_SPEED and down > 0.5 * HARD_LANDING_SPEED:
                     hits.append((float(time[i]), speed))
     if not hits:
         return []
@@ -269,7 +269,7 @@ def _drops(recording: Recording, flight: Airtime) -> list[Finding]:
             continue  # the log stood still: nobody knows when they stopped
         later = position[(time > end) & (time < end + 1.0), 2]
         fell = height - (float(later.min()) - flight.ground) if later.size else 0.0
-        if height > DROPPED and fell > 0.5 * height:
+        if height > DROP_HEIGHT and fell > 0.5 * height:
             found.append(
                 Finding(
                     "flight",

@@ -7,10 +7,10 @@ import numpy as np
 
 from crazyem.doctor import axes
 from crazyem.doctor.attitudes import Pose, poses
-from crazyem.doctor.compare import Look, look, misread
+from crazyem.doctor.hypotheses import Comparison, compare_hypotheses, misread
 from crazyem.doctor.kinematics import (
     GRAVITY,
-    STEP,
+    GRID_STEP,
     UP,
     Grid,
     Track,
@@ -25,13 +25,13 @@ from crazyem.doctor.kinematics import (
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
-WIDTH = 0.3  # s: an accelerometer in flight is loud
-ENOUGH = 0.25  # m/s^2 rms along an axis, below which frames and signs are not told
-BELIEVED = 0.5  # share of the variance about the mean that a hypothesis must explain
-OFF = 0.05
-LIKE = 0.04  # how far a velocity may be from its position's derivative to be trusted
-HOVER = 0.03  # m/s rms
-UNITS = {"g": 1.0 / GRAVITY, "mg": 1e3 / GRAVITY, "cm/s^2": 1e2, "mm/s^2": 1e3, "g taken twice": GRAVITY}
+FORCE_WINDOW = 0.3  # s: an accelerometer in flight is loud
+LEAST_FORCE_RMS = 0.25  # m/s^2 rms along an axis, below which frames and signs are not told
+LEAST_EXPLAINED_SHARE = 0.5  # share of the variance about the mean that a hypothesis must explain
+SCALE_FAULT = 0.05
+VELOCITY_TOLERANCE = 0.04  # how far a velocity may be from its position's derivative to be trusted
+HOVER_SPEED_RMS = 0.03  # m/s rms
+FORCE_UNITS = {"g": 1.0 / GRAVITY, "mg": 1e3 / GRAVITY, "cm/s^2": 1e2, "mm/s^2": 1e3, "g taken twice": GRAVITY}
 
 
 def check(recording: Recording) -> list[Finding]:
@@ -58,17 +58,19 @@ def _moving(recording: Recording) -> SignalArray | None:
 
 
 def _derived(velocity: SignalArray, position: SignalArray) -> bool:
-    """True if the slope of a velocity against a position's derivative is 1 within `LIKE`."""
+    """True if the slope of a velocity against a position's derivative is 1 within `VELOCITY_TOLERANCE`."""
     grid = grid_of(velocity, position)
-    window = Window(max(WIDTH, width_for(velocity, position)))
+    window = Window(max(FORCE_WINDOW, width_for(velocity, position)))
     x, y = window.mean(difference(track(position, grid))), window.mean(track(velocity, grid))
     rows = np.flatnonzero(x.valid & y.valid)[::3]
     if rows.size < 100:
         return False
     a, b = x.value[rows], y.value[rows]
     xx, xy, yy = (float((p * q).sum()) for p, q in ((a, a), (a, b), (b, b)))
-    hovers = xx / a.size < HOVER**2 and yy / b.size < HOVER**2
-    return hovers or (xy > 0.0 and abs(math.sqrt(yy / max(xx, 1e-12)) - 1.0) < LIKE and xy**2 > 0.8 * xx * yy)
+    hovers = xx / a.size < HOVER_SPEED_RMS**2 and yy / b.size < HOVER_SPEED_RMS**2
+    return hovers or (
+        xy > 0.0 and abs(math.sqrt(yy / max(xx, 1e-12)) - 1.0) < VELOCITY_TOLERANCE and xy**2 > 0.8 * xx * yy
+    )
 
 
 def _acceleration_of(moving: SignalArray, grid: Grid) -> Track:
@@ -98,11 +100,13 @@ def _specific_force(name: str, array: SignalArray, recording: Recording, attitud
             "turned twice": (2, Track(_twice(attitude.value, force), valid)),
             "world, gravity removed": (2, Track(kinematic, valid)),
         }
-        one = look(array, grid, f"{pose.name} and motion", candidates, width=_width(array, pose, moving), least=ENOUGH)
+        one = compare_hypotheses(
+            array, grid, f"{pose.name} and motion", candidates, width=_width(array, pose, moving), least=LEAST_FORCE_RMS
+        )
         if one is not None:
             looks.append(one)
     looks.sort(key=lambda one: -one.explained)
-    if looks and looks[0].explained >= BELIEVED:
+    if looks and looks[0].explained >= LEAST_EXPLAINED_SHARE:
         seen = looks[0]
         if seen.choice.denied:
             return [_structure(name, seen)]
@@ -116,10 +120,10 @@ def _twice(attitude: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def _width(array: SignalArray, pose: Pose, moving: SignalArray) -> float:
-    return max(WIDTH, width_for(array, pose.array, moving))
+    return max(FORCE_WINDOW, width_for(array, pose.array, moving))
 
 
-def _level(seen: Look) -> tuple[float, float]:
+def _level(seen: Comparison) -> tuple[float, float]:
     """Mean of the measurement along the predicted mean, as a factor of it; and its standard error."""
     size = float(np.linalg.norm(seen.predicted))
     return float(seen.mean @ seen.predicted) / size**2, float(np.linalg.norm(seen.mean_error)) / size
@@ -129,10 +133,10 @@ def _by_weight(name: str, array: SignalArray, attitudes: list[Pose]) -> list[Fin
     """Without motion to compare: over a flight that begins and ends at rest the mean force is the weight."""
     for pose in attitudes[:1]:
         grid = grid_of(array, pose.array)
-        window = Window(WIDTH)
+        window = Window(FORCE_WINDOW)
         attitude, force = pose.track(grid), track(array, grid)
         world = window.mean(Track(rotate(attitude.value, force.value), attitude.valid & force.valid))
-        if world.valid.sum() * STEP >= 5.0:
+        if world.valid.sum() * GRID_STEP >= 5.0:
             value = world.value[world.valid]
             return _judge_level(name, float(value[:, 2].mean()) / GRAVITY, 0.05, None)
     good = np.isfinite(array.value).all(axis=1)
@@ -140,12 +144,14 @@ def _by_weight(name: str, array: SignalArray, attitudes: list[Pose]) -> list[Fin
     return _judge_level(name, float(np.median(norm)) / GRAVITY, 0.2, None, signed=False)
 
 
-def _judge_level(name: str, level: float, error: float, seen: Look | None, *, signed: bool = True) -> list[Finding]:
+def _judge_level(
+    name: str, level: float, error: float, seen: Comparison | None, *, signed: bool = True
+) -> list[Finding]:
     """What the level of gravity in a specific force says of its unit, gravity, sign and scale."""
     evidence = {"gravity_level": level, "gravity_level_error": error, **(seen.evidence() if seen else {})}
     head = f"The mean of {name} is {level:.4g} times the weight it must carry: "
     advice = "Correct its unit where it is read."
-    for unit, factor in UNITS.items():
+    for unit, factor in FORCE_UNITS.items():
         if abs(math.log(max(abs(level), 1e-9) / factor)) < math.log(1.3) and (level > 0 or not signed):
             what = _unit_said(unit) + ", not m/s^2"
             fix = Fix("scale", (name,), (1.0 / factor,) * 3)
@@ -161,7 +167,7 @@ def _judge_level(name: str, level: float, error: float, seen: Look | None, *, si
     if level < -0.7:
         fix = Fix("scale", (name,), (-1.0,) * 3)
         return [Finding("forces", Grade.UNUSABLE, f"{head}its sign is inverted.", name, (), evidence, advice, fix)]
-    if seen is not None and abs(level - 1.0) >= OFF and abs(level - 1.0) > 4.0 * error:
+    if seen is not None and abs(level - 1.0) >= SCALE_FAULT and abs(level - 1.0) > 4.0 * error:
         return [_scale(name, level, error, seen, evidence)]
     return []
 
@@ -170,7 +176,7 @@ def _unit_said(unit: str) -> str:
     return "it was converted from g once too often" if unit == "g taken twice" else f"it is in {unit}"
 
 
-def _scale(name: str, level: float, error: float, seen: Look, evidence: Mapping[str, float]) -> Finding:
+def _scale(name: str, level: float, error: float, seen: Comparison, evidence: Mapping[str, float]) -> Finding:
     """A level off by some per cent: a scale, or a bias along the vertical; the moving part tells, where it can."""
     whole = seen.whole
     interval = f"{level:.3f} ({level - 2 * error:.3f} to {level + 2 * error:.3f})"
@@ -192,7 +198,7 @@ def _scale(name: str, level: float, error: float, seen: Look, evidence: Mapping[
     return Finding("forces", Grade.DEGRADES, text, name, (), numbers, advice, fix)
 
 
-def _structure(name: str, seen: Look) -> Finding:
+def _structure(name: str, seen: Comparison) -> Finding:
     choice = seen.choice
     head = f"{name} against {seen.against}: "
     tail = (
@@ -227,15 +233,17 @@ def _acceleration(name: str, array: SignalArray, recording: Recording, attitudes
         candidates["body, gravity removed"] = (1, Track(rotate(attitude.value, kinematic.value, inverse=True), valid))
         force = kinematic.value + GRAVITY * UP
         candidates["specific force"] = (1, Track(rotate(attitude.value, force, inverse=True), valid))
-    width = max(WIDTH, width_for(array, moving))
-    seen = look(array, grid, f"the derivative of the {moving.quantity}", candidates, width=width, least=ENOUGH)
-    if seen is None or seen.whole is None or seen.explained < BELIEVED:
+    width = max(FORCE_WINDOW, width_for(array, moving))
+    seen = compare_hypotheses(
+        array, grid, f"the derivative of the {moving.quantity}", candidates, width=width, least=LEAST_FORCE_RMS
+    )
+    if seen is None or seen.whole is None or seen.explained < LEAST_EXPLAINED_SHARE:
         return []
     evidence = seen.evidence()
     head = f"{name} against {seen.against}: "
     if seen.choice.denied:
         return [_acceleration_structure(name, head, seen)]
-    unit = axes.known_factor(seen.whole, UNITS)
+    unit = axes.known_factor(seen.whole, FORCE_UNITS)
     if unit:
         text = f"{head}it is {seen.whole.value:.4g} times as large: {_unit_said(unit[0])}, not m/s^2."
         fix = Fix("scale", (name,), (1.0 / unit[1],) * 3)
@@ -246,7 +254,7 @@ def _acceleration(name: str, array: SignalArray, recording: Recording, attitudes
         text = f"{head}gravity is still in it (its mean is {seen.mean[2]:.2f} m/s^2 along z)."
         numbers = {**evidence, "gravity_level": level}
         return [Finding("forces", Grade.UNUSABLE, text, name, (), numbers, "Take gravity off its z.")]
-    fault = axes.scale_fault(seen.whole, seen.single, OFF) if seen.covered >= 0.5 else None
+    fault = axes.scale_fault(seen.whole, seen.single, SCALE_FAULT) if seen.covered >= 0.5 else None
     if fault is None:
         return []
     text = f"{head}{fault.text}."
@@ -257,7 +265,7 @@ def _acceleration(name: str, array: SignalArray, recording: Recording, attitudes
     return [Finding("forces", Grade.DEGRADES, text, name, (), numbers, advice)]
 
 
-def _acceleration_structure(name: str, head: str, seen: Look) -> Finding:
+def _acceleration_structure(name: str, head: str, seen: Comparison) -> Finding:
     choice = seen.choice
     fix: Fix | None = None
     if choice.name == "specific force":

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import COMMANDED, QUIET, listed, longest, runs
-from crazyem.doctor.thrust import VOLTAGE_UNKNOWN, flat_voltage
+from crazyem.doctor.streams import COMMAND_SIGNALS, NO_FLOAT_WARNINGS, listed, longest, runs
+from crazyem.doctor.thrust import UNKNOWN_VOLTAGE_ERROR, flat_voltage
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.ordering import inside
@@ -17,7 +17,7 @@ Flags = NDArray[np.bool_]
 
 # Shortest stretch without any change that counts as stuck [s]: noise moves inertial sensors at every sample, while a
 # pose in millimetres, or a quaternion in 0.16 degrees, may stay for a while in a hover.
-SHORTEST: dict[str, float] = {
+SHORTEST_STILLNESS: dict[str, float] = {
     "body_rate": 0.2,
     "specific_force": 0.2,
     "acceleration": 0.2,
@@ -28,14 +28,19 @@ SHORTEST: dict[str, float] = {
     "attitude": 0.3,
     "euler": 0.3,
 }
-LEAST_SAMPLES = 10
-UNUSUAL = 6.0  # times the longest of 99 % of the channel's own still stretches
-NOTED = 0.02  # share of the flight
-_INERTIAL = frozenset({"body_rate", "specific_force", "acceleration"})
-_MOVED = {"position": 0.03, "velocity": 0.15, "attitude": 0.03, "euler": 0.03}  # m, m/s, rad meanwhile, as others say
+FEWEST_STILL_SAMPLES = 10
+STILLNESS_RATIO = 6.0  # times the longest of 99 % of the channel's own still stretches
+DEGRADING_FROZEN_SHARE = 0.02  # share of the flight
+_INERTIAL_SIGNALS = frozenset({"body_rate", "specific_force", "acceleration"})
+_LEAST_MOTION = {
+    "position": 0.03,
+    "velocity": 0.15,
+    "attitude": 0.03,
+    "euler": 0.03,
+}  # m, m/s, rad meanwhile, as others say
 
 
-@QUIET
+@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """Whole signals and single components that stand still in flight; constant columns, in one finding."""
     flight = airtime(recording)
@@ -48,7 +53,7 @@ def check(recording: Recording) -> list[Finding]:
         if not array.quantity:
             if _constant(array.value):
                 idle.append(name)
-        elif array.quantity in SHORTEST:
+        elif array.quantity in SHORTEST_STILLNESS:
             stuck += _signal(recording, name, array, flight)
         elif name == "voltage" and flat_voltage(recording, flight):
             found.append(_flat_voltage(recording, array))
@@ -83,7 +88,7 @@ def _company_of(recording: Recording, first: _Stuck, alike: list[_Stuck]) -> lis
     known = {first.name, *(other.name for other in alike)}
     found = []
     for name, array in recording.signals.items():
-        if name in known or not array.quantity or array.quantity in COMMANDED:
+        if name in known or not array.quantity or array.quantity in COMMAND_SIGNALS:
             continue
         if array.stream != first.array.stream or array.time.size != first.array.time.size:
             continue
@@ -124,7 +129,7 @@ def _flat_voltage(recording: Recording, array: SignalArray) -> Finding:
     volts = float(np.nanmedian(array.value))
     matters = "motor_command" in recording.signals or "motor_request" in recording.signals
     cost = (
-        f" Thrust from duty goes with its square, so the mass may be {percent(VOLTAGE_UNKNOWN)} off."
+        f" Thrust from duty goes with its square, so the mass may be {percent(UNKNOWN_VOLTAGE_ERROR)} off."
         if matters
         else " Nothing here needs it."
     )
@@ -143,17 +148,17 @@ def _signal(recording: Recording, name: str, array: SignalArray, flight: Airtime
     if not flight.known or not flight.airborne:
         return []
     flying = inside(array.time, flight.airborne)
-    if flying.sum() < LEAST_SAMPLES:
+    if flying.sum() < FEWEST_STILL_SAMPLES:
         return []
     still = [_still(column) & flying for column in array.value.T]
     together = np.logical_and.reduce(still)
-    least = SHORTEST[array.quantity]
+    least = SHORTEST_STILLNESS[array.quantity]
     found = []
     stuck = _stretches(array, together, least)
     stuck = [span for span in stuck if _others_moved(recording, name, array, span)]
     if stuck:
         found.append(_Stuck(name, array, "", stuck, flying))
-    if array.quantity in _INERTIAL or array.quantity == "rotor_speed":
+    if array.quantity in _INERTIAL_SIGNALS or array.quantity == "rotor_speed":
         whole = np.zeros(array.time.size, bool)
         for first, last in stuck:
             whole[first:last] = True
@@ -178,27 +183,27 @@ def _stretches(array: SignalArray, flags: Flags, least: float) -> list[tuple[int
     if not spans.size:
         return []
     lengths = spans[:, 1] - spans[:, 0]
-    enough = (array.time[spans[:, 1] - 1] - array.time[spans[:, 0] - 1] >= least) & (lengths >= LEAST_SAMPLES)
+    enough = (array.time[spans[:, 1] - 1] - array.time[spans[:, 0] - 1] >= least) & (lengths >= FEWEST_STILL_SAMPLES)
     if not enough.any():
         return []
     # the channel's habit, from its other stretches: a coarse one stays often, and for long
     others = lengths[~enough]
     habit = float(np.percentile(others, 99)) if others.size else 0.0
-    enough &= lengths >= UNUSUAL * habit
+    enough &= lengths >= STILLNESS_RATIO * habit
     return [(int(a) - 1, int(b)) for a, b in spans[enough]]
 
 
 def _company(array: SignalArray, span: tuple[int, int]) -> bool:
     """True if the other components change often enough meanwhile: one that stands still while new samples came."""
     part = array.value[span[0] : span[1]]
-    return int((part[1:] != part[:-1]).any(axis=1).sum()) >= LEAST_SAMPLES
+    return int((part[1:] != part[:-1]).any(axis=1).sum()) >= FEWEST_STILL_SAMPLES
 
 
 def _others_moved(recording: Recording, name: str, array: SignalArray, span: tuple[int, int]) -> bool:
     """True if something else shows that this signal should have changed; inertial sensors always should."""
     start, end = float(array.time[span[0]]), float(array.time[span[1] - 1])
     quantity = array.quantity
-    if quantity in _INERTIAL:
+    if quantity in _INERTIAL_SIGNALS:
         return True
     if quantity in ("motor_command", "rotor_speed"):
         other = "rotor_speed" if quantity == "motor_command" else "motor_command"
@@ -220,7 +225,7 @@ def _others_moved(recording: Recording, name: str, array: SignalArray, span: tup
             if label != name and other_array.quantity == quantity:
                 moved = _spread(recording, label, start, end)
                 break
-    return end - start > 1.0 if math.isnan(moved) else moved > _MOVED[quantity]
+    return end - start > 1.0 if math.isnan(moved) else moved > _LEAST_MOTION[quantity]
 
 
 def _between(array: SignalArray, start: float, end: float) -> NDArray[np.float64]:

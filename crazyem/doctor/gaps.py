@@ -5,22 +5,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import QUIET, Cadence, Stream, cadence, graded, listed, longest, streams
+from crazyem.doctor.streams import NO_FLOAT_WARNINGS, Cadence, Stream, cadence, graded, listed, longest, streams
 from crazyem.recordings.finding import Finding, Grade, percent
 from crazyem.recordings.ordering import Intervals
 from crazyem.recordings.recording import Recording
 
-PAUSE = 1.0  # s of silence of everything: the recorder stood still, or the link was gone
-NOTED = 0.05  # share of records lost from which results suffer
-LONG = 0.1  # s: longer than a drone's attitude lasts without measurement
-SAME_MOMENT = 0.6  # s
-_AROUND = 3  # neighbouring intervals over which a late record may catch up
+PAUSE_SECONDS = 1.0  # s of silence of everything: the recorder stood still, or the link was gone
+DEGRADING_LOST_SHARE = 0.05  # share of records lost from which results suffer
+LONG_GAP_SECONDS = 0.1  # s: longer than a drone's attitude lasts without measurement
+SIMULTANEOUS_SECONDS = 0.6  # s
+_CATCH_UP_INTERVALS = 3  # neighbouring intervals over which a late record may catch up
 # A rate of its own: nine intervals in a row of which most are alike, and half as long again as the stream's period.
 # Loss at random makes unequal ones: of those of half the records lost a quarter are alike.
-_RATE, _SLOWER, _ALIKE, _MOST = 9, 1.5, 0.2, 0.8
+_RATE_WINDOW, _SLOWER_RATIO, _INTERVAL_TOLERANCE, _EQUAL_INTERVAL_SHARE = 9, 1.5, 0.2, 0.8
 
 
-@QUIET
+@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """Records missing within streams, streams that stop early or start late, and silence of everything."""
     groups = [stream for stream in streams(recording) if stream.time.size > 1]
@@ -77,18 +77,18 @@ def lost_records(time: NDArray[np.float64], period: float) -> NDArray[np.int64]:
     """
     alone = np.maximum(np.round(np.diff(time) / period).astype(np.int64) - 1, 0)
     # what neighbours lost must not be charged to a gap; the second round knows which of them only came late
-    return _least(time, period, alone, _least(time, period, alone, alone))
+    return _fewest_lost(time, period, alone, _fewest_lost(time, period, alone, alone))
 
 
-def _least(
+def _fewest_lost(
     time: NDArray[np.float64], period: float, alone: NDArray[np.int64], others: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """The least number of records missing at each long interval over windows of up to `_AROUND` neighbours a side."""
+    """The fewest records missing at each long interval, over windows of up to `_CATCH_UP_INTERVALS` a side."""
     lost = alone.copy()
     rows = np.flatnonzero(alone)
     before = np.concatenate([[0], np.cumsum(others)])
-    for left in range(_AROUND + 1):
-        for right in range(_AROUND + 1):
+    for left in range(_CATCH_UP_INTERVALS + 1):
+        for right in range(_CATCH_UP_INTERVALS + 1):
             first = np.maximum(rows - left, 0)
             last = np.minimum(rows + 1 + right, time.size - 1)
             elsewhere = before[last] - before[first] - others[rows]
@@ -98,10 +98,10 @@ def _least(
 
 
 def _pauses(groups: list[Stream]) -> Intervals:
-    """Silence of every stream at once for at least `PAUSE`, and for much longer than the slowest of them is silent."""
+    """Silence of all streams at once: at least `PAUSE_SECONDS`, and much longer than the slowest of them is silent."""
     merged = np.sort(np.concatenate([stream.time for stream in groups]))
     steps = np.diff(merged)
-    rows = np.flatnonzero(steps >= PAUSE)
+    rows = np.flatnonzero(steps >= PAUSE_SECONDS)
     usual = max(min(cadence(np.sort(s.time)).period for s in groups), 0.0) if rows.size else 0.0
     return tuple((float(merged[i]), float(merged[i + 1])) for i in rows if not steps[i] < 20.0 * usual)
 
@@ -120,18 +120,20 @@ def _pause_finding(pauses: Intervals) -> Finding:
     )
 
 
-def own_rates(time: NDArray[np.float64], period: float) -> NDArray[np.float64]:
+def local_periods(time: NDArray[np.float64], period: float) -> NDArray[np.float64]:
     """(n - 1,) s: the period that holds at each interval, of increasing stamps (n,): where a stream was slowed down,
     nothing is missing."""
     steps = np.diff(time)
     local = np.full(steps.size, period)
-    if steps.size < _RATE:
+    if steps.size < _RATE_WINDOW:
         return local
-    windows = np.lib.stride_tricks.sliding_window_view(steps, _RATE)
+    windows = np.lib.stride_tricks.sliding_window_view(steps, _RATE_WINDOW)
     middle = np.median(windows, axis=1)
-    alike = (np.abs(windows - middle[:, None]) <= _ALIKE * middle[:, None]).mean(axis=1) >= _MOST
-    for first in np.flatnonzero(alike & (middle > _SLOWER * period)):
-        local[first : first + _RATE] = np.maximum(local[first : first + _RATE], middle[first])
+    alike = (np.abs(windows - middle[:, None]) <= _INTERVAL_TOLERANCE * middle[:, None]).mean(
+        axis=1
+    ) >= _EQUAL_INTERVAL_SHARE
+    for first in np.flatnonzero(alike & (middle > _SLOWER_RATIO * period)):
+        local[first : first + _RATE_WINDOW] = np.maximum(local[first : first + _RATE_WINDOW], middle[first])
     # the window reaches over the change of rate: a short interval in it is of the faster rate
     return np.where(steps < 0.5 * local, period, local)
 
@@ -140,7 +142,7 @@ def _drops(
     sharing: list[Stream], time: NDArray[np.float64], rhythm: Cadence, pauses: Intervals, known: Intervals | None
 ) -> list[Finding]:
     lost = lost_records(time, rhythm.period)
-    local = own_rates(time, rhythm.period)
+    local = local_periods(time, rhythm.period)
     slowed = local > rhythm.period
     lost[slowed] = np.maximum(np.round(np.diff(time)[slowed] / local[slowed]).astype(np.int64) - 1, 0)
     if known is not None:  # the source counts what it sends
@@ -161,8 +163,8 @@ def _drops(
     count = int(lost.sum())
     share = count / (time.size + count)
     lasting = float((time[rows + 1] - time[rows]).max())
-    grade = graded(share, degrades=NOTED, unusable=0.6)
-    if grade is Grade.HARMLESS and lasting > max(LONG, 3.0 * rhythm.period):
+    grade = graded(share, degrades=DEGRADING_LOST_SHARE, unusable=0.6)
+    if grade is Grade.HARMLESS and lasting > max(LONG_GAP_SECONDS, 3.0 * rhythm.period):
         grade = Grade.DEGRADES
     names = [name for stream in sharing for name in stream.names]
     if all(stream.slow for stream in sharing):
@@ -224,7 +226,9 @@ def _end_findings(ends: list[_End], duration: float) -> list[Finding]:
     while ends:
         one = ends[0]
         close = [
-            e for e in ends if e.last == one.last and abs(e.start - one.start) + abs(e.end - one.end) < SAME_MOMENT
+            e
+            for e in ends
+            if e.last == one.last and abs(e.start - one.start) + abs(e.end - one.end) < SIMULTANEOUS_SECONDS
         ]
         ends = [e for e in ends if e not in close]
         names = [name for e in close for name in e.names]

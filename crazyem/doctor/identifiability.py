@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from crazyem.doctor import excitation
 from crazyem.doctor.excitation import Steps
-from crazyem.doctor.thrust import VOLTAGE_UNKNOWN, Inputs, inputs_of
+from crazyem.doctor.thrust import UNKNOWN_VOLTAGE_ERROR, Inputs, inputs_of
 from crazyem.doctor.whitening import Fit, linear_fit
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.airborne import Airtime
@@ -25,14 +25,15 @@ from crazyem.vehicle import GRAVITY, Vehicle
 Array = NDArray[np.float64]
 
 IDENTIFIABLE = 0.15  # relative standard deviation below which a parameter counts as identified
-WEAK = 0.5  # and below which the data say anything beyond what is known of such drones anyway
-IMPLAUSIBLE = 1.5  # |log| of an inertia over the nominal beyond which it is not believed: 3 sd of the estimator's prior
-DOUBTFUL = 1.0  # and beyond which it is taken with care
-WINDOW = 800  # samples the estimator looks back by default
-SHORTEST = 2.0  # s in the air
+WEAKLY_IDENTIFIABLE = 0.5  # and below which the data say anything beyond what is known of such drones anyway
+# |log| of an inertia over the nominal beyond which it is not believed: 3 sd of the estimator's prior
+IMPLAUSIBLE_INERTIA = 1.5
+DOUBTFUL_INERTIA = 1.0  # and beyond which it is taken with care
+WINDOW_SAMPLES = 800  # samples the estimator looks back by default
+SHORTEST_AIRTIME = 2.0  # s in the air
 ACCELEROMETER_OFFSET = 0.02  # of gravity: 20 mg, typical zero-g offset of a BMI088
 TYPICAL_DRAG = 0.2  # 1/s, force per mass and speed: what the drag of a Crazyflie's rotors is near (Foerster 2015)
-SCALE = "only its ratio to the rotors' thrust scale is seen"
+SCALE_REASON = "only its ratio to the rotors' thrust scale is seen"
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,13 +76,13 @@ class Verdict:
 
 def identifiability(recording: Recording, vehicle: Vehicle, air: Airtime) -> tuple[Verdict, ...]:
     """Verdicts on mass, inertias, lag, delay, torque offsets, drag and battery law, in this order."""
-    if air.seconds < SHORTEST:
+    if air.seconds < SHORTEST_AIRTIME:
         why = f"only {air.seconds:.1f} s in the air" + (f": {air.reason}" if air.reason else "")
-        return tuple(Verdict(name, "no", why) for name in NAMES)
+        return tuple(Verdict(name, "no", why) for name in VERDICT_NAMES)
     inputs = inputs_of(recording, vehicle)
     turning, turn_from = _rates(recording, air)
     if isinstance(inputs, str):
-        rotation = tuple(Verdict(name, "no", inputs) for name in NAMES[1:7])
+        rotation = tuple(Verdict(name, "no", inputs) for name in VERDICT_NAMES[1:7])
         return (Verdict("mass", "no", inputs), *rotation, _drag(recording, air), Verdict("battery_law", "no", inputs))
     fit = excitation.rotation_fit(inputs, turning, vehicle) if turning is not None else None
     tau = math.exp(fit.value[3]) if fit is not None and inputs.lagged else vehicle.motor_time_constant
@@ -96,7 +97,7 @@ def identifiability(recording: Recording, vehicle: Vehicle, air: Airtime) -> tup
     )
 
 
-NAMES = (
+VERDICT_NAMES = (
     "mass", "Ixx", "Iyy", "Izz", "motor_time_constant", "input_delay", "torque_offsets", "drag", "battery_law",
 )  # fmt: skip
 
@@ -155,10 +156,10 @@ def _mass(vertical: _Vertical | None, inputs: Inputs, *, tau: float, delay: floa
     if fit is None or not fit.value[0] > 0.0:
         return Verdict("mass", "no", "thrust and acceleration have no common stretch long enough")
     mass = 1.0 / fit.value[0]
-    fixed = math.hypot(vertical.systematic, 0.0 if inputs.voltage_known else VOLTAGE_UNKNOWN)
+    fixed = math.hypot(vertical.systematic, 0.0 if inputs.voltage_known else UNKNOWN_VOLTAGE_ERROR)
     random = float(fit.sd[0] * mass)
     relative = math.hypot(random, fixed)
-    reason = f"{SCALE}; from {vertical.source}"
+    reason = f"{SCALE_REASON}; from {vertical.source}"
     if not inputs.voltage_known:
         reason += "; the battery voltage is not logged, which alone costs 15 %"
     elif vertical.systematic > random:
@@ -208,13 +209,13 @@ def _rotation(
         why = (
             "neither body rate nor attitude is known" if not turn_from else f"too little of the {turn_from} in the air"
         )
-        return tuple(Verdict(name, "no", why) for name in NAMES[1:7])
+        return tuple(Verdict(name, "no", why) for name in VERDICT_NAMES[1:7])
     rate = 1.0 / steps.period
     where = f"{turn_from} at {rate:.0f} Hz, {inputs.signal} at {1.0 / float(np.median(np.diff(inputs.time))):.0f} Hz"
     inertias = [_inertia(i, fit, inputs, steps, vehicle, where) for i in range(3)]
     far = np.abs(fit.value[:3] - np.log(vehicle.inertia))
-    believed = bool(np.all(far[:2] <= IMPLAUSIBLE))  # about z there is little torque to tell them from
-    doubtful = math.hypot(*far) > 1.3 * DOUBTFUL
+    believed = bool(np.all(far[:2] <= IMPLAUSIBLE_INERTIA))  # about z there is little torque to tell them from
+    doubtful = math.hypot(*far) > 1.3 * DOUBTFUL_INERTIA
     return (
         *inertias,
         _lag(fit, inputs, steps, believed=believed, doubtful=doubtful),
@@ -224,23 +225,25 @@ def _rotation(
 
 
 def _inertia(i: int, fit: Fit, inputs: Inputs, steps: Steps, vehicle: Vehicle, where: str) -> Verdict:
-    name, axis, value = NAMES[1 + i], "xyz"[i], math.exp(fit.value[i])
+    name, axis, value = VERDICT_NAMES[1 + i], "xyz"[i], math.exp(fit.value[i])
     far = np.abs(fit.value[:3] - np.log(vehicle.inertia))
-    fixed = 0.0 if inputs.voltage_known else VOLTAGE_UNKNOWN
+    fixed = 0.0 if inputs.voltage_known else UNKNOWN_VOLTAGE_ERROR
     relative = math.hypot(fit.total(i), fixed)
     window = math.hypot(fit.total(i, stretch=1.0 / _stretch(steps) ** 2), fixed)
     verdict, reason = _grade(relative), where
     if verdict != "yes":
         reason = _objection(axis, relative, fit.total(i), float(fit.bias[i]))
-    if far[i] > IMPLAUSIBLE or (i < 2 and far[1 - i] > IMPLAUSIBLE):
-        worst = i if far[i] > IMPLAUSIBLE else 1 - i
+    if far[i] > IMPLAUSIBLE_INERTIA or (i < 2 and far[1 - i] > IMPLAUSIBLE_INERTIA):
+        worst = i if far[i] > IMPLAUSIBLE_INERTIA else 1 - i
         relative, window, verdict = max(relative, float(far[worst])), max(window, float(far[worst])), "no"
         ratio = math.exp(fit.value[worst]) / vehicle.inertia[worst]
         reason = (
             f"the data ask for {ratio:.2g} times the nominal inertia about {'xyz'[worst]}: the logged commands do not "
             "explain its rotation"
         )
-    elif verdict == "yes" and (far[i] > DOUBTFUL or far.max() > IMPLAUSIBLE or math.hypot(*far) > 1.3 * DOUBTFUL):
+    elif verdict == "yes" and (
+        far[i] > DOUBTFUL_INERTIA or far.max() > IMPLAUSIBLE_INERTIA or math.hypot(*far) > 1.3 * DOUBTFUL_INERTIA
+    ):
         times = ", ".join(f"{math.exp(f - math.log(n)):.2g}" for f, n in zip(fit.value[:3], vehicle.inertia))
         verdict = "weak"
         reason = f"the data ask for {times} times the nominal inertias, which is hard to believe of such a drone"
@@ -291,7 +294,7 @@ def _delay(fit: Fit, inputs: Inputs, believed: bool) -> Verdict:
 
 
 def _offsets(fit: Fit, vehicle: Vehicle) -> Verdict:
-    unit = max(excitation.TRIM * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
+    unit = max(excitation.TRIM_SD * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
     worst = max(fit.total(i) for i in (5, 6, 7))
     verdict = "yes" if worst < 0.7 * unit else "weak" if worst < unit else "no"
     reason = "from the mean torque in flight, the worst of three axes"
@@ -381,12 +384,12 @@ def _battery(recording: Recording, vertical: _Vertical | None, inputs: Inputs, *
 
 
 def _grade(relative: float) -> str:
-    return "yes" if relative < IDENTIFIABLE else "weak" if relative < WEAK else "no"
+    return "yes" if relative < IDENTIFIABLE else "weak" if relative < WEAKLY_IDENTIFIABLE else "no"
 
 
 def _stretch(steps: Steps) -> float:
     """How much larger a random error is in one window of the estimator than in all of the flight; never below 1."""
-    return math.sqrt(max(steps.count / steps.share / WINDOW, 1.0))
+    return math.sqrt(max(steps.count / steps.share / WINDOW_SAMPLES, 1.0))
 
 
 def _with_attitude(velocity: tuple[Array, Array], attitude: tuple[Array, Array] | None) -> tuple[Array, Array]:

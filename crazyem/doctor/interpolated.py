@@ -10,16 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import COMMANDED, QUIET, cadence, graded, places, runs
+from crazyem.doctor.streams import COMMAND_SIGNALS, NO_FLOAT_WARNINGS, cadence, graded, places, runs
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.recording import Recording, SignalArray
 
-STRAIGHT = 1e-4  # of the change over two steps
-NEAR = 1e-3  # a near miss
-COARSE = 1000.0  # steps over two samples, in units of the resolution, below which nothing can be said
-NOTED = 0.05  # share of samples from which results suffer
-DRAWN = 0.5  # share of the moving samples from which the whole signal was drawn from a slower one
-_SLOW = frozenset({"voltage"})  # varies so slowly that straight lines do it no harm
+STRAIGHT_DEVIATION = 1e-4  # of the change over two steps
+NEAR_MISS_DEVIATION = 1e-3  # a near miss
+LEAST_RESOLUTION_STEPS = 1000.0  # steps over two samples, in units of the resolution, below which nothing can be said
+DEGRADING_INTERPOLATED_SHARE = 0.05  # share of samples from which results suffer
+RESAMPLED_SHARE = 0.5  # share of the moving samples from which the whole signal was drawn from a slower one
+_SLOW_SIGNALS = frozenset({"voltage"})  # varies so slowly that straight lines do it no harm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,12 +32,12 @@ class Straightness:
     bend: NDArray[np.bool_]
 
 
-@QUIET
+@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """Runs of interpolated samples and whole signals drawn up from a slower rate, one signal at a time."""
     found = []
     for name, array in recording.signals.items():
-        if array.quantity and array.quantity not in COMMANDED and array.time.size >= 8:
+        if array.quantity and array.quantity not in COMMAND_SIGNALS and array.time.size >= 8:
             found += _signal(name, array)
     return found
 
@@ -62,9 +62,9 @@ def straightness(time: NDArray[np.float64], value: NDArray[np.float64]) -> Strai
             change = column[2:] - column[:-2]
             deviation = np.abs(column[1:-1] - column[:-2] - part * change)
             np.abs(change, out=change)
-            bend[1:-1] |= ~(deviation <= STRAIGHT * change + resolution)
-            off_near[1:-1] |= ~(deviation <= NEAR * change + resolution)
-            moving[1:-1] += change > COARSE * resolution
+            bend[1:-1] |= ~(deviation <= STRAIGHT_DEVIATION * change + resolution)
+            off_near[1:-1] |= ~(deviation <= NEAR_MISS_DEVIATION * change + resolution)
+            moving[1:-1] += change > LEAST_RESOLUTION_STEPS * resolution
     # two components on a line are evidence; one alone only if its neighbour in time is on it too
     on = (moving > 0) & ~bend
     alone = on & (moving == 1)
@@ -98,7 +98,7 @@ def _signal(name: str, array: SignalArray) -> list[Finding]:
     # a smooth signal has nine near misses for every hit by chance
     if hits < 2 or hits < 0.5 * misses:
         return []
-    if array.marked.any() and hits < NOTED * time.size:
+    if array.marked.any() and hits < DEGRADING_INTERPOLATED_SHARE * time.size:
         return []  # the reader has dealt with this signal, by its own rule
     present = int(np.isfinite(value).all(axis=1).sum())
     share = hits / present
@@ -110,7 +110,7 @@ def _signal(name: str, array: SignalArray) -> list[Finding]:
     moving = hits + int((line.bend & np.isfinite(value).all(axis=1)).sum())
     evidence = {"samples": hits, "share": share, "runs": len(spans), "longest_s": lasting}
     fix = Fix("mark", (name,), rows=rows[np.flatnonzero(line.on)])
-    if hits > DRAWN * moving:
+    if hits > RESAMPLED_SHARE * moving:
         duration = float(time[-1] - time[0])
         knots = runs(line.bend)
         beat = cadence(time[knots[:, 0]]).period if len(knots) else 0.0
@@ -119,7 +119,7 @@ def _signal(name: str, array: SignalArray) -> list[Finding]:
         return [
             Finding(
                 "interpolated",
-                Grade.HARMLESS if array.quantity in _SLOW else Grade.DEGRADES,
+                Grade.HARMLESS if array.quantity in _SLOW_SIGNALS else Grade.DEGRADES,
                 f"{name} was measured at about {rate:.3g} Hz and drawn with straight lines to {stored:.0f} Hz.",
                 signal=name,
                 evidence={**evidence, "rate_hz": rate, "stored_hz": stored},
@@ -130,7 +130,7 @@ def _signal(name: str, array: SignalArray) -> list[Finding]:
     return [
         Finding(
             "interpolated",
-            graded(share, degrades=NOTED, unusable=0.6),
+            graded(share, degrades=DEGRADING_INTERPOLATED_SHARE, unusable=0.6),
             f"{percent(share)} of {name} lie on straight lines ({len(spans)} runs, the longest {lasting:.2f} s): "
             "drawn across lost samples, not measured.",
             signal=name,

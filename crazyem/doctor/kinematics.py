@@ -20,14 +20,14 @@ from crazyem.signals.sample import SIGNALS
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-STEP = 0.01  # s, of the grid
-LONGEST = 900.0  # s of a recording that are looked at, about its middle
-SHORTEST = 2.0  # s; nothing can be said of less
-WIDTH = 0.16  # s, window for streams of 50 Hz or more
-SLOWEST = 0.25  # s between samples, above which a stream tells nothing of motion
-IMPOSSIBLE = 1e9  # of any quantity in any unit; other checks report it
-MOST = 1000  # samples averaged into one: 100 kHz
-BRIDGE = 0.045  # s; motion is slow against it
+GRID_STEP = 0.01  # s, of the grid
+LONGEST_GRID_SECONDS = 900.0  # s of a recording that are looked at, about its middle
+SHORTEST_GRID_SECONDS = 2.0  # s; nothing can be said of less
+SMOOTHING_WINDOW = 0.16  # s, window for streams of 50 Hz or more
+LONGEST_SAMPLE_INTERVAL = 0.25  # s between samples, above which a stream tells nothing of motion
+IMPOSSIBLE_VALUE = 1e9  # of any quantity in any unit; other checks report it
+MOST_AVERAGED_SAMPLES = 1000  # samples averaged into one: 100 kHz
+BRIDGED_SECONDS = 0.045  # s; motion is slow against it
 UP = np.array([0.0, 0.0, 1.0])
 GRAVITY = 9.81  # m/s^2; the true value differs from place to place by 0.3 %
 
@@ -51,22 +51,22 @@ def measurements(recording: Recording, quantity: str) -> dict[str, SignalArray]:
     for name, array in recording.signals.items():
         if quantity_of(name, array) == quantity and array.value.shape[1] == SIGNALS[quantity][0]:
             made = light(array, quantity)
-            slow = quantity != "voltage" and _period(made.time) > SLOWEST
-            if made.time.size >= 20 and made.time[-1] - made.time[0] >= SHORTEST and not slow:
+            slow = quantity != "voltage" and _period(made.time) > LONGEST_SAMPLE_INTERVAL
+            if made.time.size >= 20 and made.time[-1] - made.time[0] >= SHORTEST_GRID_SECONDS and not slow:
                 found[name] = made
     return dict(sorted(found.items(), key=lambda item: (item[0] != quantity, item[0])))
 
 
 # The last signals that were made light, as long as their values live: seven checks ask for the same ones.
 _light: OrderedDict[tuple[int, int, str], tuple[weakref.ref, weakref.ref, SignalArray]] = OrderedDict()
-_KEPT = 32
+_CACHED_RECORDINGS = 32
 
 
 def light(array: SignalArray, quantity: str) -> SignalArray:
     """The sound samples of a signal, in the order of their stamps, averaged down to 100 Hz where it is faster.
 
-    Of equal stamps the first is kept. Not more than `LONGEST` about the middle of the samples (not of the stamps, so
-    that a stamp that jumped far away does no harm). Angles are picked, not averaged, for the sake of their jumps.
+    Of equal stamps the first is kept. Not more than `LONGEST_GRID_SECONDS` about the middle of the samples (not of the
+    stamps, so that a stamp that jumped far away does no harm). Angles are picked, not averaged: they jump.
     """
     key = (id(array.time), id(array.value), quantity)
     known = _light.get(key)
@@ -75,7 +75,7 @@ def light(array: SignalArray, quantity: str) -> SignalArray:
         return known[2]
     made = _lightened(array, quantity)
     _light[key] = (weakref.ref(array.time), weakref.ref(array.value), made)
-    while len(_light) > _KEPT:
+    while len(_light) > _CACHED_RECORDINGS:
         _light.popitem(last=False)
     return made
 
@@ -86,13 +86,13 @@ def _lightened(array: SignalArray, quantity: str) -> SignalArray:
     if time.size > 1 and (np.diff(time) <= 0).any():
         time, kept = np.unique(time, return_index=True)
         value = value[kept]
-    if time.size and time[-1] - time[0] > LONGEST:
-        near = np.abs(time - float(np.median(time))) <= 0.5 * LONGEST
+    if time.size and time[-1] - time[0] > LONGEST_GRID_SECONDS:
+        near = np.abs(time - float(np.median(time))) <= 0.5 * LONGEST_GRID_SECONDS
         time, value = time[near], value[near]
     if quantity == "attitude":
         value = _continuous(value)
     period = _period(time)
-    many = int(min(STEP / period + 1e-6, MOST)) if period > 0 else 1
+    many = int(min(GRID_STEP / period + 1e-6, MOST_AVERAGED_SAMPLES)) if period > 0 else 1
     if many > 1:
         rest = time.size // many * many
         first, last = time[:rest:many], time[many - 1 : rest : many]
@@ -111,14 +111,14 @@ def _lightened(array: SignalArray, quantity: str) -> SignalArray:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Times `start + i STEP`, i < size."""
+    """Times `start + i GRID_STEP`, i < size."""
 
     start: float
     size: int
 
     @property
     def time(self) -> Array:
-        return np.asarray(self.start + STEP * np.arange(self.size), float)
+        return np.asarray(self.start + GRID_STEP * np.arange(self.size), float)
 
 
 def grid_of(*arrays: SignalArray) -> Grid:
@@ -127,7 +127,7 @@ def grid_of(*arrays: SignalArray) -> Grid:
         return Grid(0.0, 0)
     start = max(float(array.time[0]) for array in arrays)
     end = min(float(array.time[-1]) for array in arrays)
-    return Grid(start, int((end - start) / STEP) + 1) if end - start >= SHORTEST else Grid(0.0, 0)
+    return Grid(start, int((end - start) / GRID_STEP) + 1) if end - start >= SHORTEST_GRID_SECONDS else Grid(0.0, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,11 +142,11 @@ class Track:
 
 
 def width_for(*arrays: SignalArray) -> float:
-    """Length [s] of the window for streams of these rates: eight samples of the slowest, at least `WIDTH`."""
-    return max([WIDTH, *(8.0 * _period(array.time) for array in arrays)])
+    """Length [s] of the window for streams of these rates: eight samples of the slowest, or `SMOOTHING_WINDOW`."""
+    return max([SMOOTHING_WINDOW, *(8.0 * _period(array.time) for array in arrays)])
 
 
-def track(array: SignalArray, grid: Grid, *, shift: float = 0.0, bridge: float = BRIDGE) -> Track:
+def track(array: SignalArray, grid: Grid, *, shift: float = 0.0, bridge: float = BRIDGED_SECONDS) -> Track:
     """A light signal on a grid, by local cubics; not valid across gaps.
 
     Args:
@@ -178,7 +178,7 @@ class Window:
 
     @property
     def half(self) -> int:
-        return max(2, round(0.5 * self.width / STEP))
+        return max(2, round(0.5 * self.width / GRID_STEP))
 
     @cached_property
     def kernel(self) -> Array:
@@ -190,7 +190,7 @@ class Window:
         """Gives exactly 1 for a ramp of 1/s."""
         i = np.arange(-self.half, self.half + 1)
         k = np.sin(np.pi * i / self.half)
-        return np.asarray(k / (k @ i * STEP), float)
+        return np.asarray(k / (k @ i * GRID_STEP), float)
 
     def mean(self, given: Track) -> Track:
         """k * x."""
@@ -219,8 +219,8 @@ def rate_of_attitude(attitude: Track) -> Track:
     q = attitude.value
     rate = np.zeros((len(q), 3))
     if len(q) >= 5:
-        near = _relative(q[1:-3], q[3:-1]) / (2.0 * STEP)
-        far = _relative(q[:-4], q[4:]) / (4.0 * STEP)
+        near = _relative(q[1:-3], q[3:-1]) / (2.0 * GRID_STEP)
+        far = _relative(q[:-4], q[4:]) / (4.0 * GRID_STEP)
         rate[2:-2] = (4.0 * near - far) / 3.0
     return Track(rate, _inner(attitude.valid))
 
@@ -230,7 +230,7 @@ def difference(given: Track) -> Track:
     x = given.value
     value = np.zeros_like(x)
     if len(x) >= 5:
-        value[2:-2] = (8.0 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12.0 * STEP)
+        value[2:-2] = (8.0 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12.0 * GRID_STEP)
     return Track(value, _inner(given.valid))
 
 
@@ -317,7 +317,7 @@ def _sound(array: SignalArray) -> Mask:
     sound = np.isfinite(array.time)
     sound &= ~array.marked
     for column in range(array.value.shape[1]):  # a reduction over a short axis costs ten times as much
-        sound &= np.abs(array.value[:, column]) < IMPOSSIBLE  # not for NaN either
+        sound &= np.abs(array.value[:, column]) < IMPOSSIBLE_VALUE  # not for NaN either
     return sound
 
 

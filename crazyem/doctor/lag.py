@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from crazyem.doctor.attitudes import Pose, poses
-from crazyem.doctor.delays import REACH, delay, spread
+from crazyem.doctor.delays import LARGEST_LAG, delay, spread
 from crazyem.doctor.kinematics import (
-    STEP,
+    GRID_STEP,
     Grid,
     Track,
     Window,
@@ -33,18 +33,18 @@ from crazyem.recordings.recording import Recording, SignalArray
 
 Array = NDArray[np.float64]
 
-CERTAIN = 0.995  # one-sided level at which a lag counts as told
-SEEN = 0.003  # s, lag reported from here on
-MATTERS = 0.010  # s, lag that degrades; half of it for its changes, which no shift repairs
-PIECE = 5.0  # s, windows that each give a lag
-AGREES = 0.6  # share of the variance that a window's best lag must explain
-MANY = 40  # windows at most, longer ones then
-FEW = 4  # windows at least
-BRIDGE = 0.1  # s; a cubic across a gap moves nothing in time
-ROUGH = 0.02  # s, standard error above which a window says nothing
-CREDIT = 0.3  # of the windows' standard errors: the least scatter that is believed
-FLOOR = 0.0005  # s, below which no standard error of a window is believed
-UNSTEADY = 2.5  # scatter of the windows over their standard errors, from which on the lag changes
+LAG_CONFIDENCE = 0.995  # one-sided level at which a lag counts as told
+REPORTED_LAG = 0.003  # s, lag reported from here on
+DEGRADING_LAG = 0.010  # s, lag that degrades; half of it for its changes, which no shift repairs
+WINDOW_SECONDS = 5.0  # s, windows that each give a lag
+LEAST_WINDOW_SHARE = 0.6  # share of the variance that a window's best lag must explain
+MOST_WINDOWS = 40  # windows at most, longer ones then
+FEWEST_WINDOWS = 4  # windows at least
+LAG_BRIDGED_SECONDS = 0.1  # s; a cubic across a gap moves nothing in time
+LARGEST_WINDOW_ERROR = 0.02  # s, standard error above which a window says nothing
+LEAST_SCATTER_RATIO = 0.3  # of the windows' standard errors: the least scatter that is believed
+SMALLEST_WINDOW_ERROR = 0.0005  # s, below which no standard error of a window is believed
+UNSTEADY_SCATTER_RATIO = 2.5  # scatter of the windows over their standard errors, from which on the lag changes
 
 
 def check(recording: Recording) -> list[Finding]:
@@ -158,7 +158,7 @@ def _lag(name: str, array: SignalArray, reference: _Reference) -> _Lag | None:
             return None
         against, other = reference.moving
     grid = grid_of(array, other)
-    if grid.size * STEP < PIECE * FEW / 2:
+    if grid.size * GRID_STEP < WINDOW_SECONDS * FEWEST_WINDOWS / 2:
         return None
     window = Window(max(0.3 if turning else 0.2, width_for(array, other)))
     first = window.mean(_speed(other, against, grid))
@@ -168,7 +168,7 @@ def _lag(name: str, array: SignalArray, reference: _Reference) -> _Lag | None:
 
 def _speed(array: SignalArray, name: str, grid: Grid) -> Track:
     quantity = quantity_of(name, array)
-    given = track(array, grid, bridge=BRIDGE)
+    given = track(array, grid, bridge=LAG_BRIDGED_SECONDS)
     if quantity == "attitude":
         return rate_of_attitude(given)
     return difference(given) if quantity == "position" else given
@@ -176,24 +176,24 @@ def _speed(array: SignalArray, name: str, grid: Grid) -> Track:
 
 def _fit(name: str, against: str, first: Track, second: Track, grid: Grid, width: float) -> _Lag | None:
     whole = delay(first, second, mixed=False)
-    if whole is None or whole.at_edge or whole.explained < AGREES:
+    if whole is None or whole.at_edge or whole.explained < LEAST_WINDOW_SHARE:
         return None
-    size = round(max(PIECE, grid.size * STEP / MANY) / STEP)
+    size = round(max(WINDOW_SECONDS, grid.size * GRID_STEP / MOST_WINDOWS) / GRID_STEP)
     error, count = spread(first, second, whole, size // 2)
     error = max(error, _error(first, second, whole.value, whole.explained, width))
-    if count < FEW or not error < math.inf:
+    if count < FEWEST_WINDOWS or not error < math.inf:
         return None
     found = []
     for first_row in range(0, grid.size - size // 2, size):
         rows = slice(first_row, first_row + size)
-        one = delay(first.part(rows), second.part(rows), reach=min(REACH, abs(whole.value) + 0.15), mixed=False)
-        if one is None or one.at_edge or one.explained < AGREES:
+        one = delay(first.part(rows), second.part(rows), reach=min(LARGEST_LAG, abs(whole.value) + 0.15), mixed=False)
+        if one is None or one.at_edge or one.explained < LEAST_WINDOW_SHARE:
             continue
         rough = _error(first.part(rows), second.part(rows), one.value, one.explained, width)
-        if rough < ROUGH:
+        if rough < LARGEST_WINDOW_ERROR:
             found.append((float(grid.time[rows].mean()), one.value, rough))
     start, end = float(grid.time[0]), float(grid.time[-1])
-    changes = _changes(np.array(found), start, end) if len(found) >= FEW else None
+    changes = _changes(np.array(found), start, end) if len(found) >= FEWEST_WINDOWS else None
     return _Lag(name, against, whole.value, error, count, whole.explained, (start, end), changes)
 
 
@@ -209,7 +209,7 @@ def _changes(found: Array, start: float, end: float) -> _Changes:
         end=line + ramp * (end - float(t.mean())),
         drift=ramp * (end - start),
         drift_error=1.25
-        * max(_robust(rest), CREDIT * float(np.median(e)))
+        * max(_robust(rest), LEAST_SCATTER_RATIO * float(np.median(e)))
         / math.sqrt(t.size)
         / float(t.std())
         * (end - start),
@@ -227,21 +227,21 @@ def _error(first: Track, second: Track, lag: float, explained: float, width: flo
     The mean square frequency of the common part is the covariance of the derivatives over that of the signals, to
     which noise of either adds nothing.
     """
-    steps = round(lag / STEP)
+    steps = round(lag / GRID_STEP)
     n = len(first.value) - abs(steps)
     x, y = first.value[max(0, -steps) :][:n], second.value[max(0, steps) :][:n]
     good = first.valid[max(0, -steps) :][:n] & second.valid[max(0, steps) :][:n]
     both = good[1:] & good[:-1]
     if both.sum() < 10:
         return math.inf
-    dx, dy = np.diff(x, axis=0)[both] / STEP, np.diff(y, axis=0)[both] / STEP
+    dx, dy = np.diff(x, axis=0)[both] / GRID_STEP, np.diff(y, axis=0)[both] / GRID_STEP
     x, y = x[good] - x[good].mean(axis=0), y[good] - y[good].mean(axis=0)
     common = float((x * y).mean(axis=0) @ (x * y).mean(axis=0))
     moving = float((dx * dy).mean(axis=0) @ (x * y).mean(axis=0))
     if common <= 0.0 or moving <= 0.0:
         return math.inf
-    independent = max(good.sum() * STEP / width, 1.0)
-    return max(FLOOR, math.sqrt(max(1.0 - explained, 0.0) / explained * common / moving / independent))
+    independent = max(good.sum() * GRID_STEP / width, 1.0)
+    return max(SMALLEST_WINDOW_ERROR, math.sqrt(max(1.0 - explained, 0.0) / explained * common / moving / independent))
 
 
 def _robust(rest: Array) -> float:
@@ -262,9 +262,11 @@ def _weighted_median(y: Array, w: Array) -> float:
 
 
 def _judge(recording: Recording, base: _Path, path: _Path, lag: _Lag) -> Finding | None:
-    wide, sure = (float(stats.t.ppf(level, lag.blocks - 1)) for level in (0.975, CERTAIN))
+    wide, sure = (float(stats.t.ppf(level, lag.blocks - 1)) for level in (0.975, LAG_CONFIDENCE))
     drifts, wanders = _drifts(lag.changes), _wanders(lag.changes)
-    late = abs(lag.value) >= SEEN and abs(lag.value) > sure * lag.error and lag.error < 0.5 * ROUGH
+    late = (
+        abs(lag.value) >= REPORTED_LAG and abs(lag.value) > sure * lag.error and lag.error < 0.5 * LARGEST_WINDOW_ERROR
+    )
     if not (late or drifts or wanders):
         return None
     low, high = lag.value - wide * lag.error, lag.value + wide * lag.error
@@ -293,20 +295,24 @@ def _judge(recording: Recording, base: _Path, path: _Path, lag: _Lag) -> Finding
         fix = Fix("shift", names, (-lag.value,))
         text += f"; 95 % interval {1e3 * min(abs(low), abs(high)):.1f} to {1e3 * max(abs(low), abs(high)):.1f} ms"
         advice = "Shift the stream, or estimate the lag along."
-    grade = Grade.DEGRADES if abs(lag.value) >= MATTERS or drifts or wanders else Grade.HARMLESS
+    grade = Grade.DEGRADES if abs(lag.value) >= DEGRADING_LAG or drifts or wanders else Grade.HARMLESS
     return Finding("lag", grade, text + ".", lag.signal, (lag.interval,), evidence, advice, fix)
 
 
 def _drifts(changes: _Changes | None) -> bool:
-    if changes is None or abs(changes.drift) < 0.5 * MATTERS:
+    if changes is None or abs(changes.drift) < 0.5 * DEGRADING_LAG:
         return False
-    sure = float(stats.t.ppf(CERTAIN, changes.windows - 2))
-    straight = changes.about_line < max(UNSTEADY, 0.7 * changes.scatter)
+    sure = float(stats.t.ppf(LAG_CONFIDENCE, changes.windows - 2))
+    straight = changes.about_line < max(UNSTEADY_SCATTER_RATIO, 0.7 * changes.scatter)
     return abs(changes.drift) > sure * changes.drift_error and straight
 
 
 def _wanders(changes: _Changes | None) -> bool:
-    return changes is not None and changes.high - changes.low >= MATTERS and changes.scatter >= UNSTEADY
+    return (
+        changes is not None
+        and changes.high - changes.low >= DEGRADING_LAG
+        and changes.scatter >= UNSTEADY_SCATTER_RATIO
+    )
 
 
 def _numbers(changes: _Changes) -> dict[str, float]:

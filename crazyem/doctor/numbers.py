@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.leaps import leaps
-from crazyem.doctor.streams import QUIET, listed, places
+from crazyem.doctor.position_jumps import position_jumps
+from crazyem.doctor.streams import NO_FLOAT_WARNINGS, listed, places
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.ordering import sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
@@ -47,7 +47,7 @@ def _extreme(value: NDArray[np.float64]) -> NDArray[np.float64]:
 
 # Wide: only what no drone of this kind can do. Gyros end at 35 (70) rad/s, accelerometers at 24 (32) g an axis, the
 # fastest small rotors at 6000 rad/s; one to six cells give 2 to 26 V; smallest-three quaternions are unit within 0.002.
-LIMITS: dict[str, Limit] = {
+VALUE_LIMITS: dict[str, Limit] = {
     "position": Limit(_largest, 0.0, 1e4, "further than 10 km from the origin"),
     "velocity": Limit(_largest, 0.0, 150.0, "faster than 150 m/s"),
     "attitude": Limit(_norm, 0.98, 1.02, "not of unit length"),
@@ -61,9 +61,12 @@ LIMITS: dict[str, Limit] = {
 }
 
 
-UNCONNECTED = {"voltage": "battery monitor", "rotor_speed": "rotor speed sensor"}  # read 0 where they are not there
+ZERO_WITHOUT_SENSOR = {
+    "voltage": "battery monitor",
+    "rotor_speed": "rotor speed sensor",
+}  # read 0 where they are not there
 # What else the motors of a drone are told in: (words, unit in a mapping, lowest and highest of a typical value).
-_UNITS = (
+_MOTOR_UNITS = (
     ("pulse lengths in us", "us", 900.0, 2100.0),
     ("percent", "%", 2.0, 100.0),
     ("counts", "pwm", 3000.0, 65535.0),
@@ -75,14 +78,14 @@ def _unit_of_motors(array: SignalArray, values: NDArray[np.float64]) -> str:
     if array.quantity not in ("motor_command", "motor_request"):
         return ""
     typical = float(np.median(values))
-    for words, unit, low, high in _UNITS:
+    for words, unit, low, high in _MOTOR_UNITS:
         if low <= typical <= high:
             return f'The numbers look like {words}: unit = "{unit}" in a mapping reads them as 0..1.'
     return ""
 
 
 def _unconnected(name: str, array: SignalArray) -> Finding:
-    sensor = UNCONNECTED[array.quantity]
+    sensor = ZERO_WITHOUT_SENSOR[array.quantity]
     return Finding(
         "numbers",
         Grade.HARMLESS,
@@ -93,7 +96,7 @@ def _unconnected(name: str, array: SignalArray) -> Finding:
     )
 
 
-@QUIET
+@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """NaN and infinities that are the file's own, impossible values and leaps, stamps that are no numbers."""
     found: list[Finding] = []
@@ -109,11 +112,11 @@ def check(recording: Recording) -> list[Finding]:
                 found.append(_not_numbers(name, array, bad))
             else:
                 unmapped.append((name, int(bad.sum())))
-        limit = LIMITS.get(array.quantity)
+        limit = VALUE_LIMITS.get(array.quantity)
         if limit is not None:
             found += _impossible(name, array, limit, sound)
         if array.quantity == "position" and "velocity" not in recording.signals:
-            found += leaps(name, array, furthest=LIMITS["position"].high)
+            found += position_jumps(name, array, furthest=VALUE_LIMITS["position"].high)
     if unmapped:
         names = [name for name, _ in unmapped]
         found.append(
@@ -167,7 +170,7 @@ def _impossible(name: str, array: SignalArray, limit: Limit, sound: Rows) -> lis
         bad = ((measure < limit.low) | (measure > limit.high)) & sound
     if not bad.any():
         return []
-    if array.quantity in UNCONNECTED and not array.value[sound].any():
+    if array.quantity in ZERO_WITHOUT_SENSOR and not array.value[sound].any():
         return [_unconnected(name, array)]
     share = float(bad.mean())
     good = measure[sound & ~bad]

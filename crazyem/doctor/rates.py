@@ -6,18 +6,18 @@ import numpy as np
 
 from crazyem.doctor import axes
 from crazyem.doctor.attitudes import Pose, poses
-from crazyem.doctor.compare import Look, look, misread, wrong_scale
+from crazyem.doctor.hypotheses import Comparison, compare_hypotheses, misread, wrong_scale
 from crazyem.doctor.kinematics import Track, grid_of, measurements, rate_of_attitude, rotate, width_for
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
 DEGREES = 180.0 / math.pi
-ENOUGH = 0.04  # rad/s rms of rotation about an axis, below which nothing is said
-BELIEVED = 0.6  # share of the variance a hypothesis must explain
-OFF = 0.05  # scale fault reported from here on, if attitudes of two origins agree
-ALONE = 0.10  # if there is only one: an onboard attitude follows the gyro by a filter of its own
-BIAS = 0.05  # rad/s, reported from here on
-WIDTH = 0.24  # s: a gyro in flight is loud
+LEAST_RATE_RMS = 0.04  # rad/s rms of rotation about an axis, below which nothing is said
+LEAST_EXPLAINED_SHARE = 0.6  # share of the variance a hypothesis must explain
+SCALE_FAULT = 0.05  # scale fault reported from here on, if attitudes of two origins agree
+SCALE_FAULT_ONE_ORIGIN = 0.10  # if there is only one: an onboard attitude follows the gyro by a filter of its own
+REPORTED_BIAS = 0.05  # rad/s, reported from here on
+RATE_WINDOW = 0.24  # s: a gyro in flight is loud
 
 
 def check(recording: Recording) -> list[Finding]:
@@ -31,7 +31,7 @@ def check(recording: Recording) -> list[Finding]:
     return found
 
 
-def _compare(array: SignalArray, pose: Pose) -> Look | None:
+def _compare(array: SignalArray, pose: Pose) -> Comparison | None:
     grid = grid_of(array, pose.array)
     if grid.size == 0:
         return None
@@ -44,13 +44,15 @@ def _compare(array: SignalArray, pose: Pose) -> Look | None:
         "turned twice": (1, Track(rotate(attitude.value, body.value, inverse=True), body.valid)),
         "world, negated": (3, Track(-world, body.valid)),
     }
-    return look(array, grid, pose.name, candidates, width=max(WIDTH, width_for(array, pose.array)), least=ENOUGH)
+    return compare_hypotheses(
+        array, grid, pose.name, candidates, width=max(RATE_WINDOW, width_for(array, pose.array)), least=LEAST_RATE_RMS
+    )
 
 
-def _judge(name: str, looks: list[Look]) -> list[Finding]:
+def _judge(name: str, looks: list[Comparison]) -> list[Finding]:
     best = max(looks, key=lambda one: one.explained)
     whole = best.whole
-    if whole is None or best.explained < BELIEVED:
+    if whole is None or best.explained < LEAST_EXPLAINED_SHARE:
         return []
     if best.choice.denied:
         return [_structure(name, best)]
@@ -68,7 +70,7 @@ def _judge(name: str, looks: list[Look]) -> list[Finding]:
     return [*_scale(name, looks), *_bias(name, best)]
 
 
-def _structure(name: str, seen: Look) -> Finding:
+def _structure(name: str, seen: Comparison) -> Finding:
     choice = seen.choice
     share, declared = 100.0 * seen.evidence()["explained"], 100.0 * choice.explained["body"]
     head = f"{name} against the derivative of {seen.against}: "
@@ -76,18 +78,18 @@ def _structure(name: str, seen: Look) -> Finding:
     return misread("rates", name, seen, noun="body rate", head=head, tail=tail)
 
 
-def _scale(name: str, looks: list[Look]) -> list[Finding]:
+def _scale(name: str, looks: list[Comparison]) -> list[Finding]:
     return wrong_scale(
-        "rates", name, looks, OFF if len(looks) > 1 else ALONE,
+        "rates", name, looks, SCALE_FAULT if len(looks) > 1 else SCALE_FAULT_ONE_ORIGIN,
         alone="One of the two is wrong; a third measurement, or the range of the gyro, must say which.",
         agreed="Attitudes of two origins agree against it: divide the rate by the factor.",
     )  # fmt: skip
 
 
-def _bias(name: str, seen: Look) -> list[Finding]:
+def _bias(name: str, seen: Comparison) -> list[Finding]:
     # in a steady turn a scale that is not known well looks like a bias
     unknown = np.abs(seen.predicted) * (seen.whole.far_high - seen.whole.far_low if seen.whole else 1.0)
-    if not (np.abs(seen.offset) > np.maximum(BIAS, 5.0 * seen.offset_error) + unknown).any():
+    if not (np.abs(seen.offset) > np.maximum(REPORTED_BIAS, 5.0 * seen.offset_error) + unknown).any():
         return []
     evidence = {f"bias_{axis}_rad_s": float(b) for axis, b in zip("xyz", seen.offset, strict=True)}
     worst = float(np.abs(seen.offset).max())

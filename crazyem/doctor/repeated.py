@@ -8,23 +8,33 @@ packet.
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import COMMANDED, QUIET, Stream, cadence, listed, places, runs, same_as_before, streams
+from crazyem.doctor.streams import (
+    COMMAND_SIGNALS,
+    NO_FLOAT_WARNINGS,
+    Stream,
+    cadence,
+    listed,
+    places,
+    runs,
+    same_as_before,
+    streams,
+)
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.ordering import inside, sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
 
 # may come from a slower task of the firmware than the rest of their table, and are held meanwhile
-_MAY_BE_SLOW = frozenset({"voltage", "motor_command", "motor_request", "rotor_speed"})
+_SLOW_SIGNALS = frozenset({"voltage", "motor_command", "motor_request", "rotor_speed"})
 Rows = NDArray[np.bool_]
 
-LEAST = 0.01  # share of repeated rows worth a word
-NOTED = 0.05  # from which results suffer: a repeat is a wrong value of the age of one sample
-FINE = 0.05  # share of the steps of a fine component that are within four resolutions
-TOGETHER = 0.9  # share of common repeats from which signals came in one packet
+REPORTED_REPEAT_SHARE = 0.01  # share of repeated rows worth a word
+DEGRADING_REPEAT_SHARE = 0.05  # from which results suffer: a repeat is a wrong value of the age of one sample
+FINE_STEP_SHARE = 0.05  # share of the steps of a fine component that are within four resolutions
+ONE_PACKET_SHARE = 0.9  # share of common repeats from which signals came in one packet
 
 
-@QUIET
+@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """Repeated rows of each stream, then signals that are held between slower measurements of their own."""
     flight = airtime(recording)
@@ -47,10 +57,10 @@ def _stream(stream: Stream, flight: Airtime) -> list[Finding]:
     fine: list[str] = []
     found = []
     for name, array in zip(stream.names, stream.arrays, strict=True):
-        if not array.quantity or array.quantity in COMMANDED:
+        if not array.quantity or array.quantity in COMMAND_SIGNALS:
             continue
         flags = same_as_before(array.value) & considered & ~_resting(array)
-        beat = _hold(flags, considered & sound_rows(array.value)) if array.quantity in _MAY_BE_SLOW else None
+        beat = _hold(flags, considered & sound_rows(array.value)) if array.quantity in _SLOW_SIGNALS else None
         if beat is not None and flags.sum() >= 0.3 * considered.sum() and not _creeps(array):
             found.append(_held_finding(name, float(flags[considered].mean()), 1.0 / stored, beat))
             continue
@@ -59,7 +69,7 @@ def _stream(stream: Stream, flight: Airtime) -> list[Finding]:
             fine.append(name)
     whole = np.logical_and.reduce([same[name] for name in fine]) if fine else np.zeros(time.size, bool)
     rest = {name: same[name] & ~whole for name in fine}
-    if whole.sum() >= LEAST * considered.sum():
+    if whole.sum() >= REPORTED_REPEAT_SHARE * considered.sum():
         names = [name for name in same if name in fine or _follows(same[name], whole)]
         found.append(_finding(names, time, whole, considered, 1.0 / stored, whole_table=len(fine) > 1))
     while rest:
@@ -67,7 +77,7 @@ def _stream(stream: Stream, flight: Airtime) -> list[Finding]:
         group = [first, *(name for name in rest if _follows(rest[name], rows) and _follows(rows, rest[name]))]
         for name in group[1:]:
             rest.pop(name)
-        if rows.sum() >= 2.0 * LEAST * considered.sum():
+        if rows.sum() >= 2.0 * REPORTED_REPEAT_SHARE * considered.sum():
             names = [n for n in same if n in group or (n not in fine and _follows(same[n], rows))]
             found.append(_finding(names, time, rows, considered, 1.0 / stored, whole_table=False))
     return found
@@ -75,7 +85,7 @@ def _stream(stream: Stream, flight: Airtime) -> list[Finding]:
 
 def _follows(flags: Rows, rows: Rows) -> bool:
     """True if a signal repeats in (nearly) all of the rows."""
-    return bool((flags & rows).sum() >= TOGETHER * rows.sum())
+    return bool((flags & rows).sum() >= ONE_PACKET_SHARE * rows.sum())
 
 
 def _resting(array: SignalArray) -> Rows:
@@ -101,7 +111,7 @@ def _is_fine(array: SignalArray, considered: Rows) -> bool:
         steps = np.abs(column[rows] - column[rows - 1])
         steps = steps[steps > 1e-9 * max(float(np.nanmax(np.abs(column[rows]), initial=0.0)), 1e-12)]
         if steps.size > 20:
-            fine += bool((steps <= 4.0 * steps.min()).mean() <= FINE)
+            fine += bool((steps <= 4.0 * steps.min()).mean() <= FINE_STEP_SHARE)
     return fine >= (3 if array.quantity == "attitude" else 1)
 
 
@@ -155,7 +165,7 @@ def _finding(
     what = "whole rows" if whole_table else "values"
     return Finding(
         "repeated",
-        Grade.DEGRADES if share > NOTED else Grade.HARMLESS,
+        Grade.DEGRADES if share > DEGRADING_REPEAT_SHARE else Grade.HARMLESS,
         f"{percent(share)} of the {what} of {listed(names)} in flight repeat the one before: "
         f"stored at {stored:.0f} Hz, measured at about {rate:.0f} Hz.",
         signal=names[0] if len(names) == 1 else "",

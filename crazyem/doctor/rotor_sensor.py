@@ -11,32 +11,37 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import QUIET, cadence, listed, longest, runs
+from crazyem.doctor.streams import NO_FLOAT_WARNINGS, cadence, listed, longest, runs
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.ordering import Intervals, inside, ordered
 from crazyem.recordings.recording import Recording, SignalArray
 
-FRACTIONS: dict[str, float] = {
+COUNTED_FRACTIONS: dict[str, float] = {
     "a quarter": 1 / 4,
     "a third": 1 / 3,
     "half": 1 / 2,
     "twice": 2.0,
     "three times": 3.0,
 }
-CONSTANT: dict[str, float] = {**FRACTIONS, "two thirds": 2 / 3, "three quarters": 3 / 4, "one and a half times": 3 / 2}
-LEAP = 0.15  # relative deviation of a leap from the fraction
-NEAR = 0.35  # relative deviation from the expected speed meanwhile: rotors lag, and rotors differ
+CONSTANT_FRACTIONS: dict[str, float] = {
+    **COUNTED_FRACTIONS,
+    "two thirds": 2 / 3,
+    "three quarters": 3 / 4,
+    "one and a half times": 3 / 2,
+}
+JUMP_TOLERANCE = 0.15  # relative deviation of a leap from the fraction
+SPEED_TOLERANCE = 0.35  # relative deviation from the expected speed meanwhile: rotors lag, and rotors differ
 # The same for a whole flight: rotors of one drone differ by some 3 %; and no nearer to another fraction than this share
 # of the way to it.
-EXACT, NEARER = 0.1, 0.4
-SLOWEST = 0.025  # s between samples, from which a real change may look like a leap
-NOTED = 0.01  # share of the flight
-ZERO = 0.1  # of what is expected: standing still
-_MOST_LEAPS = 5000
+FRACTION_TOLERANCE, FRACTION_SEPARATION = 0.1, 0.4
+LONGEST_SAMPLE_INTERVAL = 0.025  # s between samples, from which a real change may look like a leap
+DEGRADING_MISCOUNT_SHARE = 0.01  # share of the flight
+STOPPED_RATIO = 0.1  # of what is expected: standing still
+_MOST_JUMPS = 5000
 
 
-@QUIET
+@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """Findings for each rotor of each rotor_speed signal, within the time in the air."""
     flight = airtime(recording)
@@ -60,11 +65,11 @@ def _signal(recording: Recording, name: str, array: SignalArray, rows: NDArray[n
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.abs(speed) / expected
     found: list[Finding] = []
-    sampled = cadence(array.time).period < SLOWEST
+    sampled = cadence(array.time).period < LONGEST_SAMPLE_INTERVAL
     for rotor in range(speed.shape[1]):
         own = ratio[:, rotor]
-        turning = own[rows & (own >= ZERO)]
-        whole = _whole_flight(turning)
+        turning = own[rows & (own >= STOPPED_RATIO)]
+        whole = _constant_fraction(turning)
         usual = float(np.median(turning)) if turning.size else 1.0
         if whole:
             found.append(_constant(name, array, rotor, whole, usual))
@@ -72,12 +77,12 @@ def _signal(recording: Recording, name: str, array: SignalArray, rows: NDArray[n
         if zero.any():
             found.append(_finding(name, array, rotor, zero, "zero", 0.0, rows))
         if sampled and not whole:
-            leaps = _leaps(array.time, np.abs(speed[:, rotor]), own, rows)
-            if leaps is None:
+            position_jumps = _jumps(array.time, np.abs(speed[:, rotor]), own, rows)
+            if position_jumps is None:
                 continue
-            for words, fraction in FRACTIONS.items():
+            for words, fraction in COUNTED_FRACTIONS.items():
                 flags = np.zeros(array.time.size, bool)
-                flags[_between(leaps, fraction)] = True
+                flags[_between(position_jumps, fraction)] = True
                 if flags.any():
                     found.append(_finding(name, array, rotor, flags, words, fraction, rows))
     return [*found, *_missing(name, array, rows)]
@@ -136,7 +141,7 @@ def _from_the_others(speed: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDA
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Leaps:
+class _Jumps:
     """The known samples of a rotor.
 
     Attributes:
@@ -150,35 +155,35 @@ class _Leaps:
     leap: NDArray[np.float64]
 
 
-def _leaps(
+def _jumps(
     time: NDArray[np.float64], speed: NDArray[np.float64], ratio: NDArray[np.float64], rows: NDArray[np.bool_]
-) -> _Leaps | None:
+) -> _Jumps | None:
     """None if the speed never leaps."""
     known = np.flatnonzero(rows & (speed > 0) & np.isfinite(ratio))
     if known.size < 3:
         return None
     leap = speed[known[1:]] / speed[known[:-1]]
     leap[np.diff(time[known]) > 3.5 * float(np.median(np.diff(time)))] = np.nan
-    return _Leaps(known, ratio[known], leap) if ((leap < 0.6) | (leap > 1.7)).any() else None
+    return _Jumps(known, ratio[known], leap) if ((leap < 0.6) | (leap > 1.7)).any() else None
 
 
-def _between(leaps: _Leaps, fraction: float) -> NDArray[np.int64]:
+def _between(position_jumps: _Jumps, fraction: float) -> NDArray[np.int64]:
     """Rows of stretches at a fraction of the expected speed that begin and end with a leap."""
-    starts = np.flatnonzero(np.abs(leaps.leap / fraction - 1.0) < LEAP)
-    ends = np.flatnonzero(np.abs(leaps.leap * fraction - 1.0) < LEAP)
-    near = np.abs(leaps.ratio / fraction - 1.0) < NEAR
-    normal = np.abs(leaps.ratio - 1.0) < NEAR
-    last = leaps.rows.size - 1
+    starts = np.flatnonzero(np.abs(position_jumps.leap / fraction - 1.0) < JUMP_TOLERANCE)
+    ends = np.flatnonzero(np.abs(position_jumps.leap * fraction - 1.0) < JUMP_TOLERANCE)
+    near = np.abs(position_jumps.ratio / fraction - 1.0) < SPEED_TOLERANCE
+    normal = np.abs(position_jumps.ratio - 1.0) < SPEED_TOLERANCE
+    last = position_jumps.rows.size - 1
     found = [np.empty(0, np.int64)]
     after = 0
-    for start in starts[:_MOST_LEAPS]:
+    for start in starts[:_MOST_JUMPS]:
         if start < after or not normal[start]:
             continue
         place = int(np.searchsorted(ends, start, side="right"))
         # up to the leap back, or to the end of the flight
         end = int(ends[place]) if place < ends.size else last
         if near[start + 1 : end + 1].mean() > 0.8 and (place == ends.size or normal[min(end + 1, last)]):
-            found.append(leaps.rows[start + 1 : end + 1])
+            found.append(position_jumps.rows[start + 1 : end + 1])
             after = end + 1
     return np.concatenate(found)
 
@@ -190,31 +195,31 @@ def _stopped(ratio: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.
     """
     flags = np.zeros(ratio.size, bool)
     known = np.flatnonzero(np.isfinite(ratio))
-    low = ratio[known] < ZERO
+    low = ratio[known] < STOPPED_RATIO
     for first, last in runs(low):
-        beside = [k for k in (first - 1, last) if 0 <= k < known.size]
-        if (ratio[known[beside]] > 0.5).any():
+        neighbours = [k for k in (first - 1, last) if 0 <= k < known.size]
+        if (ratio[known[neighbours]] > 0.5).any():
             flags[known[first:last]] = True
     return flags & rows
 
 
-def _whole_flight(ratio: NDArray[np.float64]) -> str:
+def _constant_fraction(ratio: NDArray[np.float64]) -> str:
     """The fraction that a rotor counts all the time, "" if it counts right."""
     sound = ratio[np.isfinite(ratio)]
     if sound.size < 50:
         return ""
     middle = float(np.median(sound))
-    known = {**CONSTANT, "": 1.0}
+    known = {**CONSTANT_FRACTIONS, "": 1.0}
     off = sorted((abs(float(np.log(middle / fraction))), words) for words, fraction in known.items())
     (nearest, words), (_, second) = off[:2]
     apart = abs(float(np.log(known[words] / known[second])))
     steady = (np.abs(sound / middle - 1.0) < 0.2).mean() > 0.8
-    return words if steady and nearest < min(np.log1p(EXACT), NEARER * apart) else ""
+    return words if steady and nearest < min(np.log1p(FRACTION_TOLERANCE), FRACTION_SEPARATION * apart) else ""
 
 
 def _constant(name: str, array: SignalArray, rotor: int, words: str, ratio: float) -> Finding:
     factor = [1.0] * array.value.shape[1]
-    factor[rotor] = 1.0 / CONSTANT[words]
+    factor[rotor] = 1.0 / CONSTANT_FRACTIONS[words]
     return Finding(
         "rotor_sensor",
         Grade.DEGRADES,
@@ -240,7 +245,7 @@ def _finding(
     what = "drops to zero while the rotor must turn" if fraction == 0.0 else f"counts {words} of the turns"
     return Finding(
         "rotor_sensor",
-        Grade.DEGRADES if share >= NOTED else Grade.HARMLESS,
+        Grade.DEGRADES if share >= DEGRADING_MISCOUNT_SHARE else Grade.HARMLESS,
         f"The speed sensor of m{rotor + 1} {what} in {len(spans)} stretches, {percent(share)} of the flight.",
         signal=name,
         intervals=longest(spans),

@@ -3,20 +3,20 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import QUIET, longest, runs
+from crazyem.doctor.streams import NO_FLOAT_WARNINGS, longest, runs
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Grade, percent
 from crazyem.recordings.ordering import Intervals, inside, ordered
 from crazyem.recordings.recording import Recording
 
-FULL = 0.999  # of the greatest duty
-NOTED = 0.005  # share of the flight from which thrust and torque are not what was asked for
+FULL_DUTY = 0.999  # of the greatest duty
+DEGRADING_SATURATED_SHARE = 0.005  # share of the flight from which thrust and torque are not what was asked for
 LOW_CELL = 3.3  # V a cell under load
 _CEILING_RUN = 3  # samples at exactly the same greatest value: a cap, not a maximum
-_WORDS = {"motor_command": "duty", "motor_request": "thrust request"}
+_COMMAND_WORDS = {"motor_command": "duty", "motor_request": "thrust request"}
 
 
-@QUIET
+@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """Upper limit, and lower limit while airborne, of commanded duty and of requested thrust, a rotor at a time."""
     flight = airtime(recording)
@@ -43,8 +43,8 @@ def _upper(
     ceilings = []
     for rotor, column in enumerate(value.T):
         top = float(column[rows].max())
-        if top >= FULL:
-            flags[:, rotor] = (column >= FULL) & rows
+        if top >= FULL_DUTY:
+            flags[:, rotor] = (column >= FULL_DUTY) & rows
         elif top > 0.5 and _is_ceiling(column, top, rows):
             flags[:, rotor] = (column == top) & rows
             ceilings.append(top)
@@ -60,7 +60,7 @@ def _upper(
     if ceilings:
         evidence["ceiling"] = min(ceilings)
     words = ", ".join(f"m{i + 1} {percent(s)}" for i, s in enumerate(shares) if s > 0)
-    text = f"The {_WORDS[name]} of a rotor is at its upper limit in {percent(share)} of the flight ({words})"
+    text = f"The {_COMMAND_WORDS[name]} of a rotor is at its upper limit in {percent(share)} of the flight ({words})"
     volts = _voltage(recording, time[any_rotor])
     if np.isfinite(volts):
         evidence["voltage_V"] = volts
@@ -69,7 +69,7 @@ def _upper(
     return [
         Finding(
             "saturation",
-            Grade.DEGRADES if share >= NOTED else Grade.HARMLESS,
+            Grade.DEGRADES if share >= DEGRADING_SATURATED_SHARE else Grade.HARMLESS,
             text + ".",
             signal=name,
             intervals=longest(spans),
@@ -121,8 +121,8 @@ def _lower(
     return [
         Finding(
             "saturation",
-            Grade.DEGRADES if share >= 4.0 * NOTED else Grade.HARMLESS,
-            f"The {_WORDS[name]} of a rotor is at its lower limit in {percent(share)} of the flight ({words}).",
+            Grade.DEGRADES if share >= 4.0 * DEGRADING_SATURATED_SHARE else Grade.HARMLESS,
+            f"The {_COMMAND_WORDS[name]} of a rotor is at its lower limit in {percent(share)} of the flight ({words}).",
             signal=name,
             intervals=longest(spans),
             evidence={

@@ -16,7 +16,7 @@ from crazyem.recordings.recording import Recording, SignalArray
 MOST_INTERVALS = 50  # a finding names at most this many places, the longest ones; its evidence counts all
 
 # What a drone is told or wants, rather than what was measured: may be straight, constant or stepped in good health.
-COMMANDED = frozenset(
+COMMAND_SIGNALS = frozenset(
     {
         "setpoint_position",
         "setpoint_velocity",
@@ -61,7 +61,7 @@ class Stream:
     @property
     def commanded(self) -> bool:
         """True if nothing in it was measured."""
-        return all(array.quantity in COMMANDED for array in self.arrays)
+        return all(array.quantity in COMMAND_SIGNALS for array in self.arrays)
 
     @property
     def used(self) -> bool:
@@ -75,7 +75,7 @@ class Stream:
 
 
 # Hostile values may overflow anywhere; what comes out then is compared, and compares false.
-QUIET: Any = np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore")
+NO_FLOAT_WARNINGS: Any = np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore")
 
 
 def streams(recording: Recording) -> list[Stream]:

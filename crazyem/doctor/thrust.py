@@ -21,15 +21,15 @@ Array = NDArray[np.float64]
 
 # s between samples of a command or a rotor speed, at most: rotors lag by 30 to 70 ms, so what they did between samples
 # further apart is not known.
-SLOWEST = 0.1
-MOST_THRUST = 2.0  # of what the vehicle file says of its rotors, above which a sample is no thrust
+LONGEST_INPUT_INTERVAL = 0.1
+LARGEST_THRUST_RATIO = 2.0  # of what the vehicle file says of its rotors, above which a sample is no thrust
 ASSUMED_VOLTAGE = 3.7  # V, where none is logged
-VOLTAGE_UNKNOWN = 0.15  # of thrust: a cell between 3.2 and 4.2 V, thrust as its square
-STEADY = 5.0  # s in the air over which the voltage of a battery changes by more than its resolution
+UNKNOWN_VOLTAGE_ERROR = 0.15  # of thrust: a cell between 3.2 and 4.2 V, thrust as its square
+FLAT_VOLTAGE_SECONDS = 5.0  # s in the air over which the voltage of a battery changes by more than its resolution
 # Thrust in the air over the vehicle's weight that a payload explains: a Crazyflie of 29 g carries 15 g.
-CARRIED = 1.5
+LARGEST_CARRIED_RATIO = 1.5
 _QUADROTOR, _ROTORCRAFT = "2", {"2", "3", "4", "13", "14", "15", "29", "35", "43"}  # MAV_TYPE, of lift by rotors alone
-_LAWS = {"rotor_speed": "rotor_constant", "motor_command": "thrust_curve"}
+_THRUST_LAWS = {"rotor_speed": "rotor_constant", "motor_command": "thrust_curve"}
 
 
 def vehicle_for(recording: Recording, given: str | None = None) -> Vehicle:
@@ -68,9 +68,10 @@ def too_slow(recording: Recording, name: str) -> str:
     if found is None or found[0].size < 3:
         return ""
     period = float(np.median(np.diff(found[0])))
-    if period <= SLOWEST:
+    if period <= LONGEST_INPUT_INTERVAL:
         return ""
-    return f"{name} at {1.0 / period:.2g} Hz is too slow: steps of {period:.2g} s are gaps (at most {SLOWEST:g} s)"
+    longest = f"at most {LONGEST_INPUT_INTERVAL:g} s"
+    return f"{name} at {1.0 / period:.2g} Hz is too slow: steps of {period:.2g} s are gaps ({longest})"
 
 
 def signal_for(recording: Recording, vehicle: Vehicle) -> tuple[str, str]:
@@ -108,7 +109,7 @@ def _measured(recording: Recording, name: str) -> tuple[Array, Array] | None:
 
 
 def _lawless(name: str, vehicle: Vehicle) -> str:
-    key = _LAWS[name]
+    key = _THRUST_LAWS[name]
     have = [preset for preset in preset_names() if getattr(load_vehicle(preset), key)]
     return (
         f"{name} is recorded, but not the thrust it gives: vehicle {vehicle.name} has no {key} "
@@ -130,7 +131,7 @@ class Inputs:
 def flat_voltage(recording: Recording, air: Airtime) -> bool:
     """Whether the voltage is one number in all of a flight of 5 s or more, as that of a battery never is."""
     voltage = _measured(recording, "voltage")
-    if voltage is None or not air.known or air.seconds < STEADY:
+    if voltage is None or not air.known or air.seconds < FLAT_VOLTAGE_SECONDS:
         return False
     flying = voltage[1][air.covers(voltage[0]), 0]
     return flying.size > 1 and bool((flying == flying[0]).all())
@@ -156,7 +157,9 @@ def inputs_of(recording: Recording, vehicle: Vehicle) -> Inputs | str:
 
 def _sane(inputs: Inputs, vehicle: Vehicle) -> Inputs:
     """Less the samples that claim far more thrust than the rotors have: no rotor did that."""
-    good = (inputs.wrench[:, 0] < MOST_THRUST * 4.0 * vehicle.thrust_max) & (np.diff(inputs.time, prepend=-np.inf) > 0)
+    good = (inputs.wrench[:, 0] < LARGEST_THRUST_RATIO * 4.0 * vehicle.thrust_max) & (
+        np.diff(inputs.time, prepend=-np.inf) > 0
+    )
     return inputs if good.all() else replace(inputs, time=inputs.time[good], wrench=inputs.wrench[good])
 
 
@@ -173,7 +176,7 @@ def carried(recording: Recording, vehicle: Vehicle, air: Airtime) -> float:
 def weight_objection(recording: Recording, vehicle: Vehicle, air: Airtime) -> str:
     """A clause where by this vehicle the rotors carry far more or far less than its weight, with the ratio; else ""."""
     ratio = carried(recording, vehicle, air)
-    if math.isnan(ratio) or 1.0 / CARRIED <= ratio <= CARRIED:
+    if math.isnan(ratio) or 1.0 / LARGEST_CARRIED_RATIO <= ratio <= LARGEST_CARRIED_RATIO:
         return ""
     never = "never carry its weight: they carry" if ratio < 1.0 else "carry"
     return f"by vehicle {vehicle.name} the rotors {never} {ratio:.2g} times the weight in the air; is it this vehicle?"

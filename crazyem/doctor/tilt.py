@@ -28,17 +28,18 @@ from crazyem.doctor.kinematics import (
     track,
     width_for,
 )
-from crazyem.doctor.regress import CERTAIN, FEW, blocks
+from crazyem.doctor.regression import FEWEST_BLOCKS, SLOPE_CONFIDENCE, blocks
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
 Array = NDArray[np.float64]
 
-SEEN = math.radians(0.5)  # tilt reported from here on
-MATTERS = math.radians(1.5)  # tilt that degrades
-BODY = math.radians(2.0)  # mounting or bias of the accelerometer, as an angle, reported from here on
-APART = 2e-3  # smallest eigenvalue of the normalised normal matrix: half the variance of the heading in rad^2
-SHARP = math.radians(0.5)  # 95 % half-width that a tilt of its own must be known to
+REPORTED_TILT = math.radians(0.5)  # tilt reported from here on
+DEGRADING_TILT = math.radians(1.5)  # tilt that degrades
+REPORTED_SENSOR_ANGLE = math.radians(2.0)  # mounting or bias of the accelerometer, as an angle, reported from here on
+# smallest eigenvalue of the normalised normal matrix: half the variance of the heading in rad^2
+SMALLEST_EIGENVALUE = 2e-3
+LARGEST_HALF_WIDTH = math.radians(0.5)  # 95 % half-width that a tilt of its own must be known to
 
 
 def check(recording: Recording) -> list[Finding]:
@@ -71,7 +72,7 @@ def _look(recording: Recording, pose: Pose, name: str, array: SignalArray) -> Fi
         return None  # not a specific force in m/s^2: another check says so
     block = blocks(grid.time[rows])
     count = int(block.max()) + 1
-    if count < FEW:
+    if count < FEWEST_BLOCKS:
         return None
     design = _design(q, both=True)
     both, spread = _jackknife(design, e, block)
@@ -129,7 +130,7 @@ def _separable(a: Array) -> bool:
     """True if the heading changes enough for tilt and bias to have columns of their own."""
     flat = a.reshape(-1, a.shape[2])
     flat = flat / np.linalg.norm(flat, axis=0)
-    return float(np.linalg.eigvalsh(flat.T @ flat)[0]) > APART
+    return float(np.linalg.eigvalsh(flat.T @ flat)[0]) > SMALLEST_EIGENVALUE
 
 
 def _jackknife(a: Array, e: Array, block: NDArray[np.int64]) -> tuple[Array, Array]:
@@ -150,7 +151,7 @@ def _jackknife(a: Array, e: Array, block: NDArray[np.int64]) -> tuple[Array, Arr
 
 
 def _judge(pose: str, force: str, both: Array, spread: Array, alone: tuple[Array, Array], count: int) -> Finding | None:
-    usual, sure = (float(stats.t.ppf(level, count - 1)) for level in (0.975, CERTAIN))
+    usual, sure = (float(stats.t.ppf(level, count - 1)) for level in (0.975, SLOPE_CONFIDENCE))
     tilt, error = float(np.hypot(*both[:2])), float(np.hypot(*spread[:2]))
     mount, mount_error = float(np.hypot(*both[2:4])) / GRAVITY, float(np.hypot(*spread[2:4])) / GRAVITY
     evidence = {
@@ -164,13 +165,13 @@ def _judge(pose: str, force: str, both: Array, spread: Array, alone: tuple[Array
         "body_deg": math.degrees(mount),
     }
     said = f"{evidence['tilt_deg']:.2f} deg ({evidence['tilt_low_deg']:.2f} to {evidence['tilt_high_deg']:.2f})"
-    if usual * max(error, mount_error) <= SHARP:
-        if tilt >= SEEN and tilt > sure * error:
-            grade = Grade.DEGRADES if tilt >= MATTERS else Grade.HARMLESS
+    if usual * max(error, mount_error) <= LARGEST_HALF_WIDTH:
+        if tilt >= REPORTED_TILT and tilt > sure * error:
+            grade = Grade.DEGRADES if tilt >= DEGRADING_TILT else Grade.HARMLESS
             text = f"The frame of {pose} is tilted by {said} against gravity as felt by {force}."
             advice = "Level the frame: turn positions, velocities and attitudes by the opposite rotation."
             return Finding("tilt", grade, text, pose, (), evidence, advice)
-        if mount >= BODY and mount > sure * mount_error:
+        if mount >= REPORTED_SENSOR_ANGLE and mount > sure * mount_error:
             text = (
                 f"{force} and {pose} differ by {math.degrees(mount):.1f} deg in the body frame: the accelerometer has "
                 f"a bias ({both[2]:.2f}, {both[3]:.2f} m/s^2 along x, y), or the pose's body frame is not the IMU's."
@@ -179,13 +180,13 @@ def _judge(pose: str, force: str, both: Array, spread: Array, alone: tuple[Array
         return None
     level, level_error = alone
     total, total_error = float(np.hypot(*level[:2])), float(np.hypot(*level_error[:2]))
-    if total < 2.0 * SEEN or total <= sure * total_error:
+    if total < 2.0 * REPORTED_TILT or total <= sure * total_error:
         return None
     numbers = {"together_deg": math.degrees(total), "together_error_deg": math.degrees(total_error)}
     text = (
         f"The vertical of {pose} and gravity as felt by {force} differ by {math.degrees(total):.2f} deg: a tilted "
         "frame, or a bias of the accelerometer; the heading changed too little to tell these apart."
     )
-    grade = Grade.DEGRADES if total >= 2.0 * MATTERS else Grade.HARMLESS
+    grade = Grade.DEGRADES if total >= 2.0 * DEGRADING_TILT else Grade.HARMLESS
     advice = "Record a flight that turns once about the vertical."
     return Finding("tilt", grade, text, pose, (), numbers, advice)

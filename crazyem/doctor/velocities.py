@@ -2,16 +2,16 @@
 
 from crazyem.doctor import axes
 from crazyem.doctor.attitudes import Pose, poses
-from crazyem.doctor.compare import Look, agreed_scale, look, wrong_scale
+from crazyem.doctor.hypotheses import Comparison, agreed_scale, compare_hypotheses, wrong_scale
 from crazyem.doctor.kinematics import Track, difference, grid_of, measurements, rotate, track, width_for
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
-ENOUGH = 0.04  # m/s rms along an axis, below which nothing is said
-FAR = 0.1  # m rms along an axis, the same for positions
-WIDTH = 0.2  # s
-BELIEVED = 0.6
-OFF = 0.05
+LEAST_VELOCITY_RMS = 0.04  # m/s rms along an axis, below which nothing is said
+LEAST_POSITION_RMS = 0.1  # m rms along an axis, the same for positions
+VELOCITY_WINDOW = 0.2  # s
+LEAST_EXPLAINED_SHARE = 0.6
+SCALE_FAULT = 0.05
 # slope of velocity against the position's derivative -> what that means, and which of the two is implausible
 VELOCITY_UNITS = {"mm/s": 1e3, "cm/s": 1e2}
 POSITION_UNITS = {"mm": 1e-3, "cm": 1e-2}
@@ -38,7 +38,7 @@ def check(recording: Recording) -> list[Finding]:
     return found
 
 
-def _compare(array: SignalArray, other: str, reference: SignalArray, attitudes: list[Pose]) -> Look | None:
+def _compare(array: SignalArray, other: str, reference: SignalArray, attitudes: list[Pose]) -> Comparison | None:
     grid = grid_of(array, reference, *(pose.array for pose in attitudes[:1]))
     if grid.size == 0:
         return None
@@ -48,25 +48,32 @@ def _compare(array: SignalArray, other: str, reference: SignalArray, attitudes: 
         attitude = pose.track(grid)
         turned = rotate(attitude.value, world.value, inverse=True)
         candidates["body"] = (1, Track(turned, world.valid & attitude.valid))
-    width = max(WIDTH, width_for(array, reference))
-    return look(array, grid, other, candidates, width=width, least=ENOUGH, offset=False)
+    width = max(VELOCITY_WINDOW, width_for(array, reference))
+    return compare_hypotheses(array, grid, other, candidates, width=width, least=LEAST_VELOCITY_RMS, offset=False)
 
 
-def _compare_positions(array: SignalArray, other: str, reference: SignalArray) -> Look | None:
+def _compare_positions(array: SignalArray, other: str, reference: SignalArray) -> Comparison | None:
     """Positions themselves: the derivative of a stream with late packets is no fair witness of its scale."""
     grid = grid_of(array, reference)
     if grid.size == 0:
         return None
     candidates = {"world": (0, track(reference, grid))}
-    return look(array, grid, other, candidates, width=max(WIDTH, width_for(array, reference)), least=FAR)
+    return compare_hypotheses(
+        array,
+        grid,
+        other,
+        candidates,
+        width=max(VELOCITY_WINDOW, width_for(array, reference)),
+        least=LEAST_POSITION_RMS,
+    )
 
 
-def _judge(name: str, looks: list[Look], blamed: set[str]) -> list[Finding]:
+def _judge(name: str, looks: list[Comparison], blamed: set[str]) -> list[Finding]:
     if not looks:
         return []
     best = max(looks, key=lambda one: one.explained)
     whole = best.whole
-    if whole is None or best.explained < BELIEVED:
+    if whole is None or best.explained < LEAST_EXPLAINED_SHARE:
         return []
     head = f"{name} against the derivative of {best.against}: "
     evidence = best.evidence()
@@ -86,14 +93,14 @@ def _judge(name: str, looks: list[Look], blamed: set[str]) -> list[Finding]:
         fix = Fix("scale", (best.against,), (unit[1],) * 3)
         return [Finding("velocities", Grade.UNUSABLE, text, best.against, (), evidence, "Correct its unit.", fix)]
     return wrong_scale(
-        "velocities", name, looks, OFF,
+        "velocities", name, looks, SCALE_FAULT,
         alone="One of the two is wrong, and a third measurement must say which.",
         agreed="Positions of two origins agree against it: divide the velocity by the factor.",
     )  # fmt: skip
 
 
-def _judge_position(name: str, looks: list[Look], blamed: set[str]) -> list[Finding]:
-    if not looks or looks[0].whole is None or looks[0].explained < BELIEVED:
+def _judge_position(name: str, looks: list[Comparison], blamed: set[str]) -> list[Finding]:
+    if not looks or looks[0].whole is None or looks[0].explained < LEAST_EXPLAINED_SHARE:
         return []
     seen, whole = looks[0], looks[0].whole
     assert whole is not None
@@ -114,7 +121,7 @@ def _judge_position(name: str, looks: list[Look], blamed: set[str]) -> list[Find
         text = f"{head}it is {whole.value:.4g} times as large: it is in {unit[0]}, not m."
         fix = Fix("scale", (name,), (1.0 / unit[1],) * 3)
         return [Finding("velocities", Grade.UNUSABLE, text, name, (), seen.evidence(), "Correct its unit.", fix)]
-    agreed = agreed_scale(looks, OFF)
+    agreed = agreed_scale(looks, SCALE_FAULT)
     if agreed is None:
         return []
     numbers = {**seen.evidence(), **axes.numbers(seen.single)}
@@ -123,7 +130,7 @@ def _judge_position(name: str, looks: list[Look], blamed: set[str]) -> list[Find
     return [Finding("velocities", Grade.DEGRADES, text, name, (), numbers, advice)]
 
 
-def _structure(check_name: str, name: str, head: str, seen: Look) -> Finding:
+def _structure(check_name: str, name: str, head: str, seen: Comparison) -> Finding:
     choice = seen.choice
     tail = (
         f" ({100.0 * seen.evidence()['explained']:.2f} % of it explained, "

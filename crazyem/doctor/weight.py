@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.doctor.kinematics import GRAVITY, STEP, Grid, Track, grid_of, measurements, track
-from crazyem.doctor.regress import FEW, block_sums, blocks
+from crazyem.doctor.kinematics import GRAVITY, GRID_STEP, Grid, Track, grid_of, measurements, track
+from crazyem.doctor.regression import FEWEST_BLOCKS, block_sums, blocks
 from crazyem.doctor.thrust import carried, vehicle_for, weight_objection
 from crazyem.physics.rotors import thrust_from_command, thrust_from_speed
 from crazyem.recordings.airborne import airtime
@@ -22,10 +22,10 @@ from crazyem.vehicle import Vehicle, load_vehicle, preset_names
 
 Array = NDArray[np.float64]
 
-OFF = 0.15  # claimed mass against the nearest law: reported from here on
-LIFTING = 0.6  # of the median thrust while rotors turn: less is a take-off, a landing or the ground
-BRIDGE = 0.15  # s, gaps in thrust and force that a mean may bridge
-PIECE = 25  # rows of a block at least (0.25 s)
+REPORTED_MASS_DEVIATION = 0.15  # claimed mass against the nearest law: reported from here on
+LIFTING_THRUST_RATIO = 0.6  # of the median thrust while rotors turn: less is a take-off, a landing or the ground
+THRUST_BRIDGED_SECONDS = 0.15  # s, gaps in thrust and force that a mean may bridge
+FEWEST_BLOCK_ROWS = 25  # rows of a block at least (0.25 s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ def check(recording: Recording) -> list[Finding]:
     nearest = min(by_law, key=lambda name: abs(math.log(by_law[name].mass / claim)))
     best = by_law[nearest]
     ratio = best.mass / claim
-    if abs(math.log(ratio)) < math.log(1.0 + OFF) or best.low <= claim <= best.high:
+    if abs(math.log(ratio)) < math.log(1.0 + REPORTED_MASS_DEVIATION) or best.low <= claim <= best.high:
         return []
     evidence = {"claimed_kg": claim, "ratio": ratio, "ratio_low": best.low / claim, "ratio_high": best.high / claim}
     for name, one in by_law.items():
@@ -107,27 +107,27 @@ def apparent_mass(recording: Recording, vehicle: Vehicle) -> Carried | None:
         return None
     grid, thrust, volts = made
     force = next(iter(measurements(recording, "specific_force").values()), None)
-    carried = track(force, grid, bridge=BRIDGE) if force is not None else None
+    carried = track(force, grid, bridge=THRUST_BRIDGED_SECONDS) if force is not None else None
     lift = carried.value[:, 2] if carried is not None else np.full(grid.size, GRAVITY)
     valid = thrust.valid & (carried.valid if carried is not None else True)
     total = thrust.value[:, 0]
     turning = valid & (total > 1e-3)
-    if turning.sum() < FEW * PIECE:
+    if turning.sum() < FEWEST_BLOCKS * FEWEST_BLOCK_ROWS:
         return None
-    flying = turning & (total > LIFTING * float(np.median(total[turning]))) & (lift > 0.2 * GRAVITY)
+    flying = turning & (total > LIFTING_THRUST_RATIO * float(np.median(total[turning]))) & (lift > 0.2 * GRAVITY)
     rows = np.flatnonzero(flying)
-    if rows.size < FEW * PIECE:
+    if rows.size < FEWEST_BLOCKS * FEWEST_BLOCK_ROWS:
         return None
     sums = block_sums(blocks(grid.time[rows]), total[rows], lift[rows], volts.value[rows, 0], np.ones(rows.size))
-    sums = sums[sums[:, 3] >= PIECE]
-    if len(sums) < FEW or not 0.5 * GRAVITY < sums[:, 1].sum() / sums[:, 3].sum() < 2.0 * GRAVITY:
+    sums = sums[sums[:, 3] >= FEWEST_BLOCK_ROWS]
+    if len(sums) < FEWEST_BLOCKS or not 0.5 * GRAVITY < sums[:, 1].sum() / sums[:, 3].sum() < 2.0 * GRAVITY:
         return None
     mass = float(sums[:, 0].sum() / sums[:, 1].sum())
     each = sums[:, 0] / sums[:, 1]
     wide = float(stats.t.ppf(0.975, len(sums) - 1)) * float(each.std(ddof=1)) / math.sqrt(len(sums))
     voltage = sums[:, 2] / sums[:, 3]
     sag = float(np.polyfit(voltage - voltage.mean(), each / mass, 1)[0]) if np.ptp(voltage) > 0.1 else math.nan
-    return Carried(mass, mass - wide, mass + wide, sag, float(sums[:, 3].sum()) * STEP)
+    return Carried(mass, mass - wide, mass + wide, sag, float(sums[:, 3].sum()) * GRID_STEP)
 
 
 def _thrust(recording: Recording, vehicle: Vehicle) -> tuple[Grid, Track, Track] | None:
@@ -136,7 +136,7 @@ def _thrust(recording: Recording, vehicle: Vehicle) -> tuple[Grid, Track, Track]
     voltage = next(iter(measurements(recording, "voltage").values()), None)
     if speed is not None and vehicle.rotor_constant is not None:
         grid = grid_of(speed)
-        rotor = track(speed, grid, bridge=BRIDGE)
+        rotor = track(speed, grid, bridge=THRUST_BRIDGED_SECONDS)
         force = thrust_from_speed(rotor.value, rotor_constant=vehicle.rotor_constant).sum(axis=1)
         volts = (
             track(voltage, grid, bridge=2.0) if voltage is not None else Track(np.zeros((grid.size, 1)), rotor.valid)
@@ -146,7 +146,7 @@ def _thrust(recording: Recording, vehicle: Vehicle) -> tuple[Grid, Track, Track]
     if command is None or voltage is None or not vehicle.thrust_curve:
         return None
     grid = grid_of(command, voltage)
-    duty, volts = track(command, grid, bridge=BRIDGE), track(voltage, grid, bridge=2.0)
+    duty, volts = track(command, grid, bridge=THRUST_BRIDGED_SECONDS), track(voltage, grid, bridge=2.0)
     force = thrust_from_command(
         np.clip(duty.value, 0.0, 1.0), volts.value[:, 0], thrust_curve=vehicle.thrust_curve
     ).sum(axis=1)

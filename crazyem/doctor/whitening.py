@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-ORDER = 12  # of the whitening autoregression
+AUTOREGRESSION_ORDER = 12  # of the whitening autoregression
 _MAX_LAG = 100
 
 
@@ -58,7 +58,7 @@ def _between(response: list[Array], columns: list[Array], low: int, high: int) -
     pieces, start = [], 0
     for r, c in zip(response, columns):
         a, b = max(low - start, 0), min(high - start, r.size)
-        if b - a > ORDER:
+        if b - a > AUTOREGRESSION_ORDER:
             pieces.append((r[a:b], c[a:b]))
         start += r.size
     return pieces
@@ -68,7 +68,7 @@ def _linear_fit_once(response: list[Array], columns: list[Array], share: float) 
     width = columns[0].shape[1]
     y, x = np.concatenate(response), np.concatenate(columns)
     good = np.isfinite(y) & np.isfinite(x).all(axis=1)
-    if good.sum() < 10 * ORDER:
+    if good.sum() < 10 * AUTOREGRESSION_ORDER:
         return None
     scale = np.sqrt(np.mean(x[good] ** 2, axis=0))
     if not np.all(scale > 0.0):
@@ -90,16 +90,18 @@ def _linear_fit_once(response: list[Array], columns: list[Array], share: float) 
 
 
 def autoregression(parts: list[Array]) -> Array:
-    """(ORDER + 1,) whitening filter of residuals (k,), by the Yule-Walker equations over all stretches."""
-    covariance = np.zeros(ORDER + 1)
+    """(AUTOREGRESSION_ORDER + 1,) whitening filter of residuals (k,), by Yule-Walker over all stretches."""
+    covariance = np.zeros(AUTOREGRESSION_ORDER + 1)
     for part in parts:
         r = np.where(np.isfinite(part), part, 0.0)
         r = r - r.mean() if r.size else r
-        covariance += [float(r[lag:] @ r[: r.size - lag]) if r.size > lag else 0.0 for lag in range(ORDER + 1)]
+        covariance += [
+            float(r[lag:] @ r[: r.size - lag]) if r.size > lag else 0.0 for lag in range(AUTOREGRESSION_ORDER + 1)
+        ]
     if not covariance[0] > 0.0:
-        return np.append(1.0, np.zeros(ORDER))
+        return np.append(1.0, np.zeros(AUTOREGRESSION_ORDER))
     covariance[0] *= 1.0 + 1e-6
-    toeplitz = covariance[np.abs(np.subtract.outer(np.arange(ORDER), np.arange(ORDER)))]
+    toeplitz = covariance[np.abs(np.subtract.outer(np.arange(AUTOREGRESSION_ORDER), np.arange(AUTOREGRESSION_ORDER)))]
     return np.append(1.0, -np.linalg.solve(toeplitz, covariance[1:]))
 
 
@@ -107,8 +109,8 @@ def filtered(weights: Array, part: Array) -> Array:
     """A stretch (k,) or (k, p) through the whitening filter, without its first rows."""
     # what scipy.signal.lfilter does, to the bit; importing that takes a second
     if part.ndim == 1:
-        return np.convolve(weights, part)[ORDER : part.size]
-    return np.column_stack([np.convolve(weights, column)[ORDER : column.size] for column in part.T])
+        return np.convolve(weights, part)[AUTOREGRESSION_ORDER : part.size]
+    return np.column_stack([np.convolve(weights, column)[AUTOREGRESSION_ORDER : column.size] for column in part.T])
 
 
 def _inflation(terms: Array, covariance: Array) -> Array:

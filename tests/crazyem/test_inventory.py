@@ -15,7 +15,7 @@ from synthetic import COLUMNS, Truth, fly
 
 from crazyem.doctor.envelope import envelope
 from crazyem.doctor.excitation import rotation_fit, steps_of
-from crazyem.doctor.identifiability import NAMES, Verdict, replay_objection
+from crazyem.doctor.identifiability import VERDICT_NAMES, Verdict, replay_objection
 from crazyem.doctor.inventory import Inventory, inventory
 from crazyem.doctor.thrust import inputs_of
 from crazyem.recordings import Recording, open_recording
@@ -75,15 +75,15 @@ def test_everything_is_json_and_text() -> None:
     data = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert [s["name"] for s in data["signals"]] == list(made.signals)
     assert data["envelope"]["speed_max_m_s"] > 0.0
-    assert {v["name"] for v in data["identifiable"]} == set(NAMES)
+    assert {v["name"] for v in data["identifiable"]} == set(VERDICT_NAMES)
     text = found.text(everything=True)
     assert "version 2025.02" in text
     assert "x" * 200 not in text  # whole tables are not for a terminal
-    assert all(name in text for name in (*made.signals, *NAMES))
+    assert all(name in text for name in (*made.signals, *VERDICT_NAMES))
     short = found.text().splitlines()
     assert len(short) <= 20
     assert short[1].startswith("in the air")
-    assert all(name in found.text() for name in NAMES)
+    assert all(name in found.text() for name in VERDICT_NAMES)
 
 
 @pytest.mark.parametrize("names", [(), ("position",), ("specific_force",), ("body_rate", "voltage"), ("attitude",)])

@@ -12,37 +12,37 @@ from crazyem.recordings.recording import SignalArray
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-LEAP = 0.1  # m in one step, beyond the motion around it: ten times what a step at 100 Hz and 1 m/s is
-HARDEST = 100.0  # m/s^2 of a crash: by what a drone may leave the line between two samples
-NOISE = 12.0  # times the usual deviation of a step from the motion around it
-AROUND = 5  # steps on each side whose median is the motion
-BACK = 0.5  # s after which the position is where the motion before leads, if it leaps back
-COARSE = 0.005  # m, resolution from which a velocity over 0.1 s is known to no better than 5 cm/s
-_FEWEST = 50
+LEAST_JUMP = 0.1  # m in one step, beyond the motion around it: ten times what a step at 100 Hz and 1 m/s is
+CRASH_ACCELERATION = 100.0  # m/s^2 of a crash: by what a drone may leave the line between two samples
+JUMP_NOISE_RATIO = 12.0  # times the usual deviation of a step from the motion around it
+MEDIAN_STEPS = 5  # steps on each side whose median is the motion
+RETURN_SECONDS = 0.5  # s after which the position is where the motion before leads, if it leaps back
+COARSE_RESOLUTION = 0.005  # m, resolution from which a velocity over 0.1 s is known to no better than 5 cm/s
+_FEWEST_SAMPLES = 50
 
 
-def leaps(name: str, array: SignalArray, *, furthest: float) -> list[Finding]:
+def position_jumps(name: str, array: SignalArray, *, furthest: float) -> list[Finding]:
     """Findings of one position signal, of samples not further than `furthest` [m]; what is held is no new sample."""
     with np.errstate(invalid="ignore"):
         good = np.isfinite(array.time) & (np.abs(array.value) <= furthest).all(axis=1) & ~same_as_before(array.value)
     sound = np.flatnonzero(good)
     time, value = array.time[sound], array.value[sound]
-    if sound.size < _FEWEST or (np.diff(time) <= 0.0).any():
+    if sound.size < _FEWEST_SAMPLES or (np.diff(time) <= 0.0).any():
         return []
     steps = np.diff(time)
     velocity = np.diff(value, axis=0) / steps[:, None]
-    beside = _beside(velocity)
-    off = np.linalg.norm(velocity - beside, axis=1) * steps
+    expected = _neighbour_velocity(velocity)
+    off = np.linalg.norm(velocity - expected, axis=1) * steps
     usual = float(np.median(off))
-    limit = np.maximum(np.maximum(LEAP, NOISE * usual), 0.5 * HARDEST * steps**2)
-    rows = np.flatnonzero((off > limit) & (steps < BACK))
+    limit = np.maximum(np.maximum(LEAST_JUMP, JUMP_NOISE_RATIO * usual), 0.5 * CRASH_ACCELERATION * steps**2)
+    rows = np.flatnonzero((off > limit) & (steps < RETURN_SECONDS))
     return [*_found(name, array, sound, time, value, rows, off), *_coarse(name, array, value)]
 
 
-def _beside(velocity: Array) -> Array:
+def _neighbour_velocity(velocity: Array) -> Array:
     """(n, 3) the median velocity of the steps on both sides of each step, without itself."""
-    padded = np.pad(velocity, ((AROUND, AROUND), (0, 0)), mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * AROUND + 1, axis=0)
+    padded = np.pad(velocity, ((MEDIAN_STEPS, MEDIAN_STEPS), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * MEDIAN_STEPS + 1, axis=0)
     return np.median(windows, axis=2)
 
 
@@ -59,7 +59,7 @@ def _found(
     while k < rows.size:
         first = int(rows[k])
         size = float(off[first])
-        later = rows[k + 1 :][time[rows[k + 1 :]] - time[first] < BACK]
+        later = rows[k + 1 :][time[rows[k + 1 :]] - time[first] < RETURN_SECONDS]
         # back where the motion before leads, to half of the leap
         back = next((int(r) for r in later if np.linalg.norm(value[r + 1] - value[first]) < 0.5 * size), None)
         if back is None:
@@ -97,7 +97,7 @@ def _coarse(name: str, array: SignalArray, value: Array) -> list[Finding]:
     """A note where the position is stored in coarse steps."""
     grains = [_grain(column) for column in value.T]
     known = [g for g in grains if math.isfinite(g)]
-    if not known or min(known) < COARSE:
+    if not known or min(known) < COARSE_RESOLUTION:
         return []
     grain = min(known)
     return [

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from made_flight import Motion, array_of
 from scipy.spatial.transform import Rotation
 
-from crazyem.doctor import kinematics, regress
+from crazyem.doctor import kinematics, regression
 from crazyem.doctor.delays import delay, spread
 from crazyem.doctor.kinematics import Grid, Track, Window
 
@@ -81,7 +81,7 @@ def test_a_slope_lies_between_its_two_regressions_whatever_is_noisy(
     truth = np.column_stack([np.sin(0.7 * time + k) + np.sin(1.9 * time - k) for k in range(3)])
     x = truth + noise_x * rng.normal(size=truth.shape)
     y = factor * (truth + noise_y * rng.normal(size=truth.shape)) + 1.0
-    got = regress.slope(x, y, regress.blocks(time))
+    got = regression.slope(x, y, regression.blocks(time))
     assert got is not None
     assert got.far_low <= factor * 1.01
     assert got.far_high >= factor * 0.99
@@ -95,12 +95,12 @@ def test_a_slope_is_not_moved_by_stray_rows_nor_blind_to_rare_manoeuvres() -> No
     y = 1.3 * x + 0.01 * rng.normal(size=x.shape)
     stray = rng.random(time.size) < 0.02
     y[stray] += 50.0
-    got = regress.slope(x, y, regress.blocks(time))
+    got = regression.slope(x, y, regression.blocks(time))
     assert got is not None
     assert abs(got.value - 1.3) < 0.01
     x = 0.001 * rng.normal(size=x.shape) + x * (time > 40.0)[:, None]
     y = 1.3 * x + 0.003 * rng.normal(size=x.shape)
-    got = regress.slope(x, y, regress.blocks(time))
+    got = regression.slope(x, y, regression.blocks(time))
     assert got is not None
     assert abs(got.value - 1.3) < 0.01
 
@@ -109,15 +109,15 @@ def test_hypotheses_that_data_do_not_separate_are_left_standing() -> None:
     time = np.arange(0.0, 60.0, 0.05)
     rng = np.random.default_rng(0)
     x = np.column_stack([np.sin(time), np.cos(time), np.zeros_like(time)])
-    block = regress.blocks(time)
+    block = regression.blocks(time)
     y = x * np.array([1.0, -1.0, 1.0]) + 0.01 * rng.normal(size=x.shape)
     ways = {"plain": (0, x), "y": (1, x * [1, -1, 1]), "y and z": (2, x * [1, -1, -1])}
-    choice = regress.choose(y, ways, block)
+    choice = regression.choose(y, ways, block)
     assert choice is not None
     assert choice.denied
     assert choice.name == "y"
     ways = {"plain": (0, x), "z": (1, x * [1, 1, -1])}
-    choice = regress.choose(x + 0.3 * rng.normal(size=x.shape), ways, block)
+    choice = regression.choose(x + 0.3 * rng.normal(size=x.shape), ways, block)
     assert choice is not None
     assert not choice.denied
     assert choice.name == "plain"

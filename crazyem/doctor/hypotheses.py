@@ -11,20 +11,20 @@ from numpy.typing import NDArray
 from crazyem.doctor import axes
 from crazyem.doctor.delays import delay
 from crazyem.doctor.kinematics import Grid, Track, Window, track
-from crazyem.doctor.regress import Choice, Slope, blocks, choose, slope
+from crazyem.doctor.regression import Choice, Slope, blocks, choose, slope
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import SignalArray
 
 Array = NDArray[np.float64]
 
-WIDE = 0.5  # s, window for slopes: motion slow enough for the filters of any stream
-STRIDE = 3  # grid steps between rows, more in recordings of more than a few minutes
-ROWS = 6000  # at most
-COVERED = 0.5  # share of the time that a scale fault must have been seen over
+SLOPE_WINDOW = 0.5  # s, window for slopes: motion slow enough for the filters of any stream
+ROW_STRIDE = 3  # grid steps between rows, more in recordings of more than a few minutes
+MOST_COMPARED_ROWS = 6000  # at most
+LEAST_SCALE_COVERAGE = 0.5  # share of the time that a scale fault must have been seen over
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Comparison:
     """One measurement against one prediction.
 
     Attributes:
@@ -76,7 +76,7 @@ class Look:
         return out
 
 
-def look(
+def compare_hypotheses(
     array: SignalArray,
     grid: Grid,
     against: str,
@@ -85,7 +85,7 @@ def look(
     width: float,
     least: float,
     offset: bool = True,
-) -> Look | None:
+) -> Comparison | None:
     """Compare a measurement with predictions; None where there is too little motion or data.
 
     Args:
@@ -98,7 +98,7 @@ def look(
         offset: the hypotheses are compared about the means.
     """
     window = Window(width)
-    stride = max(STRIDE, grid.size // ROWS)
+    stride = max(ROW_STRIDE, grid.size // MOST_COMPARED_ROWS)
     raw = track(array, grid)
     smooth = {name: window.mean(given) for name, (_, given) in candidates.items()}
     declared = next(iter(smooth.values()))
@@ -121,7 +121,7 @@ def look(
     name = choice.name or choice.best
     x = chosen[name][1]
     base = name if name in candidates else next(iter(candidates))
-    wide = Window(max(WIDE, width))
+    wide = Window(max(SLOPE_WINDOW, width))
     far_x, far_y = wide.mean(candidates[base][1]), wide.mean(raw)
     keep = np.flatnonzero(far_x.valid & far_y.valid)[::stride]
     if keep.size > 200 and name in candidates:
@@ -131,7 +131,7 @@ def look(
     factor = 1.0 if whole is None or whole.far_low <= 1.0 <= whole.far_high else whole.value
     rest = y - factor * x
     at = declared.value[rows] if len(rows) == len(y) else wide.mean(next(iter(candidates.values()))[1]).value[keep]
-    return Look(
+    return Comparison(
         against=against,
         choice=choice,
         lag=lag,
@@ -146,7 +146,7 @@ def look(
     )
 
 
-def agreed_scale(looks: Sequence[Look], least: float) -> tuple[Look, axes.ScaleFault, int] | None:
+def agreed_scale(looks: Sequence[Comparison], least: float) -> tuple[Comparison, axes.ScaleFault, int] | None:
     """A scale fault that no comparison contradicts; None if one that could see it sees none.
 
     What a measurement is compared with may be at fault itself (an onboard attitude follows its own filter), so a fault
@@ -157,7 +157,7 @@ def agreed_scale(looks: Sequence[Look], least: float) -> tuple[Look, axes.ScaleF
     for one in looks:
         if one.whole is None or one.choice.denied:
             continue
-        fault = axes.scale_fault(one.whole, one.single, least) if one.covered >= COVERED else None
+        fault = axes.scale_fault(one.whole, one.single, least) if one.covered >= LEAST_SCALE_COVERAGE else None
         if fault is not None and one.explained >= 0.8:
             found.append((one, fault))
         elif one.whole.far_high - one.whole.far_low < 0.3:
@@ -169,7 +169,7 @@ def agreed_scale(looks: Sequence[Look], least: float) -> tuple[Look, axes.ScaleF
     return (*best, len(found)) if len(directions) == 1 else None
 
 
-def misread(check: str, name: str, seen: Look, *, noun: str, head: str, tail: str) -> Finding:
+def misread(check: str, name: str, seen: Comparison, *, noun: str, head: str, tail: str) -> Finding:
     """The finding that a vector is in another frame or has other axes than declared.
 
     Args:
@@ -196,7 +196,7 @@ def misread(check: str, name: str, seen: Look, *, noun: str, head: str, tail: st
 
 
 def wrong_scale(
-    check: str, name: str, looks: Sequence[Look], least: float, *, alone: str, agreed: str
+    check: str, name: str, looks: Sequence[Comparison], least: float, *, alone: str, agreed: str
 ) -> list[Finding]:
     """The finding that a signal is not the derivative of what it is compared with, by a factor; none if it is.
 

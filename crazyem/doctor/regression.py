@@ -14,12 +14,12 @@ from scipy import stats
 
 Array = NDArray[np.float64]
 
-BLOCK = 1.5  # s
-MANY = 60  # blocks at most; longer ones then
-FEW = 6  # blocks at least, else nothing is said
-CERTAIN = 0.9995  # one-sided level at which a slope counts as told
-CLEAR = 2.0  # what the runner-up leaves unexplained, over what the best leaves
-LIKELIER = 10.0  # log likelihood ratio between best and runner-up
+BLOCK_SECONDS = 1.5  # s
+MOST_BLOCKS = 60  # blocks at most; longer ones then
+FEWEST_BLOCKS = 6  # blocks at least, else nothing is said
+SLOPE_CONFIDENCE = 0.9995  # one-sided level at which a slope counts as told
+RUNNER_UP_RATIO = 2.0  # what the runner-up leaves unexplained, over what the best leaves
+LOG_LIKELIHOOD_RATIO = 10.0  # log likelihood ratio between best and runner-up
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class Slope:
         direct: y on x; too small by the noise of x.
         reverse: 1 / (x on y); too large by the noise of y. With independent noises the truth lies between the two.
         low, high: 95 % interval: the two regressions, each widened by what the jackknife says.
-        far_low, far_high: the same at the level `CERTAIN`.
+        far_low, far_high: the same at the level `SLOPE_CONFIDENCE`.
         explained: share of the variance that the two sides share (squared correlation).
         samples: how many (rows times components).
         blocks: how many, counted by the share of the motion that each holds.
@@ -50,10 +50,10 @@ class Slope:
 
 
 def blocks(time: Array) -> NDArray[np.int64]:
-    """Block number (n,) of each row, from its time: 0, 1, .. without holes; at most `MANY` blocks."""
+    """Block number (n,) of each row, from its time: 0, 1, .. without holes; at most `MOST_BLOCKS` blocks."""
     if time.size == 0:
         return np.zeros(0, np.int64)
-    length = max(BLOCK, float(time[-1] - time[0]) / MANY + 1e-9)
+    length = max(BLOCK_SECONDS, float(time[-1] - time[0]) / MOST_BLOCKS + 1e-9)
     number = ((time - time[0]) / length).astype(np.int64)
     return np.asarray(np.unique(number, return_inverse=True)[1], np.int64)
 
@@ -96,7 +96,7 @@ def slope(x: Array, y: Array, block: NDArray[np.int64], *, offset: bool = True) 
     total = sums.sum(axis=0)
     both = _two(total)
     count = len(sums)
-    if both is None or count < FEW:
+    if both is None or count < FEWEST_BLOCKS:
         return None
     parts = [_two(total - one) for one in sums]
     if any(p is None for p in parts):
@@ -104,7 +104,7 @@ def slope(x: Array, y: Array, block: NDArray[np.int64], *, offset: bool = True) 
     left = np.array(parts)
     spread = np.sqrt((count - 1) / count * np.square(left - left.mean(axis=0)).sum(axis=0))
     edges = []
-    for level in (0.975, CERTAIN):
+    for level in (0.975, SLOPE_CONFIDENCE):
         wide = float(stats.t.ppf(level, count - 1)) * spread
         edges.append((min(both[i] - wide[i] for i in (0, 1)), max(both[i] + wide[i] for i in (0, 1))))
     sxx, sxy, syy = total[:3]
@@ -172,16 +172,16 @@ def choose(
         block: (n,) from `blocks`.
         offset: free offset of each component.
 
-    "Beaten for certain" means: leaves at least `CLEAR` times as much as the best, not for the sake of a tenth of the
-    blocks, and beyond chance (log likelihood ratio of Gaussian residuals of at least `LIKELIER`, one independent
-    residual a block and component). None with too few blocks.
+    "Beaten for certain" means: leaves at least `RUNNER_UP_RATIO` times as much as the best, not for the sake of a
+    tenth of the blocks, and beyond chance (log likelihood ratio of Gaussian residuals of at least
+    `LOG_LIKELIHOOD_RATIO`, one independent residual a block and component). None with too few blocks.
     """
     if len(measured) < 20:
         return None
     number = np.asarray(np.unique(block, return_inverse=True)[1], np.int64)
     y = measured - measured.mean(axis=0) if offset else measured
     whole = float((y * y).sum())
-    if whole <= 0.0 or number.max() + 1 < FEW:
+    if whole <= 0.0 or number.max() + 1 < FEWEST_BLOCKS:
         return None
     left: dict[str, Array] = {}
     for name, (_, candidate) in candidates.items():
@@ -212,7 +212,7 @@ def better(first: Array, second: Array, components: int = 1) -> bool:
     """True if residuals (sums of squares per block) of the first are smaller beyond chance; see `choose`."""
     gain = np.sort(second - first)
     tenth = max(1, gain.size // 10)
-    if gain.size < FEW or gain[:-tenth].sum() <= 0.0:
+    if gain.size < FEWEST_BLOCKS or gain[:-tenth].sum() <= 0.0:
         return False
     ratio = float(second.sum()) / max(float(first.sum()), 1e-300)
-    return ratio >= CLEAR and 0.5 * gain.size * components * math.log(ratio) >= LIKELIER
+    return ratio >= RUNNER_UP_RATIO and 0.5 * gain.size * components * math.log(ratio) >= LOG_LIKELIHOOD_RATIO
