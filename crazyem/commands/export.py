@@ -9,7 +9,7 @@ from crazyem.commands.info import counted
 from crazyem.commands.output import Report, Result, remarks
 from crazyem.errors import UsageError
 from crazyem.recordings import ReadOptions, open_recording
-from crazyem.recordings.export import METADATA_SUFFIX, SUFFIXES, export, export_parts
+from crazyem.recordings.export import EXPORT_SUFFIXES, METADATA_SUFFIX, export, export_parts
 from crazyem.recordings.parts import can_be_parted, is_large, open_parts
 
 
@@ -20,8 +20,8 @@ def run(arguments: argparse.Namespace) -> int:
     suffix = f".{arguments.format or 'csv'}"
     outputs = targets(files.found, arguments.output, suffix, force=arguments.force)
     for output in outputs:
-        if output.suffix.lower() not in SUFFIXES:
-            raise UsageError(f"{output}: an export ends in {' or '.join(SUFFIXES)}.")
+        if output.suffix.lower() not in EXPORT_SUFFIXES:
+            raise UsageError(f"{output}: an export ends in {' or '.join(EXPORT_SUFFIXES)}.")
         if arguments.format and output.suffix.lower() != suffix:
             raise UsageError(f"{output} does not end in {suffix}, which --format asks for.")
     options = read_options(arguments)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazyem.doctor.streams import NO_FLOAT_WARNINGS, Cadence, Stream, cadence, listed, longest, streams
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.recording import Recording
-from crazyem.recordings.stamps import RESTART
+from crazyem.recordings.stamps import RESTART_SECONDS
 
 Column = NDArray[np.float64]
 
@@ -91,8 +91,8 @@ def _order(stream: Stream) -> list[Finding]:
             if rows.size:
                 wrapped[rows] = True
                 found.append(_wrap(stream, rows + 1, span, words, period))
-        back = np.flatnonzero((steps <= -RESTART) & ~wrapped)
-        late = np.flatnonzero((steps < 0) & (steps > -RESTART) & ~wrapped)
+        back = np.flatnonzero((steps <= -RESTART_SECONDS) & ~wrapped)
+        late = np.flatnonzero((steps < 0) & (steps > -RESTART_SECONDS) & ~wrapped)
         if back.size:
             found.append(_restart(stream, back))
         if late.size:

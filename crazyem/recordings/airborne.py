@@ -17,24 +17,25 @@ from crazyem.recordings.recording import Recording, SignalArray
 
 SHORTEST_FLIGHT = 0.4  # s of lift; less is a hop or a test of the rotors
 LONGEST_FALL = 0.6  # s without lift that a manoeuvre may have
-SPLIT = 1.0  # s without a sample (or five periods) after which nobody knows whether the drone still flew
-LIFTED, CLEAR = 0.03, 0.1  # m above the ground: in the air; and surely so,
-BOUNCE = 0.25  # or this share of the greatest height: a hard landing throws a drone up by 0.12 m, from 1 m
-FLOOR = 1.0  # s at rest, just before and after a flight, that show the floor: the height of an onboard filter drifts
+LONGEST_SILENCE = 1.0  # s without a sample (or five periods) after which nobody knows whether the drone still flew
+LIFTED_HEIGHT, CLEAR_HEIGHT = 0.03, 0.1  # m above the ground: in the air; and surely so,
+BOUNCE_SHARE = 0.25  # or this share of the greatest height: a hard landing throws a drone up by 0.12 m, from 1 m
+# s at rest, just before and after a flight, that show the floor: the height of an onboard filter drifts
+FLOOR_SECONDS = 1.0
 LEAST_CLIMB = 0.15  # m of height that a flight told by its height alone must show
 # A drone rests where means of 0.25 s stay within 2 mm for 1 s. In 43 recorded flights they stay within 1 mm on the
 # ground (motion capture, Lighthouse, onboard filters) and move by 3 mm or more in hover. Three standard errors of a
 # mean are allowed where the position is noisy (flow deck: 14 mm), and its resolution where that is coarse.
-MEAN, REST, STILL, ERRORS = 0.25, 1.0, 0.002, 3.0  # s, s, m, standard errors
-IMPACT = 40.0  # m/s^2 of specific force, twice what rotors can do: the drone hit something
+MEAN_SECONDS, REST_SECONDS, STILL_HEIGHT, STILL_STANDARD_ERRORS = 0.25, 1.0, 0.002, 3.0  # s, s, m, standard errors
+IMPACT_FORCE = 40.0  # m/s^2 of specific force, twice what rotors can do: the drone hit something
 AFTER_IMPACT, AROUND_IMPACT = 1.5, 0.25  # s before the end from which an impact is the end; s that it lasts
 # No signal of a drone is larger (SI; the fastest rotors reach 6e3 rad/s): a sample beyond is an error of transmission.
-POSSIBLE = {"rotor_speed": 8000.0, "motor_command": 1.5, "motor_request": 1.5}
+LARGEST_COMMAND = {"rotor_speed": 8000.0, "motor_command": 1.5, "motor_request": 1.5}
 # Least of (about) thrust, in the square of the signal's unit for duty and speed, below which rotors are off.
-_OFF = {"motor_command": 0.03, "motor_request": 0.1, "rotor_speed": 200.0**2, "mixer_command": 3000.0}
-_ROTORS = ("motor_command", "motor_request", "rotor_speed", "wrench_command", "mixer_command")
+_OFF_COMMAND = {"motor_command": 0.03, "motor_request": 0.1, "rotor_speed": 200.0**2, "mixer_command": 3000.0}
+_ROTOR_SIGNALS = ("motor_command", "motor_request", "rotor_speed", "wrench_command", "mixer_command")
 _RAW_MOTORS = ("motor.m1", "motor.m2", "motor.m3", "motor.m4")
-_FEWEST = 10  # samples of a signal that says something
+_FEWEST_SAMPLES = 10  # samples of a signal that says something
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +96,7 @@ def airtime(recording: Recording) -> Airtime:
             found = _beyond_rotors(_above_ground(found, place[0], place[1][:, 2]), *place)
     elif place is not None:
         found = _from_height(*place)
-    return _flagged(found, recording) or Airtime(_whole(recording), _whole(recording), (), ())
+    return _flagged(found, recording) or Airtime(_all_time(recording), _all_time(recording), (), ())
 
 
 # -- rotors -----------------------------------------------------------------------------------------------------------
@@ -106,25 +107,25 @@ def _rotors(recording: Recording, *, moved: bool) -> tuple[str, Array, Array] | 
 
     A speed sensor that reads 0 throughout may not be connected; it is not asked where a position (`moved`) tells.
     """
-    for name in _ROTORS:
+    for name in _ROTOR_SIGNALS:
         if name in recording.signals:
             time, value = ordered(thinned(recording.signals[name]))
             dead = name == "rotor_speed" and not value.any()
-            if time.size > _FEWEST and not (dead and (moved or "flying" in recording.signals)):
+            if time.size > _FEWEST_SAMPLES and not (dead and (moved or "flying" in recording.signals)):
                 return name, time, value
     raw = [recording.signals[name] for name in _RAW_MOTORS if name in recording.signals]
     if len(raw) == len(_RAW_MOTORS) and len({array.time.size for array in raw}) == 1:
         # duty or request: nobody knows which, but both say when the rotors carried
         value = np.column_stack([array.value[:, 0] for array in raw]) / 65535.0
         sound = np.isfinite(value).all(axis=1) & np.isfinite(raw[0].time)
-        if sound.sum() > _FEWEST and (np.diff(raw[0].time[sound]) >= 0).all():
+        if sound.sum() > _FEWEST_SAMPLES and (np.diff(raw[0].time[sound]) >= 0).all():
             return "motor_command", raw[0].time[sound], value[sound]
     return None
 
 
 def _from_rotors(name: str, time: Array, value: Array) -> Airtime:
-    possible = np.abs(value).max(axis=1) <= POSSIBLE.get(name, math.inf)
-    if possible.sum() > _FEWEST:  # a wild sample is no flight
+    possible = np.abs(value).max(axis=1) <= LARGEST_COMMAND.get(name, math.inf)
+    if possible.sum() > _FEWEST_SAMPLES:  # a wild sample is no flight
         time, value = time[possible], value[possible]
     thrust = value[:, 0] if name in ("wrench_command", "mixer_command") else value.mean(axis=1)
     thrust = np.maximum(thrust, 0.0)
@@ -132,7 +133,7 @@ def _from_rotors(name: str, time: Array, value: Array) -> Airtime:
         thrust = thrust * thrust  # about: thrust grows with the square of duty and of speed
     peak = float(np.percentile(thrust, 99))
     lifting: Intervals = ()
-    if peak > _OFF.get(name, 1e-3):
+    if peak > _OFF_COMMAND.get(name, 1e-3):
         high = thrust[thrust > 0.4 * peak]
         level = float(np.median(high)) if high.size else peak  # near hover: most of a flight is
         lifting = _closed(time, thrust > 0.3 * level)
@@ -159,12 +160,12 @@ def _above_ground(found: Airtime, when: Array, z: Array) -> Airtime:
         # each flight rises from the floor as it was just before, and comes down to that just after
         top = when[within[np.argmax(z[within])]]
         sides = [
-            resting & (when >= start - FLOOR) & (when < start),
-            resting & (when > end) & (when <= end + 0.5 + FLOOR),
+            resting & (when >= start - FLOOR_SECONDS) & (when < start),
+            resting & (when > end) & (when <= end + 0.5 + FLOOR_SECONDS),
         ]
         before, after = (float(np.median(z[rows])) if rows.sum() >= 5 else ground for rows in sides)
         above = z[within] - np.where(when[within] <= top, before, after)
-        for spans, up in ((airborne, above > LIFTED), (flown, _off_the_ground(above))):
+        for spans, up in ((airborne, above > LIFTED_HEIGHT), (flown, _off_the_ground(above))):
             if up.any():
                 spans.append((float(when[within[up][0]]), float(when[within[up][-1]])))
     why = found.reason or ("" if airborne else "its rotors turned, but it did not leave the ground")
@@ -179,8 +180,10 @@ def _beyond_rotors(found: Airtime, time: Array, position: Array) -> Airtime:
     ahead = bool(found.flown) and found.flown[0][0] <= found.begin + SHORTEST_FLIGHT
     behind = bool(found.flown) and found.flown[-1][1] >= found.end - SHORTEST_FLIGHT
     alone = _from_height(time, position).flown
-    first = next((a for a, b in alone if a < found.begin - SPLIT and b > found.begin), None) if ahead else None
-    last = next((b for a, b in alone if a < found.end and b > found.end + SPLIT), None) if behind else None
+    first = (
+        next((a for a, b in alone if a < found.begin - LONGEST_SILENCE and b > found.begin), None) if ahead else None
+    )
+    last = next((b for a, b in alone if a < found.end and b > found.end + LONGEST_SILENCE), None) if behind else None
 
     def wider(spans: Intervals) -> Intervals:
         edges = [list(span) for span in spans]
@@ -196,8 +199,8 @@ def _beyond_rotors(found: Airtime, time: Array, position: Array) -> Airtime:
 
 def _off_the_ground(height: Array) -> Flags:
     """Rows (n,) in the air, of heights above the ground [m]: without bounces before the climb and after the descent."""
-    lifted = height > LIFTED
-    high = np.flatnonzero(height > max(CLEAR, BOUNCE * float(height.max(initial=0.0))))
+    lifted = height > LIFTED_HEIGHT
+    high = np.flatnonzero(height > max(CLEAR_HEIGHT, BOUNCE_SHARE * float(height.max(initial=0.0))))
     if high.size:
         down = np.flatnonzero(~lifted)
         first, last = np.searchsorted(down, high[0]) - 1, np.searchsorted(down, high[-1])
@@ -209,7 +212,7 @@ def _off_the_ground(height: Array) -> Flags:
 def _closed(time: Array, flags: Flags) -> Intervals:
     """Runs of True with short breaks closed and short runs dropped; parted where nothing was recorded."""
     steps = np.diff(time)
-    silent = np.flatnonzero(steps > max(SPLIT, 5.0 * float(np.median(steps)))) if steps.size else steps
+    silent = np.flatnonzero(steps > max(LONGEST_SILENCE, 5.0 * float(np.median(steps)))) if steps.size else steps
     merged: list[tuple[float, float]] = []
     for first, last in zip([0, *(silent + 1)], [*(silent + 1), time.size]):
         for number, (start, end) in enumerate(intervals_of(time[first:last], flags[first:last])):
@@ -228,7 +231,7 @@ def _position(recording: Recording) -> tuple[Array, Array] | None:
     for name, array in recording.signals.items():
         if (array.quantity == "position" or name == "position") and array.value.shape[1] == 3:
             time, value = ordered(thinned(array))
-            if time.size > _FEWEST:
+            if time.size > _FEWEST_SAMPLES:
                 return time, value
     return None
 
@@ -242,16 +245,16 @@ def _from_height(time: Array, position: Array) -> Airtime:
     z = position[:, 2]
     rests = _rests(time, position)
     if not rests and float(np.ptp(z)) > LEAST_CLIMB:  # it may drift sideways on its floor, but no lower than that
-        rests = [(a, b) for a, b in _rests(time, position[:, 2:]) if float(np.median(z[a:b])) < z.min() + LIFTED]
+        rests = [(a, b) for a, b in _rests(time, position[:, 2:]) if float(np.median(z[a:b])) < z.min() + LIFTED_HEIGHT]
     bare = Airtime((), (), (), ("position",), "", math.nan, float(np.ptp(z)), float(time[0]), float(time[-1]))
     if not rests:
         whole = ((float(time[0]), float(time[-1])),)
         return replace(bare, airborne=whole, flown=whole, lifting=whole)
-    start = float(np.median(z[time < time[0] + MEAN]))
+    start = float(np.median(z[time < time[0] + MEAN_SECONDS]))
     supports: list[tuple[int, int, float]] = []
     for first, last in rests:
         level = float(np.median(z[first:last]))
-        if level < (supports[-1][2] if supports else start) + LIFTED:
+        if level < (supports[-1][2] if supports else start) + LIFTED_HEIGHT:
             supports.append((first, last, level))
     if not supports:  # it rises from where the recording begins, and rests no more
         supports = [(0, 1, start)]
@@ -261,7 +264,7 @@ def _from_height(time: Array, position: Array) -> Airtime:
     edges += [(supports[-1][1], z.size, supports[-1][2], supports[-1][2])]
     for first, last, before, after in edges:
         rows = np.arange(max(first - 1, 0), last)
-        up, still_up = rows[z[rows] > before + LIFTED], rows[z[rows] > after + LIFTED]
+        up, still_up = rows[z[rows] > before + LIFTED_HEIGHT], rows[z[rows] > after + LIFTED_HEIGHT]
         if up.size and float(z[up].max()) > before + LEAST_CLIMB:
             flags = np.zeros(z.size, bool)
             flags[up[0] : still_up[-1] + 1] = True
@@ -273,11 +276,11 @@ def _from_height(time: Array, position: Array) -> Airtime:
 
 def _rests(time: Array, position: Array) -> list[tuple[int, int]]:
     """(first row, row after the last) of stretches at rest, by all c columns of the position (n, c)."""
-    number = np.floor((time - time[0]) / MEAN).astype(np.int64)
+    number = np.floor((time - time[0]) / MEAN_SECONDS).astype(np.int64)
     first = np.flatnonzero(np.diff(number, prepend=-1))
     count = np.diff(np.append(first, time.size))
     mean = np.add.reduceat(position, first, axis=0) / count[:, None]
-    width = round(REST / MEAN)
+    width = round(REST_SECONDS / MEAN_SECONDS)
     if first.size < width:
         return []
     windows = np.lib.stride_tricks.sliding_window_view(mean, width, axis=0)
@@ -297,7 +300,9 @@ def _allowed(position: Array, count: float) -> Array:
     steps = np.abs(np.diff(position, axis=0))
     step = np.array([float(s[s > 1e-9].min(initial=math.inf)) for s in steps.T])
     coarse = np.where(np.isfinite(step) & (step < 0.1), step, 0.0)
-    return np.maximum.reduce([np.full(noise.size, STILL), ERRORS * noise / math.sqrt(max(count, 1.0)), 1.01 * coarse])
+    return np.maximum.reduce(
+        [np.full(noise.size, STILL_HEIGHT), STILL_STANDARD_ERRORS * noise / math.sqrt(max(count, 1.0)), 1.01 * coarse]
+    )
 
 
 # -- flag, impacts ----------------------------------------------------------------------------------------------------
@@ -314,7 +319,7 @@ def _flagged(found: Airtime | None, recording: Recording) -> Airtime | None:
         return found
     says = value[:, 0] > 0.5
     spans = [list(span) for span in intervals_of(time, says)]
-    ((begin, end),) = _whole(recording)
+    ((begin, end),) = _all_time(recording)
     if says[0]:
         spans[0][0] = begin
     if says[-1]:
@@ -337,7 +342,7 @@ def _without_impacts(found: Airtime, recording: Recording) -> Airtime:
     if array is None:
         return found
     time, force = ordered(array)
-    hits = time[np.einsum("ij,ij->i", force, force) > IMPACT**2]
+    hits = time[np.einsum("ij,ij->i", force, force) > IMPACT_FORCE**2]
     if not inside(hits, found.airborne).any():
         return found
     parts = tuple(part for start, end in found.airborne for part in _parted(start, end, hits))
@@ -357,7 +362,7 @@ def _parted(start: float, end: float, hits: Array) -> list[tuple[float, float]]:
     return [(a, b) for a, b in [*parts, (start, end)] if b - a >= SHORTEST_FLIGHT]
 
 
-def _whole(recording: Recording) -> Intervals:
+def _all_time(recording: Recording) -> Intervals:
     times: list[NDArray[np.float64]] = [_finite(array) for array in recording.signals.values()]
     times = [t for t in times if t.size]
     return ((float(min(t.min() for t in times)), float(max(t.max() for t in times))),) if times else ()

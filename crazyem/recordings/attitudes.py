@@ -4,7 +4,7 @@ from crazyem.recordings.recording import Recording
 from crazyem.signals.mavlink import carries_attitude
 
 # What names of attitudes that a filter on board made begin with, beside those of MAVLink: the Crazyflie's, ULog's.
-ONBOARD = ("stateEstimate", "kalman.", "vehicle_attitude.")
+ONBOARD_PREFIXES = ("stateEstimate", "kalman.", "vehicle_attitude.")
 
 
 def onboard_attitude(recording: Recording) -> bool:
@@ -14,4 +14,6 @@ def onboard_attitude(recording: Recording) -> bool:
     if attitude is None:
         return False
     claimed = recording.metadata.get("claims", {}).get("attitude") == "onboard" or "mavlink" in recording.metadata
-    return claimed or any(s.rsplit("/", 1)[-1].startswith(ONBOARD) or carries_attitude(s) for s in attitude.source)
+    return claimed or any(
+        s.rsplit("/", 1)[-1].startswith(ONBOARD_PREFIXES) or carries_attitude(s) for s in attitude.source
+    )

@@ -12,8 +12,8 @@ from crazyem.recordings.recording import Event, Recording, SignalArray
 
 # Units of the components where they differ within a signal.
 _MIXED_UNITS: dict[str, tuple[str, ...]] = {"wrench_command": ("N", "N m", "N m", "N m")}
-_RESERVED = ("time", "host_time")
-MARKED = "marked"
+_RESERVED_NAMES = ("time", "host_time")
+MARKED_COLUMN = "marked"
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,13 +80,13 @@ class Description:
     @property
     def columns(self) -> tuple["Column", ...]:
         """The columns after `time` and `host_time`: components, and a flag for signals with marked samples."""
-        used = set(_RESERVED)
+        used = set(_RESERVED_NAMES)
         columns = []
         for entry in self.entries:
             wanted = [f"{entry.name}_{part}" if part else entry.name for part in entry.parts]
             units = list(entry.units)
             if entry.marked:
-                wanted.append(f"{entry.name}_{MARKED}")
+                wanted.append(f"{entry.name}_{MARKED_COLUMN}")
                 units.append("")
             for component, (name, unit) in enumerate(zip(wanted, units, strict=True)):
                 unique = _unique(_printable(name), used)

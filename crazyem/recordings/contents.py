@@ -8,7 +8,7 @@ from crazyem.errors import FileFormatError, UsageError
 
 LARGEST_FILE = 4 << 30  # bytes of a plain file: hours of a uSD log at 1 kHz
 LARGEST_UNPACKED = 1 << 30  # bytes of a gzip file, unpacked: a bomb has no end
-_PIECE = 1 << 20
+_PIECE_BYTES = 1 << 20
 
 
 def contents(path: Path, *, limit: int = LARGEST_UNPACKED, plain: int = LARGEST_FILE) -> bytes:
@@ -31,7 +31,7 @@ def contents(path: Path, *, limit: int = LARGEST_UNPACKED, plain: int = LARGEST_
         data = bytearray()
         with gzip.open(path, "rb") as file:
             # in pieces: asking for `limit` bytes at once would set them aside at once
-            while len(data) <= limit and (piece := file.read(_PIECE)):
+            while len(data) <= limit and (piece := file.read(_PIECE_BYTES)):
                 data += piece
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise FileFormatError(f"{path} is not a readable gzip file ({error}).") from error

@@ -11,7 +11,7 @@ from crazyem.errors import UsageError
 from crazyem.recordings.finding import Finding
 from crazyem.recordings.recording import Event, Recording
 
-_OF_ALL = "statistics"  # section of the metadata that counts packets of the whole flight
+_WHOLE_FLIGHT_SECTION = "statistics"  # section of the metadata that counts packets of the whole flight
 
 
 def cut(recording: Recording, start: float | None, end: float | None) -> Recording:
@@ -71,7 +71,9 @@ def _cut(recording: Recording, low: float, high: float) -> Recording:
     return replace(
         recording,
         signals=signals,
-        metadata={section: values for section, values in recording.metadata.items() if section != _OF_ALL},
+        metadata={
+            section: values for section, values in recording.metadata.items() if section != _WHOLE_FLIGHT_SECTION
+        },
         findings=tuple(
             _finding(f, kept, sizes)
             for f in recording.findings

@@ -10,13 +10,13 @@ from crazyem.recordings.columns import Description, SignalEntry
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Event
 
-VERSION = 1
+DESCRIPTION_VERSION = 1
 
 
 def to_json(description: Description) -> dict[str, Any]:
     """For `json.dumps(..., allow_nan=False)`."""
     return {
-        "version": VERSION,
+        "version": DESCRIPTION_VERSION,
         "source": description.source,
         "origin_s": _plain(float(description.origin)),
         "signals": [
@@ -43,7 +43,7 @@ def to_json(description: Description) -> dict[str, Any]:
 
 def from_json(table: Any) -> Description:
     """Inverse of `to_json`. Raises ValueError saying what does not fit."""
-    _expect(isinstance(table, dict) and table.get("version") == VERSION, "its version is not known here")
+    _expect(isinstance(table, dict) and table.get("version") == DESCRIPTION_VERSION, "its version is not known here")
     return Description(
         _text(table, "source"),
         tuple(_entry(e) for e in _list(table, "signals")),

@@ -25,9 +25,9 @@ from crazyem.recordings.recording import Recording
 
 TIME, HOST_TIME = "time [s]", "host_time [s]"
 METADATA_SUFFIX = "-metadata.json"  # CSVW: where programs look for the description of a CSV
-SUFFIXES = (".csv", ".parquet")
-_ROWS = 65536  # rows of a block: bounds what is held besides the recording
-_WHAT = {"time": "on the clock of the recording", "host_time": "since the epoch, clock of the host"}
+EXPORT_SUFFIXES = (".csv", ".parquet")
+_BLOCK_ROWS = 65536  # rows of a block: bounds what is held besides the recording
+_TIME_COLUMNS = {"time": "on the clock of the recording", "host_time": "since the epoch, clock of the host"}
 
 
 def export(recording: Recording, path: str | Path, *, force: bool = False) -> Description:
@@ -51,7 +51,7 @@ def export_parts(parts: Any, path: str | Path, *, force: bool = False) -> Descri
     path = Path(path)
     write = {".csv": _write_csv, ".parquet": _write_parquet}.get(path.suffix.lower())
     if write is None:
-        raise UsageError(f"{path}: an export ends in {' or '.join(SUFFIXES)}.")
+        raise UsageError(f"{path}: an export ends in {' or '.join(EXPORT_SUFFIXES)}.")
     description = describe(parts())
     with new_file(path, force=force) as temporary:
         write(description, parts(), temporary)
@@ -99,8 +99,8 @@ def _blocks(description: Description, parts: Iterable[Recording], schema: Any) -
     columns = description.columns
     for recording in parts:
         for rows in rows_of(recording, names):
-            for first in range(0, rows.time.size, _ROWS):
-                last = min(first + _ROWS, rows.time.size)
+            for first in range(0, rows.time.size, _BLOCK_ROWS):
+                last = min(first + _BLOCK_ROWS, rows.time.size)
                 host = rows.host_time[first:last]
                 arrays = [pa.array(rows.time[first:last]), pa.array(host, mask=np.isnan(host))]
                 arrays += [_filled(recording, rows, column, first, last) for column in columns]
@@ -148,7 +148,7 @@ def _write_parquet(description: Description, parts: Iterable[Recording], path: P
     import pyarrow as pa
     from pyarrow import parquet
 
-    fields = [_field(name, pa.float64(), {"unit": "s", "description": text}) for name, text in _WHAT.items()]
+    fields = [_field(name, pa.float64(), {"unit": "s", "description": text}) for name, text in _TIME_COLUMNS.items()]
     for column in description.columns:
         kind = pa.bool_() if column.component is None else pa.float64()
         fields.append(_field(column.name, kind, _about(column)))
@@ -202,7 +202,13 @@ def attributes(description: Description) -> dict[str, Any]:
 def csvw(description: Description, name: str) -> dict[str, Any]:
     """The CSVW description (https://www.w3.org/TR/tabular-metadata/) of an exported CSV called `name`."""
     columns: list[dict[str, Any]] = [
-        {"titles": title, "name": key, "datatype": "double", "schema:unitText": "s", "dc:description": _WHAT[key]}
+        {
+            "titles": title,
+            "name": key,
+            "datatype": "double",
+            "schema:unitText": "s",
+            "dc:description": _TIME_COLUMNS[key],
+        }
         for title, key in ((TIME, "time"), (HOST_TIME, "host_time"))
     ]
     for column in description.columns:

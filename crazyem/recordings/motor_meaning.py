@@ -26,24 +26,24 @@ from numpy.typing import NDArray
 
 from crazyem.errors import UsageError
 from crazyem.recordings.finding import Finding, Grade
-from crazyem.recordings.tables import MEANINGS, Table
+from crazyem.recordings.tables import MOTOR_MEANINGS, Table
 
-MOTORS = ("motor.m1", "motor.m2", "motor.m3", "motor.m4")
-_SENT = tuple(f"pwm.m{i}_pwm" for i in (1, 2, 3, 4))
-_MIXED = tuple(f"controller.cmd_{name}" for name in ("thrust", "roll", "pitch", "yaw"))
-_FULL = 65535.0
+MOTOR_VARIABLES = ("motor.m1", "motor.m2", "motor.m3", "motor.m4")
+_PWM_VARIABLES = tuple(f"pwm.m{i}_pwm" for i in (1, 2, 3, 4))
+_MIXER_VARIABLES = tuple(f"controller.cmd_{name}" for name in ("thrust", "roll", "pitch", "yaw"))
+_FULL_PWM = 65535.0
 
 # Variables that crazyflie-firmware got after the change, with the pull request and its date.
-_NEWER: tuple[tuple[str, str], ...] = (
+_NEWER_VARIABLES: tuple[tuple[str, str], ...] = (
     (r"motor\.m[1-4]req", "#1147, 2022-11"),  # came with the change itself: "requested, including compensation"
     (r"supervisor\.(info|accNorm)", "#1272 and #1281, 2023-05"),
     (r"ctrlLee\.(thrustSi|torque[xyz]|error_\w+)", "#1343, 2024-01"),
     (r"motor\.m[1-4]_e?rpm", "#1556, 2025-11"),
 )
-_FIRST_NEW, _LAST_OLD = (2023, 2), (2022, 9)  # releases known to be on either side
-_VERSION = re.compile(r"\b(20\d\d)\.(\d{1,2})\b")
-_ROWS = 30  # fewer prove nothing: 0.1**30 and 0.5**30 are what chance would do
-_NAMES = {"duty": "the PWM sent, after battery compensation", "request": "the thrust asked for, before it"}
+_FIRST_NEW_RELEASE, _LAST_OLD_RELEASE = (2023, 2), (2022, 9)  # releases known to be on either side
+_RELEASE_PATTERN = re.compile(r"\b(20\d\d)\.(\d{1,2})\b")
+_FEWEST_ROWS = 30  # fewer prove nothing: 0.1**30 and 0.5**30 are what chance would do
+_MEANING_NAMES = {"duty": "the PWM sent, after battery compensation", "request": "the thrust asked for, before it"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,9 +93,9 @@ def decide(
 
     Raises: UsageError if `given` is something else.
     """
-    if given is not None and given not in MEANINGS:
+    if given is not None and given not in MOTOR_MEANINGS:
         raise UsageError(f'motor.m1..4 is "duty" or "request", not "{given}".')
-    table = next((t for t in tables if set(MOTORS) <= t.columns.keys()), None)
+    table = next((t for t in tables if set(MOTOR_VARIABLES) <= t.columns.keys()), None)
     if table is None:
         return Meaning(None)
     votes = _Votes()
@@ -127,7 +127,8 @@ def _weigh(votes: _Votes) -> tuple[str | None, str]:
 
 def _answer(decided: str | None, reason: str, given: str | None, evidence: dict[str, float]) -> Meaning:
     if decided is None and given is None:
-        text = f"What motor.m1..4 is cannot be told ({reason}): it may be {_NAMES['duty']}, or {_NAMES['request']}."
+        either = f"{_MEANING_NAMES['duty']}, or {_MEANING_NAMES['request']}"
+        text = f"What motor.m1..4 is cannot be told ({reason}): it may be {either}."
         finding = Finding(
             "motor_meaning", Grade.DEGRADES, text, evidence=evidence, advice="Say --motor duty or --motor request."
         )
@@ -135,13 +136,14 @@ def _answer(decided: str | None, reason: str, given: str | None, evidence: dict[
     if decided is None:
         reason = f"said by the user; {reason}"
     if given is not None and decided not in (None, given):
-        text = f"motor.m1..4 is taken as {_NAMES[given]}, as told, but the log says: {_NAMES[decided]} ({reason})."
+        contrary = f"{_MEANING_NAMES[decided]} ({reason})"
+        text = f"motor.m1..4 is taken as {_MEANING_NAMES[given]}, as told, but the log says: {contrary}."
         advice = f"Leave --motor out, or say --motor {decided}."
         finding = Finding("motor_meaning", Grade.DEGRADES, text, evidence=evidence, advice=advice)
         return Meaning(given, f"said by the user, against the log ({reason})", evidence, (finding,))
     meaning = given or decided
     assert meaning is not None
-    text = f"motor.m1..4 is {_NAMES[meaning]}: {reason}."
+    text = f"motor.m1..4 is {_MEANING_NAMES[meaning]}: {reason}."
     return Meaning(meaning, reason, evidence, (Finding("motor_meaning", Grade.HARMLESS, text, evidence=evidence),))
 
 
@@ -151,11 +153,11 @@ def _matrix(table: Table, names: Sequence[str]) -> NDArray[np.float64]:
 
 
 def _compare_with_sent(table: Table, votes: _Votes) -> None:
-    if not set(_SENT) <= table.columns.keys():
+    if not set(_PWM_VARIABLES) <= table.columns.keys():
         return
-    motor, sent = _matrix(table, MOTORS), _matrix(table, _SENT)
-    turning = (sent > 0) & (sent < _FULL)
-    if turning.sum() < _ROWS:
+    motor, sent = _matrix(table, MOTOR_VARIABLES), _matrix(table, _PWM_VARIABLES)
+    turning = (sent > 0) & (sent < _FULL_PWM)
+    if turning.sum() < _FEWEST_ROWS:
         return
     equal = float((motor == sent)[turning].mean())
     votes.evidence["pwm_equal_share"] = equal
@@ -182,26 +184,26 @@ def _compensated(request: NDArray[np.float64], voltage: NDArray[np.float64]) -> 
     """PWM for a request [counts] in firmware before 2025: a parabola through a measured table (motors.c)."""
     grams = request / 65536.0 * 60.0
     with np.errstate(divide="ignore", invalid="ignore"):
-        return _FULL * (-0.0006239 * grams * grams + 0.088 * grams) / voltage
+        return _FULL_PWM * (-0.0006239 * grams * grams + 0.088 * grams) / voltage
 
 
 def _judge_age(tables: Sequence[Table], metadata: Mapping[str, Mapping[str, str]], votes: _Votes) -> None:
     names = {name for table in tables for name in table.columns}
     names.update(metadata.get("drone", {}).get("log_variables", "").split())
-    for pattern, origin in _NEWER:
+    for pattern, origin in _NEWER_VARIABLES:
         found = sorted(name for name in names if re.fullmatch(pattern, name))
         if found:
             votes.age.append(("duty", f"the firmware has {found[0]}, which came later ({origin})"))
             break
-    types = {table.ctypes[name] for table in tables for name in MOTORS if name in table.ctypes}
+    types = {table.ctypes[name] for table in tables for name in MOTOR_VARIABLES if name in table.ctypes}
     if types == {"uint16_t"}:
         votes.age.append(("duty", "it is a uint16, as since 2024-05-29"))
     elif types == {"int32_t"}:
         votes.age.append(("request", "it is an int32, as until 2020-02-28"))
     version = _version(metadata)
-    if version is not None and version >= _FIRST_NEW:
+    if version is not None and version >= _FIRST_NEW_RELEASE:
         votes.age.append(("duty", f"the firmware is of {version[0]}-{version[1]:02d}"))
-    elif version is not None and version <= _LAST_OLD:
+    elif version is not None and version <= _LAST_OLD_RELEASE:
         votes.age.append(("request", f"the firmware is of {version[0]}-{version[1]:02d}"))
 
 
@@ -209,18 +211,18 @@ def _version(metadata: Mapping[str, Mapping[str, str]]) -> tuple[int, int] | Non
     """Year and month of the firmware's release, where a key or section of the metadata speaks of firmware."""
     for section, entries in metadata.items():
         for key, text in entries.items():
-            found = _VERSION.search(text[:200])
+            found = _RELEASE_PATTERN.search(text[:200])
             if found and "firmware" in f"{section} {key}".lower():
                 return int(found[1]), int(found[2])
     return None
 
 
 def _judge_mixer(table: Table, votes: _Votes) -> None:
-    motor = _matrix(table, MOTORS)
+    motor = _matrix(table, MOTOR_VARIABLES)
     # a clipped rotor, or four equal ones (idle on the ground), obey or break the rule for other reasons
-    usable = ((motor > 0) & (motor < _FULL) & (motor == np.floor(motor))).all(axis=0) & (np.ptp(motor, axis=0) > 0)
+    usable = ((motor > 0) & (motor < _FULL_PWM) & (motor == np.floor(motor))).all(axis=0) & (np.ptp(motor, axis=0) > 0)
     rows = int(usable.sum())
-    if rows < _ROWS:
+    if rows < _FEWEST_ROWS:
         return
     m1, m2, m3, m4 = motor[:, usable].astype(np.int64)
     whole = [(m1 + m3 - m2 - m4) % 4 == 0, (m1 + m2 - m3 - m4) % 4 == 0, (m1 + m4 - m2 - m3) % 4 == 0]
@@ -239,11 +241,11 @@ def _judge_mixer(table: Table, votes: _Votes) -> None:
 
 def _compare_with_mixer(table: Table, motor: NDArray[np.float64], usable: NDArray[np.bool_], votes: _Votes) -> None:
     """Against m = T -+ r +- p +- y of controller.cmd_*, which are 0 under controllers other than the PID."""
-    if not set(_MIXED) <= table.columns.keys():
+    if not set(_MIXER_VARIABLES) <= table.columns.keys():
         return
-    thrust, roll, pitch, yaw = _matrix(table, _MIXED)
+    thrust, roll, pitch, yaw = _matrix(table, _MIXER_VARIABLES)
     rows = usable & (thrust > 0)
-    if rows.sum() < _ROWS:
+    if rows.sum() < _FEWEST_ROWS:
         return
     r, p = np.trunc(roll / 2.0), np.trunc(pitch / 2.0)
     mixed = np.trunc(np.stack([thrust - r + p + yaw, thrust - r - p - yaw, thrust + r - p + yaw, thrust + r + p - yaw]))

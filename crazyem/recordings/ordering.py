@@ -9,7 +9,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Intervals = tuple[tuple[float, float], ...]
 
-FINEST = 0.005  # s between samples that `thinned` leaves: enough to see take-off and landing
+FINEST_INTERVAL = 0.005  # s between samples that `thinned` leaves: enough to see take-off and landing
 
 
 def sound_rows(value: Array) -> Flags:
@@ -39,7 +39,7 @@ def thinned(array: SignalArray) -> SignalArray:
     if array.time.size < 2:
         return array
     period = (float(array.time[-1]) - float(array.time[0])) / max(array.time.size - 1, 1)
-    step = int(FINEST / period) if 0.0 < period < 0.5 * FINEST else 1
+    step = int(FINEST_INTERVAL / period) if 0.0 < period < 0.5 * FINEST_INTERVAL else 1
     return array if step < 2 else array.rows(slice(None, None, step))
 
 

@@ -9,9 +9,9 @@ from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import reader_of
 
-SECONDS = 60.0  # of flight a part
-_SHARE = 0.25  # of the free memory that a file may take up before it is read in parts
-_PACKED = 8.0  # how much larger a gzip file is once unpacked, about
+PART_SECONDS = 60.0  # of flight a part
+_MEMORY_SHARE = 0.25  # of the free memory that a file may take up before it is read in parts
+_GZIP_RATIO = 8.0  # how much larger a gzip file is once unpacked, about
 
 
 def can_be_parted(path: Path) -> bool:
@@ -23,8 +23,8 @@ def is_large(path: Path, *, jobs: int = 1) -> bool:
     """True if reading the file whole, `jobs` such files at a time, may need more than a quarter of the free memory."""
     if not path.is_file():
         return False
-    size = path.stat().st_size * (_PACKED if path.suffix == ".gz" else 1.0)
-    return size * jobs > _SHARE * free_memory()
+    size = path.stat().st_size * (_GZIP_RATIO if path.suffix == ".gz" else 1.0)
+    return size * jobs > _MEMORY_SHARE * free_memory()
 
 
 def free_memory() -> float:
@@ -43,7 +43,7 @@ def free_memory() -> float:
 
 
 def open_parts(
-    path: str | Path, options: ReadOptions | None = None, *, seconds: float = SECONDS
+    path: str | Path, options: ReadOptions | None = None, *, seconds: float = PART_SECONDS
 ) -> Iterator[Recording]:
     """Consecutive stretches of a recording; memory is bounded by the length of one.
 

@@ -24,10 +24,10 @@ from crazyem.recordings.recording import Recording, SignalArray
 Column = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-LONGEST = 86_400.0  # s; no recording of a flight is longer than a day
-RESTART = 1.0  # s back from which a clock was set or started again; less is a record out of order
-_REACH = 3  # records before and after one that tell where its stamp should be
-CHECK = "stamps"
+LONGEST_RECORDING = 86_400.0  # s; no recording of a flight is longer than a day
+RESTART_SECONDS = 1.0  # s back from which a clock was set or started again; less is a record out of order
+_NEIGHBOURS = 3  # records before and after one that tell where its stamp should be
+STAMP_CHECK = "stamps"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ def impossible(time: Column, *, centre: float | None = None, absent: float | Non
         if not rest.size or (centre is None and absent is None and _sound(time)):
             return bad
         middle = float(np.median(rest)) if centre is None else centre
-        bad |= ~(np.abs(time - middle) <= LONGEST)
+        bad |= ~(np.abs(time - middle) <= LONGEST_RECORDING)
     keep = np.flatnonzero(~bad)
     bad[keep[out_of_order(time[keep])]] = True
     return bad
@@ -73,7 +73,7 @@ def impossible(time: Column, *, centre: float | None = None, absent: float | Non
 
 def _sound(time: Column) -> bool:
     """Whether there is nothing to look for: finite, in order, no longer than a recording can be."""
-    return time.size < 2 or bool((np.diff(time) >= 0).all() and time[-1] - time[0] <= LONGEST)
+    return time.size < 2 or bool((np.diff(time) >= 0).all() and time[-1] - time[0] <= LONGEST_RECORDING)
 
 
 def out_of_order(time: Column) -> Flags:
@@ -81,11 +81,11 @@ def out_of_order(time: Column) -> Flags:
     if time.size < 3 or bool((np.diff(time) >= 0).all()):
         return np.zeros(time.size, bool)
     # where a clock starts again, the median may be of the other side, as many steps away as it reaches
-    limit = max(RESTART, 2 * _REACH * float(np.median(np.abs(np.diff(time)))))
+    limit = max(RESTART_SECONDS, 2 * _NEIGHBOURS * float(np.median(np.abs(np.diff(time)))))
     away = np.abs(time - _running_median(time))
     far = ~(away <= limit)
     broken = np.zeros(time.size, bool)
-    for step in range(1, _REACH + 1):
+    for step in range(1, _NEIGHBOURS + 1):
         back = time[step:] < time[:-step]
         broken[step:] |= back
         broken[:-step] |= back
@@ -109,7 +109,7 @@ def _without_those_in_order(time: Column, odd: Flags, away: Column) -> Flags:
 def _running_median(time: Column) -> Column:
     from scipy.ndimage import median_filter  # takes long to import, and nearly no recording needs it
 
-    return np.asarray(median_filter(time, 2 * _REACH + 1, mode="mirror"), float)
+    return np.asarray(median_filter(time, 2 * _NEIGHBOURS + 1, mode="mirror"), float)
 
 
 def restarts(time: Column) -> NDArray[np.int64]:
@@ -117,29 +117,29 @@ def restarts(time: Column) -> NDArray[np.int64]:
 
     A few stamps that are late or cannot be are no restart: the running median goes back where the clock does.
     """
-    if time.size < 2 * _REACH + 1:
-        return np.flatnonzero(np.diff(time) < -RESTART) + 1
+    if time.size < 2 * _NEIGHBOURS + 1:
+        return np.flatnonzero(np.diff(time) < -RESTART_SECONDS) + 1
     middle = _running_median(time)
     rows = []
-    for row in np.flatnonzero(np.diff(middle) < -RESTART).tolist():
+    for row in np.flatnonzero(np.diff(middle) < -RESTART_SECONDS).tolist():
         # the median crosses over where most of its window has; the stamps themselves do so nearby
-        window = np.arange(max(0, row - _REACH), min(time.size - 1, row + _REACH + 1))
+        window = np.arange(max(0, row - _NEIGHBOURS), min(time.size - 1, row + _NEIGHBOURS + 1))
         rows.append(int(window[np.argmin(np.diff(time)[window])]) + 1)
     return np.unique(np.array(rows, np.int64))
 
 
-def shift_beside(time: Column, place: Column, others: Column, places: Column) -> float | None:
+def clock_offset(time: Column, place: Column, others: Column, places: Column) -> float | None:
     """Seconds to add to the stamps of another clock; None if they do not run beside the others.
 
     Args:
         time: (n,) s, stamps of one stream, place: (n,) where its records stand in the file, ascending.
         others, places: (m,) the same of the streams on the recording's clock.
     """
-    if time.size < _REACH or others.size < 2:
+    if time.size < _NEIGHBOURS or others.size < 2:
         return None
     lead = np.interp(place, places, others) - time
     shift = float(np.median(lead))
-    return shift if float(np.median(np.abs(lead - shift))) <= RESTART else None
+    return shift if float(np.median(np.abs(lead - shift))) <= RESTART_SECONDS else None
 
 
 def believed(
@@ -168,7 +168,7 @@ def believed(
     shifts, faults = [0.0] * len(times), []
     for i, (name, time, place) in enumerate(zip(names, times, places, strict=True)):
         own = ~impossible(time, absent=absent) & np.isfinite(place)
-        shift = shift_beside(time[own], place[own], others, known) if not keep[i].any() and own.any() else None
+        shift = clock_offset(time[own], place[own], others, known) if not keep[i].any() and own.any() else None
         if shift is not None:
             keep[i], shifts[i] = ~impossible(time, absent=absent), shift
             faults.append(Fault(name, int(keep[i].sum()), time.size, "shifted", shift))
@@ -201,12 +201,12 @@ def finding(faults: Sequence[Fault], signals: Iterable[str] = ()) -> list[Findin
         evidence["shift_s"] = moved[0].example
     return [
         Finding(
-            CHECK,
+            STAMP_CHECK,
             Grade.DEGRADES if grave else Grade.HARMLESS,
             f"Stamps that cannot be: {'; '.join(said)}.",
             evidence=evidence,
             advice=advice,
-            fix=Fix(CHECK, names) if names else None,
+            fix=Fix(STAMP_CHECK, names) if names else None,
         )
     ]
 
@@ -259,13 +259,13 @@ def screened_parts(parts: Iterator[Recording]) -> Iterator[Recording]:
             findings = _together(screened_one.findings, finding(counted, names))
             screened_one = replace(screened_one, findings=findings)
         yield screened_one
-        before = {s: np.concatenate([before.get(s, np.empty(0)), a.time])[-_REACH:] for s, a in _streams(current)}
+        before = {s: np.concatenate([before.get(s, np.empty(0)), a.time])[-_NEIGHBOURS:] for s, a in _streams(current)}
         current = after
 
 
 def _together(found: tuple[Finding, ...], more: Sequence[Finding]) -> tuple[Finding, ...]:
     """The findings with one more about stamps; one sentence with that of the reader, if it has one."""
-    said = next((i for i, f in enumerate(found) if f.check == CHECK and "records" in f.evidence), None)
+    said = next((i for i, f in enumerate(found) if f.check == STAMP_CHECK and "records" in f.evidence), None)
     if said is None:
         return (*found, *more)
     first, (second,) = found[said], more
@@ -274,7 +274,7 @@ def _together(found: tuple[Finding, ...], more: Sequence[Finding]) -> tuple[Find
         second if second.grade is Grade.DEGRADES else first,
         text=f"{first.text[:-1]}; {second.text.partition(': ')[2]}",
         evidence={**first.evidence, **{k: first.evidence[k] + v for k, v in second.evidence.items()}},
-        fix=Fix(CHECK, tuple(dict.fromkeys(sum(fixes, ())))) if fixes else None,
+        fix=Fix(STAMP_CHECK, tuple(dict.fromkeys(sum(fixes, ())))) if fixes else None,
     )
     return (*found[:said], both, *found[said + 1 :])
 
@@ -290,7 +290,7 @@ def _streams(recording: Recording) -> Iterator[tuple[str, SignalArray]]:
 
 def _kept(recording: Recording, before: Mapping[str, Column], after: Recording | None) -> dict[int, NDArray[np.int64]]:
     """Rows that stay, by the id of the array of stamps; only of streams that lose some."""
-    later = {s: a.time[:_REACH] for s, a in _streams(after)} if after is not None else {}
+    later = {s: a.time[:_NEIGHBOURS] for s, a in _streams(after)} if after is not None else {}
     streams = list(_streams(recording))
     times = [np.concatenate([before.get(s, np.empty(0)), a.time, later.get(s, np.empty(0))]) for s, a in streams]
     if all(_sound(time) for time in times) and _close(times):
@@ -322,4 +322,4 @@ def _without(recording: Recording, kept: Mapping[int, NDArray[np.int64]], *, who
 def _close(times: Sequence[Column]) -> bool:
     """Whether all streams, each in order, lie within the length of a recording."""
     ends = np.concatenate([time[[0, -1]] for time in times if time.size] or [np.zeros(1)])
-    return bool(ends.max() - ends.min() <= LONGEST)
+    return bool(ends.max() - ends.min() <= LONGEST_RECORDING)

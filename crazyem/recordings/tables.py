@@ -12,7 +12,7 @@ from crazyem.signals.firmware_units import unit_of
 from crazyem.signals.sample import SIGNALS
 from crazyem.signals.vocabulary import DUTY_SOURCES, REQUEST_SOURCES, SOURCES, Source
 
-MEANINGS = ("duty", "request")
+MOTOR_MEANINGS = ("duty", "request")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,9 +11,9 @@ from crazyem.recordings.recording import SignalArray
 from crazyem.signals.sample import SIGNALS
 
 # Bounds on columns that nobody mapped: 16 bytes a sample, so some hundred megabytes at most.
-RAW_SIGNALS = 4000
-RAW_SAMPLES = 24_000_000
-TEXT = 300  # characters of a metadata value that are kept
+MOST_RAW_SIGNALS = 4000
+MOST_RAW_SAMPLES = 24_000_000
+LONGEST_TEXT = 300  # characters of a metadata value that are kept
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,9 +214,9 @@ def _within_bounds(raw: list[tuple[Topic, str]]) -> tuple[list[tuple[Topic, str]
     place = sorted(range(len(raw)), key=lambda i: raw[i][0].time.size)
     total = 0
     kept = set()
-    for i in place[:RAW_SIGNALS]:
+    for i in place[:MOST_RAW_SIGNALS]:
         total += raw[i][0].time.size
-        if total > RAW_SAMPLES:
+        if total > MOST_RAW_SAMPLES:
             break
         kept.add(i)
     if len(kept) == len(raw):
@@ -259,5 +259,5 @@ def text_of(value: object) -> str:
     """A metadata value: printable and not endless."""
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
-    text = "".join(c if c.isprintable() else " " for c in str(value)[: 4 * TEXT]).strip()
-    return text if len(text) <= TEXT else text[: TEXT - 3] + "..."
+    text = "".join(c if c.isprintable() else " " for c in str(value)[: 4 * LONGEST_TEXT]).strip()
+    return text if len(text) <= LONGEST_TEXT else text[: LONGEST_TEXT - 3] + "..."

@@ -14,7 +14,7 @@ from crazyem.errors import UsageError
 from crazyem.live.session import block_plan
 from crazyem.recordings.mcap import schemas
 from crazyem.recordings.mcap.layout import foxglove_layout, swarm_layout, topics_of
-from crazyem.recordings.mcap.messages import EVENTS
+from crazyem.recordings.mcap.messages import EVENT_TOPICS
 from crazyem.recordings.mcap.signals import write_recording
 from crazyem.recordings.mcap.survey import from_summary
 from crazyem.signals.packet import Block, Variable
@@ -35,7 +35,7 @@ def placed(node):
 
 
 def descriptor_of(topic):
-    schema = dict(EVENTS.values())[topic]
+    schema = dict(EVENT_TOPICS.values())[topic]
     return schemas.message_class(schema).DESCRIPTOR
 
 

@@ -21,7 +21,7 @@ from crazyem.links.base import LinkStatistics, ParameterWrite
 from crazyem.recordings import open_recording
 from crazyem.recordings.mcap.recover import recover
 from crazyem.recordings.mcap.signals import write_recording
-from crazyem.recordings.mcap.writer import FLUSH_EVERY, RecordingWriter
+from crazyem.recordings.mcap.writer import FLUSH_PERIOD, RecordingWriter
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -201,7 +201,7 @@ def packets_in(path):
 
 def test_kill_9_loses_only_what_was_not_flushed(tmp_path):
     """A process records, waits for the writer's own flush, records more and is killed, however slow the machine is."""
-    assert FLUSH_EVERY <= 1.0
+    assert FLUSH_PERIOD <= 1.0
     path = tmp_path / "killed.mcap"
     program = textwrap.dedent(f"""
         import sys, time

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from crazyem.errors import UsageError
 from crazyem.recordings.finding import Grade
-from crazyem.recordings.motor_meaning import MOTORS, decide
+from crazyem.recordings.motor_meaning import MOTOR_VARIABLES, decide
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.tables import Table
 from crazyem.recordings.usd.file import read
@@ -55,7 +55,7 @@ def flight(n=200, seed=0):
 
 
 def motors(values):
-    return dict(zip(MOTORS, values, strict=True))
+    return dict(zip(MOTOR_VARIABLES, values, strict=True))
 
 
 REQUEST, DUTY, VOLTAGE, CONTROLLER = flight()
@@ -116,7 +116,7 @@ def test_sysid_logged_pwm(shared_recordings):
 
 
 def test_real_firmware_logged_pwm(shared_recordings):
-    columns = {name: [] for name in MOTORS}
+    columns = {name: [] for name in MOTOR_VARIABLES}
     with gzip.open(shared_recordings / "real_firmware" / "lee_brushless_39g.csv.gz", "rt") as file:
         for row in csv.DictReader(file):
             if row["name"] in columns:
@@ -152,7 +152,7 @@ def test_variables_of_newer_firmware(newer):
     ("ctype", "meaning"), [("uint16_t", "duty"), ("int32_t", "request"), ("uint32_t", None), ("float", None)]
 )
 def test_types(ctype, meaning):
-    assert decide([table(motors(FLAT), dict.fromkeys(MOTORS, ctype))]).meaning == meaning
+    assert decide([table(motors(FLAT), dict.fromkeys(MOTOR_VARIABLES, ctype))]).meaning == meaning
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ def test_commands_without_motors_are_not_made_into_motors():
 
 
 def test_new_firmware_on_the_grid_has_its_compensation_off():
-    told = decide([table(motors(REQUEST), dict.fromkeys(MOTORS, "uint16_t"))])
+    told = decide([table(motors(REQUEST), dict.fromkeys(MOTOR_VARIABLES, "uint16_t"))])
     assert told.meaning == "duty"
     assert "compensation was off" in told.reason
 
@@ -208,8 +208,8 @@ def test_new_firmware_on_the_grid_has_its_compensation_off():
 @pytest.mark.parametrize(
     ("values", "ctypes", "extra"),
     [
-        (DUTY, dict.fromkeys(MOTORS, "int32_t"), {}),
-        (FLAT, dict.fromkeys(MOTORS, "int32_t"), {"supervisor.info": FLAT[0]}),
+        (DUTY, dict.fromkeys(MOTOR_VARIABLES, "int32_t"), {}),
+        (FLAT, dict.fromkeys(MOTOR_VARIABLES, "int32_t"), {"supervisor.info": FLAT[0]}),
     ],
 )
 def test_contradictions_are_left_open(values, ctypes, extra):

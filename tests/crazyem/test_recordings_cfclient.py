@@ -318,4 +318,4 @@ def test_motors_are_asked_about(put):
     recording = opened(put("motor.csv", as_cfclient(MOTOR, still)))
     (finding,) = about(recording, "motor_meaning")
     assert finding.grade is Grade.DEGRADES
-    assert set(recording.signals) == set(motor_meaning.MOTORS)
+    assert set(recording.signals) == set(motor_meaning.MOTOR_VARIABLES)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from crazyem.recordings.topics import RAW_SIGNALS, Mapped, Topic, ranks, signals_of
+from crazyem.recordings.topics import MOST_RAW_SIGNALS, Mapped, Topic, ranks, signals_of
 
 
 def topic(name: str, rows: int, columns: tuple[str, ...], start: int = 0) -> Topic:
@@ -33,7 +33,7 @@ def test_orders_are_unique_and_follow_the_rows() -> None:
 
 
 def test_too_many_columns_are_left_out_and_counted() -> None:
-    many = topic("many", 2, tuple(f"c{i}" for i in range(RAW_SIGNALS + 7)))
+    many = topic("many", 2, tuple(f"c{i}" for i in range(MOST_RAW_SIGNALS + 7)))
     signals, left_out = signals_of([many], [])
-    assert len(signals) == RAW_SIGNALS
+    assert len(signals) == MOST_RAW_SIGNALS
     assert left_out[0].evidence["left_out"] == 7

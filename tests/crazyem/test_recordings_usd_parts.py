@@ -22,7 +22,7 @@ WORDS = [f.name for f in fields(SignalArray) if f.name not in ARRAYS]
 @pytest.fixture(autouse=True)
 def small_pieces(monkeypatch):
     """Records lie across pieces, often."""
-    monkeypatch.setattr("crazyem.recordings.usd.stretches._PIECE", 37)
+    monkeypatch.setattr("crazyem.recordings.usd.stretches._READ_BYTES", 37)
 
 
 def words(findings):
@@ -126,12 +126,12 @@ def test_all_parts_agree_on_the_motors(tmp_path, kind, monkeypatch):
         rows.append((0, 10_000 * i, values if i > 1000 else [0] * 4))
     path = tmp_path / "log"
     path.write_bytes(log(2, events, rows))
-    monkeypatch.setattr("crazyem.recordings.usd.stretches._PIECE", 5000)
+    monkeypatch.setattr("crazyem.recordings.usd.stretches._READ_BYTES", 5000)
     whole = read(path, ReadOptions())
     assert whole.metadata["motor"]["meaning"] == kind
     assert_joined(list(read_parts(path, ReadOptions(), seconds=5.0)), whole)
     # from a share of the rows: the same verdict, other numbers
-    monkeypatch.setattr("crazyem.recordings.usd.stretches._SAMPLED", 500)
+    monkeypatch.setattr("crazyem.recordings.usd.stretches._SAMPLED_ROWS", 500)
     parts = list(read_parts(path, ReadOptions(), seconds=5.0))
     assert {part.metadata["motor"]["meaning"] for part in parts} == {kind}
     assert [set(part.signals) for part in parts] == [set(whole.signals)] * len(parts)
@@ -155,7 +155,7 @@ def test_a_part_is_no_longer_than_told_nor_larger_than_it_may_be(tmp_path, monke
     parts = list(read_parts(path, ReadOptions(), seconds=1.0))
     assert [part.duration for part in parts[:-1]] == pytest.approx([1.0] * 9, abs=0.011)  # a record more where 0.99..9
     path.write_bytes(log(2, events, [(0, 7, [i]) for i in range(1000)]))  # a clock that stands
-    monkeypatch.setattr("crazyem.recordings.usd.stretches._MOST_BYTES", 1400)
+    monkeypatch.setattr("crazyem.recordings.usd.stretches._STRETCH_BYTES", 1400)
     parts = list(read_parts(path, ReadOptions(), seconds=1.0))
     assert len(parts) >= 10
     assert_joined(parts, read(path, ReadOptions()))
@@ -188,7 +188,7 @@ def test_a_header_longer_than_a_piece_and_one_that_never_ends(tmp_path, monkeypa
 
 
 def test_real_logs_in_parts(shared_recordings, monkeypatch):
-    monkeypatch.setattr("crazyem.recordings.usd.stretches._PIECE", 10_007)
+    monkeypatch.setattr("crazyem.recordings.usd.stretches._READ_BYTES", 10_007)
     for path in [*sorted((shared_recordings / "crazypad").iterdir())[:3], shared_recordings / "sysid" / "log10"]:
         parts = list(read_parts(path, ReadOptions(), seconds=4.0))
         assert len(parts) > 2

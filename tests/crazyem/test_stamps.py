@@ -12,13 +12,13 @@ from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.stamps import (
     Fault,
     believed,
+    clock_offset,
     finding,
     impossible,
     out_of_order,
     restarts,
     screened,
     screened_parts,
-    shift_beside,
 )
 
 Column = NDArray[np.float64]
@@ -133,7 +133,7 @@ def test_a_stream_of_another_clock_comes_back_to_where_it_was(time: Column, ahea
 
 def test_a_stream_that_runs_at_another_rate_is_not_shifted() -> None:
     time = np.arange(0.0, 30.0, 0.01)
-    assert shift_beside(1e9 + 1000.0 * time, time, time, time) is None
+    assert clock_offset(1e9 + 1000.0 * time, time, time, time) is None
 
 
 def test_one_finding_for_all_and_none_without_faults() -> None:

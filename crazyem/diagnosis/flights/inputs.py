@@ -16,7 +16,7 @@ from crazyem.doctor.thrust import kind_objection, signal_for, too_slow
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
 from crazyem.physics.rotors import thrust_from_command, thrust_from_speed, wrench
-from crazyem.recordings.airborne import POSSIBLE, Airtime, airtime
+from crazyem.recordings.airborne import LARGEST_COMMAND, Airtime, airtime
 from crazyem.recordings.attitudes import onboard_attitude
 from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording
@@ -30,7 +30,7 @@ _SAMPLED = ("motor_command", "motor_request", "mixer_command")
 FULL = 65535.0  # counts of PWM
 STAND_IN = 0.01  # m, arm and torque per thrust of a vehicle without rotors; cancels
 
-_SANE = {**POSSIBLE, "wrench_command": 1e3, "mixer_command": 1e6}  # as `POSSIBLE`, SI and counts
+_SANE = {**LARGEST_COMMAND, "wrench_command": 1e3, "mixer_command": 1e6}  # as `LARGEST_COMMAND`, SI and counts
 
 # Thrust asked for -> motor volts, in the battery compensation of crazyflie-firmware until 2022-11 (motors.c): grams of
 # thrust of all four motors, then a parabola.

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from crazyem.recordings.autopilots.tlog_frames import MESSAGES, Frames, Frameset, columns_of
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.stamps import CHECK, RESTART, Fault, impossible, restarts
+from crazyem.recordings.stamps import RESTART_SECONDS, STAMP_CHECK, Fault, impossible, restarts
 from crazyem.recordings.topics import seconds
 
-_EPOCH = 10**15  # us; a `time_usec` beyond is since 1970, below since boot
+_EPOCH_US = 10**15  # us; a `time_usec` beyond is since 1970, below since boot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Own:
+class _MessageTimes:
     """The times that messages of one kind carry.
 
     Attributes:
@@ -43,13 +43,13 @@ class Clocks:
 
     def __init__(self, found: Frameset, system: int) -> None:
         counts: Counter[int] = Counter()
-        boots: dict[int, list[_Own]] = {}
-        epochs: dict[int, list[_Own]] = {}
+        boots: dict[int, list[_MessageTimes]] = {}
+        epochs: dict[int, list[_MessageTimes]] = {}
         for (sender, component, identifier), frames in found.frames.items():
             if sender != system:
                 continue
             counts[component] += len(frames.stamps) * (1000 if identifier == 0 else 1)
-            own = _own_time(MESSAGES[identifier], frames)
+            own = _message_times(MESSAGES[identifier], frames)
             if own is not None:
                 (epochs if own.utc else boots).setdefault(component, []).append(own)
         self._utc = {c: float(np.median(_joined([o.host - o.time for o in v], v))) for c, v in epochs.items()}
@@ -75,7 +75,7 @@ class Clocks:
     def place(self, component: int, frames: Frames, message: object, name: str) -> tuple[NDArray[np.float64], str]:
         """Times of frames on the axis [s], and the clock they are of; takes note of stamps that cannot be."""
         arrival = self.arrival(np.array(frames.stamps, np.int64))
-        own = _own_time(message, frames) if self.boot is not None else None
+        own = _message_times(message, frames) if self.boot is not None else None
         if own is None or self.boot is None:
             return arrival, "host"
         if own.utc:
@@ -119,14 +119,14 @@ class Clocks:
         )
         advice = f"Use one part at a time: --from {parts[-1][0]:.1f} for the last."
         evidence = {"starts": float(len(parts))}
-        return [Finding(CHECK, Grade.DEGRADES, text, intervals=parts, evidence=evidence, advice=advice)]
+        return [Finding(STAMP_CHECK, Grade.DEGRADES, text, intervals=parts, evidence=evidence, advice=advice)]
 
 
-def _joined(columns: list[NDArray[np.float64]], own: list[_Own]) -> NDArray[np.float64]:
+def _joined(columns: list[NDArray[np.float64]], own: list[_MessageTimes]) -> NDArray[np.float64]:
     return np.concatenate([column[~o.bad] for column, o in zip(columns, own, strict=True)])
 
 
-def _starts(own: list[_Own]) -> NDArray[np.int64]:
+def _starts(own: list[_MessageTimes]) -> NDArray[np.int64]:
     """Places (k,) of the first message of each start of an autopilot but the first.
 
     The message that came most often tells where the clock goes back; others may have come since the message before.
@@ -135,19 +135,19 @@ def _starts(own: list[_Own]) -> NDArray[np.int64]:
     time, place = most.time[~most.bad], most.place[~most.bad]
     first = []
     for row in restarts(time).tolist():
-        since = [o.place[~o.bad & (o.place > place[row - 1]) & (o.time < time[row - 1] - RESTART)] for o in own]
+        since = [o.place[~o.bad & (o.place > place[row - 1]) & (o.time < time[row - 1] - RESTART_SECONDS)] for o in own]
         first.append(min(int(p.min()) for p in since if p.size))
     return np.array(first, np.int64)
 
 
-def _offsets(own: list[_Own], starts: NDArray[np.int64]) -> NDArray[np.float64]:
+def _offsets(own: list[_MessageTimes], starts: NDArray[np.int64]) -> NDArray[np.float64]:
     """Host time [s] of each start."""
     part = np.searchsorted(starts, np.concatenate([o.place[~o.bad] for o in own]), side="right")
     lead = _joined([o.host - o.time for o in own], own)
     return np.array([float(np.median(lead[part == k])) for k in range(starts.size + 1)])
 
 
-def _own_time(message: object, frames: Frames) -> _Own | None:
+def _message_times(message: object, frames: Frames) -> _MessageTimes | None:
     """Times that messages carry; None if they carry none, or too few that can be."""
     names = message.fieldnames  # type: ignore[attr-defined]
     column = next((name for name in ("time_boot_ms", "time_usec") if name in names), None)
@@ -160,8 +160,8 @@ def _own_time(message: object, frames: Frames) -> _Own | None:
         return None
     utc = False
     if column == "time_usec":
-        utc = bool(np.median(stamps[known]) > _EPOCH)
-        known &= (stamps > _EPOCH) == utc
+        utc = bool(np.median(stamps[known]) > _EPOCH_US)
+        known &= (stamps > _EPOCH_US) == utc
         if raw.dtype.itemsize == 4:  # wraps after 71 minutes
             steps = (np.diff(stamps[known]) + (1 << 31)) % (1 << 32) - (1 << 31)
             stamps[known] = stamps[known][0] + np.concatenate([[0], np.cumsum(steps)])
@@ -169,4 +169,4 @@ def _own_time(message: object, frames: Frames) -> _Own | None:
     bad = ~known
     bad[known] = impossible(time[known])
     host = seconds(np.array(frames.stamps, np.int64))
-    return _Own(time, utc, bad, host, np.array(frames.places, np.int64))
+    return _MessageTimes(time, utc, bad, host, np.array(frames.places, np.int64))

@@ -16,7 +16,7 @@ from crazyem.errors import FileFormatError
 from crazyem.recordings.autopilots.tlog_clock import Clocks
 from crazyem.recordings.autopilots.tlog_frames import MESSAGES, Frameset, columns_of, scan, units_of
 from crazyem.recordings.autopilots.tlog_link import link
-from crazyem.recordings.autopilots.tlog_signals import RAW_IMU, SIGNALS
+from crazyem.recordings.autopilots.tlog_signals import RAW_IMU, TLOG_SIGNALS
 from crazyem.recordings.autopilots.vehicle import vehicle_of
 from crazyem.recordings.contents import contents
 from crazyem.recordings.finding import Finding, Grade, note
@@ -28,7 +28,7 @@ from crazyem.recordings.topics import Topic, damage, seconds, signals_of, text_o
 _ARDUPILOT = 3
 _NOT_A_VEHICLE = {6, 18, 26, 27, 28, 30}  # MAV_TYPE of ground stations, onboard computers, gimbals, cameras ...
 _INVALID_AUTOPILOT = 8
-_EVENTS = 2000
+_MOST_EVENTS = 2000
 _SOUND_FRAMES = 3  # that make a file a tlog
 _SKIPPED_HEAD = 4096  # bytes of garbage before them that are tolerated
 # messages that come several at once, and the field that tells them apart
@@ -42,7 +42,7 @@ _INSTANCE = {
     "NAMED_VALUE_INT": "name",
     "DEBUG_VECT": "name",
 }
-_INSTANCES = 64
+_MOST_INSTANCES = 64
 _NO_SIGNALS = {"PARAM_VALUE", "STATUSTEXT", "FILE_TRANSFER_PROTOCOL", "LOG_DATA", "SERIAL_CONTROL"}
 
 Stamps = NDArray[np.int64]
@@ -70,7 +70,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
     if not topics:
         raise FileFormatError(f"{path}: the log holds no numbers from a vehicle.")
     kind, autopilot = _beat(found, system)
-    sources = (*SIGNALS, *(RAW_IMU if autopilot == _ARDUPILOT else ()))
+    sources = (*TLOG_SIGNALS, *(RAW_IMU if autopilot == _ARDUPILOT else ()))
     signals, left_out = signals_of(topics, [m for source in sources for m in source.of(topics)])
     absent, unplugged = unconnected(topics, sources, signals)
     losses = link(found, system, clocks.component, clocks.starts)
@@ -151,7 +151,7 @@ def _instances(name: str, columns: Mapping[str, NDArray[np.generic]]) -> list[tu
     key = columns.get(_INSTANCE.get(name, ""))
     if key is None:
         return [("", np.arange(next(iter(columns.values())).size))]
-    values = np.unique(key)[:_INSTANCES]
+    values = np.unique(key)[:_MOST_INSTANCES]
     text = key.dtype.kind == "S"
     return [(f"_{text_of(value)}" if i or text else "", np.flatnonzero(key == value)) for i, value in enumerate(values)]
 
@@ -205,4 +205,4 @@ def _events(found: Frameset, system: int) -> tuple[Event, ...]:
             columns = columns_of(MESSAGES[identifier], frames.payloads)
             rows = zip(frames.stamps, columns["severity"].tolist(), columns["text"].tolist(), strict=True)
             events += [Event(t / 1e6, "log", {"severity": s, "text": text_of(x)}) for t, s, x in rows]
-    return tuple(sorted(events, key=lambda e: e.time)[:_EVENTS])
+    return tuple(sorted(events, key=lambda e: e.time)[:_MOST_EVENTS])

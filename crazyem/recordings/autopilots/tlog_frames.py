@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega
 
 MESSAGES: Mapping[int, Any] = ardupilotmega.mavlink_map
-_EARLIEST = 946_684_800_000_000  # us: the year 2000
-_LATEST = 4_102_444_800_000_000  # us: the year 2100
+_EARLIEST_STAMP = 946_684_800_000_000  # us: the year 2000
+_LATEST_STAMP = 4_102_444_800_000_000  # us: the year 2100
 _V1, _V2 = 0xFE, 0xFD
 _SIGNED = 1
 _SIGNATURE = 13  # bytes
-_REVERSED = bytes(int(f"{i:08b}"[::-1], 2) for i in range(256))
+_REVERSED_BITS = bytes(int(f"{i:08b}"[::-1], 2) for i in range(256))
 # where a frame may begin: a time of arrival between those years, and the mark of a frame
 _START = re.compile(rb"(?s)(?=\x00[\x03-\x0e].{6}[\xfd\xfe])")
 _TYPE = re.compile(r"(\d*)([a-zA-Z])")
@@ -58,8 +58,8 @@ class Frameset:
 
 def checksum(data: bytes) -> int:
     """CRC-16/MCRF4XX, the checksum of MAVLink: the reflected twin of the CCITT polynomial that binascii has in C."""
-    straight = binascii.crc_hqx(data.translate(_REVERSED), 0xFFFF)
-    return _REVERSED[straight & 0xFF] << 8 | _REVERSED[straight >> 8]
+    straight = binascii.crc_hqx(data.translate(_REVERSED_BITS), 0xFFFF)
+    return _REVERSED_BITS[straight & 0xFF] << 8 | _REVERSED_BITS[straight >> 8]
 
 
 def scan(data: bytes, at_most: int | None = None) -> Frameset:
@@ -82,7 +82,7 @@ def _frame(data: bytes, at: int, found: Frameset | None) -> int:
     if at + 8 + 8 > len(data):
         return 0
     stamp = int.from_bytes(data[at : at + 8], "big")
-    if not _EARLIEST < stamp < _LATEST:
+    if not _EARLIEST_STAMP < stamp < _LATEST_STAMP:
         return 0
     magic, length = data[at + 8], data[at + 9]
     if magic == _V2:
@@ -130,7 +130,7 @@ def _looks_like_frame(data: bytes, at: int) -> bool:
         return True
     if at + 9 > len(data):
         return False
-    return _EARLIEST < int.from_bytes(data[at : at + 8], "big") < _LATEST and data[at + 8] in (_V1, _V2)
+    return _EARLIEST_STAMP < int.from_bytes(data[at : at + 8], "big") < _LATEST_STAMP and data[at + 8] in (_V1, _V2)
 
 
 def _resume(data: bytes, damaged: int) -> int:

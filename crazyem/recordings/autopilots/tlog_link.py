@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from crazyem.recordings.autopilots.tlog_frames import Frameset
 from crazyem.recordings.finding import Finding, Grade
 
-_LATE = 16  # a message this many places behind is one that came late or twice; more is the next round of the numbers
+# a message this many places behind is one that came late or twice; more is the next round of the numbers
+_LATE_PLACES = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +67,7 @@ def link(found: Frameset, system: int, component: int, starts: NDArray[np.int64]
     for numbers, stamps in zip(np.split(sequence, cuts), np.split(stamp, cuts), strict=True):
         if not numbers.size:
             continue
-        number = np.concatenate([[0], np.cumsum((np.diff(numbers) + _LATE) % 256 - _LATE)])
+        number = np.concatenate([[0], np.cumsum((np.diff(numbers) + _LATE_PLACES) % 256 - _LATE_PLACES)])
         sent, first = np.unique(number, return_index=True)
         missing = np.diff(sent) - 1
         rows = np.flatnonzero(missing)

@@ -85,7 +85,7 @@ _VOLTAGES = named("voltages[*]", "0 1 2 3 4 5 6 7 8 9") + named("voltages_ext[*]
 _TARGET = "POSITION_TARGET_LOCAL_NED"
 _BODY_RATES = named("body_*_rate", "roll pitch yaw")
 
-SIGNALS: tuple[Source, ...] = (
+TLOG_SIGNALS: tuple[Source, ...] = (
     _shared("position", "LOCAL_POSITION_NED"),
     _shared("velocity", "LOCAL_POSITION_NED"),
     _shared("attitude", "ATTITUDE_QUATERNION"),

@@ -1,7 +1,7 @@
 """PX4 ULog files: each topic at its own rate, on the autopilot's clock, turned from FRD and NED to FLU and NWU.
 
 Decoding is pyulog's; `ulog_scan` decides before what of a file is sound. What becomes which signal is the table
-`_SIGNALS`; docs/formats/ulog.md explains it. Sources: docs.px4.io (ULog file format, uORB message reference).
+`_ULOG_SIGNALS`; docs/formats/ulog.md explains it. Sources: docs.px4.io (ULog file format, uORB message reference).
 """
 
 import contextlib
@@ -28,7 +28,7 @@ from crazyem.recordings.autopilots.frd_ned import (
     stacked,
     vectors,
 )
-from crazyem.recordings.autopilots.ulog_scan import HEADER, MAGIC, Scan, scan, unknown_flags
+from crazyem.recordings.autopilots.ulog_scan import HEADER_BYTES, ULOG_MAGIC, Scan, scan, unknown_flags
 from crazyem.recordings.autopilots.vehicle import vehicle_of
 from crazyem.recordings.contents import contents
 from crazyem.recordings.finding import Finding, Grade, note
@@ -37,10 +37,10 @@ from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.stamps import Fault, believed, finding
 from crazyem.recordings.topics import Source, Topic, damage, named, ranks, seconds, signals_of, text_of, unconnected
 
-CLOCK = "autopilot"  # microseconds since boot
+AUTOPILOT_CLOCK = "autopilot"  # microseconds since boot
 _RPM = 2.0 * math.pi / 60.0
-_PARAMETERS = 4000  # that are kept as metadata
-_MESSAGES = 500  # texts of the autopilot that are kept
+_MOST_PARAMETERS = 4000  # that are kept as metadata
+_MOST_MESSAGES = 500  # texts of the autopilot that are kept
 _SECOND = 1_000_000  # us
 # a sample may lie this long before its publication; beyond, the stamp is not believed
 _LONGEST_DELAY = 1 * _SECOND
@@ -50,14 +50,16 @@ Data = Mapping[str, NDArray[np.generic]]
 
 def recognises(head: bytes) -> bool:
     """True if a file starting with these bytes is one."""
-    return head.startswith(MAGIC)
+    return head.startswith(ULOG_MAGIC)
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
     """Read a ULog file. Raises FileFormatError naming the file and what is wrong with it."""
     data = contents(path)
-    if not recognises(data) or len(data) < HEADER:
-        raise FileFormatError(f"{path}: the header of a ULog file has {HEADER} bytes, this one is cut or is none.")
+    if not recognises(data) or len(data) < HEADER_BYTES:
+        raise FileFormatError(
+            f"{path}: the header of a ULog file has {HEADER_BYTES} bytes, this one is cut or is none."
+        )
     if unknown_flags(data):
         raise FileFormatError(f"{path}: the log is marked as of a kind that readers of today must not read.")
     sound = scan(data)
@@ -67,9 +69,9 @@ def read(path: Path, options: ReadOptions) -> Recording:
     topics, faults = _topics(log, np.frombuffer(sound.identifiers, np.uint16))
     if not any(topic.time.size for topic in topics):
         raise FileFormatError(f"{path}: the log holds not a single message of a topic ({sound.messages} others).")
-    mapped = [m for source in _SIGNALS for m in source.of(topics)]
+    mapped = [m for source in _ULOG_SIGNALS for m in source.of(topics)]
     signals, left_out = signals_of(topics, mapped)
-    absent, unplugged = unconnected(topics, _SIGNALS, signals)
+    absent, unplugged = unconnected(topics, _ULOG_SIGNALS, signals)
     findings = [*_integrity(sound, topics, log), *finding(faults, _concerned(signals, faults)), *left_out]
     findings += [*unplugged, *_notes(signals)]
     metadata = _metadata(log) | {"vehicle": vehicle_of(_kind(log)), "not_measured": absent}
@@ -122,7 +124,7 @@ def _topics(log: ULog, identifiers: NDArray[np.uint16]) -> tuple[list[Topic], li
         chars = {f.field_name for f in d.field_data if f.type_str == "char"}
         columns = {k: v for k, v in data.items() if k != used and k not in chars and "_padding" not in k}
         units = {k: "us" for k in columns if k.rpartition(".")[2] in ("timestamp", "timestamp_sample")}
-        topics.append(Topic(_name(d), columns, stamps[-1], np.empty(0, np.int64), clock=CLOCK, units=units))
+        topics.append(Topic(_name(d), columns, stamps[-1], np.empty(0, np.int64), clock=AUTOPILOT_CLOCK, units=units))
     ordered = [replace(topic, order=order) for topic, order in zip(topics, ranks(stamps), strict=True)]
     return ordered, faults
 
@@ -195,7 +197,7 @@ _FOUR = "0 1 2 3"
 
 _LOCAL = "vehicle_local_position"
 _TARGET = "vehicle_local_position_setpoint"
-_SIGNALS: tuple[Source, ...] = (
+_ULOG_SIGNALS: tuple[Source, ...] = (
     Source("position", _LOCAL, _XYZ, vectors, _valid("xy_valid", "z_valid"), frame=WORLD),
     Source("velocity", _LOCAL, named("*", "vx vy vz"), vectors, _valid("v_xy_valid", "v_z_valid"), frame=WORLD),
     Source("attitude", "vehicle_attitude", named("q[*]", _FOUR), quaternions, frame=ATTITUDE),
@@ -265,13 +267,14 @@ def _metadata(log: ULog) -> dict[str, dict[str, str]]:
     info = {text_of(k): text_of(v) for k, v in list(log.msg_info_dict.items())[:200]}
     version = log.get_version_info_str() if isinstance(log.msg_info_dict.get("ver_sw_release"), int) else None
     info |= {"version": version} if version else {}
-    parameters = {text_of(k): repr(v) for k, v in list(log.initial_parameters.items())[:_PARAMETERS]}
+    parameters = {text_of(k): repr(v) for k, v in list(log.initial_parameters.items())[:_MOST_PARAMETERS]}
     changed = {
-        f"{i} {t / 1e6:.6f} s {text_of(k)}": repr(v) for i, (t, k, v) in enumerate(log.changed_parameters[:_PARAMETERS])
+        f"{i} {t / 1e6:.6f} s {text_of(k)}": repr(v)
+        for i, (t, k, v) in enumerate(log.changed_parameters[:_MOST_PARAMETERS])
     }
     texts = {
         f"{i} {m.timestamp / 1e6:.6f} s {m.log_level_str()}": text_of(m.message)
-        for i, m in enumerate(log.logged_messages[:_MESSAGES])
+        for i, m in enumerate(log.logged_messages[:_MOST_MESSAGES])
     }
     sections = {"ulog": info, "parameters": parameters, "changed_parameters": changed, "messages": texts}
     return {name: section for name, section in sections.items() if section}

@@ -13,10 +13,10 @@ import struct
 from array import array
 from dataclasses import dataclass, field
 
-MAGIC = b"ULog\x01\x12\x35"
-HEADER = 16
-SYNC = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
-SIZES = {
+ULOG_MAGIC = b"ULog\x01\x12\x35"
+HEADER_BYTES = 16
+SYNC_BYTES = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
+TYPE_SIZES = {
     "int8_t": 1,
     "uint8_t": 1,
     "int16_t": 2,
@@ -30,12 +30,12 @@ SIZES = {
     "bool": 1,
     "char": 1,
 }
-_LARGEST = 65535  # bytes of a message: its size has 16 bits
-_FIELDS = 200_000  # of all topics together
-_DEEPEST = 8  # types within types
-_CHAIN = 4  # messages in a row that make a place sound
-_KINDS = b"DAFIMPQLCOSRB"
-_CANDIDATE = re.compile(b"(?=[\x00-\x1f][" + _KINDS + b"])")  # upper half of a size below 8 KiB, type
+_LARGEST_MESSAGE = 65535  # bytes of a message: its size has 16 bits
+_MOST_FIELDS = 200_000  # of all topics together
+_DEEPEST_NESTING = 8  # types within types
+_SOUND_MESSAGES = 4  # messages in a row that make a place sound
+_MESSAGE_TYPES = b"DAFIMPQLCOSRB"
+_CANDIDATE = re.compile(b"(?=[\x00-\x1f][" + _MESSAGE_TYPES + b"])")  # upper half of a size below 8 KiB, type
 _FORMAT = re.compile(rb"[A-Za-z0-9_\-/]+:(?:\w+(?:\[\d{1,10}\])? \w+;)*(?:\w+(?:\[\d{1,10}\])? \w+)?\Z")
 _FIELD = re.compile(r"(\w+?)(?:\[(\d+)\])? (\w+)")
 _KEY = re.compile(rb"(\w+)(?:\[(\d{1,10})\])? [^\x00-\x1f]+\Z")
@@ -91,28 +91,28 @@ class _Types:
         if name not in self.formats:
             return "its format is not defined"
         size, count = self._extent(name, 0)
-        if not size or size > _LARGEST:
+        if not size or size > _LARGEST_MESSAGE:
             return "its format is larger than a message, or contains itself or an unknown type"
         if not any(f == ("uint64_t", 0, "timestamp") for f in self.formats[name]):
             return "its format has no timestamp"
-        if self.fields + count > _FIELDS:
-            return f"the topics have more than {_FIELDS} fields together"
+        if self.fields + count > _MOST_FIELDS:
+            return f"the topics have more than {_MOST_FIELDS} fields together"
         self.fields += count
         self.topics[identifier] = (size - self._padding(name), size)
         return ""
 
     def _extent(self, name: str, depth: int) -> tuple[int, int]:
         """Bytes and fields of a type; (0, 0) if it has none or too many, contains itself or an unknown type."""
-        if depth > _DEEPEST:
+        if depth > _DEEPEST_NESTING:
             return 0, 0
         size = count = 0
         for kind, length, _ in self.formats.get(name, ()):
-            one, fields = (SIZES[kind], 1) if kind in SIZES else self._extent(kind, depth + 1)
+            one, fields = (TYPE_SIZES[kind], 1) if kind in TYPE_SIZES else self._extent(kind, depth + 1)
             if not one:
                 return 0, 0
             size += one * max(length, 1)
             count += fields * max(length, 1)
-            if size > _LARGEST:
+            if size > _LARGEST_MESSAGE:
                 return 0, 0
         return size, count
 
@@ -120,21 +120,21 @@ class _Types:
         """Bytes at the end that the logger leaves out."""
         total = 0
         for kind, length, label in reversed(self.formats[name]):
-            if not label.startswith("_padding") or kind not in SIZES:
+            if not label.startswith("_padding") or kind not in TYPE_SIZES:
                 break
-            total += SIZES[kind] * max(length, 1)
+            total += TYPE_SIZES[kind] * max(length, 1)
         return total
 
 
 def scan(data: bytes) -> Scan:
-    """Every sound message of a file that starts with `MAGIC` and has its 16 bytes of header."""
+    """Every sound message of a file that starts with `ULOG_MAGIC` and has its 16 bytes of header."""
     found = Scan(size=len(data))
     types = _Types()
     whole, offsets = _appended(data)
     view = memoryview(data)
     kept: list[memoryview | bytes] = []  # runs of sound messages before `start`
-    position, start, size = HEADER, HEADER, len(data)
-    limit = HEADER  # no message reaches beyond this: the end of the file, or of the part before appended data
+    position, start, size = HEADER_BYTES, HEADER_BYTES, len(data)
+    limit = HEADER_BYTES  # no message reaches beyond this: the end of the file, or of the part before appended data
     unpack = struct.Struct("<HB").unpack_from
     two = struct.Struct("<H").unpack_from
     topics = types.topics
@@ -226,9 +226,9 @@ def _plausible(body: bytes, kind: int, at: int) -> bool:
         case "O" | "R":
             return len(body) == 2
         case "S":
-            return body == SYNC
+            return body == SYNC_BYTES
         case "B":
-            return len(body) >= 40 and at == HEADER
+            return len(body) >= 40 and at == HEADER_BYTES
     return False
 
 
@@ -237,9 +237,9 @@ def _key_value(body: bytes) -> bool:
     if len(body) < 2 or len(body) < 1 + body[0]:
         return False
     key = _KEY.match(body[1 : 1 + body[0]])
-    if key is None or key[1].decode("ascii", "replace") not in SIZES:
+    if key is None or key[1].decode("ascii", "replace") not in TYPE_SIZES:
         return False
-    return len(body) - 1 - body[0] == SIZES[key[1].decode()] * int(key[2] or 1)
+    return len(body) - 1 - body[0] == TYPE_SIZES[key[1].decode()] * int(key[2] or 1)
 
 
 def _resume(data: bytes, damaged: int, limit: int, types: _Types) -> int:
@@ -247,7 +247,7 @@ def _resume(data: bytes, damaged: int, limit: int, types: _Types) -> int:
     for match in _CANDIDATE.finditer(data, damaged + 2, limit):
         start = match.start() - 1
         position = start
-        for _ in range(_CHAIN):
+        for _ in range(_SOUND_MESSAGES):
             if position == limit:
                 break
             if position + 3 > limit:
@@ -271,28 +271,28 @@ def _sound(data: bytes, at: int, length: int, kind: int, types: _Types) -> bool:
         identifier = int.from_bytes(data[at + 3 : at + 5], "little")
         limits = types.topics.get(identifier)
         return identifier in types.refused_ids or (limits is not None and limits[0] <= length - 2 <= limits[1])
-    if kind not in _KINDS or length > 8192:
+    if kind not in _MESSAGE_TYPES or length > 8192:
         return False
     return _plausible(data[at + 3 : at + 3 + length], kind, at)
 
 
 def _appended(data: bytes) -> tuple[bool, tuple[int, ...]]:
     """Whether the file needs no other header, and the offsets at which data was appended to it."""
-    if data[HEADER + 2 : HEADER + 3] != b"B" or len(data) < HEADER + 43:
+    if data[HEADER_BYTES + 2 : HEADER_BYTES + 3] != b"B" or len(data) < HEADER_BYTES + 43:
         return True, ()
-    flags = data[HEADER + 11 : HEADER + 19]
-    offsets = struct.unpack_from("<3Q", data, HEADER + 19)
-    return not any(flags) and not any(offsets), tuple(o for o in offsets if o > HEADER)
+    flags = data[HEADER_BYTES + 11 : HEADER_BYTES + 19]
+    offsets = struct.unpack_from("<3Q", data, HEADER_BYTES + 19)
+    return not any(flags) and not any(offsets), tuple(o for o in offsets if o > HEADER_BYTES)
 
 
 def unknown_flags(data: bytes) -> bool:
     """True if the file says that readers of today must not read it."""
-    if data[HEADER + 2 : HEADER + 3] != b"B" or len(data) < HEADER + 43:
+    if data[HEADER_BYTES + 2 : HEADER_BYTES + 3] != b"B" or len(data) < HEADER_BYTES + 43:
         return False
-    flags = data[HEADER + 11 : HEADER + 19]
+    flags = data[HEADER_BYTES + 11 : HEADER_BYTES + 19]
     return bool(flags[0] & ~1) or any(flags[1:])
 
 
 def _plain_header(data: bytes) -> bytes:
     """The file's header without the mark of appended data."""
-    return data[:7] + b"\x01" + data[8:HEADER]
+    return data[:7] + b"\x01" + data[8:HEADER_BYTES]

@@ -29,12 +29,19 @@ from crazyem.recordings.stamps import Fault, finding
 from crazyem.recordings.tables import Table, signals_from_tables
 
 _VARIABLE = re.compile(r"[A-Za-z_]\w*\.[\w\[\]]+")
-_NAME = re.compile(r"(.+)-(\d{8}T\d\d-\d\d-\d\d)\.csv(\.gz)?")
-_DATE = "%Y%m%dT%H-%M-%S"
+_FILE_NAME = re.compile(r"(.+)-(\d{8}T\d\d-\d\d-\d\d)\.csv(\.gz)?")
+_DATE_FORMAT = "%Y%m%dT%H-%M-%S"
 _ONE_SESSION = 120.0  # s between estimates of when the drone was switched on: one session, blocks started late
 _MOST_FILES = 256  # in a folder
 _MOST_SIBLINGS = 32  # looked at where one file is read alone
-_RECORDINGS = {"", ".mcap", ".ulg", ".tlog", ".db3", ".parquet"}  # endings of what would be a recording of its own
+_RECORDING_SUFFIXES = {
+    "",
+    ".mcap",
+    ".ulg",
+    ".tlog",
+    ".db3",
+    ".parquet",
+}  # endings of what would be a recording of its own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +79,7 @@ def recognises_folder(path: Path) -> bool:
     """
     files = _files(path)
     others = [f for f in path.iterdir() if f.is_file() and not f.name.startswith(".") and f not in files]
-    if not 0 < len(files) <= _MOST_FILES or any(f.suffix in _RECORDINGS for f in others):
+    if not 0 < len(files) <= _MOST_FILES or any(f.suffix in _RECORDING_SUFFIXES for f in others):
         return False
     starts: list[float] = []
     undated: list[bytes] = []
@@ -138,11 +145,11 @@ def _head(file: Path) -> bytes:
 
 def _named(file: Path) -> tuple[str, datetime | None]:
     """Block and date in a file's name."""
-    found = _NAME.fullmatch(file.name)
+    found = _FILE_NAME.fullmatch(file.name)
     if not found:
         return file.name.removesuffix(".gz").removesuffix(".csv"), None
     try:
-        return found[1], datetime.strptime(found[2], _DATE)
+        return found[1], datetime.strptime(found[2], _DATE_FORMAT)
     except ValueError:
         return found[1], None
 

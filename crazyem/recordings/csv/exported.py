@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
-from crazyem.recordings.columns import MARKED, Description, SignalEntry, name_and_unit
+from crazyem.recordings.columns import MARKED_COLUMN, Description, SignalEntry, name_and_unit
 from crazyem.recordings.description import from_json
 from crazyem.recordings.export import HOST_TIME, METADATA_SUFFIX, TIME
 from crazyem.recordings.finding import Finding, Grade, note
@@ -21,12 +21,12 @@ from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.signals.sample import SIGNALS, components
 
-_BLOCK = 2 << 20  # bytes of text parsed at a time
+_BLOCK_BYTES = 2 << 20  # bytes of text parsed at a time
 _LONGEST_LINE = 4 << 20
 _LARGEST_DESCRIPTION = 256 << 20
-_GROWTH = 1.25  # of arrays that are full
+_ARRAY_GROWTH = 1.25  # of arrays that are full
 _MOST_AHEAD = 8.0
-_UNPACKED = 64 << 20, 50  # a gzip file may grow to the first, or by the second, whichever is more
+_UNPACKED_LIMITS = 64 << 20, 50  # a gzip file may grow to the first, or by the second, whichever is more
 
 Floats = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ class _Growing:
         size = self.size + count
         if size > len(self._array):
             # what is never filled takes up no memory; but what the first lines promise is not all believed
-            capacity = int(size * max(_GROWTH, min(1.05 * ahead, _MOST_AHEAD)))
+            capacity = int(size * max(_ARRAY_GROWTH, min(1.05 * ahead, _MOST_AHEAD)))
             larger = np.empty((capacity, *self._array.shape[1:]), self._array.dtype)
             larger[: self.size] = self._array[: self.size]
             self._array = larger
@@ -273,7 +273,7 @@ def _guessed(titles: list[str]) -> Description:
             name, ("",), *_scalar(name, unit), "", "", (name,)
         )
         del pairs[: len(entry.parts)]
-        if pairs and pairs[0][0] == f"{entry.name}_{MARKED}":
+        if pairs and pairs[0][0] == f"{entry.name}_{MARKED_COLUMN}":
             del pairs[0]
             entry = replace(entry, marked=True)
         entries.append(entry)
@@ -319,7 +319,7 @@ class _Text:
         self._size, self._taken = max(1, path.stat().st_size), 0
         self._tail = b""
         packed = isinstance(file, gzip.GzipFile)
-        self._left = max(_UNPACKED[0], _UNPACKED[1] * self._size) if packed else None
+        self._left = max(_UNPACKED_LIMITS[0], _UNPACKED_LIMITS[1] * self._size) if packed else None
 
     @property
     def ahead(self) -> float:
@@ -355,8 +355,8 @@ class _Text:
     def _more(self) -> bytes:
         try:
             if isinstance(self.file, gzip.GzipFile):
-                return self.file.read1(_BLOCK)  # unlike read, hands out what it has before it comes to the damage
-            return self.file.read(_BLOCK)
+                return self.file.read1(_BLOCK_BYTES)  # unlike read, hands out what it has before it comes to the damage
+            return self.file.read(_BLOCK_BYTES)
         except (EOFError, gzip.BadGzipFile, zlib.error) as error:
             self.damage = f"The gzip file is damaged ({error}); the whole lines before that were read."
             return b""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from crazyem.recordings.csv.long import read_long
 from crazyem.recordings.csv.mapping import known_mappings, mapping_for
-from crazyem.recordings.csv.text import read_header, split_header
+from crazyem.recordings.csv.text import parse_header_line, read_header
 from crazyem.recordings.csv.wide import read_wide, read_wide_parts
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
@@ -14,7 +14,7 @@ from crazyem.recordings.recording import Recording
 def recognises(head: bytes) -> bool:
     """True if the first line reads like a CSV header: text, at least two names with delimiters between them."""
     try:
-        names, _ = split_header(head.split(b"\n", 1)[0].decode("utf-8-sig"))
+        names, _ = parse_header_line(head.split(b"\n", 1)[0].decode("utf-8-sig"))
     except UnicodeDecodeError:
         return False
     return len(names) > 1 and all(name.isprintable() for name in names)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 RELATIVE_TOLERANCE = 1e-4  # of the change over two steps; measured values sit below 1e-5, noise far above 1e-2
 ABSOLUTE_TOLERANCE = 4e-9  # decimals of the file: nine digits, rounded
-_CHUNK = 1 << 16  # rows looked at together, to bound memory
+_CHUNK_ROWS = 1 << 16  # rows looked at together, to bound memory
 
 
 def interpolated_rows(
@@ -32,8 +32,8 @@ def interpolated_rows(
     """
     n = time.size
     rows = np.zeros(n, bool)
-    for start in range(0, max(n - 2, 0), _CHUNK):
-        part = slice(start, min(start + _CHUNK + 2, n))
+    for start in range(0, max(n - 2, 0), _CHUNK_ROWS):
+        part = slice(start, min(start + _CHUNK_ROWS + 2, n))
         centres = _centres(time[part], values[part], relative_tolerance, absolute_tolerance)
         for shift in (0, 1, 2):
             rows[start + shift : start + shift + centres.size] |= centres
@@ -55,7 +55,7 @@ def _centres(
     return np.asarray(on_line & moving)
 
 
-CONTEXT = 32  # rows on either side that decide what a row is; no rule below looks further
+CONTEXT_ROWS = 32  # rows on either side that decide what a row is; no rule below looks further
 _LONGEST_GROUP = 8  # rows off every line that still are corners; more of them are measured rows
 _SHARE_OUTSIDE = 0.02  # of a row's interval that a corner may lie outside it, for rounding
 

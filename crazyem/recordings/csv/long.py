@@ -11,7 +11,7 @@ import numpy as np
 from crazyem.errors import FileFormatError
 from crazyem.links.clock import StampUnwrapper
 from crazyem.recordings.csv.mapping import CsvMapping, SignalColumns
-from crazyem.recordings.csv.text import Damage, Header, split_fields, text_blocks, to_number
+from crazyem.recordings.csv.text import Damage, Header, parse_fields, text_blocks, to_number
 from crazyem.recordings.csv.wide import damage_notes
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.motor_meaning import decide
@@ -126,7 +126,7 @@ def _packets(path: Path, header: Header, mapping: CsvMapping, damage: Damage) ->
             line += 1
             if line == 1 or not raw.strip():
                 continue
-            fields = split_fields(raw, header.delimiter)
+            fields = parse_fields(raw, header.delimiter)
             if len(fields) != len(header.names):
                 damage.drop(line, f"line {line} has {len(fields)} fields, the header has {len(header.names)}")
                 continue

@@ -23,16 +23,16 @@ from crazyem.recordings.csv.mapping_units import (
 from crazyem.signals.sample import SIGNALS, components
 
 BODY_AXES, WORLD_AXES = ("FLU", "FRD"), ("ENU", "NED")
-_MOTORS = ("motor_command", "motor_request", "rotor_speed")
-_ANGLES = ("euler", "setpoint_euler")
-_LARGEST = 1_000_000  # bytes of a mapping file: nobody writes more by hand
+_MOTOR_SIGNALS = ("motor_command", "motor_request", "rotor_speed")
+_ANGLE_SIGNALS = ("euler", "setpoint_euler")
+_LARGEST_MAPPING = 1_000_000  # bytes of a mapping file: nobody writes more by hand
 
-_TOP = {
+_TOP_KEYS = {
     "name", "title", "layout", "recognise", "time", "claims", "units", "packets", "signals", "host_signals", "columns",
 }  # fmt: skip
-_TIME = {"column", "unit", "clock", "rate_hz"}
+_TIME_KEYS = {"column", "unit", "clock", "rate_hz"}
 _CLAIMABLE = {"unit", "frame", "sign", "scale", "offset", "order", "direction"}
-_ENTRY = _CLAIMABLE | {
+_ENTRY_KEYS = _CLAIMABLE | {
     "columns", "variables", "packet", "stream", "clock", "missing", "above", "hold", "rotors", "pole_pairs", "attitude",
     "corners", "published",
 }  # fmt: skip
@@ -126,7 +126,7 @@ def load_mapping(text: str, where: str) -> CsvMapping:
         table = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise FileFormatError(f"{where}: not valid TOML ({error}).") from error
-    _known(table, _TOP, where)
+    _known(table, _TOP_KEYS, where)
     layout = _get(table, "layout", str, where, "wide")
     if layout not in ("wide", "long"):
         raise FileFormatError(f'{where}: layout must be "wide" or "long", not "{layout}".')
@@ -138,7 +138,7 @@ def load_mapping(text: str, where: str) -> CsvMapping:
     signals = {n: _signal(n, e, f"{where}: {key}.{n}", columns_key) for n, e in entries.items()}
     published = {n: _signal(n, _claimed(e), f"{where}: {key}.{n}", columns_key) for n, e in entries.items()}
     time = _get(table, "time", dict, where, {})
-    _known(time, _TIME, f"{where}: time")
+    _known(time, _TIME_KEYS, f"{where}: time")
     columns = _texts(table, "columns", where)
     rate = _number(time, "rate_hz", f"{where}: time", math.nan)
     if layout == "long":
@@ -206,9 +206,9 @@ def mapping_for(header: tuple[str, ...], given: str | None, path: Path) -> CsvMa
 def _text_of(path: Path, shipped: Mapping[str, CsvMapping]) -> str:
     try:
         with path.open("rb") as file:
-            raw = file.read(_LARGEST + 1)
-        if len(raw) > _LARGEST:
-            raise FileFormatError(f"{path}: no mapping is larger than {_LARGEST} bytes.")
+            raw = file.read(_LARGEST_MAPPING + 1)
+        if len(raw) > _LARGEST_MAPPING:
+            raise FileFormatError(f"{path}: no mapping is larger than {_LARGEST_MAPPING} bytes.")
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{path}: not a text file (byte {error.start} is not UTF-8).") from error
@@ -227,7 +227,7 @@ def _signal(name: str, entry: Mapping[str, Any], where: str, key: str) -> Signal
     quantity, at, origin = name.partition("@")
     if quantity not in SIGNALS or (at and not origin):
         raise FileFormatError(f"{where}: no such signal; known are {', '.join(SIGNALS)}.")
-    _known(entry, _ENTRY, where)
+    _known(entry, _ENTRY_KEYS, where)
     _known(_get(entry, "published", dict, where, {}), _CLAIMABLE, f"{where}.published")
     columns = _names(entry, key, where)
     above = _number(entry, "above", where, None)
@@ -291,7 +291,7 @@ def _ordered(
         raise FileFormatError(f"{where}.{key}: {quantity} has {count} components, not {len(columns)}.")
     given: tuple[str, ...] = labels
     if "rotors" in entry:
-        if quantity not in _MOTORS:
+        if quantity not in _MOTOR_SIGNALS:
             raise FileFormatError(f"{where}.rotors: only for motor_command, motor_request and rotor_speed.")
         given = tuple(f"m{r}" for r in _get(entry, "rotors", list, where))
     elif "order" in entry:
@@ -349,7 +349,7 @@ def _frame(quantity: str, entry: Mapping[str, Any], where: str) -> tuple[str, tu
     """("body", "world" or "" for the signal's own frame, axes of body and world)."""
     words = _get(entry, "frame", str, where, "").replace("to", " ").replace(",", " ").split()
     own = "body" if "body" in SIGNALS[quantity][2] else "world"
-    turns = quantity == "attitude" or quantity in _ANGLES
+    turns = quantity == "attitude" or quantity in _ANGLE_SIGNALS
     frame, body, world = "", "FLU", "ENU"
     for word in words:
         if word in BODY_AXES:
@@ -389,12 +389,12 @@ def _known(table: Mapping[str, Any], known: set[str], where: str) -> None:
             raise FileFormatError(f"{where}: unknown key {key!r:.60}; known are {', '.join(sorted(known))}.")
 
 
-_NEEDED = object()
+_REQUIRED = object()
 
 
-def _get(table: Mapping[str, Any], key: str, kind: type, where: str, default: Any = _NEEDED) -> Any:
+def _get(table: Mapping[str, Any], key: str, kind: type, where: str, default: Any = _REQUIRED) -> Any:
     if key not in table:
-        if default is _NEEDED:
+        if default is _REQUIRED:
             raise FileFormatError(f"{where}: the key {key} is missing.")
         return default
     if not isinstance(table[key], kind):
@@ -403,7 +403,7 @@ def _get(table: Mapping[str, Any], key: str, kind: type, where: str, default: An
     return table[key]
 
 
-def _names(table: Mapping[str, Any], key: str, where: str, default: Any = _NEEDED) -> tuple[str, ...]:
+def _names(table: Mapping[str, Any], key: str, where: str, default: Any = _REQUIRED) -> tuple[str, ...]:
     names = tuple(_get(table, key, list, where, default))
     if not all(isinstance(n, str) for n in names):
         raise FileFormatError(f"{where}: {key} must be a list of texts.")

@@ -12,7 +12,7 @@ _FOOT = 0.3048
 _FORCE_OF_GRAM = 9.80665e-3  # N, the standard definition; g as an acceleration is the firmware's 9.81
 
 # kind of quantity -> unit -> factor to SI
-_KINDS: dict[str, dict[str, float]] = {
+_UNIT_KINDS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "um": 1e-6, "km": 1e3, "ft": _FOOT, "in": 0.0254},
     "speed": {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1.0 / 3.6, "ft/s": _FOOT},
     "acceleration": {
@@ -42,9 +42,9 @@ _KINDS: dict[str, dict[str, float]] = {
 }
 
 # what 0 of a unit is in SI, where not 0: pulses of servo outputs are 1000 us at no thrust, 2000 us at full thrust
-_ZEROS: dict[tuple[str, str], float] = {("ratio", "us"): -1.0}
+_UNIT_OFFSETS: dict[tuple[str, str], float] = {("ratio", "us"): -1.0}
 
-_TIMES: dict[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1.0 / 60.0, "h": 1.0 / 3600.0}
+_TIME_UNITS: dict[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1.0 / 60.0, "h": 1.0 / 3600.0}
 
 _KIND_OF_UNIT = {"m": "length", "m/s": "speed", "m/s^2": "acceleration", "rad": "angle", "rad/s": "angular rate"}
 
@@ -122,11 +122,11 @@ def unit_factor(unit: str, quantity: str, component: int, where: str) -> float:
     Raises: FileFormatError, one sentence that begins with `where`, if the unit is unknown or measures something else.
     """
     kind = kind_of(quantity, component)
-    known = _KINDS[kind]
+    known = _UNIT_KINDS[kind]
     name = _spelled(unit)
     if name in known:
         return known[name]
-    others = [k for k, units in _KINDS.items() if name in units]
+    others = [k for k, units in _UNIT_KINDS.items() if name in units]
     if others:
         raise FileFormatError(
             f'{where}: "{unit}" is a unit of {others[0]}, but {quantity} is {_article(kind)} '
@@ -137,15 +137,15 @@ def unit_factor(unit: str, quantity: str, component: int, where: str) -> float:
 
 def unit_offset(unit: str, quantity: str, component: int) -> float:
     """What 0 of `unit` is in the SI unit of a component of a signal."""
-    return _ZEROS.get((kind_of(quantity, component), _spelled(unit)), 0.0)
+    return _UNIT_OFFSETS.get((kind_of(quantity, component), _spelled(unit)), 0.0)
 
 
 def time_divisor(unit: str, where: str) -> float:
     """What to divide stamps in `unit` by to have seconds. Raises FileFormatError for an unknown unit of time."""
     name = _spelled(unit)
-    if name not in _TIMES:
-        raise FileFormatError(f'{where}: unknown unit "{unit}" of time; known are {", ".join(_TIMES)}.')
-    return _TIMES[name]
+    if name not in _TIME_UNITS:
+        raise FileFormatError(f'{where}: unknown unit "{unit}" of time; known are {", ".join(_TIME_UNITS)}.')
+    return _TIME_UNITS[name]
 
 
 def is_electrical(unit: str) -> bool:

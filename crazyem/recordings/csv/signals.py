@@ -17,9 +17,9 @@ from crazyem.signals.sample import SIGNALS
 
 Array = NDArray[np.float64]
 _HARMLESS_SHARE = 0.05  # of rows drawn across lost packets
-_CHUNK = 1 << 16  # rows turned together, to bound memory
-_HALF = math.sqrt(0.5)
-_NED_TO_ENU = (_HALF, _HALF, 0.0, 0.0)  # x y z w: half a turn about the bisector of north and east
+_CHUNK_ROWS = 1 << 16  # rows turned together, to bound memory
+_SQRT_HALF = math.sqrt(0.5)
+_NED_TO_ENU = (_SQRT_HALF, _SQRT_HALF, 0.0, 0.0)  # x y z w: half a turn about the bisector of north and east
 _FLU_TO_FRD = (1.0, 0.0, 0.0, 0.0)  # half a turn about x
 
 
@@ -297,8 +297,8 @@ def _rotated(quaternion: Array, vector: Array, *, inverse: bool) -> Array:
     """(n, 3) vectors turned by (n, 4) quaternions of any length but 0 (NaN for that), x y z w, or turned back."""
     sign = -1.0 if inverse else 1.0
     turned = np.empty_like(vector)
-    for start in range(0, len(vector), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for start in range(0, len(vector), _CHUNK_ROWS):
+        part = slice(start, start + _CHUNK_ROWS)
         unit = quaternion[part] / np.linalg.norm(quaternion[part], axis=1, keepdims=True)
         axis, scalar = sign * unit[:, :3], unit[:, 3:]
         side = 2.0 * np.cross(axis, vector[part])

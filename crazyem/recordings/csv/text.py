@@ -26,12 +26,12 @@ BLOCK_BYTES = 4 << 20
 LONGEST_LINE = 1 << 20  # bytes
 MOST_COLUMNS = 4096
 LARGEST_RATIO = 200  # of text to gzip; flights reach 20, constant columns 100
-_SMALL = 64 << 20  # bytes of text below which no ratio is held against a file
-_SNIFFED = 100  # lines looked at to tell numbers from words
+_SMALL_TEXT = 64 << 20  # bytes of text below which no ratio is held against a file
+_SNIFFED_LINES = 100  # lines looked at to tell numbers from words
 _DELIMITERS = (",", ";", "\t")
-_NOTHING = ("", "nan", "null", "none", "na", "n/a", "#n/a")
-_NULLS = sorted({form for n in _NOTHING for form in (n, n.upper(), n.capitalize())} | {"NaN"})
-_WORDS = {"true": 1.0, "false": 0.0}
+_MISSING_WORDS = ("", "nan", "null", "none", "na", "n/a", "#n/a")
+_NULLS = sorted({form for n in _MISSING_WORDS for form in (n, n.upper(), n.capitalize())} | {"NaN"})
+_BOOLEAN_WORDS = {"true": 1.0, "false": 0.0}
 
 Columns = dict[int, NDArray[np.float64]]
 
@@ -83,7 +83,7 @@ class Header:
     hollow: frozenset[int]
 
 
-def split_header(line: str) -> tuple[list[str], str]:
+def parse_header_line(line: str) -> tuple[list[str], str]:
     """Names in a header line, and their delimiter: the most frequent of comma, semicolon and tab."""
     delimiter = max(_DELIMITERS, key=line.count)
     try:
@@ -98,14 +98,14 @@ def read_header(path: Path) -> Header:
     block = next(text_blocks(path, Damage(), size=LONGEST_LINE), b"")
     if not block:
         raise FileFormatError(f"{path}: there is a header but not a single sample.")
-    lines = block.split(b"\n", _SNIFFED + 1)
+    lines = block.split(b"\n", _SNIFFED_LINES + 1)
     try:
-        given, delimiter = split_header(lines[0].decode("utf-8-sig"))
+        given, delimiter = parse_header_line(lines[0].decode("utf-8-sig"))
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{path} is not a text file (byte {error.start} is not UTF-8).") from error
     if len(given) > MOST_COLUMNS:
         raise FileFormatError(f"{path}: the header has {len(given)} columns, more than {MOST_COLUMNS}.")
-    rows = [split_fields(line, delimiter) for line in lines[1:-1] if line.strip()]
+    rows = [parse_fields(line, delimiter) for line in lines[1:-1] if line.strip()]
     rows = [row for row in rows if len(row) == len(given)]
     texts = [text for row in rows for text in row]
     comma = delimiter == ";" and any("," in t for t in texts) and not any("." in t for t in texts)
@@ -113,11 +113,11 @@ def read_header(path: Path) -> Header:
     words, flags, hollow = set(), set(), set()
     for column, name in enumerate(given):
         values = [row[column].strip() for row in rows]
-        values = [v for v in values if v.lower() not in _NOTHING]
+        values = [v for v in values if v.lower() not in _MISSING_WORDS]
         bad = sum(not _is_number(v, decimal) for v in values)
         if 2 * bad > len(values):
             words.add(column)
-        elif values and all(v.lower() in _WORDS for v in values):
+        elif values and all(v.lower() in _BOOLEAN_WORDS for v in values):
             flags.add(column)
         elif not values and not name:
             hollow.add(column)
@@ -177,7 +177,7 @@ def text_blocks(path: Path, damage: Damage, size: int = BLOCK_BYTES) -> Iterator
                 chunk, ended = _chunk(source, size, packed)
                 damage.cut_gzip |= ended
                 total += len(chunk)
-                if packed and total > _SMALL and total > LARGEST_RATIO * raw.tell():
+                if packed and total > _SMALL_TEXT and total > LARGEST_RATIO * raw.tell():
                     raise FileFormatError(
                         f"{path}: the gzip file unpacks to more than {LARGEST_RATIO} times its size; it is not read."
                     )
@@ -277,7 +277,7 @@ def _careful(
     for number, raw in enumerate(block.split(b"\n")[:-1], start=line):
         if not raw.strip():
             continue
-        fields = split_fields(raw, header.delimiter)
+        fields = parse_fields(raw, header.delimiter)
         if len(fields) != len(header.names):
             damage.drop(number, f"line {number} has {len(fields)} fields, the header has {len(header.names)}")
             continue
@@ -307,10 +307,10 @@ def to_number(text: str, decimal: str = ".") -> float:
     """A field as a double: NaN for nothing and for "NaN", 1 and 0 for true and false. Raises ValueError."""
     text = text.strip()
     low = text.lower()
-    if low in _NOTHING:
+    if low in _MISSING_WORDS:
         return math.nan
-    if low in _WORDS:
-        return _WORDS[low]
+    if low in _BOOLEAN_WORDS:
+        return _BOOLEAN_WORDS[low]
     if "_" in text or (decimal != "." and "." in text):
         raise ValueError(text)
     return float(text.replace(decimal, "."))
@@ -324,7 +324,7 @@ def _is_number(text: str, decimal: str) -> bool:
     return True
 
 
-def split_fields(line: bytes, delimiter: str) -> list[str]:
+def parse_fields(line: bytes, delimiter: str) -> list[str]:
     """Fields of one line without its end; [] if its quotes make no sense."""
     text = line.decode("utf-8", "replace").rstrip("\r")
     if '"' not in text:

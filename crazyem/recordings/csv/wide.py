@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
-from crazyem.recordings.csv.interpolation import CONTEXT
+from crazyem.recordings.csv.interpolation import CONTEXT_ROWS
 from crazyem.recordings.csv.mapping import CsvMapping, SignalColumns
 from crazyem.recordings.csv.signals import Layout, Rows, signals_of
 from crazyem.recordings.csv.text import Columns, Damage, Header, read_columns
@@ -113,7 +113,7 @@ def read_wide_parts(
         )
         number += rows
         end = lead + rows
-        before = {c: window[c][max(0, end - CONTEXT) : end].copy() for c in window}
+        before = {c: window[c][max(0, end - CONTEXT_ROWS) : end].copy() for c in window}
 
 
 def _parts(plan: _Plan, damage: Damage, seconds: float) -> Iterator[tuple[Columns, Columns, bool]]:
@@ -122,29 +122,29 @@ def _parts(plan: _Plan, damage: Damage, seconds: float) -> Iterator[tuple[Column
     number = 0
     for block in read_columns(plan.path, plan.header, plan.needed, plan.wanted, damage, stamp=plan.stamp):
         held.add(block)
-        while held.rows > CONTEXT:
+        while held.rows > CONTEXT_ROWS:
             cut = _cut(plan, held, number, seconds)
             if cut is None:
                 break
-            part, rest = _split(held.joined(), cut)
+            part, rest = _cut_columns(held.joined(), cut)
             number += cut
             held = _Held()
             held.add(rest)
-            yield part, {c: v[:CONTEXT] for c, v in rest.items()}, False
+            yield part, {c: v[:CONTEXT_ROWS] for c, v in rest.items()}, False
     if not held.rows and not number:
         raise FileFormatError(f"{plan.path}: there is a header but not a single sample.")
     if held.rows:
         # what was kept back may be several parts, since neighbours were waited for
         while (cut := _cut(plan, held, number, seconds, neighbours=1)) is not None:
-            part, rest = _split(held.joined(), cut)
+            part, rest = _cut_columns(held.joined(), cut)
             number += cut
             held = _Held()
             held.add(rest)
-            yield part, {c: v[:CONTEXT] for c, v in rest.items()}, False
+            yield part, {c: v[:CONTEXT_ROWS] for c, v in rest.items()}, False
         yield held.joined(), {}, True
 
 
-def _cut(plan: _Plan, held: _Held, number: int, seconds: float, neighbours: int = CONTEXT) -> int | None:
+def _cut(plan: _Plan, held: _Held, number: int, seconds: float, neighbours: int = CONTEXT_ROWS) -> int | None:
     """Rows that make the next part, None if it is not complete yet."""
     stamp = _stamps(plan, held.joined(), held.rows, number)
     late = stamp >= stamp[0] + seconds
@@ -152,7 +152,7 @@ def _cut(plan: _Plan, held: _Held, number: int, seconds: float, neighbours: int 
     return cut if cut + neighbours <= held.rows else None
 
 
-def _split(columns: Columns, cut: int) -> tuple[Columns, Columns]:
+def _cut_columns(columns: Columns, cut: int) -> tuple[Columns, Columns]:
     return {c: v[:cut] for c, v in columns.items()}, {c: v[cut:].copy() for c, v in columns.items()}
 
 

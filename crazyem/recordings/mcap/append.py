@@ -14,7 +14,7 @@ from mcap.records import MetadataIndex, Schema
 from crazyem.errors import FileFormatError
 from crazyem.recordings.mcap.messages import PROFILE
 from crazyem.recordings.mcap.output import Book, index_record, note_chunk
-from crazyem.recordings.mcap.scan import DATA_END, HEAD, MAGIC, MESSAGE_INDEX, METADATA, Loss, Problem
+from crazyem.recordings.mcap.scan import DATA_END, HEAD, MCAP_MAGIC, MESSAGE_INDEX, METADATA, Loss, Problem
 from crazyem.recordings.mcap.survey import Part, index_of, parse, parts, profile_of
 
 
@@ -46,7 +46,7 @@ def reopen(path: Path) -> Continued:
         if profile_of(head.read(4096)) != PROFILE:
             raise FileFormatError(f"{path} is not a recording of crazyem and cannot be continued.")
     problems: list[Problem] = []
-    found = _Found(Book(), len(MAGIC))
+    found = _Found(Book(), len(MCAP_MAGIC))
     for part in parts(path, problems):
         if part.record.opcode == DATA_END:
             break

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from crazyem.recordings.mcap import scan as mcap_scan
 from crazyem.recordings.mcap import schemas
-from crazyem.recordings.mcap.messages import EVENTS, OTHER_EVENTS, fields_of
+from crazyem.recordings.mcap.messages import EVENT_TOPICS, OTHER_EVENT_TOPIC, fields_of
 from crazyem.recordings.mcap.stream_codec import (
     MOST_FIELDS,
     MOST_SIGNALS,
@@ -23,8 +23,8 @@ from crazyem.recordings.recording import Event, SignalArray
 from crazyem.recordings.tables import Table
 from crazyem.signals.packet import Block
 
-_STEP = MOST_SIGNALS + 1  # places in the processing order for each message of a stream
-_KINDS = {schema: kind for kind, (_, schema) in EVENTS.items()}
+_PLACES_PER_MESSAGE = MOST_SIGNALS + 1  # places in the processing order for each message of a stream
+_KINDS = {schema: kind for kind, (_, schema) in EVENT_TOPICS.items()}
 
 
 class _Rows:
@@ -111,7 +111,7 @@ class _StreamChannel:
     def signals(self) -> list[tuple[int, str, SignalArray]]:
         """Index, name and array of each signal."""
         arrays, place = self.rows.take()
-        place *= _STEP
+        place *= _PLACES_PER_MESSAGE
         fixed, values = [a[:, 0] for a in arrays[: self.layout.first]], arrays[self.layout.first :]
         back = np.argsort(fixed[3], kind="stable") if self.layout.rows else slice(None)
         time, host_time, marked = (column[back] for column in fixed[:3])
@@ -203,9 +203,9 @@ class Content:
                 expected = self._expected.get(record.id, 0)
                 groups = [*(1 for _ in range(layout.first)), *(s.width for s in layout.signals)]
                 self._streams[record.id] = _StreamChannel(layout, _Rows(layout.messages, groups, expected))
-            elif name in _KINDS and record.topic == EVENTS[_KINDS[name]][0]:
+            elif name in _KINDS and record.topic == EVENT_TOPICS[_KINDS[name]][0]:
                 self._kinds[record.id] = (_KINDS[name], schemas.message_class(name))
-            elif name == OTHER_EVENTS[1]:
+            elif name == OTHER_EVENT_TOPIC[1]:
                 self._kinds[record.id] = ("", schemas.message_class(name))
         except (ValueError, KeyError, TypeError, RecursionError):
             self.unreadable += 1

@@ -7,22 +7,22 @@ from pathlib import Path
 from crazyem.errors import FileFormatError
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.mcap.content import Content, join
-from crazyem.recordings.mcap.findings import OWN_METADATA, finding_of, findings_from_json
+from crazyem.recordings.mcap.findings import IMPORT_METADATA, finding_of, findings_from_json
 from crazyem.recordings.mcap.messages import PROFILE
-from crazyem.recordings.mcap.scan import MAGIC, Loss, Problem
+from crazyem.recordings.mcap.scan import MCAP_MAGIC, Loss, Problem
 from crazyem.recordings.mcap.survey import Part, from_summary, parts, profile_of
 from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.tables import Table, signals_from_tables
 
-_MOST_BYTES = 256 * 1024 * 1024  # unpacked, in one part of `read_parts`, however slowly its clock runs
+_PART_BYTES = 256 * 1024 * 1024  # unpacked, in one part of `read_parts`, however slowly its clock runs
 
 
 def recognises(head: bytes) -> bool:
     """True for MCAP of ours: profile "crazyem", or a damaged header that still says so."""
     profile = profile_of(head)
-    return profile == PROFILE or (profile is None and head.startswith(MAGIC) and b"crazyem" in head[:128])
+    return profile == PROFILE or (profile is None and head.startswith(MCAP_MAGIC) and b"crazyem" in head[:128])
 
 
 def read(path: Path, options: ReadOptions) -> Recording:
@@ -60,7 +60,7 @@ def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Itera
         times = part.scan.messages[:, 3]
         begun = int(times[0]) if begun is None else begun
         size += part.scan.data.size
-        if int(times[-1]) - begun >= seconds * 1e9 or size >= _MOST_BYTES:
+        if int(times[-1]) - begun >= seconds * 1e9 or size >= _PART_BYTES:
             yield reading.recording()
             begun, size, first = None, 0, False
     if first:
@@ -103,7 +103,7 @@ class _Reading:
 
     def check(self) -> None:
         """Raise FileFormatError if there is nothing in the file that could make a recording."""
-        if not self.content.empty or OWN_METADATA in self.content.metadata:
+        if not self.content.empty or IMPORT_METADATA in self.content.metadata:
             return
         what = "it holds no log blocks"
         if self.problems:
@@ -114,7 +114,7 @@ class _Reading:
 
     def recording(self) -> Recording:
         """What has been taken since the last one."""
-        own = self.content.metadata.get(OWN_METADATA)
+        own = self.content.metadata.get(IMPORT_METADATA)
         sessions = self.content.tables()
         signals = self._signals(sessions)
         signals.update(self.content.streams())
@@ -122,7 +122,7 @@ class _Reading:
         if not self._samples and own is None:
             raise FileFormatError(f"{self.path} is a recording without a single sample.")
         events, self.content.events = tuple(self.content.events), []
-        metadata = {name: entries for name, entries in self.content.metadata.items() if name != OWN_METADATA}
+        metadata = {name: entries for name, entries in self.content.metadata.items() if name != IMPORT_METADATA}
         metadata.update({name: dict(entries) for name, entries in self._decided.items()})
         origin, source, imported = _imported(own)
         return Recording(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.mcap.scan import Loss, Problem
 
-OWN_METADATA = "crazyem.signals"  # metadata record of an imported recording that is ours, not the source's
+IMPORT_METADATA = "crazyem.signals"  # metadata record of an imported recording that is ours, not the source's
 _MOST_ROWS = 100_000_000  # of a fix; guards against runs that claim anything
 
 

@@ -6,7 +6,7 @@ One for a drone and its recording, one for several drones streamed live: /NAME b
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from crazyem.recordings.mcap.messages import WORLD
+from crazyem.recordings.mcap.messages import WORLD_FRAME
 
 _INERTIA_SHOWN = 6e-5  # kg m^2, top of the axis: intervals of the first second would flatten all that follows
 _COLOURS = ("#4e98e2", "#f5774d", "#6ac27c", "#b678d9")
@@ -197,7 +197,7 @@ def _plot(title: str, paths: list[dict[str, Any]], *, most: float | None = None)
 def _scene() -> dict[str, Any]:
     return {
         "foxglovePanelTitle": "pose",
-        "followTf": WORLD,
+        "followTf": WORLD_FRAME,
         "followMode": "follow-none",
         "cameraState": {
             "perspective": True,
@@ -215,7 +215,7 @@ def _scene() -> dict[str, Any]:
         "transforms": {"frame:world": {"visible": True}, "frame:crazyflie": {"visible": True}},
         "topics": {"/pose": {"visible": True, "type": "axis", "axisScale": 0.2}},
         "layers": {
-            "grid": {"layerId": "foxglove.Grid", "visible": True, "frameId": WORLD, "size": 10, "divisions": 10}
+            "grid": {"layerId": "foxglove.Grid", "visible": True, "frameId": WORLD_FRAME, "size": 10, "divisions": 10}
         },
         "publish": {},
         "imageMode": {},

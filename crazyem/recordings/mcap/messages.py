@@ -5,11 +5,11 @@ from typing import Any
 
 PROFILE = "crazyem"
 FORMAT_VERSION = "1"
-WORLD, BODY = "world", "crazyflie"
-POSE_EVERY = 0.04  # s between poses, which are for viewers only
+WORLD_FRAME, BODY_FRAME = "world", "crazyflie"
+POSE_PERIOD = 0.04  # s between poses, which are for viewers only
 
 # kind of event -> topic, schema
-EVENTS: dict[str, tuple[str, str]] = {
+EVENT_TOPICS: dict[str, tuple[str, str]] = {
     "setpoint": ("/setpoint", "crazyem.Setpoint"),
     "parameter_write": ("/parameter_write", "crazyem.ParameterWrite"),
     "estimate": ("/estimate", "crazyem.Estimate"),
@@ -17,9 +17,9 @@ EVENTS: dict[str, tuple[str, str]] = {
     "link": ("/link", "crazyem.Link"),
     "residual": ("/residual", "crazyem.Residual"),
 }
-OTHER_EVENTS = ("/other_events", "crazyem.Event")
-FINDINGS = "/findings"
-FRAMES = "/mavlink"  # frames as they came, message encoding "mavlink"; for other programs, never read back
+OTHER_EVENT_TOPIC = ("/other_events", "crazyem.Event")
+FINDINGS_TOPIC = "/findings"
+FRAMES_TOPIC = "/mavlink"  # frames as they came, message encoding "mavlink"; for other programs, never read back
 
 
 def pose_messages(
@@ -28,9 +28,14 @@ def pose_messages(
     """Topic, schema and fields of a pose (m, quaternion body to world), as viewers want it; time since 1970."""
     stamp = timestamp(nanoseconds)
     pose = {"position": translation, "orientation": rotation}
-    frame = {"parent_frame_id": WORLD, "child_frame_id": BODY, "translation": translation, "rotation": rotation}
+    frame = {
+        "parent_frame_id": WORLD_FRAME,
+        "child_frame_id": BODY_FRAME,
+        "translation": translation,
+        "rotation": rotation,
+    }
     return [
-        ("/pose", "foxglove.PoseInFrame", {"timestamp": stamp, "frame_id": WORLD, "pose": pose}),
+        ("/pose", "foxglove.PoseInFrame", {"timestamp": stamp, "frame_id": WORLD_FRAME, "pose": pose}),
         ("/tf", "foxglove.FrameTransform", {"timestamp": stamp, **frame}),
     ]
 

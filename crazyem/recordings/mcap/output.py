@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.recordings.mcap.scan import HEAD, MAGIC, MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX
+from crazyem.recordings.mcap.scan import HEAD, MCAP_MAGIC, MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX
 
 CHUNK_BYTES = 256 * 1024
 ANNOUNCE_EVERY = 20  # chunks
@@ -72,7 +72,7 @@ class Output:
         """Magic bytes and header of a new file."""
         from mcap.records import Header
 
-        self._stream.write(MAGIC + _bytes(Header(profile, library)))
+        self._stream.write(MCAP_MAGIC + _bytes(Header(profile, library)))
 
     # --- announcements ------------------------------------------------------------------------------------------
 
@@ -232,7 +232,7 @@ class Output:
 
         self.flush()
         self._stream.write(_bytes(DataEnd(0)))
-        self._stream.write(_summary(self.book, self._stream.tell()) + MAGIC)
+        self._stream.write(_summary(self.book, self._stream.tell()) + MCAP_MAGIC)
         self._stream.flush()
 
 

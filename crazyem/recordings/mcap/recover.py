@@ -13,7 +13,7 @@ from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings.mcap import scan as mcap_scan
 from crazyem.recordings.mcap.messages import PROFILE
 from crazyem.recordings.mcap.output import Output
-from crazyem.recordings.mcap.scan import HEAD, MAGIC, Loss, Problem, Scan
+from crazyem.recordings.mcap.scan import HEAD, MCAP_MAGIC, Loss, Problem, Scan
 from crazyem.recordings.mcap.survey import Part, from_summary, index_of, parse, parts, profile_of
 
 
@@ -88,7 +88,7 @@ def recover(source: str | Path, target: str | Path, *, replace: bool = False) ->
     try:
         with source.open("rb") as stream:
             head = stream.read(4096)
-        if not head.startswith(MAGIC):
+        if not head.startswith(MCAP_MAGIC):
             raise FileFormatError(f"{source} is not an MCAP file.")
         handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
         with os.fdopen(handle, "wb") as stream:

@@ -16,10 +16,10 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-MAGIC = b"\x89MCAP0\r\n"
+MCAP_MAGIC = b"\x89MCAP0\r\n"
 LARGEST_CHUNK = 64 * 1024 * 1024  # bytes unpacked; ours have a quarter MiB, a damaged length claims anything
 LARGEST_RECORD = 64 * 1024 * 1024  # bytes of any record but chunks and attachments
-OTHERS = 100_000  # schemas and channels in one chunk; no sound file has more
+MOST_DEFINITIONS = 100_000  # schemas and channels in one chunk; no sound file has more
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 1, 2, 3, 4, 5, 6, 7
 CHUNK_INDEX, ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX = 8, 9, 10, 11, 12, 13
@@ -28,7 +28,7 @@ SUMMARY_OFFSET, DATA_END = 14, 15
 HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, unpacked size, CRC, length of the compression's name
-_WINDOW = 1024 * 1024
+_WINDOW_BYTES = 1024 * 1024
 # where a chunk may begin: opcode, length, times, size, CRC, compression, length of what follows
 _CHUNK_START = re.compile(rb"(?s)\x06(?=.{36}(?:\x04\0\0\0zstd|\x03\0\0\0lz4|\0\0\0\0).{8})")
 
@@ -98,12 +98,12 @@ def records(stream: BinaryIO, problems: list[Problem]) -> Iterator[Record]:
     Chunks are checked for consistent lengths only; `unpack` checks the rest.
     """
     size = stream.seek(0, 2)
-    offset = len(MAGIC)
+    offset = len(MCAP_MAGIC)
     closed = False
     while offset < size:
         stream.seek(offset)
         head = stream.read(HEAD.size)
-        if closed and head[: len(MAGIC)] == MAGIC and size - offset == len(MAGIC):
+        if closed and head[: len(MCAP_MAGIC)] == MCAP_MAGIC and size - offset == len(MCAP_MAGIC):
             return
         opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (head[0], size)
         end = offset + HEAD.size + length
@@ -178,7 +178,7 @@ def _next_chunk(stream: BinaryIO, offset: int, size: int) -> int | None:
     overlap = 64
     while offset < size:
         stream.seek(offset)
-        window = stream.read(_WINDOW + overlap)
+        window = stream.read(_WINDOW_BYTES + overlap)
         for match in _CHUNK_START.finditer(window):
             at = match.start()
             length = int.from_bytes(window[at + 1 : at + 9], "little")
@@ -186,7 +186,7 @@ def _next_chunk(stream: BinaryIO, offset: int, size: int) -> int | None:
             inner = int.from_bytes(window[at + 41 + name : at + 49 + name], "little")
             if length == _CHUNK_HEAD.size + name + 8 + inner and offset + at + HEAD.size + length <= size:
                 return offset + at
-        offset += _WINDOW
+        offset += _WINDOW_BYTES
     return None
 
 
@@ -257,7 +257,7 @@ def scan(data: bytes) -> Scan:
 
     array = np.frombuffer(data, np.uint8)
     counts = np.zeros(2, np.int64)
-    if count(array, counts) < 0 or counts[1] > OTHERS:
+    if count(array, counts) < 0 or counts[1] > MOST_DEFINITIONS:
         raise ValueError("the records in a chunk make no sense")
     messages = np.empty((counts[0], 6), np.int64)
     others = np.empty((counts[1], 3), np.int64)

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from crazyem.errors import UsageError
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.mcap import schemas
-from crazyem.recordings.mcap.findings import OWN_METADATA, findings_to_json
+from crazyem.recordings.mcap.findings import IMPORT_METADATA, findings_to_json
 from crazyem.recordings.mcap.messages import (
-    EVENTS,
-    FINDINGS,
-    OTHER_EVENTS,
-    POSE_EVERY,
+    EVENT_TOPICS,
+    FINDINGS_TOPIC,
+    OTHER_EVENT_TOPIC,
+    POSE_PERIOD,
     PROFILE,
     fields_of,
     pose_messages,
@@ -35,8 +35,8 @@ from crazyem.recordings.mcap.scan import MESSAGE, MESSAGE_HEAD
 from crazyem.recordings.mcap.stream_codec import MOST_FIELDS, MOST_SIGNALS, Column, StreamLayout, unique_name
 from crazyem.recordings.recording import Event, Recording, SignalArray
 
-_EPOCH = (9.0e8, 4.2e9)  # s: stamps between 1998 and 2103 are taken for times since 1970
-_LEVELS = {Grade.HARMLESS: 2, Grade.DEGRADES: 3, Grade.UNUSABLE: 4}  # of foxglove.Log
+_EPOCH_RANGE = (9.0e8, 4.2e9)  # s: stamps between 1998 and 2103 are taken for times since 1970
+_LOG_LEVELS = {Grade.HARMLESS: 2, Grade.DEGRADES: 3, Grade.UNUSABLE: 4}  # of foxglove.Log
 
 
 def write_recording(
@@ -96,7 +96,7 @@ def _write(recording: Recording, output: Output, metadata: Mapping[str, Mapping[
         "path": recording.path,
         "findings": findings_to_json(recording.findings),
     }
-    output.metadata(OWN_METADATA, own)
+    output.metadata(IMPORT_METADATA, own)
     for section, entries in metadata.items():
         output.metadata(section, entries)
     ranks = _ranks(recording.signals)
@@ -227,7 +227,7 @@ class _Clock:
         times = [s.arrays[0].time for s in streams if s.arrays[0].time.size]
         least = min((float(np.nanmin(t)) for t in times if np.isfinite(t).any()), default=0.0)
         self.host_known = any(np.isfinite(s.arrays[0].host_time).any() for s in streams)
-        epoch = _EPOCH[0] <= least + recording.origin <= _EPOCH[1]
+        epoch = _EPOCH_RANGE[0] <= least + recording.origin <= _EPOCH_RANGE[1]
         self.shift = recording.origin if epoch else -min(least, 0.0)
 
     def of(self, time: NDArray[np.float64], host_time: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -359,7 +359,7 @@ def _poses(output: Output, recording: Recording, ranks: Mapping[str, NDArray[np.
     extras, newest = [], -math.inf
     for row in np.argsort(ranks["position"]).tolist():
         time = float(position.time[row])
-        if not abs(time - newest) >= POSE_EVERY:
+        if not abs(time - newest) >= POSE_PERIOD:
             continue
         # the attitude known by then; the sample after the position if it was taken at the same time
         at = int(np.searchsorted(known, ranks["position"][row] + 1, side="right")) - 1
@@ -383,21 +383,21 @@ def _events(output: Output, recording: Recording, clock: _Clock) -> list[_Extra]
     for event in recording.events:
         found = _native(event)
         if found is None:
-            topic, schema = OTHER_EVENTS
+            topic, schema = OTHER_EVENT_TOPIC
             fields = {"time": event.time, "kind": event.kind, "json": json.dumps(dict(event.data), default=str)}
             found = topic, schema, schemas.message_class(schema)(**fields).SerializeToString()
         topic, schema, data = found
         stamp = _nanoseconds(event.time)
-        shown = stamp if clock.host_known or clock.shift > _EPOCH[0] else 0
+        shown = stamp if clock.host_known or clock.shift > _EPOCH_RANGE[0] else 0
         extras.append(_Extra(_channel(output, topic, schema), data, log_time=shown, publish=max(stamp, 0)))
     return extras
 
 
 def _native(event: Event) -> tuple[str, str, bytes] | None:
     """The event as a message of its own kind, None if that would lose anything of it."""
-    if event.kind not in EVENTS or _nanoseconds(event.time) / 10**9 != event.time:
+    if event.kind not in EVENT_TOPICS or _nanoseconds(event.time) / 10**9 != event.time:
         return None
-    topic, schema = EVENTS[event.kind]
+    topic, schema = EVENT_TOPICS[event.kind]
     message = schemas.message_class(schema)
     try:
         data = message(**event.data).SerializeToString()
@@ -416,9 +416,14 @@ def _notes(output: Output, recording: Recording) -> list[_Extra]:
     """Findings as log lines, for viewers; they are read back from the metadata."""
     extras = []
     for finding in recording.findings:
-        fields = {"timestamp": {}, "level": _LEVELS[finding.grade], "message": _line(finding), "name": finding.check}
+        fields = {
+            "timestamp": {},
+            "level": _LOG_LEVELS[finding.grade],
+            "message": _line(finding),
+            "name": finding.check,
+        }
         data = schemas.message_class("foxglove.Log")(**fields).SerializeToString()
-        extras.append(_Extra(_channel(output, FINDINGS, "foxglove.Log"), data, log_time=0))
+        extras.append(_Extra(_channel(output, FINDINGS_TOPIC, "foxglove.Log"), data, log_time=0))
     return extras
 
 

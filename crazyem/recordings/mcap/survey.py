@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings.mcap import scan as mcap_scan
-from crazyem.recordings.mcap.scan import HEAD, MAGIC, MESSAGE_HEAD, Loss, PackedChunk, Problem, Record, Scan
+from crazyem.recordings.mcap.scan import HEAD, MCAP_MAGIC, MESSAGE_HEAD, Loss, PackedChunk, Problem, Record, Scan
 
-RATIO = 100  # a file that unpacks to more than this many times its size (and 64 MiB) is a bomb; flights have 2 to 5
-_BATCH = 256 * 1024  # bytes of records outside chunks that are looked at together
+# a file that unpacks to more than this many times its size (and 64 MiB) is a bomb; flights have 2 to 5
+LARGEST_UNPACKED_RATIO = 100
+_BATCH_BYTES = 256 * 1024  # bytes of records outside chunks that are looked at together
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +46,7 @@ def parts(path: Path, problems: list[Problem], *, limit: int = mcap_scan.LARGEST
     """
     try:
         with path.open("rb") as stream:
-            most = mcap_scan.LARGEST_CHUNK + RATIO * path.stat().st_size
+            most = mcap_scan.LARGEST_CHUNK + LARGEST_UNPACKED_RATIO * path.stat().st_size
             yield from _parts(path, stream, problems, limit, most)
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
@@ -58,7 +59,7 @@ def _parts(path: Path, stream: BinaryIO, problems: list[Problem], limit: int, mo
         if record.opcode in (mcap_scan.SCHEMA, mcap_scan.CHANNEL, mcap_scan.MESSAGE):
             loose.append(record)
             waiting += record.end - record.offset
-            if waiting < _BATCH:
+            if waiting < _BATCH_BYTES:
                 continue
         if loose:
             yield from _loose(loose, problems)
@@ -129,8 +130,8 @@ def parse(opcode: int, data: bytes) -> Any:
 
 def profile_of(head: bytes) -> str | None:
     """The profile in the header record of an MCAP file's first bytes; None if there is none."""
-    start = len(MAGIC) + HEAD.size
-    if not head.startswith(MAGIC) or len(head) < start + 4 or head[len(MAGIC)] != mcap_scan.HEADER:
+    start = len(MCAP_MAGIC) + HEAD.size
+    if not head.startswith(MCAP_MAGIC) or len(head) < start + 4 or head[len(MCAP_MAGIC)] != mcap_scan.HEADER:
         return None
     length = int.from_bytes(head[start : start + 4], "little")
     return head[start + 4 : start + 4 + length].decode("utf-8", "replace") if length < 1024 else None
@@ -138,7 +139,7 @@ def profile_of(head: bytes) -> str | None:
 
 def from_summary(path: Path) -> tuple[list[Any], dict[int, int]]:
     """Schemas and channels that the summary of a file repeats, and the messages of each channel; empty without one."""
-    tail = HEAD.size + 20 + len(MAGIC)
+    tail = HEAD.size + 20 + len(MCAP_MAGIC)
     found: list[Any] = []
     counts: dict[int, int] = {}
     try:
@@ -146,7 +147,7 @@ def from_summary(path: Path) -> tuple[list[Any], dict[int, int]]:
             size = stream.seek(0, 2)
             stream.seek(max(0, size - tail))
             end = stream.read()
-            footer: Any = parse(mcap_scan.FOOTER, end[HEAD.size :]) if end.endswith(MAGIC) else None
+            footer: Any = parse(mcap_scan.FOOTER, end[HEAD.size :]) if end.endswith(MCAP_MAGIC) else None
             start = footer.summary_start if footer is not None else 0
             if not 0 < start <= size - tail or size - start > mcap_scan.LARGEST_RECORD:
                 return [], {}
@@ -163,7 +164,7 @@ def from_summary(path: Path) -> tuple[list[Any], dict[int, int]]:
         if opcode in (mcap_scan.SCHEMA, mcap_scan.CHANNEL) and len(content) == length:
             found.append(parse(opcode, content))
         elif opcode == mcap_scan.STATISTICS and len(content) == length:
-            counts = _counts(content, RATIO * size)
+            counts = _counts(content, LARGEST_UNPACKED_RATIO * size)
         at += HEAD.size + length
     return [record for record in found if record is not None], counts
 

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 from crazyem.errors import UsageError
 from crazyem.links.base import LinkStatistics, ParameterWrite
 from crazyem.recordings.mcap import schemas
-from crazyem.recordings.mcap.messages import EVENTS, FRAMES, POSE_EVERY, PROFILE, pose_messages, timestamp, versions
+from crazyem.recordings.mcap.messages import (
+    EVENT_TOPICS,
+    FRAMES_TOPIC,
+    POSE_PERIOD,
+    PROFILE,
+    pose_messages,
+    timestamp,
+    versions,
+)
 from crazyem.recordings.mcap.output import Output
 from crazyem.signals.packet import Block, Packet
 from crazyem.signals.sample import Sample
@@ -24,7 +32,7 @@ from crazyem.signals.vocabulary import BlockDecoder, decoders
 if TYPE_CHECKING:  # the recorder takes results and does not compute them
     from crazyem.estimation.result import Estimate
 
-FLUSH_EVERY = 0.5  # s
+FLUSH_PERIOD = 0.5  # s
 
 
 class Setpoint(Protocol):
@@ -195,7 +203,7 @@ class RecordingWriter:
     def _run(self) -> None:
         ended = False
         try:
-            due = time.monotonic() + FLUSH_EVERY
+            due = time.monotonic() + FLUSH_PERIOD
             while True:
                 try:
                     item = self._queue.get(timeout=max(0.0, due - time.monotonic()))
@@ -206,7 +214,7 @@ class RecordingWriter:
                 item[0](*item[1])
                 if time.monotonic() >= due:
                     self._flush()
-                    due = time.monotonic() + FLUSH_EVERY
+                    due = time.monotonic() + FLUSH_PERIOD
             ended = True
             self._output.finish()
         except (OSError, ValueError, TypeError) as error:
@@ -261,13 +269,13 @@ class RecordingWriter:
             return
         self._message(known[0], packet.host_time, known[1].encode(packet))
         decoder = self._decoders.get(packet.block)
-        if decoder is not None and packet.firmware_time_ms / 1000.0 - self._pose_time >= POSE_EVERY:
+        if decoder is not None and packet.firmware_time_ms / 1000.0 - self._pose_time >= POSE_PERIOD:
             self._write_pose(decoder.decode(packet))
 
     def _write_frame(self, host_time: float, data: bytes) -> None:
-        if FRAMES not in self._channels:
-            self._channels[FRAMES] = self._output.channel(FRAMES, "mavlink", 0)  # 0: there is no schema
-        self._message(self._channels[FRAMES], host_time, data)
+        if FRAMES_TOPIC not in self._channels:
+            self._channels[FRAMES_TOPIC] = self._output.channel(FRAMES_TOPIC, "mavlink", 0)  # 0: there is no schema
+        self._message(self._channels[FRAMES_TOPIC], host_time, data)
 
     def _write_pose(self, samples: list[Sample]) -> None:
         """foxglove.PoseInFrame and FrameTransform, for the 3D panels of viewers."""
@@ -291,7 +299,7 @@ class RecordingWriter:
         for what in ("position", "velocity", "acceleration"):
             for axis, value in zip("xyz", getattr(reference, what), strict=True):
                 fields[f"{what}_{axis}"] = float(value)
-        self._write(*EVENTS["setpoint"], host_time, fields)
+        self._write(*EVENT_TOPICS["setpoint"], host_time, fields)
 
     def _write_parameter(self, write: ParameterWrite) -> None:
         fields = {
@@ -301,7 +309,7 @@ class RecordingWriter:
             "echoed": math.nan if write.echoed is None else float(write.echoed),
             "verified": write.verified,
         }
-        self._write(*EVENTS["parameter_write"], write.host_time, fields)
+        self._write(*EVENT_TOPICS["parameter_write"], write.host_time, fields)
 
     def _write_estimate(self, host_time: float, estimate: "Estimate") -> None:
         parameters = [
@@ -325,7 +333,7 @@ class RecordingWriter:
             "updates": int(estimate.updates),
             "converged": bool(estimate.converged),
         }
-        self._write(*EVENTS["estimate"], host_time, fields)
+        self._write(*EVENT_TOPICS["estimate"], host_time, fields)
 
     def _write_link(self, host_time: float, statistics: LinkStatistics, latency: float) -> None:
         fields: dict[str, Any] = {
@@ -345,19 +353,19 @@ class RecordingWriter:
             fields["rate"] = received / (host_time - before[0])
             fields["loss"] = lost / (received + lost) if received + lost > 0 else math.nan
         self._link_before = (host_time, statistics.received, statistics.lost)
-        self._write(*EVENTS["link"], host_time, fields)
+        self._write(*EVENT_TOPICS["link"], host_time, fields)
 
     def _write_residual(self, time: float, host_time: float, values: tuple[float, ...], sd: tuple[float, ...]) -> None:
         fields = {"time": float(time), "host_time": host_time}
         names = [f"{w}_{a}" for w in ("position", "velocity", "attitude", "body_rate") for a in "xyz"]
         fields.update(zip(names, values, strict=True))
         fields.update(zip((f"{n}_sd" for n in names), sd, strict=True))
-        self._write(*EVENTS["residual"], host_time, fields)
+        self._write(*EVENT_TOPICS["residual"], host_time, fields)
 
     def _write_event(self, host_time: float, text: str, level: str) -> None:
         stamp = timestamp(_nanoseconds(host_time))
         fields = {"timestamp": stamp, "level": level, "message": text, "name": "crazyem"}
-        self._write(*EVENTS["log"], host_time, fields)
+        self._write(*EVENT_TOPICS["log"], host_time, fields)
 
     def _write(self, topic: str, schema: str, host_time: float, fields: dict[str, Any]) -> None:
         self._message(

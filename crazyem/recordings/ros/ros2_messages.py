@@ -24,19 +24,29 @@ from rosbags.typesys.store import Typestore
 
 LARGEST_MESSAGE = 1 << 16  # bytes; larger ones are images, maps and point clouds
 _LARGEST_DEFINITION = 1 << 18  # characters
-_FIELDS = 2000  # of a message, with all that is nested in it
-_DEEPEST = 16
-_FIXED = 16  # elements of an array of fixed length that become columns; covariances have 36
-_LONGEST = 64  # elements of a sequence that become columns
+_MOST_FIELDS = 2000  # of a message, with all that is nested in it
+_DEEPEST_NESTING = 16
+_LARGEST_FIXED_ARRAY = 16  # elements of an array of fixed length that become columns; covariances have 36
+_LONGEST_SEQUENCE = 64  # elements of a sequence that become columns
 _LINE = re.compile(r"\s*([A-Za-z]\w*(?:/\w+){0,2}(?:<=\d{1,9})?(?:\[(?:<=)?\d{0,9}\])?)\s+([a-z]\w*)\s*(?:[^=\s].*)?$")
 _CONSTANT = re.compile(r"\s*[A-Za-z]\w*(?:<=\d{1,9})?\s+[A-Za-z]\w*\s*=")
 # numbers and their bytes
-_NUMBERS = {"bool": 1, "byte": 1, "char": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4}
-_NUMBERS |= {"float32": 4, "float64": 8, "int64": 8, "uint64": 8}
-_PRIMITIVE = {*_NUMBERS, "string", "wstring"}
+_NUMBER_SIZES = {
+    "bool": 1,
+    "byte": 1,
+    "char": 1,
+    "int8": 1,
+    "uint8": 1,
+    "int16": 2,
+    "uint16": 2,
+    "int32": 4,
+    "uint32": 4,
+}
+_NUMBER_SIZES |= {"float32": 4, "float64": 8, "int64": 8, "uint64": 8}
+_PRIMITIVE = {*_NUMBER_SIZES, "string", "wstring"}
 _TIMES = {"builtin_interfaces/Time": ("sec", "nanosec"), "builtin_interfaces/Duration": ("sec", "nanosec")}
 # what the decoder raises on bytes that are no message of the type
-BROKEN: tuple[type[Exception], ...] = (
+DECODING_ERRORS: tuple[type[Exception], ...] = (
     SerdeError,
     AssertionError,
     ValueError,
@@ -194,11 +204,11 @@ def _check(name: str, spec: _Spec) -> None:
             return counted[kind]
         if kind not in spec:
             raise ValueError(f"its definition does not hold {kind}")
-        if depth > _DEEPEST:
+        if depth > _DEEPEST_NESTING:
             raise ValueError("its definition is nested too deeply")
         steps, size = 1, 0 if spec[kind] else 1
         for base, array, length, _ in spec[kind]:
-            one, bytes_of_one = (1, _NUMBERS.get(base, 4)) if base in _PRIMITIVE else measure(base, depth + 1)
+            one, bytes_of_one = (1, _NUMBER_SIZES.get(base, 4)) if base in _PRIMITIVE else measure(base, depth + 1)
             if array and not length:
                 if base not in _PRIMITIVE and one > 4 * bytes_of_one:
                     raise ValueError("its definition has a sequence of things of hardly any size")
@@ -207,8 +217,8 @@ def _check(name: str, spec: _Spec) -> None:
                 steps, size = steps + 1, size + (0 if base in ("uint8", "byte") else length * bytes_of_one)
             else:
                 steps, size = steps + one * max(length, 1), size + bytes_of_one * max(length, 1)
-            if steps > _FIELDS:
-                raise ValueError(f"its definition has more than {_FIELDS} fields")
+            if steps > _MOST_FIELDS:
+                raise ValueError(f"its definition has more than {_MOST_FIELDS} fields")
         counted[kind] = (steps, size)
         return counted[kind]
 
@@ -229,9 +239,9 @@ def _leaves(
         return
     for base, array, length, name in spec[kind]:
         if array:
-            if base in _NUMBERS and length <= _FIXED:
+            if base in _NUMBER_SIZES and length <= _LARGEST_FIXED_ARRAY:
                 arrays.append((prefix + name, length))
-        elif base in _NUMBERS:
+        elif base in _NUMBER_SIZES:
             scalars.append(prefix + name)
         elif base in _PRIMITIVE:
             strings.append(prefix + name)
@@ -277,7 +287,7 @@ def rows_of(kind: MessageType, messages: Sequence[tuple[int, bytes]], *, keep: b
             row = get_numbers(message)
             parts = get_lists(message)
             stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec if kind.stamped else 0
-        except BROKEN:
+        except DECODING_ERRORS:
             broken += 1
             continue
         if not logs:
@@ -308,7 +318,7 @@ def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple[Any, ...]]:
 
 def _array_columns(name: str, length: int, lists: list[Any]) -> dict[str, NDArray[np.float64]]:
     """A column an element; NaN where a sequence has fewer."""
-    longest = length or min(max((len(x) for x in lists), default=0), _LONGEST)
+    longest = length or min(max((len(x) for x in lists), default=0), _LONGEST_SEQUENCE)
     table = np.full((len(lists), longest), np.nan)
     for i, values in enumerate(lists):
         part = list(values)[:longest]

@@ -19,11 +19,11 @@ from rosbags.rosbag2 import Reader
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.mcap import scan as mcap_scan
-from crazyem.recordings.mcap.scan import HEAD, MAGIC, MESSAGE_HEAD, Loss, Problem
+from crazyem.recordings.mcap.scan import HEAD, MCAP_MAGIC, MESSAGE_HEAD, Loss, Problem
 from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.ros.ros2_messages import LARGEST_MESSAGE, MessageType, message_type, standard_definition
-from crazyem.recordings.ros.rosbag2_signals import ROBOT_TYPES, WORLD_TOPICS, BagTopic, Told, recording_of
+from crazyem.recordings.ros.rosbag2_signals import ROBOT_TYPES, WORLD_TOPICS, BagMapping, BagTopic, recording_of
 from crazyem.recordings.topics import text_of
 
 _PROFILE = b"ros2"
@@ -31,17 +31,17 @@ _SQLITE = b"SQLite format 3\0"
 _METADATA = "metadata.yaml"
 _LARGEST_RATIO = 200  # unpacked bytes a packed byte, beyond the first gibibyte
 _LARGEST_TOTAL = 2 << 30  # bytes of messages that are kept for decoding
-_FILES = 10_000
-_KEYS = {"robot": str, "twist": str, "topics": dict}
+_MOST_FILES = 10_000
+_MAPPING_KEYS = {"robot": str, "twist": str, "topics": dict}
 
 
 def recognises(head: bytes) -> bool:
     """True for MCAP of the profile "ros2" or with its schemas, and for a bag in an SQLite file."""
     if head.startswith(_SQLITE):
         return b"topics" in head and b"messages" in head
-    if not head.startswith(MAGIC):
+    if not head.startswith(MCAP_MAGIC):
         return False
-    start = len(MAGIC) + HEAD.size
+    start = len(MCAP_MAGIC) + HEAD.size
     length = int.from_bytes(head[start : start + 4], "little")
     return head[start + 4 : start + 4 + length] == _PROFILE or b"\x07\0\0\0ros2msg" in head
 
@@ -60,7 +60,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
     Raises: FileFormatError naming the file and what is wrong; UsageError if it must be said which robot is meant.
     """
-    told = _told(options.mapping)
+    mapping = _user_mapping(options.mapping)
     bag = _Bag()
     for file in _files(path):
         if file.is_dir() or _is_sqlite(file):
@@ -69,9 +69,9 @@ def read(path: Path, options: ReadOptions) -> Recording:
             bag.add(file)
     if not any(topic.messages for topic in bag.topics.values()):
         raise FileFormatError(f"{path}: the bag holds no messages that can be read ({bag.why_nothing()}).")
-    robot, others = _robot(path, bag, told)
+    robot, others = _robot(path, bag, mapping)
     chosen = [t for t in bag.topics.values() if t.name in WORLD_TOPICS or _owner(t.name) in (robot, "")]
-    return recording_of(path, chosen, robot, told, options.motor, (*bag.findings(), *others))
+    return recording_of(path, chosen, robot, mapping, options.motor, (*bag.findings(), *others))
 
 
 def _files(path: Path) -> list[Path]:
@@ -82,7 +82,7 @@ def _files(path: Path) -> list[Path]:
         path.glob("*.mcap"), key=lambda p: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", p.name)]
     )
     if names:
-        return names[:_FILES]
+        return names[:_MOST_FILES]
     if any(path.glob("*.zstd")):
         raise FileFormatError(f"{path}: the files of the bag are compressed as a whole; unpack them with zstd -d.")
     if any(path.glob("*.db3")):
@@ -283,16 +283,16 @@ def _owner(topic: str) -> str:
     return parts[0] if len(parts) > 1 else ""
 
 
-def _robot(path: Path, bag: _Bag, told: Told) -> tuple[str, list[Finding]]:
+def _robot(path: Path, bag: _Bag, mapping: BagMapping) -> tuple[str, list[Finding]]:
     """The robot to read: the only one, or the one that the user named."""
     owners = sorted(
         {_owner(t.name) for t in bag.topics.values() if t.messages and t.kind.name in ROBOT_TYPES} - {"all", ""}
     )
     names = ", ".join(text_of(o) for o in owners[:20])
-    if told.robot is not None:
-        if told.robot not in owners:
-            raise UsageError(f'{path}: there is no robot "{told.robot}" in the bag; there are: {names or "none"}.')
-        return told.robot, []
+    if mapping.robot is not None:
+        if mapping.robot not in owners:
+            raise UsageError(f'{path}: there is no robot "{mapping.robot}" in the bag; there are: {names or "none"}.')
+        return mapping.robot, []
     if len(owners) > 1:
         raise UsageError(
             f"{path}: the bag holds several robots ({names}); say which with a mapping file (--map) "
@@ -301,28 +301,28 @@ def _robot(path: Path, bag: _Bag, told: Told) -> tuple[str, list[Finding]]:
     return (owners[0] if owners else ""), []
 
 
-def _told(mapping: str | None) -> Told:
+def _user_mapping(file: str | None) -> BagMapping:
     """What the user's mapping file says of a bag. Raises UsageError or FileFormatError."""
-    if mapping is None:
-        return Told()
+    if file is None:
+        return BagMapping()
     try:
-        table = tomllib.loads(Path(mapping).read_text(encoding="utf-8"))
+        table = tomllib.loads(Path(file).read_text(encoding="utf-8"))
     except OSError as error:
-        raise UsageError(f"{mapping} cannot be read: {error.strerror or error}.") from error
+        raise UsageError(f"{file} cannot be read: {error.strerror or error}.") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise FileFormatError(f"{mapping}: not valid TOML ({error}).") from error
+        raise FileFormatError(f"{file}: not valid TOML ({error}).") from error
     for key, value in table.items():
-        if key not in _KEYS or not isinstance(value, _KEYS[key]):
+        if key not in _MAPPING_KEYS or not isinstance(value, _MAPPING_KEYS[key]):
             known = "robot and twist (texts) and topics (a table)"
-            raise FileFormatError(f"{mapping}: {key} is not what a mapping for a bag can hold: {known}.")
+            raise FileFormatError(f"{file}: {key} is not what a mapping for a bag can hold: {known}.")
     if table.get("twist", "world") not in ("world", "body"):
-        raise FileFormatError(f'{mapping}: twist must be "world" or "body", not "{table["twist"]}".')
+        raise FileFormatError(f'{file}: twist must be "world" or "body", not "{table["twist"]}".')
     variables: dict[str, tuple[str, ...]] = {}
     for topic, entry in table.get("topics", {}).items():
         names = entry.get("variables") if isinstance(entry, dict) else None
         if not isinstance(names, list) or not all(isinstance(n, str) and n for n in names):
-            raise FileFormatError(f'{mapping}: topics."{topic}".variables must be a list of names.')
+            raise FileFormatError(f'{file}: topics."{topic}".variables must be a list of names.')
         if len(set(names)) < len(names):
-            raise FileFormatError(f'{mapping}: topics."{topic}".variables names a variable twice.')
+            raise FileFormatError(f'{file}: topics."{topic}".variables names a variable twice.')
         variables["/" + topic.strip("/")] = tuple(names)
-    return Told(mapping, table.get("robot"), table.get("twist"), variables)
+    return BagMapping(file, table.get("robot"), table.get("twist"), variables)

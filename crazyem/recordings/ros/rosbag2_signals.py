@@ -19,8 +19,8 @@ from crazyem.recordings.stamps import Fault, finding
 from crazyem.recordings.tables import Table, signals_from_tables
 from crazyem.recordings.topics import Mapped, Topic, ranks, seconds, signals_of, text_of
 
-HOST = "ros"  # the clock of the host's ROS nodes
-FIRMWARE = "firmware"
+HOST_CLOCK = "ros"  # the clock of the host's ROS nodes
+FIRMWARE_CLOCK = "firmware"
 _LOG = "crazyflie_interfaces/LogDataGeneric"
 _STATUS = "crazyflie_interfaces/Status"
 _FULL_STATE = "crazyflie_interfaces/FullState"
@@ -37,7 +37,7 @@ ROBOT_TYPES = {
     "sensor_msgs/Imu",
 }
 WORLD_TOPICS = {"/tf", "/poses"}  # of all robots
-_FLYING = 16  # supervisor.info
+_FLYING_BIT = 16  # supervisor.info
 _NS = 1_000_000_000
 _SAME_EPOCH = 3600 * _NS  # a stamp further from the time of recording is of a simulation or an unset clock
 _XYZ, _XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
@@ -54,7 +54,7 @@ class BagTopic:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class BagMapping:
     """What the user says of a bag: in which file, which robot, the frame of twists, variables by topic."""
 
     file: str | None = None
@@ -71,7 +71,7 @@ class _Decoded:
     rows: Rows
     order: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     time: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
-    clock: str = HOST
+    clock: str = HOST_CLOCK
 
     @cached_property
     def unknown(self) -> NDArray[np.bool_]:
@@ -105,7 +105,12 @@ class _Decoded:
 
 
 def recording_of(
-    path: Path, topics: Sequence[BagTopic], robot: str, told: Told, motor: str | None, findings: tuple[Finding, ...]
+    path: Path,
+    topics: Sequence[BagTopic],
+    robot: str,
+    mapping: BagMapping,
+    motor: str | None,
+    findings: tuple[Finding, ...],
 ) -> Recording:
     """The recording of one robot. Raises FileFormatError where there is nothing or the mapping does not fit."""
     decoded = [d for d in (_decode(topic, robot) for topic in topics) if d is not None]
@@ -115,7 +120,7 @@ def recording_of(
         d.order = order
     origin, clock_notes, clocks = _place(decoded)
     logs = [d for d in decoded if d.topic.kind.name == _LOG]
-    tables, log_notes = _tables(logs, told)
+    tables, log_notes = _tables(logs, mapping)
     meaning = decide(tables, given=motor)
     firmware = signals_from_tables(tables, motor=meaning.meaning) if tables else {}
     named = {table.name for table in tables}
@@ -123,7 +128,7 @@ def recording_of(
     mapped: list[Mapped] = []
     twist_notes: list[Finding] = []
     for d, topic in [(d, t) for d in decoded for t in others if t.name == _label(d)]:
-        mapped += _meaning(d, topic, told, twist_notes)
+        mapped += _meaning(d, topic, mapping, twist_notes)
     if any(d.rows.texts.get("child_frame_id") for d in decoded if d.topic.kind.name == _ODOMETRY) and any(
         d.topic.kind.name.startswith("crazyflie_interfaces/") for d in decoded
     ):
@@ -148,7 +153,7 @@ def recording_of(
             float(d.rows.stamp[d.unknown][0]) / _NS,
         )
         for d in decoded
-        if d.moved and d.clock == HOST
+        if d.moved and d.clock == HOST_CLOCK
     ]
     streams = {fault.stream for fault in faults}
     odd = finding(faults, [name for name, array in signals.items() if array.stream in streams])
@@ -250,15 +255,15 @@ def _unwrap(logs: list[_Decoded]) -> None:
         for i, stamp in zip(order.tolist(), stamps[order].tolist(), strict=True):
             stamps[i] = unwrapper.unwrap(stamp)
     for d, part in zip(logs, np.split(stamps, np.cumsum([d.order.size for d in logs])[:-1]), strict=True):
-        d.time, d.clock = seconds(part, 1e3), FIRMWARE
+        d.time, d.clock = seconds(part, 1e3), FIRMWARE_CLOCK
 
 
-def _tables(logs: list[_Decoded], told: Told) -> tuple[list[Table], list[Finding]]:
+def _tables(logs: list[_Decoded], mapping: BagMapping) -> tuple[list[Table], list[Finding]]:
     """Log blocks whose variables the user named, as tables of firmware variables; a finding for each other one."""
     tables, notes = [], []
     for d in logs:
         values = [c for c in d.rows.columns if c.startswith("values[")]
-        names = told.variables.get(d.topic.name)
+        names = mapping.variables.get(d.topic.name)
         if names is None:
             text = (
                 f"{text_of(d.topic.name)} is a log block of {len(values)} variables; their names are in "
@@ -269,17 +274,17 @@ def _tables(logs: list[_Decoded], told: Told) -> tuple[list[Table], list[Finding
             continue
         if len(names) != len(values):
             raise FileFormatError(
-                f'{told.file}: topics."{d.topic.name}".variables has {len(names)} names, but the messages hold '
+                f'{mapping.file}: topics."{d.topic.name}".variables has {len(names)} names, but the messages hold '
                 f"{len(values)} values."
             )
         columns = {name: d.rows.columns[value] for name, value in zip(names, values, strict=True)}
         host = seconds(d.rows.log, 1e9)
-        tables.append(Table(_label(d), columns, d.time, d.order, host, clock=FIRMWARE))
+        tables.append(Table(_label(d), columns, d.time, d.order, host, clock=FIRMWARE_CLOCK))
     return tables, notes
 
 
 def _topic(d: _Decoded) -> Topic:
-    used = {"timestamp"} if d.clock == FIRMWARE else set()
+    used = {"timestamp"} if d.clock == FIRMWARE_CLOCK else set()
     columns = {name: column for name, column in d.rows.columns.items() if name not in used}
     return Topic(_label(d), columns, d.time, d.order, seconds(d.rows.log, 1e9), d.clock)
 
@@ -298,7 +303,7 @@ def _together(
     }
 
 
-def _meaning(d: _Decoded, topic: Topic, told: Told, notes: list[Finding]) -> Iterator[Mapped]:
+def _meaning(d: _Decoded, topic: Topic, mapping: BagMapping, notes: list[Finding]) -> Iterator[Mapped]:
     """Signals of the vocabulary in a topic, by the type of its messages."""
     match d.topic.kind.name:
         case "geometry_msgs/PoseStamped":
@@ -306,7 +311,7 @@ def _meaning(d: _Decoded, topic: Topic, told: Told, notes: list[Finding]) -> Ite
         case "geometry_msgs/PoseWithCovarianceStamped":
             yield from _pose(topic, "pose.pose.")
         case "nav_msgs/Odometry":
-            yield from _odometry(d, topic, told, notes)
+            yield from _odometry(d, topic, mapping, notes)
         case "sensor_msgs/Imu":
             yield from _columns(topic, "body_rate", "angular_velocity.", _XYZ)
             yield from _columns(topic, "specific_force", "linear_acceleration.", _XYZ)
@@ -317,7 +322,7 @@ def _meaning(d: _Decoded, topic: Topic, told: Told, notes: list[Finding]) -> Ite
             yield from _columns(topic, "voltage", "", ("battery_voltage",))
             info = topic.columns.get("supervisor_info")
             if info is not None:
-                flag = ((np.asarray(info).astype(np.int64) & _FLYING) != 0).astype(float)[:, None]
+                flag = ((np.asarray(info).astype(np.int64) & _FLYING_BIT) != 0).astype(float)[:, None]
                 yield Mapped("flying", topic, flag, ("supervisor_info",))
         case "crazyflie_interfaces/FullState":
             yield from _columns(topic, "setpoint_position", "pose.position.", _XYZ)
@@ -356,19 +361,19 @@ def _pose(topic: Topic, prefix: str) -> Iterator[Mapped]:
     yield from _quaternion(topic, prefix + "orientation.")
 
 
-def _odometry(d: _Decoded, topic: Topic, told: Told, notes: list[Finding]) -> Iterator[Mapped]:
+def _odometry(d: _Decoded, topic: Topic, mapping: BagMapping, notes: list[Finding]) -> Iterator[Mapped]:
     """Pose, velocity in the world, body rate. crazyswarm2's C++ server leaves rates at 0 and the child frame empty."""
     pose = list(_pose(topic, "pose.pose."))
     yield from pose
     attitude = next((m.value for m in pose if m.quantity == "attitude"), None)
     child = d.rows.texts.get("child_frame_id", "")
-    frame = told.twist or ("body" if child else "world")
+    frame = mapping.twist or ("body" if child else "world")
     for m in _columns(topic, "velocity", "twist.twist.linear.", _XYZ):
         if frame == "body" and attitude is None:
             continue
         value = m.value if frame == "world" or attitude is None else rotated(attitude, m.value)
         why = f'its child frame is "{text_of(child)}"' if child else "it has no child frame"
-        why = "as told" if told.twist else why
+        why = "as told" if mapping.twist else why
         text = f"The twist of {text_of(d.topic.name)} is read as in the {frame} frame: {why}."
         advice = 'If that is wrong, say twist = "world" or twist = "body" in a mapping file (--map).'
         notes.append(Finding("mapping", Grade.HARMLESS, text, "velocity", advice=advice))

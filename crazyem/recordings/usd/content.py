@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Event
 from crazyem.recordings.tables import Table
-from crazyem.recordings.usd.format import LETTERS, STAMPS, EventType, Header
+from crazyem.recordings.usd.format import STAMP_TYPES, TYPE_LETTERS, EventType, Header
 
 CRC_BYTES = 4
 _DAMAGE_ADVICE = "Copy the file from the card again; what stands before the place named was read."
@@ -39,7 +39,7 @@ class Clock:
     """Stamps of all records in file order as seconds; 32-bit stamps are continued where they wrap (49.7 days)."""
 
     def __init__(self, header: Header) -> None:
-        self.kind, self.rate = STAMPS[header.version]
+        self.kind, self.rate = STAMP_TYPES[header.version]
         self.wraps = header.version == 1
         self._last: tuple[int, int] | None = None  # the last stamp, as it was and continued
 
@@ -68,7 +68,7 @@ def table(event: EventType, values: NDArray[np.void], time: NDArray[np.float64],
         {name: values[str(i)] for i, name in enumerate(event.variables)},
         time,
         rows.astype(np.int64, copy=False),
-        ctypes={name: LETTERS[letter][1] for name, letter in zip(event.variables, event.letters, strict=True)},
+        ctypes={name: TYPE_LETTERS[letter][1] for name, letter in zip(event.variables, event.letters, strict=True)},
     )
 
 

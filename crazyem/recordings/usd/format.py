@@ -1,9 +1,9 @@
 """The header of a uSD card log: which kinds of records a file holds, and how a record of each kind is laid out.
 
 Little-endian throughout: 0xBC, version u16, number of event types u16, then for each its id u16, its name ending in
-NUL, its number of variables u16 and as many names "group.variable(T)" ending in NUL, T a letter of `LETTERS`. Records
-follow: id u16, time stamp (version 1: u32 ms; version 2, since 2021-03-18: u64 us), packed values. The last 4 bytes are
-the CRC-32 of everything before them. Source: src/deck/drivers/src/usddeck.c of crazyflie-firmware.
+NUL, its number of variables u16 and as many names "group.variable(T)" ending in NUL, T a letter of `TYPE_LETTERS`.
+Records follow: id u16, time stamp (version 1: u32 ms; version 2, since 2021-03-18: u64 us), packed values. The last 4
+bytes are the CRC-32 of everything before them. Source: src/deck/drivers/src/usddeck.c of crazyflie-firmware.
 """
 
 import struct
@@ -13,10 +13,10 @@ import numpy as np
 
 from crazyem.errors import FileFormatError
 
-MAGIC = 0xBC
-VERSIONS = (1, 2)
+USD_MAGIC = 0xBC
+USD_VERSIONS = (1, 2)
 # letter -> (numpy type, C type as the firmware names it)
-LETTERS: dict[str, tuple[str, str]] = {
+TYPE_LETTERS: dict[str, tuple[str, str]] = {
     "B": ("u1", "uint8_t"),
     "b": ("i1", "int8_t"),
     "H": ("<u2", "uint16_t"),
@@ -26,7 +26,7 @@ LETTERS: dict[str, tuple[str, str]] = {
     "f": ("<f4", "float"),
     "e": ("<f2", "FP16"),
 }
-STAMPS = {1: ("<u4", 1e3), 2: ("<u8", 1e6)}  # type of a stamp, and stamps a second
+STAMP_TYPES = {1: ("<u4", 1e3), 2: ("<u8", 1e6)}  # type of a stamp, and stamps a second
 
 # The firmware writes at most 20 event types of at most 20 variables; a damaged count claims anything.
 _MOST_EVENTS = 256
@@ -68,10 +68,10 @@ def parse_header(data: bytes, path: object) -> Header:
     Raises: FileFormatError naming `path` and the byte at which the header stops making sense.
     """
     cursor = _Cursor(data, path)
-    if cursor.u8("magic byte") != MAGIC:
+    if cursor.u8("magic byte") != USD_MAGIC:
         raise FileFormatError(f"{path} does not start with 0xBC, as a uSD card log does.")
     version = cursor.u16("version")
-    if version not in VERSIONS:
+    if version not in USD_VERSIONS:
         raise FileFormatError(f"{path}: uSD card log of version {version}, known are 1 and 2.")
     count = cursor.u16("number of event types")
     if not 0 < count <= _MOST_EVENTS:
@@ -89,7 +89,7 @@ def parse_header(data: bytes, path: object) -> Header:
 
 def plausible(head: bytes) -> bool:
     """True if a file that starts with these bytes claims to be a log, and its first event has a name."""
-    if len(head) < 8 or head[0] != MAGIC:
+    if len(head) < 8 or head[0] != USD_MAGIC:
         return False
     version, count = struct.unpack_from("<HH", head, 1)
     name = head[7 : 7 + _LONGEST_NAME].split(b"\0", 1)[0]
@@ -108,13 +108,13 @@ def _event(cursor: "_Cursor", version: int, taken: set[str]) -> EventType:
         start = cursor.at
         text = cursor.name(f"variable name of {name}")
         variable, letter = text[:-3], text[-2:-1]
-        if text[-3:-2] != "(" or text[-1:] != ")" or letter not in LETTERS:
+        if text[-3:-2] != "(" or text[-1:] != ")" or letter not in TYPE_LETTERS:
             raise FileFormatError(f'{cursor.path}: "{text[:40]}" (byte {start}) is not a variable with a known type.')
         # a variable may be logged twice in one event: two samples, microseconds apart
         variables.append(_unique(variable, set(variables), f"#{len(variables)}"))
         letters.append(letter)
-    fields = [("id", "<u2"), ("stamp", STAMPS[version][0])]
-    fields += [(str(i), LETTERS[letter][0]) for i, letter in enumerate(letters)]
+    fields = [("id", "<u2"), ("stamp", STAMP_TYPES[version][0])]
+    fields += [(str(i), TYPE_LETTERS[letter][0]) for i, letter in enumerate(letters)]
     return EventType(identifier, name, tuple(variables), tuple(letters), np.dtype(fields))
 
 

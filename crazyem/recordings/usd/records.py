@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from crazyem.recordings.usd.format import EventType
 
-BLANK = (b"\xff", b"\x00")  # erased flash; clusters that were set aside and never written
-_STREAK = 16  # records of one kind in a row before a run is guessed
-_WINDOW = 1 << 16  # records compared at once, at most: bounds the memory of a comparison
-_GATHERED = 1 << 22  # bytes copied at once where records of one kind do not lie side by side
+BLANK_BYTES = (b"\xff", b"\x00")  # erased flash; clusters that were set aside and never written
+_RUN_RECORDS = 16  # records of one kind in a row before a run is guessed
+_WINDOW_RECORDS = 1 << 16  # records compared at once, at most: bounds the memory of a comparison
+_GATHERED_BYTES = 1 << 22  # bytes copied at once where records of one kind do not lie side by side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,14 +50,14 @@ def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int) -> 
         if identifier != previous:
             previous, streak = identifier, 0
         streak += 1
-        if streak < _STREAK:
+        if streak < _RUN_RECORDS:
             append(at)
             at += size
             continue
         run = _run(data, at, end, size, int.from_bytes(identifier, "little"))
         start.frombytes(np.arange(at, at + run * size, size, dtype=np.int64).tobytes())
         at += run * size
-        streak = _STREAK - 1 if run == _WINDOW else 0  # a full window: the run may go on
+        streak = _RUN_RECORDS - 1 if run == _WINDOW_RECORDS else 0  # a full window: the run may go on
     starts = np.frombuffer(start, np.int64)
     unknown = int.from_bytes(identifier, "little") if size is None and at + 2 <= end else None
     return Records(starts, _kinds(data, events, starts), at, unknown)
@@ -66,7 +66,7 @@ def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int) -> 
 def blank_from(data: bytes) -> int:
     """Where a run of one and the same byte that nobody wrote (0xFF of erased flash, 0) begins that ends the data."""
     last = data[-1:]
-    return len(data.rstrip(last)) if last in BLANK else len(data)
+    return len(data.rstrip(last)) if last in BLANK_BYTES else len(data)
 
 
 def written(records: Records, blank: int) -> Records:
@@ -90,7 +90,7 @@ def _kinds(data: bytes, events: tuple[EventType, ...], start: NDArray[np.int64])
 
 def _run(data: bytes, at: int, end: int, size: int, identifier: int) -> int:
     """Length of the run of whole records of one kind that starts at `at`, at most a window."""
-    count = min((end - at) // size, _WINDOW)
+    count = min((end - at) // size, _WINDOW_RECORDS)
     same = np.ndarray((count,), "<u2", data, at, (size,)) == identifier
     return count if same.all() else int(np.argmin(same))
 
@@ -102,7 +102,7 @@ def gather(data: bytes, event: EventType, start: NDArray[np.int64]) -> NDArray[n
         return np.frombuffer(data, event.layout, start.size, int(start[0]))
     source = np.frombuffer(data, np.uint8)
     result = np.empty((start.size, size), np.uint8)
-    step = max(1, _GATHERED // (8 * size))
+    step = max(1, _GATHERED_BYTES // (8 * size))
     for first in range(0, start.size, step):
         rows = start[first : first + step]
         result[first : first + step] = source[rows[:, None] + np.arange(size)]

@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings.contents import LARGEST_UNPACKED
 from crazyem.recordings.finding import Finding
-from crazyem.recordings.motor_meaning import MOTORS
+from crazyem.recordings.motor_meaning import MOTOR_VARIABLES
 from crazyem.recordings.tables import Table
 from crazyem.recordings.usd.content import CRC_BYTES, Checksum, Clock, integrity, table
 from crazyem.recordings.usd.format import EventType, Header, parse_header
-from crazyem.recordings.usd.records import BLANK, Records, gather, locate, written
+from crazyem.recordings.usd.records import BLANK_BYTES, Records, gather, locate, written
 
-_PIECE = 1 << 22  # bytes read at a time
+_READ_BYTES = 1 << 22  # bytes read at a time
 _LONGEST_HEADER = 1 << 27  # bytes; what the limits of usd/format.py add up to is less
-_MOST_BYTES = 1 << 26  # of records in a stretch, however slowly its clock runs
-_SAMPLED = 1 << 19  # rows from which is decided what motor.m1..4 is
+_STRETCH_BYTES = 1 << 26  # of records in a stretch, however slowly its clock runs
+_SAMPLED_ROWS = 1 << 19  # rows from which is decided what motor.m1..4 is
 
 Packed = list[NDArray[np.void]]  # records of each kind
 
@@ -47,10 +47,10 @@ class Survey:
         self.counts = [0] * len(self.header.events)
         self.unknown: int | None = None
         self.stop = self.header.size
-        samples = {k: _Sample() for k, e in enumerate(self.header.events) if set(MOTORS) <= set(e.variables)}
+        samples = {k: _Sample() for k, e in enumerate(self.header.events) if set(MOTOR_VARIABLES) <= set(e.variables)}
         tail = b""
         self.size, computed = 0, 0
-        blanks = dict.fromkeys(BLANK, 0)  # where the last other byte ends
+        blanks = dict.fromkeys(BLANK_BYTES, 0)  # where the last other byte ends
         for piece in _pieces(path):
             blanks = {b: self.size + len(r) if (r := piece.rstrip(b)) else at for b, at in blanks.items()}
             self.size += len(piece)
@@ -95,7 +95,7 @@ class _Sample:
         self.kept.append(records[-self.count % self.step :: self.step].copy())
         self.count += records.size
         self.held += self.kept[-1].size
-        while self.held > _SAMPLED:
+        while self.held > _SAMPLED_ROWS:
             self.kept = [np.concatenate(self.kept)[::2].copy()]
             self.held = self.kept[0].size
             self.step *= 2
@@ -144,7 +144,7 @@ def stretches(survey: Survey, seconds: float) -> Iterator[Stretch]:
             held_bytes += sum(p.nbytes for p in held[-1][2])
             at = end
             ends = first + rows == total
-            if late.size or held_bytes >= _MOST_BYTES or ends:
+            if late.size or held_bytes >= _STRETCH_BYTES or ends:
                 yield _joined(header, held, first, ends)
                 first, rows, held, held_bytes = first + rows, 0, [], 0
     if held:  # the file has become shorter meanwhile
@@ -213,7 +213,7 @@ def _pieces(path: Path) -> Iterator[bytes]:
         with path.open("rb") as plain:
             packed = plain.read(2) == b"\x1f\x8b"
         with cast(IO[bytes], gzip.open(path, "rb")) if packed else path.open("rb") as file:
-            while piece := file.read(_PIECE):
+            while piece := file.read(_READ_BYTES):
                 size += len(piece)
                 if packed and size > LARGEST_UNPACKED:
                     most = LARGEST_UNPACKED >> 20
