@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from crazyem.commands.flights import HEIGHT, trajectory_maker
+from crazyem.commands.flights import DEFAULT_HEIGHT, trajectory_maker
 from crazyem.errors import CrazyemError
 from crazyem.estimation.result import Estimate
 from crazyem.links import open_link
@@ -106,7 +106,10 @@ def record(uri: str, *, vehicle_name: str, trajectory: list[str], file: Path, se
     """One flight into `file`; what is known of its quality. Raises CrazyemError when it ended early."""
     vehicle = load_vehicle(vehicle_name)
     plan = FlightPlan(
-        trajectory=trajectory_maker(trajectory, DURATION), controller=controller_named("lee"), height=HEIGHT, push=False
+        trajectory=trajectory_maker(trajectory, DURATION),
+        controller=controller_named("lee"),
+        height=DEFAULT_HEIGHT,
+        push=False,
     )
     with contextlib.ExitStack() as stack:
         link = open_link(uri)

@@ -31,7 +31,7 @@ class LiveLine:
         self.session = session
         self.prefix, self.quiet = prefix, quiet
         self.phase, self.seconds = "connected", 0.0
-        self._told = 0
+        self._steps_said = 0
 
     def __call__(self, phase: str, seconds: float) -> None:
         self.phase, self.seconds = phase, seconds
@@ -40,10 +40,10 @@ class LiveLine:
         history.losses.append((self.session.clock.newest, lost))
         if not self.quiet():
             say(self.prefix + live_line(phase, seconds, self.session.estimate, lost=lost, pushes=len(history.pushes)))
-            self._told = tell_steps(history, self._told, prefix=self.prefix)
+            self._steps_said = say_steps(history, self._steps_said, prefix=self.prefix)
 
 
-def tell_steps(history: History, told: int, *, prefix: str = "") -> int:
+def say_steps(history: History, told: int, *, prefix: str = "") -> int:
     """A line for each step of mass that was decided since `told` of them were; returns how many are told now."""
     for step in history.steps[told:]:
         if step.real is None:

@@ -62,10 +62,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _replace(path: str, text: str) -> None:
     """All or nothing. Raises UsageError if it cannot be written."""
-    beside = Path(f"{path}.part")
+    with_stream = Path(f"{path}.part")
     try:
-        beside.write_text(text, encoding="utf-8")
-        os.replace(beside, path)
+        with_stream.write_text(text, encoding="utf-8")
+        os.replace(with_stream, path)
     except OSError as error:
-        beside.unlink(missing_ok=True)
+        with_stream.unlink(missing_ok=True)
         raise UsageError(f"cannot write {path}: {error.strerror or error}.") from None

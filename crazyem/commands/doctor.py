@@ -9,14 +9,14 @@ from typing import Any
 from crazyem.commands.batch import each, processes
 from crazyem.commands.files import find, read_options, targets
 from crazyem.commands.info import counted
-from crazyem.commands.merged import merge_findings
+from crazyem.commands.merge import merge_findings
 from crazyem.commands.output import Report, Result
 from crazyem.errors import DataError, UsageError
 from crazyem.recordings import Finding, Grade, ReadOptions, Recording, open_recording
 from crazyem.recordings.parts import can_be_parted, is_large, open_parts
 
-_WIDTH = 110
-_SHOWN = 4  # intervals that are written out
+_TEXT_WIDTH = 110
+_SHOWN_INTERVALS = 4  # intervals that are written out
 _WORST_FIRST = (Grade.UNUSABLE, Grade.DEGRADES, Grade.HARMLESS)
 
 
@@ -175,15 +175,15 @@ def _when(finding: Finding) -> str:
     intervals = finding.intervals
     if not intervals:
         return ""
-    shown = ", ".join(f"{a:.3f}" if a == b else f"{a:.3f} to {b:.3f}" for a, b in intervals[:_SHOWN])
-    more = f" and {len(intervals) - _SHOWN} more" if len(intervals) > _SHOWN else ""
+    shown = ", ".join(f"{a:.3f}" if a == b else f"{a:.3f} to {b:.3f}" for a, b in intervals[:_SHOWN_INTERVALS])
+    more = f" and {len(intervals) - _SHOWN_INTERVALS} more" if len(intervals) > _SHOWN_INTERVALS else ""
     return f", at {shown} s{more}"
 
 
 def _wrapped(text: str, indent: str = " " * 12) -> str:
     return textwrap.fill(
         text,
-        _WIDTH,
+        _TEXT_WIDTH,
         initial_indent=indent,
         subsequent_indent=indent + "  ",
         break_long_words=False,

@@ -17,7 +17,7 @@ from crazyem.recordings.registry import READERS, reader_of
 # What the reader of any CSV takes in a folder: text with commas is everywhere, so name and columns must fit (with
 # --map the name alone). A file named by the user is always read.
 _ANY_CSV, _CSV_NAMES = "CSV", (".csv", ".csv.gz", ".tsv", ".tsv.gz")
-_SUFFIXES = (".gz", ".csv", ".tsv", ".txt", ".mcap", ".ulg", ".tlog", ".bin", ".db3")
+_RECORDING_SUFFIXES = (".gz", ".csv", ".tsv", ".txt", ".mcap", ".ulg", ".tlog", ".bin", ".db3")
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +157,7 @@ def _is_recording(path: Path, *, mapped: bool) -> bool:
         reader = reader_of(path)
     except KnownFileError:
         # what stands for a recording should not vanish; pictures may be Git LFS pointers, too
-        return path.name.lower().endswith(_SUFFIXES)
+        return path.name.lower().endswith(_RECORDING_SUFFIXES)
     except FileFormatError:
         # of no known format; but a damaged gzip file called .csv.gz should not vanish without a word
         return path.name.lower().endswith(".csv.gz")
@@ -193,7 +193,7 @@ def stem(path: Path) -> str:
     name = path.name or path.resolve().name
     lower = name.lower()
     while True:
-        suffix = next((s for s in _SUFFIXES if lower.endswith(s) and len(lower) > len(s)), None)
+        suffix = next((s for s in _RECORDING_SUFFIXES if lower.endswith(s) and len(lower) > len(s)), None)
         if suffix is None:
             return name
         name, lower = name[: -len(suffix)], lower[: -len(suffix)]

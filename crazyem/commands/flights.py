@@ -21,8 +21,8 @@ from crazyem.live.policy import load_policy
 from crazyem.live.session import Session
 from crazyem.live.write_supervisor import WriteRules
 
-HEIGHT = 1.0  # m
-SIMPLE = {"hover": hover, "figure8": figure8, "excite": excite}
+DEFAULT_HEIGHT = 1.0  # m
+SIMPLE_TRAJECTORIES = {"hover": hover, "figure8": figure8, "excite": excite}
 
 
 def trajectory_maker(words: list[str], duration: float) -> Callable[[Vector, float], Trajectory]:
@@ -37,16 +37,16 @@ def trajectory_maker(words: list[str], duration: float) -> Callable[[Vector, flo
             raise UsageError("--trajectory waypoints needs one FILE.")
         read_waypoints(rest[0])  # complain before anything is started
         return lambda position, yaw: waypoints(path=rest[0], position=position, yaw=yaw)
-    if name not in SIMPLE or rest:
+    if name not in SIMPLE_TRAJECTORIES or rest:
         raise UsageError(f"unknown trajectory '{' '.join(words)}' (hover, figure8, excite, or waypoints FILE).")
-    make: Any = SIMPLE[name]
+    make: Any = SIMPLE_TRAJECTORIES[name]
     return lambda position, yaw: make(position=position, yaw=yaw, duration=duration)
 
 
 def duration_note(words: list[str], duration: float) -> str:
     """One line where the trajectory of these words takes another time than asked for, "" where it does not."""
-    make: Any = SIMPLE.get(words[0])
-    made = duration if make is None else make(position=(0.0, 0.0, HEIGHT), duration=duration).duration
+    make: Any = SIMPLE_TRAJECTORIES.get(words[0])
+    made = duration if make is None else make(position=(0.0, 0.0, DEFAULT_HEIGHT), duration=duration).duration
     if math.isclose(made, duration):
         return ""
     return f"{words[0]} flies whole periods and ends where it began: {made:g} s instead of {duration:g} s"

@@ -14,8 +14,8 @@ from crazyem.commands.common import (
     report,
     say,
 )
-from crazyem.commands.flights import HEIGHT, duration_note, interrupts, trajectory_maker, write_rules
-from crazyem.commands.view import Everyone, Shown, Streams, landing, live_view, wants_view
+from crazyem.commands.flights import DEFAULT_HEIGHT, duration_note, interrupts, trajectory_maker, write_rules
+from crazyem.commands.view import Streams, SwarmInterrupts, Viewed, landing, live_view, wants_view
 from crazyem.errors import CrazyemError, UsageError
 from crazyem.links import open_link
 from crazyem.live.controllers import controller_named
@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     plan = FlightPlan(
         trajectory=trajectory_maker(arguments.trajectory, arguments.duration),
         controller=controller,
-        height=HEIGHT,
+        height=DEFAULT_HEIGHT,
         push=not arguments.no_push,
         rules=write_rules(arguments),
     )
@@ -81,7 +81,7 @@ def _fly(
     with contextlib.ExitStack() as stack:
         # Outermost, so that even a Ctrl-C while connecting or closing ends in order.
         one = Interrupts()
-        stack.enter_context(interrupts(Everyone([one])))
+        stack.enter_context(interrupts(SwarmInterrupts([one])))
         streams = stack.enter_context(Streams(arguments.foxglove))
         link = open_link(uri)
         stack.callback(link.close)
@@ -103,7 +103,7 @@ def _fly(
         recorder = open_recorder(
             arguments.record, configuration=configuration, vehicle=vehicle, link=link, append=arguments.append
         )
-        recorder = streams.beside(recorder)
+        recorder = streams.with_stream(recorder)
         if recorder is not None:
             stack.callback(recorder.close)
         session = Session(
@@ -118,7 +118,7 @@ def _fly(
         stack.callback(session.close)
         session.history.notice(folding.notice(left_out))
         line = LiveLine(session)
-        shown = [Shown(session, line, name=vehicle.name, land=landing(one))]
+        shown = [Viewed(session, line, name=vehicle.name, land=landing(one))]
         try:
             session.start()
             with live_view(view, lambda: shown) as line.quiet:

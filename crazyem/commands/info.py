@@ -5,7 +5,7 @@ from pathlib import Path
 
 from crazyem.commands.batch import each, processes
 from crazyem.commands.files import find, read_options
-from crazyem.commands.merged import merge_inventories
+from crazyem.commands.merge import merge_inventories
 from crazyem.commands.output import Report, Result
 from crazyem.physics import folding
 from crazyem.recordings import ReadOptions, open_recording

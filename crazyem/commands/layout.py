@@ -9,7 +9,7 @@ from typing import Any
 from crazyem.commands.output import check_json
 from crazyem.errors import UsageError
 
-NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
+DRONE_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -42,7 +42,7 @@ def _layout(arguments: argparse.Namespace) -> dict[str, Any]:
 
         names = [m.name for m in read_swarm(swarm, vehicle="cf2", trajectory=("hover",))]
     for name in names:
-        if not NAME.fullmatch(name):
+        if not DRONE_NAME.fullmatch(name):
             raise UsageError(f"the name of a drone is 1 to 40 letters, digits, - or _, not {name!r}.")
     if len(set(names)) < len(names):
         raise UsageError("every drone needs a name of its own.")

@@ -9,13 +9,13 @@ from crazyem.errors import UsageError
 from crazyem.links.scan import UDP_PORTS, Interface, scan
 from crazyem.live.summary import check_writable, write_json
 
-_TITLES = {
+_INTERFACE_TITLES = {
     "radio": "Radio (Crazyradio)",
     "usb": "USB cable",
     "udp": "UDP (simulated drones, WiFi)",
     "serial": "Serial ports",
 }
-_BEST = ("radio", "usb", "udp")  # what can be said to be a drone, nearest to flying first
+_PREFERENCE = ("radio", "usb", "udp")  # what can be said to be a drone, nearest to flying first
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -41,7 +41,7 @@ def drones(interfaces: Sequence[Interface]) -> list[str]:
     by_name = {i.name: i for i in interfaces}
     return [
         f.uri
-        for name in _BEST
+        for name in _PREFERENCE
         for f in (by_name[name].found if name in by_name else ())
         if f.uri and not f.problem and (name != "radio" or f.uri.count("/") > 2)
     ]
@@ -56,7 +56,7 @@ def text(interfaces: Sequence[Interface]) -> str:
     """For people."""
     lines = []
     for interface in interfaces:
-        lines.append(_TITLES.get(interface.name, interface.name))
+        lines.append(_INTERFACE_TITLES.get(interface.name, interface.name))
         for f in interface.found:
             lines.append(f"  {'!' if f.problem else '+'} {f.uri or '(no address)':<28} {f.what}")
             if f.problem:

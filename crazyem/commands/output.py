@@ -13,7 +13,8 @@ from crazyem.errors import UsageError
 from crazyem.live.summary import check_writable, write_json
 from crazyem.recordings.finding import Finding, Grade
 
-_FIRST, _AGAIN = 1.0, 5.0  # s until progress is shown, and between its lines where they cannot overwrite each other
+# s until progress is shown, and between its lines where they cannot overwrite each other
+_FIRST_PROGRESS, _PROGRESS_PERIOD = 1.0, 5.0
 
 
 def plain(text: str) -> str:
@@ -114,7 +115,7 @@ class Progress:
     def __init__(self, what: str, total: int, unit: str = "files") -> None:
         self.what, self.total, self.done, self.unit = what, total, 0, unit
         self._terminal = sys.stderr is not None and sys.stderr.isatty()
-        self._due = time.monotonic() + _FIRST
+        self._due = time.monotonic() + _FIRST_PROGRESS
         self._shown = False
 
     def __enter__(self) -> "Progress":
@@ -134,7 +135,7 @@ class Progress:
         now = time.monotonic()
         if now < self._due:
             return
-        self._due = now + (0.2 if self._terminal else _AGAIN)
+        self._due = now + (0.2 if self._terminal else _PROGRESS_PERIOD)
         if self._terminal:
             print(f"\r{plain(text)[:78]:<78}", end="", file=sys.stderr, flush=True)
             self._shown = True

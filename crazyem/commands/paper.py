@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     stamps = {task: fingerprint(settings, task.method) for task in tasks}
     found = {task: stored(folder, task, stamps[task]) for task in tasks}
     left = [task for task in tasks if found[task][0] is None]
-    _tell(found.values(), len(tasks))
+    _say_reused(found.values(), len(tasks))
     failed = _work({task: stamps[task] for task in left}, settings, folder, arguments)
     if failed is not None:
         return failed
@@ -65,7 +65,7 @@ def _all(choice: str, names: tuple[str, ...], *, word: str = "all") -> tuple[str
     return names if choice == word else (choice,)
 
 
-def _tell(found: Any, count: int) -> None:
+def _say_reused(found: Any, count: int) -> None:
     reasons = [why for record, why in found if record is None]
     reused = count - len(reasons)
     if reused:

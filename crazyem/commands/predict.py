@@ -13,7 +13,7 @@ from crazyem.doctor.thrust import vehicle_for
 from crazyem.errors import UsageError
 from crazyem.recordings import open_recording
 
-LARGEST = 4e9  # bytes of the arrays
+LARGEST_PREDICTION = 4e9  # bytes of the arrays
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -26,10 +26,10 @@ def run(arguments: argparse.Namespace) -> int:
     vehicle = vehicle_for(recording, arguments.vehicle)
     shown = recorded(recording, vehicle)
     size = 14 * 8 * arguments.horizon * (shown.time.size / arguments.every)
-    if size > LARGEST:
+    if size > LARGEST_PREDICTION:
         raise UsageError(
             f"{shown.time.size} samples with {arguments.horizon} steps each are {size / 1e9:.0f} GB of predictions; "
-            f"use --every {int(np.ceil(arguments.every * size / LARGEST))} or more."
+            f"use --every {int(np.ceil(arguments.every * size / LARGEST_PREDICTION))} or more."
         )
     with Progress("predict", shown.time.size, "starts") as progress:
         found = predict(
@@ -60,12 +60,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def write(output: Path, arrays: dict[str, NDArray]) -> None:
     """All or nothing: into a file beside it first. Raises UsageError if it cannot be written."""
-    beside = output.with_name(output.name + ".part")
+    with_stream = output.with_name(output.name + ".part")
     try:
-        with beside.open("wb") as file:
+        with with_stream.open("wb") as file:
             np.savez(file, **arrays)  # type: ignore[arg-type]
-        os.replace(beside, output)
+        os.replace(with_stream, output)
     except OSError as error:
         raise UsageError(f"cannot write {output}: {error.strerror or error}.") from None
     finally:
-        beside.unlink(missing_ok=True)
+        with_stream.unlink(missing_ok=True)

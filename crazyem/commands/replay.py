@@ -3,7 +3,7 @@
 import argparse
 import time
 
-from crazyem.commands.common import new_estimator, plot_path, report, say, tell_steps
+from crazyem.commands.common import new_estimator, plot_path, report, say, say_steps
 from crazyem.commands.files import read_options
 from crazyem.doctor.thrust import kind_objection, signal_for, vehicle_for, weight_objection
 from crazyem.errors import DataError
@@ -75,7 +75,7 @@ def replay(recording: Recording, pipeline: Pipeline, *, progress: bool = True) -
             shown = time.monotonic()
             newest = pipeline.history.estimates[-1] if pipeline.history.estimates else None
             say(live_line("replay", sample.time - first, newest, lost=0, pushes=0))
-            told = tell_steps(pipeline.history, told)
+            told = say_steps(pipeline.history, told)
 
 
 def run(arguments: argparse.Namespace) -> int:

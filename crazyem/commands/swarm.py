@@ -23,9 +23,9 @@ from crazyem.commands.common import (
     new_estimator,
     say,
 )
-from crazyem.commands.flights import HEIGHT, duration_note, follow, interrupts, trajectory_maker, write_rules
+from crazyem.commands.flights import DEFAULT_HEIGHT, duration_note, follow, interrupts, trajectory_maker, write_rules
 from crazyem.commands.output import put
-from crazyem.commands.view import Everyone, Shown, Streams, landing, live_view, wants_view
+from crazyem.commands.view import Streams, SwarmInterrupts, Viewed, landing, live_view, wants_view
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.live.controllers import controller_named
@@ -45,9 +45,9 @@ from crazyem.live.swarm import (
 )
 from crazyem.physics import folding
 
-AT_ONCE, CLOSING = 3, 8  # connections being made and closed; more only steal each other's time
-POSITION_WITHIN = 10.0  # s
-SUFFIXES = (".csv.gz", ".csv", ".mcap", ".json", ".png")
+CONNECTIONS_AT_ONCE, CLOSINGS_AT_ONCE = 3, 8  # connections being made and closed; more only steal each other's time
+POSITION_TIMEOUT = 10.0  # s
+RESULT_SUFFIXES = (".csv.gz", ".csv", ".mcap", ".json", ".png")
 
 
 @dataclass
@@ -69,7 +69,7 @@ class Drone:
     estimator: UpdateThrottle | None = None
     recorder: Any = None
     line: LiveLine | None = None
-    shown: Shown | None = None
+    shown: Viewed | None = None
     interrupts: Interrupts = field(default_factory=Interrupts)
     error: BaseException | None = None
     outcome: str = ""
@@ -99,7 +99,7 @@ def path_for(base: str | None, name: str, suffix: str = "") -> str | None:
     if base is None:
         return None
     path = Path(base)
-    ending = next((s for s in SUFFIXES if path.name.endswith(s) and path.name != s), path.suffix)
+    ending = next((s for s in RESULT_SUFFIXES if path.name.endswith(s) and path.name != s), path.suffix)
     stem = path.name.removesuffix(ending)
     return str(path.with_name(f"{stem}.{name}{suffix or ending}"))
 
@@ -133,8 +133,8 @@ def fly(arguments: argparse.Namespace) -> int:
             raise UsageError(f"{m.name}: a MAVLink drone is flown by its own ground station: use crazyem watch.")
         make = with_offset(trajectory_maker(list(m.trajectory), arguments.duration), m.offset)
         rules = write_rules(arguments, m.uri, name=m.name)
-        drone.plan = FlightPlan(make, controller, height=HEIGHT, push=not arguments.no_push, rules=rules)
-    return _run(arguments, drones, wrench="", work=_fly, before=_keep_apart)
+        drone.plan = FlightPlan(make, controller, height=DEFAULT_HEIGHT, push=not arguments.no_push, rules=rules)
+    return _run(arguments, drones, wrench="", work=_fly, before=_check_separation)
 
 
 def watch(arguments: argparse.Namespace) -> int:
@@ -171,7 +171,7 @@ def _run(
     compile_kernels(drones[0].vehicle)
     shorten_switch_interval()
     with contextlib.ExitStack() as stack:
-        everyone = Everyone([d.interrupts for d in drones])
+        everyone = SwarmInterrupts([d.interrupts for d in drones])
         stack.enter_context(interrupts(everyone))
         streams = stack.enter_context(Streams(arguments.foxglove))
         scheduler = Scheduler()
@@ -182,7 +182,7 @@ def _run(
             with live_view(view, lambda: [d.shown for d in drones if d.shown is not None]) as showing:
                 _together(drones, work, quiet=showing)
         finally:
-            with concurrent.futures.ThreadPoolExecutor(CLOSING, thread_name_prefix="crazyem-close") as pool:
+            with concurrent.futures.ThreadPoolExecutor(CLOSINGS_AT_ONCE, thread_name_prefix="crazyem-close") as pool:
                 list(pool.map(_close, drones))
         return _report(arguments, drones)
 
@@ -213,7 +213,7 @@ def _connect(
         except Exception as error:  # a fault of ours with one drone must not bring down the others
             drone.failed(CrazyemError(f"connecting failed: {error!r}."))
 
-    with concurrent.futures.ThreadPoolExecutor(AT_ONCE, thread_name_prefix="crazyem-connect") as pool:
+    with concurrent.futures.ThreadPoolExecutor(CONNECTIONS_AT_ONCE, thread_name_prefix="crazyem-connect") as pool:
         list(pool.map(connect, range(len(drones))))
 
 
@@ -241,7 +241,7 @@ def _begin(
     recorder = open_recorder(
         drone.log, configuration=configuration, vehicle=drone.vehicle, link=drone.link, append=arguments.append
     )
-    drone.recorder = streams.beside(recorder, m.name)
+    drone.recorder = streams.with_stream(recorder, m.name)
     drone.estimator = estimator = UpdateThrottle(
         new_estimator(drone.vehicle, arguments),
         number=number,
@@ -263,17 +263,17 @@ def _begin(
     session.history.notice(folding.notice(drone.left_out))
     drone.line = LiveLine(session, prefix=f"{m.name:<8} ")
     land = landing(drone.interrupts) if plan is not None else None
-    drone.shown = Shown(session, drone.line, name=m.name, land=land)
+    drone.shown = Viewed(session, drone.line, name=m.name, land=land)
     session.start()
 
 
-def _keep_apart(drones: Sequence[Drone]) -> None:
+def _check_separation(drones: Sequence[Drone]) -> None:
     """Positions first, then what each will fly from there.
 
     Raises:
         UsageError: two would come too close.
     """
-    until = time.monotonic() + POSITION_WITHIN
+    until = time.monotonic() + POSITION_TIMEOUT
     courses = {}
     for drone in drones:
         assert drone.session is not None

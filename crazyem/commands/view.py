@@ -40,7 +40,7 @@ def _terminal(stream: Any) -> bool:
         return False
 
 
-class Everyone(Interrupts):
+class SwarmInterrupts(Interrupts):
     """Ctrl-C for all drones: a first one lands them, a second one cuts. A drone that lands already does not land twice.
 
     Args:
@@ -66,7 +66,7 @@ def landing(one: Interrupts) -> Callable[[], None]:
     return land
 
 
-class Shown:
+class Viewed:
     """A running drone as the view needs it."""
 
     def __init__(self, session: Any, line: LiveLine, *, name: str, land: Callable[[], None] | None = None) -> None:
@@ -80,7 +80,7 @@ class Shown:
 
 
 @contextlib.contextmanager
-def live_view(wanted: bool, drones: Callable[[], Sequence[Shown]]) -> Iterator[Callable[[], bool]]:
+def live_view(wanted: bool, drones: Callable[[], Sequence[Viewed]]) -> Iterator[Callable[[], bool]]:
     """The dashboard while the block runs; yields whether it is showing now (q ends it, plain lines take over).
 
     Args:
@@ -121,7 +121,7 @@ class Streams:
         if self._server is not None:
             self._server.close()
 
-    def beside(self, recorder: Recorder | None, name: str = "") -> Any:
+    def with_stream(self, recorder: Recorder | None, name: str = "") -> Any:
         """The recorder, with a stream of the same beside it; `name` goes before topics where drones are many."""
         if self._server is None:
             return recorder

@@ -19,7 +19,7 @@ from crazyem.commands.common import (
     say,
 )
 from crazyem.commands.flights import confirm_in_terminal, follow, interrupts
-from crazyem.commands.view import Shown, Streams, live_view, wants_view
+from crazyem.commands.view import Streams, Viewed, live_view, wants_view
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.live.hover_thrust import hover_afterwards
@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
         recorder = open_recorder(
             arguments.record, configuration=configuration, vehicle=vehicle, link=link, append=arguments.append
         )
-        recorder = streams.beside(recorder)
+        recorder = streams.with_stream(recorder)
         if recorder is not None:
             stack.callback(recorder.close)
         session = Session(
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
                 say(f"guard: {rules.mode}. {session.push_to_controller(rules)}")
                 session.pipeline.push_from = -math.inf
             line = LiveLine(session)
-            shown = [Shown(session, line, name=vehicle.name)]
+            shown = [Viewed(session, line, name=vehicle.name)]
             with live_view(view, lambda: shown) as line.quiet:
                 follow(session, stop, arguments.duration, line)
         except CrazyemError as e:

@@ -8,7 +8,8 @@ from crazyem.compiled import compiled
 from crazyem.control.flatness import reference_angles, reference_rate
 from crazyem.vehicle import GRAVITY
 
-STEEPEST = 0.2  # least cos(pitch) cos(roll) that thrust is divided by (eq. 83 has none: it grows without bound)
+# least cos(pitch) cos(roll) that thrust is divided by (eq. 83 has none: it grows without bound)
+SMALLEST_TILT_COSINE = 0.2
 
 
 def position_gains(*, dt: float, position_weight: float, velocity_weight: float) -> NDArray:
@@ -50,7 +51,7 @@ def control(state, reference, yaw, gains, limit, mass, inertia, wrench):
     rate = np.empty(3)
     reference_angles(a, yaw, wanted)
     reference_rate(state[6:9], wanted, gains[2], rate)
-    upright = max(np.cos(state[6]) * np.cos(state[7]), STEEPEST)
+    upright = max(np.cos(state[6]) * np.cos(state[7]), SMALLEST_TILT_COSINE)
     wrench[0] = max(0.0, (a[2] + GRAVITY) * mass / upright)
     w = state[9:12]
     for i in range(3):

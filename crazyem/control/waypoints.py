@@ -16,7 +16,7 @@ from crazyem.errors import FileFormatError
 DEFAULT_SPEED = 0.5  # m/s
 MAX_ACCELERATION = 8.0  # m/s^2; beyond this a Crazyflie runs out of thrust or of the setpoint's range
 MAX_POSITION = 32.767  # m, the range of a full-state setpoint
-COLUMNS = {"x", "y", "z", "yaw", "time", "speed"}
+WAYPOINT_COLUMNS = {"x", "y", "z", "yaw", "time", "speed"}
 
 
 def read_waypoints(path: str | Path) -> list[dict[str, float]]:
@@ -48,7 +48,7 @@ def read_waypoints(path: str | Path) -> list[dict[str, float]]:
         rows = [{str(k).strip(): v for k, v in r.items() if v not in (None, "")} for r in reader]
     out = []
     for i, row in enumerate(rows, start=1):
-        unknown = set(row) - COLUMNS
+        unknown = set(row) - WAYPOINT_COLUMNS
         if unknown:
             raise FileFormatError(f"waypoint file {path} has the unknown column '{sorted(unknown)[0]}'.")
         missing = [k for k in ("x", "y", "z") if k not in row]

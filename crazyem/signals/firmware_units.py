@@ -6,7 +6,7 @@ Sources: the log groups of crazyflie-firmware (HEAD of August 2026). A name that
 import re
 
 # first match wins; patterns are of whole names
-_UNITS: tuple[tuple[str, str], ...] = (
+_UNIT_PATTERNS: tuple[tuple[str, str], ...] = (
     (r"stateEstimate\.(roll|pitch|yaw)", "deg"),
     (r"stateEstimate\.a[xyz]", "g"),
     (r"stateEstimate\.v[xyz]", "m/s"),
@@ -53,9 +53,9 @@ _UNITS: tuple[tuple[str, str], ...] = (
     (r"kalman\.var[XYZ]", "m^2"),
     (r"kalman\.varP[XYZ]", "m^2/s^2"),
 )
-_COMPILED = tuple((re.compile(pattern), unit) for pattern, unit in _UNITS)
+_COMPILED_PATTERNS = tuple((re.compile(pattern), unit) for pattern, unit in _UNIT_PATTERNS)
 
 
 def unit_of(name: str) -> str:
     """Unit of a firmware log variable as logged, "" where not known."""
-    return next((unit for pattern, unit in _COMPILED if pattern.fullmatch(name)), "")
+    return next((unit for pattern, unit in _COMPILED_PATTERNS if pattern.fullmatch(name)), "")

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 
 MILLI_G = 9.80665e-3  # m/s^2, the standard gravity of autopilots
-RPM = 2.0 * math.pi / 60.0
+RPM_IN_RAD_PER_S = 2.0 * math.pi / 60.0
 
 # What is put together of several messages and parameters has names of its own, in our units and our order of rotors.
 OUTPUTS, ROTORS, BATTERY, INFO = "outputs", "rotors", "battery", "supervisor"
@@ -61,7 +61,7 @@ MAPPINGS: tuple[Mapping, ...] = (
     Mapping("specific_force", "SCALED_IMU", _ACC, factor=MILLI_G),
     Mapping("specific_force", "RAW_IMU", _ACC, factor=MILLI_G),
     Mapping("motor_command", OUTPUTS, _FOUR, "plain"),
-    Mapping("rotor_speed", ROTORS, _FOUR, "plain", RPM),
+    Mapping("rotor_speed", ROTORS, _FOUR, "plain", RPM_IN_RAD_PER_S),
     Mapping("voltage", BATTERY, ("mV",), "plain", 1e-3),
     Mapping("setpoint_position", "POSITION_TARGET_LOCAL_NED", _XYZ),
 )

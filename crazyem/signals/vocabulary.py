@@ -17,7 +17,7 @@ from crazyem.signals.packet import Block, Packet
 from crazyem.signals.sample import ESTIMATOR_SIGNALS, SIGNALS, Sample
 
 STANDARD_GRAVITY = 9.81  # m/s^2, the constant the firmware multiplies and divides by
-_RPM = 2.0 * math.pi / 60.0
+_RPM_IN_RAD_PER_S = 2.0 * math.pi / 60.0
 _RPM_MISSING = 65535.0
 _QUAT_MASK = (1 << 9) - 1
 _NAN = float("nan")
@@ -164,10 +164,12 @@ _legacy_rates = Conversion(
 
 def _rpm_many(columns: Columns) -> NDArray[np.float64]:
     rpm = _stacked(columns)
-    return np.where(rpm == _RPM_MISSING, np.nan, rpm * _RPM)
+    return np.where(rpm == _RPM_MISSING, np.nan, rpm * _RPM_IN_RAD_PER_S)
 
 
-_rpm = Conversion(lambda values: tuple(_NAN if v == _RPM_MISSING else float(v) * _RPM for v in values), _rpm_many)
+_rpm = Conversion(
+    lambda values: tuple(_NAN if v == _RPM_MISSING else float(v) * _RPM_IN_RAD_PER_S for v in values), _rpm_many
+)
 
 
 def _flying_many(columns: Columns) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from made_flight import made_flight
 from recording_files import cut, fails, flight_fixture, folder_fixture, link_pair, run, save
 
 from crazyem.commands import files
-from crazyem.commands.merged import merge_findings, merge_inventories
+from crazyem.commands.merge import merge_findings, merge_inventories
 from crazyem.doctor.inventory import inventory
 from crazyem.errors import UsageError
 from crazyem.recordings import Finding, Grade

@@ -16,7 +16,7 @@ import pytest
 from recording_files import fails, flight_fixture, folder_fixture, link_pair, run
 
 from crazyem.commands import batch
-from crazyem.commands.merged import merge_findings
+from crazyem.commands.merge import merge_findings
 from crazyem.commands.output import Report, Result, plain
 from crazyem.errors import LinkError, UsageError
 from crazyem.recordings import Finding, Grade, open_recording

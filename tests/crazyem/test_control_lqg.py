@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from crazyem.control.flatness import reference_angles, reference_rate
-from crazyem.control.lqg import STEEPEST, control, position_gains
+from crazyem.control.lqg import SMALLEST_TILT_COSINE, control, position_gains
 from crazyem.paper.plant import angle_rates, derivative
 
 GRAVITY = 9.81
@@ -133,6 +133,6 @@ def test_acceleration_is_limited_in_size_not_in_direction():
 def test_thrust_is_bounded_near_upside_down_and_never_negative():
     state, reference = np.zeros(12), np.zeros(9)
     state[6] = np.pi / 2
-    assert commanded(state, reference)[0] == pytest.approx(0.18 * GRAVITY / STEEPEST)
+    assert commanded(state, reference)[0] == pytest.approx(0.18 * GRAVITY / SMALLEST_TILT_COSINE)
     state[6], reference[2] = 0.0, -100.0
     assert commanded(state, reference)[0] == 0.0

@@ -200,7 +200,7 @@ def test_83_grows_without_bound_and_the_code_limits_it():
     x[6] = np.radians(89.9)
     lqg.control(x, np.zeros(9), 0.0, gains, 9.0, MASS, INERTIA, u)
     assert MASS * G / np.cos(x[6]) > 500 * MASS * G
-    assert u[0] == pytest.approx(MASS * GRAVITY / lqg.STEEPEST)
+    assert u[0] == pytest.approx(MASS * GRAVITY / lqg.SMALLEST_TILT_COSINE)
     x[6] = np.radians(100)  # printed: negative thrust
     assert MASS * G / np.cos(x[6]) < 0
     lqg.control(x, np.zeros(9), 0.0, gains, 9.0, MASS, INERTIA, u)

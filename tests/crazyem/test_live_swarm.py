@@ -136,13 +136,13 @@ def test_an_offset_is_where_the_trajectory_is_flown(fake, tmp_path):
 @pytest.mark.parametrize(("count", "outcome"), [(1, "landed on request"), (2, "motors cut")])
 def test_one_interrupt_lands_all_and_a_second_one_cuts_all(fake, monkeypatch, count, outcome):
     everyone, over = [], threading.Event()
-    real = view.Everyone
+    real = view.SwarmInterrupts
 
     def caught(ones):
         everyone.append(real(ones))
         return everyone[0]
 
-    monkeypatch.setattr(command, "Everyone", caught)
+    monkeypatch.setattr(command, "SwarmInterrupts", caught)
 
     def interrupt():
         while not all("setpoint" in fake[f"fake://{i}"].calls for i in range(3)):
@@ -166,7 +166,7 @@ def test_one_interrupt_lands_all_and_a_second_one_cuts_all(fake, monkeypatch, co
 
 def test_landing_by_key_never_cuts_and_control_c_after_it_does_not_either():
     ones = [Interrupts(), Interrupts()]
-    everyone = view.Everyone(ones)
+    everyone = view.SwarmInterrupts(ones)
     for _ in range(3):
         view.landing(ones[0])()
     assert [o.count for o in ones] == [1, 0]

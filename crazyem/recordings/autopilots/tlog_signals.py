@@ -23,7 +23,7 @@ from crazyem.recordings.autopilots.frd_ned import (
     vectors,
 )
 from crazyem.recordings.topics import Source, Topic, named
-from crazyem.signals.mavlink import RPM, mapping
+from crazyem.signals.mavlink import RPM_IN_RAD_PER_S, mapping
 
 ARMED = 128  # in HEARTBEAT.base_mode
 
@@ -96,8 +96,8 @@ TLOG_SIGNALS: tuple[Source, ...] = (
     _shared("body_rate", "ATTITUDE"),
     _shared("specific_force", "HIGHRES_IMU"),
     _shared("specific_force", "SCALED_IMU"),
-    Source("rotor_speed", "ESC_STATUS", _RPMS, _scaled(RPM), frame=MOTORS, zero_is_absent=True),
-    Source("rotor_speed", "ESC_TELEMETRY_1_TO_4", _RPMS, _scaled(RPM), frame=MOTORS, zero_is_absent=True),
+    Source("rotor_speed", "ESC_STATUS", _RPMS, _scaled(RPM_IN_RAD_PER_S), frame=MOTORS, zero_is_absent=True),
+    Source("rotor_speed", "ESC_TELEMETRY_1_TO_4", _RPMS, _scaled(RPM_IN_RAD_PER_S), frame=MOTORS, zero_is_absent=True),
     Source("voltage", "BATTERY_STATUS", _VOLTAGES, _cells, _equal("voltages[0]", 65535), zero_is_absent=True),
     Source(
         "voltage",

@@ -10,8 +10,8 @@ from crazyem.doctor.identifiability import Verdict
 from crazyem.doctor.inventory import ClockRow, Inventory, SignalRow
 from crazyem.recordings.finding import Finding, Grade
 
-_RANK = {"yes": 0, "weak": 1, "no": 2}
-_WORST = {Grade.UNUSABLE: 0, Grade.DEGRADES: 1, Grade.HARMLESS: 2}
+_VERDICT_RANK = {"yes": 0, "weak": 1, "no": 2}
+_GRADE_RANK = {Grade.UNUSABLE: 0, Grade.DEGRADES: 1, Grade.HARMLESS: 2}
 
 
 def merge_inventories(parts: Iterable[Inventory]) -> Inventory:
@@ -128,7 +128,7 @@ def _best(a: tuple[Verdict, ...], b: tuple[Verdict, ...]) -> tuple[Verdict, ...]
 
 def _order(verdict: Verdict) -> tuple[int, float]:
     sd = verdict.relative_sd if verdict.relative_sd is not None else verdict.sd
-    return _RANK.get(str(verdict.verdict), 3), math.inf if sd is None else sd
+    return _VERDICT_RANK.get(str(verdict.verdict), 3), math.inf if sd is None else sd
 
 
 def _without_edges(parts: list[tuple[Finding, ...]]) -> list[tuple[Finding, ...]]:
@@ -175,12 +175,12 @@ def merge_findings(parts: Iterable[tuple[Finding, ...]]) -> tuple[Finding, ...]:
             if known is None:
                 merged[key] = replace(finding, fix=None)
                 continue
-            worse = finding if _WORST[finding.grade] < _WORST[known.grade] else known
+            worse = finding if _GRADE_RANK[finding.grade] < _GRADE_RANK[known.grade] else known
             intervals = known.intervals
             if finding.intervals != known.intervals[-len(finding.intervals) :]:
                 intervals = (*known.intervals, *finding.intervals)
             merged[key] = replace(worse, intervals=intervals, fix=None)
     return tuple(
         replace(finding, evidence={**finding.evidence, "parts": float(counts[key])}) if counts[key] > 1 else finding
-        for key, finding in sorted(merged.items(), key=lambda item: _WORST[item[1].grade])
+        for key, finding in sorted(merged.items(), key=lambda item: _GRADE_RANK[item[1].grade])
     )
