@@ -26,12 +26,12 @@ import numpy as np
 
 from crazyem.paper.cold_start import (
     BANDS,
-    EARLY,
+    EARLY_SECONDS,
     NAMES,
     SENSORS,
-    SETTLED,
-    SMOOTH,
-    STEPS,
+    SETTLED_SECONDS,
+    SMOOTH_SETTINGS,
+    STEP_SETTINGS,
     ColdStart,
     Settling,
     cold_start,
@@ -43,7 +43,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 MARKS = ("<!-- cold start: table -->", "<!-- /cold start -->")
 STARTS = {"air": False, "floor": True}
-REFERENCES = {"smooth": SMOOTH, "steps": STEPS, "literal": LITERAL}
+REFERENCES = {"smooth": SMOOTH_SETTINGS, "steps": STEP_SETTINGS, "literal": LITERAL}
 SERIES = ("time", "ratio", "heights")
 SHOWN = 5.0  # s of the series that are kept
 Kind = tuple[str, str, str]  # start, reference, sensor
@@ -66,7 +66,7 @@ def version() -> str:
 def line_of(flight: ColdStart, *, reference: str, code: str) -> dict[str, Any]:
     """A flight for the file: the record, and its series thinned and rounded."""
     kept = flight.time <= SHOWN
-    rows = slice(0, round(SHOWN / SMOOTH.dt) + 1, 4)
+    rows = slice(0, round(SHOWN / SMOOTH_SETTINGS.dt) + 1, 4)
     return {
         "code": code,
         "reference": reference,
@@ -187,7 +187,7 @@ def table(said: Mapping[str, Any]) -> str:
         lines.append(f"| {' | '.join(cells)} |")
     lines += [
         "",
-        f"The estimate {EARLY:g} s after take-over against the Cramer-Rao bound (noise unknown) of these {EARLY:g} s:",
+        f"The estimate {EARLY_SECONDS:g} s after take-over against the Cramer-Rao bound (noise unknown) of that time:",
         "",
     ]
     lines += _head("start, reference, sensor", *(f"{name}: bound, rms error over it" for name in NAMES))
@@ -219,7 +219,7 @@ def plot(path: Path, flights: Mapping[tuple[Kind, int], ColdStart], *, sensor: s
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    panels = [("mass", 0, 0.5), ("Ixx", 1, SETTLED), ("Iyy", 2, SETTLED), ("Izz", 3, SETTLED)]
+    panels = [("mass", 0, 0.5), ("Ixx", 1, SETTLED_SECONDS), ("Iyy", 2, SETTLED_SECONDS), ("Izz", 3, SETTLED_SECONDS)]
     with matplotlib.rc_context({"font.size": 8}):
         figure = Figure(figsize=(10, 10), layout="constrained")
         FigureCanvasAgg(figure)

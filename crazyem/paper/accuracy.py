@@ -22,10 +22,10 @@ from crazyem.paper.flight import Flight, fly
 from crazyem.paper.product import PARAMETERS, ProductOnline, known_noise, product_offline
 from crazyem.paper.settings import LITERAL, P5, Settings
 
-RATIO = 1.10  # aim: rms error over the bound
-BIAS = 0.20  # aim: mean error over the bound
-COVERAGE = (0.92, 0.98)  # aim: of the 95 % intervals
-MASS_BIAS = 5e-4  # aim: sensor C, relative
+RATIO_AIM = 1.10  # aim: rms error over the bound
+BIAS_AIM = 0.20  # aim: mean error over the bound
+COVERAGE_AIM = (0.92, 0.98)  # aim: of the 95 % intervals
+MASS_BIAS_AIM = 5e-4  # aim: sensor C, relative
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class Part:
 
 
 P3 = replace(P5, smooth=True, angle_gain=40.0, rate_gain=25.0)  # the reading that an earlier study judged estimators by
-QUIET = replace(P3, force_noise=5e-4, torque_noise=2e-5)
-OFF = (1.2, 0.7, 1.3, 0.7)
+QUIET_SETTINGS = replace(P3, force_noise=5e-4, torque_noise=2e-5)
+START_FACTORS = (1.2, 0.7, 1.3, 0.7)
 PARTS = {
     "windows": Part("windows of 800 samples, one estimate each"),
     "flights": Part("whole flights of 4001 samples, one estimate each", span="flight"),
@@ -63,7 +63,7 @@ PARTS = {
     "quiet": Part(
         "windows of 800 samples, settings P3 with little process noise (s_F 5e-4, s_M 2e-5), no accelerometer, start "
         "off by +20, -30, +30, -30 %",
-        sensors="A", settings=QUIET, start=OFF, accelerometer=False,
+        sensors="A", settings=QUIET_SETTINGS, start=START_FACTORS, accelerometer=False,
     ),
 }  # fmt: skip
 
@@ -259,14 +259,14 @@ def missed(part: str, sensor: str, figures: dict[str, Any]) -> list[str]:
     out = []
     for i, name in enumerate(PARAMETERS):
         ratio, bias, coverage = (figures[key][i][0] for key in ("ratio", "bias", "coverage"))
-        low, high = COVERAGE
-        if ratio > RATIO:
+        low, high = COVERAGE_AIM
+        if ratio > RATIO_AIM:
             out.append(f"{name}: rms error {ratio:.2f} of the bound")
-        if abs(bias) > BIAS:
+        if abs(bias) > BIAS_AIM:
             out.append(f"{name}: bias {bias:+.2f} of the bound")
         if not low <= coverage <= high:
             out.append(f"{name}: intervals cover {100 * coverage:.1f} %")
-    if sensor == "C" and abs(figures["mass_bias"][0][0]) > MASS_BIAS:
+    if sensor == "C" and abs(figures["mass_bias"][0][0]) > MASS_BIAS_AIM:
         out.append(f"mass: bias {100 * figures['mass_bias'][0][0]:+.3f} %")
     if figures["converged"] < 1:
         out.append(f"{part}: converged in {100 * figures['converged']:.1f} %")

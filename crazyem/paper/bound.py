@@ -22,22 +22,22 @@ from crazyem.paper.flight import Flight
 from crazyem.paper.plant import derivative, thrust_axis
 
 PARAMETERS = ("mass", "Ixx", "Iyy", "Izz")
-PROCESS = ("force", "torque_x", "torque_y", "torque_z")
+PROCESS_NOISES = ("force", "torque_x", "torque_y", "torque_z")
 SENSORS = ("position", "velocity", "attitude", "body_rate", "specific_force")
 MEASURED = {
     "A": ("position", "body_rate", "specific_force"),
     "B": ("position", "velocity", "attitude", "body_rate"),
     "C": ("position", "velocity", "body_rate"),
 }
-NOISE = ("free", "common", "single", "known")
+NOISE_CASES = ("free", "common", "single", "known")
 # m, m/s, rad, rad/s around the true state at the start: little beside what half a second of data says (wider, the bound
 # of mass grows by 0.5 % at most), but narrow enough that the filter is linear there. From 0.3 rad of attitude its own
 # start biases the score of mass by 0.3 of the bound (sensor A).
 START_SD = np.repeat([0.05, 0.1, 0.03, 1.0], 3)
 # Of a logarithm, for the central differences. With steps ten times shorter the bound of sensor A differs by 2e-5 of
 # itself from one processor to another (rounding), with this one by 3e-7; its curvature costs 2e-7.
-STEP = 1e-3
-CHUNK = 400  # rows at a time, so that memory does not grow with the flight
+DERIVATIVE_STEP = 1e-3
+CHUNK_ROWS = 400  # rows at a time, so that memory does not grow with the flight
 
 
 @compiled
@@ -222,19 +222,19 @@ class Bound:
         Raises:
             UsageError: there is no such option, or this bound lacks the scales.
         """
-        if noise not in NOISE:
-            raise UsageError(f"unknown noise '{noise}' (known: {', '.join(NOISE)})")
+        if noise not in NOISE_CASES:
+            raise UsageError(f"unknown noise '{noise}' (known: {', '.join(NOISE_CASES)})")
         if sensors not in {"free", "known"}:
             raise UsageError(f"sensors are free or known, not '{sensors}'")
-        if any(name not in self.names for name in PROCESS):
+        if any(name not in self.names for name in PROCESS_NOISES):
             raise UsageError("this bound has no free noise scales to tie together")
         groups: list[tuple[str, tuple[str, ...]]] = [(name, (name,)) for name in PARAMETERS]
         if noise == "free":
-            groups += [(name, (name,)) for name in PROCESS]
+            groups += [(name, (name,)) for name in PROCESS_NOISES]
         elif noise == "common":
-            groups += [("force", ("force",)), ("torque", PROCESS[1:])]
+            groups += [("force", ("force",)), ("torque", PROCESS_NOISES[1:])]
         elif noise == "single":
-            groups += [("noise", PROCESS)]
+            groups += [("noise", PROCESS_NOISES)]
         if sensors == "free":
             groups += [(name, (name,)) for name in self.names if name in SENSORS]
         tie = np.array([[float(name in members) for name in self.names] for _, members in groups])
@@ -359,22 +359,22 @@ def bound(
     sds = (s.position_sd, s.velocity_sd, s.attitude_sd, s.body_rate_sd, s.acceleration_sd)
     truth = np.array([s.mass, *s.inertia, s.force_noise, *[s.torque_noise] * 3, *sds])
     free = [*range(8)] + [8 + g for g in range(5) if not np.all(np.isnan(y[:, 3 * g]))]
-    names = (*PARAMETERS, *PROCESS, *SENSORS)
+    names = (*PARAMETERS, *PROCESS_NOISES, *SENSORS)
 
     seen = np.flatnonzero(~np.all(np.isnan(y), axis=0))
     points = [truth]
     for i in free:
-        factor = np.exp(STEP * (np.arange(len(truth)) == i))
+        factor = np.exp(DERIVATIVE_STEP * (np.arange(len(truth)) == i))
         points += [truth * factor, truth / factor]
     runs = [(point, flight.truth[first].copy(), np.diag(np.square(start_sd))) for point in points]
     information, score = np.zeros((len(free), len(free))), np.zeros(len(free))
-    for begin in range(0, len(y), CHUNK):
-        end = min(begin + CHUNK, len(y))
+    for begin in range(0, len(y), CHUNK_ROWS):
+        end = min(begin + CHUNK_ROWS, len(y))
         n = end - begin
         e, cov = np.empty((len(runs), n, 15)), np.empty((len(runs), n, 15, 15))
         for i, (v, x, p) in enumerate(runs):
             innovations(begin, end, y, wrench, x, p, s.dt, v[0], v[1:4], v[4:8], v[8:13], e[i], cov[i])
-        _add(seen, e, cov, STEP, information, score)
+        _add(seen, e, cov, DERIVATIVE_STEP, information, score)
     whole = Bound(tuple(names[i] for i in free), information, score)
     if (noise, sensors) == ("free", "free"):
         return whole

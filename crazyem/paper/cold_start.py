@@ -24,15 +24,15 @@ from crazyem.paper.settings import Settings
 
 NAMES = ("mass", "Ixx", "Iyy", "Izz")
 SENSORS = "ABC"
-EARLY = 2.5  # s after lift-off: here the estimate is held against what the data can tell
-SETTLED = 4.0  # s after lift-off: the window is full; from here on tracking is compared
+EARLY_SECONDS = 2.5  # s after lift-off: here the estimate is held against what the data can tell
+SETTLED_SECONDS = 4.0  # s after lift-off: the window is full; from here on tracking is compared
 BANDS = {"mass within 5 %": (slice(0, 1), 0.05), "mass within 1 %": (slice(0, 1), 0.01),
          "inertia within 25 %": (slice(1, 4), 0.25)}  # fmt: skip
 
 
 # What is flown unless settings are given.
-SMOOTH = replace(Settings(), smooth=True)
-STEPS = Settings()
+SMOOTH_SETTINGS = replace(Settings(), smooth=True)
+STEP_SETTINGS = Settings()
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def cold_start(
         sensor: A (position, specific force, body rate), B (full state) or C (position, velocity, body rate).
         ground: start on a floor.
         smooth: whether the reference goes smoothly from waypoint to waypoint, or in steps.
-        settings: of the simulation, `SMOOTH` or `STEPS` by default; `smooth` overrides its own.
+        settings: of the simulation, `SMOOTH_SETTINGS` or `STEP_SETTINGS` by default; `smooth` overrides its own.
 
     Raises:
         UsageError: there is no such sensor or seed.
@@ -168,7 +168,7 @@ def cold_start(
         raise UsageError(f"there is no sensor '{sensor}' (known: {', '.join(SENSORS)})")
     if seed < 0:
         raise UsageError(f"a seed is not negative, {seed} is")
-    settings = replace(settings or (SMOOTH if smooth else STEPS), smooth=smooth)
+    settings = replace(settings or (SMOOTH_SETTINGS if smooth else STEP_SETTINGS), smooth=smooth)
     loop = Loop(settings, seed, sensor, ground=ground)
     flight, crashed = loop.flight, False
     while flight.size <= settings.steps and not crashed:
@@ -216,7 +216,7 @@ def _judge(loop: Loop, known: Flight, *, seed: int, crashed: bool) -> ColdStart:
     )
 
 
-def settling(time: NDArray, inside: NDArray, *, until: float = SETTLED) -> Settling:
+def settling(time: NDArray, inside: NDArray, *, until: float = SETTLED_SECONDS) -> Settling:
     """When a series came into a band and from when on it stayed there.
 
     Args:
@@ -239,11 +239,11 @@ def settling(time: NDArray, inside: NDArray, *, until: float = SETTLED) -> Settl
 def _against_bound(loop: Loop, begin: int, time: NDArray, ratio: NDArray) -> tuple[tuple[float, ...], ...]:
     """Bound of the first rows after lift-off, (4,) relative, and the error of the estimate then, in bounds."""
     flight = loop.flight
-    end = begin + round(EARLY / flight.settings.dt)
+    end = begin + round(EARLY_SECONDS / flight.settings.dt)
     if end >= flight.size or (flight.ground and flight.lift_off < 0):
         return (math.nan,) * 4, (math.nan,) * 4
     limit = bound(flight, loop.sensor, begin, end).sd
-    error = np.log(ratio[int(np.searchsorted(time, EARLY, "right")) - 1])
+    error = np.log(ratio[int(np.searchsorted(time, EARLY_SECONDS, "right")) - 1])
     return tuple(limit.tolist()), tuple((error / limit).tolist())
 
 
@@ -256,7 +256,7 @@ def _left_floor(flight: Flight) -> int:
 def _tracking(flight: Flight) -> float:
     """rms position error [m] from 4 s after lift-off to the end, NaN if it did not get so far."""
     begin = max(flight.lift_off, 0)
-    first = begin + round(SETTLED / flight.settings.dt)
+    first = begin + round(SETTLED_SECONDS / flight.settings.dt)
     rows = np.arange(first, flight.size)
     if len(rows) < 2 or (flight.ground and flight.lift_off < 0):
         return math.nan

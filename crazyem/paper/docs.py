@@ -18,7 +18,7 @@ from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.paper.experiments import Task
 from crazyem.paper.pages import notes, settings_grid
 from crazyem.paper.published_values import ONLINE_ITERATIONS
-from crazyem.paper.runner import SCHEMA, write_whole
+from crazyem.paper.runner import SCHEMA, write_atomically
 from crazyem.paper.table_text import (
     Grid,
     convergence_grid,
@@ -30,11 +30,11 @@ from crazyem.paper.table_text import (
 )  # fmt: skip
 
 Record = Mapping[str, Any]
-STORED = "paper_results.json"
+STORED_RESULTS = "paper_results.json"
 SMALL_SEEDS = 2
-KEPT = ("position", "angles", "final", "dead_reckoned", "sd", "ci95", "bound", "bound_noise_known", "windows")
+STORED_FIELDS = ("position", "angles", "final", "dead_reckoned", "sd", "ci95", "bound", "bound_noise_known", "windows")
 PAGES = ("docs/paper.md", "README.md")
-LARGEST = 200_000_000  # bytes of results.json; 20 seeds take 9 MB
+LARGEST_RESULTS = 200_000_000  # bytes of results.json; 20 seeds take 9 MB
 _BLOCK = re.compile(r"(<!-- paper:([a-z0-9_]+) -->\n)(.*?)(<!-- /paper:\2 -->)", re.DOTALL)
 
 
@@ -49,7 +49,7 @@ def small(results: Record) -> dict[str, Any]:
     for record in results["tasks"]:
         if record["seed"] < SMALL_SEEDS:
             name = Task(*(record[k] for k in ("experiment", "sensor", "method", "seed"))).name
-            kept[name] = {k: record[k] for k in KEPT if k in record}
+            kept[name] = {k: record[k] for k in STORED_FIELDS if k in record}
     return {"seeds": SMALL_SEEDS, "environment": results["environment"], "tasks": kept}
 
 
@@ -76,7 +76,7 @@ def read_results(path: Path) -> dict[str, Any]:
         FileFormatError: it cannot be read or is something else.
     """
     try:
-        if path.stat().st_size > LARGEST:
+        if path.stat().st_size > LARGEST_RESULTS:
             raise FileFormatError(f"{path} is too large for the results of `crazyem paper`.")
         content = json.loads(path.read_bytes())
     except OSError as error:
@@ -267,17 +267,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     root = Path(arguments.root)
     try:
-        kept = root / "docs" / STORED
+        kept = root / "docs" / STORED_RESULTS
         if arguments.results:
             results = read_results(Path(arguments.results))
-            write_whole(kept, json.dumps(summarised(results), indent=1, allow_nan=False) + "\n")
+            write_atomically(kept, json.dumps(summarised(results), indent=1, allow_nan=False) + "\n")
             if arguments.small:
-                write_whole(Path(arguments.small), json.dumps(small(results), indent=1, allow_nan=False) + "\n")
+                write_atomically(Path(arguments.small), json.dumps(small(results), indent=1, allow_nan=False) + "\n")
         results = read_results(kept)
         for name in PAGES:
             page = root / name
             if page.is_file():
-                write_whole(page, filled(page.read_text(encoding="utf-8"), results))
+                write_atomically(page, filled(page.read_text(encoding="utf-8"), results))
     except CrazyemError as error:
         parser.exit(error.exit_code, f"{parser.prog}: {error}\n")
     return 0

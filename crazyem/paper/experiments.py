@@ -20,12 +20,18 @@ from crazyem.paper.published import PublishedOnline, published_offline
 from crazyem.paper.published_values import PARAMETERS
 from crazyem.paper.settings import Settings
 
-SETTLED = 8.0  # s: windows of an online flight that begin later count as converged
-ITERATIONS = 20  # of EM, offline
+SETTLED_SECONDS = 8.0  # s: windows of an online flight that begin later count as converged
+OFFLINE_ITERATIONS = 20  # of EM, offline
 PATH_POINTS = 200
 _DENSE, _EVERY = 50, 10  # intervals over time: the first so many updates, then every so many-th
-_CHECK = 25  # updates between two looks at whether the drone has crashed
-NEAR = {"mass_5": (0, 0.05), "mass_1": (0, 0.01), "Ixx_25": (1, 0.25), "Iyy_25": (2, 0.25), "Izz_25": (3, 0.25)}
+_CRASH_CHECK_PERIOD = 25  # updates between two looks at whether the drone has crashed
+CONVERGENCE_BANDS = {
+    "mass_5": (0, 0.05),
+    "mass_1": (0, 0.01),
+    "Ixx_25": (1, 0.25),
+    "Iyy_25": (2, 0.25),
+    "Izz_25": (3, 0.25),
+}
 
 
 @dataclass(frozen=True, order=True)
@@ -121,10 +127,10 @@ def _table1(task: Task, settings: Settings) -> dict[str, Any]:
 
 def _offline_published(task: Task, settings: Settings) -> dict[str, Any]:
     flight = fly(settings, task.seed)
-    theta = published_offline(flight, task.sensor, iterations=ITERATIONS).theta
+    theta = published_offline(flight, task.sensor, iterations=OFFLINE_ITERATIONS).theta
     record: dict[str, Any] = {"theta": short(theta), "final": short(theta[-1])}
     if task.sensor == "C":
-        theta = published_offline(flight, "C", angles="dead-reckoned", iterations=ITERATIONS).theta
+        theta = published_offline(flight, "C", angles="dead-reckoned", iterations=OFFLINE_ITERATIONS).theta
         record["dead_reckoned"] = short(theta[-1])
     return record
 
@@ -158,7 +164,7 @@ def _bounds(flight: Flight, sensor: str, first: int, last: int) -> dict[str, Any
 def window_ends(settings: Settings) -> list[int]:
     """Rows behind the last of disjoint windows, counted from the end, that begin after 8 s; at least the last one."""
     ends = list(range(settings.steps + 1, settings.window, -settings.window))
-    late = [end for end in ends if (end - settings.window) * settings.dt >= SETTLED]
+    late = [end for end in ends if (end - settings.window) * settings.dt >= SETTLED_SECONDS]
     return (late or ends[:1])[::-1]
 
 
@@ -185,7 +191,7 @@ def _fly_online(
         theta.append((float(mass), *(float(i) for i in inertia)))
         if after is not None:
             after()
-        if len(theta) % _CHECK == 0 and flight.crashed:
+        if len(theta) % _CRASH_CHECK_PERIOD == 0 and flight.crashed:
             break
     return np.array(theta), seconds
 
@@ -262,7 +268,7 @@ def _times(theta: NDArray, settings: Settings) -> dict[str, Any]:
     truth = np.array([settings.mass, *settings.inertia])
     times = np.minimum(settings.every * (np.arange(len(theta)) + 1), settings.steps) * settings.dt
     found: dict[str, Any] = {}
-    for name, (column, share) in NEAR.items():
+    for name, (column, share) in CONVERGENCE_BANDS.items():
         inside = np.abs(theta[:, column] / truth[column] - 1) <= share  # NaN is outside
         outside = np.flatnonzero(~inside)
         stays = outside[-1] + 1 if outside.size else 0

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.paper.flight import Flight, fly
-from crazyem.paper.published_values import FIGURES, PARAMETERS, RANGES, UNITS, PaperFigure
-from crazyem.paper.runner import write_whole
+from crazyem.paper.published_values import FIGURES, PARAMETERS, PUBLISHED_RANGES, UNITS, PaperFigure
+from crazyem.paper.runner import write_atomically
 from crazyem.paper.settings import Settings
 
 Record = Mapping[str, Any]
-DENSE, EVERY = 100, 5  # of online curves: all updates at first, then every fifth; more does not show
+DENSE_UPDATES, UPDATE_STRIDE = 100, 5  # of online curves: all updates at first, then every fifth; more does not show
 STATE_EVERY = 5  # rows of the state plots
 _DPI = 100
 _STYLE: Any = {
@@ -77,7 +77,7 @@ def _save(figure: Any, path: Path) -> None:
     for suffix, options in kinds:
         buffer = io.BytesIO()
         figure.savefig(buffer, format=suffix[1:], dpi=_DPI, **options)
-        write_whole(path.with_suffix(suffix), buffer.getvalue())
+        write_atomically(path.with_suffix(suffix), buffer.getvalue())
 
 
 # states and paths ---------------------------------------------------------------------------------------------
@@ -139,7 +139,7 @@ def _panels(figure: Any, wanted: PaperFigure, settings: Settings, label: str) ->
     scale = 1.0 if wanted.parameter == "mass" else 1e4
     truth = scale * (settings.mass, *settings.inertia)[column]
     whole, near = figure.subplots(2, 1, sharex=True)
-    low, high = (scale * v for v in RANGES[wanted.experiment, wanted.sensor][wanted.parameter])
+    low, high = (scale * v for v in PUBLISHED_RANGES[wanted.experiment, wanted.sensor][wanted.parameter])
     for axis in (whole, near):
         axis.axhspan(low, high, color="0.5", alpha=0.2, linewidth=0, label="paper's range")
         axis.axhline(truth, color="r", linewidth=1.2, label="true", zorder=3)
@@ -188,7 +188,7 @@ def _offline(figure: Any, wanted: PaperFigure, settings: Settings, runs: Mapping
         axis.vlines(at, limits[:, 0], limits[:, 1], "C0", linewidth=1, label="crazyem, 95 % intervals")
         axis.plot(at, finals, "C0.", markersize=3)
     truth = scale * (settings.mass, *settings.inertia)[column]
-    paper = RANGES["offline", wanted.sensor][wanted.parameter]
+    paper = PUBLISHED_RANGES["offline", wanted.sensor][wanted.parameter]
     _enlarge(near, settled, (scale * paper[0], scale * paper[1]), truth)
     whole.legend(loc="upper right")
     return "Below, enlarged. crazyem's estimates with their 95 % intervals stand at the right, one for each flight."
@@ -201,7 +201,7 @@ def _online(figure: Any, wanted: PaperFigure, settings: Settings, runs: Mapping[
     for method, style in (("published", _PUBLISHED), ("crazyem", _CRAZYEM)):
         curves = [_column(r["theta"], column, scale) for r in runs[method]]
         longest = max(map(len, curves), default=0)
-        shown = np.array([i for i in range(longest) if i < DENSE or i % EVERY == 0], int)
+        shown = np.array([i for i in range(longest) if i < DENSE_UPDATES or i % UPDATE_STRIDE == 0], int)
         settled += [v for r in runs[method] for w in r["windows"] if (v := w["value"][column]) is not None and v > 0]
         thinned = [c[shown[shown < len(c)]] for c in curves]
         for axis in (whole, near):
@@ -212,7 +212,7 @@ def _online(figure: Any, wanted: PaperFigure, settings: Settings, runs: Mapping[
         for axis in (whole, near):
             axis.fill_between(rows, ci95[:, 0], ci95[:, 1], color="C0", alpha=0.2, linewidth=0, label="95 % interval")
     truth = scale * (settings.mass, *settings.inertia)[column]
-    paper = RANGES["online", wanted.sensor][wanted.parameter]
+    paper = PUBLISHED_RANGES["online", wanted.sensor][wanted.parameter]
     _enlarge(near, settled, (scale * paper[0], scale * paper[1]), truth)
     whole.legend(loc="upper right")
     return "Below, enlarged; the first updates are outside. The band is crazyem's 95 % interval in the first flight."

@@ -20,9 +20,10 @@ from crazyem.paper.state_filter import filter_step
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import GRAVITY
 
-LIFTED = 0.1  # m measured above the floor: the reference starts (7 standard deviations of the position sensor)
-RAMP = 2.0  # N/s of thrust until then, where there is a floor
-MERGE = 0.5  # s in which the drone, which rises by then, is led onto the reference, which begins at rest on the floor
+LIFTED_HEIGHT = 0.1  # m measured above the floor: the reference starts (7 standard deviations of the position sensor)
+THRUST_RAMP = 2.0  # N/s of thrust until then, where there is a floor
+# s in which the drone, which rises by then, is led onto the reference, which begins at rest on the floor
+MERGE_SECONDS = 0.5
 
 
 @compiled
@@ -40,7 +41,7 @@ def _advance(
     h = dt / substeps
     for k in range(first, last):
         # the controller acts on the estimate at k
-        lifted = readings[k, 2] > LIFTED
+        lifted = readings[k, 2] > LIFTED_HEIGHT
         if ground and lift_off < 0 and lifted and not np.isnan(mass):
             lift_off = k
             handover[0] = estimate[k, :3] - truth[0, :3]
@@ -48,7 +49,7 @@ def _advance(
         if ground and lift_off < 0:
             up[2], up[5] = estimate[k, 2], estimate[k, 5]
             control(estimate[k], up, 0.0, gains, limit, 1.0, inertia, wrench[k])
-            wrench[k, 0] = wrench[k - 1, 0] if lifted else RAMP * k * dt
+            wrench[k, 0] = wrench[k - 1, 0] if lifted else THRUST_RAMP * k * dt
         else:
             goal[:] = reference[k - lift_off if ground else k]
             if ground:
@@ -80,12 +81,12 @@ def _lead(handover, t, goal):
     """Add to goal (9,) the distance (3,) and velocity (3,) at take-off, critically damped, t s later."""
     for i in range(3):
         d = handover[0, i]
-        b = handover[1, i] + d / MERGE
-        here = (d + b * t) * np.exp(-t / MERGE)
-        slope = b * np.exp(-t / MERGE)
+        b = handover[1, i] + d / MERGE_SECONDS
+        here = (d + b * t) * np.exp(-t / MERGE_SECONDS)
+        slope = b * np.exp(-t / MERGE_SECONDS)
         goal[i] += here
-        goal[3 + i] += slope - here / MERGE
-        goal[6 + i] += here / MERGE**2 - 2.0 * slope / MERGE
+        goal[3 + i] += slope - here / MERGE_SECONDS
+        goal[6 + i] += here / MERGE_SECONDS**2 - 2.0 * slope / MERGE_SECONDS
 
 
 @compiled

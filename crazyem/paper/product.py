@@ -22,7 +22,7 @@ from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle
 
 PARAMETERS = ("mass", "Ixx", "Iyy", "Izz")
-NEVER = 10**9  # samples between updates when only the last one is wanted
+NO_UPDATE = 10**9  # samples between updates when only the last one is wanted
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def product_offline(
     if not 0 <= first < last <= flight.size:
         raise UsageError(f"rows {first} to {last} are not in a flight of {flight.size} rows")
     estimator = estimator_for(
-        flight.settings, sensor, window=last - first, every=NEVER, mass=mass, inertia=inertia, known=known,
+        flight.settings, sensor, window=last - first, every=NO_UPDATE, mass=mass, inertia=inertia, known=known,
         accelerometer=accelerometer,
     )  # fmt: skip
     for sample in flight.samples(sensor, first, last):

@@ -19,7 +19,8 @@ from crazyem.paper.settings import Settings
 
 __all__ = ["CORRECTIONS", "Correction", "PublishedFit", "PublishedOnline", "published_offline"]
 
-DECADE = 10.0  # `clamp` refuses an inertia further than this from I0: ten times too stiff a rate loop still is stable
+# `clamp` refuses an inertia further than this from I0: ten times too stiff a rate loop still is stable
+LARGEST_INERTIA_RATIO = 10.0
 
 Angles = Literal["zero", "dead-reckoned"]
 
@@ -46,8 +47,8 @@ class _Workspace:
         self.angular = np.empty((rows, 6, 6))
         self.smoothed = np.empty((rows, 12))
         inertia = np.array(settings.inertia_start)
-        self.lowest = np.array([0.0, *inertia / DECADE])
-        self.highest = np.array([np.inf, *inertia * DECADE])
+        self.lowest = np.array([0.0, *inertia / LARGEST_INERTIA_RATIO])
+        self.highest = np.array([np.inf, *inertia * LARGEST_INERTIA_RATIO])
 
     def iterate(
         self, observed: NDArray, wrench: NDArray, first: NDArray, theta: NDArray, *, sees_angles: bool, clamp: bool
@@ -126,8 +127,8 @@ class PublishedOnline:
         settings: of the flight.
         sensor, angles: as in `published_offline`. Dead-reckoned angles go on from where the last window's filter saw
             the row that is now the first (its smoother, which ignores Phi, would carry them away).
-        clamp: whether a mass that is not positive, or an inertia further than a factor `DECADE` from I0, is refused and
-            the last one kept. As printed it is not (False); then some flights from m0 = 1 g turn over or fall.
+        clamp: whether a mass that is not positive, or an inertia off I0 by a factor over `LARGEST_INERTIA_RATIO`,
+            is refused and the last one kept. As printed it is not (False); some flights from m0 = 1 g then crash.
 
     Attributes:
         theta: (4,) mass kg, Ixx, Iyy, Izz kg m^2, newest.

@@ -17,7 +17,7 @@ TABLE_I = {
 }
 
 # Tables II, III (offline) and IV, V (online): ranges of the converged values over 20 cycles
-RANGES: dict[tuple[str, str], dict[str, tuple[float, float]]] = {
+PUBLISHED_RANGES: dict[tuple[str, str], dict[str, tuple[float, float]]] = {
     ("offline", "A"): {
         "mass": (0.1797, 0.1802), "Ixx": (2.418e-4, 2.75e-4), "Iyy": (2.93e-4, 3.32e-4), "Izz": (1.912e-4, 2.255e-4),
     },

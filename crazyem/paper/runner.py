@@ -18,17 +18,17 @@ from crazyem.paper.overrides import described
 from crazyem.paper.settings import Settings
 
 SCHEMA = "crazyem paper 1"
-LARGEST = 20_000_000  # bytes of a task file that is ours; a whole flight of updates takes 0.1 MB
+LARGEST_TASK_FILE = 20_000_000  # bytes of a task file that is ours; a whole flight of updates takes 0.1 MB
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 # What the numbers of a task come from. Tables and figures are made anew each time.
 _CODE = ("physics/**/*.py", "signals/**/*.py", "control/**/*.py", "estimation/**/*.py", "presets/zhao.toml",
          "vehicle.py", "compiled.py", "paper/*.py")  # fmt: skip
-_TEXT = (
+_TEXT_MODULES = (
     "runner tables table_text figures pages docs overrides published_values published_corrections accuracy cold_start"
 )
-_NOT_CODE = {f"paper/{name}.py" for name in _TEXT.split()}
-_VERSIONS = ("numpy", "scipy", "numba")
+_NOT_CODE = {f"paper/{name}.py" for name in _TEXT_MODULES.split()}
+_VERSIONED_PACKAGES = ("numpy", "scipy", "numba")
 
 
 def code_hash(method: str = "crazyem") -> str:
@@ -60,7 +60,7 @@ def environment() -> dict[str, Any]:
         "crazyem": metadata.version("crazyem"),
         "code": code_hash(),
         "python": platform.python_version(),
-        **{name: metadata.version(name) for name in _VERSIONS},
+        **{name: metadata.version(name) for name in _VERSIONED_PACKAGES},
         "machine": platform.machine(),
         "system": platform.system(),
     }
@@ -84,10 +84,12 @@ def run_and_store(task: Task, settings: Settings, folder: str, stamp: str) -> No
         UsageError: it cannot be written.
     """
     record = run_task(task, settings)
-    write_whole(task_file(Path(folder), task), json.dumps({"fingerprint": stamp, "record": record}, allow_nan=False))
+    write_atomically(
+        task_file(Path(folder), task), json.dumps({"fingerprint": stamp, "record": record}, allow_nan=False)
+    )
 
 
-def write_whole(path: Path, content: str | bytes) -> None:
+def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file so that nobody ever sees half of it.
 
     Raises:
@@ -119,7 +121,7 @@ def stored(folder: Path, task: Task, stamp: str) -> tuple[dict[str, Any] | None,
     """The record of a finished task, or None and why: "missing", "other" (settings or version) or "damaged"."""
     path = task_file(folder, task)
     try:
-        if path.stat().st_size > LARGEST:
+        if path.stat().st_size > LARGEST_TASK_FILE:
             return None, "damaged"
         content = json.loads(path.read_bytes())
     except FileNotFoundError:
@@ -134,7 +136,7 @@ def stored(folder: Path, task: Task, stamp: str) -> tuple[dict[str, Any] | None,
     return (record, "") if _is_record_of(record, task) else (None, "damaged")
 
 
-_NEEDED = {
+_REQUIRED_FIELDS = {
     ("table1", "filter"): ("position", "angles"),
     ("offline", "published"): ("theta", "final"),
     ("offline", "crazyem"): ("final", "ci95"),
@@ -150,7 +152,7 @@ def _is_record_of(record: Any, task: Task) -> bool:
         and all(record.get(key) == value for key, value in asdict(task).items())
         and isinstance(record.get("timing"), dict)
         and all(isinstance(record["timing"].get(k), float | int) for k in ("seconds", "cpu_seconds"))
-        and all(key in record for key in _NEEDED[task.experiment, task.method])
+        and all(key in record for key in _REQUIRED_FIELDS[task.experiment, task.method])
     )
 
 

@@ -105,7 +105,7 @@ def table1_grid(table1: Record) -> Grid:
     return Grid("Table I: pose estimation of the EKF", ("", "paper", "here"), tuple(rows), note)
 
 
-_TITLES = {
+_TABLE_TITLES = {
     "II": "offline estimated mass [kg]",
     "III": "offline estimated inertia [1e-4 kg m^2]",
     "IV": "online estimated mass [kg]",
@@ -138,7 +138,7 @@ def table_grid(cells: Iterable[Record], table: str) -> Grid | None:
         "(20: 3.7 standard deviations, 60: 4.6), in brackets one standard deviation."
     )
     head = ("", "paper", "published, here", "width", "overlap", "crazyem", "width", "overlap", "bound")
-    return Grid(f"Table {table}: {_TITLES[table]}", head, tuple(rows), note)
+    return Grid(f"Table {table}: {_TABLE_TITLES[table]}", head, tuple(rows), note)
 
 
 def _here(cell: Record, method: str) -> tuple[str, str, str]:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.paper.experiments import NEAR, SETTLED
-from crazyem.paper.published_values import PARAMETERS, RANGES, SENSORS, TABLE_I, table_of
+from crazyem.paper.experiments import CONVERGENCE_BANDS, SETTLED_SECONDS
+from crazyem.paper.published_values import PARAMETERS, PUBLISHED_RANGES, SENSORS, TABLE_I, table_of
 from crazyem.paper.settings import Settings
 
 Record = Mapping[str, Any]
@@ -61,7 +61,7 @@ def cell(records: Iterable[Record], settings: Settings, experiment: str, sensor:
     """One cell of Tables II to V; methods without tasks are null."""
     column = PARAMETERS.index(parameter)
     truth = (settings.mass, *settings.inertia)[column]
-    paper = RANGES[experiment, sensor][parameter]
+    paper = PUBLISHED_RANGES[experiment, sensor][parameter]
     mine = [r for r in records if r["experiment"] == experiment and r["sensor"] == sensor]
     # offline the bound belongs to the flight, which both methods share; online each method flew its own
     limits = {r["seed"]: r for r in mine if r["method"] == "bound"}
@@ -110,7 +110,7 @@ def _values(
 
 def _curves(records: Sequence[Record], settings: Settings, column: int, paper: tuple[float, float]) -> dict[str, Any]:
     """The other way to read a range off online curves: everything they pass through after 8 s."""
-    first = round(SETTLED / (settings.dt * settings.every))
+    first = round(SETTLED_SECONDS / (settings.dt * settings.every))
     values = [row[column] for r in records if not r["crashed"] for row in r["theta"][first:] if row[column] is not None]
     if not values:
         return {"curve_range": None, "curve_width_ratio": None}
@@ -182,7 +182,7 @@ def flights(records: Sequence[Record]) -> list[dict[str, Any]]:
                 "crashed_as_printed": sum(r.get("crashed_as_printed_after_s") is not None for r in chosen),
                 "tracking_over_known": _digits(np.mean(ratio)) if ratio else None,
             }  # fmt: skip
-            for name in NEAR:
+            for name in CONVERGENCE_BANDS:
                 for when in ("first", "stays"):
                     times = sorted(math.inf if (t := r["times"][name][when]) is None else t for r in chosen)
                     middle = float(np.median(times))

@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from crazyem.errors import UsageError
-from crazyem.paper.bound import MEASURED, NOISE, START_SD, bound, observed
+from crazyem.paper.bound import MEASURED, NOISE_CASES, START_SD, bound, observed
 from crazyem.paper.flight import Flight, fly
 from crazyem.paper.settings import Settings
 
@@ -212,7 +212,7 @@ def test_an_accelerometer_helps_the_mass_and_hardly_the_inertia(flight):
 
 def test_options_asked_for_at_once_are_those_asked_for_afterwards(flight):
     free = bound(flight, "B", 0, 400)
-    for noise in NOISE:
+    for noise in NOISE_CASES:
         at_once = bound(flight, "B", 0, 400, noise=noise, sensors="known")
         assert np.array_equal(at_once.sd, free.under(noise, sensors="known").sd)
     assert bound(flight, "B", 0, 400, noise="common").names == (

@@ -16,8 +16,8 @@ from crazyem.errors import UsageError
 from crazyem.paper.cold_start import (
     BANDS,
     NAMES,
-    SETTLED,
-    SMOOTH,
+    SETTLED_SECONDS,
+    SMOOTH_SETTINGS,
     ColdStart,
     Loop,
     Settling,
@@ -26,7 +26,7 @@ from crazyem.paper.cold_start import (
     spread,
     summarise,
 )
-from crazyem.paper.flight import LIFTED, RAMP, Flight
+from crazyem.paper.flight import LIFTED_HEIGHT, THRUST_RAMP, Flight
 from crazyem.paper.product import estimator_for
 from crazyem.paper.settings import P5
 
@@ -65,15 +65,15 @@ def test_thrust_ramps_up_from_the_floor_and_waits_for_a_mass():
     flight = Flight(SHORT, 3, ground=True)
     flight.advance(SHORT.steps, mass=None, inertia=SHORT.inertia)
     assert flight.lift_off == -1
-    lifted = flight.readings[:-1, 2] > LIFTED
+    lifted = flight.readings[:-1, 2] > LIFTED_HEIGHT
     first = int(np.argmax(lifted))
-    ramp = RAMP * SHORT.dt * np.arange(first)
+    ramp = THRUST_RAMP * SHORT.dt * np.arange(first)
     np.testing.assert_allclose(flight.wrench[:first, 0], ramp, atol=1e-12)
     assert flight.wrench[first, 0] == flight.wrench[first - 1, 0]
-    # it stood until thrust carried it, and rose as thrust over weight says: dz'''/dt = RAMP / m
+    # it stood until thrust carried it, and rose as thrust over weight says: dz'''/dt = THRUST_RAMP / m
     left = int(np.flatnonzero(flight.contact)[-1])
-    assert left * SHORT.dt == pytest.approx(SHORT.mass * 9.81 / RAMP, abs=0.03)
-    height = RAMP / SHORT.mass * ((first - left) * SHORT.dt) ** 3 / 6
+    assert left * SHORT.dt == pytest.approx(SHORT.mass * 9.81 / THRUST_RAMP, abs=0.03)
+    height = THRUST_RAMP / SHORT.mass * ((first - left) * SHORT.dt) ** 3 / 6
     assert flight.truth[first, 2] == pytest.approx(height, abs=0.04)
 
 
@@ -84,7 +84,7 @@ def test_the_reference_begins_when_a_mass_is_known():
     assert waiting.lift_off == 280
     at_once = Flight(SHORT, 3, ground=True)
     at_once.advance(281, mass=SHORT.mass, inertia=SHORT.inertia)
-    assert at_once.lift_off == int(np.argmax(at_once.readings[:, 2] > LIFTED))
+    assert at_once.lift_off == int(np.argmax(at_once.readings[:, 2] > LIFTED_HEIGHT))
     rows = slice(0, at_once.lift_off)
     np.testing.assert_array_equal(waiting.truth[rows], at_once.truth[rows])
 
@@ -327,5 +327,5 @@ def test_whole_flights_track_as_with_known_parameters():
             assert not flight.crashed
             assert flight.contact_used == 0
             assert flight.rms < 1.15 * flight.rms_known
-            assert flight.settling["mass within 1 %"].stays < SETTLED
-    assert SMOOTH.smooth
+            assert flight.settling["mass within 1 %"].stays < SETTLED_SECONDS
+    assert SMOOTH_SETTINGS.smooth

@@ -93,7 +93,7 @@ def test_things_that_are_no_records(tmp_path: Path, content: bytes) -> None:
 
 def test_a_huge_task_file_is_not_read(tmp_path: Path) -> None:
     path = put_record(tmp_path)
-    os.truncate(path, runner.LARGEST + 1)
+    os.truncate(path, runner.LARGEST_TASK_FILE + 1)
     assert runner.stored(tmp_path, TASK, "f") == (None, "damaged")
 
 
@@ -145,7 +145,7 @@ def test_results_are_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monk
     target.write_text("before")
     monkeypatch.setattr(os, "replace", interrupted)
     with pytest.raises(UsageError, match="No space left"):
-        runner.write_whole(target, "after")
+        runner.write_atomically(target, "after")
     assert target.read_text() == "before"
     assert [p.name for p in tmp_path.iterdir()] == ["results.json"]
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from crazyem.paper.docs import KEPT, SMALL_SEEDS, STORED
+from crazyem.paper.docs import SMALL_SEEDS, STORED_FIELDS, STORED_RESULTS
 from crazyem.paper.experiments import Task, plan, run_task
 from crazyem.paper.settings import Settings
 
@@ -29,7 +29,7 @@ def check(tasks: list[Task]) -> None:
     expected = stored()["tasks"]
     for task in tasks:
         record = run_task(task, Settings())
-        found = {k: record[k] for k in KEPT if k in record}
+        found = {k: record[k] for k in STORED_FIELDS if k in record}
         assert found.keys() == expected[task.name].keys()
         for key, value in found.items():
             assert _numbers(value) == pytest.approx(_numbers(expected[task.name][key]), rel=TOLERANCE), (task.name, key)
@@ -45,7 +45,7 @@ def _numbers(value: Any) -> list[float]:
 
 
 def test_the_stored_seeds_are_those_of_the_documented_run() -> None:
-    kept = json.loads((HERE.parents[1] / "docs" / STORED).read_text()) if stored() else {}
+    kept = json.loads((HERE.parents[1] / "docs" / STORED_RESULTS).read_text()) if stored() else {}
     assert stored()["environment"] == kept["environment"]
     assert set(stored()["tasks"]) == {t.name for t in ALL}
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from crazyem.errors import UsageError
 from crazyem.paper import figures
 from crazyem.paper.figures import draw_all
-from crazyem.paper.published_values import FIGURES, RANGES
+from crazyem.paper.published_values import FIGURES, PUBLISHED_RANGES
 from crazyem.paper.settings import Settings
 
 SHORT = Settings(duration=1.0, window=100)
@@ -80,7 +80,7 @@ def test_enlargement_holds_truth_paper_and_runs() -> None:
     wanted = next(f for f in FIGURES if f.number == 25)
     figures._online(figure, wanted, SHORT, {"published": [], "crazyem": [record]})
     low, high = figure.axes[1].get_ylim()
-    paper = [1e4 * v for v in RANGES["online", "A"]["Ixx"]]
+    paper = [1e4 * v for v in PUBLISHED_RANGES["online", "A"]["Ixx"]]
     for value in (*paper, 2.5 * 0.8, 2.5 * 1.3, 2.5):
         assert low <= value <= high
 

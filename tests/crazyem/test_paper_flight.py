@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from crazyem.errors import UsageError
-from crazyem.paper.flight import LIFTED, Flight, fly, reference
+from crazyem.paper.flight import LIFTED_HEIGHT, Flight, fly, reference
 from crazyem.paper.plant import angle_rates, derivative, step, thrust_axis
 from crazyem.paper.settings import LITERAL, P5, Settings
 from crazyem.paper.state_filter import filter_step, transition
@@ -244,7 +244,7 @@ def test_from_a_floor_the_reference_waits_for_lift_off():
     flight = Flight(settings, 1, ground=True)
     while flight.lift_off < 0 and flight.size <= settings.steps:
         flight.advance(4, mass=settings.mass, inertia=settings.inertia)
-    assert flight.readings[flight.lift_off, 2] > LIFTED
+    assert flight.readings[flight.lift_off, 2] > LIFTED_HEIGHT
     assert np.all(flight.contact[1:100])
     assert np.all(flight.truth[:100, 2] == 0.0)
     flight.advance(settings.steps, mass=settings.mass, inertia=settings.inertia)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.errors import UsageError
 from crazyem.paper.flight import Flight, fly
-from crazyem.paper.published import CORRECTIONS, DECADE, PublishedOnline, published_offline
+from crazyem.paper.published import CORRECTIONS, LARGEST_INERTIA_RATIO, PublishedOnline, published_offline
 from crazyem.paper.published_kernels import expectation, maximisation
 from crazyem.paper.settings import LITERAL, Settings
 
@@ -97,7 +97,7 @@ def test_an_estimate_out_of_bounds_is_refused_only_if_asked():
     as_printed = m_step(x, wrench, TRUE, 0.005)
     assert as_printed[0] < 0
     assert np.all(np.isnan(as_printed[1:]))  # 0 / 0: no torque, no motion
-    bounds = np.array([0.0, *TRUE[1:] / DECADE]), np.array([np.inf, *TRUE[1:] * DECADE])
+    bounds = np.array([0.0, *TRUE[1:] / LARGEST_INERTIA_RATIO]), np.array([np.inf, *TRUE[1:] * LARGEST_INERTIA_RATIO])
     assert np.array_equal(m_step(x, wrench, TRUE, 0.005, clamp=True, bounds=bounds), TRUE)
 
 
@@ -273,7 +273,7 @@ def test_a_cold_start_with_clamped_estimates_flies():
             flight.advance(settings.every, mass=mass, inertia=inertia)
             mass, inertia = online.update(flight)
             assert mass > 0
-            assert np.all(inertia > np.array(settings.inertia_start) / DECADE)
+            assert np.all(inertia > np.array(settings.inertia_start) / LARGEST_INERTIA_RATIO)
         assert not flight.crashed
         assert mass == pytest.approx(0.18, rel=0.01)
 

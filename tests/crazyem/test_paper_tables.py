@@ -17,7 +17,7 @@ from crazyem.errors import FileFormatError, UsageError
 from crazyem.paper import docs
 from crazyem.paper.experiments import short, thin, window_ends
 from crazyem.paper.pages import index_html, tables_markdown
-from crazyem.paper.published_values import FIGURES, PARAMETERS, RANGES, SENSORS, TABLE_I
+from crazyem.paper.published_values import FIGURES, PARAMETERS, PUBLISHED_RANGES, SENSORS, TABLE_I
 from crazyem.paper.settings import Settings
 from crazyem.paper.table_text import Grid, grids
 from crazyem.paper.tables import cell, derive, expected_range, flights
@@ -46,8 +46,8 @@ def test_figures_are_numbered_as_in_the_paper() -> None:
 def test_ranges_are_those_of_the_papers_own_comparisons() -> None:
     """XII: online inertia ranges are "approximately 2.62 to 6 times" the offline ones, mass of A and C 2.1 to 2.2."""
     ratio = {
-        (s, p): (RANGES["online", s][p][1] - RANGES["online", s][p][0])
-        / (RANGES["offline", s][p][1] - RANGES["offline", s][p][0])
+        (s, p): (PUBLISHED_RANGES["online", s][p][1] - PUBLISHED_RANGES["online", s][p][0])
+        / (PUBLISHED_RANGES["offline", s][p][1] - PUBLISHED_RANGES["offline", s][p][0])
         for s in SENSORS
         for p in PARAMETERS
     }
@@ -336,7 +336,7 @@ def test_docs_are_written_from_a_run(tmp_path: Path) -> None:
     run = tmp_path / "results.json"
     run.write_text(json.dumps(results_of(whole_run(2, updates=8))))
     assert docs.main([str(run), "--root", str(tmp_path)]) == 0
-    stored = (tmp_path / "docs" / docs.STORED).read_text()
+    stored = (tmp_path / "docs" / docs.STORED_RESULTS).read_text()
     assert "tasks" not in json.loads(stored)
     assert "Table III" in (tmp_path / "docs" / "paper.md").read_text()
     assert "range of mass, offline" in (tmp_path / "README.md").read_text()
@@ -345,7 +345,7 @@ def test_docs_are_written_from_a_run(tmp_path: Path) -> None:
 
 def test_pages_have_not_drifted_from_the_stored_run() -> None:
     """`make paper-docs` wrote them; whoever edits a number by hand, or a generator, has to run it again."""
-    stored = REPOSITORY / "docs" / docs.STORED
+    stored = REPOSITORY / "docs" / docs.STORED_RESULTS
     if not stored.is_file():
         pytest.skip("no run is stored yet")
     results = docs.read_results(stored)
