@@ -23,7 +23,7 @@ except ImportError:  # Windows: two processes that compile one kernel at once ma
 _KERNELS: list[Any] = []
 
 
-class _OwnCode(JITCodeLibrary):
+class _SeparateLibrary(JITCodeLibrary):
     """Machine code in which calls between kernels are bound: other kernels may link its bitcode, not its symbols."""
 
     def _finalize_final_module(self) -> None:
@@ -42,7 +42,7 @@ def _relink(module: Any, old: str, new: str) -> None:
 
 class _Compiler(CompilerBase):  # numba's way to customise compilation
     def define_pipelines(self) -> list[Any]:
-        self.state.library = _OwnCode(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+        self.state.library = _SeparateLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
         self.state.library.enable_object_caching()
         return [DefaultPassBuilder.define_nopython_pipeline(self.state)]
 

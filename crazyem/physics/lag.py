@@ -16,22 +16,22 @@ import numpy as np
 
 from crazyem.compiled import compiled
 
-STEP = 1e-3  # relative change of tau for the central difference
+TAU_STEP = 1e-3  # relative change of tau for the central difference
 
 # What lies between two stamps.
 LINEAR = 0  # a straight line: measured rotor speeds
 HOLD = 1  # the earlier value: a controller that acts once per stamp, without lag
 CAUSAL = 2  # a straight line, but a step's mean knows no later stamp than its start: commands with rotor lag
 
-ORDER = 3  # of the linear prediction
-_AHEAD = 64  # most commands known or predicted inside one step
+PREDICTION_ORDER = 3  # of the linear prediction
+_MOST_AHEAD = 64  # most commands known or predicted inside one step
 
 
 @compiled
 def _segment(u0, u1, h, tau, state, acc):
     """One linear stretch of the command, u0 to u1 (4,), h long: advance `state`, add its integral to `acc`."""
     for v in range(len(acc) // 4):
-        tv = tau * (1.0 + STEP * (v if v < 2 else -1))
+        tv = tau * (1.0 + TAU_STEP * (v if v < 2 else -1))
         decay = np.exp(-h / tv) if tv > 0 else 0.0
         for c in range(4):
             y0 = state[4 * v + c]
@@ -56,18 +56,18 @@ def _at(times, commands, i, last, t, mode, out):
 @compiled
 def _predict(times, commands, i, known, end, predictor, path_times, path):
     """Commands i..known-1 (and a few before) and their prediction up to `end`, into path; returns how many."""
-    begin = max(0, min(i, known - ORDER), known - _AHEAD // 2)
+    begin = max(0, min(i, known - PREDICTION_ORDER), known - _MOST_AHEAD // 2)
     size = known - begin
     for k in range(size):
         path_times[k] = times[begin + k]
         path[k] = commands[begin + k]
     period = path_times[size - 1] - path_times[size - 2] if size >= 2 else 0.0
-    if size < ORDER or not 0.0 < period < 0.05:
+    if size < PREDICTION_ORDER or not 0.0 < period < 0.05:
         return size  # held
-    while path_times[size - 1] < end and size < _AHEAD:
+    while path_times[size - 1] < end and size < _MOST_AHEAD:
         for c in range(4):
-            value = predictor[c, ORDER]
-            for j in range(ORDER):
+            value = predictor[c, PREDICTION_ORDER]
+            for j in range(PREDICTION_ORDER):
                 value += predictor[c, j] * path[size - 1 - j, c]
             path[size, c] = value
         path_times[size] = path_times[size - 1] + period
@@ -76,8 +76,8 @@ def _predict(times, commands, i, known, end, predictor, path_times, path):
 
 
 def hold_predictor() -> np.ndarray:
-    """Prediction that the latest command stays. (4, ORDER + 1)."""
-    weights = np.zeros((4, ORDER + 1))
+    """Prediction that the latest command stays. (4, PREDICTION_ORDER + 1)."""
+    weights = np.zeros((4, PREDICTION_ORDER + 1))
     weights[:, 0] = 1.0
     return weights
 
@@ -89,23 +89,25 @@ def fit_predictor(commands: np.ndarray) -> np.ndarray:
         commands: (n, 4), evenly spaced.
 
     Returns:
-        (4, ORDER + 1): weights of the latest, the one before ..., and a constant. With too few commands, or none that
+        (4, PREDICTION_ORDER + 1): weights of the latest, the one before ..., and a constant. With too few, or none that
         vary, the prediction is to hold the latest.
     """
     weights = hold_predictor()
-    n = len(commands) - ORDER
-    if n < 10 * (ORDER + 1):
+    n = len(commands) - PREDICTION_ORDER
+    if n < 10 * (PREDICTION_ORDER + 1):
         return weights
     for c in range(4):
-        past = np.stack([commands[ORDER - 1 - j : ORDER - 1 - j + n, c] for j in range(ORDER)], 1)
+        past = np.stack(
+            [commands[PREDICTION_ORDER - 1 - j : PREDICTION_ORDER - 1 - j + n, c] for j in range(PREDICTION_ORDER)], 1
+        )
         centre, spread = past.mean(), past.std()
         if not spread > 0.0:
             continue
         a = (past - centre) / spread
-        target = (commands[ORDER:, c] - commands[ORDER - 1 : -1, c]) / spread
-        step = np.linalg.solve(a.T @ a + 1e-6 * n * np.eye(ORDER), a.T @ target)
-        weights[c, :ORDER] += step
-        weights[c, ORDER] = -step.sum() * centre
+        target = (commands[PREDICTION_ORDER:, c] - commands[PREDICTION_ORDER - 1 : -1, c]) / spread
+        step = np.linalg.solve(a.T @ a + 1e-6 * n * np.eye(PREDICTION_ORDER), a.T @ target)
+        weights[c, :PREDICTION_ORDER] += step
+        weights[c, PREDICTION_ORDER] = -step.sum() * centre
     return weights
 
 
@@ -137,7 +139,7 @@ def _back(t0, t1, u0, u1, t, tau, state):
     """Undo the lag from t back to t0 on the line from (t0, u0) to (t1, u1)."""
     h = t - t0
     for v in range(len(state) // 4):
-        tv = tau * (1.0 + STEP * (v if v < 2 else -1))
+        tv = tau * (1.0 + TAU_STEP * (v if v < 2 else -1))
         if tv <= 0.0:
             continue
         grow = np.exp(h / tv)
@@ -158,13 +160,13 @@ def lagged_means(
         times: (n,) s, stamps of the commands, increasing.
         commands: (n, 4) F [N] and M [N m] commanded at those stamps.
         first, last: range of commands to use; times[first] must not be after the start time in `state`.
-        predictor: (4, ORDER + 1) weights of the latest commands in the prediction of the next; see `fit_predictor`.
+        predictor: (4, PREDICTION_ORDER + 1) weights of the latest commands in predicting the next; see `fit_predictor`.
         nodes: (m,) s, increasing.
         node_first, node_last: fill rows node_first..node_last-1, row k being the step that ends at nodes[k].
         mode: LINEAR, HOLD or CAUSAL.
         tau: s; 0 means no lag.
         delay: s by which the command acts later than its stamp says.
-        state: (13,) lagged values for tau, tau (1 + STEP) and tau (1 - STEP), 4 each, then their time [s] on the clock
+        state: (13,) lagged values for tau and tau (1 +- TAU_STEP), 4 each, then their time [s] on the clock
             of the commands; updated in place, so that a later call goes on from the last node. (5,): for tau alone.
         mean: (m, 4) receives the means.
         mean_tau: (m, 4) receives d mean / d tau [1/s]; for tau alone nothing.
@@ -178,8 +180,8 @@ def lagged_means(
     acc = np.empty(values)
     junk = np.empty(values)
     guess = np.empty(values + 1)
-    path_times = np.empty(_AHEAD)
-    path = np.empty((_AHEAD, 4))
+    path_times = np.empty(_MOST_AHEAD)
+    path = np.empty((_MOST_AHEAD, 4))
     start = np.empty(4)
     begin = state[values]
     while i + 1 < last and times[i + 1] <= begin:
@@ -228,7 +230,7 @@ def lagged_means(
         for c in range(4):
             mean[k, c] = acc[c] / span
             if values > 4:
-                mean_tau[k, c] = (acc[4 + c] - acc[8 + c]) / (2 * STEP * tau * span) if tau > 0 else 0.0
+                mean_tau[k, c] = (acc[4 + c] - acc[8 + c]) / (2 * TAU_STEP * tau * span) if tau > 0 else 0.0
         begin = end
         state[values] = end
     return i

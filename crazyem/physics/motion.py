@@ -54,7 +54,7 @@ class Motion:
     angular_acceleration: NDArray
 
 
-def own_values(vehicle: Vehicle) -> dict[str, dict[str, float]]:
+def vehicle_values(vehicle: Vehicle) -> dict[str, dict[str, float]]:
     """The vehicle's own values for parameters whose neutral value is the vehicle's."""
     xx, yy, zz = vehicle.inertia
     xy, xz, yz = vehicle.inertia_products
@@ -67,7 +67,7 @@ def own_values(vehicle: Vehicle) -> dict[str, dict[str, float]]:
 
 def active(effects: Effects, vehicle: Vehicle) -> list[tuple[Effect, dict]]:
     """Effects with complete parameters, in the order of the catalogue."""
-    own = own_values(vehicle)
+    own = vehicle_values(vehicle)
     return [(CATALOGUE[n], CATALOGUE[n].complete(effects[n], own.get(n, {}))) for n in CATALOGUE if n in effects]
 
 

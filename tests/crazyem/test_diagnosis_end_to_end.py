@@ -21,7 +21,7 @@ from crazyem.diagnosis.fitting.model import Noise, Point
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.prediction.horizon import UNITS
 from crazyem.physics.effects.catalogue import CATALOGUE
-from crazyem.physics.motion import own_values
+from crazyem.physics.motion import vehicle_values
 from crazyem.recordings import open_recording
 from crazyem.recordings.mcap.signals import write_recording
 from crazyem.recordings.recording import Recording
@@ -100,7 +100,7 @@ def possible(effect: dict[str, Any]) -> list[str]:
         told = effect["parameters"].get(p.name, {"chosen": True})
         if told.get("chosen"):
             continue
-        none = own_values(DRONE).get(effect["name"], {}).get(p.name, 0.0) if p.neutral != p.neutral else p.neutral
+        none = vehicle_values(DRONE).get(effect["name"], {}).get(p.name, 0.0) if p.neutral != p.neutral else p.neutral
         low, high = told["ci95"]
         if not p.low <= low <= told["value"] <= high <= p.high:
             wrong.append(f"{p.name}: {told['value']} ({low} to {high})")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from crazyem.errors import FileFormatError
 from crazyem.physics.effects.catalogue import CATALOGUE, check_effects, discover
 from crazyem.physics.effects.effect import Effect, Effects, Parameter, Wrench
-from crazyem.physics.motion import RotorInput, body_of, measured, motion, own_values, rotor_thrust
+from crazyem.physics.motion import RotorInput, body_of, measured, motion, rotor_thrust, vehicle_values
 from crazyem.vehicle import parse_vehicle
 
 AGREED = {  # issue 5: names are an interface
@@ -54,7 +54,7 @@ def test_every_effect_says_what_it_needs_and_what_would_tell_it_apart(name: str)
     assert not effect.separates.endswith(".")
     for holder in (effect, *effect.parameters):
         assert {*holder.needs, *holder.without} <= SIGNALS
-    own = own_values(ROTORS).get(name, {})
+    own = vehicle_values(ROTORS).get(name, {})
     for p in effect.parameters:
         neutral = effect.complete({}, own)[p.name]
         if p.chosen:
@@ -87,7 +87,7 @@ def test_neutral_changes_nothing(name: str) -> None:
 def test_away_from_neutral_it_changes_something(name: str) -> None:
     """Each effect, a few scales away, is seen by exactly the function that it is for."""
     effect = CATALOGUE[name]
-    values = dict(effect.complete({}, own_values(ROTORS).get(name, {})))
+    values = dict(effect.complete({}, vehicle_values(ROTORS).get(name, {})))
     for p in effect.parameters:
         if not p.chosen and values[p.name] is not None:
             values[p.name] += 3 * p.scale
@@ -131,7 +131,7 @@ def everything(name: str, values: dict) -> np.ndarray:
 @pytest.mark.parametrize("name", [n for n in CATALOGUE if n != "gusts"])
 def test_where_a_fit_begins_every_parameter_matters(name: str) -> None:
     effect = CATALOGUE[name]
-    base = effect.complete({}, own_values(ROTORS).get(name, {}))
+    base = effect.complete({}, vehicle_values(ROTORS).get(name, {}))
     base |= effect.nudge
     known = [p.name for p in effect.parameters]
     assert {*effect.nudge, *effect.beginnings, *(n for group in effect.alternatives for n in group)} <= set(known)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from crazyem.physics.effects.effect import Effects
-from crazyem.physics.effects.fused_attitude import DRAWN_BACK, leads_astray, led_astray
+from crazyem.physics.effects.fused_attitude import CORRECTION_SECONDS, attitude_error, disturbs_attitude
 from crazyem.physics.motion import measured
 
 TURNING = 9.0  # rad/s: of the rates that turn to and fro
@@ -30,7 +30,8 @@ def accelerated(time, step):
 def solved(times, error):
     """e' = error(t) - e / T from 0 at the first of the times."""
     found = solve_ivp(
-        lambda t, e: error(t) - e / DRAWN_BACK, (times[0], times[-1]), np.zeros(3), t_eval=times, rtol=1e-9, atol=1e-11,
+        lambda t, e: error(t) - e / CORRECTION_SECONDS,
+        (times[0], times[-1]), np.zeros(3), t_eval=times, rtol=1e-9, atol=1e-11,
         max_step=1e-3,
     )  # fmt: skip
     return found.y.T
@@ -42,7 +43,7 @@ def flown(n=120, step=0.01, **changes):
 
 
 @pytest.mark.parametrize("delay", [0.002, 0.004, 0.012])
-def test_a_late_gyro_leads_the_attitude_astray_by_the_differential_equation(delay: float) -> None:
+def test_a_late_gyro_disturbs_the_attitude_by_the_differential_equation(delay: float) -> None:
     situation = flown()
     effects: Effects = {"measurement_delay": {"delay": delay, "streams": ["gyro"]}}
     wanted = solved(situation.time, lambda t: rate(t - delay) - rate(t))
@@ -75,18 +76,20 @@ def test_a_stretch_begins_without_an_error_and_knows_nothing_of_the_one_before(s
     step = np.where((np.arange(n) > 0) & (np.arange(n) != cut), 0.01, 0.0)
     situation = still(n, step=step, fused=True)
     error = rng.standard_normal((n, 3))
-    whole = led_astray(situation, error, delay=delay)
+    whole = attitude_error(situation, error, delay=delay)
     assert not whole[[0, cut]].any()
     alone = still(n - cut, step=step[cut:], fused=True)
-    np.testing.assert_allclose(led_astray(alone, error[cut:], delay=delay)[1:], whole[cut + 1 :], rtol=1e-9)
-    assert np.abs(whole).max() <= DRAWN_BACK * np.abs(error).max()  # a filter that is drawn back stays near
+    np.testing.assert_allclose(attitude_error(alone, error[cut:], delay=delay)[1:], whole[cut + 1 :], rtol=1e-9)
+    assert np.abs(whole).max() <= CORRECTION_SECONDS * np.abs(error).max()  # a filter that is drawn back stays near
 
 
 def test_a_steady_error_is_held_where_the_filter_is_drawn_back() -> None:
     situation = still(200, fused=True)
     error = np.tile([0.1, -0.2, 0.05], (200, 1))
-    np.testing.assert_allclose(led_astray(situation, error, delay=0.0)[-1], DRAWN_BACK * error[0], rtol=1e-9)
-    assert led_astray(still(0, fused=True), np.zeros((0, 3)), delay=0.01).shape == (0, 3)
+    np.testing.assert_allclose(
+        attitude_error(situation, error, delay=0.0)[-1], CORRECTION_SECONDS * error[0], rtol=1e-9
+    )
+    assert attitude_error(still(0, fused=True), np.zeros((0, 3)), delay=0.01).shape == (0, 3)
 
 
 @pytest.mark.parametrize(
@@ -99,5 +102,5 @@ def test_a_steady_error_is_held_where_the_filter_is_drawn_back() -> None:
         ({"x": 0.1}, False),
     ],
 )
-def test_which_effects_lead_attitudes_astray(values, leads) -> None:
-    assert leads_astray(values) is leads
+def test_which_effects_disturb_attitudes(values, leads) -> None:
+    assert disturbs_attitude(values) is leads

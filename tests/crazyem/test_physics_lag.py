@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from crazyem.physics.lag import CAUSAL, HOLD, LINEAR, ORDER, fit_predictor, hold_predictor, lagged_means
+from crazyem.physics.lag import CAUSAL, HOLD, LINEAR, PREDICTION_ORDER, fit_predictor, hold_predictor, lagged_means
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -103,7 +103,7 @@ def test_causal_means_are_blind_to_the_future(seed, k, delay, behind):
     known is a matter of stamps, whatever the delay.
     """
     rng, times, commands, nodes = after_a_while(seed, behind)
-    predictor = np.concatenate([rng.normal(size=(4, ORDER)) * 0.4, np.zeros((4, 1))], 1)
+    predictor = np.concatenate([rng.normal(size=(4, PREDICTION_ORDER)) * 0.4, np.zeros((4, 1))], 1)
     before = run(times, commands, nodes, mode=CAUSAL, tau=0.05, delay=delay, predictor=predictor)
     other = commands.copy()
     later = times > nodes[k - 1] + 1e-6
@@ -120,7 +120,7 @@ def test_causal_means_are_blind_to_the_future(seed, k, delay, behind):
 def test_causal_means_do_not_jump_with_the_delay(seed, delay, behind):
     """A delay that is fitted may pass where a shifted step begins at a stamp (it did: by 300 nats)."""
     rng, times, commands, nodes = after_a_while(seed, behind)
-    predictor = np.concatenate([rng.normal(size=(4, ORDER)) * 0.4, np.zeros((4, 1))], 1)
+    predictor = np.concatenate([rng.normal(size=(4, PREDICTION_ORDER)) * 0.4, np.zeros((4, 1))], 1)
     for at in (delay, -behind):  # the second: every step begins at a stamp
         means = [
             run(times, commands, nodes, mode=CAUSAL, tau=0.05, delay=at + d, predictor=predictor)[0][2:]
@@ -133,7 +133,7 @@ def test_causal_means_carry_the_lag_along_what_came():
     """With a prediction that comes true, CAUSAL and LINEAR agree; the lag's state agrees whatever was predicted."""
     t = np.arange(60) * 0.01
     ramp = np.outer(1 + 3 * t, [0.3, 1e-4, -1e-4, 2e-5])
-    line = np.zeros((4, ORDER + 1))
+    line = np.zeros((4, PREDICTION_ORDER + 1))
     line[:, :2] = [2.0, -1.0]  # next = 2 latest - the one before
     nodes = t[5:] + 0.002
     causal = run(t, ramp, nodes, mode=CAUSAL, tau=0.06, delay=0.003, predictor=line)
@@ -171,7 +171,7 @@ def test_derivatives_are_those_of_finite_differences(seed, mode, tau):
 @given(seeds, st.sampled_from([LINEAR, HOLD, CAUSAL]), st.integers(2, 5), st.sampled_from([0.0, 0.05]))
 def test_incremental_calls_equal_one_call(seed, mode, split, tau):
     rng, times, commands, nodes = irregular(seed)
-    predictor = np.concatenate([rng.normal(size=(4, ORDER)) * 0.4, np.zeros((4, 1))], 1)
+    predictor = np.concatenate([rng.normal(size=(4, PREDICTION_ORDER)) * 0.4, np.zeros((4, 1))], 1)
     split = min(split, len(nodes) - 1)
     one = run(times, commands, nodes, mode=mode, tau=tau, delay=0.003, predictor=predictor)
     if split < 2:
@@ -209,8 +209,8 @@ def test_predictor_recovers_an_autoregressive_process():
         x[k] = weights @ x[k - 3 : k][::-1] + rng.normal(size=4)
     fitted = fit_predictor(centre + scale * x)
     # standard error of a weight is about 1 / sqrt(n) = 0.016
-    np.testing.assert_allclose(fitted[:, :ORDER], np.tile(weights, (4, 1)), atol=0.06)
-    np.testing.assert_allclose(fitted[:, ORDER], (1 - weights.sum()) * centre, atol=0.06 * centre.max())
+    np.testing.assert_allclose(fitted[:, :PREDICTION_ORDER], np.tile(weights, (4, 1)), atol=0.06)
+    np.testing.assert_allclose(fitted[:, PREDICTION_ORDER], (1 - weights.sum()) * centre, atol=0.06 * centre.max())
 
 
 def test_predictor_holds_where_there_is_nothing_to_fit():
@@ -218,7 +218,10 @@ def test_predictor_holds_where_there_is_nothing_to_fit():
     np.testing.assert_array_equal(hold[:, 0], 1.0)
     constant = np.tile([0.3, 1e-4, 0.0, 1e-5], (500, 1))
     predicted = fit_predictor(constant)
-    np.testing.assert_allclose(predicted[:, :ORDER] @ np.ones(ORDER) * constant[0] + predicted[:, ORDER], constant[0])
+    np.testing.assert_allclose(
+        predicted[:, :PREDICTION_ORDER] @ np.ones(PREDICTION_ORDER) * constant[0] + predicted[:, PREDICTION_ORDER],
+        constant[0],
+    )
     few = np.random.default_rng(0).normal(size=(20, 4))
     np.testing.assert_array_equal(fit_predictor(few), hold)
     np.testing.assert_array_equal(fit_predictor(np.zeros((0, 4))), hold)
@@ -228,8 +231,8 @@ def test_predictor_holds_where_there_is_nothing_to_fit():
 def test_predictor_does_not_depend_on_units(seed, scale):
     x = np.random.default_rng(seed).normal(size=(300, 4)).cumsum(0)
     a, b = fit_predictor(x), fit_predictor(scale * x)
-    np.testing.assert_allclose(a[:, :ORDER], b[:, :ORDER], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(a[:, ORDER] * scale, b[:, ORDER], rtol=1e-5, atol=1e-9 * scale)
+    np.testing.assert_allclose(a[:, :PREDICTION_ORDER], b[:, :PREDICTION_ORDER], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(a[:, PREDICTION_ORDER] * scale, b[:, PREDICTION_ORDER], rtol=1e-5, atol=1e-9 * scale)
 
 
 @given(

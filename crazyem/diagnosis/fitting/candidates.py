@@ -11,7 +11,7 @@ from crazyem.diagnosis.flights.flight import Flight
 from crazyem.errors import UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effect, Parameter
-from crazyem.physics.motion import own_values
+from crazyem.physics.motion import vehicle_values
 
 ON_BOARD = 0.04  # m from the middle of the rotors: no part of a Crazyflie is further away
 STRONGEST = 1.1  # a worn, cut or bent propeller pulls less than the others; a new one among worn ones a little more,
@@ -66,7 +66,7 @@ class Candidate:
 
     def neutral(self, point: Point) -> dict[str, Any]:
         """All its parameters as the vehicle file has them, else at neutral; the choices made."""
-        own = own_values(point.vehicle).get(self.effect, {})
+        own = vehicle_values(point.vehicle).get(self.effect, {})
         filed = point.vehicle.effects.get(self.effect, {})
         if any(filed.get(name, value) != value for name, value in self.fixed):
             filed = {}  # of another rotor

@@ -15,7 +15,7 @@ from crazyem.diagnosis.flights.inputs import Inputs
 from crazyem.diagnosis.prediction.course import ThrustCourse
 from crazyem.diagnosis.prediction.earned import Weights
 from crazyem.physics.effects.effect import Effects, Situation
-from crazyem.physics.effects.fused_attitude import FORGOTTEN, leads_astray
+from crazyem.physics.effects.fused_attitude import MEMORY_SECONDS, disturbs_attitude
 from crazyem.physics.effects.pendulum import swing_along, swing_on, watched_along
 from crazyem.physics.effects.stretches import LONGEST_STEP
 from crazyem.physics.motion import Motion, active, body_of, measured, motion
@@ -103,7 +103,7 @@ class Simulator:
         self._begun = np.zeros((0, 3))
         self._late: NDArray | float = 0.0  # s: what was not known of the delay at each start
         back = max((float(values.get("delay", 0.0)) for values in sensors), default=0.0)  # s
-        forgotten = FORGOTTEN if inputs.fused and any(leads_astray(values) for values in sensors) else 0.0
+        forgotten = MEMORY_SECONDS if inputs.fused and any(disturbs_attitude(values) for values in sensors) else 0.0
         self._looks_back = back + forgotten
         values = {effect.name: found for effect, found in active(self.effects, self.vehicle)}
         load = values.get("suspended_load", {"mass": 0.0, "length": None})

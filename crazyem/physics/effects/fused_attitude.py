@@ -18,8 +18,8 @@ from crazyem.compiled import compiled
 from crazyem.physics.effects.effect import Situation
 from crazyem.physics.effects.stretches import stretches
 
-DRAWN_BACK = 0.04  # s, T above
-FORGOTTEN = 3.0 * DRAWN_BACK  # s: what a gyro showed before is 5 % of an attitude's error
+CORRECTION_SECONDS = 0.04  # s, T above
+MEMORY_SECONDS = 3.0 * CORRECTION_SECONDS  # s: what a gyro showed before is 5 % of an attitude's error
 
 
 @compiled
@@ -34,12 +34,12 @@ def _relaxed(gap, broken, drive, time, out):
             out[k, i] = left * out[k - 1, i] + time * (1.0 - left) * drive[k, i]
 
 
-def leads_astray(values: Mapping[str, Any]) -> bool:
-    """Whether an effect with these values leads attitudes astray, which are made on board."""
+def disturbs_attitude(values: Mapping[str, Any]) -> bool:
+    """Whether an effect with these values disturbs attitudes that are made on board."""
     return "gyro" in values.get("streams", ()) or bool(values.get("rate_lag", 0.0))
 
 
-def led_astray(situation: Situation, rate_error: NDArray, *, delay: float) -> NDArray:
+def attitude_error(situation: Situation, rate_error: NDArray, *, delay: float) -> NDArray:
     """(n, 3) rad, body axes: how far an attitude made on board is off by a gyro's errors; 0 where it is not made so.
 
     rate_error: (n, 3) rad/s at the rows, of a gyro that is `delay` [s] late. What it is at a row it has been since
@@ -53,5 +53,5 @@ def led_astray(situation: Situation, rate_error: NDArray, *, delay: float) -> ND
     before[broken] = 0.0
     share = np.clip(0.5 * delay / np.where(gap > 0.0, gap, np.inf), 0.0, 0.5)[:, None]
     drive = np.ascontiguousarray((1.0 - share) * rate_error + share * before, dtype=np.float64)
-    _relaxed(gap, broken, drive, DRAWN_BACK, out)
+    _relaxed(gap, broken, drive, CORRECTION_SECONDS, out)
     return out

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
-from crazyem.physics.effects.fused_attitude import led_astray
+from crazyem.physics.effects.fused_attitude import attitude_error
 from crazyem.physics.effects.rotation import rotation_between
 from crazyem.physics.effects.stretches import stretches
 
@@ -43,7 +43,7 @@ def late(situation: Situation, *, delay: float, streams: str | Sequence[str]) ->
         offset.state[:, 6:9] -= before * situation.body_rate.take(row, axis=0)
     if "body_rate" in shown:
         offset.state[:, 9:12] = _past(path.body_rate, row, part) - path.body_rate
-        offset.state[:, 6:9] += led_astray(situation, offset.state[:, 9:12], delay=delay)
+        offset.state[:, 6:9] += attitude_error(situation, offset.state[:, 9:12], delay=delay)
     if "specific_force" in shown:
         offset.specific_force[:] = _past(situation.specific_force, row, part) - situation.specific_force
     return offset

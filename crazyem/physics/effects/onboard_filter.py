@@ -11,7 +11,7 @@ It belongs to the log and not to the drone: no vehicle file needs it, and diagno
 import numpy as np
 
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
-from crazyem.physics.effects.fused_attitude import led_astray
+from crazyem.physics.effects.fused_attitude import attitude_error
 from crazyem.vehicle import GRAVITY
 
 
@@ -22,7 +22,7 @@ def filtered(situation: Situation, *, rate_lag: float, velocity_lag: float) -> O
     acceleration[:, 2] -= GRAVITY
     offset.state[:, 3:6] = -velocity_lag * acceleration
     offset.state[:, 9:12] = -rate_lag * situation.angular_acceleration
-    offset.state[:, 6:9] = led_astray(situation, offset.state[:, 9:12], delay=max(rate_lag, 0.0))
+    offset.state[:, 6:9] = attitude_error(situation, offset.state[:, 9:12], delay=max(rate_lag, 0.0))
     return offset
 
 
