@@ -102,7 +102,7 @@ class Firmware:
             flight.log, flight.param, auto_arm=auto_arm, clock=self._tick, console=self._console.append
         )
         self.high_level = HighLevelService(flight.log, self._tick)
-        self.arbiter = Arbiter(low_level=self.high_level.planner.stop, relaxed=self.high_level.tell_state)
+        self.arbiter = Arbiter(low_level=self.high_level.planner.stop, relaxed=self.high_level.set_state)
         own_log = tables.slots(dict.fromkeys(contents.LOG, 0.0) | _CONSTANT_LOG)
         own_param = tables.slots(boot | dict.fromkeys(tables.DECKS, 0.0))
         log = {**own_log, **self.supervisor.log, **flight.log}
@@ -175,7 +175,7 @@ class Firmware:
     def _flush_console(self) -> None:
         """Console text goes out after the replies, and only once there is a client to hear it."""
         for text in self._console:
-            for chunk in console.split(text):
+            for chunk in console.split_text(text):
                 self._send(wire.encode(wire.CONSOLE, 0, chunk))
         self._console.clear()
 

@@ -55,14 +55,14 @@ class Flight:
         self._estimate = np.zeros(at.ESTIMATE_SIZE)
         self._P = np.zeros((9, 9))
         self._memory = np.zeros(mem.MEMORY_SIZE)
-        self._log = np.zeros(len(variables.ALL))
+        self._log = np.zeros(len(variables.ALL_VARIABLES))
         self._log[lv.RPM : lv.RPM + 4] = RPM_UNREADABLE  # until the first report
         self._union = np.zeros(1, dtype=np.float32)
         self._union_short = self._union.view(np.int16)
         self.param_defaults = parameters.defaults(scenario.platform)
-        self._param = np.array([self.param_defaults[name] for name in parameters.NAMES])
-        self.log = {name: (self._log, variables.INDEX[name]) for name in variables.names(scenario.platform)}
-        self.param = {name: (self._param, i) for name, i in parameters.INDEX.items()}
+        self._param = np.array([self.param_defaults[name] for name in parameters.PARAMETER_NAMES])
+        self.log = {name: (self._log, variables.VARIABLE_INDEX[name]) for name in variables.names(scenario.platform)}
+        self.param = {name: (self._param, i) for name, i in parameters.PARAMETER_INDEX.items()}
         self._controller = float(DEFAULT_CONTROLLER)
         self._design_lqg()
         self._start_up(scenario)
@@ -88,7 +88,7 @@ class Flight:
 
     def _design_lqg(self) -> None:
         """New gains from the weights; weights that have no solution leave the old gains."""
-        weights = {n: float(self._param[parameters.INDEX[f"ctrlLqg.{n}"]]) for n in parameters.LQG_WEIGHTS}
+        weights = {n: float(self._param[parameters.PARAMETER_INDEX[f"ctrlLqg.{n}"]]) for n in parameters.LQG_WEIGHTS}
         gains = lqg_design.design(**weights)
         if gains is not None:
             self._memory[mem.LQG_GAIN_POS : mem.LQG_GAIN_POS + 8] = gains
@@ -106,10 +106,10 @@ class Flight:
         elif name.startswith("ctrlLqg.") and name.split(".")[1] in parameters.LQG_WEIGHTS:
             self._design_lqg()
         elif name == "stabilizer.estimator":
-            self._param[parameters.INDEX[name]] = 2.0  # the only one there is
-        elif name == "kalman.resetEstimation" and self._param[parameters.INDEX[name]] != 0.0:
+            self._param[parameters.PARAMETER_INDEX[name]] = 2.0  # the only one there is
+        elif name == "kalman.resetEstimation" and self._param[parameters.PARAMETER_INDEX[name]] != 0.0:
             self._estimate[at.E_RESET] = 1.0
-            self._param[parameters.INDEX[name]] = 0.0  # the firmware clears it when the reset is done
+            self._param[parameters.PARAMETER_INDEX[name]] = 0.0  # the firmware clears it when the reset is done
 
     def external_position(self, position: Sequence[float] | np.ndarray) -> None:
         """A position fix from outside: m, world; used at the next step. Values that are not finite are dropped."""

@@ -20,7 +20,7 @@ _BUFFER = 1 << 20  # bytes, both ways: a client reads its whole table of content
 # When the host stalls, the drone's time may fall behind by that much and catches up; beyond, it stands still instead of
 # racing. Kept below the 500 ms after which the setpoint watchdog takes a client for dead.
 _MAX_BEHIND_HOST, _MAX_BEHIND_FIRMWARE = 250.0, 300.0  # ms of host time, ms of firmware time
-_CHUNK = 20  # ms of firmware time between two looks at the socket
+_CHUNK_MS = 20  # ms of firmware time between two looks at the socket
 _TRUTH_PERIOD = 10  # ms between rows of the truth file
 
 Address = tuple[str, int]
@@ -107,17 +107,17 @@ class Server:
         Returns: host time (monotonic, s) of the next turn, 0 if there is more to do at once.
         """
         flight = self.firmware.flight
-        most = min(_MAX_BEHIND_HOST * self._speed, _MAX_BEHIND_FIRMWARE) + _CHUNK
+        most = min(_MAX_BEHIND_HOST * self._speed, _MAX_BEHIND_FIRMWARE) + _CHUNK_MS
         behind = int(self._zero + (time.monotonic() - self._epoch) * 1000.0 * self._speed) - flight.tick
         if behind > most:
             self.begin()
             behind = 0
             self.stood_still += 1
         if behind > 0:
-            self._advance(min(behind, _CHUNK))
+            self._advance(min(behind, _CHUNK_MS))
         self._receive_all()
         self._transmit()
-        if behind > _CHUNK:
+        if behind > _CHUNK_MS:
             return 0.0
         return self._epoch + (next_event() - self._zero) / (1000.0 * self._speed)
 

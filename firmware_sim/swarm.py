@@ -32,9 +32,9 @@ from firmware_sim.vehicle_file import read_toml
 if TYPE_CHECKING:
     from firmware_sim.scenario import Scenario
 
-MOST = 100  # drones
-SPACING = 1.0  # m between drones on the grid
-LATEST = 20  # ms of firmware time between two turns of a drone that has nothing to send
+MOST_DRONES = 100  # drones
+GRID_SPACING = 1.0  # m between drones on the grid
+LONGEST_PAUSE = 20  # ms of firmware time between two turns of a drone that has nothing to send
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
 _KEYS = ("name", "port", "scenario", "position", "yaw", "seed")
 
@@ -68,7 +68,7 @@ def grid(number: int, count: int) -> tuple[float, float, float]:
     side = math.ceil(math.sqrt(count))
     row, column = divmod(number, side)
     middle = (side - 1) / 2
-    return SPACING * (column - middle), SPACING * (row - middle), 0.0
+    return GRID_SPACING * (column - middle), GRID_SPACING * (row - middle), 0.0
 
 
 def of_number(count: int, *, port: int, seed: int, scenario: Path | None = None) -> list[Drone]:
@@ -76,8 +76,8 @@ def of_number(count: int, *, port: int, seed: int, scenario: Path | None = None)
 
     Raises: ScenarioError for a number or a port that cannot be.
     """
-    if not 1 <= count <= MOST:
-        raise ScenarioError(f"a swarm has 1 to {MOST} drones, not {count}")
+    if not 1 <= count <= MOST_DRONES:
+        raise ScenarioError(f"a swarm has 1 to {MOST_DRONES} drones, not {count}")
     if port + count - 1 > 65535:
         raise ScenarioError(f"{count} drones from port {port} on would need ports beyond 65535")
     return [
@@ -94,8 +94,8 @@ def of_file(path: Path, *, port: int, seed: int, scenario: Path | None = None) -
         raise ScenarioError(f"{path}: {next(iter(table))} is not part of a swarm (only [[drone]] is)")
     if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries) or not entries:
         raise ScenarioError(f"{path}: a swarm needs at least one [[drone]]")
-    if len(entries) > MOST:
-        raise ScenarioError(f"{path}: a swarm has at most {MOST} drones, not {len(entries)}")
+    if len(entries) > MOST_DRONES:
+        raise ScenarioError(f"{path}: a swarm has at most {MOST_DRONES} drones, not {len(entries)}")
     drones = [
         _drone(entry, f"{path}: drone {i}", base, path.parent)
         for i, (entry, base) in enumerate(
@@ -194,7 +194,7 @@ def _next(firmware: Firmware) -> int:
     """The tick of the next log packet; what happens inside between two of them needs no turn of its own."""
     tick = firmware.flight.tick
     due = firmware.log.next_due()
-    return tick + LATEST if due is None else min(max(due, tick + 1), tick + LATEST)
+    return tick + LONGEST_PAUSE if due is None else min(max(due, tick + 1), tick + LONGEST_PAUSE)
 
 
 def open_swarm(drones: Sequence[Drone], stack: contextlib.ExitStack, *, host: str, speed: float) -> Swarm:

@@ -11,7 +11,7 @@ from typing import Any
 
 from firmware_sim.errors import ScenarioError
 
-LARGEST = 1 << 20  # bytes; such a file has a few hundred
+LARGEST_VEHICLE_FILE = 1 << 20  # bytes; such a file has a few hundred
 NO_LIMIT = 100.0  # N per rotor, what a thrust_max of inf becomes
 _VEHICLE = (
     *("mass", "inertia", "arm", "thrust_curve", "rotor_constant"),
@@ -24,11 +24,11 @@ def read_toml(path: Path) -> dict[str, Any]:
     """The table of a small TOML file. Raises ScenarioError naming the file."""
     try:
         with open(path, "rb") as file:
-            data = file.read(LARGEST + 1)
+            data = file.read(LARGEST_VEHICLE_FILE + 1)
     except (OSError, ValueError) as error:
         raise ScenarioError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
-    if len(data) > LARGEST:
-        raise ScenarioError(f"{path}: larger than {LARGEST} bytes, not a scenario or vehicle file")
+    if len(data) > LARGEST_VEHICLE_FILE:
+        raise ScenarioError(f"{path}: larger than {LARGEST_VEHICLE_FILE} bytes, not a scenario or vehicle file")
     try:
         return tomllib.loads(data.decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -102,7 +102,7 @@ class Planner:
         self.trajectory: Trajectory | None = None
         self.last = at_rest(_ZERO, 0.0)
 
-    def tell_state(self, position: Vector, velocity: Vector, yaw: float) -> None:
+    def set_state(self, position: Vector, velocity: Vector, yaw: float) -> None:
         """The estimated state [m, m/s, rad]: plans start here unless one is being flown."""
         self.last = at_rest(position, yaw, velocity)
 

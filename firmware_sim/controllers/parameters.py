@@ -7,7 +7,7 @@ step. `ctrlLqg` is ours: the out-of-tree controller 6.
 from firmware_sim import contents
 
 # Groups of the firmware's table that are ours whole, in its order.
-_WHOLE = ("stabilizer", "powerDist", "motorPowerSet", "kalman", "locSrv", "ctrlLee", "ctrlMel")
+_WHOLE_GROUPS = ("stabilizer", "powerDist", "motorPowerSet", "kalman", "locSrv", "ctrlLee", "ctrlMel")
 # PID: the gains of the twelve regulators stand together and in this order, then what else these groups hold.
 _PID = ("pid_attitude", "pid_rate", "posCtlPid", "velCtlPid")
 _GAINS = ("kp", "ki", "kd", "kff")
@@ -41,12 +41,12 @@ def _is_gain(name: str) -> bool:
 
 
 _FIRMWARE = (
-    *_names(_WHOLE),
+    *_names(_WHOLE_GROUPS),
     *filter(_is_gain, _names(_PID)),
     *(name for name in _names(_PID) if not _is_gain(name)),
 )
-NAMES = (*_FIRMWARE, *_LQG)
-INDEX = {name: i for i, name in enumerate(NAMES)}
+PARAMETER_NAMES = (*_FIRMWARE, *_LQG)
+PARAMETER_INDEX = {name: i for i, name in enumerate(PARAMETER_NAMES)}
 
 
 def defaults(platform: str) -> dict[str, float]:
@@ -55,52 +55,52 @@ def defaults(platform: str) -> dict[str, float]:
     return values | _LQG | {"ctrlLqg.mass": values["ctrlLee.mass"]}
 
 
-CONTROLLER = INDEX["stabilizer.controller"]
-STOP = INDEX["stabilizer.stop"]
-IDLE_THRUST = INDEX["powerDist.idleThrust"]
-POWER_SET = INDEX["motorPowerSet.enable"]  # then m1..m4
-PN_ACC_XY = INDEX["kalman.pNAcc_xy"]
-PN_ACC_Z = INDEX["kalman.pNAcc_z"]
-PN_VEL = INDEX["kalman.pNVel"]
-PN_POS = INDEX["kalman.pNPos"]
-PN_ATT = INDEX["kalman.pNAtt"]
-MN_GYRO_RP = INDEX["kalman.mNGyro_rollpitch"]
-MN_GYRO_YAW = INDEX["kalman.mNGyro_yaw"]
-DRAG = INDEX["kalman.dragB_x"]  # x y z
-COP = INDEX["kalman.cop_x"]  # x y z
-MAX_POS = INDEX["kalman.maxPos"]
-MAX_VEL = INDEX["kalman.maxVel"]
-EXT_POS_SD = INDEX["locSrv.extPosStdDev"]
-EXT_QUAT_SD = INDEX["locSrv.extQuatStdDev"]
-LEE_MASS = INDEX["ctrlLee.mass"]
-LEE_J = INDEX["ctrlLee.J_x"]  # x y z
-LEE_KR = INDEX["ctrlLee.KR_x"]
-LEE_KI = INDEX["ctrlLee.KI_x"]
-LEE_KW = INDEX["ctrlLee.Kw_x"]
-LEE_KP = INDEX["ctrlLee.Kpos_Px"]
-LEE_KP_LIMIT = INDEX["ctrlLee.Kpos_P_limit"]
-LEE_KD = INDEX["ctrlLee.Kpos_Dx"]
-LEE_KD_LIMIT = INDEX["ctrlLee.Kpos_D_limit"]
-LEE_KPI = INDEX["ctrlLee.Kpos_Ix"]
-LEE_KPI_LIMIT = INDEX["ctrlLee.Kpos_I_limit"]
-MEL_MASS = INDEX["ctrlMel.mass"]
-MEL_MASS_THRUST = INDEX["ctrlMel.massThrust"]
-MEL_XY = INDEX["ctrlMel.kp_xy"]  # kp, kd, ki, range
-MEL_Z = INDEX["ctrlMel.kp_z"]
-MEL_KR = INDEX["ctrlMel.kR_xy"]  # xy, z
-MEL_KW = INDEX["ctrlMel.kw_xy"]
-MEL_KI_M = INDEX["ctrlMel.ki_m_xy"]
-MEL_RANGE_M = INDEX["ctrlMel.i_range_m_xy"]
-MEL_KD_OMEGA = INDEX["ctrlMel.kd_omega_rp"]
-PID_GAINS = INDEX["pid_attitude.roll_kp"]  # twelve times kp, ki, kd, kff
-PID_YAW_LEAD = INDEX["pid_attitude.yawMaxDelta"]
-PID_ATT_FILTER = INDEX["pid_attitude.attFiltEn"]  # then the cut-off
-PID_RATE_FILTER = INDEX["pid_rate.rateFiltEn"]  # then three cut-offs
-PID_THRUST_BASE = INDEX["posCtlPid.thrustBase"]  # then the least thrust
-PID_R_LIMIT = INDEX["posCtlPid.rLimit"]  # roll, pitch
-PID_VEL_MAX = INDEX["posCtlPid.xVelMax"]  # x, y, z
-LQG_MASS = INDEX["ctrlLqg.mass"]
-LQG_J = INDEX["ctrlLqg.J_x"]
-LQG_TAU = INDEX["ctrlLqg.tau"]
-LQG_ACC_LIMIT = INDEX["ctrlLqg.acc_limit"]
+CONTROLLER = PARAMETER_INDEX["stabilizer.controller"]
+STOP = PARAMETER_INDEX["stabilizer.stop"]
+IDLE_THRUST = PARAMETER_INDEX["powerDist.idleThrust"]
+POWER_SET = PARAMETER_INDEX["motorPowerSet.enable"]  # then m1..m4
+PN_ACC_XY = PARAMETER_INDEX["kalman.pNAcc_xy"]
+PN_ACC_Z = PARAMETER_INDEX["kalman.pNAcc_z"]
+PN_VEL = PARAMETER_INDEX["kalman.pNVel"]
+PN_POS = PARAMETER_INDEX["kalman.pNPos"]
+PN_ATT = PARAMETER_INDEX["kalman.pNAtt"]
+MN_GYRO_RP = PARAMETER_INDEX["kalman.mNGyro_rollpitch"]
+MN_GYRO_YAW = PARAMETER_INDEX["kalman.mNGyro_yaw"]
+DRAG = PARAMETER_INDEX["kalman.dragB_x"]  # x y z
+COP = PARAMETER_INDEX["kalman.cop_x"]  # x y z
+MAX_POS = PARAMETER_INDEX["kalman.maxPos"]
+MAX_VEL = PARAMETER_INDEX["kalman.maxVel"]
+EXT_POS_SD = PARAMETER_INDEX["locSrv.extPosStdDev"]
+EXT_QUAT_SD = PARAMETER_INDEX["locSrv.extQuatStdDev"]
+LEE_MASS = PARAMETER_INDEX["ctrlLee.mass"]
+LEE_J = PARAMETER_INDEX["ctrlLee.J_x"]  # x y z
+LEE_KR = PARAMETER_INDEX["ctrlLee.KR_x"]
+LEE_KI = PARAMETER_INDEX["ctrlLee.KI_x"]
+LEE_KW = PARAMETER_INDEX["ctrlLee.Kw_x"]
+LEE_KP = PARAMETER_INDEX["ctrlLee.Kpos_Px"]
+LEE_KP_LIMIT = PARAMETER_INDEX["ctrlLee.Kpos_P_limit"]
+LEE_KD = PARAMETER_INDEX["ctrlLee.Kpos_Dx"]
+LEE_KD_LIMIT = PARAMETER_INDEX["ctrlLee.Kpos_D_limit"]
+LEE_KPI = PARAMETER_INDEX["ctrlLee.Kpos_Ix"]
+LEE_KPI_LIMIT = PARAMETER_INDEX["ctrlLee.Kpos_I_limit"]
+MEL_MASS = PARAMETER_INDEX["ctrlMel.mass"]
+MEL_MASS_THRUST = PARAMETER_INDEX["ctrlMel.massThrust"]
+MEL_XY = PARAMETER_INDEX["ctrlMel.kp_xy"]  # kp, kd, ki, range
+MEL_Z = PARAMETER_INDEX["ctrlMel.kp_z"]
+MEL_KR = PARAMETER_INDEX["ctrlMel.kR_xy"]  # xy, z
+MEL_KW = PARAMETER_INDEX["ctrlMel.kw_xy"]
+MEL_KI_M = PARAMETER_INDEX["ctrlMel.ki_m_xy"]
+MEL_RANGE_M = PARAMETER_INDEX["ctrlMel.i_range_m_xy"]
+MEL_KD_OMEGA = PARAMETER_INDEX["ctrlMel.kd_omega_rp"]
+PID_GAINS = PARAMETER_INDEX["pid_attitude.roll_kp"]  # twelve times kp, ki, kd, kff
+PID_YAW_LEAD = PARAMETER_INDEX["pid_attitude.yawMaxDelta"]
+PID_ATT_FILTER = PARAMETER_INDEX["pid_attitude.attFiltEn"]  # then the cut-off
+PID_RATE_FILTER = PARAMETER_INDEX["pid_rate.rateFiltEn"]  # then three cut-offs
+PID_THRUST_BASE = PARAMETER_INDEX["posCtlPid.thrustBase"]  # then the least thrust
+PID_R_LIMIT = PARAMETER_INDEX["posCtlPid.rLimit"]  # roll, pitch
+PID_VEL_MAX = PARAMETER_INDEX["posCtlPid.xVelMax"]  # x, y, z
+LQG_MASS = PARAMETER_INDEX["ctrlLqg.mass"]
+LQG_J = PARAMETER_INDEX["ctrlLqg.J_x"]
+LQG_TAU = PARAMETER_INDEX["ctrlLqg.tau"]
+LQG_ACC_LIMIT = PARAMETER_INDEX["ctrlLqg.acc_limit"]
 LQG_WEIGHTS = ("tau", "q_pos", "q_vel", "r_acc", "q_att", "q_rate", "r_ang", "q_yaw", "q_yawrate", "r_yaw")

@@ -4,7 +4,7 @@ import numpy as np
 
 from firmware_sim.plant.layout import NOISE_WIDTH
 
-BLOCK = 1024  # ms drawn at a time
+BLOCK_MS = 1024  # ms drawn at a time
 
 
 class NoiseSource:
@@ -13,11 +13,11 @@ class NoiseSource:
     def __init__(self, seed: int) -> None:
         self._seed = seed
         self._block = -1
-        self.rows = np.zeros((BLOCK, NOISE_WIDTH))
+        self.rows = np.zeros((BLOCK_MS, NOISE_WIDTH))
 
     def prepare(self, tick: int) -> int:
         """Make the row of `tick` [ms] available; returns its index in `rows`."""
-        block, row = divmod(tick, BLOCK)
+        block, row = divmod(tick, BLOCK_MS)
         if block != self._block:
             generator = np.random.default_rng([self._seed, block])
             generator.standard_normal(out=self.rows)

@@ -14,7 +14,7 @@ from firmware_sim.errors import ScenarioError
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.quaternion import matrix
 
-MOST = 32  # events of a scenario
+MOST_EVENTS = 32  # events of a scenario
 _BODY = [
     *range(at.MASS, at.INERTIA_INV + 9),
     *range(at.CONTACT_FREQUENCY, at.CONTACT_STICK + 1),
@@ -113,8 +113,8 @@ def parse_events(table: Any, source: str, *, loaded: bool) -> tuple[PayloadEvent
     """
     if not isinstance(table, Mapping) or set(table) != {"events"} or not isinstance(table["events"], list):
         raise ScenarioError(f"{source}: payload holds events only: [[payload.events]]")
-    if len(table["events"]) > MOST:
-        raise ScenarioError(f"{source}: payload.events must be at most {MOST}, there are {len(table['events'])}")
+    if len(table["events"]) > MOST_EVENTS:
+        raise ScenarioError(f"{source}: payload.events must be at most {MOST_EVENTS}, there are {len(table['events'])}")
     events = tuple(_event(e, f"{source}: payload.events[{n}]") for n, e in enumerate(table["events"]))
     load = int(loaded)
     for n, event in enumerate(events):

@@ -12,12 +12,12 @@ from typing import Any
 from firmware_sim.errors import FirmwareSimError
 from firmware_sim.relay.errors import RelayError
 from firmware_sim.relay.faults import DOWN, FATES, UP, Engine, Fault
-from firmware_sim.relay.kinds import NAMES
+from firmware_sim.relay.kinds import KIND_NAMES
 from firmware_sim.relay.relay import Relay, parse_target
 from firmware_sim.relay.schedule import load_schedule
 
 _EPILOG = f"""\
-kinds: {", ".join(sorted(set(NAMES.values())))}; "log" is all of log.*
+kinds: {", ".join(sorted(set(KIND_NAMES.values())))}; "log" is all of log.*
 a schedule is a TOML file:
   seed = 1
   [[fault]]                  # what: drop duplicate reorder delay corrupt silence die

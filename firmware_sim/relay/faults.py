@@ -13,7 +13,7 @@ from firmware_sim.relay.kinds import check_kinds, kind_of, matches
 UP, DOWN = "up", "down"  # from the host to the drone, from the drone to the host
 WHATS = ("drop", "duplicate", "reorder", "delay", "corrupt", "silence", "die")
 FATES = ("received", "forwarded", "dropped", "silenced", "duplicated", "reordered", "delayed", "corrupted", "overflow")
-HOLD = 0.1  # s after which a packet held back for others goes out alone
+HOLD_SECONDS = 0.1  # s after which a packet held back for others goes out alone
 MOST_PENDING = 20_000  # packets on their way; more are lost, as in any queue
 
 
@@ -183,7 +183,7 @@ class Engine:
                 release = rule.newest[route, direction] = max(release, rule.newest.get((route, direction), release))
                 fates["delayed"] += 1
         if held:
-            self._held.append(_Held(route, direction, datagram, held, release + HOLD))
+            self._held.append(_Held(route, direction, datagram, held, release + HOLD_SECONDS))
             copies -= 1  # the others are not held back
         for _ in range(copies):
             self._push(release, route, direction, datagram)

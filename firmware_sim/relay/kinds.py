@@ -6,7 +6,7 @@ from firmware_sim import wire
 from firmware_sim.relay.errors import RelayError
 
 # (port, channel) -> name; the part before the dot alone means every channel of the port.
-NAMES: dict[tuple[int, int], str] = {
+KIND_NAMES: dict[tuple[int, int], str] = {
     (wire.CONSOLE, 0): "console",
     (wire.PARAM, 0): "param.toc",
     (wire.PARAM, 1): "param.read",
@@ -33,7 +33,7 @@ NAMES: dict[tuple[int, int], str] = {
     (wire.LINK, 3): "link.null",
 }
 OTHER = "other"
-_GROUPS = {name.partition(".")[0] for name in NAMES.values()}
+_GROUPS = {name.partition(".")[0] for name in KIND_NAMES.values()}
 
 
 def kind_of(datagram: bytes) -> str:
@@ -43,7 +43,7 @@ def kind_of(datagram: bytes) -> str:
     packet = wire.decode(datagram)
     if packet is None:
         return OTHER
-    return NAMES.get((packet.port, packet.channel), f"port{packet.port}.{packet.channel}")
+    return KIND_NAMES.get((packet.port, packet.channel), f"port{packet.port}.{packet.channel}")
 
 
 def check_kinds(names: Iterable[str]) -> frozenset[str]:
@@ -51,7 +51,7 @@ def check_kinds(names: Iterable[str]) -> frozenset[str]:
 
     Raises: RelayError naming what is unknown.
     """
-    known = set(NAMES.values()) | _GROUPS | {OTHER}
+    known = set(KIND_NAMES.values()) | _GROUPS | {OTHER}
     wanted = frozenset(names)
     for name in sorted(wanted - known):
         port, _, channel = name.removeprefix("port").partition(".")

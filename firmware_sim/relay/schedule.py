@@ -11,7 +11,7 @@ from firmware_sim.relay.faults import Fault
 
 LARGEST_FILE = 1 << 20  # bytes
 MOST_FAULTS = 1000
-_WHOLE = {"skip", "count", "distance", "bits", "copies"}
+_INTEGER_KEYS = {"skip", "count", "distance", "bits", "copies"}
 _RENAMED = {"from": "start", "until": "end"}  # as one would write it; `from` is no name in Python
 
 
@@ -57,9 +57,9 @@ def _fault(entry: dict[str, Any], where: str) -> Fault:
                 raise RelayError(f"{where}: {key} must be a word")
             values[name] = value
         else:
-            wanted = (int,) if name in _WHOLE else (int, float)
+            wanted = (int,) if name in _INTEGER_KEYS else (int, float)
             if isinstance(value, bool) or not isinstance(value, wanted) or math.isnan(value):
-                raise RelayError(f"{where}: {key} must be a {'whole ' if name in _WHOLE else ''}number")
+                raise RelayError(f"{where}: {key} must be a {'whole ' if name in _INTEGER_KEYS else ''}number")
             values[name] = value
     if "what" not in values:
         raise RelayError(f'{where}: "what" is missing')

@@ -66,13 +66,13 @@ class HighLevelService:
             if np.isfinite(setpoint).all():
                 return setpoint
             self.planner.disable()  # as the firmware does with an invalid evaluation
-        self.tell_state()
+        self.set_state()
         return sp.null_setpoint() if self.planner.state == PlannerState.IDLE else None
 
-    def tell_state(self) -> None:
+    def set_state(self) -> None:
         """Let the next plan start from the estimated state."""
         x, y, z, vx, vy, vz, yaw = (float(array[index]) for array, index in self._estimate)
-        self.planner.tell_state((x, y, z), (vx, vy, vz), math.radians(yaw))
+        self.planner.set_state((x, y, z), (vx, vy, vz), math.radians(yaw))
 
     def block(self, blocked: bool) -> None:
         """The supervisor does not allow flight: stop, and refuse commands."""

@@ -77,7 +77,7 @@ def test_body_rates_are_those_of_the_flat_attitude():
 
 def planner_at(position=(0.5, -0.5, 0.0), yaw=0.3):
     planner = Planner()
-    planner.tell_state(position, (0.0, 0.0, 0.0), yaw)
+    planner.set_state(position, (0.0, 0.0, 0.0), yaw)
     return planner
 
 

@@ -41,8 +41,8 @@ def test_senseless_weights_have_no_gains(bad: dict) -> None:
 
 def one_step(step, changes: dict) -> np.ndarray:  # type: ignore[no-untyped-def]
     """Force and torque of one controller step for a tilted, turning, displaced drone."""
-    param = np.array([(DEFAULTS | changes)[name] for name in parameters.NAMES])
-    memory, log = np.zeros(mem.MEMORY_SIZE), np.zeros(len(variables.ALL))
+    param = np.array([(DEFAULTS | changes)[name] for name in parameters.PARAMETER_NAMES])
+    memory, log = np.zeros(mem.MEMORY_SIZE), np.zeros(len(variables.ALL_VARIABLES))
     memory[mem.LQG_GAIN_POS : mem.LQG_GAIN_POS + 8] = lqg_design.design(**WEIGHTS)
     setpoint, estimate, sensor = sp.null_setpoint(), np.zeros(at.ESTIMATE_SIZE), np.zeros(at.SENSOR_SIZE)
     setpoint[sp.MODE_X : sp.MODE_Z + 1] = setpoint[sp.MODE_YAW] = sp.ABSOLUTE

@@ -27,7 +27,7 @@ class Board:
         self.constants = PLATFORMS[platform]
         self.board = Scenario(platform=platform).board()
         self.state, self.sensor = np.zeros(at.STATE_SIZE), np.zeros(at.SENSOR_SIZE)
-        self.memory, self.log = np.zeros(mem.MEMORY_SIZE), np.zeros(len(variables.ALL))
+        self.memory, self.log = np.zeros(mem.MEMORY_SIZE), np.zeros(len(variables.ALL_VARIABLES))
         self.param = np.array([parameters.defaults(platform)[name] for name in parameters.NAMES])
         self.noise = np.zeros(at.NOISE_WIDTH)
         self.sensor[at.VBAT] = self.sensor[at.VBAT_FILTERED] = volts

@@ -256,7 +256,7 @@ def test_no_scenario_gives_what_is_not_a_number(table: dict, controller: int, se
 )
 @given(
     values=st.dictionaries(
-        st.sampled_from(parameters.NAMES),
+        st.sampled_from(parameters.PARAMETER_NAMES),
         st.sampled_from([0.0, -1.0, 1e-9, 1e9, float("nan"), float("inf"), -float("inf")]),
         min_size=1,
         max_size=6,

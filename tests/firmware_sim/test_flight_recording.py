@@ -65,7 +65,7 @@ def test_power_distribution_gives_the_recorded_commands() -> None:
         sensor[at.VBAT] = sensor[at.VBAT_FILTERED] = got["pm.vbatMV"][t] / 1000
         memory[mem.MODE] = mem.FORCE_TORQUE_MODE
         memory[mem.WRENCH : mem.WRENCH + 4] = [wish[k][t] for k in wish]
-        motors_step(board, state, sensor, param, memory, np.zeros(len(variables.ALL)), True, True)
+        motors_step(board, state, sensor, param, memory, np.zeros(len(variables.ALL_VARIABLES)), True, True)
         errors.append([state[at.PWM + i] - got[f"motor.m{i + 1}"][t] for i in range(4)])
     if len(errors) < 50:
         pytest.skip("too few samples of both blocks at the same millisecond")

@@ -16,7 +16,7 @@ DT = 1e-3
 
 def parameters(**values: float) -> np.ndarray:
     boot = pm.defaults("cf2") | {f"kalman.{name}": value for name, value in values.items()}
-    return np.array([boot[name] for name in pm.NAMES])
+    return np.array([boot[name] for name in pm.PARAMETER_NAMES])
 
 
 def estimate(velocity: tuple, yaw: float = 0.0, rate: tuple = (0.0, 0.0, 0.0)) -> np.ndarray:
@@ -61,7 +61,7 @@ def test_the_covariance_knows_of_the_drag() -> None:
 
 
 def test_height_and_pressure_of_the_barometer_are_the_firmwares_formula() -> None:
-    state, log, noise = np.zeros(at.STATE_SIZE), np.zeros(len(lv.ALL)), np.random.default_rng(0)
+    state, log, noise = np.zeros(at.STATE_SIZE), np.zeros(len(lv.ALL_VARIABLES)), np.random.default_rng(0)
     state[at.POS + 2] = 12.0
     seen = []
     for tick in range(20_000):

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from firmware_sim.errors import FirmwareSimError
 from firmware_sim.relay.faults import DOWN, UP, Engine, Fault
-from firmware_sim.relay.kinds import NAMES, kind_of
+from firmware_sim.relay.kinds import KIND_NAMES, kind_of
 from firmware_sim.relay.relay import Relay, parse_target
 from firmware_sim.relay.schedule import load_schedule
 
@@ -178,7 +178,7 @@ def test_any_datagram_has_a_kind(datagram):
 
 
 def test_kinds_are_told_by_port_and_channel():
-    for (port, channel), name in NAMES.items():
+    for (port, channel), name in KIND_NAMES.items():
         assert kind_of(bytes([port << 4 | 0x0C | channel, 1])) == name
     assert kind_of(b"\xff") == "link.null"
     assert kind_of(b"\x9f\x00") == "port9.3"
