@@ -5,13 +5,14 @@
 The files are made here: half of them runs of one event (100 Hz, 20 variables), half with a second event after every
 other record, which is the worst case for a reader that takes runs. `crazyem` reads each to a whole `Recording` (signals
 in SI, CRC, what motor.m1..4 is); the peer is the plain loop that lab scripts have: struct.unpack a record at a time
-into lists, no units, no CRC. Both read the same files in one process; crazyem in two processes as well (joblib, started
+into lists, no units, no CRC. Both read the same files in one process; crazyem in two processes as well (started
 before the clock is). Last, ten minutes at 1 kHz with 12 variables in a process of its own, with its peak memory
 (Linux).
 """
 
 import argparse
 import json
+import multiprocessing
 import struct
 import subprocess
 import sys
@@ -19,6 +20,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -114,18 +116,16 @@ def timed(call: Callable[[], Any]) -> float:
 
 def measure_folder(*, files: int, kilobytes: int, rounds: int) -> dict[str, Any]:
     """Seconds for all files: medians over interleaved rounds, and the ranges."""
-    from joblib import Parallel, delayed
-
     with tempfile.TemporaryDirectory() as name:
         paths = []
         for i in range(files):
             paths.append(Path(name) / f"log{i:03d}")
             paths[-1].write_bytes(make(kilobytes=kilobytes, interleaved=bool(i % 2), seed=i))
         assert ours(paths[0]) == plain(paths[0])  # warm, and the same number of samples
-        with Parallel(n_jobs=2) as pool:
-            pool(delayed(ours)(path) for path in paths[:4])  # imports of the workers
+        with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+            list(pool.map(ours, paths[:4]))  # imports of the workers
             contenders: dict[str, Callable[[], Any]] = {
-                "crazyem, 2 processes": lambda: pool(delayed(ours)(path) for path in paths),
+                "crazyem, 2 processes": lambda: list(pool.map(ours, paths)),
                 "crazyem, 1 process": lambda: [ours(path) for path in paths],
                 "plain struct loop, 1 process": lambda: [plain(path) for path in paths],
             }

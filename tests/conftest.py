@@ -1,9 +1,15 @@
 """Made-up examples: few and always the same in `make test`, many and new ones in `make slow`.
 
 No example fails for its wall-clock time, which a busy machine makes any.
+
+Ctrl-C reaches the programs that tests start even where a shell has started the tests in the background, deaf to it.
 """
 
+import signal
+
 from hypothesis import HealthCheck, settings
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile(
     "steady", derandomize=True, database=None, max_examples=15, deadline=None,

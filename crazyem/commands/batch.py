@@ -3,12 +3,13 @@
 import contextlib
 import importlib
 import os
-import signal
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from crazyem.commands.output import Progress, Result
+from crazyem.commands.workers import shared
 from crazyem.errors import CrazyemError, LinkError, UsageError
 
 CONNECT_SECONDS = 10.0  # to a scheduler, and for its first worker
@@ -58,66 +59,29 @@ def _cores() -> int:
 
 
 def _results(calls: list[Any], jobs: int | None, cluster: str | None, stack: contextlib.ExitStack) -> Iterator[Result]:
-    count = processes(jobs, len(calls))
-    if cluster is None and count <= 1:
-        return (_guarded(*call) for call in calls)
-    return _parallel(calls, count, cluster, stack)
-
-
-def _parallel(calls: list[Any], count: int, cluster: str | None, stack: contextlib.ExitStack) -> Iterator[Result]:
-    import joblib
-
     if cluster is not None:
-        _connect(cluster, stack)
-        stack.enter_context(joblib.parallel_config("dask", wait_for_workers_timeout=CONNECT_SECONDS))
-        count = -1
-    pool = joblib.Parallel(n_jobs=count, return_as="generator")
-    with _workers_deaf_to_interrupts():
-        results = pool(joblib.delayed(_guarded)(*call) for call in calls)
-    finished = False
+        return _on_cluster(calls, cluster, stack)
+    count = processes(jobs, len(calls))
+    if count <= 1:
+        return (_guarded(*call) for call in calls)
+    return stack.enter_context(contextlib.closing(shared(_guarded, calls, count)))
+
+
+def _on_cluster(calls: list[Any], address: str, stack: contextlib.ExitStack) -> Iterator[Result]:
+    client = _connect(address, stack)
     try:
-        for result in results:  # noqa: UP028 (`yield from` would close `results` before the finally below can)
-            yield result
-        finished = True
-    except CrazyemError:
-        raise
-    except TimeoutError as error:
-        raise LinkError(f"the cluster at {cluster} has no worker ({error}).") from None
-    except (OSError, RuntimeError) as error:  # joblib's TerminatedWorkerError is a RuntimeError of some kind
-        died = "Terminated" in type(error).__name__ or "Broken" in type(error).__name__
-        why = "out of memory? --jobs 1 needs the least" if died else f"{type(error).__name__}: {error}"
-        raise CrazyemError(f"a worker process ended before its work was done ({why}).") from None
-    finally:
-        if not finished:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that work was cancelled is what was wanted
-                results.close()
-            if cluster is None:
-                _end_workers()
+        client.wait_for_workers(1, timeout=CONNECT_SECONDS)
+        futures = deque(client.map(_guarded, *zip(*calls, strict=True), pure=False))
+        while futures:
+            yield futures.popleft().result()
+    except TimeoutError:
+        raise LinkError(f"the cluster at {address} has no worker.") from None
+    except Exception as error:  # not of the work, see `_guarded`: a worker was killed, the scheduler has gone
+        what = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise CrazyemError(f"the cluster at {address} ended before its work was done ({what}).") from None
 
 
-@contextlib.contextmanager
-def _workers_deaf_to_interrupts() -> Iterator[None]:
-    """Processes started here ignore Ctrl-C, which the terminal sends to them too; this process deals with it."""
-    try:
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    except ValueError:  # not the main thread: no Ctrl-C comes here
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _end_workers() -> None:
-    """After Ctrl-C or an error: processes that still read are not waited for."""
-    with contextlib.suppress(Exception):
-        loky = importlib.import_module("joblib.externals.loky")
-        loky.get_reusable_executor().shutdown(wait=False, kill_workers=True)
-
-
-def _connect(address: str, stack: contextlib.ExitStack) -> None:
+def _connect(address: str, stack: contextlib.ExitStack) -> Any:
     try:
         distributed = importlib.import_module("distributed")
     except ImportError:
@@ -134,6 +98,7 @@ def _connect(address: str, stack: contextlib.ExitStack) -> None:
         first = str(error).split("\n", 1)[0] or type(error).__name__
         raise LinkError(f"no Dask scheduler answers at {address} ({first.rstrip('.')}).") from None
     stack.callback(client.close)
+    return client
 
 
 def _guarded(function: Callable[..., Result], task: tuple[Any, ...], name: str) -> Result:
