@@ -156,7 +156,7 @@ def test_a_real_file_as_signals(shared_recordings):
     assert np.array_equal(signals["position"].value[:, 1], column["stateEstimate.y"])
     assert np.array_equal(signals["motor_command"].value[:, 2], column["pwm.m3_pwm"] / 65535.0)
     assert np.array_equal(signals["motor_request"].value[:, 3], column["motor.m4"] / 65535.0)
-    assert np.array_equal(signals["voltage"].value[:, 0], column["pm.vbatMV"] / 1000.0)
+    assert np.array_equal(signals["voltage"].value[:, 0], (column["pm.vbatMV"] + 0.5) / 1000.0)
     assert np.array_equal(signals["acceleration"].value[:, 2], column["stateEstimate.az"] * 9.81)
     assert np.array_equal(signals["stateEstimate.roll"].value[:, 0], column["stateEstimate.roll"])
     assert signals["stateEstimate.roll"].unit == "deg"

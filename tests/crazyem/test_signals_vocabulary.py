@@ -85,7 +85,9 @@ def test_units_and_signs():
     )
     assert got["position"] == (1.5, -0.02, 0.003)
     assert got["body_rate"] == (0.1, -0.2, -0.3)
-    assert got["voltage"] == (3.987,)
+    assert got["voltage"] == (3.9875,)  # the firmware cuts millivolts off: 3.987 to 3.988 V
+    assert decode({"pm.vbatMV": 0})["voltage"] == (0.0,)  # nothing measured
+    assert decode({"pm.vbat": 3.987})["voltage"] == (3.987,)
     assert got["flying"] == (0.0,)
     assert decode({"supervisor.info": 0x021E})["flying"] == (1.0,)
     got = decode({"gyro.x": 180.0, "gyro.y": -90.0, "gyro.z": 0.0, "acc.x": 0.0, "acc.y": 0.5, "acc.z": 1.0})
