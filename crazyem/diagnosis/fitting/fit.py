@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import OWN, Column, Model, Point, Swept
-from crazyem.diagnosis.fitting.noise import Informed, first_guess, fit_noise
+from crazyem.diagnosis.fitting.noise import ROWS, Informed, first_guess, fit_noise
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.workers import Workers
 from crazyem.errors import DataError
@@ -132,13 +132,18 @@ class Data:
                 break
             before = now
 
-    def fit_noise(self, point: Point, *, near: bool = False) -> Point:
-        """The same model with noise scales that fit; `near`: they begin near."""
+    def fit_noise(
+        self, point: Point, *, near: bool = False, rows: int = ROWS, held: tuple[int, ...] = ()
+    ) -> Point:
+        """The same model with noise scales that fit, by that many rows of each flight; `near`: they begin near; `held`:
+        the disturbances (0 to 5) of which they stay."""
         parts = []
         for model in self.models:
             acceleration, _ = model.accelerations(point)
             parts.append((model.flight, acceleration, model.offsets(point, acceleration)))
-        found = fit_noise(parts, point.noise, near=near, workers=self.workers, informed=self.informed)
+        found = fit_noise(
+            parts, point.noise, near=near, workers=self.workers, informed=self.informed, rows=rows, held=held
+        )
         return replace(point, noise=found)
 
     def leave_out_wild(self, point: Point) -> int:
