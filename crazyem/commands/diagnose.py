@@ -20,6 +20,7 @@ def run(arguments: argparse.Namespace) -> int:
     from crazyem.diagnosis.compare import compare
     from crazyem.diagnosis.diagnose import diagnose
     from crazyem.diagnosis.document import document_of, saved_vehicle, text_of
+    from crazyem.diagnosis.posterior.diagnose import diagnose as diagnose_by_posterior
     from crazyem.diagnosis.report import write_report
 
     for path in (arguments.json, arguments.report, arguments.write_vehicle):
@@ -36,10 +37,13 @@ def run(arguments: argparse.Namespace) -> int:
     held_out = [open_recording(p, options) for p in arguments.held_out]
     vehicle = vehicle_for(recordings[0], arguments.vehicle)
     wanted = [n.strip() for n in (arguments.candidates or "").split(",") if n.strip()]
-    found = diagnose(
-        recordings, vehicle, held_out=held_out, wanted=wanted, withhold=arguments.withhold,
-        strict=arguments.strict_held_out, jobs=arguments.jobs, say=say,
-    )  # fmt: skip
+    asked = {
+        "held_out": held_out, "wanted": wanted, "withhold": arguments.withhold, "jobs": arguments.jobs, "say": say
+    }  # fmt: skip
+    if arguments.method == "posterior":
+        found = diagnose_by_posterior(recordings, vehicle, **asked)
+    else:
+        found = diagnose(recordings, vehicle, **asked, strict=arguments.strict_held_out)
     say("open-loop errors before and after")
     document, pictures = document_of(found, recordings, held_out, withhold=arguments.withhold)
     document["notices"] = [*(n for r in recordings for n in r.notices), *document["notices"]]

@@ -53,6 +53,7 @@ class Diagnosis:
             as well.
         free: what was free beside the effects.
         swapped: `recordings` are those that were held out (see `flights/roles.py`).
+        selection: by stages; None: by one posterior, whose `ranking` of single effects is as the document has it.
     """
 
     vehicle: Vehicle
@@ -67,12 +68,13 @@ class Diagnosis:
     indistinguishable: tuple[tuple[str, ...], ...]
     would_separate: tuple[str, ...]
     unexplained: Unexplained
-    selection: Selection
+    selection: Selection | None
     left_out: dict[str, str]
     explained: float
     free: tuple[Free, ...]
     own: tuple[Own, ...]
     swapped: bool = False
+    ranking: tuple[dict[str, Any], ...] = ()
 
 
 def diagnose(

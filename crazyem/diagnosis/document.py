@@ -148,7 +148,11 @@ def _effect(effect: Named) -> dict[str, Any]:
         "label": effect.label,
         "words": effect.words,
         "parameters": parameters,
-        "evidence": {"held_out_nats": _number(effect.held_out_nats), "p_value": _number(effect.p_value)},
+        "evidence": {
+            "held_out_nats": _number(effect.held_out_nats),
+            "p_value": _number(effect.p_value),
+            "log_odds": None if effect.log_odds is None else _number(effect.log_odds),
+        },
         "confidence": _number(effect.confidence),
     }
 
@@ -163,8 +167,8 @@ def _finding(f: Finding) -> dict[str, Any]:
 
 def _ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """All that was tried in the first turn, best first."""
-    if not diagnosis.selection.steps:
-        return []
+    if diagnosis.selection is None or not diagnosis.selection.steps:
+        return list(diagnosis.ranking)
     found, seen = [], set()
     for trial in diagnosis.selection.steps[0].trials:
         if trial.candidate.label in seen:

@@ -177,7 +177,7 @@ def candidates_for(
     for name, effect in CATALOGUE.items():
         if wanted and name not in wanted:
             continue
-        reason = _impossible(effect, signals, measured_speeds)
+        reason = impossible(effect, signals, measured_speeds)
         if reason:
             left_out[name] = reason
         elif name not in ASIDE and (name in wanted or name not in ASKED):
@@ -185,7 +185,7 @@ def candidates_for(
     return found, left_out
 
 
-def _impossible(effect: Effect, signals: frozenset[str], measured_speeds: bool) -> str:
+def impossible(effect: Effect, signals: frozenset[str], measured_speeds: bool) -> str:
     if effect.needs and not any(s in signals for s in effect.needs):
         return f"needs {' or '.join(effect.needs).replace('_', ' ')}, which the recording does not have"
     if effect.speed is not None and not measured_speeds:

@@ -132,9 +132,7 @@ class Data:
                 break
             before = now
 
-    def fit_noise(
-        self, point: Point, *, near: bool = False, rows: int = ROWS, held: tuple[int, ...] = ()
-    ) -> Point:
+    def fit_noise(self, point: Point, *, near: bool = False, rows: int = ROWS, held: tuple[int, ...] = ()) -> Point:
         """The same model with noise scales that fit, by that many rows of each flight; `near`: they begin near; `held`:
         the disturbances (0 to 5) of which they stay."""
         parts = []

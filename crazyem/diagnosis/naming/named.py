@@ -46,6 +46,7 @@ class Named:
         p_value: of its score test, the number of candidates allowed for.
         confidence: probability that this effect is there and not a look-alike.
         fitted_as: the effect as which it was fitted; "": by its own name.
+        log_odds: log posterior odds of the best model with it over the best without it; None: not by a posterior.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Named:
     p_value: float
     confidence: float
     fitted_as: str = ""
+    log_odds: float | None = None
 
     @property
     def words(self) -> str:

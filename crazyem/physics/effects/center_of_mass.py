@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter
+from crazyem.physics.effects.prior import Prior, alike, in_turn
 
 
 def shifted(body: Body, *, x: float, y: float, z: float) -> Body:
@@ -18,6 +19,9 @@ CENTER_OF_MASS = Effect(
     order=12,
     words="shift of the centre of mass",
     body=shifted,
+    # own: a battery of a third of the weight, put in some millimetres off; usual height: what velocities of filters on
+    # board look like (`fitting/always.py`)
+    prior=Prior(alike("x y z", 1.5e-3), in_turn("x y z", 3e-5, 3e-5, 7e-4)),
     separates=(
         "balance the drone on an edge, or log the accelerometer and yaw for 5 s at 2 Hz; for z fly hard sideways steps"
     ),

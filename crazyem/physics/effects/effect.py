@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.physics.effects.prior import Prior
+
 Values = Mapping[str, Any]  # one effect: parameter -> value
 Effects = Mapping[str, Values]  # effect -> its parameters; as in a vehicle file
 
@@ -222,6 +224,9 @@ class Effect:
         words: the effect for people; "": the name with spaces.
         belongs_to: "vehicle", or "recording" where each recording has its own: what a sensor or a filter on board shows
             on that day, which no vehicle file is to have.
+        prior: how large its parameters are.
+        random: (spread (6,) m/s^2 and rad/s^2, body axes, and memory s of a disturbance; mass kg; drag N s/m, NaN where
+            unknown) -> parameters: of an effect that is a random process and adds nothing to the mean motion.
     """
 
     name: str
@@ -250,6 +255,8 @@ class Effect:
     sizes: tuple[float, ...] = ()
     words: str = ""
     belongs_to: str = "vehicle"
+    prior: Prior = field(default_factory=Prior)
+    random: Callable[..., dict[str, float]] | None = None
 
     def said(self, values: Values) -> str:
         """The effect in words, with those of its values that say which: "rotor fault of rotor 3"."""

@@ -8,6 +8,7 @@ never part of a vehicle file; it stands against named effects that would have to
 import numpy as np
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
+from crazyem.physics.effects.prior import Prior, in_turn
 
 AXES = "xyz"
 CONSTANT = tuple(Parameter(i, "N", 0.0, -0.5, 0.5, 2e-3) for i in AXES)
@@ -29,6 +30,12 @@ FORCE_BY_PLACE = Effect(
     order=66,
     words="force that depends on place",
     external=pulling,
+    # own: 3 % of a Crazyflie's weight; usual: what thrust and drag leave
+    prior=Prior(
+        dict.fromkeys((p.name for p in CONSTANT + SLOPES), 0.01),
+        {**in_turn("x y z", 4e-4, 4e-4, 1e-3), **dict.fromkeys((p.name for p in SLOPES), 5e-4)},
+        unnamed=True,
+    ),
     needs=("position",),
     separates="fly the same path elsewhere in the room",
 )

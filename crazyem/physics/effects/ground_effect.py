@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Effect, Parameter, Situation
+from crazyem.physics.effects.prior import Prior
 
 
 def lifted(situation: Situation, *, strength: float, height: float) -> NDArray:
@@ -19,6 +20,7 @@ GROUND_EFFECT = Effect(
     ),
     order=32,
     rotors=lifted,
+    prior=Prior(own={"strength": 0.3, "height": 0.1}),
     needs=("position",),
     separates="hover for 5 s at each of several heights, from 3 cm to 1 m",
     nudge={"strength": 0.02},

@@ -3,6 +3,7 @@
 import numpy as np
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
+from crazyem.physics.effects.prior import Prior, alike, in_turn
 
 
 def force(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
@@ -16,6 +17,8 @@ LINEAR_DRAG = Effect(
     order=60,
     external=force,
     couples_air=True,
+    # usual: an attitude 1 ms late is a force of 3e-4 N s/m; along z thrust is a little wrong (`fitting/always.py`)
+    prior=Prior(alike("x y z", 0.012), in_turn("x y z", 5e-4, 5e-4, 1e-3)),
     needs=("velocity", "position"),
     separates="fly straight legs of different speeds in opposite directions",
 )

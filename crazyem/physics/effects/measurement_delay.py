@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
 from crazyem.physics.effects.fused_attitude import attitude_error
+from crazyem.physics.effects.prior import Prior
 from crazyem.physics.effects.rotation import rotation_between
 from crazyem.physics.effects.stretches import stretches
 
@@ -93,6 +94,7 @@ MEASUREMENT_DELAY = Effect(
     ),
     order=84,
     measured=late,
+    prior=Prior(own={"delay": 0.012}),  # usual: see `onboard_filter`
     needs=("position", "velocity", "attitude", "body_rate", "specific_force"),
     belongs_to="recording",
     separates="log the gyro and the pose at 100 Hz or more, and turn and stop sharply several times",

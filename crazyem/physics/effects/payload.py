@@ -3,6 +3,7 @@
 import numpy as np
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter
+from crazyem.physics.effects.prior import Prior, in_turn
 
 
 def steiner(mass: float, offset: np.ndarray) -> np.ndarray:
@@ -27,6 +28,8 @@ PAYLOAD = Effect(
     ),
     order=13,
     body=loaded,
+    # own: what a drone of this class carries; within its frame
+    prior=Prior(in_turn("mass x y z", 0.08, 0.01, 0.01, 0.01), per={"mass": "mass"}),
     separates="weigh the drone",
     nudge={"mass": 5e-4},
     amplitude="mass",

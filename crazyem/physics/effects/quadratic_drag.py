@@ -3,6 +3,7 @@
 import numpy as np
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
+from crazyem.physics.effects.prior import Prior, alike, in_turn
 
 
 def force(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
@@ -18,6 +19,7 @@ QUADRATIC_DRAG = Effect(
     order=61,
     external=force,
     couples_air=True,
+    prior=Prior(alike("x y z", 0.012), in_turn("x y z", 3e-4, 3e-4, 1e-3)),  # usual: as that of a linear drag
     needs=("velocity", "position"),
     separates="fly straight legs at 0.5, 1 and 2 m/s: linear drag doubles with speed, this one goes up four times",
 )

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
+from crazyem.physics.effects.prior import Prior
 
 SPIN = np.array([1.0, -1.0, 1.0, -1.0])  # rotors 1 and 3 turn counter-clockwise seen from above
 # N/(rad/s)^2, for vehicles that have none, and inertia is then relative to it: 46 mm propellers of a brushed Crazyflie,
@@ -42,6 +43,8 @@ ROTOR_INERTIA = Effect(
     (Parameter("inertia", "kg m^2", 0.0, 0.0, 1e-6, 2e-9),),
     order=66,
     external=reaction,
+    # own: a bar of 0.3 g and 46 mm; a Crazyflie's propeller and rotor: a tenth of that, in no file
+    prior=Prior(own={"inertia": 4e-8}, usual={"inertia": 2e-9}),
     needs=("body_rate", "attitude"),
     separates="yaw for 5 s at 2 Hz (spin-up), and roll while turning about yaw (gyroscope); weigh a propeller",
 )

@@ -3,6 +3,7 @@
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Effect, Parameter
+from crazyem.physics.effects.prior import Prior
 
 
 def recounted(thrust: NDArray, *, rotor: int, scale: float) -> NDArray:
@@ -20,6 +21,7 @@ ROTOR_SENSOR = Effect(
     ),
     order=24,
     speed=recounted,
+    prior=Prior(own={"scale": 0.05}),
     needs=("rotor_speed",),
     words="wrong speed sensor",
     separates="log the motor commands beside the speeds, or point an optical tachometer at each rotor in hover",

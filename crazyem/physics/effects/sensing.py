@@ -3,6 +3,7 @@
 import numpy as np
 
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
+from crazyem.physics.effects.prior import Logged, Prior, Sizes, alike, in_turn
 from crazyem.physics.effects.rotation import axes
 from crazyem.physics.rotations import quaternion_from_euler, rotation_vector_from_quaternion
 
@@ -39,6 +40,17 @@ def _nothing(situation: Situation) -> Offset:
     return Offset(np.zeros((situation.size, 12)), np.zeros((situation.size, 3)))
 
 
+def _leaning(logged: Logged) -> Sizes:
+    """A filter on board is off by a gyro's bias times the time in which fixes draw it back (`fitting/always.py`)."""
+    return alike("roll pitch yaw", 1.5e-3 if logged.onboard else 7e-4)
+
+
+def _jittery(logged: Logged) -> Sizes:
+    """Errors of an estimate's position and velocity hang together, so a drone that hardly moves seems to move faster
+    than it does, by 1 to 3 mm/s (`fitting/always.py`)."""
+    return in_turn("x y z", *(2e-3 + 3e-3 / np.maximum(logged.speed, 0.01)))
+
+
 _ANGLES = tuple(Parameter(name, "rad", 0.0, -np.pi, np.pi, 5e-3) for name in ("roll", "pitch", "yaw"))
 
 ATTITUDE_MISALIGNMENT = Effect(
@@ -46,6 +58,7 @@ ATTITUDE_MISALIGNMENT = Effect(
     _ANGLES,
     order=80,
     measured=tilted_pose,
+    prior=Prior(alike("roll pitch yaw", 0.04), _leaning),
     needs=("attitude",),
     separates="hover for 5 s at each of four headings: a tilted frame turns with the drone, wind stays in the world",
 )
@@ -55,6 +68,8 @@ ACCELEROMETER_MISALIGNMENT = Effect(
     _ANGLES,
     order=81,
     measured=tilted_accelerometer,
+    # usual: what is left of a bias that the firmware removes at rest; thrust along body z does not show a yaw
+    prior=Prior(alike("roll pitch yaw", 0.04), in_turn("roll pitch yaw", 3e-3, 3e-3, 0.03)),
     needs=("specific_force",),
     separates="record the accelerometer for 10 s with the drone standing on a level floor, then turned by 180 degrees",
 )
@@ -64,6 +79,8 @@ GYRO_BIAS = Effect(
     tuple(Parameter(axis, "rad/s", 0.0, -1.0, 1.0, 5e-3) for axis in "xyz"),
     order=82,
     measured=biased_gyro,
+    # usual: 0.16 deg/s between recordings of one drone (NanoBench, arXiv 2603.09908)
+    prior=Prior(alike("x y z", 0.025), alike("x y z", 2.8e-3)),
     needs=("body_rate",),
     belongs_to="recording",  # it drifts with the temperature
     separates="record the gyro for 10 s with the drone at rest",
@@ -74,6 +91,7 @@ VELOCITY_SCALE = Effect(
     tuple(Parameter(axis, "", 1.0, 0.0, 3.0, 0.01) for axis in "xyz"),
     order=83,
     measured=scaled_velocity,
+    prior=Prior(alike("x y z", 0.12), _jittery),
     needs=("velocity",),
     words="velocity scale of the onboard estimate",
     belongs_to="recording",  # in a vehicle it cost 27 % of position error on other flights of the same drone

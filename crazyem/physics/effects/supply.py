@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Effect, Parameter
+from crazyem.physics.effects.prior import Prior, in_turn
 
 REFERENCE_VOLTAGE = 3.7  # V, where gain_per_volt changes nothing: one nearly empty cell
 
@@ -37,6 +38,8 @@ THRUST_CURVE = Effect(
     order=20,
     commanded=steeper,
     needs=("motor_command",),
+    # usual: slopes of drones with nothing hidden come out up to 0.02 too large (`fitting/always.py`)
+    prior=Prior(own={"slope_error": 0.25}, usual={"slope_error": 0.02}),
     separates="climb and sink hard with the same battery, or measure thrust over command on a stand",
 )
 
@@ -60,6 +63,10 @@ BATTERY_SAG = Effect(
     commanded=sagging,
     needs=("motor_command",),
     alternatives=(("gain_per_volt",), ("gain_per_second",)),
+    # own: a cell of 0.1 to 0.3 ohm at some amperes; usual: what its law of thrust leaves of a battery that is known
+    prior=Prior(
+        in_turn("gain_per_volt gain_per_second", 0.4, 3e-3), in_turn("gain_per_volt gain_per_second", 0.03, 1.5e-4)
+    ),
     separates="log pm.vbat, and fly the same battery from full to empty",
     spared={"voltage": "log pm.vbat, and "},
 )

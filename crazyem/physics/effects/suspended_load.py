@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
 from crazyem.physics.effects.pendulum import DAMPING, swing_along, watched_along
+from crazyem.physics.effects.prior import Prior
 from crazyem.physics.effects.stretches import stretches
 from crazyem.physics.rotations import skew
 
@@ -63,6 +64,7 @@ SUSPENDED_LOAD = Effect(
     (Parameter("mass", "kg", 0.0, 0.0, 0.5, 5e-4), Parameter("length", "m", 0.3, 0.02, 10.0, 2e-4, usual=0.3)),
     order=70,
     tied=pulled,
+    prior=Prior(own={"mass": 0.08, "length": 0.3}, per={"mass": "mass"}),
     needs=("position", "velocity"),  # it swings by the drone's path, which no accelerometer alone shows
     separates="stop sharply from a straight leg and hover for 10 s, so that what hangs can be seen swinging",
     nudge={"mass": 5e-4},

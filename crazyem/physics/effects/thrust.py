@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Effect, Parameter, Situation
+from crazyem.physics.effects.prior import Logged, Prior, Sizes
 
 
 def scaled(situation: Situation, *, scale: float) -> NDArray:
@@ -30,11 +31,17 @@ def turned(torque: NDArray, *, scale: float) -> NDArray:
     return torque * scale
 
 
+def _strength(logged: Logged) -> Sizes:
+    """From day to day: batteries are put in again, propellers bend (docs/diagnosis_real.md)."""
+    return {"scale": 0.02 if logged.dated else 0.009}
+
+
 THRUST_SCALE = Effect(
     "thrust_scale",
     (Parameter("scale", "", 1.0, 0.1, 5.0, 0.01),),
     order=30,
     rotors=scaled,
+    prior=Prior(own={"scale": 0.08}, usual=_strength),
     separates="weigh the drone; without its weight thrust and mass are one number",
 )
 
@@ -47,6 +54,7 @@ ROTOR_FAULT = Effect(
     ),
     order=31,
     rotors=faulty,
+    prior=Prior(own={"scale": 0.1}),
     separates=(
         "yaw for 5 s at 2 Hz (a weak rotor also lacks drag torque, a heavy corner does not), or hover with the drone's"
         " battery turned round"
@@ -58,6 +66,8 @@ TORQUE_SCALE = Effect(
     (Parameter("scale", "", 1.0, 0.0, 5.0, 0.02),),
     order=40,
     turning=turned,
+    # usual: common to all axes of 76 flights of known torques (`fitting/always.py`)
+    prior=Prior(own={"scale": 0.2}, usual={"scale": 0.03}),
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum): torque over inertia is all that a flight shows",
 )

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
+from crazyem.physics.effects.prior import Prior, in_turn
 
 ALONE = 0.007  # N s/m: the force of wind on a drone whose drag nobody knows
 
@@ -22,12 +23,20 @@ def pushing(situation: Situation, body: Body, *, x: float, y: float, z: float) -
     return Wrench(none if situation.shaken else situation.to_body(ALONE * np.array([x, y, z])), none)
 
 
+def moving(spread: NDArray, memory: float, *, mass: float, drag: float) -> dict[str, float]:
+    """Air that moves at random, by the specific force (m/s^2, body axes) with a memory [s] that it is."""
+    push = drag if drag > 0.0 else ALONE
+    return {"standard_deviation": float(np.median(spread[:3])) * mass / push, "correlation_time": memory}
+
+
 WIND = Effect(
     "wind",
     tuple(Parameter(axis, "m/s", 0.0, -30.0, 30.0, 0.2) for axis in "xyz"),
     order=64,
     air=blowing,
     external=pushing,
+    # usual: what filters and sampling look like in still air
+    prior=Prior(in_turn("x y z", 2.0, 2.0, 0.7), in_turn("x y z", 0.05, 0.05, 0.1)),
     needs=("velocity", "position"),  # a force that goes on moves the drone; an accelerometer alone is only tilted by it
     separates="hover for 5 s at each of four headings: wind stays in the world, a tilted frame turns with the drone",
 )
@@ -39,6 +48,8 @@ GUSTS = Effect(
         Parameter("correlation_time", "s", 1.0, 0.01, 100.0, 0.1),
     ),
     order=65,
+    random=moving,
+    prior=Prior(own={"standard_deviation": 1.5}, usual={"standard_deviation": 0.3}),  # usual: a room with people in it
     separates="fly the same manoeuvre in still air",
     amplitude="standard_deviation",
 )

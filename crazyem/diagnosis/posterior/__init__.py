@@ -1,0 +1,1 @@
+"""Which effects a drone lacks, by one posterior over sets of effects (docs/diagnosis.md)."""

@@ -1,0 +1,148 @@
+"""What a model may be made of: every effect of the catalogue in each of its variants, with what its prior says."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.fitting.candidates import Candidate, impossible, variants
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.posterior.evidence import Gaussian
+from crazyem.diagnosis.posterior.settings import SETTINGS
+from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.effect import Effect
+from crazyem.physics.effects.prior import Logged, Sizes
+from crazyem.vehicle import Vehicle
+
+FELT = ("specific_force",)  # needs of an effect that the accelerometer alone shows (`accelerometer.py`)
+FEW = 5  # beginnings of an effect up to which all of its parameters are looked at from each
+BELOW = 4.0  # usual spreads by which a recording may be beyond the range of the drone: a delay counted too long
+
+
+@dataclass(frozen=True)
+class Member:
+    """A variant of an effect.
+
+    Attributes:
+        candidate: its parameters and choices.
+        own: (k,) standard deviations of what all recordings share.
+        odds: log prior odds of the variant.
+    """
+
+    candidate: Candidate
+    own: NDArray
+    odds: float
+
+    @property
+    def effect(self) -> str:
+        return self.candidate.effect
+
+    def prior(self, point: Point, *, nudged: bool = False) -> Gaussian:
+        """Of its parameters less neutral.
+
+        nudged: it is not part of the model, and derivatives are taken where there is little of it (`Candidate.begin`):
+        those by the others are as much smaller, so their changes are larger.
+        """
+        c, neutral = self.candidate, self.candidate.neutral(point)
+        low, high = (np.array([c.range_of(n)[k] - neutral[n] for n in c.free]) for k in (0, 1))
+        own, effect = self.own.copy(), CATALOGUE[c.effect]
+        if nudged and c.begin and len(c.free) > 1:
+            k = c.free.index(effect.amplitude)
+            others = np.arange(len(c.free)) != k
+            own[others] *= own[k] / (dict(c.begin)[effect.amplitude] - neutral[effect.amplitude])
+            low, high = np.where(others, -np.inf, low), np.where(others, np.inf, high)
+        together = np.full((own.size, own.size), effect.prior.together)
+        np.fill_diagonal(together, 1.0)
+        return Gaussian(together * np.outer(own, own), low, high)
+
+
+@dataclass(frozen=True)
+class Pool:
+    """All that may be part of a model.
+
+    Attributes:
+        members: variants of effects that may be missing, whole.
+        looks: the same as they are looked at from a model without them (fewer parameters where there are many
+            beginnings).
+        usual: what differs from recording to recording anyway, with its standard deviations (flights, k).
+        random: effects that are random processes.
+        left_out: effects that the recordings cannot speak of, and why.
+    """
+
+    members: tuple[Member, ...]
+    looks: tuple[Member, ...]
+    usual: tuple[tuple[Candidate, NDArray], ...]
+    random: tuple[Effect, ...]
+    left_out: dict[str, str]
+
+
+def logged(flight: Flight, vehicle: Vehicle) -> Logged:
+    """What the usual spread of a flight depends on."""
+    seen = np.isfinite(flight.y[:, 3])
+    speed = np.sqrt(np.mean(np.square(flight.y[seen, 3:6]), axis=0)) if seen.any() else np.ones(3)
+    return Logged(
+        measured=flight.inputs.measured, onboard=flight.attitude is not None, voltage="voltage" in flight.signals,
+        filed=frozenset(vehicle.effects), speed=speed,
+    )  # fmt: skip
+
+
+def pool_of(flights: Sequence[Flight], point: Point, wanted: Sequence[str] = ()) -> Pool:
+    """What flights may ask for."""
+    vehicle = point.vehicle
+    signals = frozenset.intersection(*(f.signals for f in flights))
+    facts = [logged(f, vehicle) for f in flights]
+    measured = flights[0].inputs.measured
+    members: list[Member] = []
+    looks: list[Member] = []
+    usual: list[tuple[Candidate, NDArray]] = []
+    random: list[Effect] = []
+    left_out: dict[str, str] = {}
+    for name, effect in CATALOGUE.items():
+        reason = impossible(effect, signals, measured)
+        if reason:
+            left_out[name] = reason
+            continue
+        if effect.random is not None:
+            random.append(effect)
+            continue
+        if effect.needs == FELT:
+            continue
+        found = variants(effect, point, signals)
+        spreads = [effect.prior.usual_in(fact) for fact in facts]
+        if any(spreads) and found:
+            names = tuple(dict.fromkeys(n for c in found for n in c.free if any(s.get(n, 0.0) > 0 for s in spreads)))
+            table = np.array([[s.get(n, 0.0) * share(effect, n, point) for n in names] for s in spreads])
+            if names:
+                usual.append((replace(found[0], free=names, fixed=()), table))
+        if effect.prior.own and (not wanted or name in wanted or effect.prior.unnamed):
+            found = [replace(c, free=tuple(n for n in c.free if n in effect.prior.own)) for c in found]
+            count = len({(c.fixed, c.free) for c in found})
+            odds = prior_odds() - math.log(count)
+            many = max((len(v) for v in effect.beginnings.values()), default=0) > FEW
+            for c in found:
+                members.append(Member(c, _sizes(effect, c, effect.prior.own, point), odds))
+                first = replace(c, free=(effect.amplitude,)) if many else c
+                looks.append(Member(first, _sizes(effect, first, effect.prior.own, point), odds))
+    return Pool(tuple(members), tuple(looks), tuple(usual), tuple(random), left_out)
+
+
+def prior_odds() -> float:
+    """Log odds that an effect is missing."""
+    return math.log(SETTINGS.missing / (1.0 - SETTINGS.missing))
+
+
+def _sizes(effect: Effect, candidate: Candidate, sizes: Sizes, point: Point) -> NDArray:
+    return np.array([sizes[n] * share(effect, n, point) for n in candidate.free])
+
+
+def share(effect: Effect, name: str, point: Point) -> float:
+    """What the sizes of a parameter are shares of; 1 where they are in SI units."""
+    per = effect.prior.per.get(name, "")
+    if per == "mass":
+        return point.vehicle.mass
+    if per == "inertia":
+        return point.vehicle.inertia[0]
+    return float(Candidate(effect.name, (), (name,)).neutral(point)[name]) if per else 1.0

@@ -1,0 +1,160 @@
+"""The search among sets of effects: every single one is fitted once, then one is added, taken away or exchanged.
+
+All models are compared by fitted evidence. What the pass of a fitted model says of its neighbours in the linear
+approximation only tells which of them are fitted next.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.fitting.fit import DivergedError
+from crazyem.diagnosis.posterior.members import Member
+from crazyem.diagnosis.posterior.settings import SETTINGS
+from crazyem.diagnosis.posterior.study import Fit, Study
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Neighbour:
+    """A model with one effect more, by the linear approximation.
+
+    Attributes:
+        member: the best variant; None: a random effect.
+        effect: its name.
+        gain: log posterior odds against the model that it was looked at from.
+        change: (k,) of its parameters from neutral.
+    """
+
+    member: Member | None
+    effect: str
+    gain: float
+    change: NDArray
+
+
+class Search:
+    """Models that were fitted, by their effects."""
+
+    def __init__(self, study: Study, say: Say) -> None:
+        self.study, self.say = study, say
+        self.visited: dict[frozenset[str], Fit] = {}
+        self._looked: dict[frozenset[str], list[Neighbour]] = {}
+
+    def run(self) -> list[Fit]:
+        """All models that were fitted, the most probable first."""
+        study = self.study
+        nothing = study.fit([d.twin() for d in study.data], study.points, (), frozenset(), np.zeros(0))
+        self._keep(nothing)
+        self.say(f"nothing missing: {nothing.value:.1f}, scatter {np.median(nothing.look.shared.scatter):.2f}")
+        self._grow(nothing, most=None)
+        for _ in range(SETTINGS.turns):
+            best = self.best
+            self._grow(best, most=SETTINGS.most)
+            if self.best is best:
+                self._exchange(best)
+            if self.best is best:
+                break
+        return sorted(self.visited.values(), key=lambda f: -f.value)
+
+    @property
+    def best(self) -> Fit:
+        """The most probable."""
+        return max(self.visited.values(), key=lambda f: f.value)
+
+    def _keep(self, fit: Fit) -> Fit:
+        known = self.visited.get(fit.effects)
+        if known is None or fit.value > known.value:
+            self.visited[fit.effects] = fit
+        return self.visited[fit.effects]
+
+    def neighbours(self, fit: Fit) -> list[Neighbour]:
+        """Models with one effect more, the most promising first."""
+        if fit.effects in self._looked:
+            return self._looked[fit.effects]
+        study = self.study
+        found: dict[str, Neighbour] = {}
+        data = [d.twin() for d in fit.data]
+        look, _ = study.look(data, fit.points, fit.members, study.pool.looks)
+        base = study.posterior(look, fit.members).gain
+        size = fit.phi.size
+        for whole, m in zip(study.pool.members, study.pool.looks, strict=True):
+            if m.effect in fit.effects:
+                continue
+            there = study.posterior(look, (*fit.members, m), nudged=(m,))
+            scatter = float(np.median(look.shared.scatter[list(look.places[m.candidate])]))
+            gain = (there.gain - base) / scatter + m.odds
+            if m.effect not in found or gain > found[m.effect].gain:
+                # of an effect of many beginnings only the amplitude was looked at; the rest is where it begins
+                change = np.zeros(len(whole.candidate.free))
+                change[[whole.candidate.free.index(n) for n in m.candidate.free]] = there.mean[size:]
+                found[m.effect] = Neighbour(whole, m.effect, gain, change)
+        for effect in study.pool.random:
+            if effect.name not in fit.effects and fit.held:
+                found[effect.name] = Neighbour(None, effect.name, np.inf, np.zeros(0))
+        self._looked[fit.effects] = sorted(found.values(), key=lambda n: -n.gain)
+        return self._looked[fit.effects]
+
+    def _fitted(self, base: Fit, neighbour: Neighbour) -> Fit | None:
+        """A neighbour, fitted; None where it leaves the range of numbers."""
+        try:
+            if neighbour.member is None:
+                return self.study.restarted(base, base.members, base.random | {neighbour.effect})
+            return self.study.begun(base, neighbour.member, neighbour.change)
+        except (DivergedError, np.linalg.LinAlgError):
+            return None
+
+    def _grow(self, base: Fit, *, most: int | None) -> None:
+        """Fit neighbours with one effect more."""
+        near = self.neighbours(base)
+        top = max((n.gain for n in near if np.isfinite(n.gain)), default=0.0)
+        least = -np.inf if most is None else min(top - SETTINGS.near, SETTINGS.worth * top)
+        wanted = [n for n in near if n.gain > least and base.effects | {n.effect} not in self.visited][:most]
+        self._fit_all(base, wanted)
+
+    def _exchange(self, best: Fit) -> None:
+        """Fit the model without each of its effects, and with another one in its place."""
+        for effect in sorted(best.effects):
+            less = best.effects - {effect}
+            if less not in self.visited:
+                members = [m for m in best.members if m.effect != effect]
+                try:
+                    self._keep(self.study.restarted(best, members, best.random - {effect}))
+                except (DivergedError, np.linalg.LinAlgError):
+                    continue
+            if less:
+                self._grow(self.visited[less], most=SETTINGS.most)
+
+    def _fit_all(self, base: Fit, wanted: Sequence[Neighbour]) -> None:
+        for n, fit in zip(wanted, self.study.workers.map(lambda n: self._fitted(base, n), wanted), strict=True):
+            if fit is None:
+                continue
+            self._keep(fit)
+            self.say(f"  {', '.join(sorted(fit.effects))}: {fit.value - base.value:+.1f} (linear {n.gain:+.1f})")
+
+
+def tempered(best: Fit, other: Fit) -> float:
+    """Log posterior odds of a model against the best, by how the difference of their likelihoods scatters over blocks.
+
+    A difference of normal likelihoods that holds has a variance of twice its mean; where it scatters more, blocks count
+    less: the odds are 2 m^2 / v for a mean m and a variance v (Pauli, Racugno, Ventura 2011).
+    """
+    gap = best.value - other.value
+    apart = best.blocks - other.blocks
+    centred = apart - apart.mean()
+    variance = float(centred @ centred + max(0.0, 2.0 * float(centred[1:] @ centred[:-1])))
+    return -min(gap, 2.0 * gap * gap / max(variance, 1e-9)) if gap > 0.0 else 0.0
+
+
+def probabilities(models: Sequence[Fit]) -> list[float]:
+    """Of models, the most probable first."""
+    weights = np.array([tempered(models[0], m) for m in models])
+    weights = np.exp(weights - weights.max())
+    return (weights / weights.sum()).tolist()
+
+
+def without_data(fit: Fit) -> Fit:
+    """The fit without the paths of its flights, which need memory."""
+    return replace(fit, data=())

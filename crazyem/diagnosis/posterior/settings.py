@@ -1,0 +1,39 @@
+"""Every number that the posterior is tuned by, with unit and source. Sizes of effects stand with the effects."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Attributes:
+    missing: prior probability that one effect is missing from a vehicle file. Two of 26 in a typical file.
+    memory: s, correlation time of the disturbing force that every flight has; moving air at a Crazyflie's speed.
+    rounds: of Gauss-Newton for a model, at most.
+    enough: nats; a round that gains less ends a fit.
+    steps: shares of a Gauss-Newton step that are tried, the first that is no worse is taken.
+    rows: of a flight from which noise scales are taken, at most.
+    worth: share of the best linear gain of a neighbour from which another one is fitted,
+    near: and nats below the best from which it is, whatever its share.
+    most: neighbours that are fitted in a turn after the first.
+    turns: of the search, at most.
+    told: probability of inclusion from which an effect is named.
+    rival: probability of models with a rival in place of a name, from which the two are told as one group.
+    sure: probability of inclusion from which a name stands alone.
+    """
+
+    missing: float = 0.05
+    memory: float = 1.0
+    rounds: int = 6
+    enough: float = 0.3
+    steps: tuple[float, ...] = (1.0, 0.4, 0.1)
+    rows: int = 4000
+    worth: float = 0.1
+    near: float = 8.0
+    most: int = 6
+    turns: int = 6
+    told: float = 0.5
+    rival: float = 0.05
+    sure: float = 0.9
+
+
+SETTINGS = Settings()
