@@ -175,7 +175,7 @@ class Firmware:
     def _flush_console(self) -> None:
         """Console text goes out after the replies, and only once there is a client to hear it."""
         for text in self._console:
-            for chunk in console.split_text(text):
+            for chunk in console.text_chunks(text):
                 self._send(wire.encode(wire.CONSOLE, 0, chunk))
         self._console.clear()
 

@@ -3,7 +3,7 @@
 from firmware_sim.wire import MAX_DATA
 
 
-def split_text(text: str) -> list[bytes]:
+def text_chunks(text: str) -> list[bytes]:
     """The text as packet payloads, in order; each decodes as UTF-8 on its own."""
     chunks: list[bytes] = []
     current = b""

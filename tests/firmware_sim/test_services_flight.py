@@ -180,9 +180,9 @@ def test_boot_console_text_and_splitting():
     assert all(p.port == wire.CONSOLE and len(p.data) <= 30 for p in rest)
     text = "".join(p.data.decode() for p in rest)
     assert "up and running" in text
-    from firmware_sim.services.console import split_text
+    from firmware_sim.services.console import text_chunks
 
-    assert [chunk.decode() for chunk in split_text("ä" * 20)] == ["ä" * 15, "ä" * 5]
+    assert [chunk.decode() for chunk in text_chunks("ä" * 20)] == ["ä" * 15, "ä" * 5]
 
 
 def test_scenario_parameters_are_boot_values():
