@@ -108,7 +108,7 @@ class Pipeline:
         for step in steps[max(len(known) - 1, 0) :]:
             if step in known:
                 continue
-            on_mass_step = getattr(self.guard, "stepped", None)
+            on_mass_step = getattr(self.guard, "on_mass_step", None)
             if on_mass_step is not None:
                 on_mass_step(step, time)
             if self.on_step is not None:
