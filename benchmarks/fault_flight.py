@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.in_process import OPEN_GATE, Pace, in_a_thread, simulator
-from crazyem.commands.flights import trajectory_maker
+from crazyem.control.named_trajectories import trajectory_maker
 from crazyem.errors import CrazyemError
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.estimation.result import Estimate

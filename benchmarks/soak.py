@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.in_process import OPEN_GATE
-from crazyem.commands.flights import trajectory_maker
+from crazyem.control.named_trajectories import trajectory_maker
 from crazyem.errors import CrazyemError
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.links import open_link

@@ -1,22 +1,90 @@
-"""Firmware-in-the-loop estimation of a Crazyflie's mass and inertia, online, by expectation maximisation."""
+"""Firmware-in-the-loop estimation of a Crazyflie's mass and inertia, online, by expectation maximisation.
 
-from typing import Any
+What the commands do, as functions: they return results and raise `crazyem.errors.CrazyemError`; they never print or
+exit. Every name is imported on first use, so `import crazyem` is quick.
+"""
 
-__all__ = ["attach", "load_vehicle", "open_recording"]
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from crazyem.api.diagnosing import Diagnosis, diagnose
+    from crazyem.api.flying import fly
+    from crazyem.api.predicting import predict
+    from crazyem.api.replaying import replay
+    from crazyem.diagnosis.prediction.predict import Prediction
+    from crazyem.errors import CrazyemError
+    from crazyem.estimation.online import OnlineEstimator
+    from crazyem.estimation.result import Estimate
+    from crazyem.live.attach import attach
+    from crazyem.live.flight_result import FlightResult
+    from crazyem.live.guard import Guard
+    from crazyem.live.policy import Policy, load_policy
+    from crazyem.recordings.options import ReadOptions
+    from crazyem.recordings.recording import Recording
+    from crazyem.recordings.registry import open_recording
+    from crazyem.signals.sample import Sample
+    from crazyem.vehicle import Vehicle, load_vehicle
+
+    __version__: str
+
+_HOME = {
+    "CrazyemError": "errors",
+    "Diagnosis": "api.diagnosing",
+    "Estimate": "estimation.result",
+    "FlightResult": "live.flight_result",
+    "Guard": "live.guard",
+    "OnlineEstimator": "estimation.online",
+    "Policy": "live.policy",
+    "Prediction": "diagnosis.prediction.predict",
+    "ReadOptions": "recordings.options",
+    "Recording": "recordings.recording",
+    "Sample": "signals.sample",
+    "Vehicle": "vehicle",
+    "attach": "live.attach",
+    "diagnose": "api.diagnosing",
+    "fly": "api.flying",
+    "load_policy": "live.policy",
+    "load_vehicle": "vehicle",
+    "open_recording": "recordings.registry",
+    "predict": "api.predicting",
+    "replay": "api.replaying",
+}
+
+__all__ = [
+    "CrazyemError",
+    "Diagnosis",
+    "Estimate",
+    "FlightResult",
+    "Guard",
+    "OnlineEstimator",
+    "Policy",
+    "Prediction",
+    "ReadOptions",
+    "Recording",
+    "Sample",
+    "Vehicle",
+    "__version__",
+    "attach",
+    "diagnose",
+    "fly",
+    "load_policy",
+    "load_vehicle",
+    "open_recording",
+    "predict",
+    "replay",
+]
 
 
-def __getattr__(name: str) -> Any:
-    # Lazy, so that `crazyem --help` does not wait for numba and cflib.
-    if name == "attach":
-        from crazyem.live.attach import attach
+def __getattr__(name: str) -> object:
+    if name == "__version__":
+        from importlib.metadata import version
 
-        return attach
-    if name == "load_vehicle":
-        from crazyem.vehicle import load_vehicle
+        return version("crazyem")
+    if name not in _HOME:
+        raise AttributeError(f"module 'crazyem' has no attribute '{name}'")
+    return getattr(importlib.import_module(f"crazyem.{_HOME[name]}"), name)
 
-        return load_vehicle
-    if name == "open_recording":
-        from crazyem.recordings import open_recording
 
-        return open_recording
-    raise AttributeError(f"module 'crazyem' has no attribute '{name}'")
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.commands.fly import HEIGHT, trajectory_maker
+from crazyem.control.named_trajectories import DEFAULT_HEIGHT, trajectory_maker
 from crazyem.control.trajectories import smooth_step, window
 
 RATE = 100.0  # Hz
@@ -70,9 +70,9 @@ def course(flight: Mapping[str, Any], duration: float) -> Course:
     up = np.array([smooth_step(t / TAKE_OFF)[0] for t in np.arange(0.0, TAKE_OFF, 1.0 / RATE)])
     down = np.array([smooth_step(t / LANDING)[0] for t in np.arange(0.0, LANDING, 1.0 / RATE)])
     still = np.zeros((round(HOVER * RATE), 4))
-    still[:, 2] = HEIGHT
+    still[:, 2] = DEFAULT_HEIGHT
     rise, sink = np.zeros((up.size, 4)), np.tile(moved[-1], (down.size, 1))
-    rise[:, 2], sink[:, 2] = HEIGHT * up, moved[-1, 2] + (-0.02 - moved[-1, 2]) * down
+    rise[:, 2], sink[:, 2] = DEFAULT_HEIGHT * up, moved[-1, 2] + (-0.02 - moved[-1, 2]) * down
     path = np.concatenate([rise, still, moved, sink])
     velocity = np.gradient(path, 1.0 / RATE, axis=0)
     acceleration = np.gradient(velocity, 1.0 / RATE, axis=0)
@@ -95,7 +95,7 @@ def _of_the_tool(flight: Mapping[str, Any], times: NDArray, duration: float) -> 
                 table.writeheader()
                 table.writerows(flight["waypoints"])
             words = ["waypoints", str(file)]
-        path = trajectory_maker(words, duration)((0.0, 0.0, HEIGHT), 0.0)
+        path = trajectory_maker(words, duration)((0.0, 0.0, DEFAULT_HEIGHT), 0.0)
     references = [path.at(float(t)) for t in times]
     return np.array([(*r.position, r.yaw) for r in references])
 
@@ -127,5 +127,5 @@ def _moved(style: str, size: Table, times: NDArray, duration: float) -> NDArray:
                 most = min(size["size"] * rms * math.sqrt(2 / 5) / (2 * math.pi * f) ** 2, 0.25)
                 out[:, axis] += most * np.sin(2 * math.pi * f * times + p)
     out *= weight[:, None]
-    out[:, 2] += HEIGHT
+    out[:, 2] += DEFAULT_HEIGHT
     return out

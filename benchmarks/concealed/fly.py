@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from crazyem.commands.flights import DEFAULT_HEIGHT, trajectory_maker
+from crazyem.control.named_trajectories import DEFAULT_HEIGHT, trajectory_maker
 from crazyem.errors import CrazyemError
 from crazyem.estimation.result import Estimate
 from crazyem.links import open_link

@@ -2,16 +2,13 @@
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from crazyem.estimation.result import Estimate
-from crazyem.links.base import LinkStatistics
+from crazyem.live.flight_result import FlightResult
 from crazyem.live.history import History
-from crazyem.live.pipeline import Pipeline
-from crazyem.live.recorder import Recorder
-from crazyem.live.summary import build_summary, live_line, text_summary, write_json
+from crazyem.live.summary import live_line, write_json
 from crazyem.vehicle import Vehicle
 
 
@@ -67,62 +64,25 @@ def plot_path(arguments: argparse.Namespace, *others: str | None) -> str | None:
     return None
 
 
-def report(
-    arguments: argparse.Namespace,
-    *,
-    pipeline: Pipeline,
-    vehicle: Vehicle,
-    log: str | None,
-    plot: str | None,
-    title: str,
-    received: int,
-    lost: int,
-    extra: Mapping[str, Any],
-    notices: Iterable[str] = (),
-) -> Estimate:
-    """Final estimate, summary on the terminal, JSON and plot, where these are wanted.
+def report(arguments: argparse.Namespace, result: FlightResult, *, plot: str | None) -> None:
+    """Summary on the terminal, JSON and plot, where these are wanted.
 
     Raises:
-        DataError: nothing was flown that could be estimated from.
+        UsageError: a file cannot be written.
     """
-    from crazyem.live.plot import write_plot
-
-    history = pipeline.history
-    for sentence in notices:
-        history.notice(sentence)
-    estimate = pipeline.finish()
-    summary = build_summary(
-        log=log,
-        vehicle=vehicle.name,
-        estimate=estimate,
-        history=history,
-        update_seconds=pipeline.estimator.update_seconds,
-        received=received,
-        lost=lost,
-        extra={**extra, "plot": plot},
-    )
-    text = text_summary(summary, estimate)
+    text = str(result)
     if arguments.json == "-":
         say(text)
     else:
         print(text, flush=True)
     if arguments.json:
-        write_json(summary, arguments.json)
+        write_json({**result.summary, "plot": plot}, arguments.json)
     files = {"summary": arguments.json} if arguments.json not in (None, "-") else {}
     if plot is not None:
-        write_plot(plot, history, vehicle, title=title)
+        result.plot(plot)
         files = {"plot": plot, **files}
     if files:
         say("   ".join(f"{what}: {file}" for what, file in files.items()))
-    return estimate
-
-
-def close_recorder(recorder: Recorder, statistics: LinkStatistics, history: History) -> None:
-    """Finish the recording, with the account of lost packets in it; say so if it is not whole."""
-    counts = {n: getattr(statistics, n) for n in ("received", "lost", "late", "duplicates")}
-    recorder.metadata("statistics", {k: str(v) for k, v in counts.items()})
-    recorder.close()
-    history.notice(recorder.failure)
 
 
 def raise_after(error: BaseException | None) -> None:
@@ -131,23 +91,11 @@ def raise_after(error: BaseException | None) -> None:
         raise error
 
 
-def new_estimator(
-    vehicle: Vehicle, arguments: argparse.Namespace, *, onboard: bool = True, input_signal: str | None = None
-) -> Any:
-    """The estimator with the window of the command line; it begins its window anew when the mass steps.
+def new_estimator(vehicle: Vehicle, arguments: argparse.Namespace) -> Any:
+    """The estimator with the window of the command line."""
+    from crazyem.estimation.steps import estimator_for
 
-    `onboard`: attitudes come from a filter on board, as those of every link do. `input_signal`: None takes what comes
-    first.
-    """
-    from crazyem.estimation.online import ATTITUDE_PERIOD, OnlineEstimator
-    from crazyem.estimation.steps import StepAwareEstimator
-
-    period = ATTITUDE_PERIOD if onboard else 0.0
-    return StepAwareEstimator(
-        OnlineEstimator(
-            vehicle, window=arguments.window, every=arguments.every, attitude_period=period, input_signal=input_signal
-        )
-    )
+    return estimator_for(vehicle, window=arguments.window, every=arguments.every)
 
 
 def compile_kernels(vehicle: Vehicle) -> None:

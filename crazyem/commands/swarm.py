@@ -18,19 +18,19 @@ from typing import Any
 
 from crazyem.commands.common import (
     LiveLine,
-    close_recorder,
     compile_kernels,
     new_estimator,
     say,
 )
-from crazyem.commands.flights import DEFAULT_HEIGHT, duration_note, follow, interrupts, trajectory_maker, write_rules
+from crazyem.commands.flights import follow, interrupts, write_rules
 from crazyem.commands.output import put
 from crazyem.commands.view import Streams, SwarmInterrupts, Viewed, landing, live_view, wants_view
+from crazyem.control.named_trajectories import DEFAULT_HEIGHT, duration_note, trajectory_maker
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.live.controllers import controller_named
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
-from crazyem.live.mcap_recorder import open_recorder
+from crazyem.live.mcap_recorder import close_recorder, open_recorder
 from crazyem.live.scheduler import Scheduler, UpdateThrottle
 from crazyem.live.session import Session
 from crazyem.live.summary import build_summary, check_writable, write_json

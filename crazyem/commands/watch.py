@@ -10,7 +10,6 @@ import math
 
 from crazyem.commands.common import (
     LiveLine,
-    close_recorder,
     compile_kernels,
     new_estimator,
     plot_path,
@@ -22,8 +21,9 @@ from crazyem.commands.flights import confirm_in_terminal, follow, interrupts
 from crazyem.commands.view import Streams, Viewed, live_view, wants_view
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
+from crazyem.live.flight_result import result_of
 from crazyem.live.hover_thrust import hover_afterwards
-from crazyem.live.mcap_recorder import open_recorder
+from crazyem.live.mcap_recorder import close_recorder, open_recorder
 from crazyem.live.policy import load_policy
 from crazyem.live.session import Session
 from crazyem.live.summary import check_writable
@@ -99,17 +99,16 @@ def run(arguments: argparse.Namespace) -> int:
         if recorder is not None:
             close_recorder(recorder, statistics, session.history)
         try:
-            report(
-                arguments,
-                pipeline=session.pipeline,
-                vehicle=vehicle,
-                log=arguments.record,
-                plot=plot,
+            result = result_of(
+                session.pipeline,
+                vehicle,
                 title=f"crazyem watch {arguments.uri}, vehicle {vehicle.name}",
+                log=arguments.record,
                 received=statistics.received,
                 lost=statistics.lost,
                 extra={"uri": arguments.uri, "late": statistics.late},
             )
+            report(arguments, result, plot=plot)
         except CrazyemError as e:
             error = error or e
     raise_after(error)

@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_discrete_are
 
 from crazyem.compiled import compiled
 from crazyem.control.flatness import reference_angles, reference_rate
@@ -12,7 +11,7 @@ from crazyem.vehicle import GRAVITY
 SMALLEST_TILT_COSINE = 0.2
 
 
-def position_gains(*, dt: float, position_weight: float, velocity_weight: float) -> NDArray:
+def position_gains(*, dt: float, position_weight: float, velocity_weight: float) -> NDArray[np.float64]:
     """Gains [1/s^2, 1/s] of u = -K (x - x_ref) for one axis of position, acceleration held over dt (eq. 79, 82).
 
     Args:
@@ -21,8 +20,10 @@ def position_gains(*, dt: float, position_weight: float, velocity_weight: float)
     """
     a = np.array([[1.0, dt], [0.0, 1.0]])
     b = np.array([[0.5 * dt * dt], [dt]])
-    p = solve_discrete_are(a, b, np.diag([position_weight, velocity_weight]), np.eye(1))
-    return np.linalg.solve(np.eye(1) + b.T @ p @ b, b.T @ p @ a)[0]
+    from control import dlqr  # slow to import, and no flight designs gains
+
+    gain, _, _ = dlqr(a, b, np.diag([position_weight, velocity_weight]), np.eye(1))
+    return np.array([float(gain[0, 0]), float(gain[0, 1])])
 
 
 @compiled

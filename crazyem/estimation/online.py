@@ -73,7 +73,7 @@ class Counters:
 @dataclass
 class _Node:
     time: float
-    y: NDArray = field(default_factory=lambda: np.full(16, np.nan))  # 13 of the tape, specific force
+    y: NDArray[np.float64] = field(default_factory=lambda: np.full(16, np.nan))  # 13 of the tape, specific force
 
 
 def _sane(signal: str, value: tuple[float, ...]) -> bool:
@@ -177,12 +177,12 @@ class OnlineEstimator:
         return self._gate.airborne
 
     @property
-    def trace(self) -> list[NDArray]:
+    def trace(self) -> list[NDArray[np.float64]]:
         """Parameters (9,) at every point on the way to the maximum in the last `finish`; empty before."""
         return [] if self.settled is None else [stop.theta for stop in self.settled.path]
 
     @property
-    def residual(self) -> tuple[float, NDArray, NDArray] | None:
+    def residual(self) -> tuple[float, NDArray[np.float64], NDArray[np.float64]] | None:
         """What the newest filtered sample had that the model did not predict; None before the first.
 
         Returns: its time [s]; (12,) position [m], velocity [m/s], attitude [rad, body] and body rate [rad/s]; (12,)

@@ -2,7 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crazyem.notebook import finite, html_table, new_figure, saved
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PARAMETER_UNITS = {
     "mass": "kg",
@@ -72,6 +78,38 @@ class Estimate:
     def to_json(self) -> dict[str, Any]:
         """The `estimates` object of the summary JSON."""
         return {name: p.to_json() for name, p in self.parameters.items()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """All of it, ready for JSON: `estimates` as in the summary, and what they rest on."""
+        about = {"time": self.time, "samples": self.samples, "updates": self.updates, "converged": self.converged}
+        whole: dict[str, Any] = finite({**about, "estimates": self.to_json(), "noise": dict(self.noise)})
+        return whole
+
+    def _repr_html_(self) -> str:
+        header = ("parameter", "value", "sd", "95 % from", "to", "unit", "not identifiable")
+        rows = [(n, p.value, p.sd, *p.ci95, p.unit, p.reason) for n, p in self.parameters.items()]
+        return html_table(f"Estimate at {self.time:.2f} s from {self.samples} samples", header, rows)
+
+    def plot(self, path: str | Path | None = None) -> "Figure":
+        """The 95 % intervals of mass and inertia, relative to their values; saved where `path` says.
+
+        Raises:
+            UsageError: the file cannot be written. MissingExtraError: no matplotlib.
+        """
+        figure = new_figure(6.0, 2.5)
+        axes = figure.subplots()
+        names = [n for n in ("Izz", "Iyy", "Ixx", "mass") if n in self.parameters]
+        for row, name in enumerate(names):
+            p = self.parameters[name]
+            low, high = (100.0 * (bound / p.value - 1.0) for bound in p.ci95)
+            axes.plot([low, high], [row, row], "C0" if p.identifiable else "0.6", linewidth=3)
+            axes.plot([0.0], [row], "k|")
+        axes.set_yticks(
+            range(len(names)), [f"{n} {self.parameters[n].value:.4g} {self.parameters[n].unit}" for n in names]
+        )
+        axes.set_xlabel("95 % interval, % of the value (grey: not identifiable)")
+        axes.grid(alpha=0.3)
+        return saved(figure, path)
 
     def __str__(self) -> str:
         lines = [f"{'parameter':<20} {'value':>12} {'sd':>10}  {'95 % interval':<27} unit"]

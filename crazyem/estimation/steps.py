@@ -20,9 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.estimation.online import OnlineEstimator
+from crazyem.estimation.online import ATTITUDE_PERIOD, OnlineEstimator
 from crazyem.estimation.result import Estimate, Step
 from crazyem.signals.sample import Sample
+from crazyem.vehicle import Vehicle
 
 VERTICAL = 5  # of the innovations: velocity along world z
 DRIFT = 0.4  # standard deviations that the mean may be off without being summed up; a step of 3 % is 0.75 in hover
@@ -91,7 +92,7 @@ class Wandering:
             self.sd = max(WHITE, 1.4826 * float(np.median(self._sums)) / math.sqrt(BATCH))
 
 
-def largest_jump(times: NDArray, wrenches: NDArray, *, since: float) -> float:
+def largest_jump(times: NDArray[np.float64], wrenches: NDArray[np.float64], *, since: float) -> float:
     """Largest lasting jump of the logarithm of thrust from one command to the next; 0 where there is none to be seen.
 
     Args:
@@ -244,3 +245,22 @@ class StepAwareEstimator:
         self.steps[-1] = Step(step.time, step.found, step.before, mass, real, jumped)
         if not real:
             self.inner.window = self.window  # what is still on the tape is used again
+
+
+def estimator_for(
+    vehicle: Vehicle, *, window: int = 800, every: int = 4, onboard: bool = True, input_signal: str | None = None
+) -> StepAwareEstimator:
+    """The estimator of a flight or a replay; its window begins anew when the mass steps.
+
+    Args:
+        window, every: newest samples used; samples between updates.
+        onboard: attitudes come from a filter on board, as those of every link do.
+        input_signal: what thrust is computed from; None takes what comes first.
+
+    Raises:
+        UsageError: a window too short to estimate from.
+    """
+    period = ATTITUDE_PERIOD if onboard else 0.0
+    return StepAwareEstimator(
+        OnlineEstimator(vehicle, window=window, every=every, attitude_period=period, input_signal=input_signal)
+    )

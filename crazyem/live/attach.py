@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any
+from typing import Protocol
 
 from crazyem.errors import DataError
 from crazyem.estimation.result import Estimate
@@ -13,6 +13,15 @@ from crazyem.live.session import Session
 from crazyem.live.write_supervisor import WriteRules
 from crazyem.physics import folding
 from crazyem.vehicle import Vehicle
+
+
+class OpenCrazyflie(Protocol):
+    """cflib's `Crazyflie`, connected: `scf.cf` of a SyncCrazyflie."""
+
+    link_uri: str
+
+    def is_connected(self) -> bool:
+        """Whether its link is open."""
 
 
 class Attachment:
@@ -69,7 +78,7 @@ class Attachment:
 
 
 def attach(
-    cf: Any,
+    cf: OpenCrazyflie,
     vehicle: str | Vehicle = "cf2",
     *,
     push: bool = False,

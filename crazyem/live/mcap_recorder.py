@@ -4,7 +4,8 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from crazyem.links.base import Link
+from crazyem.links.base import Link, LinkStatistics
+from crazyem.live.history import History
 from crazyem.live.recorder import Recorder
 from crazyem.vehicle import Vehicle
 
@@ -41,3 +42,11 @@ def open_recorder(
         },
         append=append,
     )
+
+
+def close_recorder(recorder: Recorder, statistics: LinkStatistics, history: History) -> None:
+    """Finish the recording, with the account of lost packets in it; say so if it is not whole."""
+    counts = {n: getattr(statistics, n) for n in ("received", "lost", "late", "duplicates")}
+    recorder.metadata("statistics", {k: str(v) for k, v in counts.items()})
+    recorder.close()
+    history.notice(recorder.failure)

@@ -1,12 +1,16 @@
 """The summary plot: estimates with their intervals over time, pushes, and the tracking error."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crazyem.errors import UsageError
 from crazyem.live.history import History
+from crazyem.notebook import new_figure, saved
 from crazyem.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MOST_POINTS = 2000  # points per curve
 
@@ -15,11 +19,15 @@ def write_plot(path: str | Path, history: History, vehicle: Vehicle, *, title: s
     """Draw `history` into a PNG (or any format matplotlib knows by the suffix).
 
     Raises:
-        UsageError: the file cannot be written.
+        UsageError: the file cannot be written. MissingExtraError: no matplotlib.
     """
+    saved(figure_of(history, vehicle, title=title), path)
+
+
+def figure_of(history: History, vehicle: Vehicle, *, title: str) -> "Figure":
+    """The figure of a history. Raises MissingExtraError without matplotlib."""
+    figure = new_figure(9, 11)
     import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
     track = history.track_array()
     estimates = history.estimates[:: max(1, len(history.estimates) // MOST_POINTS)] + history.estimates[-1:]
@@ -29,8 +37,6 @@ def write_plot(path: str | Path, history: History, vehicle: Vehicle, *, title: s
     nominal["motor_time_constant"] = vehicle.motor_time_constant
 
     with matplotlib.rc_context({"font.size": 9}):
-        figure = Figure(figsize=(9, 11), layout="constrained")
-        FigureCanvasAgg(figure)
         axes = figure.subplots(5, 1, sharex=True)
         figure.suptitle(title)
         panels = (
@@ -72,7 +78,4 @@ def write_plot(path: str | Path, history: History, vehicle: Vehicle, *, title: s
         last.set_ylabel("height [m]")
         last.set_xlabel("time [s], drone's clock (dotted: vehicle file; vertical lines: pushes)")
         last.grid(alpha=0.3)
-        try:
-            figure.savefig(path, dpi=110)
-        except (OSError, ValueError) as error:
-            raise UsageError(f"cannot write the plot {path}: {error}.") from None
+    return figure

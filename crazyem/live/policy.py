@@ -75,7 +75,12 @@ class EndRules:
 
 @dataclass(frozen=True)
 class Policy:
-    """All of it."""
+    """The rules of the guard: what may be written to a flying drone, when, and what is taken back.
+
+    Attributes:
+        limits: what an estimate must be like. health: what the drone must be like.
+        watch: what counts as worse after a write. end: what stays in the drone after the flight.
+    """
 
     name: str = "default"
     limits: Limits = field(default_factory=Limits)

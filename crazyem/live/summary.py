@@ -2,7 +2,6 @@
 
 import errno
 import json
-import math
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -14,6 +13,7 @@ import numpy as np
 from crazyem.errors import UsageError
 from crazyem.estimation.result import Estimate
 from crazyem.live.history import History
+from crazyem.notebook import finite
 
 
 def build_summary(
@@ -60,24 +60,13 @@ def build_summary(
     }
 
 
-def _finite(value: Any) -> Any:
-    """JSON knows no NaN and no infinity: they become null."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    return value
-
-
 def write_json(summary: Mapping[str, Any], path: str) -> None:
     """Write the summary to a file, or to standard output for '-'.
 
     Raises:
         UsageError: the file cannot be written.
     """
-    text = json.dumps(_finite(summary), indent=2, allow_nan=False) + "\n"
+    text = json.dumps(finite(summary), indent=2, allow_nan=False) + "\n"
     if path == "-":
         sys.stdout.write(text)
         return

@@ -3,13 +3,19 @@
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import DataError
+from crazyem.notebook import finite, html_table, new_figure, saved
 from crazyem.recordings.finding import Finding
 from crazyem.signals.sample import ESTIMATOR_SIGNALS, SIGNALS, Sample, components
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,6 +121,47 @@ class Recording:
         """Seconds from the first to the last sample, on the clock of the source."""
         times = [array.time for array in self.signals.values() if array.time.size]
         return float(max(t.max() for t in times) - min(t.min() for t in times)) if times else 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """What is in it, ready for JSON; without the samples."""
+        signals = {
+            name: {
+                "samples": int(a.time.size), "period_s": a.period, "unit": a.unit, "frame": a.frame, "clock": a.clock,
+                "source": list(a.source),
+            }
+            for name, a in self.signals.items()
+        }  # fmt: skip
+        whole: dict[str, Any] = finite(
+            {"path": self.path, "source": self.source, "duration_s": self.duration, "signals": signals,
+             "notices": list(self.notices)}
+        )  # fmt: skip
+        return whole
+
+    def __str__(self) -> str:
+        return f"{self.path} ({self.source}): {self.duration:.1f} s, {len(self)} samples of {len(self.signals)} signals"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (name, a.time.size, 1.0 / a.period if a.period else math.nan, a.unit, a.frame)
+            for name, a in self.signals.items()
+        ]
+        return html_table(str(self), ("signal", "samples", "Hz", "unit", "frame"), rows, self.notices)
+
+    def plot(self, path: str | Path | None = None) -> "Figure":
+        """The signals that an estimator uses, over time; saved where `path` says.
+
+        Raises:
+            UsageError: the file cannot be written. MissingExtraError: no matplotlib.
+        """
+        shown = {n: a for n, a in self.signals.items() if n in ESTIMATOR_SIGNALS and a.time.size}
+        figure = new_figure(8.0, 1.6 * max(1, len(shown)))
+        panels = figure.subplots(max(1, len(shown)), sharex=True, squeeze=False)[:, 0]
+        for axes, (name, a) in zip(panels, shown.items(), strict=False):
+            axes.plot(a.time, a.value, linewidth=0.8, label=a.components or None)
+            axes.set_ylabel(f"{name} [{a.unit}]" if a.unit else name)
+            axes.grid(alpha=0.3)
+        panels[-1].set_xlabel("time [s]")
+        return saved(figure, path)
 
     def __len__(self) -> int:
         return sum(array.time.size for array in self.signals.values())

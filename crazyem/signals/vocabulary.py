@@ -214,7 +214,7 @@ def _half_turn(factor: float) -> Conversion:
     signs = np.array([1.0, -1.0, -1.0])
 
     def many(columns: Columns) -> NDArray[np.float64]:
-        return _stacked(columns) * signs * factor
+        return np.asarray(_stacked(columns) * signs * factor, float)
 
     return Conversion(lambda v: (float(v[0]) * factor, float(v[1]) * -1.0 * factor, float(v[2]) * -1.0 * factor), many)
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from crazyem.cli import main, parser
-from crazyem.commands.flights import trajectory_maker
+from crazyem.control.named_trajectories import trajectory_maker
 from crazyem.errors import UsageError
 
 NANOBENCH = "nanobench/B3_figure8_medium_rep1.csv.gz"
@@ -183,7 +183,7 @@ def test_trajectory_maker_reads_the_waypoints_at_once(tmp_path):
 
 
 def test_whole_periods_are_told_in_one_line():
-    from crazyem.commands.flights import duration_note
+    from crazyem.control.named_trajectories import duration_note
 
     assert duration_note(["figure8"], 20.0) == (
         "figure8 flies whole periods and ends where it began: 22 s instead of 20 s"

@@ -8,12 +8,11 @@ import pytest
 from closed_loop import DRONE, fly
 from made_flight import array_of
 
-from crazyem.commands.common import new_estimator
 from crazyem.diagnosis.fitting.always import refine_base
 from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.flights.flight import APART, Flight, flight_of
-from crazyem.estimation import online, steps
+from crazyem.estimation import steps
 from crazyem.recordings.attitudes import onboard_attitude
 from crazyem.recordings.recording import Recording
 from crazyem.signals.vocabulary import MAVLINK_SOURCES, SOURCES
@@ -71,7 +70,7 @@ def test_attitudes_that_a_filter_on_board_made(
 
 
 def test_every_attitude_that_a_link_gives_is_of_a_filter_on_board() -> None:
-    """So that a replay thins them as the flight did (`new_estimator`)."""
+    """So that a replay thins them as the flight did (`estimator_for`)."""
     given = [s.variables for s in (*SOURCES, *MAVLINK_SOURCES) if s.signal == "attitude"]
     assert len(given) >= 5
     flown = onboard(fly(seconds=2.0))
@@ -85,9 +84,9 @@ def test_the_estimator_of_the_commands_thins_attitudes_of_filters_on_board_and_n
     monkeypatch: pytest.MonkeyPatch, onboard: bool, period: float
 ) -> None:
     made = []
-    monkeypatch.setattr(online, "OnlineEstimator", lambda vehicle, **given: made.append(given) or SimpleNamespace())
+    monkeypatch.setattr(steps, "OnlineEstimator", lambda vehicle, **given: made.append(given) or SimpleNamespace())
     monkeypatch.setattr(steps, "StepAwareEstimator", lambda estimator: estimator)
-    new_estimator(DRONE, SimpleNamespace(window=800, every=4), onboard=onboard)  # type: ignore[arg-type]
+    steps.estimator_for(DRONE, onboard=onboard)
     assert made == [{"window": 800, "every": 4, "attitude_period": period, "input_signal": None}]
 
 

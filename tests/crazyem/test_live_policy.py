@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from crazyem.api.flying import simulated
 from crazyem.cli import main, parser
-from crazyem.commands.flights import confirm_in_terminal, simulated, write_rules
+from crazyem.commands.flights import confirm_in_terminal, write_rules
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.live.guard import Limits
 from crazyem.live.policy import LARGEST_POLICY_FILE, EndRules, Policy, default_text, load_policy, parse_policy

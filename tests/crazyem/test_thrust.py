@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from made_flight import array_of, changed, made_flight, without
 
-from crazyem.commands.replay import check_flown, doctors_findings, required_signals
+from crazyem.api.replaying import check_flown, doctors_findings, required_signals
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.doctor.thrust import carried, inputs_of, signal_for, vehicle_for, weight_objection
 from crazyem.errors import DataError

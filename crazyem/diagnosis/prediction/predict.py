@@ -7,6 +7,8 @@ A prediction is of what the recording would show.
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +19,15 @@ from crazyem.diagnosis.prediction.earned import Turned, earned, remembered
 from crazyem.diagnosis.prediction.simulate import Simulator
 from crazyem.doctor.kinematics import quaternion_of_euler
 from crazyem.errors import DataError
+from crazyem.notebook import finite, html_table, new_figure, saved
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.ordering import inside, ordered
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 NAMES = ("x", "y", "z", "vx", "vy", "vz", "qx", "qy", "qz", "qw", "wx", "wy", "wz")
 SAME = 1.5e-3  # s: samples closer than this are of one moment
@@ -50,13 +56,13 @@ class Recorded:
     """
 
     path: str
-    time: NDArray
-    state: NDArray
-    age: NDArray
-    row: NDArray
-    airborne: NDArray
+    time: NDArray[np.float64]
+    state: NDArray[np.float64]
+    age: NDArray[np.float64]
+    row: NDArray[np.int64]
+    airborne: NDArray[np.bool_]
     inputs: Inputs
-    parts: Mapping[str, tuple[NDArray, NDArray]]
+    parts: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
     flights: tuple[tuple[float, float], ...]
     before: tuple[Inputs, ...] = ()
 
@@ -79,17 +85,23 @@ class Prediction:
         start_age: (starts,) s, how much older the oldest part of the start's state is.
         airborne: (starts,) bool: the drone flew at the start, as far as the recording tells.
         step: s; the median one where the steps are the recording's.
+        vehicle: whose model it is. input_signal: what its rotors were driven by. notices: what had to be assumed.
+        left_out: starts that are missing: no whole state, or a gap in the inputs.
     """
 
-    prediction: NDArray
-    time: NDArray
-    start_time: NDArray
-    start_index: NDArray
-    start_age: NDArray
-    airborne: NDArray
+    prediction: NDArray[np.float64]
+    time: NDArray[np.float64]
+    start_time: NDArray[np.float64]
+    start_index: NDArray[np.int64]
+    start_age: NDArray[np.float64]
+    airborne: NDArray[np.bool_]
     step: float
+    vehicle: Vehicle
+    input_signal: str
+    notices: tuple[str, ...] = ()
+    left_out: int = 0
 
-    def arrays(self) -> dict[str, NDArray]:
+    def arrays(self) -> dict[str, NDArray[Any]]:
         """Everything by name, for a file."""
         return {
             "prediction": self.prediction,
@@ -101,6 +113,42 @@ class Prediction:
             "step": np.array(self.step),
             "names": np.array(NAMES),
         }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything by name, ready for JSON: lists, and None for what left the range of numbers."""
+        arrays = {name: finite(array.tolist()) for name, array in self.arrays().items()}
+        about = {"vehicle": self.vehicle.name, "input_signal": self.input_signal, "left_out": self.left_out}
+        return {**arrays, **about, "notices": list(self.notices)}
+
+    def __str__(self) -> str:
+        effects = f" with {', '.join(self.vehicle.effects)}" if self.vehicle.effects else ""
+        return (
+            f"{self.prediction.shape[0]} starts x {self.prediction.shape[1]} steps of {1e3 * self.step:.4g} ms from "
+            f"{self.input_signal}, vehicle {self.vehicle.name}{effects}"
+        )
+
+    def _repr_html_(self) -> str:
+        last = self.prediction[:, -1]
+        rows = [
+            (name, *(float(v) for v in np.nanquantile(last[:, k], (0.0, 0.5, 1.0)))) for k, name in enumerate(NAMES)
+        ]
+        return html_table(str(self), ("after the last step", "smallest", "median", "largest"), rows, self.notices)
+
+    def plot(self, path: str | Path | None = None) -> "Figure":
+        """Position and body rate over time, from thirty starts; saved where `path` says.
+
+        Raises:
+            UsageError: the file cannot be written. MissingExtraError: no matplotlib.
+        """
+        figure = new_figure(8.0, 8.0)
+        columns = (0, 1, 2, 10, 11, 12)
+        for axes, k in zip(figure.subplots(len(columns), sharex=True), columns, strict=True):
+            for start in np.unique(np.linspace(0, len(self.time) - 1, 30).astype(int)):
+                axes.plot(self.time[start], self.prediction[start, :, k], linewidth=0.8)
+            axes.set_ylabel(f"{NAMES[k]} [{'m' if k < 3 else 'rad/s'}]")
+            axes.grid(alpha=0.3)
+        axes.set_xlabel("time [s]")
+        return saved(figure, path)
 
 
 # -- what was recorded -------------------------------------------------------------------------------------------------
@@ -190,6 +238,7 @@ def predict(
         DataError: no start has its whole horizon in the recording.
     """
     rows = np.arange(0, shown.time.size, every)
+    all_starts = len(range(0, shown.time.size - (horizon if step is None else 0), every))
     rows = rows[start_rows(shown, rows, horizon=horizon, step=step)]
     span = horizon * (shown.period if step is None else step)
     if not rows.size:
@@ -215,7 +264,8 @@ def predict(
     result, times = (np.concatenate(whole) for whole in zip(*pieces, strict=True))
     return Prediction(
         result, times, shown.time[rows], shown.row[rows], shown.age[rows], shown.airborne[rows],
-        shown.period if step is None else step,
+        shown.period if step is None else step, shown.inputs.vehicle, shown.inputs.signal,
+        tuple(shown.inputs.notices), all_starts - rows.size,
     )  # fmt: skip
 
 

@@ -7,14 +7,16 @@ import os
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
-
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from typing import TYPE_CHECKING, Any
 
 from crazyem.diagnosis.report.content import facts, sections
 from crazyem.diagnosis.report.pictures import Series, data_uri
 from crazyem.diagnosis.report.verdict import Document, changes, claim
 from crazyem.errors import UsageError
+from crazyem.extras import require
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 
 def write_report(path: str | Path, document: Document, pictures: Mapping[str, Series] | None = None) -> None:
@@ -25,7 +27,7 @@ def write_report(path: str | Path, document: Document, pictures: Mapping[str, Se
         document: the result of a diagnosis, as its JSON has it. Keys that are missing leave out their part.
         pictures: by name, in order; see `Series.section`.
 
-    Raises: UsageError if the file cannot be written.
+    Raises: UsageError if the file cannot be written. MissingExtraError: no Jinja2, or no matplotlib.
     """
     text = report(document, pictures or {})
     target = Path(path)
@@ -48,7 +50,10 @@ def report(document: Document, pictures: Mapping[str, Series]) -> str:
 
 
 @cache
-def _template() -> Template:
+def _template() -> "Template":
+    require("jinja2", "A report")
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
     environment = Environment(
         loader=PackageLoader("crazyem.diagnosis.report", "."), autoescape=True, finalize=_printable,
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,

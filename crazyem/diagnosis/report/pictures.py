@@ -6,10 +6,15 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from crazyem.extras import require
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 MOST_POINTS = 1500  # of a line; more cannot be seen
 COLORS = ("#2f6f9f", "#d1603d", "#5a9367", "#8a6bbf", "#b58b00", "#4a4a4a")
@@ -43,16 +48,13 @@ class Series:
 def data_uri(series: Series) -> str:
     """The picture as a data URI (SVG), which needs no other file.
 
-    Raises: ValueError if a line has not as many values as there are x.
+    Raises: ValueError if a line has not as many values as there are x. MissingExtraError: no matplotlib.
     """
+    require("matplotlib", "A picture")
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
     from matplotlib.style import context
 
-    lines = {str(label): np.asarray(values, float).ravel() for label, values in series.lines.items()}
-    for label, values in lines.items():
-        if values.size != len(series.x):
-            raise ValueError(f"picture '{series.title}': line '{label}' has {values.size} values for {len(series.x)} x")
     style = {
         "font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#999999",
         "axes.labelcolor": "#333333", "xtick.color": "#555555", "ytick.color": "#555555", "svg.hashsalt": "crazyem",
@@ -62,16 +64,18 @@ def data_uri(series: Series) -> str:
         warnings.simplefilter("ignore")  # letters that the font has not
         figure = Figure(figsize=(7.4, 2.3), layout="constrained")
         canvas = FigureCanvasSVG(figure)
-        axes = figure.add_subplot()
-        _lines(axes, series, lines)
-        if len(lines) > 1:
-            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.02), frameon=False, handlelength=1.2)
+        draw(figure.add_subplot(), series)
         buffer = io.BytesIO()
         canvas.print_svg(buffer, metadata={"Date": None})
     return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def _lines(axes: Any, series: Series, lines: Mapping[str, NDArray]) -> None:
+def draw(axes: "Axes", series: Series) -> None:
+    """A picture into axes of matplotlib. Raises: ValueError if a line has not as many values as there are x."""
+    lines = {str(label): np.asarray(values, float).ravel() for label, values in series.lines.items()}
+    for label, values in lines.items():
+        if values.size != len(series.x):
+            raise ValueError(f"picture '{series.title}': line '{label}' has {values.size} values for {len(series.x)} x")
     x = np.asarray(series.x, float).ravel()
     for begin, end in series.shaded:
         if math.isfinite(begin) and math.isfinite(end):
@@ -85,6 +89,8 @@ def _lines(axes: Any, series: Series, lines: Mapping[str, NDArray]) -> None:
     axes.set_xlabel(_text(series.x_label))
     axes.set_ylabel(_text(series.y_label))
     axes.margins(x=0.01)
+    if len(lines) > 1:
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.02), frameon=False, handlelength=1.2)
 
 
 def _color(label: str, k: int) -> str:

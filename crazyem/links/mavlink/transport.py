@@ -106,7 +106,7 @@ class SerialTransport:
 
     def send(self, data: bytes) -> bool:
         try:
-            return self._port.write(data) == len(data)
+            return int(self._port.write(data)) == len(data)
         except self._errors:
             return False
 

@@ -1,0 +1,138 @@
+"""Which physics is missing from a vehicle's model, by its recordings: the diagnosis with its document and report."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, vehicle_of
+from crazyem.diagnosis import diagnose as by_recordings
+from crazyem.diagnosis.compare import compare
+from crazyem.diagnosis.document import document_of, saved_vehicle, text_of
+from crazyem.diagnosis.posterior.diagnose import diagnose as by_posterior
+from crazyem.diagnosis.report.pictures import Series, draw
+from crazyem.errors import UsageError
+from crazyem.notebook import finite, html_table, new_figure, saved
+from crazyem.recordings.options import ReadOptions
+from crazyem.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis(by_recordings.Diagnosis):
+    """A diagnosis with its document: what was found, the fitted vehicle, and errors of prediction before and after.
+
+    Attributes:
+        document: for programs; keys as in docs/reference/json.md.
+        pictures: what is accused and how predictions err, by name.
+    """
+
+    document: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    pictures: Mapping[str, Series] = field(default_factory=dict, repr=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The document, ready for JSON."""
+        document: dict[str, Any] = finite(self.document)
+        return document
+
+    def __str__(self) -> str:
+        return text_of(self.document)
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (effect.words, name, value.value, value.sd, value.unit, effect.confidence)
+            for effect in self.effects
+            for name, value in effect.parameters.items()
+        ]
+        title = f"{self.vehicle.name}: {'mismatch' if self.mismatch else 'no mismatch'}"
+        header = ("effect", "parameter", "value", "sd", "unit", "confidence")
+        return html_table(title, header, rows, self.document["notices"])
+
+    def plot(self, path: str | Path | None = None) -> "Figure":
+        """What the model lacks over time, before and after; saved where `path` says.
+
+        Raises:
+            UsageError: the file cannot be written. MissingExtraError: no matplotlib.
+        """
+        figure = new_figure(8.0, 2.3 * max(1, len(self.pictures)))
+        for axes, series in zip(
+            figure.subplots(max(1, len(self.pictures)), squeeze=False)[:, 0], self.pictures.values(), strict=False
+        ):
+            draw(axes, series)
+            axes.set_title(series.title, fontsize=9)
+        return saved(figure, path)
+
+    def report(self, path: str | Path) -> None:
+        """One self-contained HTML page.
+
+        Raises:
+            UsageError: the file cannot be written. MissingExtraError: no Jinja2, or no matplotlib.
+        """
+        from crazyem.diagnosis.report import write_report
+
+        write_report(path, self.document, self.pictures)
+
+    def named_vehicle(self, name: str) -> Vehicle:
+        """The fitted vehicle under a name of its own; `Vehicle.to_toml` gives the text of its file."""
+        return saved_vehicle(self, name)
+
+
+def diagnose(
+    recordings: RecordingLike | Sequence[RecordingLike],
+    vehicle: VehicleLike | None = None,
+    *,
+    held_out: RecordingLike | Sequence[RecordingLike] = (),
+    against: RecordingLike | None = None,
+    candidates: Sequence[str] = (),
+    withhold: Sequence[str] = (),
+    strict_held_out: bool = False,
+    method: Literal["stages", "posterior"] = "stages",
+    jobs: int | None = None,
+    options: ReadOptions | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """Find where a vehicle's model and its flights differ, which physics was left out, and the model with it.
+
+    Args:
+        recordings: flights of one drone: recordings or paths.
+        vehicle: the nominal model: a Vehicle, a preset's name or a file; None: the one that was flown.
+        held_out: flights only to judge by, unless only these move.
+        against: a simulated recording of the same mission, to compare the first recording with.
+        candidates: effects to look for; none: the whole catalogue.
+        withhold: signals to leave unused, such as "pm.vbat".
+        strict_held_out: fit nothing to `held_out`, even where the others only hover.
+        method: how effects are named: in stages, or by one posterior over sets of effects.
+        jobs: threads; None: one a core. The result is the same for any number.
+        options: how paths are read.
+        progress: told in a few words what is being done; by several threads.
+
+    Raises:
+        UsageError: no such file, vehicle or effect. FileFormatError: no recording, or no vehicle.
+        DataError: a recording cannot be used (no flight, no inputs, too short).
+    """
+    say = progress or (lambda text: None)
+    flown = [recording_of(r, options) for r in _several(recordings)]
+    kept = [recording_of(r, options) for r in _several(held_out)]
+    if not flown:
+        raise UsageError("a diagnosis needs at least one recording.")
+    nominal = vehicle_of(vehicle, flown[0])
+    if method == "posterior":
+        found = by_posterior(flown, nominal, held_out=kept, wanted=candidates, withhold=withhold, jobs=jobs, say=say)
+    else:
+        found = by_recordings.diagnose(
+            flown, nominal, held_out=kept, wanted=candidates, withhold=withhold, strict=strict_held_out, jobs=jobs,
+            say=say,
+        )  # fmt: skip
+    say("open-loop errors before and after")
+    document, pictures = document_of(found, flown, kept, withhold=withhold)
+    document["notices"] = [*(n for r in flown for n in r.notices), *document["notices"]]
+    if against is not None:
+        document["against"] = compare(flown[0], recording_of(against, options))
+    values = {f.name: getattr(found, f.name) for f in fields(found)}
+    return Diagnosis(**values, document=document, pictures=pictures)
+
+
+def _several(given: RecordingLike | Sequence[RecordingLike]) -> Sequence[RecordingLike]:
+    return given if isinstance(given, Sequence) and not isinstance(given, str) else [given]

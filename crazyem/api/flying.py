@@ -1,0 +1,286 @@
+"""Fly a drone, or the simulated firmware, and let it learn its own mass and inertia on the way."""
+
+import contextlib
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from crazyem.api.inputs import VehicleLike, vehicle_of
+from crazyem.control.named_trajectories import DEFAULT_HEIGHT, TrajectoryMaker, trajectory_maker
+from crazyem.errors import CrazyemError, UsageError
+from crazyem.estimation.steps import estimator_for
+from crazyem.links import open_link
+from crazyem.live.controllers import controller_named
+from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
+from crazyem.live.flight_result import FlightResult, result_of
+from crazyem.live.mcap_recorder import close_recorder, open_recorder
+from crazyem.live.policy import Policy, load_policy
+from crazyem.live.recorder import Recorder
+from crazyem.live.session import RATE, RECONNECT_WITHIN, Session
+from crazyem.live.simulator import Simulator
+from crazyem.live.warm_up import warm_up
+from crazyem.live.write_supervisor import WriteRules
+from crazyem.physics import folding
+from crazyem.vehicle import Vehicle
+
+Progress = Callable[[str, float], None]  # phase of the flight, and seconds in it
+
+
+@dataclass(frozen=True)
+class FlightSettings:
+    """One flight; the attributes are the arguments of `fly`."""
+
+    uri: str | None
+    vehicle: Vehicle
+    controller: str = "lee"
+    trajectory: tuple[str, ...] | TrajectoryMaker = ("hover",)
+    duration: float = 20.0
+    push: bool = True
+    rules: WriteRules = field(default_factory=WriteRules)
+    record: str | None = None
+    append: bool = False
+    scenario: str | None = None
+    seed: int | None = None
+    speed: float | None = None
+    rate: float = RATE
+    reconnect: float = RECONNECT_WITHIN
+    window: int = 800
+    every: int = 4
+
+    @property
+    def trajectory_name(self) -> str:
+        """In words."""
+        return " ".join(self.trajectory) if isinstance(self.trajectory, tuple) else "a trajectory of the caller's"
+
+
+class FlightObserver:
+    """Who watches a flight; this one watches nothing. The command shows lines, a live view and a stream."""
+
+    def say(self, sentence: str) -> None:
+        """Progress before the flight."""
+
+    def recorder(self, recorder: Recorder | None) -> Recorder | None:
+        """The recorder that the session is to have."""
+        return recorder
+
+    def interrupts(self) -> Interrupts:
+        """What counts the user's wishes to end the flight; asked for once, before the drone is connected."""
+        return Interrupts()
+
+    def progress(self, session: Session, interrupts: Interrupts) -> AbstractContextManager[Progress]:
+        """What is told once a second, for the length of the flight."""
+        return contextlib.nullcontext(lambda phase, seconds: None)
+
+
+def fly(
+    uri: str | None = None,
+    *,
+    vehicle: VehicleLike = "cf2",
+    controller: str = "lee",
+    trajectory: str | Sequence[str] | TrajectoryMaker = "hover",
+    duration: float = 20.0,
+    push: bool | None = None,
+    dry_run: bool = False,
+    policy: Policy | str | Path | None = None,
+    record: str | Path | None = None,
+    append: bool = False,
+    scenario: str | Path | None = None,
+    seed: int | None = None,
+    speed: float | None = None,
+    rate: float = RATE,
+    reconnect: float = RECONNECT_WITHIN,
+    window: int = 800,
+    every: int = 4,
+) -> FlightResult:
+    """Take off, fly a trajectory, land, and estimate mass and inertia all along.
+
+    An exception in the flight, such as KeyboardInterrupt, lands the drone before the exception goes on.
+
+    Args:
+        uri: of the drone; None starts the simulated firmware.
+        vehicle: the nominal model: a Vehicle, a preset's name or a file.
+        controller: "lee" or "lqg".
+        trajectory: "hover", "figure8", "excite", ("waypoints", "FILE"), or a maker of trajectories.
+        duration: of a named trajectory, s.
+        push: write what was learnt to the controller: True, False, or None: to simulators only.
+        dry_run: decide what would be written, and write nothing.
+        policy: of the guard; None: the shipped one.
+        record, append: an MCAP file for everything; continue an existing one as its next session.
+        scenario, seed, speed: of the simulated firmware: file of its truth, its noise, times real time.
+        rate: of the log, Hz.
+        reconnect: how long a lost link is tried again, s.
+        window, every: newest samples that an update uses; samples between updates.
+
+    Raises:
+        UsageError: an argument that does not fit. LinkError: no drone, or the drone was lost.
+        DataError: nothing was flown that could be estimated from. CrazyemError: the flight ended early.
+    """
+    chosen = (trajectory,) if isinstance(trajectory, str) else trajectory
+    settings = FlightSettings(
+        uri=uri,
+        vehicle=vehicle_of(vehicle),
+        controller=controller,
+        trajectory=chosen if callable(chosen) else tuple(chosen),
+        duration=duration,
+        push=push is not False,
+        rules=write_rules_for(uri or "", push=push, dry_run=dry_run, policy=policy),
+        record=None if record is None else str(record),
+        append=append,
+        scenario=None if scenario is None else str(scenario),
+        seed=seed,
+        speed=speed,
+        rate=rate,
+        reconnect=reconnect,
+        window=window,
+        every=every,
+    )
+    result, error = observed_flight(settings, FlightObserver())
+    if error is not None or result is None:
+        raise error or CrazyemError("the flight gave no result.")
+    return result
+
+
+def simulated(uri: str) -> bool:
+    """Whether a URI is a simulator's: UDP on this host, or none at all, which starts one. All else may be a drone."""
+    if not uri:
+        return True
+    try:
+        parts = urlsplit(uri)
+        return parts.scheme == "udp" and parts.hostname == "127.0.0.1"
+    except ValueError:
+        return False
+
+
+def write_rules_for(
+    uri: str, *, push: bool | None = None, dry_run: bool = False, policy: Policy | str | Path | None = None
+) -> WriteRules:
+    """Policy and mode of the guard: simulators are written to, drones only where `push` says so.
+
+    Raises:
+        UsageError: no such policy. FileFormatError: the file is no policy.
+    """
+    meant = push or (push is None and simulated(uri))
+    loaded = policy if isinstance(policy, Policy) else load_policy(policy)
+    return WriteRules(loaded, dry_run=dry_run or not meant)
+
+
+def observed_flight(
+    settings: FlightSettings, observer: FlightObserver
+) -> tuple[FlightResult | None, BaseException | None]:
+    """The flight of `fly` with an observer.
+
+    Returns: the result, None where nothing could be estimated; and what ended the flight early, if anything.
+
+    Raises:
+        CrazyemError: nothing has flown.
+    """
+    if (settings.uri or "").startswith("mavlink:"):
+        raise UsageError("a MAVLink drone is flown by its own ground station: use crazyem watch, with --push to write.")
+    chosen = (settings.scenario, settings.speed, settings.seed)
+    if settings.uri and any(value is not None for value in chosen):
+        raise UsageError("--scenario, --seed and --speed belong to the built-in simulator: leave out the URI.")
+    nominal, left_out = folding.fold(settings.vehicle)
+    settings = replace(settings, vehicle=nominal)
+    words = settings.trajectory
+    plan = FlightPlan(
+        trajectory=trajectory_maker(words, settings.duration) if isinstance(words, tuple) else words,
+        controller=controller_named(settings.controller),
+        height=DEFAULT_HEIGHT,
+        push=settings.push,
+        rules=settings.rules,
+    )
+    estimator_for(nominal, window=settings.window, every=settings.every)  # a wrong window is refused here
+    with contextlib.ExitStack() as stack:
+        uri, simulator = settings.uri, None
+        if not uri:
+            simulator = Simulator(scenario=settings.scenario, seed=settings.seed or 0, speed=settings.speed or 1.0)
+            stack.callback(simulator.stop)
+            simulator.launch()  # both may have to compile: side by side
+        if seconds := warm_up(nominal):
+            observer.say(f"compiled the estimator in {seconds:.0f} s (once per installation)")
+        if simulator is not None:
+            uri = simulator.start()
+            observer.say(f"simulated firmware at {uri}")
+        return _flown(settings, plan, observer, observer.interrupts(), str(uri), left_out)
+
+
+def _flown(
+    settings: FlightSettings,
+    plan: FlightPlan,
+    observer: FlightObserver,
+    interrupts: Interrupts,
+    uri: str,
+    left_out: list[str],
+) -> tuple[FlightResult | None, BaseException | None]:
+    error: BaseException | None = None
+    result: FlightResult | None = None
+    with contextlib.ExitStack() as stack:
+        link = open_link(uri)
+        stack.callback(link.close)
+        link.connect()
+        observer.say(f"connected to {uri}: {len(link.log_variables)} log variables, {len(link.parameters)} parameters")
+        configuration = {
+            "command": "fly",
+            "uri": uri,
+            "controller": plan.controller.name,
+            "trajectory": settings.trajectory_name,
+            "duration": settings.duration,
+            "rate": settings.rate,
+            "window": settings.window,
+            "every": settings.every,
+            "push": plan.push,
+            "guard": settings.rules.mode if plan.push else "no push",
+            "seed": settings.seed or 0 if not settings.uri else None,
+        }
+        recorder = observer.recorder(
+            open_recorder(
+                settings.record, configuration=configuration, vehicle=settings.vehicle, link=link,
+                append=settings.append,
+            )
+        )  # fmt: skip
+        if recorder is not None:
+            stack.callback(recorder.close)
+        session = Session(
+            link,
+            vehicle=settings.vehicle,
+            estimator=estimator_for(settings.vehicle, window=settings.window, every=settings.every),
+            recorder=recorder,
+            wrench=plan.controller.wrench,
+            rate=settings.rate,
+            reconnect_within=settings.reconnect,
+        )
+        stack.callback(session.close)
+        session.history.notice(folding.notice(left_out))
+        try:
+            session.start()
+            with observer.progress(session, interrupts) as progress:
+                Flight(session, plan, interrupts=interrupts, progress=progress).fly()
+        except (FlightInterruptedError, MotorsCutError) as ended:
+            error = ended
+            session.history.notice("the flight was ended by the user.")
+        except CrazyemError as failed:
+            error = failed
+            session.history.notice(str(failed))
+        session.close()
+        statistics = link.statistics()
+        if recorder is not None:
+            close_recorder(recorder, statistics, session.history)
+        try:
+            result = result_of(
+                session.pipeline,
+                settings.vehicle,
+                title=f"crazyem fly: {settings.trajectory_name}, {plan.controller.name}, "
+                f"vehicle {settings.vehicle.name}",
+                log=settings.record,
+                received=statistics.received,
+                lost=statistics.lost,
+                extra={
+                    **{k: configuration[k] for k in ("uri", "controller", "trajectory", "seed")},
+                    "late": statistics.late,
+                },
+            )
+        except CrazyemError as failed:
+            error = error or failed
+    return result, error

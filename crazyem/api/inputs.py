@@ -1,0 +1,31 @@
+"""What users hand to the functions of the API: recordings and vehicles, as objects or by where they are."""
+
+from pathlib import Path
+
+from crazyem.doctor.thrust import vehicle_for
+from crazyem.physics import folding
+from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.recording import Recording
+from crazyem.recordings.registry import open_recording
+from crazyem.vehicle import Vehicle
+
+RecordingLike = Recording | str | Path
+VehicleLike = Vehicle | str | Path
+
+
+def recording_of(given: RecordingLike, options: ReadOptions | None = None) -> Recording:
+    """The recording itself, or that of a path. Raises as `open_recording`."""
+    return given if isinstance(given, Recording) else open_recording(given, options)
+
+
+def vehicle_of(given: VehicleLike | None, recording: Recording | None = None) -> Vehicle:
+    """The vehicle itself, a preset or file; None: that of the recording (see `doctor.thrust.vehicle_for`).
+
+    Raises:
+        UsageError: no such vehicle. FileFormatError: the file is no vehicle.
+    """
+    if isinstance(given, Vehicle):
+        return given
+    if recording is not None:
+        return vehicle_for(recording, None if given is None else str(given))
+    return folding.load("cf2" if given is None else given)

@@ -1,0 +1,180 @@
+"""The estimator of the live loop over a recording, sample by sample in the recorded order."""
+
+from collections.abc import Callable
+
+from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, vehicle_of
+from crazyem.doctor import examine
+from crazyem.doctor.thrust import kind_objection, signal_for, weight_objection
+from crazyem.errors import DataError
+from crazyem.estimation.steps import estimator_for
+from crazyem.live.flight_result import FlightResult, result_of
+from crazyem.live.history import History, Push
+from crazyem.live.pipeline import Pipeline
+from crazyem.physics import folding
+from crazyem.recordings.airborne import Airtime, airtime
+from crazyem.recordings.attitudes import onboard_attitude
+from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.recording import Recording
+from crazyem.signals.sample import ESTIMATOR_SIGNALS
+from crazyem.vehicle import Vehicle
+
+WINDOW, EVERY = 800, 4  # samples in the window, and between updates, where neither user nor recording says
+Progress = Callable[[float, History], None]  # seconds since the first sample, and what is known by then
+
+
+def replay(
+    recording: RecordingLike,
+    vehicle: VehicleLike | None = None,
+    *,
+    window: int | None = None,
+    every: int | None = None,
+    options: ReadOptions | None = None,
+    progress: Progress | None = None,
+) -> FlightResult:
+    """Estimate mass and inertia from a recording, as the live loop would have done.
+
+    Args:
+        recording: a recording, or the path of one of any known format.
+        vehicle: the nominal model: a Vehicle, a preset's name or a file; None: the one that was flown.
+        window: newest samples that an update uses; None: as in the flight, else 800.
+        every: samples between updates; None: as in the flight, else 4.
+        options: how a path is read.
+        progress: called after every sample.
+
+    Raises:
+        UsageError: no such file or vehicle. FileFormatError: no recording, or no vehicle.
+        DataError: nothing was flown, or a signal that the estimator needs is missing or not a number.
+    """
+    recording = recording_of(recording, options)
+    nominal, left_out = folding.fold(vehicle_of(vehicle, recording))
+    configured = recording.metadata.get("configuration", {})
+    thrust_from, required = required_signals(recording, nominal)
+    recording.check(required)
+    air = airtime(recording)
+    check_flown(recording, nominal, air)
+    findings = doctors_findings(recording)
+    history = History()
+    take_events(recording, history)
+    # a live flight takes what comes first, and a replay must do the same; but never what says nothing
+    unfit = [n for n in ("rotor_speed", "motor_command") if n in recording.signals and n != thrust_from]
+    estimator = estimator_for(
+        nominal,
+        window=int(configured.get("window", WINDOW)) if window is None else window,
+        every=int(configured.get("every", EVERY)) if every is None else every,
+        onboard=onboard_attitude(recording),
+        input_signal=thrust_from if unfit or thrust_from == "wrench_command" else None,
+    )
+    pipeline = Pipeline(estimator, history=history)
+    pipeline.estimate_until = history.marks.get("estimate_end", pipeline.estimate_until)
+    first: float | None = None
+    for sample in recording.samples():
+        first = sample.time if first is None else first
+        pipeline.sample(sample)
+        if progress is not None:
+            progress(sample.time - first, history)
+    check_flown(recording, nominal, air, max((e.samples for e in history.estimates), default=0))
+    received, lost = packet_counts(recording)
+    return result_of(
+        pipeline,
+        nominal,
+        title=f"crazyem replay {recording.path.rsplit('/', 1)[-1]}, vehicle {nominal.name}",
+        log=recording.path,
+        received=received,
+        lost=lost,
+        extra={
+            "source": recording.source,
+            "duration_s": recording.duration,
+            "airborne_s": air.seconds,
+            "findings": [f.to_dict() for f in findings],
+        },
+        notices=(
+            SCALE_NOTICE,
+            *filter(None, [folding.notice(left_out), sentence(weight_objection(recording, nominal, air))]),
+            *recording.notices,
+            *(f"the doctor says ({f.grade}): {f.text}" for f in findings if f not in recording.findings),
+        ),
+    )
+
+
+SCALE_NOTICE = (
+    "mass and thrust scale are one parameter in this data: the value is as right as the thrust law of the vehicle "
+    "file (a thrust law x % too strong reads as a mass x % too high), and the interval does not include that."
+)
+
+
+def required_signals(recording: Recording, vehicle: Vehicle) -> tuple[str, list[str]]:
+    """The signal that thrust is computed from, and all that the estimator needs of this recording.
+
+    Raises:
+        DataError: there is nothing to compute thrust from, or its voltage is not known.
+    """
+    if other := kind_objection(recording):
+        raise DataError(f"{recording.path}: {other}.")
+    name, why = signal_for(recording, vehicle)
+    if not name:
+        raise DataError(f"{recording.path}: nothing says what the rotors did: {why}.")
+    names = {n for n, a in recording.signals.items() if a.time.size}
+    if name == "motor_command" and "voltage" not in names:
+        absent = recording.metadata.get("not_measured", {}).get("voltage", "")
+        raise DataError(
+            f"{recording.path}: the recording has no voltage{f' ({absent})' if absent else ''}, and without one "
+            "motor_command is no thrust; crazyem diagnose can take a voltage from the flight."
+        )
+    inputs = {"motor_command": ["motor_command", "voltage"], "wrench_command": ["wrench_command"]}.get(name, [])
+    return name, ["position", "attitude", *inputs, *(n for n in ("velocity", "body_rate") if n in names)]
+
+
+def check_flown(recording: Recording, vehicle: Vehicle, air: Airtime, samples: int | None = None) -> None:
+    """Raise DataError, saying why, if nothing was flown: by the recording, or (`samples` 0) by the estimator's gate."""
+    if air.known and not air.airborne:
+        raise DataError(f"{recording.path}: nothing was flown in this recording: {air.reason}.")
+    if samples == 0:
+        why = weight_objection(recording, vehicle, air) or "no sample of position and attitude is off the ground"
+        raise DataError(f"{recording.path}: {air.seconds:.1f} s in the air, but nothing to estimate from: {why}.")
+
+
+def doctors_findings(recording: Recording) -> list[Finding]:
+    """What the doctor finds that bears on an estimate: more than harmless, of a signal that the estimator uses."""
+    used = {*ESTIMATOR_SIGNALS, ""}
+    # the weight is judged by the vehicle of the replay
+    found = [f for f in examine(recording) if f.grade is not Grade.HARMLESS and f.check != "weight"]
+    return [f for f in found if f.signal in used]
+
+
+def sentence(clause: str) -> str:
+    """A clause as a sentence; "" stays."""
+    return clause[:1].upper() + clause[1:]
+
+
+def packet_counts(recording: Recording) -> tuple[int, int]:
+    """Log packets received and lost, as counted in flight; of a foreign file samples, and those that carry nothing."""
+    counted = recording.metadata.get("statistics", {})
+    if "received" in counted:
+        return int(counted["received"]), int(counted["lost"])
+    total = sum(a.time.size for a in recording.signals.values())
+    marked = sum(int(a.marked.sum()) for a in recording.signals.values())
+    return total, marked
+
+
+def take_events(recording: Recording, history: History) -> None:
+    """Phases and pushes of a flight of ours, so that the summary can tell before from after."""
+    for event in recording.events:
+        text = str(event.data.get("message", ""))
+        if event.kind == "log" and text.startswith("mark "):
+            _, name, value = text.split(" ", 2)
+            history.marks[name] = float(value)
+        elif event.kind == "parameter_write":
+            name, written = str(event.data.get("name", "")), event.data.get("value")
+            if name.startswith("ctrl") and isinstance(written, int | float):
+                when = drone_time(recording, event.time)
+                history.pushes.append(Push(when, name, float(written), bool(event.data.get("verified"))))
+
+
+def drone_time(recording: Recording, host_time: float) -> float:
+    """Drone time [s] of the newest position that had arrived at a host time; NaN without any."""
+    position = recording.signals.get("position")
+    if position is None or not position.time.size:
+        return float("nan")
+    index = int(position.host_time.searchsorted(host_time, side="right")) - 1
+    return float(position.time[max(index, 0)])
