@@ -18,7 +18,7 @@ from crazyem.live.flight_result import FlightResult, result_of
 from crazyem.live.mcap_recorder import close_recorder, open_recorder
 from crazyem.live.policy import Policy, load_policy
 from crazyem.live.recorder import Recorder
-from crazyem.live.session import RATE, RECONNECT_WITHIN, Session
+from crazyem.live.session import LOG_RATE, RECONNECT_WITHIN, Session
 from crazyem.live.simulator import Simulator
 from crazyem.live.warm_up import warm_up
 from crazyem.live.write_supervisor import WriteRules
@@ -44,7 +44,7 @@ class FlightSettings:
     scenario: str | None = None
     seed: int | None = None
     speed: float | None = None
-    rate: float = RATE
+    rate: float = LOG_RATE
     reconnect: float = RECONNECT_WITHIN
     window: int = 800
     every: int = 4
@@ -89,7 +89,7 @@ def fly(
     scenario: str | Path | None = None,
     seed: int | None = None,
     speed: float | None = None,
-    rate: float = RATE,
+    rate: float = LOG_RATE,
     reconnect: float = RECONNECT_WITHIN,
     window: int = 800,
     every: int = 4,
