@@ -30,13 +30,12 @@ from crazyem.live.guard import Decision, Guard
 from crazyem.live.history import History, Push
 from crazyem.live.pipeline import Pipeline
 from crazyem.live.policy import load_policy
-from crazyem.live.session import STATE_VARIABLES
 from crazyem.live.telemetry import CAN_FLY, FLYING, Telemetry
 from crazyem.live.write_gate import WriteGate
 from crazyem.live.write_supervisor import WriteRules, WriteSupervisor
 from crazyem.signals.packet import Block, Packet, Variable
 from crazyem.signals.sample import Sample
-from crazyem.signals.vocabulary import decoders
+from crazyem.signals.vocabulary import STATE_VARIABLES, decoders
 from crazyem.vehicle import load_vehicle
 from firmware_sim.commander import setpoint as sp
 from firmware_sim.flight import Flight
@@ -197,11 +196,10 @@ def fly(case: Case, seed: int, *, aware: bool = True, push: bool = True) -> dict
     drone, vehicle, history = Drone(case, seed), load_vehicle("cf2"), History()
     inner = OnlineEstimator(vehicle)
     estimator: Any = StepAwareEstimator(inner) if aware else inner
-    newest = [0.0]
-    gate = WriteGate(Telemetry(info=FLYING | CAN_FLY, heard=0.0), now=lambda: 0.0)
+    newest, policy = [0.0], load_policy()
+    gate = WriteGate(Telemetry(info=FLYING | CAN_FLY, heard=0.0), policy.health, now=lambda: 0.0)
     gate.telemetry.take(Sample("position", 0.0, (0.0, 0.0, 1.0)))  # this one begins in the air
     originals = {p: drone.read(p) for p in LEE.parameters}
-    policy = load_policy()
     nominal = dict(zip(("mass", "Ixx", "Iyy", "Izz"), (vehicle.mass, *vehicle.inertia)))
     write_supervisor = WriteSupervisor(
         Guard(LEE, nominal=nominal, originals=originals, limits=policy.limits),

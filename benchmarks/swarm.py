@@ -41,9 +41,8 @@ class StreamLink:
     def __init__(self, seed: int, seconds: float) -> None:
         from flight import VOLTAGE, simulate
 
-        from crazyem.live.session import STATE_VARIABLES
         from crazyem.live.telemetry import FLYING
-        from crazyem.signals.vocabulary import MOTOR_BLOCK, compress_quaternion
+        from crazyem.signals.vocabulary import MOTOR_BLOCK, STATE_VARIABLES, compress_quaternion
 
         self.uri = f"stream://{seed}"
         self.packets: queue.SimpleQueue[Any] = queue.SimpleQueue()

@@ -77,14 +77,14 @@ def confirm_in_terminal(question: str, ended: threading.Event) -> bool:
     return False
 
 
-def follow(session: Session, stop: object, duration: float | None, line: LiveLine) -> None:
+def follow(session: Session, stop: Interrupts, duration: float | None, line: LiveLine) -> None:
     """Until Ctrl-C, or `duration` [s] of the drone's clock; a line a second.
 
     Raises:
         CrazyemError: what went wrong in the session.
     """
     begun, shown = math.nan, time.monotonic()
-    while not getattr(stop, "count", 0):
+    while not stop.count:
         session.raise_if_failed()
         now = session.clock.newest
         begun = now if math.isnan(begun) else begun

@@ -357,7 +357,7 @@ def _report(arguments: argparse.Namespace, drones: Sequence[Drone]) -> int:
     errors = [d.error for d in drones if d.error is not None]
     stopped = any(isinstance(e, FlightInterruptedError | MotorsCutError) for e in errors)
     real = [e for e in errors if not isinstance(e, FlightInterruptedError | MotorsCutError)]
-    code = int(getattr(real[0], "exit_code", 1)) if real else 130 if stopped else 0
+    code = _exit_code(real[0]) if real else 130 if stopped else 0
     rows = [{"name": d.name, "uri": d.member.uri, "outcome": d.outcome, **d.row, **_error(d)} for d in drones]
     text = table(rows)
     if arguments.json == "-":
@@ -369,10 +369,14 @@ def _report(arguments: argparse.Namespace, drones: Sequence[Drone]) -> int:
     return code
 
 
+def _exit_code(error: BaseException) -> int:
+    return error.exit_code if isinstance(error, CrazyemError) else 1
+
+
 def _error(drone: Drone) -> dict[str, Any]:
     if drone.error is None or isinstance(drone.error, FlightInterruptedError | MotorsCutError):
         return {}
-    return {"error": str(drone.error), "exit_code": getattr(drone.error, "exit_code", 1)}
+    return {"error": str(drone.error), "exit_code": _exit_code(drone.error)}
 
 
 def _summary(drone: Drone) -> dict[str, Any]:

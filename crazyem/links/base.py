@@ -1,23 +1,37 @@
-"""The narrow interface every link to a drone offers: what it logs, what it takes, and an honest account of losses."""
+"""The narrow interface of every link to a drone, and what some links can do besides.
+
+`Link` is what all of them do. Each further ability is a protocol of its own; `isinstance(link, ReconnectingLink)` asks
+an open link whether it has that ability.
+"""
 
 import math
 import queue
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from crazyem.errors import LinkError
+from crazyem.links.clock import ClockFit
 from crazyem.signals.packet import Block, Packet, Variable
 
 __all__ = [
+    "AccountingLink",
     "AnotherDroneError",
     "Block",
+    "ClockedLink",
+    "ConfirmingLink",
+    "DescribingLink",
+    "HostClockLink",
+    "HoverThrustLink",
     "Link",
     "LinkLost",
     "LinkStatistics",
     "Outage",
     "Packet",
     "ParameterWrite",
+    "ReconnectingLink",
+    "StreamingLink",
     "Variable",
     "link_account",
 ]
@@ -150,3 +164,77 @@ class Link(Protocol):
     def send_hover(self, vx: float, vy: float, yaw_rate: float, z: float) -> None: ...
     def release_setpoints(self) -> None: ...  # "notify stop": hand back to the high-level commander
     def stop(self) -> None: ...  # motors off now
+
+
+# --- abilities that some links have -------------------------------------------------------------------------------
+
+
+@runtime_checkable
+class StreamingLink(Protocol):
+    """A drone that sends messages by itself; nobody asks for single variables."""
+
+    on_frame: Callable[[float, bytes], None] | None  # called with (host time [s], frame) for every sound frame
+
+    def start_streams(self, rate_hz: float) -> tuple[Block, ...]: ...  # raises LinkError
+
+
+@runtime_checkable
+class ReconnectingLink(Protocol):
+    """A link that can bring back the same drone after a `LinkLost`."""
+
+    @property
+    def can_reconnect(self) -> bool: ...
+    def reconnect(self, timeout: float = 5.0, abort: threading.Event | None = None) -> Outage: ...  # raises LinkError
+
+
+@runtime_checkable
+class ClockedLink(Protocol):
+    """A link that relates the host's clock to the drone's; None before the first packet."""
+
+    def clock(self) -> ClockFit | None: ...
+
+
+@runtime_checkable
+class HostClockLink(Protocol):
+    """A link whose `Packet.host_time` is not `time.time()` but this clock, s: simulated time."""
+
+    def host_clock(self) -> float: ...
+
+
+@runtime_checkable
+class AccountingLink(Protocol):
+    """A link that knows more about lost bytes than `LinkStatistics` says."""
+
+    def account(self) -> Mapping[str, str]: ...
+
+
+@runtime_checkable
+class DescribingLink(Protocol):
+    """A link whose firmware describes itself, in sections for a recording."""
+
+    @property
+    def about(self) -> Mapping[str, Mapping[str, str]]: ...
+
+
+@runtime_checkable
+class ConfirmingLink(Protocol):
+    """A link that repeats a command to land until the drone has it; False after `timeout` [s]."""
+
+    def land_and_confirm(self, height: float, duration: float, *, timeout: float) -> bool: ...
+
+
+@runtime_checkable
+class HoverThrustLink(Protocol):
+    """An autopilot that takes hover thrust instead of a mass.
+
+    `hover_parameter` is "" where none is known; `onboard_hover_estimator` says what else on board writes it, "" if
+    nothing does; `cells` of the battery are 0 while unknown.
+    """
+
+    @property
+    def hover_parameter(self) -> str: ...
+    @property
+    def onboard_hover_estimator(self) -> str: ...
+    @property
+    def cells(self) -> int: ...
+    def read_parameter(self, name: str, timeout: float = 2.0) -> float: ...

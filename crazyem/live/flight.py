@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from crazyem.control.trajectories import Trajectory, Vector, after_hover
 from crazyem.errors import CrazyemError, LinkError, UsageError
-from crazyem.links.base import Link
+from crazyem.links.base import ConfirmingLink, Link
 from crazyem.live.controllers import Controller
 from crazyem.live.session import Session
 from crazyem.live.stream import SetpointStream
@@ -250,8 +250,8 @@ class Flight:
         both are sent three times; a plan that begins anew does no harm, and 2 s without a release would drop the drone.
         A link that can ask whether the plan arrived does so first.
         """
-        confirm = getattr(self.link, "land_and_confirm", None)
-        if confirm is not None and confirm(self._ground, duration, timeout=CONFIRMED_WITHIN):
+        link = self.link
+        if isinstance(link, ConfirmingLink) and link.land_and_confirm(self._ground, duration, timeout=CONFIRMED_WITHIN):
             for _ in range(HAND_OVERS):
                 self.link.release_setpoints()
                 self._sleep(HAND_OVER_EVERY)

@@ -1,5 +1,6 @@
 """The gate between estimate and controller: decides what may be written to a flying drone, and says why not."""
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -142,8 +143,11 @@ class Guard:
         """Never write again in this flight (a write was not confirmed: what the drone believes is not known)."""
         self.stopped = self.stopped or reason
 
-    def on_mass_step(self, step: Step) -> None:
-        """A change of mass was noticed, or it is known by now what it was: what was estimated before is of no use."""
+    def on_mass_step(self, step: Step, time: float = math.nan) -> None:
+        """A change of mass was noticed, or it is known by now what it was: what was estimated before is of no use.
+
+        `time` [s] is part of what a pipeline calls; a guard alone needs only the step's own times.
+        """
         if step.jumped:
             self.stop(f"{step}; nothing more is pushed.")
         self._step = step if step.real is not False else None

@@ -9,9 +9,9 @@ step.
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 from crazyem.errors import CrazyemError
+from crazyem.links.base import HoverThrustLink
 from crazyem.live.controllers import Controller
 from crazyem.live.write_supervisor import WriteRules
 from crazyem.vehicle import Vehicle
@@ -20,11 +20,11 @@ LOWEST_HOVER_THRUST, HIGHEST_HOVER_THRUST = 0.1, 0.8  # of full thrust: PX4's ow
 _NO_CONTROLLER = -1  # there is no stabilizer.controller
 
 
-def hover_target(link: Any, vehicle: Vehicle) -> tuple[Controller | None, str]:
+def hover_target(link: HoverThrustLink, vehicle: Vehicle) -> tuple[Controller | None, str]:
     """Where estimates can be pushed to on a MAVLink drone, or None and one sentence why not.
 
     Args:
-        link: a MavlinkLink. vehicle: its mass is the one at which the parameter was right.
+        link: open. vehicle: its mass is the one at which the parameter was right.
     """
     name = link.hover_parameter
     if not name:
@@ -43,7 +43,7 @@ def hover_target(link: Any, vehicle: Vehicle) -> tuple[Controller | None, str]:
     return Controller("hover thrust", _NO_CONTROLLER, mass=name, mass_scale=scale, persistent=True, note=note), note
 
 
-def hover_rules(rules: WriteRules, link: Any, controller: Controller | None) -> WriteRules:
+def hover_rules(rules: WriteRules, link: HoverThrustLink, controller: Controller | None) -> WriteRules:
     """The policy's bounds and those of hover thrust, whichever are narrower; its battery threshold for every cell."""
     policy = rules.policy
     if controller is not None:
@@ -53,7 +53,7 @@ def hover_rules(rules: WriteRules, link: Any, controller: Controller | None) -> 
             min(most, HIGHEST_HOVER_THRUST * controller.mass_scale),
         )
         policy = replace(policy, limits=replace(policy.limits, mass_absolute=inside))
-    cells = max(int(getattr(link, "cells", 0)), 1)
+    cells = max(link.cells, 1)
     if math.isfinite(policy.health.battery):
         policy = replace(policy, health=replace(policy.health, battery=policy.health.battery * cells))
     return replace(rules, policy=policy)

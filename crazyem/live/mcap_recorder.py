@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from crazyem.links.base import Link, LinkStatistics
+from crazyem.links.base import DescribingLink, Link, LinkStatistics
 from crazyem.live.history import History
 from crazyem.live.recorder import Recorder
 from crazyem.vehicle import Vehicle
@@ -38,7 +38,7 @@ def open_recorder(
                 "log_variables": " ".join(sorted(link.log_variables)),
                 "parameters": " ".join(sorted(link.parameters)),
             },
-            **getattr(link, "about", {}),
+            **(link.about if isinstance(link, DescribingLink) else {}),
         },
         append=append,
     )

@@ -6,7 +6,7 @@ same order give the same estimates, live or replayed.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from crazyem.estimation.result import Estimate, Step
 from crazyem.live.guard import Decision
@@ -30,16 +30,43 @@ class Gate(Protocol):
     """What decides over writes: a `Guard`, or a `WriteSupervisor` around it."""
 
     def consider(self, estimate: Estimate, time: float, *, airborne: bool, enabled: bool = True) -> Decision: ...
+    def on_mass_step(self, step: Step, time: float) -> None: ...
 
 
-def steps_of(estimator: Any) -> Sequence[Step]:
+@runtime_checkable
+class StepFinder(Protocol):
+    """An estimator that looks for steps of mass."""
+
+    @property
+    def steps(self) -> Sequence[Step]: ...
+
+
+@runtime_checkable
+class EstimatorAround(Protocol):
+    """An estimator around another one."""
+
+    @property
+    def inner(self) -> Any: ...
+
+
+@runtime_checkable
+class ResidualSource(Protocol):
+    """An estimator that knows the innovations of its newest sample: time [s], values, standard deviations."""
+
+    @property
+    def residual(self) -> tuple[float, Any, Any] | None: ...
+
+
+def steps_of(estimator: object) -> Sequence[Step]:
     """The steps that an estimator, or the one inside it, has found; none where it does not look for any."""
-    while estimator is not None:
-        found = getattr(estimator, "steps", None)
-        if found is not None:
-            return tuple(found)
-        estimator = getattr(estimator, "inner", None)
-    return ()
+    if isinstance(estimator, StepFinder):
+        return tuple(estimator.steps)
+    return steps_of(estimator.inner) if isinstance(estimator, EstimatorAround) else ()
+
+
+def residual_of(estimator: object) -> tuple[float, Any, Any] | None:
+    """Innovations of the newest sample, None where the estimator does not say them."""
+    return estimator.residual if isinstance(estimator, ResidualSource) else None
 
 
 class Pipeline:
@@ -108,9 +135,8 @@ class Pipeline:
         for step in steps[max(len(known) - 1, 0) :]:
             if step in known:
                 continue
-            on_mass_step = getattr(self.guard, "on_mass_step", None)
-            if on_mass_step is not None:
-                on_mass_step(step, time)
+            if self.guard is not None:
+                self.guard.on_mass_step(step, time)
             if self.on_step is not None:
                 self.on_step(step)
 

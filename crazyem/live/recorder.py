@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from crazyem.control.trajectories import Reference
 from crazyem.estimation.result import Estimate
@@ -25,3 +25,10 @@ class Recorder(Protocol):
     def metadata(self, section: str, entries: Mapping[str, str]) -> None: ...
     def event(self, text: str) -> None: ...
     def close(self) -> None: ...
+
+
+@runtime_checkable
+class FrameRecorder(Protocol):
+    """A recorder that also takes a drone's messages as they came."""
+
+    def frame(self, host_time: float, data: bytes) -> None: ...

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from crazyem.estimation.result import Estimate
-from crazyem.live.pipeline import Estimator
+from crazyem.live.pipeline import Estimator, residual_of
 from crazyem.signals.sample import Sample
 
 POLL_PAUSE = 0.002  # s between two rounds of receiving: a twentieth of an update's budget
@@ -212,7 +212,7 @@ class UpdateThrottle:
     @property
     def residual(self) -> Any:
         """Of the inner estimator, None where it has none."""
-        return getattr(self.inner, "residual", None)
+        return residual_of(self.inner)
 
     def feed(self, sample: Sample) -> Estimate | None:
         """One sample; see `OnlineEstimator.feed`."""

@@ -9,25 +9,39 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
-from crazyem.errors import CrazyemError, DataError, LinkError, UsageError
+from crazyem.errors import CrazyemError, DataError, LinkError
 from crazyem.estimation.result import Estimate, Step
-from crazyem.links.base import AnotherDroneError, Block, Link, LinkLost, Outage, Packet, link_account
+from crazyem.links.base import (
+    AccountingLink,
+    AnotherDroneError,
+    Block,
+    ClockedLink,
+    HostClockLink,
+    HoverThrustLink,
+    Link,
+    LinkLost,
+    Outage,
+    Packet,
+    ReconnectingLink,
+    StreamingLink,
+    link_account,
+)
 from crazyem.live.clock import FirmwareClock
 from crazyem.live.guard import Guard
 from crazyem.live.history import History
 from crazyem.live.hover_thrust import hover_rules, hover_target
-from crazyem.live.pipeline import Estimator, Pipeline
+from crazyem.live.pipeline import Estimator, Pipeline, residual_of
 from crazyem.live.policy import load_policy
 from crazyem.live.push import Pusher, push_target, read_originals
-from crazyem.live.recorder import Recorder
+from crazyem.live.recorder import FrameRecorder, Recorder
 from crazyem.live.scheduler import Mailbox, Scheduler
 from crazyem.live.telemetry import Telemetry
 from crazyem.live.write_gate import WriteGate
 from crazyem.live.write_supervisor import WriteRules, WriteSupervisor
 from crazyem.signals.sample import Sample
-from crazyem.signals.vocabulary import MOTOR_BLOCK, ROTOR_SPEED_BLOCK, STATE_BLOCK, decoders
+from crazyem.signals.vocabulary import block_plan, decoders
 from crazyem.vehicle import Vehicle
 
 # Every 11 ms: in step with the onboard estimate, predicted every 10 ms, logged commands are off by the same part of a
@@ -37,30 +51,6 @@ LINK_RECORD_PERIOD = 1.0  # s between notes on the link's health
 # A drone under low-level setpoints levels out after 0.5 s without them and cuts its motors after 2 s; one that hovers
 # by itself goes on. So a link is worth waiting for, but not for long.
 RECONNECT_WITHIN = 8.0  # s
-STATE_VARIABLES = STATE_BLOCK + tuple(f"stateEstimateZ.rate{a}" for a in ("Roll", "Pitch", "Yaw"))
-EXTRA_VARIABLES = tuple(f"acc.{a}" for a in "xyz") + tuple(f"ctrltargetZ.{a}" for a in "xyz")
-WRENCH_VARIABLES = ("thrustSi", "torquex", "torquey", "torquez")
-
-
-def block_plan(available: Sequence[str], *, wrench: str = "ctrlLee") -> list[tuple[str, ...]]:
-    """Blocks to log, of what the drone offers, each within 26 bytes; the estimator's needs first.
-
-    The whole rigid state of one instant (22 bytes), motors with voltage and flight state (12, or 20 with rotor
-    speeds), accelerometer and active setpoint (18), commanded wrench (16). Body rates come in the state block, in
-    steps of 1 mrad/s, rather than as gyro.* in a packet of another instant: blocks are not sampled together, and one
-    sample of everything is worth more to the estimator than two halves.
-
-    Raises:
-        UsageError: naming a variable the estimator cannot do without.
-    """
-    names = set(available)
-    for needed in (*STATE_VARIABLES, *MOTOR_BLOCK):
-        if needed not in names:
-            raise UsageError(f"the drone has no log variable {needed}, which the estimator needs.")
-    motors = MOTOR_BLOCK + (ROTOR_SPEED_BLOCK if names.issuperset(ROTOR_SPEED_BLOCK) else ())
-    commanded = tuple(f"{wrench}.{n}" for n in WRENCH_VARIABLES)
-    optional = (tuple(v for v in extra if v in names) for extra in (EXTRA_VARIABLES, commanded))
-    return [STATE_VARIABLES, motors, *(extra for extra in optional if extra)]
 
 
 class Session:
@@ -133,10 +123,10 @@ class Session:
     def start(self) -> None:
         """Subscribe and let packets flow."""
         blocks: list[Block] = []
-        start_streams = getattr(self.link, "start_streams", None)
-        if start_streams is not None:  # a drone that sends messages, not variables
-            self._keep_frames()
-            blocks.extend(start_streams(self.rate))
+        if isinstance(self.link, StreamingLink):
+            if isinstance(self.recorder, FrameRecorder):
+                self.link.on_frame = self.recorder.frame
+            blocks.extend(self.link.start_streams(self.rate))
         else:
             # Threads first: packets of the first block must not pile up behind the set-up of the last.
             for variables in block_plan(tuple(self.link.log_variables), wrench=self._wrench):
@@ -154,12 +144,6 @@ class Session:
             thread.start()
             self._threads.append(thread)
 
-    def _keep_frames(self) -> None:
-        """The drone's messages as they came, into the recording."""
-        keep = getattr(self.recorder, "frame", None)
-        if keep is not None:
-            self.link.on_frame = keep  # type: ignore[attr-defined]
-
     def push_to_controller(self, rules: WriteRules | None = None) -> str:
         """Let the guard push to the controller that runs now; returns a sentence if there is anything to say.
 
@@ -167,7 +151,7 @@ class Session:
             rules: policy, dry run, confirmation; the shipped policy without.
         """
         rules = rules or WriteRules(load_policy())
-        if getattr(self.link, "hover_parameter", None) is not None:
+        if isinstance(self.link, HoverThrustLink):
             controller, note = hover_target(self.link, self.vehicle)
             rules = hover_rules(rules, self.link, controller)
         else:
@@ -183,8 +167,8 @@ class Session:
             on_write = self.recorder.parameter_write
             self.recorder.metadata("parameters_at_connect", {k: repr(v) for k, v in originals.items()})
             self.recorder.metadata("guard", {"mode": rules.mode, "policy": rules.policy.to_toml()})
-        host_clock = getattr(self.link, "host_clock", time.time)  # that of `Packet.host_time`
-        gate = WriteGate(self.telemetry, rate=lambda: self.clock.rate, now=host_clock)
+        host_clock = self.link.host_clock if isinstance(self.link, HostClockLink) else time.time
+        gate = WriteGate(self.telemetry, rules.policy.health, rate=lambda: self.clock.rate, now=host_clock)
         write_supervisor = WriteSupervisor(
             guard,
             rules,
@@ -192,7 +176,7 @@ class Session:
             history=self.history,
             gate=gate,
             now=lambda: self.clock.newest,
-            residual=lambda: getattr(self.pipeline.estimator, "residual", None),
+            residual=lambda: residual_of(self.pipeline.estimator),
             enabled=lambda time: self.pipeline.push_from <= time <= self.pipeline.push_until,
             record=self._record_event,
         )
@@ -278,13 +262,13 @@ class Session:
         if self.write_supervisor is not None:
             self.write_supervisor.close()
         if self.recorder is not None and self.blocks:
-            account: dict[str, str] = dict(getattr(self.link, "account", dict)())
+            account = self.link.account() if isinstance(self.link, AccountingLink) else {}
             self.recorder.metadata("link", {**link_account(self.link.statistics(), self.outages), **account})
 
     def _estimated(self, estimate: Estimate) -> None:
         if self.recorder is not None:
             self.recorder.estimate(estimate)
-            residual = getattr(self.pipeline.estimator, "residual", None)
+            residual = residual_of(self.pipeline.estimator)
             if residual is not None:
                 self.recorder.residual(*residual)
         if self._on_estimate is not None:
@@ -363,14 +347,14 @@ class Session:
     def _reconnect(self, lost: LinkLost) -> bool:
         """Bring the link back; there is nothing to receive meanwhile. False: lost for good."""
         self.telemetry.heard = -math.inf
-        reconnect = getattr(self.link, "reconnect", None)
-        if reconnect is None or not getattr(self.link, "can_reconnect", True) or self.reconnect_within <= 0.0:
+        link = self.link
+        if not isinstance(link, ReconnectingLink) or not link.can_reconnect or self.reconnect_within <= 0.0:
             self._give_up(lost)
             return False
         self._linked.clear()
         self._record_event(f"the link was lost, trying again: {lost.reason}")
         try:
-            outage: Outage = reconnect(self.reconnect_within, self._stop)
+            outage = link.reconnect(self.reconnect_within, self._stop)
         except LinkError as error:
             reason = f"{lost.reason.rstrip('.')}; {str(error)[:1].lower()}{str(error)[1:]}"
             self._give_up(LinkLost(reason, lost.host_time, restarted=isinstance(error, AnotherDroneError)))
@@ -431,8 +415,7 @@ class Session:
     def _record_link(self, packet: Packet) -> None:
         """The link's health, into the recording; latency against the promptest packets, where the link knows them."""
         assert self.recorder is not None
-        clock = getattr(self.link, "clock", None)
-        fit = clock() if clock is not None else None
+        fit = self.link.clock() if isinstance(self.link, ClockedLink) else None
         late = math.nan if fit is None else packet.host_time - fit.to_host(packet.firmware_time_ms)
         self.recorder.link(self.link.statistics(), late)
 

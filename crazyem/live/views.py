@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from crazyem.live.scheduler import UpdateThrottle
 from crazyem.live.session import Session
 
 TREND_SECONDS = 60.0  # s of estimates in a trend
@@ -119,7 +120,8 @@ class Observer:
         phase, seconds = self._phase()
         account: Any = history.guard
         pushes = history.pushes[-3:]
-        guard = getattr(session.write_supervisor, "guard", None)
+        supervisor, estimator = session.write_supervisor, session.pipeline.estimator
+        throttle = estimator if isinstance(estimator, UpdateThrottle) else None
         decision = session.pipeline.decision
         return Snapshot(
             name=self.name,
@@ -130,19 +132,19 @@ class Observer:
             parameters=self._parameters(),
             updates=estimate.updates if estimate is not None else 0,
             converged=estimate.converged if estimate is not None else False,
-            airborne=bool(session.pipeline.estimator.airborne),
+            airborne=bool(estimator.airborne),
             link=self._link_view(),
             guard=str(account.get("mode", "")) if account else "",
             decision=str(decision) if decision is not None else "",
             paused=session.pipeline.paused,
-            stopped=str(getattr(guard, "stopped", "")),
+            stopped=supervisor.guard.stopped if supervisor is not None else "",
             pushes=tuple((p.time, p.parameter, p.value, p.verified, p.purpose) for p in pushes),
             writes=len(history.pushes),
             alarms=self._alarms(),
             voltage=session.telemetry.voltage,
             height=session.telemetry.height,
-            behind=float(getattr(session.pipeline.estimator, "behind", 0.0)),
-            skipped=int(getattr(session.pipeline.estimator, "skipped", 0)),
+            behind=throttle.behind if throttle is not None else 0.0,
+            skipped=throttle.skipped if throttle is not None else 0,
             marks=sum(name.startswith(USER_MARK) for name in tuple(history.marks)),
         )
 

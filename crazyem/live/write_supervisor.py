@@ -15,7 +15,6 @@ from typing import Any
 from crazyem.estimation.result import Estimate, Step
 from crazyem.live.controllers import EQUAL_WITHIN, writes_back
 from crazyem.live.guard import Decision, Guard
-from crazyem.live.health import Health
 from crazyem.live.history import History
 from crazyem.live.policy import Policy
 from crazyem.live.post_write_monitor import PostWriteMonitor
@@ -84,7 +83,6 @@ class WriteSupervisor:
         self.originals, self.good = dict(originals), dict(originals)
         self.history, self.now, self.record = history, now, record
         self.gate = gate
-        self.health = Health(rules.policy.health, gate.telemetry)
         self.watch = PostWriteMonitor(rules.policy.watch)
         guard.capped = rules.policy.watch.enabled and not rules.dry_run
         self.pusher: Pusher | None = None
@@ -106,7 +104,7 @@ class WriteSupervisor:
     def take(self, samples: Iterable[Sample]) -> None:
         """Samples of the flight as they arrive; takes back what made it worse."""
         for sample in samples:
-            self.health.take(sample)
+            self.gate.take(sample)
             self.watch.take(sample)
         newest = self.watch.newest
         if self.watch.judging and newest - self._monitor_time >= MONITOR_PERIOD:
@@ -240,7 +238,7 @@ class WriteSupervisor:
             return "waits for confirmation"
         if self.watch.full:
             return "what was written is still being judged"
-        return self.health.objection(age=self.now() - time) or self.gate.objection("push")
+        return self.gate.health_objection(age=self.now() - time) or self.gate.objection("push")
 
     def _judge(self, time: float) -> None:
         if self.pusher is None or self.pusher.busy or self._reverted or self._ended.is_set():

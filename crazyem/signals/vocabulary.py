@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.errors import UsageError
 from crazyem.signals.mavlink import MAPPINGS
 from crazyem.signals.packet import Block, Packet
 from crazyem.signals.sample import ESTIMATOR_SIGNALS, SIGNALS, Sample
@@ -294,6 +295,31 @@ MOTOR_BLOCK = (*_names("motor.*", "m1 m2 m3 m4"), "pm.vbatMV", "supervisor.info"
 ROTOR_SPEED_BLOCK = _names("motor.*_rpm", "m1 m2 m3 m4")
 SETPOINT_BLOCK = _names("ctrltarget.*", "x y z vx vy vz")
 STANDARD_BLOCKS: tuple[tuple[str, ...], ...] = (STATE_BLOCK, IMU_BLOCK, MOTOR_BLOCK)
+# And what a session logs.
+STATE_VARIABLES = STATE_BLOCK + tuple(f"stateEstimateZ.rate{a}" for a in ("Roll", "Pitch", "Yaw"))
+EXTRA_VARIABLES = tuple(f"acc.{a}" for a in "xyz") + tuple(f"ctrltargetZ.{a}" for a in "xyz")
+WRENCH_VARIABLES = ("thrustSi", "torquex", "torquey", "torquez")
+
+
+def block_plan(available: Sequence[str], *, wrench: str = "ctrlLee") -> list[tuple[str, ...]]:
+    """Blocks to log, of what the drone offers, each within 26 bytes; the estimator's needs first.
+
+    The whole rigid state of one instant (22 bytes), motors with voltage and flight state (12, or 20 with rotor
+    speeds), accelerometer and active setpoint (18), commanded wrench (16). Body rates come in the state block, in
+    steps of 1 mrad/s, rather than as gyro.* in a packet of another instant: blocks are not sampled together, and one
+    sample of everything is worth more to the estimator than two halves.
+
+    Raises:
+        UsageError: naming a variable the estimator cannot do without.
+    """
+    names = set(available)
+    for needed in (*STATE_VARIABLES, *MOTOR_BLOCK):
+        if needed not in names:
+            raise UsageError(f"the drone has no log variable {needed}, which the estimator needs.")
+    motors = MOTOR_BLOCK + (ROTOR_SPEED_BLOCK if names.issuperset(ROTOR_SPEED_BLOCK) else ())
+    commanded = tuple(f"{wrench}.{n}" for n in WRENCH_VARIABLES)
+    optional = (tuple(v for v in extra if v in names) for extra in (EXTRA_VARIABLES, commanded))
+    return [STATE_VARIABLES, motors, *(extra for extra in optional if extra)]
 
 
 def standard_variables(available: Mapping[str, str] | Iterable[str], *, rotor_speed: bool = True) -> tuple[str, ...]:

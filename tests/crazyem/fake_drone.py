@@ -9,9 +9,14 @@ from types import SimpleNamespace
 from crazyem.errors import LinkError
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
 from crazyem.links.base import Block, LinkLost, LinkStatistics, Packet, ParameterWrite, Variable
-from crazyem.live.session import EXTRA_VARIABLES, STATE_VARIABLES, WRENCH_VARIABLES
 from crazyem.live.telemetry import ARMED, AUTO_ARM, CAN_ARM, CAN_FLY, FLYING
-from crazyem.signals.vocabulary import MOTOR_BLOCK, compress_quaternion
+from crazyem.signals.vocabulary import (
+    EXTRA_VARIABLES,
+    MOTOR_BLOCK,
+    STATE_VARIABLES,
+    WRENCH_VARIABLES,
+    compress_quaternion,
+)
 
 LEVEL = float(compress_quaternion((0.0, 0.0, 0.0, 1.0)))
 WAITING = 10  # packets of a block that a session may be behind

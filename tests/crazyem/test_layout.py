@@ -11,14 +11,13 @@ from test_mcap_signals import flight
 
 from crazyem.commands import layout as command
 from crazyem.errors import UsageError
-from crazyem.live.session import block_plan
 from crazyem.recordings.mcap import schemas
 from crazyem.recordings.mcap.layout import foxglove_layout, swarm_layout, topics_of
 from crazyem.recordings.mcap.messages import EVENT_TOPICS
 from crazyem.recordings.mcap.signals import write_recording
 from crazyem.recordings.mcap.survey import from_summary
 from crazyem.signals.packet import Block, Variable
-from crazyem.signals.vocabulary import MOTOR_BLOCK, ROTOR_SPEED_BLOCK
+from crazyem.signals.vocabulary import MOTOR_BLOCK, ROTOR_SPEED_BLOCK, block_plan
 
 PATH = re.compile(r"(?P<topic>(?:/\w+)+)\.(?P<fields>.+)")
 FILTER = re.compile(r'\[:\]\{(?P<key>\w+)=="(?P<value>\w+)"\}')

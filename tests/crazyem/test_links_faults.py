@@ -14,8 +14,7 @@ from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import LinkLost, Packet
 from crazyem.links.connection import _Progress, new_crazyflie
 from crazyem.links.crazyflie import CrazyflieLink
-from crazyem.live.session import STATE_VARIABLES
-from crazyem.signals.vocabulary import standard_variables
+from crazyem.signals.vocabulary import STATE_VARIABLES, standard_variables
 
 NAMES = ("stateEstimateZ.x", "stateEstimateZ.y", "stateEstimateZ.z", "pm.vbat")
 

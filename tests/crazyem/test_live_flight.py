@@ -10,8 +10,9 @@ from crazyem.control.trajectories import excite, hover
 from crazyem.errors import CrazyemError, DataError, LinkError, UsageError
 from crazyem.live.controllers import LEE, LQG
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
-from crazyem.live.session import Session, block_plan
+from crazyem.live.session import Session
 from crazyem.live.summary import build_summary
+from crazyem.signals.vocabulary import block_plan
 from crazyem.vehicle import load_vehicle
 
 

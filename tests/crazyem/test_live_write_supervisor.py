@@ -13,11 +13,11 @@ from crazyem.errors import CrazyemError, LinkError
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
 from crazyem.live.controllers import LEE
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
-from crazyem.live.health import Health
 from crazyem.live.policy import EndRules, HealthLimits, MonitorLimits, Policy
 from crazyem.live.session import Session
 from crazyem.live.summary import build_summary, text_summary
 from crazyem.live.telemetry import CRASHED, FLYING, LOCKED, TUMBLED, Telemetry
+from crazyem.live.write_gate import WriteGate
 from crazyem.live.write_supervisor import WriteRules
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle
@@ -294,14 +294,14 @@ def test_nothing_is_put_back_that_was_never_pushed():
 
 def healthy(**limits):
     telemetry = Telemetry(info=FLYING)
-    health = Health(replace(HealthLimits(), **limits), telemetry)
+    health = WriteGate(telemetry, replace(HealthLimits(), **limits))
     health.take(Sample("voltage", 0.0, (3.9,)))
     health.take(Sample("attitude", 0.0, (0.0, 0.0, 0.0, 1.0)))
     return health, telemetry
 
 
 def test_a_healthy_drone_has_no_objection():
-    assert healthy()[0].objection(age=0.1) == ""
+    assert healthy()[0].health_objection(age=0.1) == ""
 
 
 @pytest.mark.parametrize(
@@ -312,33 +312,33 @@ def test_a_healthy_drone_has_no_objection():
 def test_the_supervisor_has_a_say(info, says):
     health, telemetry = healthy()
     telemetry.info = info
-    assert says in health.objection(age=0.0)
+    assert says in health.health_objection(age=0.0)
     health, telemetry = healthy(supervisor=False)
     telemetry.info = info
-    assert health.objection(age=0.0) == ""
+    assert health.health_objection(age=0.0) == ""
 
 
 def test_the_battery_is_averaged_and_has_to_recover():
     health, _ = healthy()
     for i in range(1, 101):
         health.take(Sample("voltage", 0.1 * i, (2.9 if i == 50 else 3.3,)))
-        assert health.objection(age=0.0) == ""  # a dip of a tenth of a second is none
+        assert health.health_objection(age=0.0) == ""  # a dip of a tenth of a second is none
     for i in range(101, 120):
         health.take(Sample("voltage", 0.1 * i, (3.1,)))
-    assert "3.10 V" in health.objection(age=0.0)
+    assert "3.10 V" in health.health_objection(age=0.0)
     for i in range(120, 140):
         health.take(Sample("voltage", 0.1 * i, (3.22,)))
-    assert "3.22 V" in health.objection(age=0.0)
+    assert "3.22 V" in health.health_objection(age=0.0)
     for i in range(140, 160):
         health.take(Sample("voltage", 0.1 * i, (3.3,)))
-    assert health.objection(age=0.0) == ""
-    unknown = Health(HealthLimits(), Telemetry(info=FLYING))
-    assert "not known" in unknown.objection(age=0.0)
-    assert Health(HealthLimits(battery=0.0), Telemetry(info=FLYING)).objection(age=0.0) == ""
+    assert health.health_objection(age=0.0) == ""
+    unknown = WriteGate(Telemetry(info=FLYING), HealthLimits())
+    assert "not known" in unknown.health_objection(age=0.0)
+    assert WriteGate(Telemetry(info=FLYING), HealthLimits(battery=0.0)).health_objection(age=0.0) == ""
 
 
 def test_old_estimates_and_leaning_drones():
     health, _ = healthy()
-    assert "4.0 s old" in health.objection(age=4.0)
+    assert "4.0 s old" in health.health_objection(age=4.0)
     health.take(Sample("attitude", 0.0, (0.71, 0.0, 0.0, 0.71)))
-    assert "leans 90 degrees" in health.objection(age=0.0)
+    assert "leans 90 degrees" in health.health_objection(age=0.0)
