@@ -28,7 +28,7 @@ class Board:
         self.board = Scenario(platform=platform).board()
         self.state, self.sensor = np.zeros(at.STATE_SIZE), np.zeros(at.SENSOR_SIZE)
         self.memory, self.log = np.zeros(mem.MEMORY_SIZE), np.zeros(len(variables.ALL_VARIABLES))
-        self.param = np.array([parameters.defaults(platform)[name] for name in parameters.NAMES])
+        self.param = np.array([parameters.defaults(platform)[name] for name in parameters.PARAMETER_NAMES])
         self.noise = np.zeros(at.NOISE_WIDTH)
         self.sensor[at.VBAT] = self.sensor[at.VBAT_FILTERED] = volts
         self.volts = volts

@@ -56,7 +56,7 @@ def test_power_distribution_gives_the_recorded_commands() -> None:
     wish = {k: dict(series[f"ctrlLee.{k}"]) for k in ("thrustSi", "torquex", "torquey", "torquez")}
     got = {k: dict(series[k]) for k in ("motor.m1", "motor.m2", "motor.m3", "motor.m4", "pm.vbatMV")}
     board = parse_scenario({}, "test").board()
-    param = np.array([parameters.defaults("cf2")[name] for name in parameters.NAMES])
+    param = np.array([parameters.defaults("cf2")[name] for name in parameters.PARAMETER_NAMES])
     errors = []
     for t in sorted(set(wish["thrustSi"]) & set(got["motor.m1"])):
         if wish["thrustSi"][t] < 0.2:

@@ -36,7 +36,7 @@ def test_a_number_gives_ports_seeds_and_places_in_a_row():
 @pytest.mark.parametrize("count", [2, 5, 9, 20, 100])
 def test_places_on_the_grid_are_apart_and_around_the_origin(count):
     places = [swarm.grid(i, count) for i in range(count)]
-    assert min(math.dist(a, b) for a, b in itertools.combinations(places, 2)) == pytest.approx(swarm.SPACING)
+    assert min(math.dist(a, b) for a, b in itertools.combinations(places, 2)) == pytest.approx(swarm.GRID_SPACING)
     assert all(abs(v) <= 5.0 for place in places for v in place)
     if math.isqrt(count) ** 2 == count:
         assert [sum(axis) for axis in zip(*places)] == pytest.approx([0, 0, 0])
@@ -174,13 +174,13 @@ def test_a_drone_with_nothing_to_send_gets_its_turn_all_the_same():
 
         log = Log()
 
-    assert swarm._next(Firmware) == 100 + swarm.LATEST
+    assert swarm._next(Firmware) == 100 + swarm.LONGEST_PAUSE
     Firmware.log.due = 107
     assert swarm._next(Firmware) == 107
     Firmware.log.due = 90
     assert swarm._next(Firmware) == 101
     Firmware.log.due = NOTHING_SENT
-    assert swarm._next(Firmware) == 100 + swarm.LATEST
+    assert swarm._next(Firmware) == 100 + swarm.LONGEST_PAUSE
 
 
 @pytest.mark.slow
