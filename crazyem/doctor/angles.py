@@ -1,6 +1,7 @@
 """Check: angles against the quaternion, and the quaternion against gyro and gravity: unit, sign, order, direction."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +21,7 @@ from crazyem.doctor.kinematics import (
     track,
     width_for,
 )
-from crazyem.doctor.regression import blocks, choose, slope
+from crazyem.doctor.regression import Choice, Slope, blocks, choose, slope
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -194,7 +195,13 @@ def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -
         "lag_ms": 1e3 * lag,
     }
     evidence |= {f"slope_{key}": s.value for key, s in parts.items() if s is not None}
-    head = f"{name} against {other}: "
+    return _euler_finding(name, f"{name} against {other}: ", choice, parts, evidence), True
+
+
+def _euler_finding(
+    name: str, head: str, choice: Choice, parts: Mapping[str, Slope | None], evidence: dict[str, float]
+) -> Finding | None:
+    """What the best reading of Euler angles says: an inverted sign, another order, another unit; None: all is well."""
     if choice.denied:
         what = choice.name.removeprefix("as declared ")
         factor = axes.sign_factor(what, ANGLE_NAMES) if choice.name else None
@@ -205,16 +212,16 @@ def _euler(name: str, array: SignalArray, other: str, quaternion: SignalArray) -
             scale = 1.0 / ANGLE_UNITS[unit] if unit else 1.0
             text = text if not unit else text[:-1] + f", and it is {_unit_said(unit)}."
             fix = Fix("scale", (name,), tuple(f * scale for f in factor))
-            return Finding("angles", Grade.UNUSABLE, text, name, (), evidence, "Correct its sign.", fix), True
+            return Finding("angles", Grade.UNUSABLE, text, name, (), evidence, "Correct its sign.", fix)
         said = f"its components are {what}" if choice.name else "it does not agree, and why cannot be told"
         advice = "Correct the order of its components where it is read."
-        return Finding("angles", Grade.UNUSABLE, f"{head}{said}.", name, (), evidence, advice), True
+        return Finding("angles", Grade.UNUSABLE, f"{head}{said}.", name, (), evidence, advice)
     unit = _unit_of([s.value for s in parts.values() if s is not None])
     if not unit:
-        return None, True
+        return None
     text = f"{head}it is {_unit_said(unit)}."
     fix = Fix("scale", (name,), (1.0 / ANGLE_UNITS[unit],) * 3)
-    return Finding("angles", Grade.UNUSABLE, text, name, (), evidence, "Correct its unit.", fix), True
+    return Finding("angles", Grade.UNUSABLE, text, name, (), evidence, "Correct its unit.", fix)
 
 
 def _upright(attitude: Track, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -76,6 +76,14 @@ class Comparison:
         return out
 
 
+def _aligned(array: SignalArray, grid: Grid, declared: Track, window: Window) -> tuple[Track, float]:
+    """A measurement on the grid without its lag behind a smoothed prediction, and that lag [s]; 0 if none is seen."""
+    raw = track(array, grid)
+    late = delay(declared, window.mean(raw))
+    lag = 0.0 if late is None or late.at_edge or late.explained < 0.3 else late.value
+    return (track(array, grid, shift=lag) if lag else raw), lag
+
+
 def compare_hypotheses(
     array: SignalArray,
     grid: Grid,
@@ -99,13 +107,9 @@ def compare_hypotheses(
     """
     window = Window(width)
     stride = max(ROW_STRIDE, grid.size // MOST_COMPARED_ROWS)
-    raw = track(array, grid)
     smooth = {name: window.mean(given) for name, (_, given) in candidates.items()}
     declared = next(iter(smooth.values()))
-    late = delay(declared, window.mean(raw))
-    lag = 0.0 if late is None or late.at_edge or late.explained < 0.3 else late.value
-    if lag:
-        raw = track(array, grid, shift=lag)
+    raw, lag = _aligned(array, grid, declared, window)
     measured = window.mean(raw)
     rows = np.flatnonzero(measured.valid & np.logical_and.reduce([s.valid for s in smooth.values()]))[::stride]
     if rows.size < 100 or float(declared.value[rows].std(axis=0).max()) < least:
@@ -120,17 +124,25 @@ def compare_hypotheses(
         return None
     name = choice.name or choice.best
     x = chosen[name][1]
-    base = name if name in candidates else next(iter(candidates))
-    wide = Window(max(SLOPE_WINDOW, width))
-    far_x, far_y = wide.mean(candidates[base][1]), wide.mean(raw)
-    keep = np.flatnonzero(far_x.valid & far_y.valid)[::stride]
-    if keep.size > 200 and name in candidates:
-        x, y, block = far_x.value[keep], far_y.value[keep], blocks(grid.time[keep])
+    at = declared.value[rows]
+    if name in candidates:  # slopes are better seen in slow motion
+        wide = Window(max(SLOPE_WINDOW, width))
+        far_x, far_y = wide.mean(candidates[name][1]), wide.mean(raw)
+        keep = np.flatnonzero(far_x.valid & far_y.valid)[::stride]
+        if keep.size > 200:
+            at = at if keep.size == len(rows) else wide.mean(next(iter(candidates.values()))[1]).value[keep]
+            x, y, block = far_x.value[keep], far_y.value[keep], blocks(grid.time[keep])
+    return _comparison(against, choice, lag, x, y, at, block, covered=len(y) * stride / grid.size)
+
+
+def _comparison(
+    against: str, choice: Choice, lag: float, x: Array, y: Array, at: Array, block: NDArray[np.int64], *, covered: float
+) -> Comparison:
+    """Slopes, offset and means of (n, 3) measurements `y`, the chosen prediction `x` and the declared one `at`."""
     whole = slope(x, y, block)
     single = tuple(slope(x[:, i], y[:, i], block) for i in range(3))
     factor = 1.0 if whole is None or whole.far_low <= 1.0 <= whole.far_high else whole.value
     rest = y - factor * x
-    at = declared.value[rows] if len(rows) == len(y) else wide.mean(next(iter(candidates.values()))[1]).value[keep]
     return Comparison(
         against=against,
         choice=choice,
@@ -139,7 +151,7 @@ def compare_hypotheses(
         single=single,
         offset=np.median(rest, axis=0),
         offset_error=_error(rest, block),
-        covered=len(y) * stride / grid.size,
+        covered=covered,
         mean=y.mean(axis=0),
         predicted=at.mean(axis=0),
         mean_error=_error(y - at * _ratio(y, at), block),

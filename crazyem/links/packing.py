@@ -63,28 +63,13 @@ def pack(
     Raises: UsageError naming the variable that does not exist, or what does not fit.
     """
     wanted = list(dict.fromkeys(variables))
-    for name in wanted:
-        if name not in available:
-            raise UsageError(f'The drone has no log variable "{name}"{_hint(name, available)}.')
-        if available[name] not in CTYPE_SIZES:
-            raise UsageError(f'The log variable "{name}" has type {available[name]}, which cannot be logged.')
+    _check_loggable(wanted, available)
     if variables_in_use + len(wanted) > MAX_VARIABLES:
         taken = f" ({variables_in_use} are in use already)" if variables_in_use else ""
         raise UsageError(f"{len(wanted)} variables do not fit: the firmware logs {MAX_VARIABLES} at once{taken}.")
 
     size = {name: CTYPE_SIZES[available[name]] for name in wanted}
-    bins: list[list[str]] = []
-    room: list[int] = []
-    for unit in sorted(_units(wanted, size, groups), key=lambda names: -sum(size[n] for n in names)):
-        need = sum(size[n] for n in unit)
-        for i, free in enumerate(room):
-            if need <= free:
-                bins[i].extend(unit)
-                room[i] -= need
-                break
-        else:
-            bins.append(list(unit))
-            room.append(MAX_BYTES - need)
+    bins = _first_fit(_units(wanted, size, groups), size)
     if blocks_in_use + len(bins) > MAX_BLOCKS:
         taken = f", {blocks_in_use} of them in use already" if blocks_in_use else ""
         raise UsageError(
@@ -97,6 +82,31 @@ def pack(
         Block(first_identifier + i, tuple(Variable(n, available[n]) for n in names), period_ms)
         for i, names in enumerate(ordered)
     )
+
+
+def _check_loggable(names: Sequence[str], available: Mapping[str, str]) -> None:
+    for name in names:
+        if name not in available:
+            raise UsageError(f'The drone has no log variable "{name}"{_hint(name, available)}.')
+        if available[name] not in CTYPE_SIZES:
+            raise UsageError(f'The log variable "{name}" has type {available[name]}, which cannot be logged.')
+
+
+def _first_fit(units: Sequence[tuple[str, ...]], size: Mapping[str, int]) -> list[list[str]]:
+    """Names of each block: units in decreasing size, each into the first block with room."""
+    bins: list[list[str]] = []
+    room: list[int] = []
+    for unit in sorted(units, key=lambda names: -sum(size[n] for n in names)):
+        need = sum(size[n] for n in unit)
+        for i, free in enumerate(room):
+            if need <= free:
+                bins[i].extend(unit)
+                room[i] -= need
+                break
+        else:
+            bins.append(list(unit))
+            room.append(MAX_BYTES - need)
+    return bins
 
 
 def _units(

@@ -42,6 +42,17 @@ def reset(memory):
 
 
 @kernel
+def log_step(estimate, D, memory, log):
+    """Wrench, roll, pitch and yaw as they are and as wanted, into the ctrlLee.* variables."""
+    for i in range(4):
+        log[lv.LEE_OUT + i] = memory[mem.WRENCH + i]
+    roll, pitch, heading = roll_pitch_yaw(estimate, at.E_QUAT)
+    log[lv.LEE_RPY], log[lv.LEE_RPY + 1], log[lv.LEE_RPY + 2] = roll, pitch, heading
+    roll, pitch, heading = angles(D)
+    log[lv.LEE_RPY + 3], log[lv.LEE_RPY + 4], log[lv.LEE_RPY + 5] = roll, pitch, heading
+
+
+@kernel
 def lee_step(setpoint, estimate, sensor, param, memory, log):
     """One controller step: writes memory[WRENCH] and the ctrlLee.* variables."""
     memory[mem.MODE] = mem.FORCE_TORQUE_MODE
@@ -100,9 +111,4 @@ def lee_step(setpoint, estimate, sensor, param, memory, log):
         )
         log[lv.LEE_OMEGA + i] = w[i]
         log[lv.LEE_OMEGA + 3 + i] = wr[i]
-    for i in range(4):
-        log[lv.LEE_OUT + i] = memory[out + i]
-    roll, pitch, heading = roll_pitch_yaw(estimate, at.E_QUAT)
-    log[lv.LEE_RPY], log[lv.LEE_RPY + 1], log[lv.LEE_RPY + 2] = roll, pitch, heading
-    roll, pitch, heading = angles(D)
-    log[lv.LEE_RPY + 3], log[lv.LEE_RPY + 4], log[lv.LEE_RPY + 5] = roll, pitch, heading
+    log_step(estimate, D, memory, log)

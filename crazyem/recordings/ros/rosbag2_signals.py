@@ -139,34 +139,44 @@ def recording_of(
     mapped = [m if m.quantity in have else replace(m, origin="") for m in mapped]
     rest, left_out = signals_of(others, mapped)
     signals = _together(firmware, rest, {_label(d): d.order for d in decoded})
-    broken = [(d.topic.name, d.rows.broken) for d in decoded if d.rows.broken]
-    damaged = [
-        note("integrity", f"{n} messages of {text_of(name)} do not fit their type.", Grade.DEGRADES, messages=float(n))
-        for name, n in broken
-    ]
-    faults = [
-        Fault(
-            _label(d),
-            int(d.unknown.sum()),
-            d.unknown.size,
-            "placed by arrival",
-            float(d.rows.stamp[d.unknown][0]) / _NS,
-        )
-        for d in decoded
-        if d.moved and d.clock == HOST_CLOCK
-    ]
-    streams = {fault.stream for fault in faults}
-    odd = finding(faults, [name for name, array in signals.items() if array.stream in streams])
     about = {"robot": robot, "topics": " ".join(sorted(text_of(t.name) for t in topics))[:4000], **clocks}
     return Recording(
         str(path),
         "rosbag2",
         signals,
         {"rosbag2": about, **meaning.metadata},
-        (*findings, *damaged, *odd, *clock_notes, *log_notes, *meaning.findings, *twist_notes, *left_out),
+        (
+            *findings,
+            *_damage(decoded),
+            *_stamp_faults(decoded, signals),
+            *clock_notes,
+            *log_notes,
+            *meaning.findings,
+            *twist_notes,
+            *left_out,
+        ),
         (),
         origin,
     )
+
+
+def _damage(decoded: Sequence[_Decoded]) -> list[Finding]:
+    broken = [(text_of(d.topic.name), d.rows.broken) for d in decoded if d.rows.broken]
+    return [
+        note("integrity", f"{n} messages of {name} do not fit their type.", Grade.DEGRADES, messages=float(n))
+        for name, n in broken
+    ]
+
+
+def _stamp_faults(decoded: Sequence[_Decoded], signals: Mapping[str, SignalArray]) -> list[Finding]:
+    """Stamps of the host's clock that were not believed."""
+    faults = []
+    for d in decoded:
+        if d.moved and d.clock == HOST_CLOCK:
+            first = float(d.rows.stamp[d.unknown][0]) / _NS
+            faults.append(Fault(_label(d), int(d.unknown.sum()), d.unknown.size, "placed by arrival", first))
+    streams = {fault.stream for fault in faults}
+    return finding(faults, [name for name, array in signals.items() if array.stream in streams])
 
 
 _PREFERRED = {"mocap": 1, "tf": 2}
