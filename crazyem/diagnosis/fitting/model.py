@@ -333,6 +333,13 @@ class Model:
                  np.stack(showing, 2) if showing else np.zeros((n, 12, 0)))  # fmt: skip
         return np.ascontiguousarray(stack[0]), np.ascontiguousarray(stack[1]), order
 
+    def slopes(self, point: Point, columns: Sequence[Column], workers: Workers) -> list[Column]:
+        """The columns with their derivatives at a point, to be used near it."""
+        acceleration, _ = self.accelerations(point)
+        offset = self.offsets(point, acceleration)
+        found = workers.map(lambda c: self._derivative(point, c, acceleration, offset), columns)
+        return [Column(c.name, acting=a, showing=s) for c, (a, s) in zip(columns, found, strict=True)]
+
     def _derivative(
         self, point: Point, column: Column, acceleration: NDArray, offset: NDArray
     ) -> tuple[NDArray | None, NDArray | None]:

@@ -140,9 +140,7 @@ def _sizes(effect: Effect, candidate: Candidate, sizes: Sizes, point: Point) -> 
 
 def share(effect: Effect, name: str, point: Point) -> float:
     """What the sizes of a parameter are shares of; 1 where they are in SI units."""
-    per = effect.prior.per.get(name, "")
-    if per == "mass":
-        return point.vehicle.mass
-    if per == "inertia":
-        return point.vehicle.inertia[0]
-    return float(Candidate(effect.name, (), (name,)).neutral(point)[name]) if per else 1.0
+    if name not in effect.prior.per:
+        return 1.0
+    neutral = Candidate(effect.name, (), (name,)).neutral(point)[name]
+    return effect.prior.share(name, mass=point.vehicle.mass, inertia=point.vehicle.inertia[0], neutral=float(neutral))

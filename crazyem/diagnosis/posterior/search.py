@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.fit import DivergedError
 from crazyem.diagnosis.posterior.members import Member
 from crazyem.diagnosis.posterior.settings import SETTINGS
-from crazyem.diagnosis.posterior.study import Fit, Study
+from crazyem.diagnosis.posterior.study import Fit, Slopes, Study
 
 Say = Callable[[str], None]
 
@@ -42,11 +42,12 @@ class Search:
         self.study, self.say = study, say
         self.visited: dict[frozenset[str], Fit] = {}
         self._looked: dict[frozenset[str], list[Neighbour]] = {}
+        self._slopes: dict[frozenset[str], Slopes] = {}
 
     def run(self) -> list[Fit]:
         """All models that were fitted, the most probable first."""
         study = self.study
-        nothing = study.fit([d.twin() for d in study.data], study.points, (), frozenset(), np.zeros(0))
+        nothing = study.fit([d.twin() for d in study.data], study.points, (), frozenset(), np.zeros(0), {})
         self._keep(nothing)
         self.say(f"nothing missing: {nothing.value:.1f}, scatter {np.median(nothing.look.shared.scatter):.2f}")
         self._grow(nothing, most=None)
@@ -77,7 +78,10 @@ class Search:
         study = self.study
         found: dict[str, Neighbour] = {}
         data = [d.twin() for d in fit.data]
-        look, _ = study.look(data, fit.points, fit.members, study.pool.looks)
+        near = study.slopes(data, fit.points, fit.members, study.pool.looks)
+        look = study.look(data, fit.points, fit.members, near, study.pool.looks)
+        usual = {c.effect for c, _ in study.pool.usual}
+        self._slopes[fit.effects] = {key: columns for key, columns in near.items() if key[0] in usual}
         base = study.posterior(look, fit.members).gain
         size = fit.phi.size
         for whole, m in zip(study.pool.members, study.pool.looks, strict=True):
@@ -99,10 +103,11 @@ class Search:
 
     def _fitted(self, base: Fit, neighbour: Neighbour) -> Fit | None:
         """A neighbour, fitted; None where it leaves the range of numbers."""
+        near = self._slopes[base.effects]
         try:
             if neighbour.member is None:
-                return self.study.restarted(base, base.members, base.random | {neighbour.effect})
-            return self.study.begun(base, neighbour.member, neighbour.change)
+                return self.study.restarted(base, base.members, base.random | {neighbour.effect}, near)
+            return self.study.begun(base, neighbour.member, neighbour.change, near)
         except (DivergedError, np.linalg.LinAlgError):
             return None
 
@@ -121,7 +126,7 @@ class Search:
             if less not in self.visited:
                 members = [m for m in best.members if m.effect != effect]
                 try:
-                    self._keep(self.study.restarted(best, members, best.random - {effect}))
+                    self._keep(self.study.restarted(best, members, best.random - {effect}, {}))
                 except (DivergedError, np.linalg.LinAlgError):
                     continue
             if less:

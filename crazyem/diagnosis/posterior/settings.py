@@ -10,6 +10,7 @@ class Settings:
     memory: s, correlation time of the disturbing force that every flight has; moving air at a Crazyflie's speed.
     rounds: of Gauss-Newton for a model, at most.
     enough: nats; a round that gains less ends a fit.
+    much: nats; a round that gains more asks for noise scales anew.
     steps: shares of a Gauss-Newton step that are tried, the first that is no worse is taken.
     rows: of a flight from which noise scales are taken, at most.
     worth: share of the best linear gain of a neighbour from which another one is fitted,
@@ -25,6 +26,7 @@ class Settings:
     memory: float = 1.0
     rounds: int = 6
     enough: float = 0.3
+    much: float = 2.0
     steps: tuple[float, ...] = (1.0, 0.4, 0.1)
     rows: int = 4000
     worth: float = 0.1

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, nominal
 from crazyem.diagnosis.fitting.gram import bounded
-from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.model import Column, Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.posterior.evidence import Gaussian, Pass, Posterior, Shared
@@ -29,6 +29,14 @@ from crazyem.vehicle import Vehicle
 FORCES = (0, 1, 2)  # of the disturbances
 
 
+Key = tuple[str, Any, Any, str]  # of a column: effect, choices, beginning, parameter
+Slopes = Mapping[Key, tuple[Column, ...]]  # derivatives by column, one a flight
+
+
+def _key(c: Candidate, name: str) -> Key:
+    return c.effect, c.fixed, c.begin, name
+
+
 @dataclass(frozen=True)
 class Look:
     """One pass at a point of every flight.
@@ -37,11 +45,13 @@ class Look:
         places: columns of each member and each variant that was looked at.
         usual: columns of what differs from recording to recording.
         shared: what the flights say.
+        loglik: of all flights [nats].
     """
 
     places: Mapping[Candidate, tuple[int, ...]]
     usual: Mapping[Candidate, tuple[int, ...]]
     shared: Shared
+    loglik: float
 
 
 @dataclass(frozen=True)
@@ -153,50 +163,68 @@ class Study:
     # one pass
 
     def look(
-        self, data: Sequence[Data], points: Sequence[Point], members: Sequence[Member], more: Sequence[Member] = ()
-    ) -> tuple[Look, NDArray]:
-        """One pass with the columns of the members, of what is usual, and of `more`; log-likelihoods (flights,).
+        self, data: Sequence[Data], points: Sequence[Point], members: Sequence[Member], near: Slopes,
+        more: Sequence[Member] = (),
+    ) -> Look:  # fmt: skip
+        """One pass with the columns of the members, of what is usual, and of `more`.
+
+        near: derivatives that were taken near the points; those of the members are taken at these.
 
         Raises: DivergedError.
         """
-        keys: dict[tuple[str, Any, Any, str], int] = {}
+        keys: dict[Key, int] = {}
         columns: list[Candidate] = []
 
         def placed(c: Candidate, names: Sequence[str]) -> tuple[int, ...]:
-            out = []
             for n in names:
-                key = (c.effect, c.fixed, c.begin, n)
-                if key not in keys:
-                    keys[key] = len(columns)
+                if _key(c, n) not in keys:
+                    keys[_key(c, n)] = len(columns)
                     columns.append(replace(c, free=(n,)))
-                out.append(keys[key])
-            return tuple(out)
+            return tuple(keys[_key(c, n)] for n in names)
 
-        present = {m.effect for m in members}
+        present = {m.effect: m.candidate for m in members}
         places = {m.candidate: placed(m.candidate, m.candidate.free) for m in members}
         usual: dict[Candidate, tuple[int, ...]] = {}
         sds: dict[int, NDArray] = {}
         for c, table in self.pool.usual:
-            own = next((m.candidate for m in members if m.effect == c.effect), c)
-            usual[c] = placed(replace(own, free=()), c.free)
+            usual[c] = placed(present.get(c.effect, c), c.free)
             sds.update(zip(usual[c], table.T, strict=True))
         for m in more:
             if m.effect not in present:
                 places[m.candidate] = placed(m.candidate, m.candidate.free)
         sd = np.array([sds.get(i, np.zeros(len(data))) for i in range(len(columns))]).T
-        passes, logliks = [], []
-        for one, point in zip(data, points, strict=True):
+        passes = []
+        for f, (one, point) in enumerate(zip(data, points, strict=True)):
+            used = [
+                near[_key(c, c.free[0])][f]
+                if c.effect not in present and _key(c, c.free[0]) in near
+                else c.columns(point)[0]
+                for c in columns
+            ]
             with np.errstate(over="ignore", invalid="ignore"):
-                gram, loglik = one.gram_and_loglik(point, [c.columns(point)[0] for c in columns])
+                gram, loglik = one.gram_and_loglik(point, used)
             if not np.isfinite(loglik) or not np.isfinite(gram.information).all():
                 raise DivergedError(
                     "the vehicle's model leaves the range of numbers on this flight: is it this drone's?"
                 )
             here = np.array([_away(c, point, c.free[0]) for c in columns])
             passes.append(Pass(loglik, gram.score, gram.information, here))
-            logliks.append(loglik)
         self.passes += 1
-        return Look(places, usual, Shared(passes, sd)), np.array(logliks)
+        return Look(places, usual, Shared(passes, sd), sum(p.loglik for p in passes))
+
+    def slopes(
+        self, data: Sequence[Data], points: Sequence[Point], members: Sequence[Member], more: Sequence[Member] = ()
+    ) -> Slopes:
+        """Derivatives of what is usual and of `more` at some points, but for the members' effects."""
+        present, wanted = {m.effect for m in members}, {}
+        for c in (*(c for c, _ in self.pool.usual), *(m.candidate for m in more)):
+            if c.effect not in present:
+                wanted.update({_key(c, n): replace(c, free=(n,)) for n in c.free})
+        each = [
+            d.models[0].slopes(p, [c.columns(p)[0] for c in wanted.values()], self.workers)
+            for d, p in zip(data, points, strict=True)
+        ]
+        return dict(zip(wanted, zip(*each, strict=True), strict=True))
 
     def prior(self, members: Sequence[Member], *, nudged: Sequence[Member] = ()) -> Gaussian:
         """Of what all flights share of some members, in their order."""
@@ -216,16 +244,9 @@ class Study:
 
     # a fit
 
-    def height(self, data: Sequence[Data], points: Sequence[Point], members: Sequence[Member], phi: NDArray) -> float:
-        """Log-likelihood of the flights and log density of what is usual and of phi, but for constants."""
-        total = 0.0
-        for one, point in zip(data, points, strict=True):
-            with np.errstate(over="ignore", invalid="ignore"):
-                one.converge(point)
-                total += one.loglik(point)
-        if not np.isfinite(total):
-            return -np.inf
-        common, k = {}, 0
+    def height(self, look: Look, points: Sequence[Point], members: Sequence[Member], phi: NDArray) -> float:
+        """Log-likelihood of the flights by a look, and log density of what is usual and of phi, but for constants."""
+        common, k, total = {}, 0, look.loglik
         for m in members:
             common.update({(m.effect, n): phi[k + i] for i, n in enumerate(m.candidate.free)})
             k += len(m.candidate.free)
@@ -241,33 +262,41 @@ class Study:
 
     def fit(
         self, data: Sequence[Data], points: Sequence[Point], members: Sequence[Member], random: frozenset[str],
-        phi: NDArray,
+        phi: NDArray, near: Slopes,
     ) -> Fit:  # fmt: skip
         """The maximum near some points, with noise scales that fit there; what is in `data` changes.
 
         Raises: DivergedError.
         """
         data, points = tuple(data), tuple(points)
+
+        def seen(points: tuple[Point, ...], phi: NDArray) -> tuple[float, Look]:
+            for one, point in zip(data, points, strict=True):
+                with np.errstate(over="ignore", invalid="ignore"):
+                    one.converge(point)
+            look = self.look(data, points, members, near)
+            return self.height(look, points, members, phi), look
+
         for one, point in zip(data, points, strict=True):
             one.settle(point)
-        height = self.height(data, points, members, phi)
-        look, _ = self.look(data, points, members)
+        height, look = seen(points, phi)
         for turn in range(SETTINGS.rounds):
             before = height
             aim, wanted = self._aim(look, members)
             for part in SETTINGS.steps:
-                there = self._moved(points, members, look, wanted, part)
-                step = phi + part * (aim - phi)
-                found = self.height(data, there, members, step)
+                there = self._moved(points, members, look, wanted, part), phi + part * (aim - phi)
+                try:
+                    found, slopes = seen(*there)
+                except DivergedError:
+                    continue
                 if found > height - 1e-3:
-                    points, phi, height = there, step, found
+                    (points, phi), height, look = there, found, slopes
                     break
-            if turn < 2 or height - before > 2.0:
+            if turn < 1 or height - before > SETTINGS.much:
                 noisy = tuple(self.noisy(d, p, random) for d, p in zip(data, points, strict=True))
-                found = self.height(data, noisy, members, phi)
+                found, slopes = seen(noisy, phi)
                 if found > height or turn == 0:
-                    points, height = noisy, found
-            look, _ = self.look(data, points, members)
+                    points, height, look = noisy, found, slopes
             if abs(height - before) < SETTINGS.enough:
                 break
         return self.fitted(data, points, members, random, phi, look)
@@ -324,7 +353,7 @@ class Study:
             moved.append(point.with_effects(changes))
         return tuple(moved)
 
-    def begun(self, base: Fit, member: Member, change: NDArray) -> Fit:
+    def begun(self, base: Fit, member: Member, change: NDArray, near: Slopes) -> Fit:
         """The base with one member more, begun where the linear approximation says, or nearer to nothing.
 
         Raises: DivergedError.
@@ -338,9 +367,9 @@ class Study:
             tried.append((value if np.isfinite(value) else -np.inf, part, starts, data))
         _, part, starts, data = max(tried, key=lambda t: t[0])
         phi = np.concatenate([base.phi, [_away(c, starts[0], n) - _away(c, base.points[0], n) for n in c.free]])
-        return self.fit(data, starts, (*base.members, member), base.random, phi)
+        return self.fit(data, starts, (*base.members, member), base.random, phi, near)
 
-    def restarted(self, base: Fit, members: Sequence[Member], random: frozenset[str]) -> Fit:
+    def restarted(self, base: Fit, members: Sequence[Member], random: frozenset[str], near: Slopes) -> Fit:
         """The base with some of its members only, or with other random effects.
 
         Raises: DivergedError.
@@ -361,7 +390,9 @@ class Study:
                 elif m.effect in usual:
                     effects[m.effect] = usual[m.effect].neutral(point)
             points.append(replace(point, effects=effects))
-        return self.fit([d.twin() for d in base.data], points, members, random, np.concatenate([*phi, np.zeros(0)]))
+        return self.fit(
+            [d.twin() for d in base.data], points, members, random, np.concatenate([*phi, np.zeros(0)]), near
+        )
 
 
 def _drag(fit: Fit) -> float:

@@ -66,6 +66,11 @@ class Prior:
         """From recording to recording, for one as it was logged."""
         return self.usual(logged) if callable(self.usual) else self.usual
 
+    def share(self, name: str, *, mass: float, inertia: float, neutral: float) -> float:
+        """What the sizes of a parameter are shares of, of a vehicle of that mass [kg] and inertia about x [kg m^2]; 1
+        where they are in SI units."""
+        return {"mass": mass, "inertia": inertia, "neutral": neutral}.get(self.per.get(name, ""), 1.0)
+
 
 def alike(names: str, size: float) -> dict[str, float]:
     """The same size for several parameters, named with spaces between."""
