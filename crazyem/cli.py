@@ -255,6 +255,30 @@ def _predict(commands: Any) -> None:
     _cutting(p)
 
 
+def _vehicle(commands: Any) -> None:
+    """Files of simulators."""
+    text = "vehicle files and those of simulators: converted, checked by flights, sampled"
+    actions = commands.add_parser("vehicle", help=text, description=text).add_subparsers(
+        dest="action", required=True, metavar="ACTION"
+    )
+
+    def action(name: str, text: str) -> argparse.ArgumentParser:
+        p: argparse.ArgumentParser = actions.add_parser(name, help=text, description=text)
+        p.add_argument("--name", metavar="DRONE", help="which drone of a file that has several")
+        p.add_argument("--force", action="store_true", help="replace what is there")
+        p.add_argument("--json", nargs="?", const="-", metavar="FILE", help="for programs; without FILE on stdout")
+        return p
+
+    convert = action("convert", "a vehicle file or preset into a simulator's file, or the other way")
+    convert.add_argument("source", metavar="SOURCE", help="preset, vehicle file, or a file of a known simulator")
+    convert.add_argument("-o", "--output", required=True, metavar="TARGET", help="the new file")
+    convert.add_argument("--from", dest="form", metavar="FORMAT", help="of the source (default: told by its content)")
+    convert.add_argument("--to", metavar="FORMAT", help="of the target (default: the template's, or by the suffix)")
+    convert.add_argument("--template", metavar="FILE", help="a file of yours, of which all that is not ours stays")
+    convert.add_argument("--vehicle", metavar="NAME|FILE", help="what a simulator's file does not say")
+    convert.add_argument("--flight", metavar="RECORDING", help="tell costs by this flight (default: a made one)")
+
+
 def _on_recordings(commands: Any) -> None:
     """The commands that work on files and need neither drone nor estimator."""
 
@@ -304,6 +328,7 @@ def _on_recordings(commands: Any) -> None:
 
     _diagnose(commands)
     _predict(commands)
+    _vehicle(commands)
     layout = command("layout", "a Foxglove and Lichtblick layout for recordings of ours", many=False)
     writes(layout, "FILE.json", "file (default: standard output)", required=False)
     layout.add_argument("--swarm", metavar="FILE.toml", help="for the drones of this file, as --foxglove streams them")

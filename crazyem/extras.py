@@ -11,6 +11,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "plots": ("matplotlib", "jinja2"),
     "live": ("rich", "foxglove"),
     "cluster": ("distributed",),
+    "simulators": ("tomlkit", "ruamel"),
 }
 
 

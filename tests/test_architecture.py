@@ -33,15 +33,16 @@ ALLOWED: dict[str, set[str]] = {
     "recordings": {"compiled", "signals", "links", "estimation"},
     "doctor": {"vehicle", "physics", "signals", "recordings"},
     "diagnosis": {"vehicle", "compiled", "physics", "signals", "estimation", "recordings", "doctor"},
+    "simulators": {"vehicle", "physics", "recordings", "diagnosis"},
     "paper": {"vehicle", "compiled", "physics", "signals", "control", "estimation"},
     "live": {"kernel_cache", "vehicle", "physics", "signals", "control", "links", "estimation", "recordings"},
     "api": {
         *("vehicle", "physics", "signals", "control", "links", "estimation", "recordings", "doctor", "diagnosis"),
-        "live",
+        *("live", "simulators"),
     },
     "commands": {
         *("vehicle", "physics", "signals", "control", "links", "estimation", "recordings", "doctor", "diagnosis"),
-        *("live", "paper", "api"),
+        *("live", "paper", "api", "simulators"),
     },
     "cli": {"commands"},
     "__main__": {"cli"},

@@ -2,14 +2,12 @@
 
 import argparse
 import json
-import os
 import sys
 import time
 from pathlib import Path
 
 from crazyem.commands.files import read_options
-from crazyem.commands.output import put
-from crazyem.errors import UsageError
+from crazyem.commands.output import put, replace_text
 from crazyem.live.summary import check_writable
 
 
@@ -42,24 +40,13 @@ def run(arguments: argparse.Namespace) -> int:
     )
     document = {**found.document, "seconds": time.monotonic() - begin}
     if arguments.write_vehicle:
-        _replace(arguments.write_vehicle, found.named_vehicle(Path(arguments.write_vehicle).stem).to_toml())
+        replace_text(arguments.write_vehicle, found.named_vehicle(Path(arguments.write_vehicle).stem).to_toml())
     if arguments.report:
         found.report(arguments.report)
     if arguments.json == "-":
         put(json.dumps(document, indent=1))
         return 0
     if arguments.json:
-        _replace(arguments.json, json.dumps(document, indent=1) + "\n")
+        replace_text(arguments.json, json.dumps(document, indent=1) + "\n")
     put(text_of(document))
     return 0
-
-
-def _replace(path: str, text: str) -> None:
-    """All or nothing. Raises UsageError if it cannot be written."""
-    part = Path(f"{path}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise UsageError(f"cannot write {path}: {error.strerror or error}.") from None

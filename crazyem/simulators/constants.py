@@ -1,0 +1,226 @@
+"""What simulators hold of a drone, in SI: one typed value between a vehicle file and all of their files."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from crazyem.physics.motion import active, body_of
+from crazyem.vehicle import GRAVITY, Vehicle
+
+SHORTEST_LAG = 1e-3  # s: simulators divide by the lag, so none is written as this one, and this one is read as none
+BODY = ("inertia", "inertia_products", "center_of_mass", "payload")  # effects that a body holds, exactly
+ROTORS = ("thrust_scale", "torque_scale", "motor_lag")  # effects that the constants of rotors hold, exactly
+AIR = ("linear_drag", "quadratic_drag", "rate_damping")  # effects with constants of their own
+
+
+@dataclass(frozen=True)
+class Constants:
+    """A quadrotor in SI; None: not said. Body axes x forward, y left, z up, origin in the middle of the rotors.
+
+    Attributes:
+        name: what it is called.
+        mass: kg.
+        inertia_xx, ..., inertia_yz: elements of the matrix about the centre of mass [kg m^2].
+        centre_x, centre_y, centre_z: centre of mass from the middle of the rotors [m].
+        arm_x, arm_y: rotor offsets [m].
+        thrust_per_speed2: of a rotor [N/(rad/s)^2].
+        torque_per_thrust: yaw torque of a rotor over its thrust [m].
+        thrust_max: of a rotor [N].
+        lag: first-order time constant of a rotor [s].
+        drag_x, drag_y, drag_z: force against the velocity in body axes [N s/m].
+        quadratic_drag_x, ...: force against speed times velocity [N s^2/m^2].
+        damping_x, damping_y, damping_z: torque against the body rate [N m s].
+    """
+
+    name: str
+    mass: float | None = None
+    inertia_xx: float | None = None
+    inertia_yy: float | None = None
+    inertia_zz: float | None = None
+    inertia_xy: float | None = None
+    inertia_xz: float | None = None
+    inertia_yz: float | None = None
+    centre_x: float | None = None
+    centre_y: float | None = None
+    centre_z: float | None = None
+    arm_x: float | None = None
+    arm_y: float | None = None
+    thrust_per_speed2: float | None = None
+    torque_per_thrust: float | None = None
+    thrust_max: float | None = None
+    lag: float | None = None
+    drag_x: float | None = None
+    drag_y: float | None = None
+    drag_z: float | None = None
+    quadratic_drag_x: float | None = None
+    quadratic_drag_y: float | None = None
+    quadratic_drag_z: float | None = None
+    damping_x: float | None = None
+    damping_y: float | None = None
+    damping_z: float | None = None
+
+    def or_(self, quantity: str, default: float) -> float:
+        """A quantity, or a default where it is not said."""
+        value = getattr(self, quantity)
+        return default if value is None else float(value)
+
+
+NUMBERS = tuple(f.name for f in fields(Constants) if f.name != "name")
+UNITS = {
+    **dict.fromkeys(("arm_x", "arm_y", "centre_x", "centre_y", "centre_z", "torque_per_thrust"), "m"),
+    **{f"inertia_{a}": "kg m^2" for a in ("xx", "yy", "zz", "xy", "xz", "yz")},
+    **{f"drag_{a}": "N s/m" for a in "xyz"},
+    **{f"quadratic_drag_{a}": "N s^2/m^2" for a in "xyz"},
+    **{f"damping_{a}": "N m s" for a in "xyz"},
+    "mass": "kg", "thrust_per_speed2": "N/(rad/s)^2", "thrust_max": "N", "lag": "s",
+}  # fmt: skip
+
+
+def hover_speed(c: Constants) -> float:
+    """Rotor speed at which four rotors carry the weight [rad/s]; NaN where unknown."""
+    if c.mass is None or not c.thrust_per_speed2:
+        return math.nan
+    return math.sqrt(c.mass * GRAVITY / (4.0 * c.thrust_per_speed2))
+
+
+def _needs(*names: str) -> Callable[[Callable[..., float]], Callable[[Constants], float]]:
+    """A function of quantities, as one of constants that is NaN where a quantity is not said."""
+
+    def wrap(function: Callable[..., float]) -> Callable[[Constants], float]:
+        def of(c: Constants) -> float:
+            values = [hover_speed(c) if n == "hover_speed" else getattr(c, n) for n in names]
+            return math.nan if any(v is None or math.isnan(v) for v in values) else function(*values)
+
+        return of
+
+    return wrap
+
+
+# What files hold that follows from the constants: quantity -> its value.
+DERIVED: dict[str, Callable[[Constants], float]] = {
+    "torque_per_speed2": _needs("thrust_per_speed2", "torque_per_thrust")(lambda k, r: k * r),
+    "speed_max": _needs("thrust_max", "thrust_per_speed2")(lambda t, k: math.sqrt(t / k)),
+    "thrust_to_weight": _needs("thrust_max", "mass")(lambda t, m: 4.0 * t / (m * GRAVITY)),
+    "arm_length": _needs("arm_x", "arm_y")(math.hypot),
+    "arm": _needs("arm_x", "arm_y")(lambda x, y: math.sqrt(x * y)),
+    "weight": _needs("mass")(lambda m: m * GRAVITY),
+    "hover_thrust": _needs("mass")(lambda m: m * GRAVITY / 4.0),
+    "total_thrust_max": _needs("thrust_max")(lambda t: 4.0 * t),
+    "torque_max": _needs("thrust_max", "torque_per_thrust")(lambda t, r: t * r),
+    "hover_share": _needs("mass", "thrust_max")(lambda m, t: m * GRAVITY / (4.0 * t)),
+    "hover_speed_share": _needs("mass", "thrust_max")(lambda m, t: math.sqrt(m * GRAVITY / (4.0 * t))),
+    "drag": _needs("drag_x", "drag_y", "drag_z")(lambda x, y, z: (x + y + z) / 3.0),
+    "damping": _needs("damping_x", "damping_y", "damping_z")(lambda x, y, z: (x + y + z) / 3.0),
+    "rotor_drag_xy": _needs("drag_x", "drag_y", "hover_speed")(lambda x, y, w: (x + y) / (8.0 * w)),
+    "rotor_drag_z": _needs("drag_z", "hover_speed")(lambda z, w: z / (4.0 * w)),
+}
+
+# The same the other way: a quantity, what it follows from, and how; the first that can be done is done.
+SOLVED: tuple[tuple[str, tuple[str, ...], Callable[..., float]], ...] = (
+    ("mass", ("weight",), lambda w: w / GRAVITY),
+    ("torque_per_thrust", ("torque_per_speed2", "thrust_per_speed2"), lambda q, k: q / k),
+    ("thrust_max", ("total_thrust_max",), lambda t: t / 4.0),
+    ("thrust_max", ("speed_max", "thrust_per_speed2"), lambda w, k: k * w * w),
+    ("thrust_max", ("thrust_to_weight", "mass"), lambda r, m: r * m * GRAVITY / 4.0),
+    ("torque_per_thrust", ("torque_max", "thrust_max"), lambda q, t: q / t),
+    ("arm_x", ("arm",), lambda a: a),
+    ("arm_y", ("arm",), lambda a: a),
+    ("arm_x", ("arm_length",), lambda a: a / math.sqrt(2.0)),
+    ("arm_y", ("arm_length",), lambda a: a / math.sqrt(2.0)),
+    *((f"drag_{a}", ("drag",), lambda d: d) for a in "xyz"),
+    *((f"damping_{a}", ("damping",), lambda d: d) for a in "xyz"),
+    ("hover_speed", ("mass", "thrust_per_speed2"), lambda m, k: math.sqrt(m * GRAVITY / (4.0 * k))),
+    *((f"drag_{a}", ("rotor_drag_xy", "hover_speed"), lambda d, w: 4.0 * d * w) for a in "xy"),
+    ("drag_z", ("rotor_drag_z", "hover_speed"), lambda d, w: 4.0 * d * w),
+)
+
+
+def value_of(c: Constants, quantity: str) -> float:
+    """A quantity or one that follows from others; NaN where it is not said."""
+    return DERIVED[quantity](c) if quantity in DERIVED else c.or_(quantity, math.nan)
+
+
+def solved(found: Mapping[str, float]) -> dict[str, float]:
+    """Quantities of a file with those that follow from them."""
+    values = dict(found)
+    for target, needs, function in SOLVED:
+        if target not in values and all(n in values for n in needs):
+            try:
+                values[target] = function(*(values[n] for n in needs))
+            except (ZeroDivisionError, ValueError, OverflowError):
+                continue
+    return values
+
+
+def from_vehicle(vehicle: Vehicle) -> tuple[Constants, list[str]]:
+    """The constants of a vehicle, and the names of its effects that are in none of them.
+
+    Exact: inertia, centre of mass and payload as one body, scales of thrust and torque, the lag, drags and damping.
+    """
+    values = {effect.name: found for effect, found in active(vehicle.effects, vehicle)}
+    body = body_of(vehicle, {n: values[n] for n in BODY if n in values})
+    thrust = float(values.get("thrust_scale", {}).get("scale", 1.0))
+    torque = float(values.get("torque_scale", {}).get("scale", 1.0))
+    has_rotors = bool(vehicle.thrust_curve) or vehicle.rotor_constant is not None
+    constant, limit = vehicle.rotor_constant, vehicle.thrust_max
+    matrix = body.inertia
+    found: dict[str, float | None] = {
+        "mass": body.mass,
+        **{f"inertia_{a}{b}": matrix["xyz".index(a), "xyz".index(b)] for a, b in ("xx", "yy", "zz", "xy", "xz", "yz")},
+        **{f"centre_{a}": body.centre["xyz".index(a)] for a in "xyz"},
+        "arm_x": vehicle.arm[0] * torque if has_rotors else None,
+        "arm_y": vehicle.arm[1] * torque if has_rotors else None,
+        "thrust_per_speed2": None if constant is None else constant * thrust,
+        "torque_per_thrust": vehicle.torque_per_thrust * torque if has_rotors else None,
+        "thrust_max": limit * thrust if math.isfinite(limit) else None,
+        "lag": values.get("motor_lag", {}).get("time_constant", vehicle.motor_time_constant),
+    }
+    for effect, prefix in zip(AIR, ("drag", "quadratic_drag", "damping"), strict=True):
+        found |= {f"{prefix}_{a}": values.get(effect, {}).get(a, 0.0) for a in "xyz"}
+    left = [n for n in values if n not in (*BODY, *ROTORS, *AIR)]
+    return Constants(vehicle.name, **{n: None if v is None else float(v) for n, v in found.items()}), left
+
+
+def to_vehicle(c: Constants, base: Vehicle | None = None) -> Vehicle:
+    """The vehicle of constants; what they do not say is that of `base` (its law from command to thrust, above all).
+
+    Raises:
+        ValueError: no mass or no inertia.
+    """
+    matrix = inertia_of(c)
+    if c.mass is None or matrix is None:
+        raise ValueError("a vehicle needs a mass and an inertia")
+    plain = Vehicle(c.name, c.mass, (0.0, 0.0, 0.0)) if base is None else base
+    if base is not None and c.thrust_per_speed2 is None:
+        plain = replace(plain, rotor_constant=base.rotor_constant)
+    effects: dict[str, dict[str, float]] = {}
+    for effect, prefix in (("center_of_mass", "centre"), *zip(AIR, ("drag", "quadratic_drag", "damping"), strict=True)):
+        axes = {a: c.or_(f"{prefix}_{a}", 0.0) for a in "xyz"}
+        if any(axes.values()):
+            effects[effect] = axes
+    return replace(
+        plain,
+        name=c.name,
+        mass=c.mass,
+        inertia=(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[2, 2])),
+        inertia_products=(float(matrix[0, 1]), float(matrix[0, 2]), float(matrix[1, 2])),
+        arm=(c.or_("arm_x", plain.arm[0]), c.or_("arm_y", plain.arm[1])),
+        rotor_constant=plain.rotor_constant if c.thrust_per_speed2 is None else c.thrust_per_speed2,
+        torque_per_thrust=c.or_("torque_per_thrust", plain.torque_per_thrust),
+        motor_time_constant=c.or_("lag", plain.motor_time_constant),
+        thrust_max=c.or_("thrust_max", plain.thrust_max),
+        effects=effects,
+        mass_sd=None,
+        inertia_sd=None,
+        motor_time_constant_sd=None,
+    )
+
+
+def inertia_of(c: Constants) -> np.ndarray | None:
+    """(3, 3) kg m^2; None where a moment is not said. Products that are not said are 0."""
+    if c.inertia_xx is None or c.inertia_yy is None or c.inertia_zz is None:
+        return None
+    xy, xz, yz = (c.or_(f"inertia_{a}", 0.0) for a in ("xy", "xz", "yz"))
+    return np.array([[c.inertia_xx, xy, xz], [xy, c.inertia_yy, yz], [xz, yz, c.inertia_zz]])

@@ -1,0 +1,262 @@
+"""From a vehicle to a simulator's file and back, with what the file cannot hold and what that costs."""
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from crazyem.errors import FileFormatError, UsageError
+from crazyem.physics import folding
+from crazyem.recordings.recording import Recording
+from crazyem.simulators.constants import AIR, Constants, from_vehicle, to_vehicle
+from crazyem.simulators.cost import HORIZON, apart, errors_after, flown, reference_flight, said, to_json
+from crazyem.simulators.fields import Contradiction, Format, Imported, read, write
+from crazyem.simulators.formats.rotorpy import ROTORPY, ROTORPY_JSON
+from crazyem.simulators.plausible import impossible, objection
+from crazyem.simulators.registry import FORMATS, OWN, format_named, format_of
+from crazyem.vehicle import Vehicle, preset_names
+
+# What is held or lost together: words, and the quantities.
+GROUPS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "motor_lag": ("rotor lag", ("lag",)),
+    "center_of_mass": ("centre of mass", ("centre_x", "centre_y", "centre_z")),
+    "inertia": ("inertia", ("inertia_xx", "inertia_yy", "inertia_zz")),
+    "inertia_products": ("products of inertia", ("inertia_xy", "inertia_xz", "inertia_yz")),
+    "arm": ("arms", ("arm_x", "arm_y")),
+    "linear_drag": ("drag by axis", ("drag_x", "drag_y", "drag_z")),
+    "quadratic_drag": ("quadratic drag", ("quadratic_drag_x", "quadratic_drag_y", "quadratic_drag_z")),
+    "rate_damping": ("damping of rotation", ("damping_x", "damping_y", "damping_z")),
+}
+OF_ROTORS = {
+    "thrust_per_speed2": "thrust per squared rotor speed", "torque_per_thrust": "torque per thrust",
+    "thrust_max": "largest thrust",
+}  # fmt: skip
+HELD = 1e-6  # relative difference up to which a quantity is held
+TOLERANCE_OF_NOTHING = {"centre": 1e-9, "lag": 1e-3}  # m, s: as good as none
+
+
+@dataclass(frozen=True)
+class Lost:
+    """Something that a file does not hold.
+
+    Attributes:
+        name: of the effect or constant; words: for people.
+        cost: distance after half a second with and without it, by quantity; None where it is no part of the motion
+            from rotor thrusts.
+        errors: on a recording, the errors with and without it.
+        why: a clause.
+    """
+
+    name: str
+    words: str
+    cost: dict[str, float] | None
+    why: str
+    errors: dict[str, dict[str, float]] | None = None
+
+    def __str__(self) -> str:
+        if self.errors is not None:
+            return (
+                f"{self.words}: {self.why}; error after {HORIZON:g} s {said(self.errors['with'])} with it, "
+                f"{said(self.errors['without'])} without"
+            )
+        cost = f"; without it {HORIZON:g} s of flight are off by {said(self.cost)}" if self.cost is not None else ""
+        return f"{self.words}: {self.why}{cost}"
+
+    def to_json(self) -> dict[str, Any]:
+        """For programs."""
+        found: dict[str, Any] = {"name": self.name, "words": self.words, "why": self.why, "horizon_s": HORIZON}
+        found["cost"] = None if self.cost is None else to_json(self.cost)
+        if self.errors is not None:
+            found["errors"] = {k: to_json(v) for k, v in self.errors.items()}
+        return found
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file that was read: the vehicle, and what is to be known of it."""
+
+    vehicle: Vehicle
+    format: str
+    imported: Imported | None
+    text: str
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A file that was made.
+
+    Attributes:
+        text: of it. format: by name.
+        vehicle: what was to be written. held: what the file says of it.
+        lost: what it does not hold.
+        contradictions, remarks: of the source.
+    """
+
+    text: str
+    format: str
+    vehicle: Vehicle
+    held: Vehicle
+    lost: tuple[Lost, ...]
+    contradictions: tuple[Contradiction, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "format": self.format, "vehicle": self.vehicle.name, "lost": [one.to_json() for one in self.lost],
+            "contradictions": [c.to_json() for c in self.contradictions], "remarks": list(self.remarks),
+        }  # fmt: skip
+
+
+def load_source(
+    name_or_path: str | Path,
+    *,
+    form: str | None = None,
+    name: str | None = None,
+    base: Vehicle | None = None,
+    strict: bool = True,
+) -> Source:
+    """A preset, a vehicle file or a simulator's file as a vehicle.
+
+    Args:
+        form: its format; None: told by content.
+        name: of the drone, where a file has several.
+        base: what a simulator's file does not say.
+        strict: contradictory fields are an error.
+
+    Raises:
+        UsageError: no such file, format or drone. FileFormatError: it cannot be used; the sentence names the field.
+    """
+    path = str(name_or_path)
+    if form in (None, OWN) and path in preset_names():
+        return Source(folding.load(path), OWN, None, "")
+    text = read_text(path)
+    kind = form or format_of(text, where=path)
+    if kind == OWN:
+        return Source(folding.load(path), OWN, None, text)
+    imported = read(format_named(kind), text, where=path, name=name, strict=strict)
+    return Source(to_vehicle(imported.constants, base), kind, imported, text)
+
+
+def read_text(path: str) -> str:
+    """The text of a file. Raises UsageError if there is none, FileFormatError if it is no text."""
+    try:
+        return Path(path).read_bytes().decode()
+    except UnicodeDecodeError:
+        raise FileFormatError(f"{path}: not a text file") from None
+    except OSError as error:
+        presets = ", ".join(preset_names())
+        raise UsageError(f"cannot read {path}: {error.strerror or error} (presets are {presets}).") from None
+
+
+def convert(
+    vehicle: Vehicle,
+    to: str,
+    *,
+    template: str | None = None,
+    where: str = "",
+    name: str = "",
+    suffix: str = "",
+    flight: Recording | None = None,
+) -> Converted:
+    """A simulator's file of a vehicle.
+
+    Args:
+        to: format by name; `OWN` gives a vehicle file.
+        template: text of a file of that format, of which all else stays.
+        where: its name, for errors.
+        name: of the drone in the file; "": the vehicle's.
+        suffix: of the file that will be written: `.json` makes rotorpy's dict JSON.
+        flight: costs are told by this recording instead of the made flight.
+
+    Raises: UsageError for an unknown format or drone; FileFormatError if the vehicle lacks what the format needs, or
+        the template cannot be used.
+    """
+    constants, left = from_vehicle(vehicle)
+    if to == OWN:
+        plain = to_vehicle(constants, replace(vehicle, effects={}))
+        kept = {n: v for n, v in vehicle.effects.items() if n in left}
+        held = replace(plain, effects={**plain.effects, **kept}, name=name or vehicle.name)
+        return Converted(held.to_toml(), OWN, vehicle, held, ())
+    form = format_named(to)
+    if form is ROTORPY and template is None and suffix == ".json":
+        form = ROTORPY_JSON
+    named = "'{}'".format
+    if problem := objection(constants, named) or impossible(constants, named):
+        raise FileFormatError(f"vehicle {vehicle.name}: {problem}")
+    text = write(form, constants, template=template, where=where, name=name)
+    said_there = _held(form, text, where=where, name=name)
+    lost = _lost(vehicle, constants, left, said_there, flight)
+    return Converted(text, to, vehicle, to_vehicle(said_there, replace(vehicle, effects={})), tuple(lost))
+
+
+def _held(form: Format, text: str, *, where: str, name: str) -> Constants:
+    """What a file that was written says. Contradictions are its template's own, and stay."""
+    return read(form, text, where=where or f"the {form.name} file", name=name or None, strict=False).constants
+
+
+def _lost(vehicle: Vehicle, full: Constants, left: list[str], held: Constants, flight: Recording | None) -> list[Lost]:
+    """What a file lacks of a vehicle, each with its cost: with all, against with all but this."""
+    base = replace(vehicle, effects={})
+    kept = {n: vehicle.effects[n] for n in left}
+
+    def with_left(c: Constants, without: str = "") -> Vehicle:
+        made = to_vehicle(c, base)
+        return replace(made, effects={**made.effects, **{n: v for n, v in kept.items() if n != without}})
+
+    variants: list[tuple[str, str, str, Vehicle]] = []
+    for name, (words, quantities) in GROUPS.items():
+        if same(full, held, quantities) or (name == "arm" and full.arm_x is None):
+            continue
+        silent = all(getattr(held, q) is None for q in quantities)
+        why = "the file has no field for it" if silent else f"the file says {_said(held, quantities)}"
+        if name == "arm" and silent:
+            continue  # of rotors, below
+        changed: dict[str, Any] = {q: held.or_(q, 0.0) for q in quantities}
+        variants.append((name, words, why, with_left(replace(full, **changed))))
+    variants += [(n, n.replace("_", " "), "no simulator here has it", with_left(full, n)) for n in left]
+    found = []
+    for name, words, why, without in variants:
+        cost, errors = _cost(with_left(full), without, flight)
+        found.append(Lost(name, words, cost, why, errors))
+    for quantity, words in OF_ROTORS.items():
+        value, other = getattr(full, quantity), getattr(held, quantity)
+        if value is not None and (other is None or not math.isclose(value, other, rel_tol=HELD)):
+            why = "not in this file" if other is None else f"the file says {other:.4g}"
+            found.append(Lost(quantity, words, None, why))
+    if vehicle.thrust_curve:
+        why = "a simulator is told rotor speeds or thrusts; the law from command and voltage stays in the vehicle file"
+        found.append(Lost("thrust_curve", "battery and thrust curve", None, why))
+    return found
+
+
+def _cost(
+    vehicle: Vehicle, without: Vehicle, flight: Recording | None
+) -> tuple[dict[str, float], dict[str, dict[str, float]] | None]:
+    if flight is not None:
+        errors = errors_after(flight, {"with": vehicle, "without": without})
+        return {q: errors["without"][q] - errors["with"][q] for q in errors["with"]}, errors
+    reference = reference_flight(vehicle)
+    return apart(flown(reference, vehicle), flown(reference, without)), None
+
+
+def same(first: Constants, second: Constants, quantities: tuple[str, ...]) -> bool:
+    """Whether quantities agree; one that is not said is nothing."""
+    pairs = [(first.or_(q, 0.0), second.or_(q, 0.0)) for q in quantities]
+    scale = max(max(abs(a), abs(b)) for a, b in pairs)
+    floor = TOLERANCE_OF_NOTHING.get(quantities[0].split("_")[0], 0.0)
+    # products of inertia are small or large against moments, not against themselves
+    scale = max(scale, 1e-6 * first.or_("inertia_xx", 0.0)) if quantities[0] == "inertia_xy" else scale
+    return all(abs(a - b) <= max(HELD * scale, floor) for a, b in pairs)
+
+
+def _said(c: Constants, quantities: tuple[str, ...]) -> str:
+    return ", ".join(f"{c.or_(q, 0.0):.3g}" for q in quantities)
+
+
+def known_formats() -> dict[str, str]:
+    """Name -> words, of every format."""
+    return {n: f.words for n, f in FORMATS.items() if n != ROTORPY_JSON.name}
+
+
+__all__ = ["AIR", "Converted", "Lost", "Source", "convert", "known_formats", "load_source", "read_text"]

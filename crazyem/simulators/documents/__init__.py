@@ -1,0 +1,1 @@
+"""Text files that are edited in place: one number changes, every other byte stays."""

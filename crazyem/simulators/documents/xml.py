@@ -1,0 +1,152 @@
+"""XML with places: URDF, MJCF and SDF. A path is steps of elements, then "@attribute" or "#", then maybe an index.
+
+An element step is `tag`, `tag[2]` (the third of that tag) or `tag[name=x]`. "#" is the text of an element. An index
+chooses one of several numbers in a text: `("link[name=base_link]", "inertial", "origin", "@xyz", 0)`.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+from xml.parsers import expat
+
+from crazyem.errors import FileFormatError
+from crazyem.simulators.documents.spliced import Path, Spliced, as_number, number_text
+
+_TAG = re.compile(rb"""<[^>"']*(?:"[^"]*"[^>"']*|'[^']*'[^>"']*)*>""")
+_ATTRIBUTE = re.compile(rb"""([\w:.\-]+)\s*=\s*("[^"]*"|'[^']*')""")
+_STEP = re.compile(r"([^\[]+)(?:\[(?:(\d+)|name=([^\]]*))\])?$")
+
+
+@dataclass
+class Element:
+    """An element: its attributes as (value, start, end), its text likewise, and where it starts and ends [bytes]."""
+
+    tag: str
+    attributes: dict[str, tuple[str, int, int]]
+    start: int
+    inside: int
+    end: int = 0
+    last: int = 0
+    children: list["Element"] = field(default_factory=list)
+
+    def all(self, tag: str) -> list["Element"]:
+        """Children of a tag."""
+        return [c for c in self.children if c.tag == tag]
+
+    def name(self) -> str:
+        """Its `name`."""
+        return self.attributes.get("name", ("", 0, 0))[0]
+
+
+class XmlDocument(Spliced):
+    """An XML file. Raises FileFormatError if it is none."""
+
+    def __init__(self, text: str, where: str) -> None:
+        super().__init__(text, where)
+        self._open: list[Element] = [Element("", {}, 0, 0)]
+        parser = expat.ParserCreate()
+        parser.StartElementHandler = lambda tag, _: self._begun(tag, parser.CurrentByteIndex)
+        parser.EndElementHandler = lambda _: self._ended(parser.CurrentByteIndex)
+        parser.EntityDeclHandler = self._entity
+        try:
+            parser.Parse(self._data, True)
+        except expat.ExpatError as error:
+            raise FileFormatError(f"{where}: not valid XML: {error}") from None
+        self.root = self._open[0].children[0]
+
+    def _entity(self, *_: Any) -> None:
+        raise FileFormatError(f"{self.where}: XML with entities of its own is not read")
+
+    def _begun(self, tag: str, at: int) -> None:
+        found = _TAG.match(self._data, at)
+        if found is None:
+            raise FileFormatError(f"{self.where}: element <{tag}> cannot be read")
+        attributes = {
+            m[1].decode(): (m[2][1:-1].decode(), at + m.start(2) + 1, at + m.end(2) - 1)
+            for m in _ATTRIBUTE.finditer(found[0])
+        }
+        element = Element(tag, attributes, at, found.end())
+        self._open[-1].children.append(element)
+        self._open.append(element)
+
+    def _ended(self, at: int) -> None:
+        element = self._open.pop()
+        element.end = max(at, element.inside)
+        closing = _TAG.match(self._data, at) if at >= element.inside else None
+        element.last = closing.end() if closing else element.inside
+
+    def find(self, path: Path) -> Element | None:
+        """The element of a path of steps below the root; None if there is none."""
+        element = self.root
+        for step in path:
+            tag, index, name = _STEP.match(step).groups()  # type: ignore[union-attr]
+            found = element.all(tag)
+            if name is not None:
+                found = [c for c in found if c.name() == name]
+            if int(index or 0) >= len(found):
+                return None
+            element = found[int(index or 0)]
+        return element
+
+    def inner(self, element: Element) -> str:
+        """The text of an element, as it was read."""
+        return self._data[element.inside : element.end].decode()
+
+    def words(self, path: Path) -> tuple[list[str], int, int] | None:
+        """The words of an attribute or text, and where it is."""
+        index = next(k for k, step in enumerate(path) if str(step)[0] in "@#")
+        element = self.find(path[:index])
+        if element is None:
+            return None
+        if path[index] != "#":
+            found = element.attributes.get(path[index][1:])
+            return None if found is None else (found[0].split(), found[1], found[2])
+        text = self.inner(element)
+        return text.split(), element.inside, element.end
+
+    def get(self, path: Path) -> float | None:
+        """The number at a path; None if there is none."""
+        found = self.words(path)
+        at = path[-1] if isinstance(path[-1], int) else 0
+        return None if found is None or at >= len(found[0]) else as_number(found[0][at], self.where)
+
+    def put(self, path: Path, value: float) -> bool:
+        """Let a number stand at a path; False if there is no such place."""
+        found = self.words(path)
+        at = path[-1] if isinstance(path[-1], int) else 0
+        if found is None:
+            return self._added(path, value)
+        words, start, end = found
+        if at >= len(words):
+            return False
+        now = self._edits.get((start, end), self._data[start:end]).decode()
+        spans = [m.span() for m in re.finditer(r"\S+", now)]
+        self._place((start, end), now[: spans[at][0]] + number_text(value) + now[spans[at][1] :])
+        return True
+
+    def put_vector(self, path: Path, values: Sequence[float]) -> bool:
+        """Let numbers stand in a text, which is added if there is none."""
+        found, text = self.words(path), " ".join(map(number_text, values))
+        if found is None:
+            return self._insert(path, text)
+        self._place((found[1], found[2]), text)
+        return True
+
+    def _added(self, path: Path, value: float) -> bool:
+        return self._insert(path, number_text(value))
+
+    def _insert(self, path: Path, text: str) -> bool:
+        """A missing leaf `<tag>value</tag>` as the last child of its parent."""
+        if path[-1] != "#" or len(path) < 2:
+            return False
+        parent = self.find(path[:-2])
+        if parent is None or not parent.children:
+            return False
+        sibling = parent.children[-1]
+        before = self._data[: sibling.start].decode()
+        indent = before[len(before.rstrip(" \t\r\n")) :]
+        span = (sibling.last, sibling.last)
+        present = self._edits.get(span, b"").decode()
+        self._place(span, f"{present}{indent}<{path[-2]}>{text}</{path[-2]}>")
+        return True

@@ -1,0 +1,97 @@
+"""YAML with places. A path is keys of mappings and indices of lists."""
+
+import re
+from typing import Any
+
+from crazyem.errors import FileFormatError
+from crazyem.extras import require
+from crazyem.simulators.documents.spliced import Path, Spliced, as_number, number_text
+
+
+class YamlDocument(Spliced):
+    """A YAML file. Raises FileFormatError if it is none, MissingExtraError without ruamel.yaml."""
+
+    def __init__(self, text: str, where: str) -> None:
+        super().__init__(text, where)
+        yaml = require("ruamel.yaml", "A YAML file")
+        self._text = text
+        try:
+            self.root: Any = yaml.YAML(typ="safe", pure=True).compose(text)
+        except (yaml.error.YAMLError, ValueError, RecursionError) as error:
+            line = str(error).splitlines()[0] if str(error) else "no YAML"
+            raise FileFormatError(f"{where}: not valid YAML: {line}") from None
+
+    def keys(self, path: Path) -> list[str]:
+        """Keys of the mapping at a path."""
+        node = self._node(path)
+        return [str(k.value) for k, _ in node.value] if node is not None and _is_mapping(node) else []
+
+    def length(self, path: Path) -> int:
+        """How many entries the list at a path has."""
+        node = self._node(path)
+        return len(node.value) if node is not None and _is_list(node) else 0
+
+    def get(self, path: Path) -> float | None:
+        """The number at a path; None if there is none."""
+        node = self._node(path)
+        return None if node is None or not isinstance(node.value, str) else as_number(node.value, self.where)
+
+    def put(self, path: Path, value: float) -> bool:
+        """Let a number stand at a path; False if there is no such place. A missing key is added to its mapping."""
+        node = self._node(path)
+        if node is None:
+            return self._added(path, value)
+        if not isinstance(node.value, str):
+            return False
+        self._place(self._span(node.start_mark.index, node.end_mark.index), number_text(value))
+        return True
+
+    def _added(self, path: Path, value: float) -> bool:
+        known = next(k for k in range(len(path) - 1, -1, -1) if self._node(path[:k]) is not None)
+        parent = self._node(path[:known])
+        if not _is_mapping(parent) or parent.flow_style or not parent.value:
+            return False
+        key, last = parent.value[-1]
+        indent = key.start_mark.column
+        end = len(self._text[: last.end_mark.index].rstrip())
+        line = self._text.find("\n", end)
+        end = len(self._text) if line < 0 else line
+        deeper = path[known:]
+        text = "".join(f"\n{' ' * (indent + 2 * k)}{step}:" for k, step in enumerate(deeper)) + f" {number_text(value)}"
+        span = self._span(end, end)
+        present = self._edits.get(span, b"").decode()
+        self._place(span, _merged(present, text))
+        return True
+
+    def _node(self, path: Path) -> Any:
+        node = self.root
+        for step in path:
+            if node is None:
+                return None
+            if isinstance(step, int):
+                node = node.value[step] if _is_list(node) and step < len(node.value) else None
+            else:
+                pairs = node.value if _is_mapping(node) else []
+                node = next((v for k, v in pairs if str(k.value) == step), None)
+        return node
+
+    def _span(self, start: int, end: int) -> tuple[int, int]:
+        """Bytes of characters."""
+        return len(self._text[:start].encode()), len(self._text[:end].encode())
+
+
+def _is_mapping(node: Any) -> bool:
+    return type(node).__name__ == "MappingNode"
+
+
+def _is_list(node: Any) -> bool:
+    return type(node).__name__ == "SequenceNode"
+
+
+def _merged(present: str, text: str) -> str:
+    """An addition after another one at the same place, without headings that stand there already."""
+    lines = text.splitlines()
+    for line in lines[:-1]:
+        if line and re.search(rf"^{re.escape(line)}$", present, re.MULTILINE):
+            text = text.replace(f"\n{line}", "", 1)
+    return present + text

@@ -1,0 +1,297 @@
+"""What every format is: a table of fields, and how a file is read and written by it.
+
+A field says where a number stands, which quantity it is, and in which unit. All else follows: the first field of a
+quantity gives it, further ones must agree, all of them are written.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+from crazyem.errors import FileFormatError, UsageError
+from crazyem.simulators.constants import NUMBERS, SHORTEST_LAG, Constants, solved, value_of
+from crazyem.simulators.documents.spliced import Path, said
+from crazyem.simulators.plausible import impossible, objection
+
+AGREE = 0.01  # relative difference up to which two fields say the same
+SAME = 1e-9  # relative difference up to which a number in a template stays as it is written
+
+
+class Document(Protocol):
+    """A text with numbers at paths."""
+
+    where: str
+
+    @property
+    def text(self) -> str: ...
+    def get(self, path: Path) -> float | None: ...
+    def put(self, path: Path, value: float) -> bool: ...
+
+
+@dataclass(frozen=True)
+class Field:
+    """A number in a file: `factor` times a quantity plus `offset`.
+
+    Attributes:
+        path: where it stands.
+        quantity: of `Constants`, or one that follows from them (`constants.DERIVED`).
+        unit: of the number in the file.
+        magnitude: the sign is the file's own: it says on which side a rotor is, or which way it turns.
+        checked: whether it must agree with what other fields say.
+        given: whether the quantity may be taken from here.
+        own: read and written by the format's own functions; here it is for names and units alone.
+    """
+
+    path: Path
+    quantity: str
+    unit: str
+    factor: float = 1.0
+    offset: float = 0.0
+    magnitude: bool = False
+    checked: bool = True
+    given: bool = True
+    own: bool = False
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return said(self.path)
+
+    def read(self, number: float) -> float:
+        """The quantity that a number in the file says."""
+        return ((abs(number) if self.magnitude else number) - self.offset) / self.factor
+
+    def written(self, value: float, now: float | None) -> float:
+        """The number that says a quantity; `now` is what stands there."""
+        number = value * self.factor + self.offset
+        return -number if self.magnitude and now is not None and now < 0.0 else number
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """Two fields of which only one can be right."""
+
+    field: str
+    value: float
+    other: str
+    expected: float
+    unit: str
+
+    def __str__(self) -> str:
+        return (
+            f"{self.field} is {self.value:.4g} {self.unit}, and by {self.other} it is {self.expected:.4g} {self.unit}"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "field": self.field, "value": self.value, "expected_by": self.other, "expected": self.expected,
+            "unit": self.unit,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A file that was read.
+
+    Attributes:
+        format: by name.
+        where: the file.
+        name: of the drone in it, "" where the file has one only.
+        constants: what it says.
+        fields: its fields, as found.
+        contradictions: between its fields.
+        remarks: what else is to be known of it, a sentence each.
+    """
+
+    format: str
+    where: str
+    name: str
+    constants: Constants
+    fields: tuple[Field, ...]
+    contradictions: tuple[Contradiction, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    def label(self, quantity: str) -> str:
+        """A quantity as the file calls it."""
+        return label_of(self.fields, quantity)
+
+
+def label_of(fields: Sequence[Field], quantity: str) -> str:
+    """The first field of a quantity, else the one that gives it by way of another quantity, else its own name."""
+    names = [quantity, *(d for d in _GIVERS.get(quantity, ()))]
+    found = next((f for n in names for f in fields if f.quantity == n), None)
+    return quantity if found is None else f"{found.label} [{found.unit}]"
+
+
+_GIVERS = {
+    "torque_per_thrust": ("torque_per_speed2", "torque_max"), "thrust_max": ("speed_max", "thrust_to_weight",
+    "total_thrust_max"), "arm_x": ("arm", "arm_length"), "arm_y": ("arm", "arm_length"),
+    **{f"drag_{a}": ("drag", "rotor_drag_xy") for a in "xy"}, "drag_z": ("drag", "rotor_drag_z"),
+    **{f"damping_{a}": ("damping",) for a in "xyz"},
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Format:
+    """A simulator's kind of file.
+
+    Attributes:
+        name: as the command line has it.
+        suffix: of its files.
+        words: what it is, for people.
+        open: from a text and its name to a document.
+        recognises: whether a text is of this kind.
+        fields: the table: document and name of the drone -> fields.
+        skeleton: name of the drone -> a file of it, where the user has no template.
+        source: where the fields are documented.
+        names: the drones in a document; empty where it is of one.
+        read_more: document, drone and the quantities found until then -> remarks; adds to these what is no multiple of
+            one number (masses of propellers, laws that are no parabola).
+        write_more: the same for writing; called last.
+    """
+
+    name: str
+    suffix: str
+    words: str
+    open: Callable[[str, str], Any]
+    recognises: Callable[[str], bool]
+    fields: Callable[[Any, str], list[Field]]
+    skeleton: Callable[[str], str]
+    source: str
+    names: Callable[[Any], list[str]] = field(default=lambda document: [])
+    read_more: Callable[[Any, str, dict[str, float]], list[str]] = field(default=lambda document, name, found: [])
+    write_more: Callable[[Any, str, Constants], None] = field(default=lambda document, name, constants: None)
+
+
+def read(form: Format, text: str, *, where: str, name: str | None = None, strict: bool = True) -> Imported:
+    """The constants that a file says.
+
+    Args:
+        name: of the drone, where the file has several.
+        strict: contradictory fields and an inertia that no body has are errors.
+
+    Raises: FileFormatError that names the field; UsageError for an unknown drone.
+    """
+    document = form.open(text, where)
+    drone = drone_of(form, document, name)
+    fields = form.fields(document, drone)
+    found: dict[str, float] = {}
+    for f in fields:
+        number = None if f.own else document.get(f.path)
+        if number is not None and not math.isfinite(number):
+            raise FileFormatError(f"{where}: {f.label} must be a finite number, got {number:g}")
+        if number is not None and f.given and f.quantity not in found:
+            found[f.quantity] = f.read(number)
+    remarks = form.read_more(document, drone, found)
+    values = {n: v for n, v in solved(found).items() if n in NUMBERS}
+    if "lag" in values and 0.0 < values["lag"] <= SHORTEST_LAG * (1.0 + AGREE):
+        values["lag"] = 0.0
+    constants = Constants(drone or _stem(where), **values)
+    problem = objection(constants, lambda q: label_of(fields, q))
+    if problem:
+        raise FileFormatError(f"{where}: {problem}")
+    if wrong := impossible(constants, lambda q: label_of(fields, q)):
+        if strict:
+            raise FileFormatError(f"{where}: {wrong}")
+        remarks = [wrong, *remarks]
+    contradictions = tuple(_contradictions(document, fields, constants))
+    if contradictions and strict:
+        raise FileFormatError(f"{where}: {contradictions[0]}")
+    return Imported(form.name, where, drone, constants, tuple(fields), contradictions, tuple(remarks))
+
+
+def _contradictions(document: Document, fields: Sequence[Field], constants: Constants) -> list[Contradiction]:
+    found: list[Contradiction] = []
+    firsts: dict[str, Field] = {}
+    for f in fields:
+        if f.own:
+            continue
+        first = firsts.setdefault(f.quantity, f)
+        number, expected = document.get(f.path), value_of(constants, f.quantity)
+        if number is None or not f.checked or not math.isfinite(expected):
+            continue
+        said_here, wanted = f.read(number), expected
+        scale = max(abs(said_here), abs(wanted))
+        if abs(said_here - wanted) > AGREE * scale and scale > 1e-12:
+            other = first.label if first is not f else _needed(f.quantity, fields)
+            found.append(Contradiction(f.label, number, other, f.written(wanted, number), f.unit))
+    return found
+
+
+def _needed(quantity: str, fields: Sequence[Field]) -> str:
+    """The fields from which a quantity follows."""
+    needs = _FOLLOWS.get(quantity, ())
+    labels = dict.fromkeys(label_of(fields, n).split(" [")[0] for n in needs)
+    return " and ".join(labels) or "other fields"
+
+
+_FOLLOWS = {
+    "torque_per_speed2": ("thrust_per_speed2", "torque_per_thrust"), "speed_max": ("thrust_max", "thrust_per_speed2"),
+    "thrust_to_weight": ("thrust_max", "mass"), "arm_length": ("arm_x", "arm_y"), "arm": ("arm_x", "arm_y"),
+    "weight": ("mass",), "total_thrust_max": ("thrust_max",), "torque_max": ("thrust_max", "torque_per_thrust"),
+    "hover_share": ("mass", "thrust_max"), "hover_speed_share": ("mass", "thrust_max"),
+}  # fmt: skip
+
+
+def write(form: Format, constants: Constants, *, template: str | None = None, where: str = "", name: str = "") -> str:
+    """The text of a file with these constants; all else is the template's.
+
+    Raises: UsageError where the constants lack what every file of this format needs, or for an unknown drone.
+    """
+    text = form.skeleton(name or constants.name) if template is None else template
+    document = form.open(text, where or f"the {form.name} template")
+    drone = drone_of(form, document, name or None)
+    constants = replace(
+        constants, lag=max(constants.or_("lag", 0.0), SHORTEST_LAG) if constants.lag is not None else None
+    )
+    before = _said_before(form, text, document.where, drone)
+    for f in form.fields(document, drone):
+        value, now = value_of(constants, f.quantity), document.get(f.path)
+        if f.own or math.isnan(value) or (now is not None and _stays(f, now, value, before)):
+            continue
+        number = f.written(value, now)
+        if now is None and number == 0.0:
+            continue  # what is not said is nothing
+        if now is None or abs(number - now) > SAME * max(abs(number), abs(now)):
+            document.put(f.path, number)
+    form.write_more(document, drone, constants)
+    return str(document.text)
+
+
+def _said_before(form: Format, text: str, where: str, drone: str) -> Constants | None:
+    """What a template says; None where it says nothing that can be used."""
+    try:
+        return read(form, text, where=where, name=drone or None, strict=False).constants
+    except FileFormatError:
+        return None
+
+
+def _stays(f: Field, now: float, value: float, before: Constants | None) -> bool:
+    """Whether a number in a template still says, as well as it did, what it said: its quantity did not change."""
+    if before is None or not math.isclose(value_of(before, f.quantity), value, rel_tol=SAME):
+        return False
+    return not f.checked or math.isclose(f.read(now), value, rel_tol=AGREE)
+
+
+def drone_of(form: Format, document: Any, name: str | None) -> str:
+    """Which drone of a file is meant. Raises UsageError where that is not clear."""
+    names = form.names(document)
+    if not names:
+        return ""
+    if name is None and len(names) == 1:
+        return names[0]
+    if name in names:
+        return str(name)
+    asked = f"no drone '{name}'" if name else "several drones"
+    raise UsageError(f"{document.where}: {asked} in this file; --name chooses one of {', '.join(names)}.")
+
+
+def _stem(where: str) -> str:
+    return where.replace("\\", "/").rsplit("/", 1)[-1].split(".")[0] or "drone"
+
+
+def unread(found: Mapping[str, float], quantity: str) -> bool:
+    """Whether a file says nothing of a quantity, nor of what it follows from."""
+    return quantity not in solved(found)

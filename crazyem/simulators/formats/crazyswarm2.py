@@ -1,0 +1,53 @@
+"""crazyswarm2: `robots.NAME.firmware_params` of config/crazyflies.yaml, what the controllers on board believe.
+
+Its own simulator takes no constants from here.
+"""
+
+from crazyem.simulators.documents.yaml import YamlDocument
+from crazyem.simulators.fields import Field, Format
+
+
+def _fields(document: YamlDocument, name: str) -> list[Field]:
+    lee, mellinger = (("robots", name, "firmware_params", group) for group in ("ctrlLee", "ctrlMel"))
+    return [
+        Field((*lee, "mass"), "mass", "kg"),
+        *(Field((*lee, f"J_{a}"), f"inertia_{a}{a}", "kg m^2") for a in "xyz"),
+        Field((*mellinger, "mass"), "mass", "kg"),
+    ]
+
+
+def _skeleton(name: str) -> str:
+    return f"""\
+robots:
+  {name}:
+    enabled: true
+    uri: radio://0/80/2M/E7E7E7E7E7
+    initial_position: [0, 0, 0]
+    type: default
+    firmware_params:
+      ctrlLee:
+        mass: 0.0
+        J_x: 0.0
+        J_y: 0.0
+        J_z: 0.0
+      ctrlMel:
+        mass: 0.0
+"""
+
+
+def _recognises(text: str) -> bool:
+    lines = text.splitlines()
+    return any(line.rstrip() == "robots:" for line in lines) and ("uri:" in text or "firmware_params:" in text)
+
+
+CRAZYSWARM2 = Format(
+    name="crazyswarm2",
+    suffix=".yaml",
+    words="crazyswarm2's crazyflies.yaml",
+    open=YamlDocument,
+    recognises=_recognises,
+    names=lambda document: document.keys(("robots",)),
+    fields=_fields,
+    skeleton=_skeleton,
+    source="crazyswarm2, config/crazyflies.yaml; parameter groups ctrlLee and ctrlMel of the firmware",
+)

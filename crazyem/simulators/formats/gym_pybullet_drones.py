@@ -1,0 +1,104 @@
+"""gym-pybullet-drones: a URDF with `<properties>`. kf and km are per RPM squared; rotors have no lag.
+
+Drag acts in the physics modes that have it (`pyb_drag` and its kin), by rotor speed; it is written for hover.
+"""
+
+from typing import Any
+
+from crazyem.simulators.documents.xml import XmlDocument
+from crazyem.simulators.fields import Field, Format
+from crazyem.simulators.formats.crazyflow import PER_RPM2
+from crazyem.simulators.layout import PLUS
+
+_BASE = ("link[name=base_link]", "inertial")
+
+
+def _prop(k: int, axis: int) -> tuple[Any, ...]:
+    return (f"link[name=prop{k}_link]", "inertial", "origin", "@xyz", axis)
+
+
+def _is_plus(document: XmlDocument) -> bool:
+    return any(abs(document.get(_prop(k, axis)) or 0.0) < 1e-6 for k in range(4) for axis in (0, 1))
+
+
+def _fields(document: XmlDocument, name: str) -> list[Field]:
+    arms = [] if _is_plus(document) else [
+        Field(_prop(k, axis), f"arm_{'xy'[axis]}", "m", magnitude=True) for k in range(4) for axis in (0, 1)
+    ]  # fmt: skip
+    return [
+        Field((*_BASE, "mass", "@value"), "mass", "kg"),
+        *(Field((*_BASE, "inertia", f"@i{a}"), f"inertia_{a}", "kg m^2") for a in ("xx", "yy", "zz", "xy", "xz", "yz")),
+        *(Field((*_BASE, "origin", "@xyz", k), f"centre_{'xyz'[k]}", "m") for k in range(3)),
+        *(Field(("link[name=center_of_mass_link]", "inertial", "origin", "@xyz", k), f"centre_{'xyz'[k]}", "m")
+          for k in range(3)),
+        *arms,
+        Field(("properties", "@arm"), "arm_length", "m"),
+        Field(("properties", "@kf"), "thrust_per_speed2", "N/RPM^2", factor=PER_RPM2),
+        Field(("properties", "@km"), "torque_per_speed2", "N m/RPM^2", factor=PER_RPM2),
+        Field(("properties", "@thrust2weight"), "thrust_to_weight", ""),
+        Field(("properties", "@drag_coeff_xy"), "rotor_drag_xy", "N/(m/s)/(rad/s)"),
+        Field(("properties", "@drag_coeff_z"), "rotor_drag_z", "N/(m/s)/(rad/s)"),
+    ]  # fmt: skip
+
+
+def _read_more(document: XmlDocument, name: str, found: dict[str, float]) -> list[str]:
+    return [PLUS] if _is_plus(document) else []
+
+
+def _link(name: str, x: int = 0, y: int = 0) -> str:
+    return f"""
+  <link name="{name}_link">
+    <inertial>
+      <origin rpy="0 0 0" xyz="{x} {y} 0"/>
+      <mass value="0"/>
+      <inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>
+    </inertial>
+  </link>
+  <joint name="{name}_joint" type="fixed">
+    <parent link="base_link"/>
+    <child link="{name}_link"/>
+  </joint>
+"""
+
+
+def _skeleton(name: str) -> str:
+    corners = ((1, -1), (-1, -1), (-1, 1), (1, 1))  # front right and then clockwise, as rotors of a Crazyflie
+    props = "".join(_link(f"prop{k}", x, y) for k, (x, y) in enumerate(corners))
+    return f"""\
+<?xml version="1.0" ?>
+
+<robot name="cf2">
+
+  <properties arm="0" kf="0" km="0" thrust2weight="2" max_speed_kmh="30" gnd_eff_coeff="11.36859"
+    prop_radius="2.31348e-2" drag_coeff_xy="0" drag_coeff_z="0"
+    dw_coeff_1="2267.18" dw_coeff_2=".16" dw_coeff_3="-.11"/>
+
+  <link name="base_link">
+    <inertial>
+      <origin rpy="0 0 0" xyz="0 0 0"/>
+      <mass value="0"/>
+      <inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>
+    </inertial>
+    <collision>
+      <origin rpy="0 0 0" xyz="0 0 0"/>
+      <geometry>
+        <cylinder radius=".06" length=".025"/>
+      </geometry>
+    </collision>
+  </link>
+{props}{_link("center_of_mass")}
+</robot>
+"""
+
+
+GYM_PYBULLET_DRONES = Format(
+    name="gym-pybullet-drones",
+    suffix=".urdf",
+    words="a URDF of gym-pybullet-drones",
+    open=XmlDocument,
+    recognises=lambda text: "<robot" in text and "<properties" in text and "kf=" in text,
+    fields=_fields,
+    skeleton=_skeleton,
+    read_more=_read_more,
+    source="gym-pybullet-drones, BaseAviary.py (_parseURDFParameters, _physics, _drag)",
+)
