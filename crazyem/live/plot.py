@@ -51,8 +51,50 @@ def figure_of(history: History, vehicle: Vehicle, *, title: str) -> "Figure":
             _draw_parameters(axis, *panel, estimates, time, nominal)
             for push in history.pushes:
                 axis.axvline(push.time - t0, color="0.5" if push.verified else "red", linewidth=0.6, alpha=0.6)
-from typing import TYPE_CHECKING, Any
+        _draw_height(axes[4], track, t0)
+    return figure
 
-import numpy as np
 
-from crazyem.estimation.result import Estimate
+def _draw_parameters(
+    axis: Any,
+    names: Sequence[str],
+    scale: float,
+    label: str,
+    estimates: Sequence[Estimate],
+    time: np.ndarray,
+    nominal: Mapping[str, float],
+) -> None:
+    """Values with intervals over `time` [s], (n,); dotted what the vehicle file says. The last ones set the limits."""
+    limits = []
+    for i, name in enumerate(names):
+        if not all(name in e.parameters for e in estimates) or not estimates:
+            continue
+        value = scale * np.array([e[name].value for e in estimates])
+        ci = scale * np.array([e[name].ci95 for e in estimates])
+        colour = f"C{i}"
+        axis.plot(time, value, colour, label=name)
+        axis.fill_between(time, ci[:, 0], ci[:, 1], color=colour, alpha=0.2, linewidth=0)
+        axis.axhline(scale * nominal[name], color=colour, linestyle=":", linewidth=1)
+        limits += [value[-1], scale * nominal[name], *ci[-1]]
+    limits = [v for v in limits if np.isfinite(v)]
+    if limits:
+        low, high = min(limits), max(limits)
+        margin = 0.6 * (high - low) + 0.02 * abs(high)
+        axis.set_ylim(max(low - margin, 0.0), high + margin)
+    axis.set_ylabel(label)
+    axis.grid(alpha=0.3)
+    if len(names) > 1:
+        axis.legend(loc="upper right")
+
+
+def _draw_height(axis: Any, track: np.ndarray, t0: float) -> None:
+    """Height and wanted height [m] of a track (n, 7), see `History.track_array`."""
+    if len(track):
+        thin = track[:: max(1, len(track) // MOST_POINTS)]
+        axis.plot(thin[:, 0] - t0, thin[:, 3], "C0", label="height")
+        if np.isfinite(thin[:, 6]).any():
+            axis.plot(thin[:, 0] - t0, thin[:, 6], "k:", label="height wanted")
+        axis.legend(loc="upper right")
+    axis.set_ylabel("height [m]")
+    axis.set_xlabel("time [s], drone's clock (dotted: vehicle file; vertical lines: pushes)")
+    axis.grid(alpha=0.3)
