@@ -36,7 +36,7 @@ from crazyem.live.session import Session
 from crazyem.live.warm_up import warm_up
 from crazyem.vehicle import load_vehicle
 from firmware_sim.commander import setpoint as sp
-from firmware_sim.commander.arbiter import CRTP
+from firmware_sim.commander.setpoint import CRTP
 from firmware_sim.firmware import Firmware
 from firmware_sim.flight import Flight as SimulatedFlight
 from firmware_sim.scenario import parse_scenario

@@ -28,7 +28,7 @@ from crazyem.links.base import Packet
 from crazyem.live.controllers import LEE, writes_for
 from crazyem.live.flight import Flight, FlightPlan
 from crazyem.live.guard import INERTIA_NAMES, Decision
-from crazyem.live.mcap_recorder import open_recorder
+from crazyem.live.recorder import open_recorder
 from crazyem.live.session import Session
 from crazyem.live.warm_up import warm_up
 from crazyem.live.write_supervisor import WriteRules

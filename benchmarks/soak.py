@@ -34,9 +34,9 @@ from crazyem.links.base import ParameterWrite
 from crazyem.live.controllers import LEE
 from crazyem.live.flight import Flight, FlightPlan
 from crazyem.live.history import History
-from crazyem.live.mcap_recorder import open_recorder
 from crazyem.live.policy import load_policy
 from crazyem.live.push import Pusher
+from crazyem.live.recorder import open_recorder
 from crazyem.live.session import Session
 from crazyem.live.simulator import Simulator
 from crazyem.live.warm_up import warm_up

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from crazyem.live.flight_result import FlightResult
     from crazyem.live.guard import Guard
     from crazyem.live.policy import Policy, load_policy
-    from crazyem.recordings.options import ReadOptions
+    from crazyem.recordings.contents import ReadOptions
     from crazyem.recordings.recording import Recording
     from crazyem.recordings.registry import open_recording
     from crazyem.signals.sample import Sample
@@ -37,7 +37,7 @@ _HOME = {
     "OnlineEstimator": "estimation.online",
     "Policy": "live.policy",
     "Prediction": "diagnosis.prediction.predict",
-    "ReadOptions": "recordings.options",
+    "ReadOptions": "recordings.contents",
     "Recording": "recordings.recording",
     "Sample": "signals.sample",
     "Vehicle": "vehicle",

@@ -181,7 +181,7 @@ def _paper(commands: Any) -> None:
 
 
 def _reading(p: argparse.ArgumentParser) -> None:
-    """What a reader may have to be told (`crazyem.recordings.options`)."""
+    """What a reader may have to be told (`crazyem.recordings.contents`)."""
     p.add_argument("--map", metavar="FILE.toml", help="which columns of a CSV are which signals: a file or a preset")
     p.add_argument(
         "--motor",

@@ -7,10 +7,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from firmware_sim.air import Air
 from firmware_sim.errors import FirmwareSimError, ServerError
 from firmware_sim.firmware import Firmware
 from firmware_sim.server import Server, bind
+from firmware_sim.wire import Air
 
 
 def _positive(text: str) -> float:
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             other = "--mavlink" if arguments.mavlink is not None else "--swarm"
             raise FirmwareSimError(f"--storage is for one Crazyflie: leave it out with {other}")
         if arguments.mavlink is not None:
-            from firmware_sim.mavlink.run import run as run_mavlink
+            from firmware_sim.mavlink.server import run as run_mavlink
 
             run_mavlink(arguments)
         elif arguments.swarm is not None:

@@ -10,8 +10,8 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from firmware_sim import contents, tables, wire
-from firmware_sim.commander.arbiter import HIGH_LEVEL, Arbiter
 from firmware_sim.commander.decode import RpytDecoder
+from firmware_sim.commander.setpoint import HIGH_LEVEL, Arbiter
 from firmware_sim.commander.supervisor import PERIOD as SUPERVISOR_PERIOD
 from firmware_sim.commander.supervisor import Supervisor
 from firmware_sim.errors import ScenarioError

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from typing import TextIO
 
 from firmware_sim import wire
-from firmware_sim.air import Air
 from firmware_sim.errors import ServerError
 from firmware_sim.firmware import Firmware
+from firmware_sim.wire import Air
 
 _BUFFER = 1 << 20  # bytes, both ways: a client reads its whole table of contents in bursts
 # When the host stalls, the drone's time may fall behind by that much and catches up; beyond, it stands still instead of

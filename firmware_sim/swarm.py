@@ -23,11 +23,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from firmware_sim.air import Air
 from firmware_sim.errors import ScenarioError
 from firmware_sim.firmware import Firmware
 from firmware_sim.server import Server, bind
 from firmware_sim.vehicle_file import read_toml
+from firmware_sim.wire import Air
 
 if TYPE_CHECKING:
     from firmware_sim.scenario import Scenario

@@ -170,7 +170,7 @@ def plain(many: list[Table], estimate: str) -> Table:
 @pytest.mark.parametrize("estimate", ["kalman", "none"])
 def test_a_flight_is_the_same_twice_and_logged_as_drawn(many: list[Table], tmp_path: Path, estimate: str) -> None:
     from benchmarks.concealed.simulate import fly
-    from crazyem.recordings.options import ReadOptions
+    from crazyem.recordings.contents import ReadOptions
     from crazyem.recordings.registry import open_recording
 
     case, suffix = plain(many, estimate), ".mcap" if estimate == "kalman" else ".csv"

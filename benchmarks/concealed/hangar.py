@@ -32,11 +32,11 @@ class Drone:
 
 def _serve(pipe: Connection, seen: Any) -> None:
     """Process body: a Drone comes in, its port goes out, anything more ends it; None ends the process."""
-    from firmware_sim.air import Air
     from firmware_sim.firmware import Firmware
     from firmware_sim.flight import Flight
     from firmware_sim.scenario import load_scenario
     from firmware_sim.server import Server, bind
+    from firmware_sim.wire import Air
 
     class UpdateThrottle(Server):
         """A server that waits for its host; `seen`: ms stamp of the newest log packet that the host has read."""

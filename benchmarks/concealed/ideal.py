@@ -20,7 +20,7 @@ from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, remembering_ane
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording
 from crazyem.vehicle import Vehicle

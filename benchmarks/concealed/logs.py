@@ -14,9 +14,9 @@ import numpy as np
 
 from crazyem.recordings.mcap.writer import RecordingWriter
 from crazyem.signals.packet import Block, Packet, Variable
-from firmware_sim.air import Air
 from firmware_sim.tables import Table as Contents
 from firmware_sim.tables import pack, unpack
+from firmware_sim.wire import Air
 
 Table = dict[str, Any]
 EPOCH = 1.7e9  # s, host time of the first millisecond: any, and the same in every flight

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_sim.commander import setpoint as sp
-from firmware_sim.commander.arbiter import CRTP
+from firmware_sim.commander.setpoint import CRTP
 from firmware_sim.firmware import Firmware
 from firmware_sim.flight import Flight
 from firmware_sim.scenario import parse_scenario

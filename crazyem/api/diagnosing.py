@@ -13,7 +13,7 @@ from crazyem.diagnosis.posterior.diagnose import diagnose as by_posterior
 from crazyem.diagnosis.report.pictures import Series, draw
 from crazyem.errors import UsageError
 from crazyem.notebook import finite, html_table, new_figure, saved
-from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.contents import ReadOptions
 from crazyem.vehicle import Vehicle
 
 if TYPE_CHECKING:

@@ -15,9 +15,8 @@ from crazyem.links import open_link
 from crazyem.live.controllers import controller_named
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
 from crazyem.live.flight_result import FlightResult, result_of
-from crazyem.live.mcap_recorder import close_recorder, open_recorder
 from crazyem.live.policy import Policy, load_policy
-from crazyem.live.recorder import Recorder
+from crazyem.live.recorder import Recorder, close_recorder, open_recorder
 from crazyem.live.session import LOG_RATE, RECONNECT_WITHIN, Session
 from crazyem.live.simulator import Simulator
 from crazyem.live.warm_up import warm_up

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from crazyem.doctor.thrust import vehicle_for
 from crazyem.physics import folding
-from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording
 from crazyem.vehicle import Vehicle

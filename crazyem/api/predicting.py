@@ -7,7 +7,7 @@ from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, vehicle
 from crazyem.diagnosis.prediction import predict as prediction
 from crazyem.diagnosis.prediction.predict import Prediction, recorded
 from crazyem.errors import UsageError
-from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.contents import ReadOptions
 
 LARGEST_PREDICTION = 4e9  # bytes of the arrays
 

@@ -12,10 +12,9 @@ from crazyem.live.history import History, Push
 from crazyem.live.pipeline import Pipeline
 from crazyem.physics import folding
 from crazyem.recordings.airborne import Airtime, airtime
-from crazyem.recordings.attitudes import onboard_attitude
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Finding, Grade
-from crazyem.recordings.options import ReadOptions
-from crazyem.recordings.recording import Recording
+from crazyem.recordings.recording import Recording, onboard_attitude
 from crazyem.signals.sample import ESTIMATOR_SIGNALS
 from crazyem.vehicle import Vehicle
 

@@ -30,7 +30,7 @@ from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.live.controllers import controller_named
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
-from crazyem.live.mcap_recorder import close_recorder, open_recorder
+from crazyem.live.recorder import close_recorder, open_recorder
 from crazyem.live.scheduler import Scheduler, UpdateThrottle
 from crazyem.live.session import Session
 from crazyem.live.summary import build_summary, check_writable, write_json

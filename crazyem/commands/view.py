@@ -70,8 +70,7 @@ class Viewed:
     """A running drone as the view needs it."""
 
     def __init__(self, session: Any, line: LiveLine, *, name: str, land: Callable[[], None] | None = None) -> None:
-        from crazyem.live.controls import SessionControls
-        from crazyem.live.views import Observer
+        from crazyem.live.views import Observer, SessionControls
 
         self.line = line
         self.ended = ""

@@ -23,8 +23,8 @@ from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.live.flight_result import result_of
 from crazyem.live.hover_thrust import hover_afterwards
-from crazyem.live.mcap_recorder import close_recorder, open_recorder
 from crazyem.live.policy import load_policy
+from crazyem.live.recorder import close_recorder, open_recorder
 from crazyem.live.session import Session
 from crazyem.live.summary import check_writable
 from crazyem.live.telemetry import FLYING

@@ -6,18 +6,19 @@ from collections.abc import Mapping
 import numpy as np
 
 from crazyem.doctor import axes
-from crazyem.doctor.attitudes import Pose, poses
 from crazyem.doctor.hypotheses import Comparison, compare_hypotheses, misread
 from crazyem.doctor.kinematics import (
     GRAVITY,
     GRID_STEP,
     UP,
     Grid,
+    Pose,
     Track,
     Window,
     difference,
     grid_of,
     measurements,
+    poses,
     rotate,
     track,
     width_for,

@@ -30,7 +30,6 @@ SHORTEST_STILLNESS: dict[str, float] = {
 }
 FEWEST_STILL_SAMPLES = 10
 STILLNESS_RATIO = 6.0  # times the longest of 99 % of the channel's own still stretches
-DEGRADING_FROZEN_SHARE = 0.02  # share of the flight
 _INERTIAL_SIGNALS = frozenset({"body_rate", "specific_force", "acceleration"})
 _LEAST_MOTION = {
     "position": 0.03,

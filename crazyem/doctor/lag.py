@@ -12,17 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.doctor.attitudes import Pose, poses
 from crazyem.doctor.delays import LARGEST_LAG, delay, spread
 from crazyem.doctor.kinematics import (
     GRID_STEP,
     Grid,
+    Pose,
     Track,
     Window,
     difference,
     grid_of,
     measurements,
     origin_of,
+    poses,
     quantity_of,
     rate_of_attitude,
     track,

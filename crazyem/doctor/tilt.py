@@ -11,18 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.doctor.attitudes import Pose, poses
 from crazyem.doctor.delays import delay
 from crazyem.doctor.kinematics import (
     GRAVITY,
     UP,
     Grid,
+    Pose,
     Track,
     Window,
     difference,
     grid_of,
     measurements,
     origin_of,
+    poses,
     rate_of_attitude,
     rotate,
     track,

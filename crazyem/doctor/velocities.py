@@ -1,9 +1,8 @@
 """Check: velocity against the position's derivative, and positions of two origins: unit, frame, sign, scale."""
 
 from crazyem.doctor import axes
-from crazyem.doctor.attitudes import Pose, poses
 from crazyem.doctor.hypotheses import Comparison, agreed_scale, compare_hypotheses, wrong_scale
-from crazyem.doctor.kinematics import Track, difference, grid_of, measurements, rotate, track, width_for
+from crazyem.doctor.kinematics import Pose, Track, difference, grid_of, measurements, poses, rotate, track, width_for
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 

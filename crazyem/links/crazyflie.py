@@ -17,9 +17,9 @@ from crazyem.links.base import AnotherDroneError, LinkLost, LinkStatistics, Outa
 from crazyem.links.blocks import LogBlocks
 from crazyem.links.clock import ClockFit
 from crazyem.links.connection import connect, quiet_cflib, shut
-from crazyem.links.high_level import land_command, send_until_confirmed
 from crazyem.links.parameters import ParameterClient
 from crazyem.links.reconnection import Reconnector
+from crazyem.links.requests import land_command, send_until_confirmed
 from crazyem.signals.packet import Block, Packet
 
 SILENT_AFTER = 2.0  # s without log data, while blocks run, after which the drone counts as lost

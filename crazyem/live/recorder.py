@@ -1,12 +1,15 @@
-"""What a session tells a recording; the interface the flight loop writes through."""
+"""What a session tells a recording: the interface that the flight loop writes through, and our MCAP file behind it."""
 
+import json
 import math
 from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from crazyem.control.trajectories import Reference
 from crazyem.estimation.result import Estimate
-from crazyem.links.base import Block, LinkStatistics, Packet, ParameterWrite
+from crazyem.links.base import Block, DescribingLink, Link, LinkStatistics, Packet, ParameterWrite
+from crazyem.live.history import History
+from crazyem.vehicle import Vehicle
 
 
 class Recorder(Protocol):
@@ -32,3 +35,45 @@ class FrameRecorder(Protocol):
     """A recorder that also takes a drone's messages as they came."""
 
     def frame(self, host_time: float, data: bytes) -> None: ...
+
+
+def open_recorder(
+    path: str | None, *, configuration: Mapping[str, Any], vehicle: Vehicle, link: Link, append: bool = False
+) -> Recorder | None:
+    """A recorder for `path`, None without one.
+
+    Args:
+        configuration: of the run; values are stored as JSON.
+        vehicle: its file's text is stored, so that a replay starts from the same constants.
+        link: connected; its tables and what the firmware says of itself are stored, as far as it knows them.
+        append: continue an existing recording as its next session (after a reconnect) instead of replacing it.
+
+    Raises:
+        UsageError: the file cannot be created. FileFormatError: it cannot be continued.
+    """
+    if path is None:
+        return None
+    from crazyem.recordings.mcap.writer import RecordingWriter
+
+    return RecordingWriter(
+        path,
+        metadata={
+            "configuration": {k: json.dumps(v) for k, v in configuration.items()},
+            "vehicle": {"name": vehicle.name, "toml": vehicle.to_toml()},
+            "drone": {
+                "uri": link.uri,
+                "log_variables": " ".join(sorted(link.log_variables)),
+                "parameters": " ".join(sorted(link.parameters)),
+            },
+            **(link.about if isinstance(link, DescribingLink) else {}),
+        },
+        append=append,
+    )
+
+
+def close_recorder(recorder: Recorder, statistics: LinkStatistics, history: History) -> None:
+    """Finish the recording, with the account of lost packets in it; say so if it is not whole."""
+    counts = {n: getattr(statistics, n) for n in ("received", "lost", "late", "duplicates")}
+    recorder.metadata("statistics", {k: str(v) for k, v in counts.items()})
+    recorder.close()
+    history.notice(recorder.failure)

@@ -1,10 +1,32 @@
-"""The bytes of a file, unpacked if it is a gzip file: never more memory than a limit, whatever the file claims."""
+"""What every reader gets: what the user has to tell it, and the bytes of a file, bounded against bombs."""
 
 import gzip
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
 
 from crazyem.errors import FileFormatError, UsageError
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOptions:
+    """What a user may have to tell a reader.
+
+    Attributes:
+        mapping: TOML file that says which columns of a CSV are which signals (`--map`); None: by the header.
+        motor: what motor.m1..4 of an old log is where the file holds no evidence (`--motor`): "duty" (PWM sent, after
+            battery compensation) or "request" (thrust asked for, before it); None: say that it is not known.
+        start, end: read only what was sampled between these times [s] of the recording's time axis (`--from`, `--to`);
+            None: no limit.
+        as_published: believe a preset's publisher instead of correcting what is known to be wrong (`--as-published`).
+    """
+
+    mapping: str | None = None
+    motor: str | None = None
+    as_published: bool = False
+    start: float | None = None
+    end: float | None = None
+
 
 LARGEST_FILE = 4 << 30  # bytes of a plain file: hours of a uSD log at 1 kHz
 LARGEST_UNPACKED = 1 << 30  # bytes of a gzip file, unpacked: a bomb has no end

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from crazyem.errors import UsageError
-from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import reader_of
 

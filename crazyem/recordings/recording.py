@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from crazyem.errors import DataError
 from crazyem.notebook import finite, html_table, new_figure, saved
 from crazyem.recordings.finding import Finding
+from crazyem.signals.mavlink import carries_attitude
 from crazyem.signals.sample import ESTIMATOR_SIGNALS, SIGNALS, Sample, components
 
 if TYPE_CHECKING:
@@ -229,3 +230,19 @@ def collect(samples: Iterable[tuple[Sample, bool]]) -> dict[str, SignalArray]:
         for name in SIGNALS
         if name in times
     }
+
+
+# What names of attitudes that a filter on board made begin with, beside those of MAVLink: the Crazyflie's, ULog's.
+ONBOARD_PREFIXES = ("stateEstimate", "kalman.", "vehicle_attitude.")
+
+
+def onboard_attitude(recording: Recording) -> bool:
+    """Whether the attitude is that of a filter on board, and not of motion capture: by its name, or by a CSV mapping
+    that claims it (`attitude = "onboard"`)."""
+    attitude = recording.signals.get("attitude")
+    if attitude is None:
+        return False
+    claimed = recording.metadata.get("claims", {}).get("attitude") == "onboard" or "mavlink" in recording.metadata
+    return claimed or any(
+        s.rsplit("/", 1)[-1].startswith(ONBOARD_PREFIXES) or carries_attitude(s) for s in attitude.source
+    )

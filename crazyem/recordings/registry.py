@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crazyem.errors import FileFormatError, KnownFileError, UsageError
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.cut import cut, cut_parts
-from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.stamps import screened, screened_parts
 

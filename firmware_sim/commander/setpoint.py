@@ -1,7 +1,14 @@
-"""The setpoint that the commander hands to the controllers: one flat float64 array, so that compiled code can read it.
+"""The setpoint that the commander hands to the controllers, and who may set it (crazyflie-firmware commander.c).
 
-Layout follows `setpoint_t` of the firmware (stabilizer_types.h); each constant below is an index into the array.
+It is one flat float64 array, so that compiled code can read it. Its layout follows `setpoint_t` of the firmware
+(stabilizer_types.h); each constant below is an index into the array.
+
+Any low-level setpoint locks the high-level commander out until the client notifies that its stream has stopped. cflib
+sends a zero setpoint when it closes a link, so the next client's take-off has no effect before such a notice. A
+client's setpoint also stops the planner: a notice in flight with no command after it stops the motors.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -27,3 +34,38 @@ def null_setpoint() -> np.ndarray:
     setpoint = np.zeros(SIZE)
     setpoint[QW] = 1.0
     return setpoint
+
+
+NO_SETPOINT, HIGH_LEVEL, CRTP = 0, 1, 2  # priorities of whoever sends setpoints (commander.c)
+
+
+class Arbiter:
+    """Keeps the newest setpoint among those of the highest priority, with its time stamp for the watchdogs.
+
+    low_level is called when a setpoint from a client takes over; relaxed when a client gives the drone back.
+    """
+
+    def __init__(self, low_level: Callable[[], None], relaxed: Callable[[], None]):
+        self.setpoint = null_setpoint()
+        self.stamp = 0  # tick [ms] the setpoint arrived
+        self._priority = NO_SETPOINT
+        self._low_level, self._relaxed = low_level, relaxed
+
+    @property
+    def disabled(self) -> bool:
+        """True until the first setpoint of any kind."""
+        return self._priority == NO_SETPOINT
+
+    def offer(self, setpoint: np.ndarray, priority: int, tick: int) -> bool:
+        """Take the setpoint if its priority is at least the current one; tells whether it was taken."""
+        if priority < self._priority:
+            return False
+        self.setpoint, self.stamp, self._priority = setpoint, tick, priority
+        if priority > HIGH_LEVEL:
+            self._low_level()
+        return True
+
+    def relax(self) -> None:
+        """The client's stream of setpoints has ended: the high-level commander may command again."""
+        self._relaxed()
+        self._priority = HIGH_LEVEL

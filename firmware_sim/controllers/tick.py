@@ -30,10 +30,9 @@ from firmware_sim.controllers.pid import reset as pid_reset
 from firmware_sim.controllers.power_distribution import motors_step
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.battery import battery_step
 from firmware_sim.plant.onboard_estimate import estimate_step
 from firmware_sim.plant.rigid_body import body_step
-from firmware_sim.plant.rotors import lag, wrench
+from firmware_sim.plant.rotors import battery_step, lag, wrench
 from firmware_sim.plant.sensors import sensors_step
 
 DT = 1e-3  # s

@@ -14,12 +14,11 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from firmware_sim.commander import setpoint as sp
-from firmware_sim.commander.arbiter import CRTP
+from firmware_sim.commander.setpoint import CRTP
 from firmware_sim.commander.supervisor import State
 from firmware_sim.firmware import Firmware
-from firmware_sim.mavlink.frames import turned
 from firmware_sim.mavlink.parameters import Parameters
-from firmware_sim.mavlink.telemetry import Telemetry
+from firmware_sim.mavlink.telemetry import Telemetry, turned
 
 LEE = 5.0  # the controller that takes a mass
 MANUAL, HOLD, OFFBOARD, TAKEOFF, LAND = (1, 0), (4, 3), (6, 0), (4, 2), (4, 6)  # main and sub mode of PX4

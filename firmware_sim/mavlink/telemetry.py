@@ -1,14 +1,46 @@
-"""The messages the simulated autopilot streams, made from the firmware's log variables."""
+"""Messages that the simulated autopilot streams, made from the firmware's log variables, in MAVLink's frames.
+
+MAVLink's are FRD and north-east-down; our x axis is north. Half a turn about x leads from one to the other and back:
+y and z change their signs.
+"""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from firmware_sim.commander import setpoint as sp
-from firmware_sim.mavlink.frames import angles, px4_order, turned, turned_quaternion
 from firmware_sim.tables import Slot
+
+# PX4's motors 1..4 of an X quad: front right, back left, front left, back right; index of the simulator's rotor
+ROTOR = (0, 2, 3, 1)
+
+
+def turned(v: Sequence[float]) -> tuple[float, float, float]:
+    """A vector, either way."""
+    return v[0], -v[1], -v[2]
+
+
+def turned_quaternion(x: float, y: float, z: float, w: float) -> tuple[float, float, float, float]:
+    """w, x, y, z of body FRD to NED from x, y, z, w of body FLU to north-west-up; w is never negative."""
+    sign = -1.0 if w < 0.0 else 1.0
+    return sign * w, sign * x, -sign * y, -sign * z
+
+
+def angles(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Roll, pitch, yaw [rad], ZYX, of a quaternion."""
+    return (
+        math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+        math.asin(min(max(2.0 * (w * y - z * x), -1.0), 1.0)),
+        math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+    )
+
+
+def px4_order(values: Sequence[float]) -> tuple[float, ...]:
+    """Values of the simulator's rotors in PX4's order."""
+    return tuple(values[i] for i in ROTOR)
+
 
 GRAVITY = 9.81
 UNKNOWN = 65535

@@ -1,6 +1,9 @@
-"""Rotors: motor command and battery voltage to thrust, first-order lag, and the sum of four rotors as force and torque.
+"""Rotors and the cell that drives them: command and voltage to thrust, lag, four rotors to force and torque.
 
 Motors: M1 front right, M2 back right, M3 back left, M4 front left (x forward, y left, z up).
+
+The battery is one lithium-polymer cell: open-circuit voltage from the charge left, sag under the load. A rotor's
+shaft power grows as thrust^1.5 (momentum theory); the coefficient lumps the motor's efficiency.
 """
 
 import math
@@ -49,3 +52,23 @@ def wrench(truth, f, o, out):
     out[1] = dy * (-f1 - f2 + f3 + f4)
     out[2] = dx * (-f1 + f2 + f3 - f4)
     out[3] = k * (-f1 + f2 - f3 + f4)
+
+
+@kernel
+def open_circuit(soc):
+    """Open-circuit voltage in V for a state of charge 0..1: 3.0 V empty, 3.7 V at 20 %, 4.2 V full."""
+    soc = min(max(soc, 0.0), 1.0)
+    if soc < 0.2:
+        return 3.0 + 0.7 * (soc / 0.2) ** 0.5
+    return 3.7 + 0.5 * (soc - 0.2) / 0.8
+
+
+@kernel
+def battery_step(truth, state, dt):
+    """Discharge by dt and set the terminal voltage for the present load. The voltage never drops below 0.5 V."""
+    power = truth[at.ELECTRONICS_POWER]
+    for i in range(4):
+        power += truth[at.POWER_COEFFICIENT] * max(state[at.ROTOR + i], 0.0) ** 1.5
+    current = power / max(state[at.VOLTS], 2.0)
+    state[at.CHARGE] = max(state[at.CHARGE] - current * dt, 0.0)
+    state[at.VOLTS] = max(open_circuit(state[at.CHARGE] / truth[at.CAPACITY]) - truth[at.RESISTANCE] * current, 0.5)

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from firmware_sim.errors import FirmwareSimError
-from firmware_sim.relay.errors import RelayError
 from firmware_sim.relay.faults import DOWN, FATES, UP, Engine, Fault
-from firmware_sim.relay.kinds import KIND_NAMES
+from firmware_sim.relay.kinds import KIND_NAMES, RelayError
 from firmware_sim.relay.relay import Relay, parse_target
 from firmware_sim.relay.schedule import load_schedule
 

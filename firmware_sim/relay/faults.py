@@ -6,9 +6,8 @@ from collections import Counter
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 
-from firmware_sim.air import Air
-from firmware_sim.relay.errors import RelayError
-from firmware_sim.relay.kinds import check_kinds, kind_of, matches
+from firmware_sim.relay.kinds import RelayError, check_kinds, kind_of, matches
+from firmware_sim.wire import Air
 
 UP, DOWN = "up", "down"  # from the host to the drone, from the drone to the host
 WHATS = ("drop", "duplicate", "reorder", "delay", "corrupt", "silence", "die")

@@ -1,9 +1,14 @@
-"""Names for kinds of CRTP packets, so that a fault can be aimed at one of them."""
+"""Names for kinds of CRTP packets, so that a fault can be aimed at one of them; and the error of the relay."""
 
 from collections.abc import Iterable
 
 from firmware_sim import wire
-from firmware_sim.relay.errors import RelayError
+from firmware_sim.errors import FirmwareSimError
+
+
+class RelayError(FirmwareSimError):
+    """A schedule, an option or an address that cannot be used."""
+
 
 # (port, channel) -> name; the part before the dot alone means every channel of the port.
 KIND_NAMES: dict[tuple[int, int], str] = {

@@ -6,8 +6,8 @@ import socket
 import time
 from collections.abc import Callable
 
-from firmware_sim.relay.errors import RelayError
 from firmware_sim.relay.faults import DOWN, UP, Engine
+from firmware_sim.relay.kinds import RelayError
 
 Address = tuple[str, int]
 MOST_HOSTS = 64  # the one that was silent longest goes first: every scan is a host of its own

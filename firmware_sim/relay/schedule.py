@@ -6,8 +6,8 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from firmware_sim.relay.errors import RelayError
 from firmware_sim.relay.faults import Fault
+from firmware_sim.relay.kinds import RelayError
 
 LARGEST_FILE = 1 << 20  # bytes
 MOST_FAULTS = 1000

@@ -4,8 +4,8 @@ import struct
 
 import numpy as np
 
-from firmware_sim.commander.arbiter import CRTP, Arbiter
 from firmware_sim.commander.decode import RpytDecoder, decode_generic
+from firmware_sim.commander.setpoint import CRTP, Arbiter
 
 SETPOINT, META = 0, 1
 NOTIFY_STOP = 0

@@ -13,8 +13,7 @@ from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.flights.flight import APART, Flight, flight_of
 from crazyem.estimation import steps
-from crazyem.recordings.attitudes import onboard_attitude
-from crazyem.recordings.recording import Recording
+from crazyem.recordings.recording import Recording, onboard_attitude
 from crazyem.signals.vocabulary import MAVLINK_SOURCES, SOURCES
 
 PULL, TILT = 0.04, 4e-3  # s, rad: how long an error lasts, and its standard deviation

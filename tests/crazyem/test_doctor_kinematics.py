@@ -15,8 +15,8 @@ from made_flight import Motion, array_of, changed, made_flight
 from scipy.spatial.transform import Rotation
 
 from crazyem.doctor.weight import apparent_mass
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Finding, Grade
-from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording
 from crazyem.signals.sample import SIGNALS

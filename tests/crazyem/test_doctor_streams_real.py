@@ -10,7 +10,7 @@ from doctor_checks import only, run
 
 from crazyem.doctor.streams import runs
 from crazyem.recordings.airborne import airtime
-from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.registry import open_recording
 
 # -- real flights -----------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from crazyem.links.high_level import land_command, send_until_confirmed
+from crazyem.links.requests import land_command, send_until_confirmed
 
 
 class Drone:

@@ -10,10 +10,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from crazyem.errors import UsageError
 from crazyem.links.mavlink import parameters
-from crazyem.links.mavlink.address import Address, parse
-from crazyem.links.mavlink.frames import FrameParser, checksum, definitions, number_of
-from crazyem.links.mavlink.sequence import SequenceCounter
+from crazyem.links.mavlink.frames import FrameParser, SequenceCounter, checksum, definitions, number_of
 from crazyem.links.mavlink.stamps import DroneClock, RestartedError
+from crazyem.links.mavlink.transport import Address, parse
 
 
 def slow_checksum(data):

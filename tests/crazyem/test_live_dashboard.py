@@ -16,11 +16,10 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from crazyem.live import dashboard
-from crazyem.live.controls import SessionControls
 from crazyem.live.dashboard import BARS, Dashboard, picture, sparkline
 from crazyem.live.keys import Keys
 from crazyem.live.session import Session
-from crazyem.live.views import LinkView, Observer, ParameterView, Snapshot
+from crazyem.live.views import LinkView, Observer, ParameterView, SessionControls, Snapshot
 from crazyem.vehicle import load_vehicle
 
 MASS = ParameterView("mass", "g", 36.02, 35.9, 36.14, True, "", (34.0, 35.0, 36.0))

@@ -11,8 +11,8 @@ from crazyem.estimation.online import OnlineEstimator
 from crazyem.links import open_link
 from crazyem.live.controllers import LEE
 from crazyem.live.flight import Flight, FlightPlan
-from crazyem.live.mcap_recorder import open_recorder
 from crazyem.live.policy import MonitorLimits, Policy
+from crazyem.live.recorder import open_recorder
 from crazyem.live.session import Session
 from crazyem.live.warm_up import warm_up
 from crazyem.live.write_supervisor import WriteRules

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings import open_recording
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.csv.mapping import known_mappings, load_mapping
-from crazyem.recordings.options import ReadOptions
 
 ENU_FROM_NED = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 FRD_FROM_FLU = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.errors import UsageError
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Grade
 from crazyem.recordings.motor_meaning import MOTOR_VARIABLES, decide
-from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.tables import Table
 from crazyem.recordings.usd.file import read
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from crazyem.errors import CrazyemError, FileFormatError
 from crazyem.recordings import motor_meaning
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.csv.cfclient import read, recognises, recognises_folder
 from crazyem.recordings.finding import Grade
-from crazyem.recordings.options import ReadOptions
 
 STATE = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z")
 MOTOR = ("motor.m1", "motor.m2", "motor.m3", "motor.m4")

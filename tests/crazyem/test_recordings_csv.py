@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from crazyem.errors import CrazyemError, DataError, FileFormatError
 from crazyem.recordings import open_recording
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.csv import file as csv_file
 from crazyem.recordings.csv.mapping import known_mappings
-from crazyem.recordings.options import ReadOptions
 from crazyem.signals.sample import ESTIMATOR_SIGNALS
 
 NANOBENCH = [

@@ -40,7 +40,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
-from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording
 from crazyem.recordings.ros.ros2_messages import message_type, rows_of

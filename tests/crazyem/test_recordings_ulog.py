@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.errors import CrazyemError, FileFormatError
 from crazyem.recordings.autopilots.ulog_file import read, recognises
-from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording
 from crazyem.recordings.topics import MOST_RAW_SIGNALS

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from crazyem.errors import CrazyemError, FileFormatError
 from crazyem.recordings import motor_meaning
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Grade
-from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.tables import Table
 from crazyem.recordings.usd.file import read, recognises
 

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from firmware_sim.air import Air
+from firmware_sim.wire import Air
 
 
 @pytest.mark.parametrize(("loss", "burst"), [(0.1, 4.0), (0.02, 1.0), (0.5, 10.0), (0.9, 3.0)])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from firmware_sim.commander import decode
 from firmware_sim.commander import setpoint as sp
-from firmware_sim.commander.arbiter import CRTP, HIGH_LEVEL, Arbiter
+from firmware_sim.commander.setpoint import CRTP, HIGH_LEVEL, Arbiter
 from firmware_sim.commander.supervisor import PERIOD, State, Supervisor
 from firmware_sim.tables import slots
 

@@ -13,8 +13,8 @@ from firmware_sim.errors import FirmwareSimError
 from firmware_sim.firmware import Firmware
 from firmware_sim.flight import Flight
 from firmware_sim.mavlink.autopilot import Autopilot
-from firmware_sim.mavlink.frames import angles, turned_quaternion
 from firmware_sim.mavlink.server import wire_of
+from firmware_sim.mavlink.telemetry import angles, turned_quaternion
 from firmware_sim.scenario import parse_scenario
 
 THRUST = 0.48  # N, four rotors of a cf2 as its firmware has them

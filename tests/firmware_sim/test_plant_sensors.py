@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.battery import battery_step, open_circuit
+from firmware_sim.plant.rotors import battery_step, open_circuit
 from firmware_sim.plant.sensors import low_pass, sensors_step, settle
 from firmware_sim.scenario import parse_scenario
 

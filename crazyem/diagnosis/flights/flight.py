@@ -12,9 +12,8 @@ from crazyem.diagnosis.flights.inputs import inputs_of
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
 from crazyem.recordings.airborne import airtime
-from crazyem.recordings.attitudes import onboard_attitude
 from crazyem.recordings.ordering import ordered
-from crazyem.recordings.recording import Recording
+from crazyem.recordings.recording import Recording, onboard_attitude
 from crazyem.vehicle import GRAVITY, Vehicle
 
 SAME_NODE = 1.5e-3  # s: measurements closer than this belong to one node

@@ -12,18 +12,15 @@ from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import AnotherDroneError, LinkLost, LinkStatistics, Outage, ParameterWrite
 from crazyem.links.clock import ClockFit
 from crazyem.links.mavlink import motors, streams
-from crazyem.links.mavlink.address import parse
 from crazyem.links.mavlink.frames import number_of
 from crazyem.links.mavlink.parameters import ParameterClient
 from crazyem.links.mavlink.receiver import Receiver
 from crazyem.links.mavlink.sender import ACCEPTED, MessageSender
-from crazyem.links.mavlink.transport import open_transport
+from crazyem.links.mavlink.transport import open_transport, parse
 from crazyem.signals.packet import Block, Packet
 
-_LISTEN_SECONDS, _LONGEST_LISTEN_SECONDS = (
-    0.7,
-    5.0,
-)  # s of listening after streams were asked for; at most, if something is missing
+# s of listening after streams were asked for; at most, if something is missing
+_LISTEN_SECONDS, _LONGEST_LISTEN_SECONDS = 0.7, 5.0
 HOVER_PARAMETERS = {motors.PX4: "MPC_THR_HOVER", motors.ARDUPILOT: "MOT_THST_HOVER"}
 # another estimator on board that writes the same: parameter, the value that means it is on, what it does
 ONBOARD_HOVER_ESTIMATORS = {

@@ -16,9 +16,8 @@ from crazyem.errors import LinkError
 from crazyem.links.base import LinkLost, LinkStatistics
 from crazyem.links.clock import ClockFit, ClockRelation
 from crazyem.links.mavlink import streams
-from crazyem.links.mavlink.frames import Frame, FrameParser, number_of
+from crazyem.links.mavlink.frames import Frame, FrameParser, SequenceCounter, number_of
 from crazyem.links.mavlink.sender import MessageSender
-from crazyem.links.mavlink.sequence import SequenceCounter
 from crazyem.links.mavlink.stamps import DroneClock, RestartedError
 from crazyem.links.mavlink.transport import Peer
 from crazyem.signals.packet import Block, Packet

@@ -27,12 +27,11 @@ from crazyem.recordings.autopilots.frd_ned import (
     quaternions,
     stacked,
     vectors,
+    vehicle_of,
 )
 from crazyem.recordings.autopilots.ulog_scan import HEADER_BYTES, ULOG_MAGIC, Scan, scan, unknown_flags
-from crazyem.recordings.autopilots.vehicle import vehicle_of
-from crazyem.recordings.contents import contents
+from crazyem.recordings.contents import ReadOptions, contents
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.stamps import Fault, believed, finding
 from crazyem.recordings.topics import Source, Topic, damage, named, ranks, seconds, signals_of, text_of, unconnected

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.links.clock import STAMP_MODULUS
 from crazyem.recordings import motor_meaning
-from crazyem.recordings.contents import contents
+from crazyem.recordings.contents import ReadOptions, contents
 from crazyem.recordings.csv.file import read as read_csv
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.stamps import Fault, finding
 from crazyem.recordings.tables import Table, signals_from_tables

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
 from crazyem.recordings.columns import MARKED_COLUMN, Description, SignalEntry, name_and_unit
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.description import from_json
 from crazyem.recordings.export import HOST_TIME, METADATA_SUFFIX, TIME
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.signals.sample import SIGNALS, components
 

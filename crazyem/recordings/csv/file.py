@@ -3,11 +3,11 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.csv.long import read_long
 from crazyem.recordings.csv.mapping import known_mappings, mapping_for
 from crazyem.recordings.csv.text import parse_header_line, read_header
 from crazyem.recordings.csv.wide import read_wide, read_wide_parts
-from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 
 

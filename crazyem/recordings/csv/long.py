@@ -10,12 +10,12 @@ import numpy as np
 
 from crazyem.errors import FileFormatError
 from crazyem.links.clock import StampUnwrapper
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.csv.mapping import CsvMapping, SignalColumns
 from crazyem.recordings.csv.text import Damage, Header, parse_fields, text_blocks, to_number
 from crazyem.recordings.csv.wide import damage_notes
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.motor_meaning import decide
-from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.tables import Table, signals_from_tables
 from crazyem.signals.sample import SIGNALS

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from crazyem.errors import FileFormatError
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.mcap.content import Content, join
 from crazyem.recordings.mcap.findings import IMPORT_METADATA, finding_of, findings_from_json
@@ -12,7 +13,6 @@ from crazyem.recordings.mcap.messages import PROFILE
 from crazyem.recordings.mcap.scan import MCAP_MAGIC, Loss, Problem
 from crazyem.recordings.mcap.survey import Part, from_summary, parts, profile_of
 from crazyem.recordings.motor_meaning import decide
-from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.tables import Table, signals_from_tables
 

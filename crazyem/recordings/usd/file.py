@@ -7,8 +7,7 @@ import numpy as np
 
 from crazyem.errors import FileFormatError
 from crazyem.recordings import motor_meaning
-from crazyem.recordings.contents import contents
-from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.contents import ReadOptions, contents
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.tables import signals_from_tables
 from crazyem.recordings.usd import content

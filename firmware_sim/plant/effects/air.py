@@ -1,4 +1,4 @@
-"""Forces of the air: linear_drag, quadratic_drag, velocity_moment, rate_damping, wind and gusts.
+"""Forces on the body from outside: drag, moments, wind and gusts; hidden ones: vibration, cable_spring.
 
     v_a = R' (v - wind - gust)                      the origin's velocity through the air, body axes
     force  = -D v_a - Q |v_a| v_a                   body axes, at the geometric origin (D, Q diagonal)
@@ -7,6 +7,10 @@
     gust <- gust exp(-dt/T) + sd sqrt(1 - exp(-2 dt/T)) N(0, 1)   each world axis, stationary from the start
 
 Sources: Foerster 2015 and Faessler et al., RA-L 2018 (linear rotor drag); the Ornstein-Uhlenbeck process, exactly.
+
+vibration (not in the catalogue): torque A (cos p, sin p, 0) in body axes that turns with one rotor, dp/dt = +- ratio
+* rotor speed; its exact average over each step. cable_spring (neither): force stiffness (r - length) towards a fixed
+point of the world at distance r, from the geometric origin, none when slack (r < length); undamped.
 """
 
 import math
@@ -44,3 +48,29 @@ def air_forces(truth, R, v, w, air, force, torque):
         torque[i] -= truth[at.RATE_DAMPING + i] * w[i]
     torque[0] += truth[at.ROLL_PER_VY] * ay
     torque[1] += truth[at.PITCH_PER_VX] * ax
+
+
+@kernel
+def vibrate(truth, state, dt, torque):
+    """Add the vibration's mean torque [N m, body] over dt and advance its phase."""
+    i = int(truth[at.VIBRATION_ROTOR]) - 1
+    speed = truth[at.VIBRATION_RATIO] * math.sqrt(max(state[at.ROTOR + i], 0.0) / truth[at.ROTOR_CONSTANT])
+    half = 0.5 * speed * dt if i % 2 == 0 else -0.5 * speed * dt  # M1 and M3 counter-clockwise from above
+    if half != 0.0:
+        mean = truth[at.VIBRATION_TORQUE] * math.sin(half) / half
+        torque[0] += mean * math.cos(state[at.PHASE] + half)
+        torque[1] += mean * math.sin(state[at.PHASE] + half)
+        state[at.PHASE] = (state[at.PHASE] + 2.0 * half) % (2.0 * math.pi)
+
+
+@kernel
+def pull_cable(truth, p, force):
+    """Add the spring's force [N, world] on the geometric origin at p [m, world]."""
+    k = at.CABLE_POINT
+    dx, dy, dz = truth[k] - p[0], truth[k + 1] - p[1], truth[k + 2] - p[2]
+    r = math.sqrt(dx * dx + dy * dy + dz * dz)
+    if r > truth[at.CABLE_LENGTH] and r > 0.0:
+        pull = truth[at.CABLE_STIFFNESS] * (r - truth[at.CABLE_LENGTH]) / r
+        force[0] += pull * dx
+        force[1] += pull * dy
+        force[2] += pull * dz

@@ -1,4 +1,25 @@
-"""Rotors with effects: commands, lag, thrust and reaction in their order, instead of rotors.lag and rotors.wrench."""
+"""Rotors with effects, in their order: input_delay and sticky_rotor, lag, thrust and torque effects, rotor_inertia.
+
+They take the place of rotors.lag and rotors.wrench.
+
+input_delay: the command of t acts at t + delay, exactly, also between two milliseconds; the log shows it undelayed.
+sticky_rotor: one rotor keeps its command until the wanted one is more than `deadband` (of full scale) away.
+
+    goal   = clip(f + slope_error (f - f_hover), 0, thrust_max) (1 + gain_per_volt (V - 3.7 V))  before the lag
+           = ...                                               (1 + gain_per_second t)           t since take-off
+    thrust = lagged * thrust_scale * fault * (1 + strength exp(-z / height))                     after the lag
+
+f: the thrust curve's value for the command; f_hover: a quarter of the vehicle's weight without payload; V: the voltage
+at the battery's terminals; z: height of the geometric origin above the floor. What is before the lag moves the rotor's
+speed, what is after it does not. A rotor's drag torque follows its thrust. torque_scale multiplies the three torques of
+the rotors about the geometric origin; trim adds a torque that goes with their whole thrust.
+
+    J dw/dt = ... - w x (H e3) - dH/dt e3,   W_i = sqrt(f_i / rotor_constant)
+
+I: of one rotor and propeller about its axis, kg m^2 (the body's J holds the rotors as if they stood still). f_i: the
+lagged thrust, without what rotor_fault and the like do to it. M1 and M3 turn counter-clockwise seen from above. The
+spin-up reaction is the exact change of H over each step. Source: Euler's equation of a gyrostat.
+"""
 
 import math
 
@@ -6,10 +27,75 @@ import numpy as np
 
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.effects.command import delayed, remember
-from firmware_sim.plant.effects.rotor_inertia import angular_momentum
-from firmware_sim.plant.effects.thrust import acting_thrust, acting_wrench, goal_thrust
-from firmware_sim.plant.rotors import wrench
+from firmware_sim.plant.rotors import steady_thrust, wrench
+
+
+@kernel
+def angular_momentum(truth, f, o):
+    """H [N m s] along body z of rotors with lagged thrusts f[o:o+4]."""
+    total = 0.0
+    for i in range(4):
+        speed = math.sqrt(max(f[o + i], 0.0) / truth[at.ROTOR_CONSTANT])
+        total += speed if i % 2 == 0 else -speed
+    return truth[at.ROTOR_INERTIA] * total
+
+
+NOMINAL_VOLTS = 3.7  # V, where battery_sag is neutral: the nominal voltage of a lithium-polymer cell
+
+
+@kernel
+def goal_thrust(truth, state, pwm):
+    """Thrust [N] that the lag of one rotor goes to under this command."""
+    f = steady_thrust(truth, pwm, state[at.VOLTS])
+    if pwm > 0.0 and truth[at.SLOPE_ERROR] != 0.0:
+        f += truth[at.SLOPE_ERROR] * (f - truth[at.HOVER_THRUST])
+        f = min(max(f, 0.0), truth[at.THRUST_MAX])
+    f *= max(1.0 + truth[at.SAG_PER_VOLT] * (state[at.VOLTS] - NOMINAL_VOLTS), 0.0)
+    return f * max(1.0 + truth[at.SAG_PER_SECOND] * 1e-3 * state[at.AIRBORNE], 0.0)
+
+
+@kernel
+def acting_thrust(truth, state, f, o, origin_height, out):
+    """out[0:4] = thrust [N] of the rotors whose lagged thrusts are f[o:o+4]; origin_height in m, world."""
+    factor = truth[at.THRUST_SCALE]
+    if truth[at.GROUND_STRENGTH] != 0.0:
+        z = max(origin_height - truth[at.FLOOR], 0.0)
+        factor *= 1.0 + truth[at.GROUND_STRENGTH] * math.exp(-z / truth[at.GROUND_HEIGHT])
+    for i in range(4):
+        out[i] = factor * f[o + i]
+        if truth[at.FAULT_ROTOR] == i + 1 and state[at.CLOCK] >= truth[at.FAULT_ONSET]:
+            out[i] *= truth[at.FAULT_SCALE]
+
+
+@kernel
+def acting_wrench(truth, thrust, u):
+    """u = [F, Mx, My, Mz] of four acting thrusts [N], torque about the centre of mass."""
+    wrench(truth, thrust, 0, u)
+    for i in range(1, 4):
+        u[i] = u[i] * truth[at.TORQUE_SCALE] + truth[at.TRIM + i - 1] * u[0]
+    u[1] -= truth[at.COM + 1] * u[0]
+    u[2] += truth[at.COM] * u[0]
+
+
+@kernel
+def remember(truth, state):
+    """Put the commands of this millisecond (CLOCK) into the ring, the sticky rotor's as it follows them."""
+    row = at.COMMANDS + 4 * (int(state[at.CLOCK]) % at.DELAY_ROWS)
+    for i in range(4):
+        pwm = state[at.PWM + i]
+        if truth[at.STICKY_ROTOR] == i + 1:
+            if abs(pwm - state[at.HELD]) > truth[at.STICKY_BAND] or pwm == 0.0:
+                state[at.HELD] = pwm
+            pwm = state[at.HELD]
+        state[row + i] = pwm
+
+
+@kernel
+def delayed(truth, state, i, part):
+    """Command of motor i in part 0 (the first delay - floor(delay) ms) or part 1 (the rest) of this millisecond."""
+    back = math.floor(truth[at.INPUT_DELAY]) + (1 - part)
+    row = (int(state[at.CLOCK]) - back) % at.DELAY_ROWS  # not yet written, so 0, before the first command acts
+    return state[at.COMMANDS + 4 * row + i]
 
 
 @kernel

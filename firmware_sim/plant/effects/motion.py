@@ -9,8 +9,7 @@ import numpy as np
 
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.effects.air import air_forces
-from firmware_sim.plant.effects.hidden import pull_cable
+from firmware_sim.plant.effects.air import air_forces, pull_cable
 from firmware_sim.plant.ground import GRAVITY, contact
 from firmware_sim.plant.quaternion import matrix
 
