@@ -180,7 +180,11 @@ def _run(
             _connect(arguments, drones, wrench=wrench, streams=streams, scheduler=scheduler, everyone=everyone)
             before([d for d in drones if d.error is None])
             with live_view(view, lambda: [d.shown for d in drones if d.shown is not None]) as showing:
-                _together(drones, work, quiet=showing)
+                try:
+                    _together(drones, work, quiet=showing)
+                finally:
+                    for session in (d.session for d in drones if d.session is not None):
+                        session.stop_pushing()  # of all, before anything else ends
         finally:
             with concurrent.futures.ThreadPoolExecutor(CLOSINGS_AT_ONCE, thread_name_prefix="crazyem-close") as pool:
                 list(pool.map(_close, drones))

@@ -84,7 +84,10 @@ def run(arguments: argparse.Namespace) -> int:
             line = LiveLine(session)
             shown = [Viewed(session, line, name=vehicle.name)]
             with live_view(view, lambda: shown) as line.quiet:
-                follow(session, stop, arguments.duration, line)
+                try:
+                    follow(session, stop, arguments.duration, line)
+                finally:
+                    session.stop_pushing()  # before anything else ends
         except CrazyemError as e:
             error = e
             session.history.notice(str(e))

@@ -31,7 +31,7 @@ class HealthLimits:
     supervisor: bool = True
     battery: float = 3.2
     tilt: float = math.radians(60.0)
-    stale: float = 3.0
+    stale: float = 1.0
 
 
 @dataclass(frozen=True)

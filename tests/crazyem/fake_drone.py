@@ -150,8 +150,8 @@ class FakeLink:
         s = self._session
         if s is None or s.failure is not None or s.lost is not None:
             return False
-        waiting = self.packets.qsize() + s._samples.qsize() > WAITING * len(self.blocks)
-        return waiting or self._unseen() or (s.pusher is not None and s.pusher.busy)
+        waiting = self.packets.qsize() + (s._samples.qsize() if s._mailbox is None else len(s._mailbox._items))
+        return waiting > WAITING * len(self.blocks) or self._unseen() or (s.pusher is not None and s.pusher.busy)
 
     def _unseen(self):
         seen = self._flight._moved[0] if self._flight is not None else -1.0
