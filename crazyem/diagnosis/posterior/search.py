@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.fit import DivergedError
 from crazyem.diagnosis.posterior.members import Member
+from crazyem.diagnosis.posterior.onset import begun_later, dated
 from crazyem.diagnosis.posterior.settings import SETTINGS
 from crazyem.diagnosis.posterior.study import Fit, Slopes, Study
 
@@ -95,6 +96,11 @@ class Search:
                 change = np.zeros(len(whole.candidate.free))
                 change[[whole.candidate.free.index(n) for n in m.candidate.free]] = there.mean[size:]
                 found[m.effect] = Neighbour(whole, m.effect, gain, change)
+            later = begun_later(study, fit, look, m)
+            if later is not None:
+                gain = (later[1] - base) / scatter + later[0].odds
+                if gain > found[m.effect].gain:
+                    found[m.effect] = Neighbour(later[0], m.effect, gain, later[2])
         for effect in study.pool.random:
             if effect.name not in fit.effects and fit.held:
                 found[effect.name] = Neighbour(None, effect.name, np.inf, np.zeros(0))
@@ -107,7 +113,7 @@ class Search:
         try:
             if neighbour.member is None:
                 return self.study.restarted(base, base.members, base.random | {neighbour.effect}, near)
-            return self.study.begun(base, neighbour.member, neighbour.change, near)
+            return dated(self.study, self.study.begun(base, neighbour.member, neighbour.change, near))
         except (DivergedError, np.linalg.LinAlgError):
             return None
 

@@ -45,13 +45,14 @@ class Look:
         places: columns of each member and each variant that was looked at.
         usual: columns of what differs from recording to recording.
         shared: what the flights say.
-        loglik: of all flights [nats].
+        loglik: of all flights [nats]. passes: of each.
     """
 
     places: Mapping[Candidate, tuple[int, ...]]
     usual: Mapping[Candidate, tuple[int, ...]]
     shared: Shared
     loglik: float
+    passes: tuple[Pass, ...]
 
 
 @dataclass(frozen=True)
@@ -210,7 +211,7 @@ class Study:
             here = np.array([_away(c, point, c.free[0]) for c in columns])
             passes.append(Pass(loglik, gram.score, gram.information, here))
         self.passes += 1
-        return Look(places, usual, Shared(passes, sd), sum(p.loglik for p in passes))
+        return Look(places, usual, Shared(passes, sd), sum(p.loglik for p in passes), tuple(passes))
 
     def slopes(
         self, data: Sequence[Data], points: Sequence[Point], members: Sequence[Member], more: Sequence[Member] = ()
