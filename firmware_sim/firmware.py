@@ -52,6 +52,7 @@ class FlightLike(Protocol):
     setpoint: np.ndarray
     motors_allowed: bool
     armed: bool
+    flying: bool
     truth_header: ClassVar[list[str]]
 
     def truth_row(self) -> list[float]:
@@ -217,6 +218,7 @@ class Firmware:
                     self.arbiter.offer(setpoint, HIGH_LEVEL, tick)
             flight.setpoint[:] = self.supervisor.override(self.arbiter.setpoint)
             flight.motors_allowed, flight.armed = self.supervisor.motors_allowed, self.supervisor.armed
+            flight.flying = self.supervisor.flying
             for _ in range(min(end, self.next_event()) - tick):
                 flight.step()
             for data in self.log.samples(flight.tick):

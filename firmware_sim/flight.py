@@ -26,7 +26,7 @@ from firmware_sim.plant.sensors import ACC_CUTOFF, settle
 from firmware_sim.scenario import Scenario
 
 DEFAULT_CONTROLLER = 1  # PID, as in the firmware
-CONTROLLERS = (1, 2, 5, 6)
+CONTROLLERS = (1, 2, 3, 5, 6)
 
 
 class Flight:
@@ -41,6 +41,7 @@ class Flight:
         self.tick = 0
         self.setpoint = sp.null_setpoint()
         self.motors_allowed = True
+        self.flying = False  # as the supervisor says: the onboard estimate then leaves out what it does in the air
         self.armed = scenario.platform != "cf21bl"
         self._noise = NoiseSource(seed)
         self._truth = scenario.truth()
@@ -143,7 +144,7 @@ class Flight:
         while self._payload is not None and self._payload.due(self.tick, self.state):
             self._payload.apply(self._truth, self.state)
         row = self._noise.prepare(self.tick)
-        flags = int(self.motors_allowed) | int(self.armed) << 1
+        flags = int(self.motors_allowed) | int(self.armed) << 1 | int(self.flying) << 2
         self._tick_step(*self._arrays(), self._noise.rows[row], self.tick, flags)
         self.tick += 1
 

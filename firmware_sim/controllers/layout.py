@@ -23,6 +23,25 @@ PID_STATE = 48  # twelve regulators of four
 PID_ATTITUDE = 96  # wanted roll, pitch, yaw, deg
 PID_THRUST = 99
 PID_MODES = 100  # the setpoint's seven modes at the last step
-MEMORY_SIZE = 108
+# INDI: what controllerINDIInit empties comes first
+INDI_FILTERS = 108
+INDI_RATE = 108  # three filters of four: rates
+INDI_PASSED = 120  # commands after the rotors' lag
+INDI_ACC = 132  # specific force
+INDI_ANGLE = 144
+INDI_LIFTED = 156  # one filter: thrust
+INDI_FILTERS_END = 160
+INDI_TILT = 160  # three coefficients: of roll and pitch, of yaw, of the outer loop
+INDI_TURN = 163
+INDI_PLACE = 166
+INDI_ACT = 169  # u_act_dyn: roll, pitch, yaw in PWM units after the rotors' lag
+INDI_U = 172  # u_in
+INDI_DU = 175
+INDI_ATTITUDE = 178  # wanted roll, pitch, yaw, rad
+INDI_THRUST = 181
+INDI_TILTS = 182  # what the outer loop wants: roll, pitch, rad
+INDI_LIFT = 184  # T_incremented
+INDI_LIFT_ACT = 185  # T_inner
+MEMORY_SIZE = 186
 
 LEGACY_MODE, FORCE_TORQUE_MODE = 0.0, 1.0

@@ -7,7 +7,10 @@ step. `ctrlLqg` is ours: the out-of-tree controller 6.
 from firmware_sim import contents
 
 # Groups of the firmware's table that are ours whole, in its order.
-_WHOLE_GROUPS = ("stabilizer", "powerDist", "motorPowerSet", "kalman", "locSrv", "ctrlLee", "ctrlMel")
+_WHOLE_GROUPS = (
+    *("stabilizer", "powerDist", "motorPowerSet", "kalman", "locSrv"),
+    *("ctrlLee", "ctrlMel", "ctrlINDI", "posCtrlIndi"),
+)
 # PID: the gains of the twelve regulators stand together and in this order, then what else these groups hold.
 _PID = ("pid_attitude", "pid_rate", "posCtlPid", "velCtlPid")
 _GAINS = ("kp", "ki", "kd", "kff")
@@ -92,6 +95,15 @@ MEL_KW = PARAMETER_INDEX["ctrlMel.kw_xy"]
 MEL_KI_M = PARAMETER_INDEX["ctrlMel.ki_m_xy"]
 MEL_RANGE_M = PARAMETER_INDEX["ctrlMel.i_range_m_xy"]
 MEL_KD_OMEGA = PARAMETER_INDEX["ctrlMel.kd_omega_rp"]
+INDI_THRESHOLD = PARAMETER_INDEX["ctrlINDI.thrust_threshold"]
+INDI_BOUND = PARAMETER_INDEX["ctrlINDI.bound_ctrl_input"]
+INDI_G1 = PARAMETER_INDEX["ctrlINDI.g1_p"]  # p, q, r, then g2
+INDI_ERR = PARAMETER_INDEX["ctrlINDI.ref_err_p"]  # p, q, r, then those of the rates
+INDI_ACT_DYN = PARAMETER_INDEX["ctrlINDI.act_dyn_p"]  # p, q, r
+INDI_CUTOFF = PARAMETER_INDEX["ctrlINDI.filt_cutoff"]  # roll and pitch, yaw
+INDI_OUTER = PARAMETER_INDEX["ctrlINDI.outerLoopActive"]
+INDI_XI = PARAMETER_INDEX["posCtrlIndi.K_xi_x"]  # x, y, z, then K_dxi
+INDI_TILT_LIMIT = PARAMETER_INDEX["posCtrlIndi.pq_clamping"]
 PID_GAINS = PARAMETER_INDEX["pid_attitude.roll_kp"]  # twelve times kp, ki, kd, kff
 PID_YAW_LEAD = PARAMETER_INDEX["pid_attitude.yawMaxDelta"]
 PID_ATT_FILTER = PARAMETER_INDEX["pid_attitude.attFiltEn"]  # then the cut-off

@@ -19,6 +19,8 @@ from firmware_sim.controllers.externalise import (
     log_rotor_speed,
     log_setpoint,
 )
+from firmware_sim.controllers.indi import indi_step
+from firmware_sim.controllers.indi import reset as indi_reset
 from firmware_sim.controllers.lee import lee_step
 from firmware_sim.controllers.lee import reset as lee_reset
 from firmware_sim.controllers.lqg import lqg_step
@@ -36,7 +38,7 @@ from firmware_sim.plant.rotors import battery_step, lag, wrench
 from firmware_sim.plant.sensors import sensors_step
 
 DT = 1e-3  # s
-PID, MELLINGER, LEE, LQG = 1.0, 2.0, 5.0, 6.0  # stabilizer.controller
+PID, MELLINGER, INDI, LEE, LQG = 1.0, 2.0, 3.0, 5.0, 6.0  # stabilizer.controller
 
 
 @kernel
@@ -48,12 +50,15 @@ def control_step(setpoint, estimate, sensor, param, memory, log, tick):
         lee_reset(memory)
         lqg_reset(memory)
         mellinger_reset(memory)
+        indi_reset(param, memory)
         pid_reset(estimate, memory)
     if tick % 2 == 0:
         if which == PID:
             pid_step(setpoint, estimate, sensor, param, memory, log, tick)
         elif which == MELLINGER:
             mellinger_step(setpoint, estimate, sensor, param, memory, log)
+        elif which == INDI:
+            indi_step(setpoint, estimate, sensor, param, memory, log, tick)
         elif which == LQG:
             lqg_step(setpoint, estimate, sensor, param, memory, log)
         else:
@@ -86,9 +91,9 @@ def plant_step(truth, state, noise, dt):
 def tick_step(
     truth, board, state, sensor, estimate, P, setpoint, param, memory, log, union_float, union_short, noise, tick, flags
 ):
-    """One millisecond. flags: bit 0 motors allowed by the supervisor, bit 1 armed."""
+    """One millisecond. flags: bit 0 motors allowed by the supervisor, bit 1 armed, bit 2 flies."""
     sensors_step(truth, state, sensor, noise, tick)
-    estimate_step(truth, state, sensor, estimate, P, param, noise, tick)
+    estimate_step(truth, state, sensor, estimate, P, param, noise, tick, (flags & 4) != 0)
     control_step(setpoint, estimate, sensor, param, memory, log, tick)
     motors_step(board, state, sensor, param, memory, log, (flags & 1) != 0, (flags & 2) != 0)
     if moves(truth, tick):

@@ -23,10 +23,10 @@ from firmware_sim.plant.sensors import sensors_step
 def tick_step_with_effects(
     truth, board, state, sensor, estimate, P, setpoint, param, memory, log, union_float, union_short, noise, tick, flags
 ):
-    """One millisecond. flags: bit 0 motors allowed by the supervisor, bit 1 armed."""
+    """One millisecond. flags: bit 0 motors allowed by the supervisor, bit 1 armed, bit 2 flies."""
     sensors_step(truth, state, sensor, noise, tick)
     sense_late(truth, state, sensor, tick)
-    estimate_step(truth, state, sensor, estimate, P, param, noise, tick)
+    estimate_step(truth, state, sensor, estimate, P, param, noise, tick, (flags & 4) != 0)
     claim_velocity(truth, sensor, estimate)
     control_step(setpoint, estimate, sensor, param, memory, log, tick)
     motors_step(board, state, sensor, param, memory, log, (flags & 1) != 0, (flags & 2) != 0)

@@ -28,6 +28,16 @@ COMMON: list[str] = [
     *_run("ctrlLqg", "accx", "accy", "accz", "angaccx", "angaccy", "angaccz"),
     *_run("ctrlMel", "cmd_thrust", "cmd_roll", "cmd_pitch", "cmd_yaw", "r_roll", "r_pitch", "r_yaw", "accelz"),
     *_run("ctrlMel", "zdx", "zdy", "zdz", "i_err_x", "i_err_y", "i_err_z"),
+    *_run("ctrlINDI", "cmd_thrust", "cmd_roll", "cmd_pitch", "cmd_yaw", "r_roll", "r_pitch", "r_yaw"),
+    *_run("ctrlINDI", "u_act_dyn_p", "u_act_dyn_q", "u_act_dyn_r", "du_p", "du_q", "du_r"),
+    *_run("ctrlINDI", "ang_accel_ref_p", "ang_accel_ref_q", "ang_accel_ref_r", "rate_d[0]", "rate_d[1]", "rate_d[2]"),
+    *_run("ctrlINDI", "uf_p", "uf_q", "uf_r", "Omega_f_p", "Omega_f_q", "Omega_f_r", "n_p", "n_q", "n_r"),
+    *_run("posCtrlIndi", "posRef_x", "posRef_y", "posRef_z", "velS_x", "velS_y", "velS_z"),
+    *_run("posCtrlIndi", "velRef_x", "velRef_y", "velRef_z", "angS_roll", "angS_pitch", "angS_yaw"),
+    *_run("posCtrlIndi", "angF_roll", "angF_pitch", "angF_yaw", "accRef_x", "accRef_y", "accRef_z"),
+    *_run("posCtrlIndi", "accS_x", "accS_y", "accS_z", "accF_x", "accF_y", "accF_z", "accFT_x", "accFT_y", "accFT_z"),
+    *_run("posCtrlIndi", "accErr_x", "accErr_y", "accErr_z", "phi_tilde", "theta_tilde", "T_tilde", "T_inner"),
+    *_run("posCtrlIndi", "T_inner_f", "T_incremented", "cmd_phi", "cmd_theta"),
     *_run("controller", "cmd_thrust", "cmd_roll", "cmd_pitch", "cmd_yaw", "r_roll", "r_pitch", "r_yaw", "accelz"),
     *_run("controller", "actuatorThrust", "roll", "pitch", "yaw", "rollRate", "pitchRate", "yawRate", "ctr_yaw"),
     # The parts of the twelve PID regulators, in the order of their gains (parameters.py), then targets.
@@ -79,6 +89,8 @@ LQG_OUT = VARIABLE_INDEX["ctrlLqg.thrustSi"]
 LQG_RPYD = VARIABLE_INDEX["ctrlLqg.rpydx"]
 LQG_ACC = VARIABLE_INDEX["ctrlLqg.accx"]
 MEL = VARIABLE_INDEX["ctrlMel.cmd_thrust"]
+INDI = VARIABLE_INDEX["ctrlINDI.cmd_thrust"]
+INDI_POS = VARIABLE_INDEX["posCtrlIndi.posRef_x"]
 PID = VARIABLE_INDEX["controller.cmd_thrust"]
 PID_CTR_YAW = VARIABLE_INDEX["controller.ctr_yaw"]
 PID_PARTS = VARIABLE_INDEX["pid_attitude.roll_outP"]

@@ -22,7 +22,7 @@ from firmware_sim.plant.quaternion import matrix, turn
 
 
 @kernel
-def estimate_step(truth, state, sensor, estimate, P, param, noise, tick):
+def estimate_step(truth, state, sensor, estimate, P, param, noise, tick, flying):
     """One millisecond: add up the sensors, predict when it is time, and take the fixes that are due."""
     if estimate[at.E_RESET] > 0.0 or not healthy(estimate, P):
         estimate[at.E_RESET] = 0.0
@@ -33,9 +33,10 @@ def estimate_step(truth, state, sensor, estimate, P, param, noise, tick):
         if noise[at.N_SLIP] > truth[at.PREDICT_SLIP]:
             estimate[at.E_DUE] += 1.0  # as the firmware counts: from when it came to the next
         dt = 1e-3 * estimate[at.E_COUNT]
-        integrate(estimate, dt)
-        drag(estimate, param, dt)
-        predict(estimate, P, param, dt)
+        integrate(estimate, dt, flying)
+        if flying:
+            drag(estimate, param, dt)
+        predict(estimate, P, param, dt, flying)
     kind = truth[at.FIX_KIND]
     if kind > 0.0 and (tick - int(truth[at.FIX_PHASE])) % int(truth[at.FIX_PERIOD]) == 0:
         p, q = np.empty(3), np.empty(4)
@@ -102,8 +103,11 @@ def add_up(sensor, estimate):
 
 
 @kernel
-def integrate(estimate, dt):
-    """Strapdown integration over dt of the filtered gyro and accelerometer, by their mean since the last time."""
+def integrate(estimate, dt, flying):
+    """Strapdown integration over dt of the filtered gyro and accelerometer, by their mean since the last time.
+
+    In the air only the accelerometer's z counts (kalman_core.c, predictDt): a drag along x and y is not seen then.
+    """
     R = np.empty((3, 3))
     matrix(estimate, at.E_QUAT, R)
     a, g = at.E_ACC, at.E_GYRO
@@ -113,6 +117,9 @@ def integrate(estimate, dt):
         estimate[at.E_SUM + i] = 0.0
         estimate[at.E_SUM + 3 + i] = 0.0
     estimate[at.E_COUNT] = 0.0
+    if flying:
+        estimate[a] = 0.0
+        estimate[a + 1] = 0.0
     for i in range(3):
         acc = R[i, 0] * estimate[a] + R[i, 1] * estimate[a + 1] + R[i, 2] * estimate[a + 2]
         if i == 2:
@@ -127,7 +134,7 @@ def drag(estimate, param, dt):
     """The drag that kalman.dragB_* tells the filter of: acceleration -dragB v of the centre of pressure, body axes.
 
     dragB [1/s] is drag over mass (the firmware's own text says N s/m); the centre of pressure lies at kalman.cop_* [m].
-    The firmware leaves it out while it does not fly, when nothing moves here.
+    The firmware leaves it out while it does not fly.
     """
     if param[pm.DRAG] == 0.0 and param[pm.DRAG + 1] == 0.0 and param[pm.DRAG + 2] == 0.0:
         return
@@ -146,8 +153,11 @@ def drag(estimate, param, dt):
 
 
 @kernel
-def predict(estimate, P, param, dt):
-    """P <- A P A' + Q with A = [[I, dt I, 0], [0, I - dt R dragB R', -dt R [a]x], [0, 0, I - dt [w]x]]."""
+def predict(estimate, P, param, dt, flying):
+    """P <- A P A' + Q with A = [[I, dt I, 0], [0, I - dt R dragB R', -dt R [a]x], [0, 0, I - dt [w]x]].
+
+    dragB counts in the air only.
+    """
     R, A = np.empty((3, 3)), np.zeros((9, 9))
     matrix(estimate, at.E_QUAT, R)
     ax, ay, az = estimate[at.E_ACC], estimate[at.E_ACC + 1], estimate[at.E_ACC + 2]
@@ -156,7 +166,7 @@ def predict(estimate, P, param, dt):
         A[i, i] = 1.0
     for i in range(3):
         A[i, 3 + i] = dt
-        for j in range(3):
+        for j in range(3 if flying else 0):
             for k in range(3):
                 A[3 + i, 3 + j] -= dt * R[i, k] * param[pm.DRAG + k] * R[j, k]
         A[3 + i, 6] = -dt * (R[i, 1] * az - R[i, 2] * ay)

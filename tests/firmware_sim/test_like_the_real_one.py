@@ -17,7 +17,7 @@ from firmware_sim.plant import layout as at
 from firmware_sim.plant.platforms import PLATFORMS
 from firmware_sim.scenario import parse_scenario
 
-PID, MELLINGER, LEE = 1, 2, 5
+PID, MELLINGER, INDI, LEE = 1, 2, 3, 5
 CAN_ARM, ARMED, AUTO, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED, HL_ACTIVE, HL_FINISHED = (1 << n for n in range(10))
 EBUSY = 16
 PERIOD = 4.0  # s of the circle
@@ -144,7 +144,7 @@ def test_the_high_level_commander_holds_a_hover_without_any_packet():
     assert drone.info & (FLYING | HL_ACTIVE | HL_FINISHED) == FLYING | HL_ACTIVE | HL_FINISHED
 
 
-@pytest.mark.parametrize("controller", [PID, MELLINGER, LEE])
+@pytest.mark.parametrize("controller", [PID, MELLINGER, INDI, LEE])
 def test_a_setpoint_of_500_ms_levels_out_and_one_of_2000_ms_locks_until_reboot(controller):
     drone = Drone(stabilizer__controller=controller)
     drone.run(4.0, lambda t: full_state((0, 0, min(1.0, t / 2)), (0.3, 0.0, 0.0)))

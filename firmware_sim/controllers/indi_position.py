@@ -1,0 +1,96 @@
+"""INDI's outer loop, as in position_controller_indi.c: place -> velocity -> acceleration -> increments of tilt, thrust.
+
+G [roll, pitch, T] = acceleration that is missing, with G the derivative of the thrust's acceleration by roll and pitch
+(at hover) and by thrust. K_THR [m/s^2 a unit] is compiled in: a drone of another mass only has another loop gain.
+Axes: x forward, y right, z down. A place's velocity and acceleration are ignored, and velocities count as the world's.
+"""
+
+import math
+
+import numpy as np
+
+from firmware_sim.commander import setpoint as sp
+from firmware_sim.controllers import layout as mem
+from firmware_sim.controllers import parameters as pm
+from firmware_sim.controllers import variables as lv
+from firmware_sim.controllers.low_pass import butterworth
+from firmware_sim.kernel import kernel
+from firmware_sim.plant import layout as at
+from firmware_sim.plant.ground import GRAVITY
+
+K_THR = 0.00024730  # m/s^2 a unit of thrust
+ACT_DYN = 0.03149  # of the thrust, a step; ctrlINDI.act_dyn_* does not reach it
+MAX_THRUST = 60000.0
+
+
+@kernel
+def axes(f, M, G):
+    """M (3x3): body to world of the angles f (roll, pitch, yaw, rad); G (3x3): the effect of roll, pitch and thrust."""
+    c0, s0, c1, s1, c2, s2 = (
+        math.cos(f[0]), math.sin(f[0]), math.cos(f[1]), math.sin(f[1]), math.cos(f[2]), math.sin(f[2])
+    )  # fmt: skip
+    M[0, 0], M[0, 1], M[0, 2] = c1 * c2, s0 * s1 * c2 - c0 * s2, c0 * s1 * c2 + s0 * s2
+    M[1, 0], M[1, 1], M[1, 2] = c1 * s2, s0 * s1 * s2 + c0 * c2, c0 * s1 * s2 - s0 * c2
+    M[2, 0], M[2, 1], M[2, 2] = -s1, s0 * c1, c0 * c1
+    for i in range(3):
+        G[i, 0] = GRAVITY * M[i, 1]  # d(M e3)/d(roll) = -M e2
+        G[i, 2] = M[i, 2]
+    G[0, 1], G[1, 1], G[2, 1] = -GRAVITY * c0 * c1 * c2, -GRAVITY * c0 * c1 * s2, GRAVITY * c0 * s1
+
+
+@kernel
+def solve(G, e, out):
+    """out = G^-1 e by cofactors (a thrust that lies flat gives what is not finite)."""
+    det = 0.0
+    for j in range(3):
+        a, b = (j + 1) % 3, (j + 2) % 3
+        out[j] = 0.0
+        for i in range(3):
+            k, m = (i + 1) % 3, (i + 2) % 3
+            cofactor = G[k, a] * G[m, b] - G[k, b] * G[m, a]
+            out[j] += cofactor * e[i]
+            if j == 0:
+                det += G[i, 0] * cofactor
+    for j in range(3):
+        out[j] /= det
+
+
+@kernel
+def indi_position_step(setpoint, estimate, sensor, angle, param, memory, log):
+    """One step (500 Hz): INDI_TILTS [rad], INDI_LIFT [PWM units] and posCtrlIndi.*. angle: roll, pitch, yaw, rad."""
+    M, G = np.empty((3, 3)), np.empty((3, 3))
+    error, f, acc, turned, gain = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    o = lv.INDI_POS
+    for i in range(3):
+        sign = 1.0 if i == 0 else -1.0
+        velocity = sign * estimate[at.E_VEL + i]
+        goal = sign * setpoint[sp.VX + i]
+        if setpoint[sp.MODE_X + i] == sp.ABSOLUTE:
+            place = sign * setpoint[sp.X + i]
+            goal = param[pm.INDI_XI + i] * (place - sign * estimate[at.E_POS + i])
+            log[o + i] = place
+        error[i] = param[pm.INDI_XI + 3 + i] * (goal - velocity)
+        sensed = sign * sensor[at.ACCEL + i]
+        acc[i] = butterworth(memory, mem.INDI_PLACE, mem.INDI_ACC + 4 * i, sensed)
+        f[i] = butterworth(memory, mem.INDI_PLACE, mem.INDI_ANGLE + 4 * i, angle[i])
+        log[o + 3 + i], log[o + 6 + i], log[o + 9 + i], log[o + 12 + i] = velocity, goal, angle[i], f[i]
+        log[o + 15 + i], log[o + 18 + i], log[o + 21 + i] = error[i], sensed, acc[i]
+    axes(f, M, G)
+    for i in range(3):
+        turned[i] = M[i, 0] * acc[0] + M[i, 1] * acc[1] + M[i, 2] * acc[2]
+        if i == 2:
+            turned[i] += GRAVITY
+        error[i] -= turned[i]
+        log[o + 24 + i], log[o + 27 + i] = turned[i], error[i]
+    solve(G, error, gain)
+    passed = butterworth(memory, mem.INDI_PLACE, mem.INDI_LIFTED, memory[mem.INDI_LIFT])
+    memory[mem.INDI_LIFT_ACT] += ACT_DYN * (passed - memory[mem.INDI_LIFT_ACT])
+    more = -gain[2] / K_THR
+    memory[mem.INDI_LIFT] = min(max(more + memory[mem.INDI_LIFT_ACT], 0.0), MAX_THRUST)
+    limit = math.radians(param[pm.INDI_TILT_LIMIT])
+    for i in range(2):
+        memory[mem.INDI_TILTS + i] = min(max(f[i] + gain[i], -limit), limit)
+        log[o + 30 + i] = gain[i]
+        log[o + 36 + i] = memory[mem.INDI_TILTS + i]
+    log[o + 32], log[o + 33], log[o + 34] = more, memory[mem.INDI_LIFT_ACT], passed
+    log[o + 35] = memory[mem.INDI_LIFT]
