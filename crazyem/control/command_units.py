@@ -1,0 +1,112 @@
+"""From a drone's constants to what controllers in command units believe: INDI's ctrlINDI.*, Mellinger's massThrust.
+
+PID, Mellinger and INDI command in units of the firmware's legacy mixer (powerDistributionLegacy in
+power_distribution_quadrotor.c): a unit of thrust or yaw is one of every rotor, two units of roll or pitch are. 65535
+units are the firmware's THRUST_MAX where it compensates the battery voltage (motors.c, motorsCompensateBatteryVoltage),
+else full duty.
+"""
+
+import math
+
+from crazyem.vehicle import Vehicle
+
+FULL = 65535.0  # units
+LOOP = 0.002  # s, the period of INDI's loop: ATTITUDE_RATE 500 Hz in stabilizer_types.h
+BISECTIONS = 60  # of the voltage interval: to the last bit
+
+
+def motor_volts(vehicle: Vehicle, thrust: float) -> float:
+    """Motor volts at which one rotor's thrust curve gives `thrust` [N], on the branch that rises (0 to 20 V).
+
+    Raises:
+        ValueError: the curve does not reach that thrust.
+    """
+    low, high = _lowest(vehicle), 20.0
+    if not _thrust(vehicle, low) <= thrust <= _thrust(vehicle, high):
+        raise ValueError(f"the thrust curve of {vehicle.name} does not give {thrust:.4g} N")
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _thrust(vehicle, middle) < thrust else (low, middle)
+    return 0.5 * (low + high)
+
+
+def _thrust(vehicle: Vehicle, volts: float) -> float:
+    return sum(c * volts**n for n, c in enumerate(vehicle.thrust_curve))
+
+
+def _lowest(vehicle: Vehicle) -> float:
+    """Volts from which the curve rises for good, in steps of 0.05 V."""
+    steps = [0.05 * n for n in range(401)]
+    falling = [v for v in steps if _slope(vehicle, v) <= 0.0]
+    return max(falling, default=-0.05) + 0.05
+
+
+def _slope(vehicle: Vehicle, volts: float) -> float:
+    return sum(n * c * volts ** (n - 1) for n, c in enumerate(vehicle.thrust_curve) if n)
+
+
+def thrust_per_unit(vehicle: Vehicle, *, thrust: float, volts: float) -> float:
+    """Change of one rotor's thrust with one unit of command [N], about `thrust` [N] at the battery's `volts` [V].
+
+    A firmware that compensates the voltage makes it THRUST_MAX/65535 at every voltage: the vehicle's thrust_max.
+
+    Raises:
+        ValueError: the vehicle has no finite thrust_max (compensated), or no curve that reaches the thrust.
+    """
+    if vehicle.battery_compensated:
+        if not math.isfinite(vehicle.thrust_max):
+            raise ValueError(f"the vehicle file of {vehicle.name} has no thrust_max")
+        return vehicle.thrust_max / FULL
+    return _slope(vehicle, motor_volts(vehicle, thrust)) * volts / FULL
+
+
+def effectiveness(vehicle: Vehicle, per_unit: float, inertia: tuple[float, float, float]) -> tuple[float, float, float]:
+    """ctrlINDI.g1_p, g1_q, g1_r: angular acceleration about each axis per unit of its command [rad/s^2].
+
+    Args:
+        per_unit: see `thrust_per_unit` [N]. inertia: Ixx, Iyy, Izz [kg m^2].
+    """
+    torque = unit_torque(vehicle, per_unit)
+    return torque[0] / inertia[0], torque[1] / inertia[1], torque[2] / inertia[2]
+
+
+def unit_torque(vehicle: Vehicle, per_unit: float) -> tuple[float, float, float]:
+    """Torque about x, y, z of one unit of roll, pitch, yaw command [N m]: four rotors, half a unit each but in yaw."""
+    along_x, along_y = vehicle.arm
+    return 2.0 * along_y * per_unit, 2.0 * along_x * per_unit, 4.0 * vehicle.torque_per_thrust * per_unit
+
+
+def rotor_reaction(per_unit: float, *, thrust: float, rotor_constant: float, rotor_inertia: float, izz: float) -> float:
+    """ctrlINDI.g2 [rad/s^2 a unit]: what four rotors' inertia adds to the yaw acceleration in the step of a command.
+
+    4 I_r (dW/df)(df/du) / (Izz T) with W = sqrt(f/k), T the loop's period: G2 of Smeur, Chu, de Croon 2016, eq. 12.
+
+    Args:
+        per_unit: N. thrust: of one rotor in hover [N]. rotor_constant: k [N/(rad/s)^2]. rotor_inertia: I_r of a rotor
+            with propeller [kg m^2]. izz: kg m^2.
+    """
+    speed_per_thrust = 0.5 / math.sqrt(rotor_constant * thrust)  # dW/df = 1/(2 k W)
+    return 4.0 * rotor_inertia * speed_per_thrust * per_unit / (izz * LOOP)
+
+
+def lag_share(time_constant: float) -> float:
+    """ctrlINDI.act_dyn_*: share of the way that rotors with this lag [s] go in one period of the loop; 1 without lag."""
+    return 1.0 - math.exp(-LOOP / time_constant) if time_constant > 0.0 else 1.0
+
+
+def lag_of(share: float) -> float:
+    """Inverse of `lag_share`: s; 0 for a share of 1 and more, infinite for none."""
+    if share >= 1.0:
+        return 0.0
+    return -LOOP / math.log1p(-share) if share > 0.0 else math.inf
+
+
+def mass_thrust(vehicle: Vehicle, *, force: float, volts: float) -> float:
+    """ctrlMel.massThrust: units of thrust a newton of wanted force [1/N], exact at `force` [N] of the four rotors.
+
+    Raises:
+        ValueError: as `thrust_per_unit`.
+    """
+    if vehicle.battery_compensated:
+        return 1.0 / (4.0 * thrust_per_unit(vehicle, thrust=force / 4.0, volts=volts))
+    return motor_volts(vehicle, force / 4.0) / volts * FULL / force
