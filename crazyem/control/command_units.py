@@ -90,7 +90,7 @@ def rotor_reaction(per_unit: float, *, thrust: float, rotor_constant: float, rot
 
 
 def lag_share(time_constant: float) -> float:
-    """ctrlINDI.act_dyn_*: share of the way that rotors with this lag [s] go in one period of the loop; 1 without lag."""
+    """ctrlINDI.act_dyn_*: share of the way that rotors with this lag [s] go in a period of the loop; 1 without lag."""
     return 1.0 - math.exp(-LOOP / time_constant) if time_constant > 0.0 else 1.0
 
 
