@@ -140,7 +140,9 @@ def test_every_command_is_the_plain_versions() -> None:
     seen = [log[lv.VARIABLE_INDEX[f"ctrlINDI.{name}"]] for name in names]
     expected = [plain.lift, plain.du_yaw, plain.act[2], -math.radians(20.0), plain.rate.out[1]]
     assert seen == pytest.approx(expected, rel=1e-6)
-    assert log[lv.VARIABLE_INDEX["ctrlINDI.r_yaw"]] == log[lv.VARIABLE_INDEX["ctrlINDI.r_roll"]] == rate[0]  # as the source has it
+    assert (
+        log[lv.VARIABLE_INDEX["ctrlINDI.r_yaw"]] == log[lv.VARIABLE_INDEX["ctrlINDI.r_roll"]] == rate[0]
+    )  # as the source has it
     assert log[lv.VARIABLE_INDEX["posCtrlIndi.T_incremented"]] == pytest.approx(plain.lift, rel=1e-6)
 
 
