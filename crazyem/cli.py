@@ -65,7 +65,7 @@ def parser() -> argparse.ArgumentParser:
 
     fly = common("fly", "fly a drone, or a simulated firmware, and push what is learnt")
     fly.add_argument("uri", nargs="?", metavar="URI", help="the drone; without it firmware_sim is started")
-    fly.add_argument("--controller", choices=("lee", "lqg"), default="lee")
+    fly.add_argument("--controller", choices=("lee", "mellinger", "indi", "lqg"), default="lee")
     fly.add_argument(
         "--trajectory", nargs="+", default=["hover"], metavar="NAME", help="hover, figure8, excite, or waypoints FILE"
     )

@@ -8,7 +8,8 @@ else full duty.
 
 import math
 
-from crazyem.vehicle import Vehicle
+from crazyem.physics.effects.rotor_inertia import TYPICAL_ROTOR_CONSTANT
+from crazyem.vehicle import GRAVITY, Vehicle
 
 FULL = 65535.0  # units
 LOOP = 0.002  # s, the period of INDI's loop: ATTITUDE_RATE 500 Hz in stabilizer_types.h
@@ -110,3 +111,26 @@ def mass_thrust(vehicle: Vehicle, *, force: float, volts: float) -> float:
     if vehicle.battery_compensated:
         return 1.0 / (4.0 * thrust_per_unit(vehicle, thrust=force / 4.0, volts=volts))
     return motor_volts(vehicle, force / 4.0) / volts * FULL / force
+
+
+def effectiveness_torque(vehicle: Vehicle) -> tuple[float, float, float]:
+    """Torque about x, y, z of one unit of command [N m], at every voltage: g1 times the inertia.
+
+    Raises:
+        ValueError: the vehicle has no rotors or thrust_max, or its firmware does not compensate the battery voltage, so
+            that this would change with the voltage (`thrust_per_unit` and `unit_torque` have it at one voltage).
+    """
+    if not vehicle.battery_compensated:
+        raise ValueError(f"commands of {vehicle.name} are not compensated for the battery voltage")
+    torque = unit_torque(vehicle, thrust_per_unit(vehicle, thrust=0.0, volts=0.0))
+    if not min(torque) > 0.0:
+        raise ValueError(f"the vehicle file of {vehicle.name} has no arm or no torque_per_thrust")
+    return torque
+
+
+def rotor_reaction_factor(vehicle: Vehicle, rotor_inertia: float) -> float:
+    """g2 times Izz [N m a unit] in hover, for rotors of `rotor_inertia` [kg m^2]; see `rotor_reaction`."""
+    constant = vehicle.rotor_constant or TYPICAL_ROTOR_CONSTANT
+    per_unit = thrust_per_unit(vehicle, thrust=0.0, volts=0.0)
+    thrust = vehicle.mass * GRAVITY / 4.0
+    return rotor_reaction(per_unit, thrust=thrust, rotor_constant=constant, rotor_inertia=rotor_inertia, izz=1.0)

@@ -1,10 +1,12 @@
-"""What each firmware controller believes about the drone, and the parameter writes that tell it better."""
+"""What each firmware controller believes about the drone, and the parameter writes that tell it better, in order."""
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from crazyem.errors import UsageError
+from crazyem.live.beliefs import INERTIA_NAMES, Belief, Slot, drag_beliefs, indi_beliefs, mass_thrust_belief
+from crazyem.vehicle import Vehicle
 
 AXES = ("x", "y", "z")
 
@@ -20,8 +22,11 @@ class Controller:
         inertia: parameters that hold the believed principal inertia [kg m^2], empty if it takes none.
         attitude_gains: for each axis, (proportional, derivative) gain parameters in absolute N m/rad and N m s/rad
             that have to be scaled with the inertia, empty if gains are per unit of inertia already.
+        others: what it believes besides, or the onboard filter does.
         wrench: log group of its commanded thrust and torque, "" if it logs none in SI units.
         note: what a user has to know about pushing to it.
+        known: estimates that the vehicle file gives rather than the flight, such as mass_thrust [1/N].
+        incremental: whether it believes control effectiveness: the loop gain itself (INDI).
     """
 
     name: str
@@ -29,20 +34,26 @@ class Controller:
     mass: str = ""
     inertia: tuple[str, ...] = ()
     attitude_gains: tuple[tuple[str, str], ...] = ()
+    others: tuple[Belief, ...] = ()
     wrench: str = ""
     note: str = ""
+    known: tuple[tuple[str, float], ...] = ()
+    incremental: bool = False
     mass_scale: float = 1.0  # kg a unit of the mass parameter, where that is not a mass (see crazyem.live.hover_thrust)
     persistent: bool = False  # whether parameters outlive a restart of the firmware
 
-    def scale(self, parameter: str) -> float:
-        """SI units of the estimate in a unit of a parameter."""
-        return self.mass_scale if parameter == self.mass else 1.0
+    @property
+    def beliefs(self) -> tuple[Belief, ...]:
+        """Everything it believes."""
+        mass = (Belief("mass", (Slot(self.mass, scale=self.mass_scale),)),) if self.mass else ()
+        inertia = tuple(Belief(name, (Slot(p),)) for name, p in zip(INERTIA_NAMES, self.inertia))
+        return (*mass, *inertia, *self.others)
 
     @property
     def parameters(self) -> tuple[str, ...]:
         """Every parameter a push may write; their values at connect are the reference for scaling."""
-        gains = tuple(g for pair in self.attitude_gains for g in pair)
-        return ((self.mass,) if self.mass else ()) + self.inertia + gains
+        held = tuple(slot.parameter for belief in self.beliefs for slot in belief.slots)
+        return held + tuple(g for pair in self.attitude_gains for g in pair)
 
 
 # ctrlLee.J_* enters only the small term omega x J omega, the attitude gains are absolute torques: without scaling the
@@ -56,14 +67,33 @@ LEE = Controller(
     wrench="ctrlLee",
 )
 LQG = Controller("lqg", 6, mass="ctrlLqg.mass", inertia=tuple(f"ctrlLqg.J_{a}" for a in AXES), wrench="ctrlLqg")
-MELLINGER = Controller(
-    "mellinger",
-    2,
-    mass="ctrlMel.mass",
-    note="the Mellinger controller takes a mass but no inertia, and its mass is one only if ctrlMel.massThrust fits",
-)
-CONTROLLERS = {c.number: c for c in (LEE, LQG, MELLINGER)}
+MELLINGER = Controller("mellinger", 2, mass="ctrlMel.mass")
+INDI = Controller("indi", 3, incremental=True)
+CONTROLLERS = {c.number: c for c in (LEE, LQG, MELLINGER, INDI)}
 CONTROLLER_NAMES = {0: "auto", 1: "PID", 2: "Mellinger", 3: "INDI", 4: "Brescianini", 5: "Lee", 6: "LQG"}
+
+
+def for_vehicle(controller: Controller, vehicle: Vehicle) -> Controller | str:
+    """The controller with what it can be told of this vehicle, or one clause why it can be told nothing."""
+    if controller.number == INDI.number:
+        try:
+            return replace(controller, others=indi_beliefs(vehicle))
+        except ValueError as error:
+            return f"{error}: the control effectiveness of INDI is not known"
+    if controller.number == MELLINGER.number:
+        try:
+            belief, value = mass_thrust_belief(vehicle)
+        except ValueError as error:
+            return replace(
+                controller, note=f"{error}: ctrlMel.massThrust is left alone, and ctrlMel.mass goes with it."
+            )
+        return replace(controller, others=(belief,), known=((belief.name, value),))
+    return controller
+
+
+def with_drag(controller: Controller) -> Controller:
+    """The controller and the onboard filter's drag beside it."""
+    return replace(controller, others=controller.others + drag_beliefs())
 
 
 def controller_named(name: str) -> Controller:
@@ -75,15 +105,22 @@ def controller_named(name: str) -> Controller:
     for c in CONTROLLERS.values():
         if c.name == name:
             return c
-    raise UsageError(f"unknown controller '{name}' (choose lee or lqg).")
+    raise UsageError(f"unknown controller '{name}' (choose {', '.join(c.name for c in CONTROLLERS.values())}).")
+
+
+# What Lee, LQG, Mellinger or INDI could be told, for a controller that takes nothing.
+_SWITCHING = "Lee takes mass and inertia, Mellinger mass and thrust scale, INDI control effectiveness and rotor lag"
 
 
 def without_target(number: int) -> str:
-    """One sentence for a controller that takes no mass."""
-    return (
-        f"the {CONTROLLER_NAMES.get(number, f'number {number}')} controller takes no mass or inertia: "
-        "estimates are not pushed (select Lee, LQG or Mellinger)."
-    )
+    """One sentence for a controller that takes nothing."""
+    name = CONTROLLER_NAMES.get(number, f"number {number}")
+    why = "takes no mass or inertia"
+    if number == 1:
+        why = "takes no mass or inertia, only gains"
+    elif number == 4:
+        why = "has mass and inertia compiled in"
+    return f"the {name} controller {why}: estimates are not pushed to it ({_SWITCHING})."
 
 
 def writes_for(
@@ -100,18 +137,15 @@ def writes_for(
     so that a half-done set is never less damped than either end.
 
     Args:
-        changed: mass [kg], Ixx, Iyy, Izz [kg m^2] that are to change.
-        beliefs: all four as the controller believes them now.
+        changed: estimates [SI] that are to change: mass, Ixx, Iyy, Izz, ...
+        beliefs: all of the controller's as it believes them now.
         originals: parameter values at connect.
     """
     now = {**beliefs, **changed}
-    writes: list[tuple[str, float]] = []
-    if "mass" in changed and controller.mass:
-        writes.append((controller.mass, changed["mass"] / controller.mass_scale))
-    for name, parameter in zip(("Ixx", "Iyy", "Izz"), controller.inertia):
-        if name in changed:
-            writes.append((parameter, changed[name]))
-    if not controller.attitude_gains:
+    held = {p: v for b in controller.beliefs for p, v in b.writes(beliefs[b.name])}
+    target = {p: v for b in controller.beliefs if b.name in changed for p, v in b.writes(changed[b.name])}
+    writes = [(name, target[name]) for name in _ordered(controller, target, held)]
+    if not controller.attitude_gains or not set(INERTIA_NAMES) & set(changed):
         return tuple(writes)
     jx, jy, jz = (originals[p] for p in controller.inertia)
     tilt = (now["Ixx"] + now["Iyy"]) / (jx + jy)
@@ -151,9 +185,38 @@ def writes_back(
         value = now.get(name, math.nan)
         return name in target and (name in uncertain or not math.isclose(value, target[name], rel_tol=EQUAL_WITHIN))
 
-    names = [n for n in ((controller.mass,) if controller.mass else ()) + controller.inertia if differs(n)]
+    held = [slot.parameter for belief in controller.beliefs for slot in belief.slots]
+    wanted = {n: target[n] for n in held if differs(n)}
+    names = _ordered(controller, wanted, now)
     for stiffness, damping in controller.attitude_gains:
         rising = now.get(stiffness, math.nan) <= target.get(stiffness, math.nan)
         pair = (damping, stiffness) if rising else (stiffness, damping)
         names += [n for n in pair if differs(n)]
     return tuple((n, target[n]) for n in names)
+
+
+def _ordered(controller: Controller, target: Mapping[str, float], now: Mapping[str, float]) -> list[str]:
+    """Names of `target` in an order in which every state on the way is safe; attitude gains have their own.
+
+    INDI: first what makes a loop slower (act_dyn that falls), then g1 that rises and g2, then g1 that falls, and last
+    what makes a loop faster. Mellinger: of mass and massThrust first the one after which their product, the thrust, is
+    nearer to the thrust in the end.
+    """
+    names = list(target)
+    if controller.incremental:
+        return sorted(names, key=lambda n: _caution(n, rising=not target[n] < now.get(n, math.nan)))
+    if controller.number == MELLINGER.number and {"ctrlMel.mass", "ctrlMel.massThrust"} <= set(names):
+        errors = {n: abs(math.log(now[n] / target[n])) if now.get(n, 0.0) > 0.0 else math.inf for n in names[:2]}
+        names[:2] = sorted(names[:2], key=lambda n: -errors[n])
+    return names
+
+
+def _caution(name: str, *, rising: bool) -> int:
+    """Place of a parameter of INDI in the order of writes; g2 moves while g1_r is the larger of its two values."""
+    if "act_dyn" in name:
+        return 5 if rising else 0
+    if name.endswith(".g2"):
+        return 2 if rising else 3
+    if ".g1_" in name:
+        return 1 if rising else 4
+    return 6  # of the filter

@@ -3,15 +3,20 @@
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
-from crazyem.estimation.result import Estimate, Step
+from crazyem.estimation.result import Estimate, ParameterEstimate, Step
+from crazyem.live.beliefs import DRAG_NAMES, INERTIA_NAMES
 from crazyem.live.controllers import Controller, writes_for
 
-INERTIA_NAMES = ("Ixx", "Iyy", "Izz")
 # After a change of mass its new value has to agree for this share of the agreement time, and may follow the last write
 # after this share of the interval: what is known is that the old value is wrong.
 STEP_SHARE = 0.4
+WRITABLE_ESTIMATES = ("mass", *INERTIA_NAMES, "motor_time_constant", "mass_thrust", *DRAG_NAMES)
+# Which limits hold for an estimate, by the first part of their names.
+LIMITS_OF = {"mass": "mass", "motor_time_constant": "lag", "mass_thrust": "mass_thrust"}
+LIMITS_OF |= dict.fromkeys(INERTIA_NAMES, "inertia") | dict.fromkeys(DRAG_NAMES, "drag")
 LARGEST_STEP = 0.25  # relative change of mass that one write may follow at once
 STEP_RECENT = 5.0  # s for which that holds, or until the new mass is written
 
@@ -21,19 +26,22 @@ class Limits:
     """What the guard asks of an estimate before it reaches a controller.
 
     Attributes:
-        parameters: which of mass, Ixx, Iyy, Izz may be written at all.
-        mass_bounds, inertia_bounds: allowed range as multiples of the vehicle's nominal value.
-        mass_absolute, inertia_absolute: allowed range in kg and kg m^2, whatever the vehicle file says.
-        mass_half_width, inertia_half_width: largest 95 % half width, relative to the value.
-        mass_agreement, inertia_agreement: largest spread (max - min over value) within `agreement_time`.
+        parameters: which of `WRITABLE_ESTIMATES` may be written at all.
+        ..._bounds: allowed range as multiples of the vehicle's nominal value.
+        ..._absolute: allowed range in SI units, whatever the vehicle file says.
+        ..._half_width: largest 95 % half width, relative to the value.
+        ..._agreement: largest spread (max - min over value) within `agreement_time`.
+        ..._deadband: relative changes smaller than this are not worth a write.
+        effectiveness_slew, effectiveness_unjudged, effectiveness_bounds: what stands for an incremental controller's
+            inertia and lag instead of `slew`, `unjudged` and `inertia_bounds`.
+        drag_slew: largest change of drag over mass in one write, 1/s.
         agreement_time: s over which estimates have to agree, all of them acceptable.
         slew: largest relative change in one write; a step of mass adds itself, up to `LARGEST_STEP`.
         unjudged: largest relative change from what was last judged good.
         interval: s between writes.
-        mass_deadband, inertia_deadband: relative changes smaller than this are not worth a write.
     """
 
-    parameters: tuple[str, ...] = ("mass", *INERTIA_NAMES)
+    parameters: tuple[str, ...] = WRITABLE_ESTIMATES
     mass_bounds: tuple[float, float] = (0.5, 2.0)
     inertia_bounds: tuple[float, float] = (0.33, 3.0)
     mass_absolute: tuple[float, float] = (0.010, 0.250)
@@ -48,20 +56,42 @@ class Limits:
     interval: float = 0.5
     mass_deadband: float = 0.002
     inertia_deadband: float = 0.03
+    lag_bounds: tuple[float, float] = (0.33, 3.0)
+    lag_absolute: tuple[float, float] = (0.005, 0.2)
+    lag_half_width: float = 0.20
+    lag_agreement: float = 0.15
+    lag_deadband: float = 0.10
+    mass_thrust_bounds: tuple[float, float] = (0.99, 1.01)
+    mass_thrust_absolute: tuple[float, float] = (1e4, 1e6)
+    mass_thrust_half_width: float = 0.05
+    mass_thrust_agreement: float = 0.02
+    mass_thrust_deadband: float = 0.005
+    drag_bounds: tuple[float, float] = (0.0, math.inf)
+    drag_absolute: tuple[float, float] = (0.02, 1.5)
+    drag_half_width: float = 0.30
+    drag_agreement: float = 0.15
+    drag_deadband: float = 0.10
+    drag_slew: float = 0.25
+    effectiveness_bounds: tuple[float, float] = (0.5, 2.0)
+    effectiveness_slew: float = 0.35
+    effectiveness_unjudged: float = 0.50
 
-    def of(self, name: str, kind: str) -> float:
-        """A scalar limit for a parameter."""
-        return float(getattr(self, f"{'mass' if name == 'mass' else 'inertia'}_{kind}"))
-
-    def bounds(self, name: str) -> tuple[float, float]:
-        """Allowed multiples of nominal for a parameter."""
-        return self.mass_bounds if name == "mass" else self.inertia_bounds
+    def of(self, name: str, kind: str) -> Any:
+        """A limit for an estimate: bounds, absolute, half_width, agreement or deadband."""
+        return getattr(self, f"{LIMITS_OF[name]}_{kind}")
 
     def allowed(self, name: str, nominal: float) -> tuple[float, float]:
-        """Allowed range [SI] of a parameter whose nominal value is `nominal`: both kinds of bounds hold."""
-        low, high = (b * nominal for b in self.bounds(name))
-        least, most = self.mass_absolute if name == "mass" else self.inertia_absolute
+        """Allowed range [SI] of an estimate whose nominal value is `nominal`: both kinds of bounds hold.
+
+        Where nothing is nominal (a vehicle without lag, drag) the absolute ones alone.
+        """
+        least, most = self.of(name, "absolute")
+        low, high = (b * nominal for b in self.of(name, "bounds")) if nominal > 0.0 else (least, most)
         return max(low, least), min(high, most)
+
+    def for_incremental(self) -> "Limits":
+        """The limits for a controller that believes control effectiveness."""
+        return replace(self, inertia_bounds=self.effectiveness_bounds)
 
 
 @dataclass(frozen=True)
@@ -98,7 +128,7 @@ class Guard:
 
     Args:
         controller: where the values go.
-        nominal: mass [kg], Ixx, Iyy, Izz [kg m^2] of the vehicle file, the centre of the allowed range.
+        nominal: mass [kg], Ixx, Iyy, Izz [kg m^2], ... of the vehicle file, the centre of the allowed range.
         originals: the controller's parameter values at connect.
         limits: see `Limits`.
     """
@@ -115,6 +145,8 @@ class Guard:
         self.nominal = dict(nominal)
         self.originals = dict(originals)
         self.limits = limits or Limits()
+        if controller.incremental:
+            self.limits = self.limits.for_incremental()
         self.stopped = ""
         self.beliefs = self._beliefs()
         self._history: deque[tuple[float, dict[str, float], dict[str, str]]] = deque()
@@ -125,9 +157,7 @@ class Guard:
         self._trusted = dict(self.beliefs)  # what the controller believed when it was last judged
 
     def _beliefs(self) -> dict[str, float]:
-        parameters = ((self.controller.mass,) if self.controller.mass else ()) + self.controller.inertia
-        names = (("mass",) if self.controller.mass else ()) + (INERTIA_NAMES if self.controller.inertia else ())
-        return {n: self.originals[p] * self.controller.scale(p) for n, p in zip(names, parameters)}
+        return {belief.name: belief.read(self.originals) for belief in self.controller.beliefs}
 
     def withdraw(self) -> None:
         """The newest decision was not carried out: the controller still believes what it did before."""
@@ -189,11 +219,11 @@ class Guard:
             if name not in self.limits.parameters:
                 reasons[name] = "not to be pushed by this policy"
             if not reasons[name]:
-                value = self._slewed(name, estimate[name].value, recent)
+                value = self._slewed(name, self._found(estimate, name).value, recent)
                 if self.beliefs[name] > 0 and abs(value / self.beliefs[name] - 1) < self.limits.of(name, "deadband"):
                     reasons[name] = "a change as large as this waits until the last one was judged"
                     continue
-                low, high = self.limits.allowed(name, self.nominal[name])
+                low, high = self.limits.allowed(name, self.nominal.get(name, 0.0))
                 if low <= value <= high:
                     changed[name] = value
                 else:  # one step from what it believes now still leads outside
@@ -215,21 +245,32 @@ class Guard:
         return Decision(time, writes=writes, reason=reasons)
 
     def _remember(self, estimate: Estimate, time: float) -> None:
-        values = {n: estimate[n].value for n in self.beliefs}
+        values = {n: self._found(estimate, n).value for n in self.beliefs}
         faults = {n: self._fault(estimate, n) for n in self.beliefs}
         self._history.append((time, values, faults))
         # One entry older than the span stays, so that the span is really covered.
         while len(self._history) > 2 and self._history[1][0] <= time - self.limits.agreement_time:
             self._history.popleft()
 
+    def _found(self, estimate: Estimate, name: str) -> ParameterEstimate:
+        """What is known of an estimate: by the flight, or by the vehicle file once the flight has shown the mass."""
+        p = estimate.parameters.get(name)
+        if p is not None:
+            return p
+        known = dict(self.controller.known).get(name)
+        if known is None:
+            return ParameterEstimate(math.nan, math.inf, (math.nan, math.nan), "", False, "not estimated")
+        mass = estimate["mass"]
+        return ParameterEstimate(known, 0.0, (known, known), "", mass.identifiable, mass.reason)
+
     def _fault(self, estimate: Estimate, name: str) -> str:
-        p = estimate[name]
+        p = self._found(estimate, name)
         low, high = p.ci95
         if not p.identifiable:
             return p.reason or "not identifiable"
         if not (low <= p.value <= high) or not p.value > 0:  # also catches NaN
             return "no valid value"
-        lo, hi = self.limits.allowed(name, self.nominal[name])
+        lo, hi = self.limits.allowed(name, self.nominal.get(name, 0.0))
         if not lo <= p.value <= hi:
             return f"{p.value:.4g} {p.unit} is outside [{lo:.4g}, {hi:.4g}]"
         half = max(high - p.value, p.value - low) / p.value
@@ -264,7 +305,11 @@ class Guard:
         return ""
 
     def _slewed(self, name: str, value: float, step: Step | None) -> float:
-        now, slew = self.beliefs[name], self.limits.slew
+        now, slew, unjudged = self.beliefs[name], self.limits.slew, self.limits.unjudged
+        if name in DRAG_NAMES:
+            return min(max(value, now - self.limits.drag_slew), now + self.limits.drag_slew)
+        if self.controller.incremental:
+            slew, unjudged = self.limits.effectiveness_slew, self.limits.effectiveness_unjudged
         if name == "mass" and step is not None and step.after is not None:
             slew += min(abs(step.after / step.before - 1), LARGEST_STEP)
         if not now > 0:
@@ -272,5 +317,5 @@ class Guard:
         low, high = now * (1 - slew), now * (1 + slew)
         trusted = self._trusted[name]
         if self.capped and trusted > 0:
-            low, high = max(low, trusted * (1 - self.limits.unjudged)), min(high, trusted * (1 + self.limits.unjudged))
+            low, high = max(low, trusted * (1 - unjudged)), min(high, trusted * (1 + unjudged))
         return min(max(value, low), high)

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.live.guard import INERTIA_NAMES, Limits
+from crazyem.live.guard import WRITABLE_ESTIMATES, Limits
 
 LARGEST_POLICY_FILE = 65536  # bytes
-WRITABLE_PARAMETERS = ("mass", *INERTIA_NAMES)
 END_RULES = ("keep", "good", "restore")
 
 
@@ -44,6 +43,7 @@ class MonitorLimits:
         tracking_ratio, tracking, tracking_alarm: position error, relative to before, and over it [m].
         innovation_ratio, innovation: normalised innovation, relative to before, and at least (standard deviations).
         oscillation_ratio, oscillation, oscillation_alarm: fast part of the body rates, relative, and over it [rad/s].
+        incremental_oscillation: the same as `oscillation` [rad/s] after writes of control effectiveness, a loop gain.
         tilt_alarm: rad.
     """
 
@@ -60,6 +60,7 @@ class MonitorLimits:
     oscillation_ratio: float = 2.5
     oscillation: float = 1.5
     oscillation_alarm: float = 8.0
+    incremental_oscillation: float = 0.5
     tilt_alarm: float = math.radians(75.0)
 
 
@@ -160,11 +161,11 @@ def _read_flag(value: Any) -> bool:
 
 
 def _read_names(value: Any) -> tuple[str, ...]:
-    if not isinstance(value, list) or not all(isinstance(v, str) and v in WRITABLE_PARAMETERS for v in value):
-        raise ValueError(f"a list of {', '.join(WRITABLE_PARAMETERS)}")
+    if not isinstance(value, list) or not all(isinstance(v, str) and v in WRITABLE_ESTIMATES for v in value):
+        raise ValueError(f"a list of {', '.join(WRITABLE_ESTIMATES)}")
     if ("Ixx" in value) != ("Iyy" in value):
         raise ValueError("without Ixx or with Iyy, too: roll and pitch share their scale of gains")
-    return tuple(n for n in WRITABLE_PARAMETERS if n in value)
+    return tuple(n for n in WRITABLE_ESTIMATES if n in value)
 
 
 def _read_end(value: Any) -> str:
@@ -194,6 +195,22 @@ _POLICY_KEYS: tuple[tuple[str, str, str, str, _Kind], ...] = (
     ("inertia", "half_width", "limits", "inertia_half_width", _SHARE),
     ("inertia", "agreement", "limits", "inertia_agreement", _SHARE),
     ("inertia", "deadband", "limits", "inertia_deadband", _SHARE),
+    ("lag", "bounds_s", "limits", "lag_absolute", _range(1e-4, 1.0)),
+    ("lag", "bounds_relative", "limits", "lag_bounds", _range(0.05, 20.0)),
+    ("lag", "half_width", "limits", "lag_half_width", _SHARE),
+    ("lag", "agreement", "limits", "lag_agreement", _SHARE),
+    ("lag", "deadband", "limits", "lag_deadband", _SHARE),
+    ("effectiveness", "bounds_relative", "limits", "effectiveness_bounds", _range(0.05, 20.0)),
+    ("effectiveness", "slew", "limits", "effectiveness_slew", _number(0.001, 0.5)),
+    ("effectiveness", "unjudged_change", "limits", "effectiveness_unjudged", _SHARE),
+    ("effectiveness", "oscillation_rad_s", "watch", "incremental_oscillation", _number(0.0, 100.0)),
+    ("mass_thrust", "bounds_per_N", "limits", "mass_thrust_absolute", _range(1e3, 1e7)),
+    ("mass_thrust", "deadband", "limits", "mass_thrust_deadband", _SHARE),
+    ("drag", "bounds_per_s", "limits", "drag_absolute", _range(0.0, 100.0)),
+    ("drag", "slew_per_s", "limits", "drag_slew", _number(0.001, 10.0)),
+    ("drag", "half_width", "limits", "drag_half_width", _SHARE),
+    ("drag", "agreement", "limits", "drag_agreement", _SHARE),
+    ("drag", "deadband", "limits", "drag_deadband", _SHARE),
     ("health", "supervisor", "health", "supervisor", _FLAG),
     ("health", "battery_V", "health", "battery", _number(0.0, 100.0)),
     ("health", "tilt_deg", "health", "tilt", _number(1.0, 180.0, scale=_DEGREE)),

@@ -11,11 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 
 from crazyem.errors import CrazyemError
 from crazyem.links.base import Link, ParameterWrite
-from crazyem.live.controllers import CONTROLLERS, Controller, without_target, writes_back
+from crazyem.live.controllers import CONTROLLERS, Controller, for_vehicle, with_drag, without_target, writes_back
 from crazyem.live.guard import Decision, Guard
 from crazyem.live.history import History, Push
 from crazyem.live.write_gate import WriteGate
+from crazyem.vehicle import Vehicle
 
+ONBOARD_DRAG = ("kalman.dragB_x", "kalman.dragB_y")
 WRITE_TIMEOUT = 0.3  # s; an echo takes 2 to 30 ms on a working link, and the link does not send again so soon
 RETRY_PAUSE = 0.1  # s before the next attempt: a link that refuses at once is known as lost a little later
 WRITE_ATTEMPTS = 9  # of a write, 3.6 s in all: an outage is noticed within 2 s, and attempts during it do not count
@@ -27,12 +29,17 @@ def running_controller(link: Link) -> int:
     return int(link.read_parameter("stabilizer.controller"))
 
 
-def push_target(link: Link) -> tuple[Controller | None, str]:
+def push_target(link: Link, vehicle: Vehicle) -> tuple[Controller | None, str]:
     """Where estimates can be pushed to on this drone now, or None and one sentence why not."""
     number = running_controller(link)
-    controller = CONTROLLERS.get(number)
-    if controller is None:
+    plain = CONTROLLERS.get(number)
+    if plain is None:
         return None, without_target(number)
+    controller = for_vehicle(plain, vehicle)
+    if isinstance(controller, str):
+        return None, f"{controller}, estimates are not pushed."
+    if set(ONBOARD_DRAG) <= set(link.parameters):
+        controller = with_drag(controller)
     missing = [p for p in controller.parameters if p not in link.parameters]
     if missing:
         return None, f"the drone has no parameter {missing[0]}: estimates are not pushed."
@@ -42,6 +49,12 @@ def push_target(link: Link) -> tuple[Controller | None, str]:
 def read_originals(link: Link, controller: Controller) -> dict[str, float]:
     """The values of every parameter a push may write, as the drone has them now."""
     return {name: link.read_parameter(name) for name in controller.parameters}
+
+
+def nominal_estimates(vehicle: Vehicle, controller: Controller) -> dict[str, float]:
+    """What the vehicle file says of everything that may be pushed [SI]: the centre of the allowed ranges."""
+    values = (vehicle.mass, *vehicle.inertia, vehicle.motor_time_constant)
+    return dict(zip(("mass", "Ixx", "Iyy", "Izz", "motor_time_constant"), values)) | dict(controller.known)
 
 
 class Pusher:

@@ -34,7 +34,7 @@ from crazyem.live.history import History
 from crazyem.live.hover_thrust import hover_rules, hover_target
 from crazyem.live.pipeline import Estimator, Pipeline, residual_of
 from crazyem.live.policy import load_policy
-from crazyem.live.push import Pusher, push_target, read_originals
+from crazyem.live.push import Pusher, nominal_estimates, push_target, read_originals
 from crazyem.live.recorder import FrameRecorder, Recorder
 from crazyem.live.scheduler import Mailbox, Scheduler
 from crazyem.live.telemetry import Telemetry
@@ -155,11 +155,11 @@ class Session:
             controller, note = hover_target(self.link, self.vehicle)
             rules = hover_rules(rules, self.link, controller)
         else:
-            controller, note = push_target(self.link)
+            controller, note = push_target(self.link, self.vehicle)
         self.history.notice(note)
         if controller is None:
             return note
-        nominal = dict(zip(("mass", "Ixx", "Iyy", "Izz"), (self.vehicle.mass, *self.vehicle.inertia)))
+        nominal = nominal_estimates(self.vehicle, controller)
         originals = read_originals(self.link, controller)
         guard = Guard(controller, nominal=nominal, originals=originals, limits=rules.policy.limits)
         on_write = None

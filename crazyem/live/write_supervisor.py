@@ -8,10 +8,11 @@ import math
 import re
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+from crazyem.estimation.drag import DragRegression
 from crazyem.estimation.result import Estimate, Step
 from crazyem.live.controllers import EQUAL_WITHIN, writes_back
 from crazyem.live.guard import Decision, Guard
@@ -83,7 +84,11 @@ class WriteSupervisor:
         self.originals, self.good = dict(originals), dict(originals)
         self.history, self.now, self.record = history, now, record
         self.gate = gate
-        self.watch = PostWriteMonitor(rules.policy.watch)
+        limits = rules.policy.watch
+        if guard.controller.incremental:
+            limits = replace(limits, oscillation=limits.incremental_oscillation)
+        self.watch = PostWriteMonitor(limits)
+        self.drag = DragRegression()
         guard.capped = rules.policy.watch.enabled and not rules.dry_run
         self.pusher: Pusher | None = None
         self._residual, self._enabled = residual, enabled
@@ -101,11 +106,14 @@ class WriteSupervisor:
         history.guard = {"mode": rules.mode, "policy": rules.policy.name, "decisions": self.entries}
         record(f"guard: {rules.mode}, policy {rules.policy.name}")
 
-    def take(self, samples: Iterable[Sample]) -> None:
+    def take(self, samples: Sequence[Sample]) -> None:
         """Samples of the flight as they arrive; takes back what made it worse."""
         for sample in samples:
             self.gate.take(sample)
             self.watch.take(sample)
+        with self._lock:
+            for sample in samples:
+                self.drag.feed(sample, airborne=self._airborne)
         newest = self.watch.newest
         if self.watch.judging and newest - self._monitor_time >= MONITOR_PERIOD:
             self._monitor_time = newest
@@ -116,6 +124,8 @@ class WriteSupervisor:
         """What to write after this estimate; see `Guard.consider`."""
         self._innovations()
         self._airborne = airborne
+        with self._lock:
+            estimate = replace(estimate, parameters={**estimate.parameters, **self.drag.estimates()})
         decision = self.guard.consider(estimate, time, airborne=airborne, enabled=enabled, objection=self._hold(time))
         if self.guard.stopped and self.guard.stopped != self._reported_stop:
             self._reported_stop = self.guard.stopped
