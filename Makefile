@@ -15,7 +15,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no
 
 $(FLIES): pyproject.toml  # what a flight needs; modules are compiled when they are imported
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) .
+	$(INSTALL) '.[plots,live]'
 	touch $(FLIES)
 
 $(READY): $(FLIES)  # and what developers need

@@ -1,13 +1,15 @@
 """Optional dependencies: which extra of the package installs a module, and one sentence where the module is missing."""
 
 import importlib
+import importlib.util
+import sys
 from types import ModuleType
 
-from crazyem.errors import CrazyemError
+from crazyem.errors import UsageError
 
 # extra of pyproject.toml -> modules that come with it; a test compares the two
 EXTRAS: dict[str, tuple[str, ...]] = {
-    "formats": ("rosbags", "pyulog", "pyarrow"),
+    "formats": ("rosbags", "pyulog"),
     "plots": ("matplotlib", "jinja2"),
     "live": ("rich", "foxglove"),
     "cluster": ("distributed",),
@@ -15,8 +17,13 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 }
 
 
-class MissingExtraError(CrazyemError):
+class MissingExtraError(UsageError):
     """A library is not installed that an optional part of the package needs; the message has the pip line."""
+
+
+def installed(module: str) -> bool:
+    """Whether a library can be imported, without importing it."""
+    return sys.modules.get(module, "") is not None and importlib.util.find_spec(module) is not None
 
 
 def require(module: str, purpose: str) -> ModuleType:
@@ -37,5 +44,5 @@ def require(module: str, purpose: str) -> ModuleType:
         if (error.name or "").partition(".")[0] != top:
             raise  # the library is there, and lacks something of its own
         raise MissingExtraError(
-            f'{purpose} needs {top}, which is not installed: pip install "crazyem[{extra}]".'
+            f"{purpose} needs {top}, which is not installed: pip install 'crazyem[{extra}]'."
         ) from None

@@ -1,7 +1,6 @@
 """One function over many files: in this process, in processes of this machine, or on a Dask cluster."""
 
 import contextlib
-import importlib
 import os
 import warnings
 from collections import deque
@@ -11,6 +10,7 @@ from typing import Any
 from crazyem.commands.output import Progress, Result
 from crazyem.commands.workers import shared
 from crazyem.errors import CrazyemError, LinkError, UsageError
+from crazyem.extras import require
 
 CONNECT_SECONDS = 10.0  # to a scheduler, and for its first worker
 
@@ -82,10 +82,7 @@ def _on_cluster(calls: list[Any], address: str, stack: contextlib.ExitStack) -> 
 
 
 def _connect(address: str, stack: contextlib.ExitStack) -> Any:
-    try:
-        distributed = importlib.import_module("distributed")
-    except ImportError:
-        raise UsageError("--cluster needs Dask: pip install 'crazyem[cluster]', here and on its workers.") from None
+    distributed = require("distributed", "--cluster")
     if "://" not in address:
         address = f"tcp://{address}"
     try:

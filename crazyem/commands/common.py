@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from crazyem.extras import MissingExtraError, require
 from crazyem.live.flight_result import FlightResult
 from crazyem.live.history import History
 from crazyem.live.summary import live_line, write_json
@@ -52,11 +53,21 @@ def say_steps(history: History, told: int, *, prefix: str = "") -> int:
 
 
 def plot_path(arguments: argparse.Namespace, *others: str | None) -> str | None:
-    """--plot, or a PNG beside the recording or the summary; None where no file was asked for."""
+    """--plot, or a PNG beside the recording or the summary; None where no file was asked for, or nothing can draw.
+
+    Raises:
+        MissingExtraError: --plot without matplotlib.
+    """
     if arguments.plot:
+        require("matplotlib", "--plot")
         return str(arguments.plot)
     for other in others:
         if other and other != "-" and Path(other).name:
+            try:
+                require("matplotlib", "The summary plot")
+            except MissingExtraError as error:
+                say(str(error))
+                return None
             name = Path(other).name
             for suffix in (".csv.gz", ".csv", ".mcap", ".json"):
                 name = name.removesuffix(suffix)

@@ -9,6 +9,7 @@ from typing import Any
 
 from crazyem.commands.common import LiveLine, say
 from crazyem.errors import UsageError
+from crazyem.extras import installed, require
 from crazyem.live.flight import Interrupts
 from crazyem.live.recorder import Recorder
 
@@ -19,18 +20,19 @@ def wants_view(arguments: argparse.Namespace) -> bool:
     It is drawn on standard error, so that a summary may go to a file. --confirm asks its question on plain lines.
 
     Raises:
-        UsageError: --live without a terminal, or with --confirm.
+        UsageError: --live without a terminal, or with --confirm. MissingExtraError: --live without rich.
     """
     if arguments.no_live:
         return False
     drawable = _terminal(sys.stderr) and os.environ.get("TERM") != "dumb"  # a terminal that cannot move its cursor
     if arguments.live:
+        require("rich", "--live")
         if not drawable:
             raise UsageError("--live needs a terminal: leave it out, and plain lines are printed.")
         if getattr(arguments, "confirm", False):
             raise UsageError("--confirm asks its question on plain lines: leave out --live.")
         return True
-    return drawable and _terminal(sys.stdout) and not getattr(arguments, "confirm", False)
+    return drawable and _terminal(sys.stdout) and not getattr(arguments, "confirm", False) and installed("rich")
 
 
 def _terminal(stream: Any) -> bool:

@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import Any
 
 from crazyem.errors import UsageError
+from crazyem.extras import require
 from crazyem.live.recorder import Recorder
 from crazyem.recordings.mcap.writer import RecordingWriter
 
@@ -20,12 +21,8 @@ FRAME_SCHEMA = "foxglove.FrameTransform"
 
 
 def sdk() -> ModuleType:
-    """The module foxglove. Raises UsageError where it is not installed."""
-    try:
-        import foxglove
-    except ImportError:
-        raise UsageError("--foxglove needs the extra 'foxglove': pip install 'crazyem[foxglove]'.") from None
-    return foxglove  # type: ignore[no-any-return, unused-ignore]
+    """The module foxglove. Raises MissingExtraError where it is not installed."""
+    return require("foxglove", "--foxglove")
 
 
 class FoxgloveServer:

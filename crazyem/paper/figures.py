@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.extras import require
 from crazyem.paper.flight import Flight, fly
 from crazyem.paper.published_values import FIGURES, PARAMETERS, PUBLISHED_RANGES, UNITS, PaperFigure
 from crazyem.paper.runner import write_atomically
@@ -36,8 +37,9 @@ def draw_all(records: Sequence[Record], settings: Settings, folder: Path) -> lis
     Returns: number, file (without suffix), caption, note (what differs from the paper's) of each, in order.
 
     Raises:
-        UsageError: a file cannot be written.
+        UsageError: a file cannot be written. MissingExtraError: no matplotlib.
     """
+    require("matplotlib", "The paper's figures")
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -21,10 +21,10 @@ from crazyem.vehicle import load_vehicle
 
 def test_without_the_extra_there_is_one_sentence(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "foxglove", None)
-    with pytest.raises(UsageError, match=r"pip install 'crazyem\[foxglove\]'"):
+    with pytest.raises(UsageError, match=r"pip install 'crazyem\[live\]'"):
         live.FoxgloveServer(0)
     assert main(["watch", "udp://127.0.0.1:9", "--foxglove"]) == 2
-    assert "--foxglove needs the extra 'foxglove'" in capsys.readouterr().err
+    assert "--foxglove needs foxglove, which is not installed" in capsys.readouterr().err
 
 
 class Recorder:

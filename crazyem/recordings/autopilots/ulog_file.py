@@ -10,12 +10,13 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pyulog import ULog
 
 from crazyem.errors import FileFormatError
+from crazyem.extras import require
 from crazyem.recordings.autopilots.frd_ned import (
     ATTITUDE,
     BODY,
@@ -35,6 +36,9 @@ from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.stamps import Fault, believed, finding
 from crazyem.recordings.topics import Source, Topic, damage, named, ranks, seconds, signals_of, text_of, unconnected
+
+if TYPE_CHECKING:
+    from pyulog import ULog
 
 AUTOPILOT_CLOCK = "autopilot"  # microseconds since boot
 _RPM = 2.0 * math.pi / 60.0
@@ -82,7 +86,7 @@ def _concerned(signals: Mapping[str, SignalArray], faults: list[Fault]) -> list[
     return [name for name, array in signals.items() if array.stream in streams]
 
 
-def _kind(log: ULog) -> int:
+def _kind(log: "ULog") -> int:
     """MAV_TYPE: of the status that PX4 publishes, else of its parameter; 0 where neither says."""
     status = next((d.data["system_type"] for d in log.data_list if "system_type" in d.data), None)
     if status is not None and status.size and int(status[-1]):
@@ -91,16 +95,18 @@ def _kind(log: ULog) -> int:
     return int(parameter) if isinstance(parameter, int) else 0
 
 
-def _decode(path: Path, sound: Scan) -> ULog:
-    """pyulog's view of the sound messages; whatever it trips over names the file."""
+def _decode(path: Path, sound: Scan) -> "ULog":
+    """pyulog's view of the sound messages; whatever it trips over names the file. Raises MissingExtraError, too."""
+    library = require("pyulog", "Reading a ULog file")
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints what it notices
-            return ULog(io.BytesIO(sound.data))
+            log: ULog = library.ULog(io.BytesIO(sound.data))
+            return log
     except Exception as error:  # of any kind, from deep inside pyulog
         raise FileFormatError(f"{path}: the log cannot be decoded ({type(error).__name__}: {error}).") from error
 
 
-def _topics(log: ULog, identifiers: NDArray[np.uint16]) -> tuple[list[Topic], list[Fault]]:
+def _topics(log: "ULog", identifiers: NDArray[np.uint16]) -> tuple[list[Topic], list[Fault]]:
     """One topic a message and instance, its rows in the order of the file, times in s since boot.
 
     Args:
@@ -128,11 +134,11 @@ def _topics(log: ULog, identifiers: NDArray[np.uint16]) -> tuple[list[Topic], li
     return ordered, faults
 
 
-def _name(d: ULog.Data) -> str:
+def _name(d: "ULog.Data") -> str:
     return str(d.name) if d.multi_id == 0 else f"{d.name}_{d.multi_id}"
 
 
-def _places(d: ULog.Data, identifiers: NDArray[np.uint16]) -> NDArray[np.float64]:
+def _places(d: "ULog.Data", identifiers: NDArray[np.uint16]) -> NDArray[np.float64]:
     """(n,) where the records of a topic stand among all of the file; NaN where that is not known."""
     places = np.flatnonzero(identifiers == d.msg_id).astype(float)
     count = d.data["timestamp"].size
@@ -231,7 +237,7 @@ _ULOG_SIGNALS: tuple[Source, ...] = (
 )
 
 
-def _integrity(sound: Scan, topics: list[Topic], log: ULog) -> list[Finding]:
+def _integrity(sound: Scan, topics: list[Topic], log: "ULog") -> list[Finding]:
     found = damage(sound.skipped, sound.size, "ULog message")
     for name, reason in sorted(sound.refused.items())[:20]:
         found.append(note("integrity", f"The topic {text_of(name)} is not read: {reason}.", Grade.DEGRADES))
@@ -261,7 +267,7 @@ def _notes(signals: Mapping[str, object]) -> list[Finding]:
     return [note("motor_meaning", text)]
 
 
-def _metadata(log: ULog) -> dict[str, dict[str, str]]:
+def _metadata(log: "ULog") -> dict[str, dict[str, str]]:
     """What the log says of the autopilot, its parameters and its own words."""
     info = {text_of(k): text_of(v) for k, v in list(log.msg_info_dict.items())[:200]}
     version = log.get_version_info_str() if isinstance(log.msg_info_dict.get("ver_sw_release"), int) else None

@@ -1,0 +1,306 @@
+"""rosbag2 recordings (MCAP or SQLite): crazyswarm2's topics of one robot, and what other ROS 2 drones have in common.
+
+Two clocks: messages of log blocks (LogDataGeneric) carry the firmware's; all others are stamped by the host. Where the
+firmware's is there, it is the time axis. What becomes which signal is in `rosbag2_signals`; docs/formats/rosbag2.md
+explains both, and the mapping file that says what a bag cannot: which variables are in a log block. Sources:
+IMRCLab/crazyswarm2 (crazyflie_interfaces/msg, crazyflie/src/crazyflie_server.cpp, crazyflie/scripts), mcap.dev.
+"""
+
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.rosbag2 import Reader
+
+from crazyem.errors import CrazyemError, FileFormatError, UsageError
+from crazyem.recordings.finding import Finding, Grade, note
+from crazyem.recordings.mcap import scan as mcap_scan
+from crazyem.recordings.mcap.scan import HEAD, MESSAGE_HEAD, Loss, Problem
+from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.recording import Recording
+from crazyem.recordings.ros.ros2_messages import LARGEST_MESSAGE, MessageType, message_type, standard_definition
+from crazyem.recordings.ros.rosbag2_signals import ROBOT_TYPES, WORLD_TOPICS, BagMapping, BagTopic, recording_of
+from crazyem.recordings.topics import text_of
+
+_SQLITE = b"SQLite format 3\0"
+_LARGEST_RATIO = 200  # unpacked bytes a packed byte, beyond the first gibibyte
+_LARGEST_TOTAL = 2 << 30  # bytes of messages that are kept for decoding
+_MOST_FILES = 10_000
+_MAPPING_KEYS = {"robot": str, "twist": str, "topics": dict}
+
+
+def read(path: Path, options: ReadOptions) -> Recording:
+    """Read the flight of one robot from a bag, a file or the folder of one.
+
+    Raises: FileFormatError naming the file and what is wrong; UsageError if it must be said which robot is meant.
+    """
+    mapping = _user_mapping(options.mapping)
+    bag = _Bag()
+    for file in _files(path):
+        if file.is_dir() or _is_sqlite(file):
+            bag.add_sqlite(file)
+        else:
+            bag.add(file)
+    if not any(topic.messages for topic in bag.topics.values()):
+        raise FileFormatError(f"{path}: the bag holds no messages that can be read ({bag.why_nothing()}).")
+    robot, others = _robot(path, bag, mapping)
+    chosen = [t for t in bag.topics.values() if t.name in WORLD_TOPICS or _owner(t.name) in (robot, "")]
+    return recording_of(path, chosen, robot, mapping, options.motor, (*bag.findings(), *others))
+
+
+def _files(path: Path) -> list[Path]:
+    """The MCAP files of a bag in the order in which they were written; a folder itself where these are of SQLite."""
+    if path.is_file():
+        return [path]
+    names = sorted(
+        path.glob("*.mcap"), key=lambda p: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", p.name)]
+    )
+    if names:
+        return names[:_MOST_FILES]
+    if any(path.glob("*.zstd")):
+        raise FileFormatError(f"{path}: the files of the bag are compressed as a whole; unpack them with zstd -d.")
+    if any(path.glob("*.db3")):
+        return [path]
+    raise FileFormatError(f"{path}: the bag has neither an MCAP nor an SQLite file.")
+
+
+def _is_sqlite(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return stream.read(len(_SQLITE)) == _SQLITE
+
+
+@dataclass(slots=True)
+class _Bag:
+    """Everything that one or several files hold for us."""
+
+    topics: dict[str, BagTopic] = field(default_factory=dict)
+    problems: list[tuple[Path, Problem]] = field(default_factory=list)
+    refused: dict[str, str] = field(default_factory=dict)  # topic -> why
+    large: dict[str, int] = field(default_factory=dict)  # topic -> messages that were too large
+    damage: list[Finding] = field(default_factory=list)
+    kept: int = 0
+    unpacked: int = 0
+    packed: int = 0
+    count: int = 0
+    _types: dict[tuple[str, str], MessageType | str] = field(default_factory=dict)
+
+    def add(self, path: Path) -> None:
+        """Read one file to its end, or as far as it is sound."""
+        problems: list[Problem] = []
+        channels: dict[int, BagTopic | None] = {}
+        schemas: dict[int, Any] = {}
+        try:
+            self.packed += path.stat().st_size
+            with path.open("rb") as stream:
+                for opcode, data in self._records(path, stream, problems):
+                    if opcode == mcap_scan.MESSAGE:
+                        self._message(path, data, channels)
+                    elif opcode == mcap_scan.SCHEMA:
+                        schema = _parsed(opcode, data)
+                        if schema is not None:
+                            schemas[schema.id] = schema
+                    elif opcode == mcap_scan.CHANNEL:
+                        channel = _parsed(opcode, data)
+                        if channel is not None and channel.id not in channels:
+                            channels[channel.id] = self._topic(channel, schemas.get(channel.schema_id))
+        except OSError as error:
+            raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
+        self.problems += [(path, problem) for problem in problems]
+
+    def _records(self, path: Path, stream: Any, problems: list[Problem]) -> Iterator[tuple[int, bytes]]:
+        """Schemas, channels and messages in the order of the file, with their content."""
+        for record in mcap_scan.records(stream, problems):
+            if record.opcode != mcap_scan.CHUNK:
+                yield record.opcode, record.data
+                continue
+            try:
+                chunk = mcap_scan.parse_chunk(record.data)
+                self.unpacked += chunk.size
+                if self.unpacked > (1 << 30) + _LARGEST_RATIO * self.packed:
+                    raise FileFormatError(f"{path} unpacks to more than {_LARGEST_RATIO} times its size.")
+                data = mcap_scan.unpack(chunk)
+                inner = list(_inner(data))
+            except ValueError as error:
+                problems.append(Problem(Loss.DAMAGED, record.offset, record.end, str(error)))
+                continue
+            yield from inner
+
+    def _message(self, path: Path, data: bytes, channels: Mapping[int, BagTopic | None]) -> None:
+        if len(data) < MESSAGE_HEAD.size - HEAD.size:
+            return
+        topic = channels.get(int.from_bytes(data[:2], "little"))
+        if topic is not None:
+            log = int.from_bytes(data[6:14], "little")
+            self._take(path, topic, log, data[MESSAGE_HEAD.size - HEAD.size :])
+
+    def add_sqlite(self, path: Path) -> None:
+        """Read an SQLite file, or the folder of a bag with several, to its end or as far as it is sound."""
+        if path.is_file() and path.suffix != ".db3":
+            raise FileFormatError(f"{path}: a bag in SQLite storage is read where its name ends in .db3.")
+        before = self.count
+        try:
+            with Reader(path) as reader:
+                topics = {c.id: self._stored(c) for c in reader.connections}
+                for connection, log, payload in reader.messages():
+                    topic = topics[connection.id]
+                    if topic is not None:
+                        self._take(path, topic, log, bytes(payload))
+        except CrazyemError:
+            raise
+        except Exception as error:  # of rosbags and of SQLite, of many kinds
+            if self.count == before:
+                raise FileFormatError(f"{path}: the bag cannot be read ({error}).") from error
+            text = f"{path.name} is damaged after {self.count - before} messages ({error})."
+            self.damage.append(note("integrity", text, Grade.DEGRADES, messages=float(self.count - before)))
+
+    def _stored(self, connection: Connection) -> BagTopic | None:
+        """The topic of a connection if its messages can be decoded."""
+        definition: str | None = connection.msgdef.data
+        if connection.msgdef.format is MessageDefinitionFormat.NONE:
+            definition = standard_definition(connection.msgtype)
+        elif connection.msgdef.format is not MessageDefinitionFormat.MSG:
+            definition = None
+        if definition is None:
+            name = "/" + connection.topic.strip("/")
+            self.refused[name] = f"the bag has no definition of {text_of(connection.msgtype)} that can be read here"
+            return None
+        return self._announce(connection.topic, connection.msgtype, definition)
+
+    def _take(self, path: Path, topic: BagTopic, log: int, payload: bytes) -> None:
+        if len(payload) > LARGEST_MESSAGE:
+            self.large[topic.name] = self.large.get(topic.name, 0) + 1
+            return
+        self.kept += len(payload) + 100
+        if self.kept > _LARGEST_TOTAL:
+            raise FileFormatError(f"{path}: the bag holds more than {_LARGEST_TOTAL >> 20} MiB of messages; split it.")
+        topic.messages.append((min(log, 2**63 - 1), payload))
+        topic.places.append(self.count)
+        self.count += 1
+
+    def _topic(self, channel: Any, schema: Any) -> BagTopic | None:
+        """The topic of a channel if its messages can be decoded."""
+        name = "/" + str(channel.topic).strip("/")
+        if schema is None or channel.message_encoding != "cdr" or schema.encoding != "ros2msg":
+            encoding = f"{channel.message_encoding} with {schema.encoding if schema else 'no'} definitions"
+            self.refused[name] = f"its encoding is {text_of(encoding)}"
+            return None
+        return self._announce(str(channel.topic), str(schema.name), bytes(schema.data).decode("utf-8", "replace"))
+
+    def _announce(self, topic: str, kind_name: str, definition: str) -> BagTopic | None:
+        name = "/" + topic.strip("/")
+        key = (kind_name, definition)
+        if key not in self._types:
+            try:
+                self._types[key] = message_type(*key)
+            except ValueError as error:
+                self._types[key] = str(error)
+        kind = self._types[key]
+        if isinstance(kind, str):
+            self.refused[name] = kind
+            return None
+        known = self.topics.setdefault(name, BagTopic(name, kind))
+        if known.kind != kind:
+            self.refused[name] = "its type changes within the bag"
+            return None
+        return known
+
+    def why_nothing(self) -> str:
+        """In a few words."""
+        real = [problem for _, problem in self.problems if problem.loss is not Loss.OPEN]
+        if real:
+            return f"byte {real[0].offset}: {real[0].why}"
+        if self.refused:
+            name, why = next(iter(self.refused.items()))
+            return f"{text_of(name)}: {why}"
+        return "it is empty"
+
+    def findings(self) -> list[Finding]:
+        found = [*self.damage]
+        for path, problem in self.problems[:20]:
+            if problem.loss is Loss.OPEN:
+                text = f"{path.name} was not closed: the recorder was stopped before it could finish."
+                found.append(note("integrity", text, offset=float(problem.offset)))
+            else:
+                text = f"{path.name}: bytes {problem.offset} to {problem.end} are lost, {problem.why}."
+                lost = float(problem.end - problem.offset)
+                found.append(note("integrity", text, Grade.DEGRADES, offset=float(problem.offset), bytes=lost))
+        for name, why in list(self.refused.items())[:20]:
+            found.append(note("mapping", f"The topic {text_of(name)} is not read: {why}."))
+        for name, number in self.large.items():
+            found.append(note("mapping", f"{number} messages of {text_of(name)} are too large to hold signals."))
+        return found
+
+
+def _inner(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Opcode and content of each record in a chunk. Raises ValueError where they make no sense."""
+    at, size = 0, len(data)
+    while at < size:
+        if at + HEAD.size > size:
+            raise ValueError("the records in a chunk make no sense")
+        opcode, length = HEAD.unpack_from(data, at)
+        at += HEAD.size
+        if at + length > size:
+            raise ValueError("the records in a chunk make no sense")
+        yield opcode, data[at : at + length]
+        at += length
+
+
+def _parsed(opcode: int, data: bytes) -> Any:
+    from crazyem.recordings.mcap.survey import parse
+
+    return parse(opcode, data)
+
+
+def _owner(topic: str) -> str:
+    """Robot of a topic: "cf1" of "/cf1/pose", "" of "/pose"."""
+    parts = topic.strip("/").split("/")
+    return parts[0] if len(parts) > 1 else ""
+
+
+def _robot(path: Path, bag: _Bag, mapping: BagMapping) -> tuple[str, list[Finding]]:
+    """The robot to read: the only one, or the one that the user named."""
+    owners = sorted(
+        {_owner(t.name) for t in bag.topics.values() if t.messages and t.kind.name in ROBOT_TYPES} - {"all", ""}
+    )
+    names = ", ".join(text_of(o) for o in owners[:20])
+    if mapping.robot is not None:
+        if mapping.robot not in owners:
+            raise UsageError(f'{path}: there is no robot "{mapping.robot}" in the bag; there are: {names or "none"}.')
+        return mapping.robot, []
+    if len(owners) > 1:
+        raise UsageError(
+            f"{path}: the bag holds several robots ({names}); say which with a mapping file (--map) "
+            f'that holds the line robot = "{text_of(owners[0])}".'
+        )
+    return (owners[0] if owners else ""), []
+
+
+def _user_mapping(file: str | None) -> BagMapping:
+    """What the user's mapping file says of a bag. Raises UsageError or FileFormatError."""
+    if file is None:
+        return BagMapping()
+    try:
+        table = tomllib.loads(Path(file).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"{file} cannot be read: {error.strerror or error}.") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise FileFormatError(f"{file}: not valid TOML ({error}).") from error
+    for key, value in table.items():
+        if key not in _MAPPING_KEYS or not isinstance(value, _MAPPING_KEYS[key]):
+            known = "robot and twist (texts) and topics (a table)"
+            raise FileFormatError(f"{file}: {key} is not what a mapping for a bag can hold: {known}.")
+    if table.get("twist", "world") not in ("world", "body"):
+        raise FileFormatError(f'{file}: twist must be "world" or "body", not "{table["twist"]}".')
+    variables: dict[str, tuple[str, ...]] = {}
+    for topic, entry in table.get("topics", {}).items():
+        names = entry.get("variables") if isinstance(entry, dict) else None
+        if not isinstance(names, list) or not all(isinstance(n, str) and n for n in names):
+            raise FileFormatError(f'{file}: topics."{topic}".variables must be a list of names.')
+        if len(set(names)) < len(names):
+            raise FileFormatError(f'{file}: topics."{topic}".variables names a variable twice.')
+        variables["/" + topic.strip("/")] = tuple(names)
+    return BagMapping(file, table.get("robot"), table.get("twist"), variables)
