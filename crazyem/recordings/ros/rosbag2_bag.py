@@ -17,10 +17,10 @@ from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader
 
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.mcap import scan as mcap_scan
 from crazyem.recordings.mcap.scan import HEAD, MESSAGE_HEAD, Loss, Problem
-from crazyem.recordings.options import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.ros.ros2_messages import LARGEST_MESSAGE, MessageType, message_type, standard_definition
 from crazyem.recordings.ros.rosbag2_signals import ROBOT_TYPES, WORLD_TOPICS, BagMapping, BagTopic, recording_of
