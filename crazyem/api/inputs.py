@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from crazyem.doctor.thrust import vehicle_for
 from crazyem.physics import folding
 from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording
+from crazyem.recordings.thrust import vehicle_for
 from crazyem.vehicle import Vehicle
 
 RecordingLike = Recording | str | Path

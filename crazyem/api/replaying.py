@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, vehicle_of
 from crazyem.doctor import examine
-from crazyem.doctor.thrust import kind_objection, signal_for, weight_objection
 from crazyem.errors import DataError
 from crazyem.estimation.steps import estimator_for
 from crazyem.live.flight_result import FlightResult, result_of
@@ -15,6 +14,7 @@ from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording, onboard_attitude
+from crazyem.recordings.thrust import kind_objection, signal_for, weight_objection
 from crazyem.signals.sample import ESTIMATOR_SIGNALS
 from crazyem.vehicle import Vehicle
 

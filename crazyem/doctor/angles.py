@@ -12,7 +12,6 @@ from crazyem.doctor.delays import delay
 from crazyem.doctor.kinematics import (
     Track,
     Window,
-    euler_of_quaternion,
     grid_of,
     measurements,
     origin_of,
@@ -22,6 +21,7 @@ from crazyem.doctor.kinematics import (
     width_for,
 )
 from crazyem.doctor.regression import Choice, Slope, blocks, choose, slope
+from crazyem.physics.rotations import euler_from_quaternion
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -226,7 +226,7 @@ def _euler_finding(
 
 def _upright(attitude: Track, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The longest stretch in which roll and pitch are far from where Euler angles jump."""
-    angles = np.abs(euler_of_quaternion(attitude.value))
+    angles = np.abs(euler_from_quaternion(attitude.value))
     far = (angles[:, 0] < LARGEST_ANGLES[0]) & (angles[:, 1] < LARGEST_ANGLES[1]) | ~attitude.valid
     edges = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]]).astype(np.int8)))
     out = np.zeros(valid.size, bool)
@@ -267,7 +267,7 @@ def _unit_said(unit: str) -> str:
 def _unwrapped(quaternion: SignalArray) -> SignalArray:
     """Roll, pitch, yaw [rad] of a quaternion signal, without jumps."""
     norm = np.linalg.norm(quaternion.value, axis=1, keepdims=True)
-    angles = np.unwrap(euler_of_quaternion(quaternion.value / np.where(norm > 0, norm, 1.0)), axis=0)
+    angles = np.unwrap(euler_from_quaternion(quaternion.value / np.where(norm > 0, norm, 1.0)), axis=0)
     return replace(quaternion, value=angles, quantity="euler")
 
 

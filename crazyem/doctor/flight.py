@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor.streams import NO_FLOAT_WARNINGS, longest, runs
-from crazyem.doctor.thrust import is_rotorcraft, kind_objection
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.ordering import Intervals, inside, ordered
 from crazyem.recordings.recording import Recording
+from crazyem.recordings.thrust import is_rotorcraft, kind_objection
 
 UPSET_TILT = 90.0  # degrees of tilt
 LYING_TILT = 60.0  # degrees of tilt at rest

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor.streams import COMMAND_SIGNALS, NO_FLOAT_WARNINGS, listed, longest, runs
-from crazyem.doctor.thrust import UNKNOWN_VOLTAGE_ERROR, flat_voltage
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.ordering import inside
 from crazyem.recordings.recording import Recording, SignalArray
+from crazyem.recordings.thrust import UNKNOWN_VOLTAGE_ERROR, flat_voltage
 
 Flags = NDArray[np.bool_]
 

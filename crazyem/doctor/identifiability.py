@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from crazyem.doctor import excitation
 from crazyem.doctor.excitation import Steps
-from crazyem.doctor.thrust import UNKNOWN_VOLTAGE_ERROR, Inputs, inputs_of
 from crazyem.doctor.whitening import Fit, linear_fit
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.airborne import Airtime
 from crazyem.recordings.finding import percent
 from crazyem.recordings.ordering import held, sound_samples
 from crazyem.recordings.recording import Recording
+from crazyem.recordings.thrust import UNKNOWN_VOLTAGE_ERROR, Inputs, inputs_of
 from crazyem.vehicle import GRAVITY, Vehicle
 
 Array = NDArray[np.float64]

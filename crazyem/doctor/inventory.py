@@ -9,11 +9,11 @@ import numpy as np
 
 from crazyem.doctor.envelope import Envelope, envelope
 from crazyem.doctor.identifiability import Verdict, identifiability, replay_objection
-from crazyem.doctor.thrust import kind_objection, vehicle_for, weight_objection
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.finding import percent
 from crazyem.recordings.ordering import sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
+from crazyem.recordings.thrust import kind_objection, vehicle_for, weight_objection
 from crazyem.vehicle import Vehicle
 
 _MOST_ENTRIES = 12  # of a section of metadata that are shown as text

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
+from crazyem.physics.rotations import quaternion_from_euler
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.signals.sample import SIGNALS
 
@@ -249,33 +250,6 @@ def rotate(attitude: Array, vector: Array, *, inverse: bool = False) -> Array:
     return np.asarray(vector + attitude[:, 3:] * cross + np.cross(u, cross), float)
 
 
-def quaternion_of_euler(angles: Array) -> Array:
-    """(m, 3) roll, pitch, yaw [rad] (ZYX) to (m, 4) quaternions x y z w."""
-    c, s = np.cos(0.5 * angles), np.sin(0.5 * angles)
-    cr, cp, cy = c.T
-    sr, sp, sy = s.T
-    return np.column_stack(
-        [
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            cr * cp * cy + sr * sp * sy,
-        ]
-    )
-
-
-def euler_of_quaternion(q: Array) -> Array:
-    """(m, 4) unit quaternions x y z w to (m, 3) roll, pitch, yaw [rad] (ZYX)."""
-    x, y, z, w = q.T
-    return np.column_stack(
-        [
-            np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
-            np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0)),
-            np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
-        ]
-    )
-
-
 def _relative(first: Array, second: Array) -> Array:
     """Rotation vectors of conj(first) * second, (m, 3)."""
     ax, ay, az, aw = first.T
@@ -346,7 +320,7 @@ def poses(recording: Recording) -> list[Pose]:
         return found
     angles = measurements(recording, "euler")
     return [
-        Pose(name, replace(array, value=quaternion_of_euler(array.value), quantity="attitude"))
+        Pose(name, replace(array, value=quaternion_from_euler(*array.value.T), quantity="attitude"))
         for name, array in angles.items()
         if np.nanmax(np.abs(array.value)) <= 7.0
     ]

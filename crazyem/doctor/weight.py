@@ -13,11 +13,11 @@ from scipy import stats
 
 from crazyem.doctor.kinematics import GRAVITY, GRID_STEP, Grid, Track, grid_of, measurements, track
 from crazyem.doctor.regression import FEWEST_BLOCKS, block_sums, blocks
-from crazyem.doctor.thrust import carried, vehicle_for, weight_objection
 from crazyem.physics.rotors import thrust_from_command, thrust_from_speed
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording
+from crazyem.recordings.thrust import carried, vehicle_for, weight_objection
 from crazyem.vehicle import Vehicle, load_vehicle, preset_names
 
 Array = NDArray[np.float64]

@@ -79,3 +79,16 @@ def quaternion_from_euler(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> 
         ],
         axis=-1,
     )
+
+
+def euler_from_quaternion(q: ArrayLike) -> NDArray:
+    """Roll, pitch, yaw [rad] of R = Rz(yaw) Ry(pitch) Rx(roll), (..., 3), of unit quaternions (..., 4)."""
+    x, y, z, w = np.moveaxis(np.asarray(q), -1, 0)
+    return np.stack(
+        [
+            np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+            np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0)),
+            np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+        ],
+        axis=-1,
+    )

@@ -17,9 +17,9 @@ from crazyem.doctor.envelope import envelope
 from crazyem.doctor.excitation import rotation_fit, steps_of
 from crazyem.doctor.identifiability import VERDICT_NAMES, Verdict, replay_objection
 from crazyem.doctor.inventory import Inventory, inventory
-from crazyem.doctor.thrust import inputs_of
 from crazyem.recordings import Recording, open_recording
 from crazyem.recordings.airborne import airtime
+from crazyem.recordings.thrust import inputs_of
 from crazyem.vehicle import GRAVITY, Vehicle, load_vehicle
 
 TRUTH = Truth()

@@ -8,11 +8,11 @@ from made_flight import array_of, changed, made_flight, without
 
 from crazyem.api.replaying import check_flown, doctors_findings, required_signals
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.doctor.thrust import carried, inputs_of, signal_for, vehicle_for, weight_objection
 from crazyem.errors import DataError
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings import Recording
 from crazyem.recordings.airborne import airtime
+from crazyem.recordings.thrust import carried, inputs_of, signal_for, vehicle_for, weight_objection
 from crazyem.vehicle import load_vehicle
 
 CF2, BRUSHLESS = load_vehicle("cf2"), load_vehicle("cf21bl")

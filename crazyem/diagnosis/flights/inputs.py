@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.alignment import Alignment, align
 from crazyem.diagnosis.flights.level import Level, level_of
-from crazyem.doctor.thrust import kind_objection, signal_for, too_slow
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
 from crazyem.physics.rotors import thrust_from_command, thrust_from_speed, wrench
 from crazyem.recordings.airborne import LARGEST_COMMAND, Airtime, airtime
 from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording, onboard_attitude
+from crazyem.recordings.thrust import kind_objection, signal_for, too_slow
 from crazyem.vehicle import Vehicle
 
 NOMINAL_VOLTAGE = 3.85  # V under load, middle of 3.7 to 4.0 V, where none is recorded

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 from scipy.optimize import brentq
 
-from crazyem.doctor.kinematics import quaternion_of_euler
+from crazyem.physics.rotations import quaternion_from_euler
 from crazyem.physics.rotors import thrust_from_command
 from crazyem.recordings.airborne import Airtime
 from crazyem.recordings.ordering import ordered
@@ -104,7 +104,7 @@ def _upright(recording: Recording, time: NDArray) -> NDArray:
     for name in ("attitude", "euler"):
         when, value = ordered(recording.signals[name]) if name in recording.signals else (np.empty(0), np.empty(0))
         if when.size:
-            q = quaternion_of_euler(value) if name == "euler" else value
+            q = quaternion_from_euler(*value.T) if name == "euler" else value
             tilt = 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2) / np.maximum((q**2).sum(axis=1), 1e-12)
             return np.interp(time, when, tilt)
     return np.ones(time.size)

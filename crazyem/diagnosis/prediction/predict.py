@@ -17,10 +17,9 @@ from crazyem.diagnosis.flights.inputs import Inputs, inputs_of
 from crazyem.diagnosis.flights.level import LOOKS
 from crazyem.diagnosis.prediction.earned import Turned, earned, remembered
 from crazyem.diagnosis.prediction.simulate import Simulator
-from crazyem.doctor.kinematics import quaternion_of_euler
 from crazyem.errors import DataError
 from crazyem.notebook import finite, html_table, new_figure, saved
-from crazyem.physics.rotations import rotation_matrix
+from crazyem.physics.rotations import quaternion_from_euler, rotation_matrix
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.ordering import inside, ordered
 from crazyem.recordings.recording import Recording, SignalArray
@@ -198,7 +197,12 @@ def _state_signals(recording: Recording) -> dict[str, SignalArray]:
         if array is None and name == "attitude" and "euler" in recording.signals:
             euler = recording.signals["euler"]
             array = SignalArray(
-                euler.time, quaternion_of_euler(euler.value), euler.order, euler.host_time, euler.marked, "attitude"
+                euler.time,
+                quaternion_from_euler(*euler.value.T),
+                euler.order,
+                euler.host_time,
+                euler.marked,
+                "attitude",
             )
         if array is not None and array.time.size:
             found[name] = array

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20.ardupilotmega import enums
 
+from crazyem.physics.rotations import euler_from_quaternion
 from crazyem.recordings.topics import floats
 
 Columns = Sequence[NDArray[np.generic]]
@@ -44,31 +45,10 @@ def euler(columns: Columns) -> NDArray[np.float64]:
     return vectors(columns)
 
 
-def quaternions_from_euler(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 4) x y z w from (n, 3) roll, pitch, yaw [rad], ZYX, in whatever frame the angles are in."""
-    cr, cp, cy = np.moveaxis(np.cos(angles / 2.0), -1, 0)
-    sr, sp, sy = np.moveaxis(np.sin(angles / 2.0), -1, 0)
-    return np.column_stack(
-        [
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            cr * cp * cy + sr * sp * sy,
-        ]
-    )
-
-
 def euler_from_quaternions(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """(n, 3) roll, pitch, yaw [rad], ZYX, from (n, 4) x y z w of any length but 0; NaN for that."""
     with np.errstate(invalid="ignore"):
-        x, y, z, w = np.moveaxis(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True), -1, 0)
-    return np.column_stack(
-        [
-            np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
-            np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0)),
-            np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
-        ]
-    )
+        return euler_from_quaternion(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
 
 
 def vehicle_of(kind: int) -> dict[str, str]:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.physics.rotations import quaternion_from_euler
 from crazyem.recordings.autopilots.frd_ned import (
     ATTITUDE,
     BODY,
@@ -18,7 +19,6 @@ from crazyem.recordings.autopilots.frd_ned import (
     euler,
     euler_from_quaternions,
     quaternions,
-    quaternions_from_euler,
     stacked,
     vectors,
 )
@@ -33,7 +33,7 @@ def _scaled(factor: float, turned: Callable[[Columns], NDArray[np.float64]] = st
 
 
 def _quaternions_of_angles(columns: Columns) -> NDArray[np.float64]:
-    return quaternions_from_euler(euler(columns))
+    return quaternion_from_euler(*euler(columns).T)
 
 
 def _angles_of_quaternion(columns: Columns) -> NDArray[np.float64]:

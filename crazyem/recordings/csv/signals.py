@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.recordings.autopilots.frd_ned import quaternions_from_euler
+from crazyem.physics.rotations import quaternion_from_euler
 from crazyem.recordings.csv.interpolation import corners, interpolated_rows
 from crazyem.recordings.csv.mapping import SignalColumns
 from crazyem.recordings.finding import Finding, Grade, intervals_of
@@ -223,7 +223,7 @@ class _Kept:
         if name not in self._turned:
             value, marked = self._scaled(source)
             if len(source.columns) == 3:
-                value = quaternions_from_euler(value)
+                value = quaternion_from_euler(*value.T)
             if source.inverted:
                 value = value * [-1.0, -1.0, -1.0, 1.0]
             if source.axes[1] == "NED":
