@@ -11,12 +11,12 @@ from crazyem.api.inputs import VehicleLike, vehicle_of
 from crazyem.control.named_trajectories import DEFAULT_HEIGHT, TrajectoryMaker, trajectory_maker
 from crazyem.errors import CrazyemError, UsageError
 from crazyem.estimation.steps import estimator_for
-from crazyem.links import open_link
 from crazyem.live.controllers import controller_named
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
-from crazyem.live.flight_result import FlightResult, result_of
+from crazyem.live.flight_result import FlightResult
 from crazyem.live.policy import Policy, load_policy
-from crazyem.live.recorder import Recorder, close_recorder, open_recorder
+from crazyem.live.recorder import Recorder
+from crazyem.live.runner import connect, finished, open_session
 from crazyem.live.session import LOG_RATE, RECONNECT_WITHIN, Session
 from crazyem.live.simulator import Simulator
 from crazyem.live.warm_up import warm_up
@@ -214,11 +214,8 @@ def _flown(
     left_out: list[str],
 ) -> tuple[FlightResult | None, BaseException | None]:
     error: BaseException | None = None
-    result: FlightResult | None = None
     with contextlib.ExitStack() as stack:
-        link = open_link(uri)
-        stack.callback(link.close)
-        link.connect()
+        link = connect(stack, uri)
         observer.say(f"connected to {uri}: {len(link.log_variables)} log variables, {len(link.parameters)} parameters")
         configuration = {
             "command": "fly",
@@ -233,25 +230,12 @@ def _flown(
             "guard": settings.rules.mode if plan.push else "no push",
             "seed": settings.seed or 0 if not settings.uri else None,
         }
-        recorder = observer.recorder(
-            open_recorder(
-                settings.record, configuration=configuration, vehicle=settings.vehicle, link=link,
-                append=settings.append,
-            )
-        )  # fmt: skip
-        if recorder is not None:
-            stack.callback(recorder.close)
-        session = Session(
-            link,
-            vehicle=settings.vehicle,
+        session = open_session(
+            stack, link, vehicle=settings.vehicle, left_out=left_out, configuration=configuration,
             estimator=estimator_for(settings.vehicle, window=settings.window, every=settings.every),
-            recorder=recorder,
-            wrench=plan.controller.wrench,
-            rate=settings.rate,
-            reconnect_within=settings.reconnect,
-        )
-        stack.callback(session.close)
-        session.history.notice(folding.notice(left_out))
+            record=settings.record, append=settings.append, rate=settings.rate, reconnect=settings.reconnect,
+            wrench=plan.controller.wrench, wrap=observer.recorder,
+        )  # fmt: skip
         try:
             session.start()
             with observer.progress(session, interrupts) as progress:
@@ -263,23 +247,6 @@ def _flown(
             error = failed
             session.history.notice(str(failed))
         session.close()
-        statistics = link.statistics()
-        if recorder is not None:
-            close_recorder(recorder, statistics, session.history)
-        try:
-            result = result_of(
-                session.pipeline,
-                settings.vehicle,
-                title=f"crazyem fly: {settings.trajectory_name}, {plan.controller.name}, "
-                f"vehicle {settings.vehicle.name}",
-                log=settings.record,
-                received=statistics.received,
-                lost=statistics.lost,
-                extra={
-                    **{k: configuration[k] for k in ("uri", "controller", "trajectory", "seed")},
-                    "late": statistics.late,
-                },
-            )
-        except CrazyemError as failed:
-            error = error or failed
-    return result, error
+        title = f"crazyem fly: {settings.trajectory_name}, {plan.controller.name}, vehicle {settings.vehicle.name}"
+        extra = {k: configuration[k] for k in ("uri", "controller", "trajectory", "seed")}
+        return finished(session, title=title, log=settings.record, extra=extra, error=error)

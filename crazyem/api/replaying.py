@@ -47,7 +47,6 @@ def replay(
     """
     recording = recording_of(recording, options)
     nominal, left_out = folding.fold(vehicle_of(vehicle, recording))
-    configured = recording.metadata.get("configuration", {})
     thrust_from, required = required_signals(recording, nominal)
     recording.check(required)
     air = airtime(recording)
@@ -58,12 +57,9 @@ def replay(
     # a live flight takes what comes first, and a replay must do the same; but never what says nothing
     unfit = [n for n in ("rotor_speed", "motor_command") if n in recording.signals and n != thrust_from]
     estimator = estimator_for(
-        nominal,
-        window=int(configured.get("window", WINDOW)) if window is None else window,
-        every=int(configured.get("every", EVERY)) if every is None else every,
-        onboard=onboard_attitude(recording),
+        nominal, onboard=onboard_attitude(recording), **_window_of(recording, window, every),
         input_signal=thrust_from if unfit or thrust_from == "wrench_command" else None,
-    )
+    )  # fmt: skip
     pipeline = Pipeline(estimator, history=history)
     pipeline.estimate_until = history.marks.get("estimate_end", pipeline.estimate_until)
     first: float | None = None
@@ -87,13 +83,22 @@ def replay(
             "airborne_s": air.seconds,
             "findings": [f.to_dict() for f in findings],
         },
-        notices=(
-            SCALE_NOTICE,
-            *filter(None, [folding.notice(left_out), sentence(weight_objection(recording, nominal, air))]),
-            *recording.notices,
-            *(f"the doctor says ({f.grade}): {f.text}" for f in findings if f not in recording.findings),
-        ),
+        notices=_notices(recording, findings, folding.notice(left_out), weight_objection(recording, nominal, air)),
     )
+
+
+def _notices(recording: Recording, findings: list[Finding], left_out: str, weight: str) -> list[str]:
+    said = [f"the doctor says ({f.grade}): {f.text}" for f in findings if f not in recording.findings]
+    return [SCALE_NOTICE, *filter(None, [left_out, sentence(weight)]), *recording.notices, *said]
+
+
+def _window_of(recording: Recording, window: int | None, every: int | None) -> dict[str, int]:
+    """Window and samples between updates: as asked for, else as in the flight, else ours."""
+    configured = recording.metadata.get("configuration", {})
+    return {
+        "window": int(configured.get("window", WINDOW)) if window is None else window,
+        "every": int(configured.get("every", EVERY)) if every is None else every,
+    }
 
 
 SCALE_NOTICE = (

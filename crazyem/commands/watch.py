@@ -21,10 +21,9 @@ from crazyem.commands.flights import confirm_in_terminal, follow, interrupts
 from crazyem.commands.view import Streams, Viewed, live_view, wants_view
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
-from crazyem.live.flight_result import result_of
 from crazyem.live.hover_thrust import hover_afterwards
 from crazyem.live.policy import load_policy
-from crazyem.live.recorder import close_recorder, open_recorder
+from crazyem.live.runner import connect, finished, open_session
 from crazyem.live.session import Session
 from crazyem.live.summary import check_writable
 from crazyem.live.telemetry import FLYING
@@ -52,30 +51,17 @@ def run(arguments: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(interrupts())
         streams = stack.enter_context(Streams(arguments.foxglove))
-        link = open_link(arguments.uri)
-        stack.callback(link.close)
-        link.connect()
+        link = connect(stack, arguments.uri)
         say(f"watching {arguments.uri} (Ctrl-C ends)")
         configuration = {
             "command": "watch", "uri": arguments.uri, "window": arguments.window, "every": arguments.every,
             "rate": arguments.rate,
         }  # fmt: skip
-        recorder = open_recorder(
-            arguments.record, configuration=configuration, vehicle=vehicle, link=link, append=arguments.append
-        )
-        recorder = streams.with_stream(recorder)
-        if recorder is not None:
-            stack.callback(recorder.close)
-        session = Session(
-            link,
-            vehicle=vehicle,
-            estimator=new_estimator(vehicle, arguments),
-            recorder=recorder,
-            rate=arguments.rate,
-            reconnect_within=arguments.reconnect,
-        )
-        session.history.notice(folding.notice(left_out))
-        stack.callback(session.close)
+        session = open_session(
+            stack, link, vehicle=vehicle, left_out=left_out, configuration=configuration,
+            estimator=new_estimator(vehicle, arguments), record=arguments.record, append=arguments.append,
+            rate=arguments.rate, reconnect=arguments.reconnect, wrap=streams.with_stream,
+        )  # fmt: skip
         try:
             session.start()
             if rules is not None:
@@ -93,25 +79,12 @@ def run(arguments: argparse.Namespace) -> int:
             session.history.notice(str(e))
         session.end_pushing(_outcome(session, error))
         session.close()
-        if session.write_supervisor is not None and session.pusher is not None:
-            known, before = session.pusher.known, session.write_supervisor.originals
-            session.history.notice(
-                hover_afterwards(session.write_supervisor.guard.controller, now=known, before=before)
-            )
-        statistics = link.statistics()
-        if recorder is not None:
-            close_recorder(recorder, statistics, session.history)
+        _note_hover_thrust(session)
+        title, extra = f"crazyem watch {arguments.uri}, vehicle {vehicle.name}", {"uri": arguments.uri}
+        result, error = finished(session, title=title, log=arguments.record, extra=extra, error=error)
         try:
-            result = result_of(
-                session.pipeline,
-                vehicle,
-                title=f"crazyem watch {arguments.uri}, vehicle {vehicle.name}",
-                log=arguments.record,
-                received=statistics.received,
-                lost=statistics.lost,
-                extra={"uri": arguments.uri, "late": statistics.late},
-            )
-            report(arguments, result, plot=plot)
+            if result is not None:
+                report(arguments, result, plot=plot)
         except CrazyemError as e:
             error = error or e
     raise_after(error)
@@ -142,3 +115,10 @@ def _outcome(session: Session, error: BaseException | None) -> str:
     if error is not None:
         return "failed"
     return "interrupted" if session.telemetry.has(FLYING) else "landed"
+
+
+def _note_hover_thrust(session: Session) -> None:
+    supervisor, pusher = session.write_supervisor, session.pusher
+    if supervisor is not None and pusher is not None:
+        note = hover_afterwards(supervisor.guard.controller, now=pusher.known, before=supervisor.originals)
+        session.history.notice(note)

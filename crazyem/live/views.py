@@ -230,7 +230,7 @@ class SessionControls:
         return f"{self.name}: pushing is {state}."
 
     def revert(self) -> str:
-        """See `WriteSupervisor.take_back`."""
+        """See `WriteSupervisor.revert_on_request`."""
         if self.session.write_supervisor is None:
             return f"{self.name}: nothing was written in this session."
         return f"{self.name}: {self.session.write_supervisor.revert_on_request()}"

@@ -11,6 +11,7 @@ from test_write_gate import Behind, Script, Watched
 
 from crazyem.cli import main
 from crazyem.commands import swarm, watch
+from crazyem.live import runner
 from crazyem.live.flight import Flight
 from crazyem.live.session import Session
 
@@ -18,7 +19,7 @@ from crazyem.live.session import Session
 class Autopilot(Script):
     """A drone that takes a hover thrust, flown by somebody else."""
 
-    hover_parameter, own_hover_estimate, cells = "MPC_THR_HOVER", "", 1
+    hover_parameter, onboard_hover_estimator, cells = "MPC_THR_HOVER", "", 1
 
     def __init__(self):
         super().__init__()
@@ -51,13 +52,14 @@ class Watch:
             try:
                 yield lambda: True
             finally:
-                self.ended_at_view = self.session.oversight._ended.is_set()
+                self.ended_at_view = self.session.write_supervisor._ended.is_set()
 
         watch_follow = watch.follow
         monkeypatch.setattr(watch, "open_link", lambda uri: self.link)
+        monkeypatch.setattr(runner, "open_link", lambda uri: self.link)
         monkeypatch.setattr(watch, "compile_kernels", lambda vehicle: None)
         monkeypatch.setattr(watch, "new_estimator", lambda vehicle, arguments: estimator)
-        monkeypatch.setattr(watch, "Session", make_session)
+        monkeypatch.setattr(runner, "Session", make_session)
         monkeypatch.setattr(watch, "follow", follow)
         monkeypatch.setattr(watch, "live_view", live_view)
 
@@ -150,10 +152,10 @@ def test_a_swarm_writes_in_the_air_only_and_begins_no_set_once_it_is_left(monkey
 
         return counted
 
-    real = swarm.Everyone
+    real = swarm.SwarmInterrupts
     for i, link in enumerate(links.values()):
         link.uri, link.wanted, link.write_parameter = f"fake://{i}", (float(i), 0.0, 0.0), writes(link)
-    monkeypatch.setattr(swarm, "Everyone", caught)
+    monkeypatch.setattr(swarm, "SwarmInterrupts", caught)
     monkeypatch.setattr(swarm, "open_link", links.__getitem__)
     monkeypatch.setattr(swarm, "compile_kernels", lambda vehicle: None)
     monkeypatch.setattr(swarm, "new_estimator", lambda vehicle, arguments, **_: fake.FakeEstimator())

@@ -1,0 +1,87 @@
+"""A session from a URI to its result: what `fly` and `watch` share."""
+
+import contextlib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from crazyem.errors import CrazyemError
+from crazyem.links import open_link
+from crazyem.links.base import Link
+from crazyem.live.flight_result import FlightResult, result_of
+from crazyem.live.pipeline import Estimator
+from crazyem.live.recorder import Recorder, close_recorder, open_recorder
+from crazyem.live.session import Session
+from crazyem.physics import folding
+from crazyem.vehicle import Vehicle
+
+
+def connect(stack: contextlib.ExitStack, uri: str) -> Link:
+    """A connected link that `stack` closes. Raises UsageError, LinkError."""
+    link = open_link(uri)
+    stack.callback(link.close)
+    link.connect()
+    return link
+
+
+def open_session(
+    stack: contextlib.ExitStack,
+    link: Link,
+    *,
+    vehicle: Vehicle,
+    left_out: list[str],
+    estimator: Estimator,
+    configuration: Mapping[str, Any],
+    record: str | None,
+    append: bool,
+    rate: float,
+    reconnect: float,
+    wrench: str = "ctrlLee",
+    wrap: Callable[[Recorder | None], Recorder | None] = lambda recorder: recorder,
+) -> Session:
+    """A session with its recording, not yet started; `stack` closes both.
+
+    Args:
+        left_out: effects of the vehicle file that the estimator does not know.
+        configuration: of the run, for the recording.
+        record, append: path of the recording, None: none; continue an existing one.
+        rate: of the log, Hz. reconnect: how long a lost link is tried again, s.
+        wrench: log group of the controller whose commanded thrust and torque are recorded.
+        wrap: adds what else takes the recorder's messages, such as a live stream.
+    """
+    recorder = wrap(open_recorder(record, configuration=configuration, vehicle=vehicle, link=link, append=append))
+    if recorder is not None:
+        stack.callback(recorder.close)
+    session = Session(
+        link,
+        vehicle=vehicle,
+        estimator=estimator,
+        recorder=recorder,
+        wrench=wrench,
+        rate=rate,
+        reconnect_within=reconnect,
+    )
+    stack.callback(session.close)
+    session.history.notice(folding.notice(left_out))
+    return session
+
+
+def finished(
+    session: Session, *, title: str, log: str | None, extra: Mapping[str, Any], error: BaseException | None
+) -> tuple[FlightResult | None, BaseException | None]:
+    """Close the recording of a closed session; its result, and the first error: `error`, or that of the result."""
+    statistics = session.link.statistics()
+    if session.recorder is not None:
+        close_recorder(session.recorder, statistics, session.history)
+    try:
+        result = result_of(
+            session.pipeline,
+            session.vehicle,
+            title=title,
+            log=log,
+            received=statistics.received,
+            lost=statistics.lost,
+            extra={**extra, "late": statistics.late},
+        )
+    except CrazyemError as late:
+        return None, error or late
+    return result, error
