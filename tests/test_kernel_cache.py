@@ -56,14 +56,6 @@ def run(program: Path, *arguments: str, cache: Path) -> dict[str, str]:
     return dict(line.split() for line in done.stdout.splitlines())
 
 
-def test_what_is_compiled_is_counted_and_what_is_loaded_is_not(toy: Path, tmp_path: Path) -> None:
-    first = run(toy, "inner", "outer", cache=tmp_path)
-    again = run(toy, "outer", "inner", cache=tmp_path)
-    assert int(first.pop("compiled")) >= 2
-    assert again.pop("compiled") == "0"
-    assert first == again
-
-
 def test_no_function_can_be_taken_from_another_library() -> None:
     """Symbols that are weak in a library are taken from whichever library was loaded first."""
 
@@ -88,11 +80,14 @@ def test_no_function_can_be_taken_from_another_library() -> None:
 
 
 def test_processes_that_compile_at_once_leave_a_whole_cache(toy: Path, tmp_path: Path) -> None:
-    with ThreadPoolExecutor(4) as threads:
-        found = list(threads.map(lambda name: run(toy, name, cache=tmp_path), ("inner", "outer") * 2))
-    later = run(toy, "inner", "outer", cache=tmp_path)
-    assert later["compiled"] == "0"
-    assert all(later[name] == value for one in found for name, value in one.items() if name != "compiled")
+    """What is compiled is counted, what is loaded is not; the numbers are the same alone, together, in either order."""
+    names = (("inner", "outer"), ("outer", "inner"))
+    with ThreadPoolExecutor(2) as threads:
+        found = list(threads.map(lambda both: run(toy, *both, cache=tmp_path), names))
+    later = run(toy, "outer", cache=tmp_path)
+    assert all(int(one.pop("compiled")) >= 1 for one in found)
+    assert later.pop("compiled") == "0"
+    assert found[0] == found[1] == {**found[0], **later}
 
 
 BACKWARDS = """

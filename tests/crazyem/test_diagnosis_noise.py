@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.fitting.model import Noise, run_sweep, scored_sweep
-from crazyem.diagnosis.fitting.noise import LEANING_FLOOR, ROWS, fit_noise, logs_of, noise_of, sample_rows
+from crazyem.diagnosis.fitting.noise import LEANING_FLOOR, fit_noise, logs_of, noise_of, sample_rows
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.motion import RotorInput
 
@@ -104,12 +104,12 @@ def test_no_attitude_made_from_an_acceleration_is_very_good() -> None:
 
 
 def test_long_flights_are_judged_by_stretches_all_over() -> None:
-    flight, _, _ = drawn(6, TRUE, rows=ROWS * 2)
-    keep = sample_rows(flight)
-    assert keep.sum() == pytest.approx(ROWS, rel=0.01)
+    flight, _, _ = drawn(6, TRUE, rows=1000)
+    keep = sample_rows(flight, rows=500, stretch=100)
+    assert keep.sum() == pytest.approx(500, rel=0.01)
     assert keep[0]
     assert keep[-1]
-    assert sample_rows(flight.rows(np.arange(ROWS * 2) < ROWS)).all()
+    assert sample_rows(flight.rows(np.arange(1000) < 500), rows=500, stretch=100).all()
 
 
 def test_logarithms_and_back() -> None:

@@ -198,10 +198,12 @@ def test_a_planted_fault_is_named_and_nothing_else(fault: str) -> None:
     assert said in mine[0].text
     assert (mine[0].fix is not None) == fixable
     if fixable:
-        again = repaired(broken, mine[0])
-        while more := found_in(again, check):  # two faults in one signal come off one after the other
+        again, more = broken, mine
+        for _ in range(3):  # two faults in one signal come off one after the other
             again = repaired(again, more[0])
-        assert found_in(again, check) == []
+            if not (more := found_in(again, check)):
+                break
+        assert more == []
 
 
 def test_orders_of_quaternions_are_told_by_gravity_alone_in_a_hover() -> None:

@@ -386,7 +386,7 @@ def test_truncation_keeps_every_whole_chunk(tmp_path: Path) -> None:
     values = random_poses(12)
     content = bag([pose_message("/cf1/pose", START + i * 10**7, v) for i, v in enumerate(values)], chunk=300)
     most = 0
-    for size in range(0, len(content), 3):
+    for size in range(0, len(content), 7):
         try:
             recording = opened(tmp_path, content[:size])
         except FileFormatError:

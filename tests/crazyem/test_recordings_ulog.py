@@ -325,7 +325,7 @@ def test_appended_data_is_read(tmp_path: Path) -> None:
     assert recording.findings[0].evidence["offset"] == offset - len(cut)
 
 
-def test_truncation_at_every_byte(tmp_path: Path) -> None:
+def test_truncation_at_any_byte(tmp_path: Path) -> None:
     content = header() + definitions("vehicle_attitude", "battery_status", "esc_status")
     for i in range(1, 5):
         content += data("vehicle_attitude", 1000 * i, 1, 0, i, 0) + data("battery_status", 1000 * i + 5, 4, i)
@@ -334,8 +334,9 @@ def test_truncation_at_every_byte(tmp_path: Path) -> None:
     starts = {16}
     while max(starts) < len(content):
         starts.add(max(starts) + 3 + int.from_bytes(content[max(starts) : max(starts) + 2], "little"))
+    near = {start + d for start in starts for d in (-1, 0, 1)} & set(range(len(content)))
     readable = 0
-    for size in range(len(content)):
+    for size in sorted({*range(0, len(content), 5), *near}):
         try:
             part = opened(tmp_path, content[:size])
         except FileFormatError:
@@ -353,7 +354,7 @@ def test_truncation_at_every_byte(tmp_path: Path) -> None:
             assert offset in starts
         else:
             assert size in starts
-    assert readable > 700  # from the first data message on
+    assert readable > 140  # from the first data message on
 
 
 def test_garbage_in_the_middle_costs_only_itself(tmp_path: Path) -> None:

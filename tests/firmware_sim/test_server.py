@@ -3,6 +3,7 @@
 import collections
 import contextlib
 import csv
+import io
 import itertools
 import signal
 import socket
@@ -11,9 +12,11 @@ import subprocess
 import sys
 import time
 import types
+from unittest import mock
 
 import pytest
 
+from firmware_sim.__main__ import main
 from firmware_sim.server import Server
 
 TIMEOUT = 60.0  # s; only for a machine that hangs
@@ -162,8 +165,15 @@ def test_when_the_socket_is_full_log_packets_are_dropped_and_replies_wait():
 
 
 def run(*arguments):
-    command = [sys.executable, "-m", "firmware_sim", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=False)
+    """The command in this process: exit code and what it says. It must end before it serves."""
+    out, err = io.StringIO(), io.StringIO()
+    serves = mock.patch("firmware_sim.__main__.Server.run", side_effect=AssertionError("it runs"))
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), serves:
+        try:
+            code = main(arguments)
+        except SystemExit as end:
+            code = end.code
+    return types.SimpleNamespace(returncode=code, stdout=out.getvalue(), stderr=err.getvalue())
 
 
 def assert_one_sentence(result, *words):
