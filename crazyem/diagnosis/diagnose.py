@@ -53,6 +53,7 @@ class Diagnosis:
             as well.
         free: what was free beside the effects.
         swapped: `recordings` are those that were held out (see `flights/roles.py`).
+        by_others: of several recordings with none held out, for each the vehicle fitted to the others.
         selection: by stages; None: by one posterior, whose `ranking` of single effects is as the document has it.
     """
 
@@ -75,6 +76,7 @@ class Diagnosis:
     own: tuple[Own, ...]
     swapped: bool = False
     ranking: tuple[dict[str, Any], ...] = ()
+    by_others: tuple[Vehicle, ...] = ()
 
 
 def diagnose(

@@ -57,9 +57,10 @@ def document_of(
     # a recording has its own sensors: what was found of them is of those that were fitted
     models = [vehicle, as_flown] + ([] if drone == as_flown else [drone])
     train = _compared([without(r, withhold) for r in recordings], models)
-    fitted, confirmed = (
-        _before_after(c) for c in (train, _compared([without(r, withhold) for r in held_out], [vehicle, drone]))
-    )
+    apart = _compared([without(r, withhold) for r in held_out], [vehicle, drone])
+    for recording, other in zip(recordings, diagnosis.by_others, strict=False):
+        apart += _compared([without(recording, withhold)], [vehicle, other])
+    fitted, confirmed = _before_after(train), _before_after(apart)
     left = diagnosis.unexplained
     where = strongest(diagnosis.before.findings)
     document: dict[str, Any] = {

@@ -103,6 +103,9 @@ class Toy:
     def restarted(self, base: ToyFit, members: Any, random: Any, near: Any) -> ToyFit:
         return self.made(members)
 
+    def quiet(self, points: Any) -> Any:
+        return points
+
     def slopes(self, *given: Any) -> dict:
         return {}
 

@@ -279,7 +279,7 @@ class Model:
             self.path = self.shown = self.moved = self.seen = None
             return swept
         self.path = causal_middle(swept.filtered, swept.predicted, flight.starts)
-        self.shown = swept.filtered
+        self.shown = relaxed(swept.filtered, self.shown, offset)
         found = corrected(swept, flight)
         self.moved = acceleration + lacking(*found)
         self.seen = seen_force(acceleration, *found)
@@ -360,6 +360,21 @@ class Model:
             down = offset if column.minus is None else self.offsets(point, acceleration, column.minus)
             d_showing = (up - down) / column.width
         return d_acting, d_showing
+
+
+def relaxed(filtered: NDArray, before: NDArray | None, offset: NDArray) -> NDArray:
+    """(n, 19) states at which what sensors show is evaluated next, by those of this pass and of the one before.
+
+    A velocity that is shown s times too large is taken off by the velocity of the pass before, so errors of that come
+    back -(s - 1) times as large: passes went to and fro without end from s = 1.8 on. Of each change 1/s is taken.
+    """
+    if before is None or not offset[:, 3:6].any():
+        return filtered
+    old = before[:, 3:6]
+    excess = np.sum(offset[:, 3:6] * old, axis=0) / np.maximum(np.sum(old * old, axis=0), 1e-12)
+    out = filtered.copy()
+    out[:, 3:6] = old + (filtered[:, 3:6] - old) / (1.0 + np.maximum(excess, 0.0))
+    return out
 
 
 def _in_order(swept: Swept, order: NDArray) -> Swept:

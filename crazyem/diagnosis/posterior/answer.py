@@ -81,7 +81,7 @@ def told(study: Study, models: Sequence[Fit], felt: Sequence[Felt]) -> Told:
             unnamed = True
             continue
         odds = _gain(effect, models)
-        found.append((odds, _named(study, best, effect, probability, odds)))
+        found.append((odds, named(study, best, effect, probability, odds)))
         known = [r for r in group if not CATALOGUE[r].prior.unnamed]
         if known and probability < SETTINGS.sure:
             groups.append((effect, *known))
@@ -105,7 +105,8 @@ def _gain(effect: str, models: Sequence[Fit]) -> float:
     return models[0].value - max(without) if without else prior_odds()
 
 
-def _named(study: Study, best: Fit, effect: str, probability: float, odds: float) -> Named:
+def named(study: Study, best: Fit, effect: str, probability: float = math.nan, odds: float = math.nan) -> Named:
+    """An effect of a fitted model, with its numbers."""
     random = next((e for e in study.pool.random if e.name == effect), None)
     if random is not None:
         return _random(study, best, effect, probability, odds)

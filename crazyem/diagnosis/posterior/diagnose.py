@@ -4,16 +4,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from crazyem.diagnosis.diagnose import Diagnosis
+from crazyem.diagnosis.fitting.fit import DivergedError
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.flights.floor import on_one_floor
 from crazyem.diagnosis.flights.frame import alike as in_one_frame
 from crazyem.diagnosis.flights.own import owned
 from crazyem.diagnosis.naming.determined import determined
+from crazyem.diagnosis.naming.named import Named
 from crazyem.diagnosis.posterior.accelerometer import felt
-from crazyem.diagnosis.posterior.answer import Told, fitted_vehicle, left_free, ranking, told
+from crazyem.diagnosis.posterior.answer import Told, fitted_vehicle, left_free, named, ranking, told
 from crazyem.diagnosis.posterior.remains import located, remains
 from crazyem.diagnosis.posterior.search import Search
-from crazyem.diagnosis.posterior.study import Study
+from crazyem.diagnosis.posterior.study import Fit, Study
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording
@@ -63,6 +65,10 @@ def diagnose(
         replace(vehicle, effects=fitted_vehicle(vehicle, effects, kinds))
         for kinds in (("vehicle",), ("vehicle", "recording"))
     )
+    by_others: tuple[Vehicle, ...] = ()
+    if effects and len(flights) > 1 and not apart:
+        say("each recording by the others")
+        by_others = tuple(_by_others(study, models, i, effects) for i in range(len(flights)))
     return Diagnosis(
         vehicle=vehicle,
         fitted_vehicle=drone,
@@ -82,7 +88,18 @@ def diagnose(
         free=left_free(study, best),
         own=owned(flights, apart),
         ranking=ranking(models, search.neighbours(nothing)),
+        by_others=by_others,
     )
+
+
+def _by_others(study: Study, models: Sequence[Fit], index: int, effects: Sequence[Named]) -> Vehicle:
+    """The vehicle with what was named, fitted to all recordings but one."""
+    try:
+        again = study.without_flight(models[0], index)
+    except DivergedError:
+        return study.vehicle
+    known = [named(study, again, e.name) for e in effects if e.name in again.effects]
+    return replace(study.vehicle, effects=fitted_vehicle(study.vehicle, known, ("vehicle",)))
 
 
 def _kept(found: Told, impossible: dict[str, str]) -> Told:

@@ -19,7 +19,7 @@ from crazyem.vehicle import Vehicle
 
 FELT = ("specific_force",)  # needs of an effect that the accelerometer alone shows (`accelerometer.py`)
 FEW = 5  # beginnings of an effect up to which all of its parameters are looked at from each
-BELOW = 4.0  # usual spreads by which a recording may be beyond the range of the drone: a delay counted too long
+REACH = 4.0  # usual spreads within which a recording stays, also beyond the range of a drone: a delay counted too long
 
 
 @dataclass(frozen=True)

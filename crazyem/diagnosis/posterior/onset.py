@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.posterior.evidence import Pass, Shared
 from crazyem.diagnosis.posterior.members import Member
-from crazyem.diagnosis.posterior.study import Fit, Look, Study
+from crazyem.diagnosis.posterior.study import Fit, Look, Slopes, Study
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 SCANS = ((1.2, 0.1), (0.12, 0.02))  # s to either side of an onset, and the step between those that are tried
@@ -54,7 +54,7 @@ def begun_later(study: Study, fit: Fit, look: Look, member: Member) -> tuple[Mem
     return later, found[k].gain, found[k].mean[-1:]
 
 
-def dated(study: Study, fit: Fit) -> Fit:
+def dated(study: Study, fit: Fit, near: Slopes) -> Fit:
     """The fit with the onset of its last member to some hundredths of a second, by the likelihood."""
     member = fit.members[-1]
     name = onset_parameter(member.effect)
@@ -69,6 +69,6 @@ def dated(study: Study, fit: Fit) -> Fit:
         fixed = tuple((n, begin if n == name else v) for n, v in member.candidate.fixed)
         members = (*fit.members[:-1], replace(member, candidate=replace(member.candidate, fixed=fixed)))
         start = fit.points[0].with_effects({member.effect: {name: begin}})
-        fit = study.fit([d.twin() for d in fit.data], [start], members, fit.random, fit.phi, {})
+        fit = study.fit([d.twin() for d in fit.data], [start], members, fit.random, fit.phi, near)
         member = fit.members[-1]
     return fit

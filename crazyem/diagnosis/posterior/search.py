@@ -14,7 +14,7 @@ from crazyem.diagnosis.fitting.fit import DivergedError
 from crazyem.diagnosis.posterior.members import Member
 from crazyem.diagnosis.posterior.onset import begun_later, dated
 from crazyem.diagnosis.posterior.settings import SETTINGS
-from crazyem.diagnosis.posterior.study import Fit, Slopes, Study
+from crazyem.diagnosis.posterior.study import Fit, Look, Slopes, Study
 
 Say = Callable[[str], None]
 
@@ -28,12 +28,14 @@ class Neighbour:
         effect: its name.
         gain: log posterior odds against the model that it was looked at from.
         change: (k,) of its parameters from neutral.
+        most: the gain where the noise has no memory, if that is more: a force that lasts may hide in such noise.
     """
 
     member: Member | None
     effect: str
     gain: float
     change: NDArray
+    most: float = -np.inf
 
 
 class Search:
@@ -51,10 +53,10 @@ class Search:
         nothing = study.fit([d.twin() for d in study.data], study.points, (), frozenset(), np.zeros(0), {})
         self._keep(nothing)
         self.say(f"nothing missing: {nothing.value:.1f}, scatter {np.median(nothing.look.shared.scatter):.2f}")
-        self._grow(nothing, most=None)
+        self._grow(nothing, least=SETTINGS.asked, most=None)
         for _ in range(SETTINGS.turns):
             best = self.best
-            self._grow(best, most=SETTINGS.most)
+            self._grow(best)
             if self.best is best:
                 self._exchange(best)
             if self.best is best:
@@ -78,12 +80,14 @@ class Search:
             return self._looked[fit.effects]
         study = self.study
         found: dict[str, Neighbour] = {}
+        loud: dict[str, float] = {}
         data = [d.twin() for d in fit.data]
         near = study.slopes(data, fit.points, fit.members, study.pool.looks)
         look = study.look(data, fit.points, fit.members, near, study.pool.looks)
+        quiet = study.look([d.twin() for d in data], study.quiet(fit.points), fit.members, near, study.pool.looks)
         usual = {c.effect for c, _ in study.pool.usual}
         self._slopes[fit.effects] = {key: columns for key, columns in near.items() if key[0] in usual}
-        base = study.posterior(look, fit.members).gain
+        base, bare = (study.posterior(there, fit.members).gain for there in (look, quiet))
         size = fit.phi.size
         for whole, m in zip(study.pool.members, study.pool.looks, strict=True):
             if m.effect in fit.effects:
@@ -91,6 +95,7 @@ class Search:
             there = study.posterior(look, (*fit.members, m), nudged=(m,))
             scatter = float(np.median(look.shared.scatter[list(look.places[m.candidate])]))
             gain = (there.gain - base) / scatter + m.odds
+            loud[m.effect] = max(loud.get(m.effect, gain), gain, self._of(quiet, fit, m, bare))
             if m.effect not in found or gain > found[m.effect].gain:
                 # of an effect of many beginnings only the amplitude was looked at; the rest is where it begins
                 change = np.zeros(len(whole.candidate.free))
@@ -104,8 +109,15 @@ class Search:
         for effect in study.pool.random:
             if effect.name not in fit.effects and fit.held:
                 found[effect.name] = Neighbour(None, effect.name, np.inf, np.zeros(0))
-        self._looked[fit.effects] = sorted(found.values(), key=lambda n: -n.gain)
+        most = [replace(n, most=max(n.gain, loud.get(n.effect, n.gain))) for n in found.values()]
+        self._looked[fit.effects] = sorted(most, key=lambda n: -n.most)
         return self._looked[fit.effects]
+
+    def _of(self, look: Look, fit: Fit, member: Member, base: float) -> float:
+        """Log posterior odds of a member by another look, by how its scores scatter there."""
+        scatter = float(np.median(look.shared.scatter[list(look.places[member.candidate])]))
+        there = self.study.posterior(look, (*fit.members, member), nudged=(member,))
+        return (there.gain - base) / scatter + member.odds
 
     def _fitted(self, base: Fit, neighbour: Neighbour) -> Fit | None:
         """A neighbour, fitted; None where it leaves the range of numbers."""
@@ -113,17 +125,17 @@ class Search:
         try:
             if neighbour.member is None:
                 return self.study.restarted(base, base.members, base.random | {neighbour.effect}, near)
-            return dated(self.study, self.study.begun(base, neighbour.member, neighbour.change, near))
+            return dated(self.study, self.study.begun(base, neighbour.member, neighbour.change, near), near)
         except (DivergedError, np.linalg.LinAlgError):
             return None
 
-    def _grow(self, base: Fit, *, most: int | None) -> None:
-        """Fit neighbours with one effect more."""
+    def _grow(self, base: Fit, *, least: float | None = None, most: int | None = SETTINGS.most) -> None:
+        """Fit neighbours with one effect more, of which as much is expected; a few in any case."""
         near = self.neighbours(base)
-        top = max((n.gain for n in near if np.isfinite(n.gain)), default=0.0)
-        least = -np.inf if most is None else min(top - SETTINGS.near, SETTINGS.worth * top)
-        wanted = [n for n in near if n.gain > least and base.effects | {n.effect} not in self.visited][:most]
-        self._fit_all(base, wanted)
+        top = max((n.most for n in near if np.isfinite(n.most)), default=0.0)
+        least = min(top - SETTINGS.near, SETTINGS.worth * top) if least is None else least
+        wanted = [n for k, n in enumerate(near) if n.most > least or k < SETTINGS.few][:most]
+        self._fit_all(base, [n for n in wanted if base.effects | {n.effect} not in self.visited])
 
     def _exchange(self, best: Fit) -> None:
         """Fit the model without each of its effects, and with another one in its place."""
@@ -135,8 +147,8 @@ class Search:
                     self._keep(self.study.restarted(best, members, best.random - {effect}, {}))
                 except (DivergedError, np.linalg.LinAlgError):
                     continue
-            if less:
-                self._grow(self.visited[less], most=SETTINGS.most)
+            if less:  # rivals of an effect that brings much must bring some of that, too
+                self._grow(self.visited[less], least=SETTINGS.worth * (best.value - self.visited[less].value))
 
     def _fit_all(self, base: Fit, wanted: Sequence[Neighbour]) -> None:
         for n, fit in zip(wanted, self.study.workers.map(lambda n: self._fitted(base, n), wanted), strict=True):
@@ -164,8 +176,3 @@ def probabilities(models: Sequence[Fit]) -> list[float]:
     weights = np.array([tempered(models[0], m) for m in models])
     weights = np.exp(weights - weights.max())
     return (weights / weights.sum()).tolist()
-
-
-def without_data(fit: Fit) -> Fit:
-    """The fit without the paths of its flights, which need memory."""
-    return replace(fit, data=())

@@ -13,9 +13,11 @@ class Settings:
     much: nats; a round that gains more asks for noise scales anew.
     steps: shares of a Gauss-Newton step that are tried, the first that is no worse is taken.
     rows: of a flight from which noise scales are taken, at most.
+    asked: nats of log posterior odds, by the linear approximation, from which a single effect is fitted.
     worth: share of the best linear gain of a neighbour from which another one is fitted,
     near: and nats below the best from which it is, whatever its share.
-    most: neighbours that are fitted in a turn after the first.
+    few, most: neighbours that are fitted in a turn, at least and, after the first turn, at most.
+    quiet: share of the noise with memory that is left where neighbours are looked at without it.
     turns: of the search, at most.
     told: probability of inclusion from which an effect is named.
     rival: probability of models with a rival in place of a name, from which the two are told as one group.
@@ -29,9 +31,12 @@ class Settings:
     much: float = 2.0
     steps: tuple[float, ...] = (1.0, 0.4, 0.1)
     rows: int = 4000
+    asked: float = -1.5
     worth: float = 0.1
-    near: float = 8.0
-    most: int = 6
+    near: float = 6.0
+    few: int = 3
+    most: int = 5
+    quiet: float = 0.1
     turns: int = 6
     told: float = 0.5
     rival: float = 0.05

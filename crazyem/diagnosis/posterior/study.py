@@ -5,6 +5,7 @@ share and what differs from recording to recording, and its noise scales.
 """
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +19,7 @@ from crazyem.diagnosis.fitting.model import Column, Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.posterior.evidence import Gaussian, Pass, Posterior, Shared
-from crazyem.diagnosis.posterior.members import BELOW, Member, pool_of, prior_odds
+from crazyem.diagnosis.posterior.members import REACH, Member, pool_of, prior_odds
 from crazyem.diagnosis.posterior.settings import SETTINGS
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -140,6 +141,12 @@ class Study:
         disturbance[list(large)] = self.calm
         held = replace(found, noise=replace(found.noise, disturbance=disturbance))
         return data.fit_noise(held, near=near, rows=SETTINGS.rows, held=large)
+
+    def quiet(self, points: Sequence[Point]) -> list[Point]:
+        """The points with little of the noise that has a memory."""
+        return [
+            replace(p, noise=replace(p.noise, disturbance=SETTINGS.quiet * p.noise.disturbance)) for p in points
+        ]  # fmt: skip
 
     def restless(self, fit: Fit) -> float:
         """Log of how much probability the spread of its random effects takes of their prior."""
@@ -339,7 +346,7 @@ class Study:
             free.append((own or c, dict(zip(c.free, look.usual[c], strict=True)), table))
         for m in members:
             free.append((m.candidate, dict(zip(m.candidate.free, look.places[m.candidate], strict=True)), None))
-        moved = []
+        moved, present = [], {m.effect for m in members}
         for f, (point, goal) in enumerate(zip(points, wanted, strict=True)):
             changes: dict[str, dict[str, Any]] = {}
             for c, where, table in free:
@@ -348,7 +355,10 @@ class Study:
                 for k, (name, i) in enumerate(where.items()):
                     low, high = c.range_of(name)
                     if table is not None and table[f, k] > 0:
-                        low = min(low, neutral[name] - BELOW * table[f, k])
+                        reach = REACH * table[f, k]
+                        low = min(low, neutral[name] - reach)
+                        if c.effect not in present:  # beyond, it is an effect
+                            low, high = max(low, neutral[name] - reach), min(high, neutral[name] + reach)
                     here = _away(c, point, name)
                     values[name] = float(np.clip(neutral[name] + here + part * (goal[i] - here), low, high))
             moved.append(point.with_effects(changes))
@@ -360,15 +370,29 @@ class Study:
         Raises: DivergedError.
         """
         c = member.candidate
-        tried = []
+        tried: list[tuple[float, list[Point], list[Data]]] = []
         for part in SETTINGS.steps:
             starts, data = [_started(p, c, part * change) for p in base.points], [d.twin() for d in base.data]
             with np.errstate(over="ignore", invalid="ignore"):
                 value = sum(d.loglik(p, passes=2) for d, p in zip(data, starts, strict=True))
-            tried.append((value if np.isfinite(value) else -np.inf, part, starts, data))
-        _, part, starts, data = max(tried, key=lambda t: t[0])
+            tried.append((value if np.isfinite(value) else -np.inf, starts, data))
+            if tried[-1][0] > base.look.loglik:
+                break
+        _, starts, data = max(tried, key=lambda t: t[0])
         phi = np.concatenate([base.phi, [_away(c, starts[0], n) - _away(c, base.points[0], n) for n in c.free]])
         return self.fit(data, starts, (*base.members, member), base.random, phi, near)
+
+    def without_flight(self, base: Fit, index: int) -> Fit:
+        """The base fitted to all flights but one.
+
+        Raises: DivergedError.
+        """
+        kept = [f for f in range(len(base.points)) if f != index]
+        usual = tuple((c, table[kept]) for c, table in self.pool.usual)
+        rest = copy(self)
+        rest.pool, rest.points = replace(self.pool, usual=usual), tuple(self.points[f] for f in kept)
+        data, points = [base.data[f].twin() for f in kept], [base.points[f] for f in kept]
+        return rest.fit(data, points, base.members, base.random, base.phi, {})
 
     def restarted(self, base: Fit, members: Sequence[Member], random: frozenset[str], near: Slopes) -> Fit:
         """The base with some of its members only, or with other random effects.
