@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from crazyem.control.indi_setpoint import PARAMETERS, IndiGains
 from crazyem.control.trajectories import Trajectory, Vector, after_hover
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links.base import ConfirmingLink, Link
@@ -108,6 +109,7 @@ class Flight:
         self.link = session.link
         self.plan = plan
         self.interrupts = interrupts or Interrupts()
+        self._indi: IndiGains | None = None
         self.progress = progress or (lambda phase, seconds: None)
         self.phase = "on the ground"
         self._phase_start = math.nan
@@ -164,6 +166,9 @@ class Flight:
         if telemetry.grounded_reason():
             raise UsageError(f"the drone cannot fly: {telemetry.grounded_reason()}.")
         select_controller(self.link, self.plan.controller)
+        if self.plan.controller.incremental:
+            told = {name: self.link.read_parameter(name) for name in PARAMETERS if name in self.link.parameters}
+            self._indi = IndiGains.of(told)
         if self.plan.push:
             note = self.session.push_to_controller(self.plan.rules)
             if note and self.session.recorder is not None:
@@ -195,7 +200,12 @@ class Flight:
         path = after_hover(self.path, seconds=self.plan.baseline)
         record = self.session.recorder.setpoint if self.session.recorder is not None else None
         self._stream = stream = SetpointStream(
-            self.link, path, self.session.clock, on_setpoint=record, reconnecting=lambda: self.session.reconnecting
+            self.link,
+            path,
+            self.session.clock,
+            on_setpoint=record,
+            reconnecting=lambda: self.session.reconnecting,
+            indi=self._indi,
         )
         self._enter("hovering")
         stream.start()

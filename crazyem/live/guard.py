@@ -17,6 +17,9 @@ WRITABLE_ESTIMATES = ("mass", *INERTIA_NAMES, "motor_time_constant", "mass_thrus
 # Which limits hold for an estimate, by the first part of their names.
 LIMITS_OF = {"mass": "mass", "motor_time_constant": "lag", "mass_thrust": "mass_thrust"}
 LIMITS_OF |= dict.fromkeys(INERTIA_NAMES, "inertia") | dict.fromkeys(DRAG_NAMES, "drag")
+# Largest 95 % half widths between a belief about INDI's loop gain and an acceptable estimate beyond which the belief
+# counts as wrong: the estimate then has to agree with itself for `STEP_SHARE` of the time only.
+REFUTED = 3.0
 LARGEST_STEP = 0.25  # relative change of mass that one write may follow at once
 STEP_RECENT = 5.0  # s for which that holds, or until the new mass is written
 
@@ -61,7 +64,7 @@ class Limits:
     lag_half_width: float = 0.20
     lag_agreement: float = 0.15
     lag_deadband: float = 0.10
-    mass_thrust_bounds: tuple[float, float] = (0.99, 1.01)
+    mass_thrust_bounds: tuple[float, float] = (0.5, 2.0)
     mass_thrust_absolute: tuple[float, float] = (1e4, 1e6)
     mass_thrust_half_width: float = 0.05
     mass_thrust_agreement: float = 0.02
@@ -73,7 +76,7 @@ class Limits:
     drag_deadband: float = 0.10
     drag_slew: float = 0.25
     effectiveness_bounds: tuple[float, float] = (0.5, 2.0)
-    effectiveness_slew: float = 0.35
+    effectiveness_slew: float = 0.50
     effectiveness_unjudged: float = 0.50
 
     def of(self, name: str, kind: str) -> Any:
@@ -287,6 +290,8 @@ class Guard:
         newest, needed = self._history[-1], self.limits.agreement_time
         if name == "mass" and self._recent_step(time) is not None:
             needed *= STEP_SHARE
+        if self.controller.incremental and self._refuted(name):
+            needed *= STEP_SHARE
         if newest[2][name]:
             return newest[2][name]
         if time - self._history[0][0] < needed:
@@ -303,6 +308,11 @@ class Guard:
         if change < self.limits.of(name, "deadband"):
             return "unchanged"
         return ""
+
+    def _refuted(self, name: str) -> bool:
+        """Whether a belief is so far from an acceptable estimate that what is known is that the belief is wrong."""
+        far = REFUTED * float(self.limits.of(name, "half_width"))
+        return abs(self._history[-1][1][name] / self.beliefs[name] - 1) > far if self.beliefs[name] > 0 else True
 
     def _slewed(self, name: str, value: float, step: Step | None) -> float:
         now, slew, unjudged = self.beliefs[name], self.limits.slew, self.limits.unjudged

@@ -38,6 +38,7 @@ class MonitorLimits:
     """What counts as worse after a write than before.
 
     Attributes:
+        lead: s by which a setpoint may be ahead of a drone without that being an error.
         before, settle, after: s, lengths of the stretches.
         unjudged: sets of writes that may follow each other before they were judged.
         tracking_ratio, tracking, tracking_alarm: position error, relative to before, and over it [m].
@@ -48,6 +49,7 @@ class MonitorLimits:
     """
 
     enabled: bool = True
+    lead: float = 0.1  # no key of a policy: it belongs to the controller
     before: float = 2.0
     settle: float = 0.5
     after: float = 2.5

@@ -14,7 +14,9 @@ from crazyem.signals.sample import Sample
 
 HIGH_PASS_SECONDS = 0.1  # s, time constant of the high-pass on body rates: 1.6 Hz, above what trajectories ask for
 ALARM_SECONDS = 0.3  # s over which an alarm is taken
-LEAD_SECONDS = 0.1  # s by which a drone may follow a moving setpoint late without that being an error
+# m/s by which the setpoint may speed up before innovations are not compared any more: drag, which the model does not
+# know, grows with speed.
+LIKE_SPEED = 0.5
 SPEED_SPAN = 0.1  # s over which the setpoint's speed is taken: logged positions come in whole millimetres
 FEWEST_VALUES = 20  # values without which a stretch says nothing
 SERIES_LENGTH = 4096  # values of each series: bounded memory, whatever the rates
@@ -236,7 +238,7 @@ class PostWriteMonitor:
         if (
             base < LOST_TRACKING_DISTANCE
             and time - self._first > 0
-            and distance > base + alarm + LEAD_SECONDS * now.speed
+            and distance > base + alarm + limits.lead * now.speed
         ):
             return f"{distance:.2f} m from the setpoint, {base:.2f} m before"
         if now.oscillation > _or(before.oscillation, 0.0) + limits.oscillation_alarm:
@@ -246,11 +248,12 @@ class PostWriteMonitor:
     def _worse(self, before: Figures, after: Figures) -> str:
         """Comparisons with NaN are false: what is not known is not worse."""
         limits = self.limits
-        moving = LEAD_SECONDS * max(_or(after.speed, 0.0) - _or(before.speed, 0.0), 0.0)
+        moving = limits.lead * max(_or(after.speed, 0.0) - _or(before.speed, 0.0), 0.0)
         allowed = max(limits.tracking_ratio * before.tracking, before.tracking + limits.tracking) + moving
         if before.tracking < LOST_TRACKING_DISTANCE and after.tracking > allowed:
             return f"{after.tracking:.3f} m rms from the setpoint, {before.tracking:.3f} m before"
-        if after.innovation > max(limits.innovation_ratio * before.innovation, limits.innovation):
+        faster = _or(after.speed, 0.0) - _or(before.speed, 0.0) > LIKE_SPEED
+        if not faster and after.innovation > max(limits.innovation_ratio * before.innovation, limits.innovation):
             return f"innovations of {after.innovation:.1f} standard deviations, {before.innovation:.1f} before"
         allowed = max(limits.oscillation_ratio * before.oscillation, before.oscillation + limits.oscillation)
         if after.oscillation > allowed:

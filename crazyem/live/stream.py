@@ -1,9 +1,10 @@
-"""Streams full-state setpoints at a steady rate of the firmware's clock, in a thread nothing else can delay."""
+"""Streams setpoints at a steady rate of the firmware's clock, in a thread nothing else can delay."""
 
 import threading
 import time
 from collections.abc import Callable
 
+from crazyem.control.indi_setpoint import IndiGains, place_ahead
 from crazyem.control.trajectories import Reference, Trajectory
 from crazyem.errors import LinkError
 from crazyem.links.base import Link
@@ -23,6 +24,7 @@ class SetpointStream:
 
     Args:
         on_setpoint: called with (firmware time [s], reference) after each setpoint (recording).
+        indi: gains of INDI, which then gets places ahead of the reference; None: full-state setpoints.
         returning: whether a lost link is being brought back; a setpoint that cannot be sent meanwhile is left out.
     """
 
@@ -34,11 +36,13 @@ class SetpointStream:
         *,
         on_setpoint: Callable[[float, Reference], None] | None = None,
         reconnecting: Callable[[], bool] | None = None,
+        indi: IndiGains | None = None,
     ) -> None:
         self.link = link
         self.trajectory = trajectory
         self.clock = clock
         self.on_setpoint = on_setpoint
+        self.indi = indi
         self.reconnecting = reconnecting or (lambda: False)
         self.left_out = 0
         self._reached = 0.0
@@ -96,7 +100,10 @@ class SetpointStream:
     def _send(self, r: Reference) -> bool:
         """Whether it left; raises LinkError if it did not and nobody is bringing the link back."""
         try:
-            self.link.send_full_state(r.position, r.velocity, r.acceleration, r.quaternion, (0.0, 0.0, r.yaw_rate))
+            if self.indi is not None:
+                self.link.send_position(*place_ahead(r, self.indi))
+            else:
+                self.link.send_full_state(r.position, r.velocity, r.acceleration, r.quaternion, (0.0, 0.0, r.yaw_rate))
         except LinkError as error:
             # The link reports its loss through the queue of packets: give whoever reads it a moment to act on it.
             until = time.monotonic() + OUTAGE_NOTICE_SECONDS

@@ -1,0 +1,296 @@
+"""What pushing INDI's effectiveness, the filter's drag and Mellinger's massThrust does, in random worlds with payloads.
+
+    python -m benchmarks.controller_parameters fly --seeds 200 --out out/controllers.jsonl   # goes on where it stopped
+    python -m benchmarks.controller_parameters table --out out/controllers.jsonl [--docs]
+
+A seed is nine flights (20 s of processor time): INDI with the true g1, with 0.5 and 1.5 times the true one and the
+guard; INDI with an estimate of inertia that is wrong by a drawn factor and certain of it, with the guard and without;
+figure 8 at 1.5 m/s under Lee with and without kalman.dragB_* pushed; Mellinger on a brushless drone, whose
+massThrust is 1.61 times what it should be, with and without pushing. Judged by the simulator's truth.
+"""
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.indi_flight import GuardedFlight, scaled
+from crazyem.control.command_units import effectiveness_torque, lag_share
+from crazyem.control.trajectories import Reference, Trajectory, excite, figure8, hover
+from crazyem.vehicle import Vehicle, load_vehicle
+from firmware_sim.plant import layout as at
+from firmware_sim.scenario import Scenario, parse_scenario
+
+MELLINGER, INDI, LEE = 2, 3, 5  # stabilizer.controller
+AXES = "pqr"
+EXCITED, REST, STEP, AFTER = 4.0, 1.0, 0.5, 2.0  # s, s, m, s: excitation, hover, step of the place, hover
+LATERAL, ANGULAR, RAMP = 0.9, 9.0, 0.5  # m/s^2, rad/s^2, s of the excitation
+TILT_LIMIT = math.radians(10.0)  # posCtrlIndi.pq_clamping: what a step of the place asks for
+WITHIN = 0.05  # of the true g1
+SPEED = 1.5  # m/s, the highest of the figure
+MARKS = ("<!-- controllers: table -->", "<!-- /controllers -->")
+DOCS = Path(__file__).resolve().parents[1] / "docs" / "controller_parameters.md"
+
+
+@dataclass(frozen=True)
+class World:
+    """What a seed draws: SI. `lie`: inertia estimated over the true one in the flights with a wrong estimate."""
+
+    mass: float
+    inertia: tuple[float, float, float]
+    lag: float
+    payload: float
+    place: tuple[float, float, float]
+    drag: tuple[float, float]
+    lie: float
+
+    def table(self, platform: str = "cf2") -> dict[str, Any]:
+        """The scenario's keys."""
+        payload = {"mass": self.payload, "x": self.place[0], "y": self.place[1], "z": self.place[2]}
+        scale = 1.35 if platform == "cf21bl" else 1.0
+        body = {
+            "mass": scale * self.mass,
+            "inertia": [scale * j for j in self.inertia],
+            "motor_time_constant": self.lag,
+        }
+        return {"platform": platform, "vehicle": body, "effects": {"payload": payload}}
+
+
+def draw(seed: int) -> World:
+    """The world of a seed."""
+    r = np.random.default_rng([seed, 44])
+    spread = np.exp(r.normal(0.0, 0.08, 3)) * math.exp(r.normal(0.0, 0.1))
+    inertia = np.array([1.657e-5, 1.666e-5, 2.926e-5]) * spread
+    inertia[2] = min(inertia[2], 0.97 * (inertia[0] + inertia[1]))
+    return World(
+        mass=0.029 * r.uniform(0.95, 1.08),
+        inertia=(float(inertia[0]), float(inertia[1]), float(inertia[2])),
+        lag=r.uniform(0.035, 0.065),
+        payload=r.uniform(0.001, 0.006),
+        place=(r.uniform(-0.004, 0.004), r.uniform(-0.004, 0.004), r.uniform(-0.02, 0.01)),
+        drag=(r.uniform(0.006, 0.018), r.uniform(0.006, 0.018)),
+        lie=math.exp(r.choice((-1, 1)) * r.uniform(math.log(1.4), math.log(5.0))),
+    )
+
+
+def true_effectiveness(scenario: Scenario, vehicle: Vehicle) -> tuple[float, ...]:
+    """g1 of the body with its payload [rad/s^2 a unit]."""
+    inertia = scenario.truth()[at.INERTIA : at.INERTIA + 9 : 4]
+    return tuple(t / float(j) for t, j in zip(effectiveness_torque(vehicle), inertia))
+
+
+def excite_and_step() -> Trajectory:
+    """Excitation, hover, then the place jumps by half a metre along x."""
+    shaken = excite(
+        position=(0.0, 0.0, 1.0), duration=EXCITED, lateral=LATERAL, vertical=0.5, angular=ANGULAR, ramp=RAMP
+    )
+
+    def at_time(t: float) -> Reference:
+        if t < EXCITED:
+            return shaken.at(t)
+        return Reference((0.0 if t < EXCITED + REST else STEP, 0.0, 1.0))
+
+    return Trajectory("excite and step", EXCITED + REST + AFTER, at_time)
+
+
+def pitch(row: Sequence[float]) -> float:
+    """rad, of a row of `GuardedFlight.rows`."""
+    w, x, y, z = row[7:11]
+    return math.asin(max(-1.0, min(1.0, 2.0 * (w * y - x * z))))
+
+
+def overshoot(flight: GuardedFlight) -> float:
+    """Of the pitch that a step of the place asks for, over that pitch: 0.1 is 11 degrees; NaN after a crash."""
+    begun = EXCITED + REST
+    seen = [pitch(row) for row in flight.rows if begun <= row[0] <= begun + 0.6]
+    return max(seen) / TILT_LIMIT - 1.0 if seen and not flight.crashed else math.nan
+
+
+def indi(seed: int, start: float, *, push: bool = True, lie: float | None = None, guard: bool = True) -> dict[str, Any]:
+    """One flight of INDI whose g1 is `start` times the true one at take-off, and what came of it."""
+    world, vehicle = draw(seed), load_vehicle("cf2")
+    scenario = parse_scenario(world.table(), f"seed {seed}")
+    true = true_effectiveness(scenario, vehicle)
+    told = {f"ctrlINDI.g1_{a}": start * g for a, g in zip(AXES, true)}
+    if not push:
+        told |= {f"ctrlINDI.act_dyn_{a}": lag_share(world.lag) for a in AXES}
+    tamper = None if lie is None else lambda e: scaled(e, ("Ixx", "Iyy", "Izz"), lie)
+    flight = GuardedFlight(scenario, seed, vehicle, INDI, told, push=push and guard, tamper=tamper)
+    errors: list[tuple[float, float]] = []  # s, largest error of the three
+    at_once: list[float] = []
+
+    def look(f: GuardedFlight) -> None:
+        if lie is not None and not guard and not at_once and f.seconds > 1.0:
+            at_once.append(f.seconds)
+            for a, g in zip(AXES, true):
+                f.client.set(f"ctrlINDI.g1_{a}", g / lie)
+        errors.append((f.seconds, max(abs(f.read(f"ctrlINDI.g1_{a}") / g - 1.0) for a, g in zip(AXES, true))))
+
+    flight.fly(excite_and_step(), each=look, push_for=EXCITED + 0.9 * REST)
+    far = [t for t, error in errors if error > WITHIN]
+    return {
+        "crashed": flight.crashed,
+        "reverted": flight.reverted,
+        "writes": len(flight.writes),
+        "within_s": max(far, default=-math.inf) if far and far[-1] < errors[-1][0] - 0.1 else (None if far else 0.0),
+        "error_2s": next((e for t, e in errors if t >= 2.0), None),
+        "error": errors[-1][1],
+        "worst_error": max(e for _, e in errors),
+        "overshoot": overshoot(flight),
+        "oscillation": float(np.sqrt(np.mean([np.square(r[11:13]).sum() for r in flight.rows[-150:]]))),
+    }
+
+
+def onboard_drag(seed: int, *, push: bool) -> dict[str, Any]:
+    """Figure 8 at 1.5 m/s under Lee: rms error of the onboard velocity along x and y in the last 10 s."""
+    world, vehicle = draw(seed), load_vehicle("cf2")
+    table = world.table()
+    table["effects"]["linear_drag"] = {"x": world.drag[0], "y": world.drag[1], "z": 0.0}
+    mass = world.mass + world.payload
+    period = 2.0 * math.pi * math.hypot(1.0, 1.0) / SPEED  # speed at the crossing: 2 pi/T sqrt(sx^2 + (2 sy)^2)
+    flight = GuardedFlight(parse_scenario(table, f"seed {seed}"), seed, vehicle, LEE, {"ctrlLee.mass": mass}, push=push)
+    path = figure8(position=(0.0, 0.0, 1.0), duration=25.0, size=(1.0, 0.5), period=period)
+    flight.fly(path)
+    late = [r for r in flight.rows if r[0] >= path.duration - 12.0 and r[0] <= path.duration - 2.0]
+    errors = [(r[14] - r[4], r[15] - r[5]) for r in late]
+    found = [flight.read(f"kalman.dragB_{a}") for a in "xy"]
+    return {
+        "crashed": flight.crashed,
+        "reverted": flight.reverted,
+        "error_m_s": float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1)))),
+        "speed_m_s": float(max(math.hypot(r[4], r[5]) for r in flight.rows)),
+        "found": [f * mass / d - 1.0 for f, d in zip(found, world.drag)] if push else None,
+    }
+
+
+def mass_thrust(seed: int, *, push: bool) -> dict[str, Any]:
+    """Mellinger on a brushless drone that knows its mass: mean height error of the last 3 s of 20 s of hover."""
+    world, vehicle = draw(seed), load_vehicle("cf21bl")
+    scenario = parse_scenario(world.table("cf21bl"), f"seed {seed}")
+    mass = float(scenario.truth()[at.MASS])
+    flight = GuardedFlight(scenario, seed, vehicle, MELLINGER, {"ctrlMel.mass": mass}, push=push)
+    flight.fly(hover(position=(0.0, 0.0, 1.0), duration=20.0))
+    return {
+        "crashed": flight.crashed,
+        "reverted": flight.reverted,
+        "height_m": float(np.mean([r[3] for r in flight.rows if r[0] > 17.0]) - 1.0),
+        "first_m": float(np.mean([r[3] for r in flight.rows if -0.5 < r[0] < 0.0]) - 1.0),
+        "mass_error": flight.read("ctrlMel.mass") / mass - 1.0,
+        "mass_thrust": flight.read("ctrlMel.massThrust"),
+    }
+
+
+def flights(seed: int) -> dict[str, Callable[[], dict[str, Any]]]:
+    """Name -> flight."""
+    lie = draw(seed).lie
+    return {
+        "ideal": lambda: indi(seed, 1.0, push=False),
+        "low": lambda: indi(seed, 0.5),
+        "high": lambda: indi(seed, 1.5),
+        "lie guarded": lambda: indi(seed, 1.0, lie=lie),
+        "lie unguarded": lambda: indi(seed, 1.0, lie=lie, guard=False),
+        "drag": lambda: onboard_drag(seed, push=True),
+        "no drag": lambda: onboard_drag(seed, push=False),
+        "massThrust": lambda: mass_thrust(seed, push=True),
+        "no massThrust": lambda: mass_thrust(seed, push=False),
+    }
+
+
+def load(path: Path) -> dict[int, dict[str, Any]]:
+    """Seed -> name -> result of what has been flown."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    done: dict[int, dict[str, Any]] = {}
+    for line in lines:
+        entry = json.loads(line)
+        done.setdefault(entry["seed"], {})[entry["flight"]] = entry["result"]
+    return done
+
+
+def fly_all(seeds: Sequence[int], path: Path, only: Sequence[str]) -> None:
+    """Fly what is missing; a line a flight."""
+    done = load(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for seed in seeds:
+        for name, flight in flights(seed).items():
+            if name in done.get(seed, {}) or (only and name not in only):
+                continue
+            entry = {"seed": seed, "flight": name, "result": flight()}
+            with path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(entry) + "\n")
+            print(json.dumps(entry), flush=True)
+
+
+def table(done: dict[int, dict[str, Any]]) -> str:
+    """Markdown: what was asked for, and what came out."""
+
+    def of(name: str, key: str) -> list[float]:
+        values = [r[name][key] for r in done.values() if name in r]
+        return [math.nan if v is None else float(v) for v in values]
+
+    def said(values: Sequence[float], unit: str, scale: float = 1.0) -> str:
+        v = np.array([x for x in values if math.isfinite(x)]) * scale
+        return f"{np.median(v):.2f} ({np.quantile(v, 0.1):.2f} to {np.quantile(v, 0.9):.2f}) {unit}" if v.size else "-"
+
+    lines = ["| | n | median (10 to 90 %) | share |", "|---|---|---|---|"]
+    for name, what in (("low", "INDI, g1 at 0.5 of the true"), ("high", "INDI, g1 at 1.5 of the true")):
+        n, within, error = len(of(name, "crashed")), of(name, "within_s"), of(name, "error_2s")
+        lines.append(f"| {what}: all three within 5 %, s of excitation | {n} | {said(within, 's')} "
+                     f"| within 2 s: {sum(w <= 2.0 for w in within)} of {n} |")  # fmt: skip
+        lines.append(f"| the same: largest error after 2 s | {n} | {said(error, '%', 100)} | "
+                     f"under 5 %: {sum(e <= WITHIN for e in error)} of {n} |")  # fmt: skip
+        both = [r[name]["overshoot"] - r["ideal"]["overshoot"] for r in done.values() if {name, "ideal"} <= set(r)]
+        lines.append(f"| the same: overshoot of a step of tilt over the ideal's | {len(both)} | {said(both, '%', 100)} "
+                     f"| within 10 %: {sum(abs(b) <= 0.1 for b in both)} of {len(both)}; crashed: "
+                     f"{int(sum(of(name, 'crashed')))} |")  # fmt: skip
+    for name, what in (("lie unguarded", "inertia wrong 1.4 to 5 times, written at once"),
+                       ("lie guarded", "the same estimate, through the guard")):  # fmt: skip
+        n, worst = len(of(name, "crashed")), of(name, "worst_error")
+        lines.append(f"| INDI, {what}: largest error of g1 | {n} | {said(worst, '%', 100)} | crashed: "
+                     f"{int(sum(of(name, 'crashed')))}, taken back: {int(sum(of(name, 'reverted')))} |")  # fmt: skip
+    for name, what in (("no drag", "nothing pushed"), ("drag", "kalman.dragB_* pushed")):
+        lines.append(f"| figure 8 at {SPEED} m/s, Lee, {what}: error of the onboard velocity | "
+                     f"{len(of(name, 'crashed'))} | {said(of(name, 'error_m_s'), 'cm/s', 100)} | crashed: "
+                     f"{int(sum(of(name, 'crashed')))} |")  # fmt: skip
+    falls = [
+        1 - r["drag"]["error_m_s"] / r["no drag"]["error_m_s"] for r in done.values() if {"drag", "no drag"} <= set(r)
+    ]
+    lines.append(f"| the same: the error falls by | {len(falls)} | {said(falls, '%', 100)} "
+                 f"| by a third or more: {sum(f >= 1 / 3 for f in falls)} of {len(falls)} |")  # fmt: skip
+    for name, what in (("no massThrust", "nothing pushed"), ("massThrust", "massThrust pushed")):
+        height = of(name, "height_m")
+        n = len(height)
+        lines.append(f"| Mellinger, brushless, massThrust 132000, {what}: height error | {n} "
+                     f"| {said(height, 'cm', 100)} | under 2 cm: {sum(abs(h) < 0.02 for h in height)} of {n}; "
+                     f"mass over 1 % wrong: {sum(abs(m) > 0.01 for m in of(name, 'mass_error'))} |")  # fmt: skip
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Fly, or make the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("fly", "table"))
+    parser.add_argument("--seeds", type=int, default=200, metavar="N", help="how many (default: 200)")
+    parser.add_argument("--first", type=int, default=1, metavar="SEED", help="the first (default: 1)")
+    parser.add_argument("--only", nargs="+", default=[], metavar="FLIGHT", help="these flights of a seed")
+    parser.add_argument("--out", type=Path, default=Path("out/controllers.jsonl"), metavar="FILE", help="results")
+    parser.add_argument("--docs", action="store_true", help="write the table into docs/controller_parameters.md")
+    given = parser.parse_args(argv)
+    if given.what == "fly":
+        fly_all(range(given.first, given.first + given.seeds), given.out, given.only)
+        return 0
+    text = table(load(given.out))
+    print(text)
+    if given.docs:
+        head, rest = DOCS.read_text(encoding="utf-8").split(MARKS[0])
+        DOCS.write_text(f"{head}{MARKS[0]}\n\n{text}\n\n{MARKS[1]}{rest.split(MARKS[1])[1]}", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
