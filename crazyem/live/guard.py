@@ -18,7 +18,7 @@ WRITABLE_ESTIMATES = ("mass", *INERTIA_NAMES, "motor_time_constant", "mass_thrus
 LIMITS_OF = {"mass": "mass", "motor_time_constant": "lag", "mass_thrust": "mass_thrust"}
 LIMITS_OF |= dict.fromkeys(INERTIA_NAMES, "inertia") | dict.fromkeys(DRAG_NAMES, "drag")
 # Largest 95 % half widths between a belief about INDI's loop gain and an acceptable estimate beyond which the belief
-# counts as wrong: the estimate then has to agree with itself for `STEP_SHARE` of the time only.
+# counts as wrong: the estimate then has to agree with itself for `STEP_SHARE` of the time, and waits as much shorter.
 REFUTED = 3.0
 LARGEST_STEP = 0.25  # relative change of mass that one write may follow at once
 STEP_RECENT = 5.0  # s for which that holds, or until the new mass is written
@@ -210,7 +210,8 @@ class Guard:
         if objection:
             return Decision(time, reason=objection)
         recent = self._recent_step(time)
-        if time - self._last_write < self.limits.interval * (STEP_SHARE if recent is not None else 1.0):
+        hurry = recent is not None or any(map(self._refuted, self.beliefs))
+        if time - self._last_write < self.limits.interval * (STEP_SHARE if hurry else 1.0):
             return Decision(time, reason="too soon after the last write")
 
         reasons: dict[str, str] = {}
@@ -290,7 +291,7 @@ class Guard:
         newest, needed = self._history[-1], self.limits.agreement_time
         if name == "mass" and self._recent_step(time) is not None:
             needed *= STEP_SHARE
-        if self.controller.incremental and self._refuted(name):
+        if self._refuted(name):
             needed *= STEP_SHARE
         if newest[2][name]:
             return newest[2][name]
@@ -310,9 +311,11 @@ class Guard:
         return ""
 
     def _refuted(self, name: str) -> bool:
-        """Whether a belief is so far from an acceptable estimate that what is known is that the belief is wrong."""
-        far = REFUTED * float(self.limits.of(name, "half_width"))
-        return abs(self._history[-1][1][name] / self.beliefs[name] - 1) > far if self.beliefs[name] > 0 else True
+        """Whether what INDI believes of its loop gain is so far from an acceptable estimate that it counts as wrong."""
+        _, values, faults = self._history[-1]
+        if not self.controller.incremental or name not in INERTIA_NAMES or faults[name] or not self.beliefs[name] > 0:
+            return False
+        return abs(values[name] / self.beliefs[name] - 1) > REFUTED * self.limits.inertia_half_width
 
     def _slewed(self, name: str, value: float, step: Step | None) -> float:
         now, slew, unjudged = self.beliefs[name], self.limits.slew, self.limits.unjudged

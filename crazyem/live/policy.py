@@ -39,6 +39,7 @@ class MonitorLimits:
 
     Attributes:
         lead: s by which a setpoint may be ahead of a drone without that being an error.
+        high_pass: s, time constant of the high-pass on body rates: 1.6 Hz, above what trajectories ask for.
         before, settle, after: s, lengths of the stretches.
         unjudged: sets of writes that may follow each other before they were judged.
         tracking_ratio, tracking, tracking_alarm: position error, relative to before, and over it [m].
@@ -49,7 +50,8 @@ class MonitorLimits:
     """
 
     enabled: bool = True
-    lead: float = 0.1  # no key of a policy: it belongs to the controller
+    lead: float = 0.1  # no key of a policy, like the next one: they belong to the controller
+    high_pass: float = 0.1
     before: float = 2.0
     settle: float = 0.5
     after: float = 2.5

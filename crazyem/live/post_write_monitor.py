@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from crazyem.live.policy import MonitorLimits
 from crazyem.signals.sample import Sample
 
-HIGH_PASS_SECONDS = 0.1  # s, time constant of the high-pass on body rates: 1.6 Hz, above what trajectories ask for
 ALARM_SECONDS = 0.3  # s over which an alarm is taken
 # m/s by which the setpoint may speed up before innovations are not compared any more: drag, which the model does not
 # know, grows with speed.
@@ -156,7 +155,7 @@ class PostWriteMonitor:
         if before is None or not 0.0 < time - before[0] < HIGH_PASS_GAP:
             self._slow = rate
             return
-        share = 1.0 - math.exp(-(time - before[0]) / HIGH_PASS_SECONDS)
+        share = 1.0 - math.exp(-(time - before[0]) / self.limits.high_pass)
         self._slow = tuple(s + share * (r - s) for s, r in zip(self._slow, rate))
         self._oscillation.add(time, math.dist(rate, self._slow) ** 2)
 

@@ -24,6 +24,8 @@ from crazyem.live.write_gate import WriteGate
 from crazyem.signals.sample import Sample
 
 INDI_LEAD = 1.0  # s, 1/posCtrlIndi.K_xi: INDI follows a place by its speed only where the place is so far ahead
+# s, 6 Hz: with a loop gain that is too high INDI trembles with 7 to 12 Hz (docs/guard.md), an excitation has 1 to 4 Hz.
+INDI_HIGH_PASS = 0.027
 MONITOR_PERIOD = 0.04  # s between looks of the watch
 GROUNDED_WITHIN = 3.0  # s; the firmware says that it flies for 2 s after its motors stopped
 HOLD_NOTE_PERIOD = 1.0  # s between notes on why nothing is written; only when the reason is another one
@@ -87,7 +89,12 @@ class WriteSupervisor:
         self.gate = gate
         limits = rules.policy.watch
         if guard.controller.incremental:
-            limits = replace(limits, oscillation=limits.incremental_oscillation, lead=INDI_LEAD)
+            limits = replace(
+                limits,
+                oscillation=limits.incremental_oscillation,
+                lead=INDI_LEAD,
+                high_pass=INDI_HIGH_PASS,
+            )
         self.watch = PostWriteMonitor(limits)
         self.drag = DragRegression()
         guard.capped = rules.policy.watch.enabled and not rules.dry_run

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from crazyem.live.policy import MonitorLimits
-from crazyem.live.post_write_monitor import HIGH_PASS_SECONDS, SERIES_LENGTH, PostWriteMonitor
+from crazyem.live.post_write_monitor import SERIES_LENGTH, PostWriteMonitor
 from crazyem.signals.sample import Sample
 
 LIMITS = MonitorLimits()
@@ -148,7 +148,7 @@ def test_figures_against_a_plain_version():
         if slow is None:
             slow = list(w)
         else:
-            a = math.exp(-(t - last) / HIGH_PASS_SECONDS)
+            a = math.exp(-(t - last) / MonitorLimits().high_pass)
             slow = [a * x + (1 - a) * y for x, y in zip(slow, w)]
         last = t
         rows.append((t, math.dist(p, s), math.dist(w, slow)))
