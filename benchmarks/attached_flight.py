@@ -48,7 +48,7 @@ STANDS = 0.01  # m above the floor below which the drone stands
 HEIGHT, RISE = 1.0, 2.0  # m, s
 WAYS = ("leaves", "exception", "Ctrl-C", "stays", "link lost")
 CTYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t", "i8": "int8_t", "i16": "int16_t", "i32": "int32_t"}
-DOCS = Path(__file__).resolve().parents[1] / "docs" / "fault_campaign.md"
+DOCS = Path(__file__).resolve().parents[1] / "docs" / "results" / "fault_campaign.md"
 MARKS = ("<!-- attached: table -->", "<!-- /attached -->")
 
 
@@ -399,7 +399,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--flights", type=int, default=200, help="seeds (default %(default)s)")
     parser.add_argument("--first", type=int, default=1, help="seed (default %(default)s)")
     parser.add_argument("--out", type=Path, required=True, help="results, JSON")
-    parser.add_argument("--docs", action="store_true", help="write the table into docs/fault_campaign.md")
+    parser.add_argument("--docs", action="store_true", help="write the table into docs/results/fault_campaign.md")
     a = parser.parse_args(argv)
     results = []
     for seed in range(a.first, a.first + a.flights):

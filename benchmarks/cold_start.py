@@ -2,8 +2,8 @@
 
     python benchmarks/cold_start.py --seeds 100 --out cold_start          # 1200 flights, 3 s of processor time each
     python benchmarks/cold_start.py --seeds 100 --out cold_start --minutes 3     # a piece; run again to go on
-    python benchmarks/cold_start.py --out cold_start --write-docs         # table and plot of docs/cold_start.md
-    python benchmarks/cold_start.py --check docs/cold_start.json --seeds 1       # flown again: is it still so?
+    python benchmarks/cold_start.py --out cold_start --write-docs         # table and plot of docs/results/cold_start.md
+    python benchmarks/cold_start.py --check docs/results/cold_start.json --seeds 1       # flown again: is it still so?
 
 Every flight is one line of OUT/flights.jsonl, written when it has landed, so an interrupted study goes on where it was.
 Lines of an older version of the code are flown again. The judging is done in crazyem/paper/cold_start.py.
@@ -40,7 +40,7 @@ from crazyem.paper.cold_start import (
 from crazyem.paper.settings import LITERAL
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCS = ROOT / "docs"
+DOCS = ROOT / "docs" / "results"
 MARKS = ("<!-- cold start: table -->", "<!-- /cold start -->")
 STARTS = {"air": False, "floor": True}
 REFERENCES = {"smooth": SMOOTH_SETTINGS, "steps": STEP_SETTINGS, "literal": LITERAL}
@@ -159,7 +159,7 @@ def summary(flights: Mapping[tuple[Kind, int], ColdStart]) -> dict[str, Any]:
 
 
 def table(said: Mapping[str, Any]) -> str:
-    """The tables of docs/cold_start.md in markdown, from a summary."""
+    """The tables of docs/results/cold_start.md in markdown, from a summary."""
     lines = _head(
         "start, reference, sensor", "flights", "crashed", "mass within 5 % [s]", "within 1 % [s]",
         "inertia within 25 % [s]", "rms over known, all", "each flight", "sag [mm]", "contact used",
@@ -246,7 +246,7 @@ def plot(path: Path, flights: Mapping[tuple[Kind, int], ColdStart], *, sensor: s
 
 
 def write_docs(out: Path) -> None:
-    """Summary, plot and table of docs/cold_start.md from what was flown with the present code."""
+    """Summary, plot and table of docs/results/cold_start.md from what was flown with the present code."""
     flights = read(out / "flights.jsonl", code=version())
     if not flights:
         sys.exit(f"{out} holds no flights of this version of the code")

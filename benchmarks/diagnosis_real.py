@@ -1,9 +1,9 @@
-"""Proof 2: `crazyem diagnose` and `predict` on real recordings; writes docs/diagnosis_real.json and its table.
+"""Proof 2: `crazyem diagnose` and `predict` on real recordings; writes docs/results/diagnosis_real.json and its table.
 
     python benchmarks/diagnosis_real.py --shared ../shared [--parts alignment,nanodrone,...] [--docs docs] [--work DIR]
 
 Each part runs the commands as a user would, scores what they write by code that shares nothing with them, and replaces
-its own entry of the JSON file; parts that are not run keep theirs. The tables of docs/diagnosis_real.md between the
+its own entry of the JSON file; parts that are not run keep theirs. The tables of docs: diagnosis_real.md between the
 marks are made from the JSON file.
 """
 
@@ -365,7 +365,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shared", type=Path, required=True, help="folder with recordings/")
     parser.add_argument("--parts", default=",".join(PARTS), help="a,b,... of " + ", ".join(PARTS))
-    parser.add_argument("--docs", type=Path, default=Path("docs"))
+    parser.add_argument("--docs", type=Path, default=Path("docs/results"))
     parser.add_argument("--work", type=Path, default=Path("diagnosis_real"), help="for fitted vehicles and documents")
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)

@@ -2,7 +2,7 @@
 
     python -m benchmarks.fault_campaign run --flights 500 --arms guarded --out out/faults    # goes on where it stopped
     python -m benchmarks.fault_campaign run --flights 100 --arms none unguarded --out out/faults
-    python -m benchmarks.fault_campaign score --out out/faults --docs                        # docs/fault_campaign.md
+    python -m benchmarks.fault_campaign score --out out/faults --docs                        # docs: fault_campaign.md
 
 A crash counts as caused by a write if the same seed without writes did not crash; where a guarded flight crashed, the
 same seed is flown without writes as well. One process flies many, one after the other; a flight over its limit of wall
@@ -30,7 +30,7 @@ LIMIT = 120.0  # s of wall time for one flight
 START = 180.0  # s more for the first of a process, which may compile
 OF_A_PROCESS = 40  # flights, then a fresh one
 ARMS = ("none", "guarded", "unguarded")
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+DOCS = Path(__file__).resolve().parents[1] / "docs" / "results"
 MARKS = ("<!-- faults: table -->", "<!-- /faults -->")
 
 
@@ -197,7 +197,7 @@ ROWS = (
 
 
 def page(table: dict[str, Any]) -> str:
-    """The tables of docs/fault_campaign.md."""
+    """The tables of docs/results/fault_campaign.md."""
     names = {"guarded": "guard", "unguarded": "no guard", "none": "no writes"}
     lines = [f"| | {' | '.join(names.values())} |", "|---|---|---|---|"]
     for key, label in ROWS:
@@ -218,7 +218,7 @@ def page(table: dict[str, Any]) -> str:
 
 
 def write_docs(table: dict[str, Any]) -> None:
-    """The tables into docs/fault_campaign.md."""
+    """The tables into docs/results/fault_campaign.md."""
     place = DOCS / "fault_campaign.md"
     head, rest = place.read_text(encoding="utf-8").split(MARKS[0])
     tail = rest.split(MARKS[1])[1]
@@ -235,7 +235,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS), help="default: all three")
     parser.add_argument("--speed", type=float, default=3.0, help="of the simulator (default %(default)s)")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after that; run again to go on")
-    parser.add_argument("--docs", action="store_true", help="with score: write docs/fault_campaign.md")
+    parser.add_argument("--docs", action="store_true", help="with score: write docs/results/fault_campaign.md")
     a = parser.parse_args(argv)
     if a.step == "pilot":
         return pilot(a.out, a.speed)

@@ -1,4 +1,4 @@
-"""The product's estimator against the Cramer-Rao bound on the paper's flights: figures of docs/paper_accuracy.md.
+"""The product's estimator against the Cramer-Rao bound on the paper's flights: figures of docs: paper_accuracy.md.
 
     python benchmarks/paper_accuracy.py --seeds 48                       # every part, an hour and a half on one core
     python benchmarks/paper_accuracy.py --part windows --sensor C --seeds 8
@@ -20,8 +20,8 @@ from typing import Any
 from crazyem.paper.accuracy import PARTS, Record, missed, study, summary, table
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCS = ROOT / "docs" / "paper_accuracy.md"
-RESULTS = ROOT / "docs" / "paper_accuracy.json"
+DOCS = ROOT / "docs" / "results" / "paper_accuracy.md"
+RESULTS = ROOT / "docs" / "results" / "paper_accuracy.json"
 KEPT = 1  # flights of each part whose records stand in the results, for the drift check
 
 

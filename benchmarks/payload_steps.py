@@ -2,7 +2,7 @@
 
     python -m benchmarks.payload_steps run --seeds 20 --out out/steps              # goes on where it was stopped
     python -m benchmarks.payload_steps run --out out/steps --minutes 3             # a piece of it
-    python -m benchmarks.payload_steps score --out out/steps --docs               # docs/payload_steps.md, .json, .png
+    python -m benchmarks.payload_steps score --out out/steps --docs               # docs: payload_steps.md, .json, .png
 
 The simulated firmware's plant and Lee controller, its log values rounded as its packets round them, the estimator and
 the guard of `crazyem fly`; no sockets and no clock, so a seed always gives the same flight.
@@ -41,7 +41,7 @@ from firmware_sim.commander import setpoint as sp
 from firmware_sim.flight import Flight
 from firmware_sim.scenario import parse_scenario
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+DOCS = Path(__file__).resolve().parents[1] / "docs" / "results"
 MASS = 0.029  # kg, of the bare drone
 HEIGHT, RISE = 1.0, 2.0  # m, s
 EVENT, AFTER = 10.0, 4.0  # s after boot; s flown after it
@@ -392,7 +392,7 @@ def plot(flights: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def write_docs(flights: Sequence[Mapping[str, Any]], table: Mapping[str, Any]) -> None:
-    """Tables, figures and plot of docs/payload_steps.md."""
+    """Tables, figures and plot of docs/results/payload_steps.md."""
     page = DOCS / "payload_steps.md"
     head, rest = page.read_text(encoding="utf-8").split(MARKS[0])
     tail = rest.split(MARKS[1])[1]
@@ -408,7 +408,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder of the study")
     parser.add_argument("--seeds", type=int, default=20, help="flights of each case (default %(default)s)")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after that; run again to go on")
-    parser.add_argument("--docs", action="store_true", help="write docs/payload_steps.md, .json and .png")
+    parser.add_argument("--docs", action="store_true", help="write docs/results/payload_steps.md, .json and .png")
     a = parser.parse_args(argv)
     if a.step == "run":
         run(a.out, seeds=a.seeds, minutes=a.minutes)

@@ -2,7 +2,7 @@
 
     python -m benchmarks.soak run --minutes 30 --out out/soak      # half an hour; 100 Hz; out/soak/soak.json, soak.mcap
     python -m benchmarks.soak run --minutes 60 --speed 2 --out ... # an hour of flight in half an hour
-    python -m benchmarks.soak docs out/soak/soak.json              # its tables into docs/soak.md
+    python -m benchmarks.soak docs out/soak/soak.json              # its tables into docs/results/soak.md
 
 The simulated firmware, the fault relay and the host (this process) are three processes. The drone flies the excitation
 all the time, estimates are pushed under the shipped policy, and once a second a parameter that no flight uses is
@@ -50,7 +50,7 @@ IN_TOUCH = 0.5  # s since the newest packet
 SETTLED = 0.4  # share of the flight after which memory should stand still
 # A battery that lasts, and a mass that the firmware does not know
 SCENARIO = "[vehicle]\nmass = 0.032\n[battery]\ncapacity = 50.0\n"
-DOCS = Path(__file__).resolve().parents[1] / "docs" / "soak.md"
+DOCS = Path(__file__).resolve().parents[1] / "docs" / "results" / "soak.md"
 MARKS = ("<!-- soak: table -->", "<!-- /soak -->")
 
 
@@ -354,7 +354,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def write_docs(result: dict[str, Any]) -> None:
-    """Put the tables between the marks of docs/soak.md."""
+    """Put the tables between the marks of docs/results/soak.md."""
     head, rest = DOCS.read_text(encoding="utf-8").split(MARKS[0])
     tail = rest.split(MARKS[1])[1]
     DOCS.write_text(f"{head}{MARKS[0]}\n\n{table(result)}\n\n{MARKS[1]}{tail}", encoding="utf-8")
@@ -369,7 +369,7 @@ def main() -> int:
     fly.add_argument("--speed", type=float, default=1.0, help="of the simulator (default %(default)g)")
     fly.add_argument("--seed", type=int, default=0)
     fly.add_argument("--out", type=Path, default=Path("out/soak"))
-    page = commands.add_parser("docs", help="tables of a soak.json into docs/soak.md")
+    page = commands.add_parser("docs", help="tables of a soak.json into docs/results/soak.md")
     page.add_argument("file", type=Path)
     arguments = parser.parse_args()
     if arguments.command == "docs":

@@ -1,6 +1,6 @@
 """The scenario: what is true about the simulated drone, from a TOML file. Never visible to the firmware's tables.
 
-Every key is listed in docs/firmware_sim.md with its default; a wrong one raises ScenarioError naming file and key.
+Every key is listed in docs: firmware_sim.md with its default; a wrong one raises ScenarioError naming file and key.
 """
 
 import math

@@ -1,6 +1,6 @@
 """The architecture as rules a machine can check: who may import whom, docstrings first, files readable in one sitting.
 
-Read with `ast`, so nothing under test is executed. docs/architecture.md explains the rules."""
+Read with `ast`, so nothing under test is executed. docs/explanation/architecture.md explains the rules."""
 
 import ast
 import functools

@@ -28,7 +28,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--command", nargs="+", help="diagnose: instead of `crazyem diagnose`")
     parser.add_argument("--limit", type=float, default=900.0, help="diagnose: s after which an answer counts as none")
     parser.add_argument("--alone", action="store_true", help="diagnose, score: by one flight, with none held out")
-    parser.add_argument("--write-docs", action="store_true", help="score: docs/concealed.md and docs/concealed.json")
+    parser.add_argument(
+        "--write-docs", action="store_true", help="score: docs/results/concealed.md and docs/results/concealed.json"
+    )
     parser.add_argument(
         "--ideal", choices=("all", "failures", "kept"), default="all",
         help="score: of which cases to ask what an ideal observer sees, half a minute each (default %(default)s)",

@@ -27,7 +27,7 @@ STYLES = ("hover", "excite", "figure8", "fast", *MADE)
 # A style of the home world suits what is hidden; these do as well.
 LIKE = {"figure8": ("helix", "oval"), "fast": ("star", "oval"), "excite": ("multisine", "vertical")}
 # Of drones with a file of their own: sd of trim (m of torque over thrust) from drone to drone, and from day to day with
-# the thrust (relative) and the lag, as on CrazyPAD's two drones (docs/diagnosis_real.md); heavy tails.
+# the thrust (relative) and the lag, as on CrazyPAD's two drones (docs/results/diagnosis_real.md); heavy tails.
 OWN_TRIM, DAY_TRIM, DAY_THRUST, DAY_LAG, DAY_FREEDOM = (1.0e-3, 1.0e-3, 3e-4), (5e-4, 5e-4, 1.6e-4), 0.02, 0.03, 5
 DRAG, FLAPPING = (3e-3, 9e-3), (3e-6, 2e-5)  # N s/m, N m s/m of the drone as built
 DRAUGHT = (0.05, 0.25)  # m/s, sd
@@ -62,7 +62,9 @@ GAINS: dict[str, dict[str, tuple[str, ...]]] = {
     },
 }
 NUMBER = {"pid": 1, "mellinger": 2, "lee": 5, "lqg": 6}  # stabilizer.controller
-FITTING_THRUST = 132000.0 / 1.61  # ctrlMel.massThrust that makes the wanted force on a cf21bl (docs/firmware_sim.md)
+FITTING_THRUST = (
+    132000.0 / 1.61
+)  # ctrlMel.massThrust that makes the wanted force on a cf21bl (docs/reference/firmware_sim.md)
 
 
 def rounded(value: float) -> float:

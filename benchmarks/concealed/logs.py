@@ -120,7 +120,7 @@ ROTORS_OF = ("motor_command", "rotor_speed")
 
 
 def mapping_of(signals: Iterable[str], *, onboard: bool, rotors: Sequence[int] = ()) -> str:
-    """The mapping (docs/formats/csv.md) of a table with these signals.
+    """The mapping (docs/reference/formats/csv.md) of a table with these signals.
 
     onboard: a filter on board made the attitude. rotors: which rotor each column of the four is.
     """

@@ -13,8 +13,8 @@ from .paths import Study, read, write
 from .random_world import of_the_day
 from .score import Outcome, failures, figures, wilson
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-# Where the table of a world stands in docs/concealed.md, and its figures beside it.
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "results"
+# Where the table of a world stands in docs/results/concealed.md, and its figures beside it.
 MARKS = {
     "home": ("<!-- concealed: table -->", "<!-- /concealed -->", "concealed.json"),
     "random": ("<!-- random: table -->", "<!-- /random -->", "concealed_random.json"),

@@ -1,7 +1,7 @@
 """What may be concealed: every effect of the catalogue with its range from weak to strong, and four outside of it.
 
 Sizes are drawn log-uniformly between the two ends; `u` in [0, 1] says where (weak below 1/3, strong from 2/3).
-Meaning and sign of every parameter: docs/firmware_sim_effects.md. All SI. The strong ends are what the Lee controller,
+Meaning and sign of every parameter: docs: firmware_sim_effects.md. All SI. The strong ends are what the Lee controller,
 which believes in the bare drone, still flies.
 """
 

@@ -51,7 +51,7 @@ SANE = {
 
 # s between attitudes of a filter on board that are used. It integrates its gyro and takes a fix now and then, so its
 # attitude errs as its rates do and for far longer than a sample lasts: as ten independent attitudes in 0.1 s they
-# contradict the rates, and inertia in hover comes out too high (docs/estimator.md, docs/mavlink.md).
+# contradict the rates, and inertia in hover comes out too high (docs: estimator.md, docs: mavlink.md).
 ATTITUDE_PERIOD = 0.05
 
 _COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}

@@ -45,7 +45,7 @@ from crazyem.signals.vocabulary import block_plan, decoders
 from crazyem.vehicle import Vehicle
 
 # Every 11 ms: in step with the onboard estimate, predicted every 10 ms, logged commands are off by the same part of a
-# step for seconds (docs/estimator.md, In step).
+# step for seconds (docs/explanation/estimator.md, In step).
 LOG_RATE = 1000.0 / 11.0  # Hz
 LINK_RECORD_PERIOD = 1.0  # s between notes on the link's health
 # A drone under low-level setpoints levels out after 0.5 s without them and cuts its motors after 2 s; one that hovers

@@ -1,7 +1,7 @@
-"""`python -m crazyem.paper.docs RESULTS.json`: the numbers of docs/paper.md and of the table in README.md, from a run.
+"""`python -m crazyem.paper.docs RESULTS.json`: the numbers of docs: paper.md and of the table in README.md, from a run.
 
 A page holds blocks between `<!-- paper:NAME -->` and `<!-- /paper:NAME -->`. What is written there comes from
-docs/paper_results.json, the run without its single flights, so that a test can tell whether a page has drifted.
+docs: paper_results.json, the run without its single flights, so that a test can tell whether a page has drifted.
 `--small FILE` takes the numbers of the first two seeds from the run, so that another test can repeat just those.
 """
 
@@ -30,10 +30,10 @@ from crazyem.paper.table_text import (
 )  # fmt: skip
 
 Record = Mapping[str, Any]
-STORED_RESULTS = "paper_results.json"
+STORED_RESULTS = "explanation/paper_results.json"
 SMALL_SEEDS = 2
 STORED_FIELDS = ("position", "angles", "final", "dead_reckoned", "sd", "ci95", "bound", "bound_noise_known", "windows")
-PAGES = ("docs/paper.md", "README.md")
+PAGES = ("docs/explanation/paper.md", "README.md")
 LARGEST_RESULTS = 200_000_000  # bytes of results.json; 20 seeds take 9 MB
 _BLOCK = re.compile(r"(<!-- paper:([a-z0-9_]+) -->\n)(.*?)(<!-- /paper:\2 -->)", re.DOTALL)
 
@@ -257,7 +257,7 @@ BLOCKS: dict[str, Callable[[Record], str]] = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write docs/paper_results.json and every page that has blocks; returns the exit code."""
+    """Write docs/explanation/paper_results.json and every page that has blocks; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m crazyem.paper.docs", description=__doc__.split("\n", maxsplit=1)[0]
     )

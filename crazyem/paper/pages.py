@@ -22,7 +22,7 @@ figcaption { font-size: 13px; }"""
 def corrections_grid() -> Grid:
     """What had to be changed before the paper's algorithm ran."""
     rows = tuple((c.equation, c.printed, c.used, c.why) for c in CORRECTIONS)
-    note = "Everything else of the published method is as printed, wrong or not (docs/errata.md)."
+    note = "Everything else of the published method is as printed, wrong or not (docs/explanation/errata.md)."
     return Grid("Corrections to the published method", ("equation", "printed", "used", "why"), rows, note)
 
 

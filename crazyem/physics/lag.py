@@ -10,7 +10,7 @@ logged at 100 Hz that reads as 5 ms of delay and 16 % of inertia. So the mean of
 stamped before the step began, continued by the prediction that the past allows (a linear one, fitted to the same
 commands: an innovation must be orthogonal to what predicts it); the lag itself is carried on along the commands as
 they then came (CAUSAL). Which commands those are is a matter of stamps alone, whatever the delay: what is known must
-not change with a parameter that is fitted. One stamped even 1 ms later answers already (`docs/estimator.md`)."""
+not change with a parameter that is fitted. One stamped even 1 ms later answers already (`docs: estimator.md`)."""
 
 import numpy as np
 

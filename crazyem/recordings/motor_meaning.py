@@ -10,7 +10,7 @@ What does tell, strongest first:
 * The mixer's arithmetic. Without compensation m1..4 = T -+ r +- p +- y, where r, p and y are whole numbers and T loses
   its fraction: m1+m3-m2-m4, m1+m2-m3-m4 and m1+m4-m2-m3 are then multiples of 4, in every row. The compensation is not
   linear and leaves that to chance, one row in 16. On real logs: 99.9 to 100 % of rows of known requests, 5 to 7 % of
-  known PWM (docs/formats/usd.md).
+  known PWM (docs/reference/formats/usd.md).
 * controller.cmd_*, from which the mixer's output can be computed and compared.
 
 How the commands follow the battery is not used: on real flights whose answer is known, the slope of log(request) over

@@ -1,4 +1,4 @@
-"""What the tests of docs/errata.md share: the paper's formulas as printed, the right ones, and simulated flights.
+"""What the tests of docs: errata.md share: the paper's formulas as printed, the right ones, and simulated flights.
 
 Nothing here is taken from crazyem but the simulator, which makes the flights; all formulas are written down anew from
 the paper, or from textbooks, for many flights at once: arrays are (flights, rows, ...), row k is at t = k dt.

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 HERE = Path(__file__).parent
-PAGE = HERE.parents[1] / "docs" / "errata.md"
+PAGE = HERE.parents[1] / "docs" / "explanation" / "errata.md"
 
 
 def _tests() -> set[str]:

@@ -1,4 +1,4 @@
-"""Errata of the paper, sections V and X.F to X.H: expectation maximization, mass, inertia (docs/errata.md)."""
+"""Errata of the paper, sections V and X.F to X.H: expectation maximization, mass, inertia (docs: errata.md)."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Errata of the paper, sections III, VII, VIII and X.A to X.E: sensors, filter, smoother (docs/errata.md)."""
+"""Errata of the paper, sections III, VII, VIII and X.A to X.E: sensors, filter, smoother (docs: errata.md)."""
 
 import numpy as np
 import pytest

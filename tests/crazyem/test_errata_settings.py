@@ -1,4 +1,4 @@
-"""Errata of the paper, sections VI.A, XI and XII: noise, settings, tables, statements (docs/errata.md)."""
+"""Errata of the paper, sections VI.A, XI and XII: noise, settings, tables, statements (docs/explanation/errata.md)."""
 
 import numpy as np
 import pytest

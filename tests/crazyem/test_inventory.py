@@ -265,7 +265,7 @@ def test_drag_and_mass_are_those_of_the_flight() -> None:
     assert mass.relative_sd < 0.01
 
 
-# real flights: what `crazyem replay` concludes of them is in docs/real_recordings.md and test_replay_real.py --------
+# real flights: what `crazyem replay` concludes of them is in docs: real_recordings.md and test_replay_real.py --------
 
 
 def test_the_shipped_flight_identifies_all() -> None:

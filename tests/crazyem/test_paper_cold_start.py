@@ -313,9 +313,9 @@ def test_the_check_tells_what_changed(study, monkeypatch):
 
 
 def test_the_page_says_what_the_stored_flights_say(study):
-    """Every number in the tables of docs/cold_start.md comes from docs/cold_start.json."""
-    stored = json.loads((ROOT / "docs" / "cold_start.json").read_text())
-    page = (ROOT / "docs" / "cold_start.md").read_text()
+    """Every number in the tables of docs/results/cold_start.md comes from docs/results/cold_start.json."""
+    stored = json.loads((ROOT / "docs" / "results" / "cold_start.json").read_text())
+    page = (ROOT / "docs" / "results" / "cold_start.md").read_text()
     assert study.put_table(page, study.table(stored)) == page
 
 

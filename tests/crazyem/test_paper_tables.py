@@ -330,15 +330,15 @@ def test_results_that_are_none(tmp_path: Path, content: bytes) -> None:
 
 
 def test_docs_are_written_from_a_run(tmp_path: Path) -> None:
-    (tmp_path / "docs").mkdir()
-    (tmp_path / "docs" / "paper.md").write_text("<!-- paper:tables -->\n<!-- /paper:tables -->\n")
+    (tmp_path / "docs" / "explanation").mkdir(parents=True)
+    (tmp_path / "docs" / "explanation" / "paper.md").write_text("<!-- paper:tables -->\n<!-- /paper:tables -->\n")
     (tmp_path / "README.md").write_text("<!-- paper:better -->\n<!-- /paper:better -->\n")
     run = tmp_path / "results.json"
     run.write_text(json.dumps(results_of(whole_run(2, updates=8))))
     assert docs.main([str(run), "--root", str(tmp_path)]) == 0
     stored = (tmp_path / "docs" / docs.STORED_RESULTS).read_text()
     assert "tasks" not in json.loads(stored)
-    assert "Table III" in (tmp_path / "docs" / "paper.md").read_text()
+    assert "Table III" in (tmp_path / "docs" / "explanation" / "paper.md").read_text()
     assert "range of mass, offline" in (tmp_path / "README.md").read_text()
     assert docs.main(["--root", str(tmp_path)]) == 0  # from what was kept
 

@@ -178,7 +178,7 @@ def test_whatever_is_admitted_is_finite(one: Effects, other: Effects, seed: int,
 
 # --- one file ---------------------------------------------------------------------------------------------------------
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "effects.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "effects.md"
 ONE_FILE = PAGE.read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]  # the example that readers see
 
 

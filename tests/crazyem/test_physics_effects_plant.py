@@ -1,4 +1,4 @@
-"""The two implementations of one page, docs/firmware_sim_effects.md: what the simulated drone does, the host predicts.
+"""The two implementations of one page, docs: firmware_sim_effects.md: what the simulated drone does, the host predicts.
 
 The simulator's plant flies under changing motor commands with each effect; along its path, millisecond by millisecond,
 the host's model must give the same accelerations. The two packages share no line; here alone they meet.

@@ -1,4 +1,4 @@
-"""Signs and sizes of every effect, each by hand from docs/firmware_sim_effects.md, where their meaning is agreed."""
+"""Signs and sizes of every effect, each by hand from docs: firmware_sim_effects.md, where their meaning is agreed."""
 
 import math
 

@@ -1,6 +1,6 @@
 """`crazyem replay` over recorded flights: two whose truth is known, and two of a real drone whose truth is not.
 
-The recordings are not part of this repository; without them beside it these tests skip. docs/real_recordings.md says
+The recordings are not part of this repository; without them beside it these tests skip. docs: real_recordings.md says
 what is found in them and why."""
 
 import json

@@ -1,4 +1,4 @@
-"""What each controller makes of each kind of setpoint (the table in docs/firmware_sim.md), on the whole flight."""
+"""What each controller makes of each kind of setpoint (the table in docs: firmware_sim.md), on the whole flight."""
 
 import numpy as np
 import pytest

@@ -1,6 +1,6 @@
 """The figures of crtp.md about behaviour, one test each, on the whole firmware: flights, stops, refusals.
 
-What concerns bytes alone is in test_services.py, test_server.py and test_wire_tables.py (docs/firmware_sim.md lists
+What concerns bytes alone is in test_services.py, test_server.py and test_wire_tables.py (docs: firmware_sim.md lists
 which figure is tested where). [M] in a docstring: measured on the real C firmware. No sockets, no real time.
 """
 

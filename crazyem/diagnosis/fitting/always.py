@@ -47,7 +47,7 @@ TORQUE_SD = 0.03
 # flights of 11 drones with nothing hidden (and of 8e-5 to 2.4e-4 in hovers, which hardly show it).
 DAMPING_SD = 6e-6
 # From one day to the next, of a drone whose file has a trim: batteries are put in again, propellers and feet bent.
-# Healthy and damaged flights of two drones on several days scatter like this (docs/diagnosis_real.md). The thrust is
+# Healthy and damaged flights of two drones on several days scatter like this (docs: diagnosis_real.md). The thrust is
 # free for each of several recordings of any drone (`SEVERAL`): one number for all would make it heed commands less.
 THRUST_SD = 0.02  # relative
 # s: of the lag of rotors in the calm flights of real drones, 24 to 105 ms in 26 flights for a file's 50, whether

@@ -19,7 +19,7 @@ from crazyem.vehicle import Vehicle
 COARSE = 0.2  # simulated flights have up to 0.12, whatever is wrong with the drone
 EDGE, SLOW = 0.5, 1.0  # s left out at either end; Hz below which torques say nothing of sampling
 # m, torque per thrust: by how much the trim of a drone whose file has one differs from one day to the next. Healthy and
-# damaged flights of two drones on several days scatter like this (docs/diagnosis_real.md).
+# damaged flights of two drones on several days scatter like this (docs/results/diagnosis_real.md).
 TRIM_SD = (5e-4, 5e-4, 1.6e-4)
 
 

@@ -22,7 +22,7 @@ MEMORY_SD = 0.5
 SMALLEST = 0.08  # m/s^2: less is what onboard filters leave
 ALIKE = 3.0  # largest ratio between the axes' spreads for moving air; a force on one axis alone is none
 KNOWN = 1e-3  # N s/m: a drag below it is none that was found, but one that is free near nothing
-PUSH = 0.007  # N s/m: of moving air on a drone whose drag is not known (docs/effects.md)
+PUSH = 0.007  # N s/m: of moving air on a drone whose drag is not known (docs/reference/effects.md)
 
 
 @dataclass(frozen=True)

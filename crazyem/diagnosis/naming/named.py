@@ -10,7 +10,7 @@ from scipy import stats
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
 
-CALIBRATED = 0.95  # of the names that nothing speaks against this share was right (docs/diagnosis.md)
+CALIBRATED = 0.95  # of the names that nothing speaks against this share was right (docs/explanation/diagnosis.md)
 # Confidence at most beside structure that a name does not outweigh, or where something that shakes explains as much.
 DOUBTFUL = 0.45
 # Nats on flight held out below which a name is weak, and the p-value above which it is so twice. Of 35 weak ones that

@@ -1,1 +1,1 @@
-"""Which effects a drone lacks, by one posterior over sets of effects (docs/diagnosis.md)."""
+"""Which effects a drone lacks, by one posterior over sets of effects (docs/explanation/diagnosis.md)."""

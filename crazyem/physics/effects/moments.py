@@ -33,7 +33,7 @@ VELOCITY_MOMENT = Effect(
     ),
     order=62,
     external=flapping,
-    # own: a Crazyflie tilts its flow by some 1e-5 N m s/m (docs/effects.md)
+    # own: a Crazyflie tilts its flow by some 1e-5 N m s/m (docs/reference/effects.md)
     prior=Prior(alike("roll_per_vy pitch_per_vx", 4e-5), alike("roll_per_vy pitch_per_vx", 1.5e-6)),
     needs=("velocity", "position"),
     separates="fly straight legs forward and back, then left and right, at 1 and 2 m/s, and hover between them",

@@ -32,7 +32,7 @@ def turned(torque: NDArray, *, scale: float) -> NDArray:
 
 
 def _strength(logged: Logged) -> Sizes:
-    """From day to day: batteries are put in again, propellers bend (docs/diagnosis_real.md)."""
+    """From day to day: batteries are put in again, propellers bend (docs/results/diagnosis_real.md)."""
     return {"scale": 0.02 if logged.dated else 0.009}
 
 

@@ -18,7 +18,7 @@ def trimmed(situation: Situation, body: Body, *, x: float, y: float, z: float) -
 
 
 def _of_the_day(logged: Logged) -> Sizes:
-    """As healthy and damaged flights of two drones on several days scatter (docs/diagnosis_real.md)."""
+    """As healthy and damaged flights of two drones on several days scatter (docs/results/diagnosis_real.md)."""
     return in_turn("x y z", 5e-4, 5e-4, 1.6e-4) if logged.dated else {}
 
 

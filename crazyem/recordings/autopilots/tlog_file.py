@@ -2,7 +2,7 @@
 
 A ground station writes a tlog: it knows when it received a message and, where the message says so, the autopilot's
 time since boot. The latter is the time axis (`tlog_clock`). What becomes which signal is the table of `tlog_signals`;
-docs/formats/tlog.md explains it.
+docs/reference/formats/tlog.md explains it.
 """
 
 from collections import Counter

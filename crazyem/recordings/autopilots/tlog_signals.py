@@ -1,6 +1,6 @@
 """Which fields of which MAVLink messages are which signals in a telemetry log: the best source first.
 
-docs/formats/tlog.md explains the table. Sources: mavlink.io/en/messages/common.html, ArduPilot's GCS_MAVLINK (units of
+docs: tlog.md explains the table. Sources: mavlink.io/en/messages/common.html, ArduPilot's GCS_MAVLINK (units of
 RAW_IMU).
 """
 

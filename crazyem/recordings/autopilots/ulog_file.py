@@ -1,7 +1,7 @@
 """PX4 ULog files: each topic at its own rate, on the autopilot's clock, turned from FRD and NED to FLU and NWU.
 
 Decoding is pyulog's; `ulog_scan` decides before what of a file is sound. What becomes which signal is the table
-`_ULOG_SIGNALS`; docs/formats/ulog.md explains it. Sources: docs.px4.io (ULog file format, uORB message reference).
+`_ULOG_SIGNALS`; docs: ulog.md explains it. Sources: docs.px4.io (ULog file format, uORB message reference).
 """
 
 import contextlib

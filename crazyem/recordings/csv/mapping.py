@@ -88,7 +88,7 @@ class SignalColumns:
 
 @dataclass(frozen=True, slots=True)
 class CsvMapping:
-    """A CSV format: how to recognise it by its header, and what is in it (docs/formats/csv.md).
+    """A CSV format: how to recognise it by its header, and what is in it (docs/reference/formats/csv.md).
 
     Attributes:
         name, title: for people.

@@ -2,7 +2,7 @@
 
 Log packets have one message type a block, with one field a variable, and are packed and unpacked by `struct`: all their
 fields are 8 bytes wide, so a message has a fixed length and costs about a microsecond. Every other message goes
-through google.protobuf. Field numbers are part of the file format (docs/formats/mcap.md).
+through google.protobuf. Field numbers are part of the file format (docs/reference/formats/mcap.md).
 """
 
 import functools

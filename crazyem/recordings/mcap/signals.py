@@ -1,7 +1,7 @@
 """Writing any recording as MCAP of ours: one channel a stream, its signals exact, in the order of processing.
 
 What `mcap.file.read` makes of it is the same recording: times, values, host times and marks bit for bit, units, frames,
-clocks and sources, events, findings and metadata. docs/formats/mcap.md has the channels.
+clocks and sources, events, findings and metadata. docs/reference/formats/mcap.md has the channels.
 """
 
 import json

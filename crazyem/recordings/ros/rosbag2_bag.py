@@ -1,7 +1,7 @@
 """rosbag2 recordings (MCAP or SQLite): crazyswarm2's topics of one robot, and what other ROS 2 drones have in common.
 
 Two clocks: messages of log blocks (LogDataGeneric) carry the firmware's; all others are stamped by the host. Where the
-firmware's is there, it is the time axis. What becomes which signal is in `rosbag2_signals`; docs/formats/rosbag2.md
+firmware's is there, it is the time axis. What becomes which signal is in `rosbag2_signals`; docs: rosbag2.md
 explains both, and the mapping file that says what a bag cannot: which variables are in a log block. Sources:
 IMRCLab/crazyswarm2 (crazyflie_interfaces/msg, crazyflie/src/crazyflie_server.cpp, crazyflie/scripts), mcap.dev.
 """

@@ -1,6 +1,6 @@
 """The catalogue of effects: names, parameters, units, neutral values and ranges, and the check of a scenario's tables.
 
-Source of names and units: the catalogue that host and simulator share (docs/firmware_sim_effects.md). An effect whose
+Source of names and units: the catalogue that host and simulator share (docs: firmware_sim_effects.md). An effect whose
 parameters are all neutral changes nothing, not even the last bit. `HIDDEN` lists effects outside the catalogue, for
 tests of what a diagnosis says about physics it does not know.
 """
