@@ -26,8 +26,6 @@ import numpy as np
 
 from crazyem.paper.cold_start import (
     BANDS,
-    EARLY_SECONDS,
-    NAMES,
     SENSORS,
     SETTLED_SECONDS,
     SMOOTH_SETTINGS,
@@ -159,7 +157,7 @@ def summary(flights: Mapping[tuple[Kind, int], ColdStart]) -> dict[str, Any]:
 
 
 def table(said: Mapping[str, Any]) -> str:
-    """The tables of docs/results/cold_start.md in markdown, from a summary."""
+    """The table of docs/results/cold_start.md in markdown, from a summary; the JSON file has more."""
     lines = _head(
         "start, reference, sensor", "flights", "crashed", "mass within 5 % [s]", "within 1 % [s]",
         "inertia within 25 % [s]", "rms over known, all", "each flight", "sag [mm]", "contact used",
@@ -174,26 +172,6 @@ def table(said: Mapping[str, Any]) -> str:
             str(s["contact_used"]),
         ]
         lines.append(f"| {' | '.join(cells)} |")
-    lines += ["", "The first time inside; `leave`: flights whose estimate leaves the band once the window is full:", ""]
-    lines += _head(
-        "start, reference, sensor", "mass 5 %: first [s]", "mass 1 %: first [s]", "leave", "inertia 25 %: first [s]",
-        "leave", "largest mass over true", "largest tilt [rad]",
-    )  # fmt: skip
-    for kind, s in said["kinds"].items():
-        five, one, inertia = (s[name] for name in BANDS)
-        cells = [", ".join(kind.split()), _three(five["first"], "{:.3f}"), _three(one["first"], "{:.3f}")]
-        cells += [str(one["leaves_later"]), _three(inertia["first"], "{:.3f}"), str(inertia["leaves_later"])]
-        cells += [_three(s["highest_mass"], "{:.2f}"), _three(s["largest_tilt"], "{:.2f}")]
-        lines.append(f"| {' | '.join(cells)} |")
-    lines += [
-        "",
-        f"The estimate {EARLY_SECONDS:g} s after take-over against the Cramer-Rao bound (noise unknown) of that time:",
-        "",
-    ]
-    lines += _head("start, reference, sensor", *(f"{name}: bound, rms error over it" for name in NAMES))
-    for kind, s in said["kinds"].items():
-        cells = [f"{100 * b:.2f} %, {e:.2f}" for b, e in zip(s["bound"], s["rms_over_bound"])]
-        lines.append(f"| {' | '.join([', '.join(kind.split()), *cells])} |")
     return "\n".join(lines)
 
 

@@ -306,7 +306,7 @@ PARTS: dict[str, Callable[[Path, Path], dict[str, Any]]] = {
 
 
 def tables(done: dict[str, Any]) -> str:
-    """Markdown of what was measured."""
+    """Markdown of the figures that were measured; every diagnosis in words is in the JSON file."""
     out: list[str] = []
     if "nanodrone" in done:
         out += ["| nanodrone, run 4, sum over 50 steps | position m | velocity m/s | rotation rad | rate rad/s |",
@@ -325,20 +325,11 @@ def tables(done: dict[str, Any]) -> str:
                 "by `predict` |", "| --- | --- | --- | --- | --- |"]  # fmt: skip
         for name in ("before", "after", "withheld_before", "withheld_after"):
             s = done["nanobench"][name]
-            for flight, scores in ((name.replace("_", ", "), s), *s.get("flights", {}).items()):
-                x, y, z = scores["force_rms"]
-                by = ", ".join(map(str, scores.get("predicted_force_rms", ["-"])))
-                late = scores.get("predicted_position_rms", "-")
-                out.append(f"| {flight} | {x}, {y}, {z} | {by} | {scores['position_rms']} | {late} |")
+            x, y, z = s["force_rms"]
+            by = ", ".join(map(str, s.get("predicted_force_rms", ["-"])))
+            late = s.get("predicted_position_rms", "-")
+            out.append(f"| {name.replace('_', ', ')} | {x}, {y}, {z} | {by} | {s['position_rms']} | {late} |")
         out.append("")
-    if "crazypad" in done:
-        out += ["| crazypad: flight, by the file fitted to | what was said first |", "| --- | --- |"]
-        for name, found in _diagnoses("", done["crazypad"]):
-            out.append(f"| {name.removeprefix(': ')} | {found['text'].strip().splitlines()[0]} |")
-        out.append("")
-    for part, entry in done.items():
-        for name, found in _diagnoses(part, entry) if part != "crazypad" else []:
-            out += [f"### {name}", "", "```text", found["text"].strip(), "```", ""]
     return "\n".join(out)
 
 
@@ -353,11 +344,6 @@ def _delay(entry: dict[str, float] | None) -> str:
     if not entry:
         return "not told"
     return f"{entry['delay_ms']:+.1f} ± {entry['sd_ms']:.1f}, {entry['roll_ms']:+.1f}, {entry['pitch_ms']:+.1f}"
-
-
-def _diagnoses(part: str, entry: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
-    found = [(part, entry)] if "text" in entry else []
-    return found + [(f"{part}: {k}", v) for k, v in entry.items() if isinstance(v, dict) and "text" in v]
 
 
 def main() -> None:

@@ -77,12 +77,12 @@ def results(path: Path) -> dict[str, Any]:
 
 
 def blocks(found: Mapping[str, Any]) -> dict[str, str]:
-    """What stands between the markers of the docs, by part."""
+    """What stands between the markers of the docs, by part: the last sensor whole, a line for each."""
     out = {}
     for part, sensors in found.items():
-        lines = [table(sensors.items()), ""]
+        lines = [table(list(sensors.items())[-1:]), ""]
         for sensor, s in sensors.items():
-            said = "; ".join(s["missed"]) or "none"
+            said = len(s["missed"]) or "none"
             lines.append(
                 f"{sensor}: seeds {s['seeds'][0]} to {s['seeds'][1]}; mass off by {100 * s['mass_bias'][0][0]:+.4f} ± "
                 f"{100 * s['mass_bias'][0][1]:.4f} %; converged {100 * s['converged']:.1f} %; "

@@ -1,5 +1,6 @@
 """Collects a study from its files, scores it, writes the table that is published."""
 
+import textwrap
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -180,7 +181,8 @@ def report(study: Study, *, write_docs: bool = False, ideal: Ideal = "all") -> s
     if write_docs:
         begin, end, file = MARKS[world]
         write(DOCS / file, found)
-        shown = text if world == "home" else f"Seed {found['study_seed']}. {table(found, brief=True)}"
+        first, _, rest = f"Seed {found['study_seed']}. {table(found, brief=True)}".partition("\n")
+        shown = f"{textwrap.fill(first, 118)}\n{rest}"
         page = (DOCS / "concealed.md").read_text()
         before, _, rest = page.partition(begin)
         _, _, after = rest.partition(end)
