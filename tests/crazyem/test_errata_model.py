@@ -1,4 +1,4 @@
-"""Errata of the paper, sections II, VI and IX: state space, frames, dynamics, flatness, controller (docs: errata.md)."""
+"""Errata of the paper, sections II, VI and IX: state space, frames, dynamics, controller (docs: errata.md)."""
 
 import control as ct
 import numpy as np
