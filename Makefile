@@ -61,7 +61,7 @@ concealed: $(READY)  ## physics hidden in the simulator, and whether diagnose fi
 paper: $(READY)  ## Zhao's paper again: its tables and figures, by its method and by ours; goes on where it was stopped
 	$(BIN)/crazyem paper --out paper
 
-paper-docs: paper  ## the numbers of that run into docs/explanation/paper.md, README.md and the drift test
+paper-docs: paper  ## the numbers of that run into docs/explanation/paper.md, and the drift test
 	$(BIN)/python -m crazyem.paper.docs paper/results.json --small tests/crazyem/expectations/paper_small.json
 
 cfclient-test: $(READY)  ## the graphical client against the simulator, in an environment of its own

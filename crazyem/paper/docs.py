@@ -8,6 +8,7 @@ docs: paper_results.json, the run without its single flights, so that a test can
 import argparse
 import json
 import re
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -64,9 +65,19 @@ def filled(text: str, results: Record) -> str:
         start, name, _, end = match.groups()
         if name not in BLOCKS:
             raise UsageError(f"there is no block {name!r} (known: {', '.join(BLOCKS)}).")
-        return f"{start}{BLOCKS[name](results).strip()}\n{end}"
+        return f"{start}{wrapped(BLOCKS[name](results).strip())}\n{end}"
 
     return _BLOCK.sub(block, text)
+
+
+def wrapped(text: str) -> str:
+    """Prose in lines of at most 118 characters; tables stay as they are."""
+    lines = []
+    for line in text.split("\n"):
+        indent = "  " if line.startswith("- ") else ""
+        whole = line.startswith("|") or not line
+        lines += [line] if whole else textwrap.wrap(line, 118, subsequent_indent=indent, break_on_hyphens=False)
+    return "\n".join(lines)
 
 
 def read_results(path: Path) -> dict[str, Any]:
