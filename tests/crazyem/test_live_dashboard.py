@@ -252,7 +252,7 @@ def test_snapshots_of_a_session_are_what_it_knows(session):
     assert s.parameters[0].value == pytest.approx(36.0)
     assert s.parameters[0].low < 36.0 < s.parameters[0].high
     assert 1 < len(s.parameters[0].trend) <= 24
-    assert s.voltage == pytest.approx(3.9)
+    assert s.voltage == pytest.approx(3.9005)
     session.history.notice("look here")
     assert "look here" in observer.snapshot().alarms
     assert "36.00" in shown([s])

@@ -326,7 +326,7 @@ def test_a_gzip_file_that_ends_early_gives_what_it_has(tmp_path):
 
 
 def test_a_gzip_bomb_is_refused_and_never_unpacked(tmp_path, monkeypatch):
-    monkeypatch.setattr("crazyem.recordings.csv.text._SMALL", 4 << 20)
+    monkeypatch.setattr("crazyem.recordings.csv.text._SMALL_TEXT", 4 << 20)
     header = ",".join(NAMES) + "\n"
     row = ",".join("0" * 9) + "\n"
     path, options = mine(tmp_path, gzip.compress((header + row * 800_000).encode()))
