@@ -44,7 +44,7 @@ def _convert(arguments: argparse.Namespace) -> int:
     lines = [f"{output}: {to}, from {arguments.source} ({source.format}), vehicle {source.vehicle.name}"]
     lines += [f"  {remark}" for remark in remarks]
     lines += _listed("not held by this file:", made.lost)
-    return _told(arguments, document, lines)
+    return _report(arguments, document, lines)
 
 
 def _several(source: str, form: str | None) -> list[str]:
@@ -84,7 +84,7 @@ def _listed(head: str, entries: Sequence[Any]) -> list[str]:
     return [f"  {head}", *(f"    {entry}" for entry in entries)] if entries else []
 
 
-def _told(arguments: argparse.Namespace, document: dict[str, Any], lines: list[str]) -> int:
+def _report(arguments: argparse.Namespace, document: dict[str, Any], lines: list[str]) -> int:
     text = json.dumps(document, indent=1)
     if arguments.json == "-":
         put(text)

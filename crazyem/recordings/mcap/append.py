@@ -23,7 +23,7 @@ class Continued:
     """A recording to go on with.
 
     Attributes:
-        stream: positioned behind the last complete record.
+        stream: positioned behind the last complete record. offset: of what is written next, bytes.
         book: what is in the file so far.
         sequence: of the last message.
         log_time: the latest [ns].
@@ -31,6 +31,7 @@ class Continued:
     """
 
     stream: Any
+    offset: int
     book: Book
     sequence: int
     log_time: int
@@ -58,7 +59,14 @@ def reopen(path: Path) -> Continued:
         raise FileFormatError(f"{path} is an imported recording, to which no flight can be added.")
     missing = found.close_chunk()
     stream = _Tail(path, found.end, missing)
-    return Continued(stream, found.book, found.sequence, min(found.book.end or 0, 2**63 - 1), found.sessions)
+    return Continued(
+        stream,
+        found.end + len(missing),
+        found.book,
+        found.sequence,
+        min(found.book.end or 0, 2**63 - 1),
+        found.sessions,
+    )
 
 
 class _Found:
@@ -134,9 +142,6 @@ class _Tail:
             self._file.write(self._first)
             self._begun = True
         return self._file.write(data)
-
-    def tell(self) -> int:
-        return self._file.tell() if self._begun else self._offset + len(self._first)
 
     def flush(self) -> None:
         self._file.flush()

@@ -54,25 +54,31 @@ class Output:
 
     Args:
         stream: opened for writing, positioned where the next record goes; stays open.
-        book: of a file that is continued, else None.
+        book, offset: of a file that is continued: what is in it, and the place [bytes] of the next record.
         chunk_bytes: a chunk is closed before it grows beyond this (a single larger message makes a larger chunk).
 
     Raises: OSError from the stream, as it comes.
     """
 
-    def __init__(self, stream: BinaryIO, *, book: Book | None = None, chunk_bytes: int = CHUNK_BYTES) -> None:
+    def __init__(
+        self, stream: BinaryIO, *, book: Book | None = None, offset: int = 0, chunk_bytes: int = CHUNK_BYTES
+    ) -> None:
         self.book = book or Book()
-        self._stream = stream
+        self._stream, self._offset = stream, offset
         self._limit = chunk_bytes
         self._buffer = bytearray()
         self._index: dict[int, list[tuple[int, int]]] = {}
         self._since = 0  # chunks since everything was announced
 
+    def _put(self, data: bytes) -> None:
+        self._stream.write(data)
+        self._offset += len(data)
+
     def start(self, profile: str, library: str) -> None:
         """Magic bytes and header of a new file."""
         from mcap.records import Header
 
-        self._stream.write(MCAP_MAGIC + _bytes(Header(profile, library)))
+        self._put(MCAP_MAGIC + _bytes(Header(profile, library)))
 
     # --- announcements ------------------------------------------------------------------------------------------
 
@@ -107,7 +113,7 @@ class Output:
     def flush_announcements(self) -> None:
         """What waits to be announced goes out in records of its own, before a chunk that is copied."""
         if not self._index and self._buffer:
-            self._stream.write(bytes(self._buffer))
+            self._put(bytes(self._buffer))
             self._buffer.clear()
 
     # --- messages -----------------------------------------------------------------------------------------------
@@ -194,9 +200,9 @@ class Output:
                 uncompressed_size=size,
             )
         )
-        offset = self._stream.tell()
+        offset = self._offset
         indexes = {channel: index_record(channel, pairs) for channel, pairs in index.items()}
-        self._stream.write(b"".join((record, *indexes.values())))
+        self._put(b"".join((record, *indexes.values())))
         note_chunk(self.book, offset, len(record), compression, len(packed), size, index, indexes)
 
     # --- beside the chunks --------------------------------------------------------------------------------------
@@ -206,8 +212,8 @@ class Output:
         from mcap.records import Metadata, MetadataIndex
 
         record = _bytes(Metadata(name=_text(name), metadata={_text(k): _text(v) for k, v in entries.items()}))
-        self.book.metadata.append(MetadataIndex(offset=self._stream.tell(), length=len(record), name=_text(name)))
-        self._stream.write(record)
+        self.book.metadata.append(MetadataIndex(offset=self._offset, length=len(record), name=_text(name)))
+        self._put(record)
 
     def attachment(self, record: Any) -> None:
         """An attachment: a record of the mcap library."""
@@ -215,7 +221,7 @@ class Output:
 
         data = _bytes(record)
         entry = AttachmentIndex(
-            offset=self._stream.tell(),
+            offset=self._offset,
             length=len(data),
             log_time=record.log_time,
             create_time=record.create_time,
@@ -224,15 +230,15 @@ class Output:
             media_type=record.media_type,
         )
         self.book.attachments.append(entry)
-        self._stream.write(data)
+        self._put(data)
 
     def finish(self) -> None:
         """Everything that waits, then the summary; the file is complete."""
         from mcap.records import DataEnd
 
         self.flush()
-        self._stream.write(_bytes(DataEnd(0)))
-        self._stream.write(_summary(self.book, self._stream.tell()) + MCAP_MAGIC)
+        self._put(_bytes(DataEnd(0)))
+        self._put(_summary(self.book, self._offset) + MCAP_MAGIC)
         self._stream.flush()
 
 

@@ -115,7 +115,7 @@ class RecordingWriter:
 
         before = reopen(path)
         self._file = before.stream
-        self._output = Output(self._file, book=before.book)
+        self._output = Output(self._file, book=before.book, offset=before.offset)
         self.session = before.sessions + 1
         self._sequence, self._log_time = before.sequence, before.log_time
 
