@@ -1,6 +1,5 @@
 """What no named effect explains: members of the best model that have no name, and structure that it leaves."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -73,8 +72,3 @@ def _by_place(fit: Fit) -> list[Finding]:
             found += [one] if one else []
         k += size
     return found
-
-
-def without_twins(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Each signal, axis and kind of regime once, the strongest first."""
-    return tuple(strongest(findings))
