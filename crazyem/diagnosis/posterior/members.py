@@ -1,14 +1,15 @@
 """What a model may be made of: every effect of the catalogue in each of its variants, with what its prior says."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import Candidate, impossible, variants
-from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.model import Column, Point
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.posterior.evidence import Gaussian
 from crazyem.diagnosis.posterior.settings import SETTINGS
@@ -20,6 +21,14 @@ from crazyem.vehicle import Vehicle
 FELT = ("specific_force",)  # needs of an effect that the accelerometer alone shows (`accelerometer.py`)
 FEW = 5  # beginnings of an effect up to which all of its parameters are looked at from each
 REACH = 4.0  # usual spreads within which a recording stays, also beyond the range of a drone: a delay counted too long
+
+Key = tuple[str, Any, Any, str]  # of a column: effect, choices, beginning, parameter
+Slopes = Mapping[Key, tuple[Column, ...]]  # derivatives by column, one a flight
+
+
+def key_of(c: Candidate, name: str) -> Key:
+    """Of the column of a parameter."""
+    return c.effect, c.fixed, c.begin, name
 
 
 @dataclass(frozen=True)
@@ -85,7 +94,7 @@ def logged(flight: Flight, vehicle: Vehicle) -> Logged:
     speed = np.sqrt(np.mean(np.square(flight.y[seen, 3:6]), axis=0)) if seen.any() else np.ones(3)
     return Logged(
         measured=flight.inputs.measured, onboard=flight.attitude is not None, voltage="voltage" in flight.signals,
-        filed=frozenset(vehicle.effects), speed=speed,
+        filed=frozenset(vehicle.effects), speed=speed, period=float(np.median(np.diff(flight.inputs.time))),
     )  # fmt: skip
 
 
@@ -144,3 +153,18 @@ def share(effect: Effect, name: str, point: Point) -> float:
         return 1.0
     neutral = Candidate(effect.name, (), (name,)).neutral(point)[name]
     return effect.prior.share(name, mass=point.vehicle.mass, inertia=point.vehicle.inertia[0], neutral=float(neutral))
+
+
+def away(c: Candidate, point: Point, name: str) -> float:
+    """A parameter less neutral; 0 while the effect is no part of the point."""
+    neutral = c.neutral(point)[name]
+    return float(point.effects.get(c.effect, {}).get(name, neutral)) - float(neutral)
+
+
+def started(point: Point, c: Candidate, change: NDArray) -> Point:
+    """The point with an effect put in where the linear approximation says."""
+    if c.begin:
+        return point.with_effects({c.effect: c.started(point, change.tolist())})
+    here, neutral = c.values(point), c.neutral(point)
+    values = {n: float(np.clip(here[n] + d, *c.range_of(n))) for n, d in zip(c.free, change, strict=True)}
+    return point.with_effects({c.effect: {**neutral, **here, **values}})

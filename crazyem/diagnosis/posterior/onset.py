@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.posterior.evidence import Pass, Shared
-from crazyem.diagnosis.posterior.members import Member
-from crazyem.diagnosis.posterior.study import Fit, Look, Slopes, Study
+from crazyem.diagnosis.posterior.members import Member, Slopes
+from crazyem.diagnosis.posterior.study import Fit, Look, Study
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 SCANS = ((1.2, 0.1), (0.12, 0.02))  # s to either side of an onset, and the step between those that are tried

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.fit import DivergedError
-from crazyem.diagnosis.posterior.members import Member
+from crazyem.diagnosis.posterior.members import Member, Slopes
 from crazyem.diagnosis.posterior.onset import begun_later, dated
 from crazyem.diagnosis.posterior.settings import SETTINGS
-from crazyem.diagnosis.posterior.study import Fit, Look, Slopes, Study
+from crazyem.diagnosis.posterior.study import Fit, Look, Study
 
 Say = Callable[[str], None]
 
@@ -51,6 +51,9 @@ class Search:
         """All models that were fitted, the most probable first."""
         study = self.study
         nothing = study.fit([d.twin() for d in study.data], study.points, (), frozenset(), np.zeros(0), {})
+        still = study.stilled(nothing.points)
+        if any(a is not b for a, b in zip(still, nothing.points, strict=True)):
+            nothing = study.fit([d.twin() for d in study.data], still, (), frozenset(), np.zeros(0), {})
         self._keep(nothing)
         self.say(f"nothing missing: {nothing.value:.1f}, scatter {np.median(nothing.look.shared.scatter):.2f}")
         self._grow(nothing, least=SETTINGS.asked, most=None)

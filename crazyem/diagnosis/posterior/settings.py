@@ -6,7 +6,7 @@ from dataclasses import dataclass
 @dataclass(frozen=True)
 class Settings:
     """Attributes:
-    missing: prior probability that one effect is missing from a vehicle file. Two of 26 in a typical file.
+    missing: prior probability that one effect is missing from a vehicle file: one drone in two lacks one of 26.
     memory: s, correlation time of the disturbing force that every flight has; moving air at a Crazyflie's speed.
     rounds: of Gauss-Newton for a model, at most.
     enough: nats; a round that gains less ends a fit.
@@ -17,6 +17,7 @@ class Settings:
     worth: share of the best linear gain of a neighbour from which another one is fitted,
     near: and nats below the best from which it is, whatever its share.
     few, most: neighbours that are fitted in a turn, at least and, after the first turn, at most.
+    still: share of the usual force with memory below which no model has one.
     quiet: share of the noise with memory that is left where neighbours are looked at without it.
     turns: of the search, at most.
     told: probability of inclusion from which an effect is named.
@@ -24,7 +25,7 @@ class Settings:
     sure: probability of inclusion from which a name stands alone.
     """
 
-    missing: float = 0.05
+    missing: float = 0.02
     memory: float = 1.0
     rounds: int = 6
     enough: float = 0.3
@@ -36,6 +37,7 @@ class Settings:
     near: float = 6.0
     few: int = 3
     most: int = 5
+    still: float = 0.25
     quiet: float = 0.1
     turns: int = 6
     told: float = 0.5

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, nominal
 from crazyem.diagnosis.fitting.gram import bounded
-from crazyem.diagnosis.fitting.model import Column, Point
+from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.posterior.evidence import Gaussian, Pass, Posterior, Shared
-from crazyem.diagnosis.posterior.members import REACH, Member, pool_of, prior_odds
+from crazyem.diagnosis.posterior.members import REACH, Key, Member, Slopes, away, key_of, pool_of, prior_odds, started
 from crazyem.diagnosis.posterior.settings import SETTINGS
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -28,14 +28,6 @@ from crazyem.physics.effects.prior import Logged
 from crazyem.vehicle import Vehicle
 
 FORCES = (0, 1, 2)  # of the disturbances
-
-
-Key = tuple[str, Any, Any, str]  # of a column: effect, choices, beginning, parameter
-Slopes = Mapping[Key, tuple[Column, ...]]  # derivatives by column, one a flight
-
-
-def _key(c: Candidate, name: str) -> Key:
-    return c.effect, c.fixed, c.begin, name
 
 
 @dataclass(frozen=True)
@@ -142,6 +134,15 @@ class Study:
         held = replace(found, noise=replace(found.noise, disturbance=disturbance))
         return data.fit_noise(held, near=near, rows=SETTINGS.rows, held=large)
 
+    def stilled(self, points: Sequence[Point]) -> tuple[Point, ...]:
+        """The points without a force that has a memory, where it is far below what is usual in all of them."""
+        if any(np.any(p.noise.disturbance[list(FORCES)] > SETTINGS.still * self.calm) for p in points):
+            return tuple(points)
+        turns = [np.where(np.isin(range(6), FORCES), 0.0, p.noise.disturbance) for p in points]
+        return tuple(
+            replace(p, noise=replace(p.noise, disturbance=d)) for p, d in zip(points, turns, strict=True)
+        )  # fmt: skip
+
     def quiet(self, points: Sequence[Point]) -> list[Point]:
         """The points with little of the noise that has a memory."""
         return [
@@ -185,10 +186,10 @@ class Study:
 
         def placed(c: Candidate, names: Sequence[str]) -> tuple[int, ...]:
             for n in names:
-                if _key(c, n) not in keys:
-                    keys[_key(c, n)] = len(columns)
+                if key_of(c, n) not in keys:
+                    keys[key_of(c, n)] = len(columns)
                     columns.append(replace(c, free=(n,)))
-            return tuple(keys[_key(c, n)] for n in names)
+            return tuple(keys[key_of(c, n)] for n in names)
 
         present = {m.effect: m.candidate for m in members}
         places = {m.candidate: placed(m.candidate, m.candidate.free) for m in members}
@@ -204,8 +205,8 @@ class Study:
         passes = []
         for f, (one, point) in enumerate(zip(data, points, strict=True)):
             used = [
-                near[_key(c, c.free[0])][f]
-                if c.effect not in present and _key(c, c.free[0]) in near
+                near[key_of(c, c.free[0])][f]
+                if c.effect not in present and key_of(c, c.free[0]) in near
                 else c.columns(point)[0]
                 for c in columns
             ]
@@ -215,7 +216,7 @@ class Study:
                 raise DivergedError(
                     "the vehicle's model leaves the range of numbers on this flight: is it this drone's?"
                 )
-            here = np.array([_away(c, point, c.free[0]) for c in columns])
+            here = np.array([away(c, point, c.free[0]) for c in columns])
             passes.append(Pass(loglik, gram.score, gram.information, here))
         self.passes += 1
         return Look(places, usual, Shared(passes, sd), sum(p.loglik for p in passes), tuple(passes))
@@ -227,7 +228,7 @@ class Study:
         present, wanted = {m.effect for m in members}, {}
         for c in (*(c for c, _ in self.pool.usual), *(m.candidate for m in more)):
             if c.effect not in present:
-                wanted.update({_key(c, n): replace(c, free=(n,)) for n in c.free})
+                wanted.update({key_of(c, n): replace(c, free=(n,)) for n in c.free})
         each = [
             d.models[0].slopes(p, [c.columns(p)[0] for c in wanted.values()], self.workers)
             for d, p in zip(data, points, strict=True)
@@ -261,9 +262,9 @@ class Study:
         for c, table in self.pool.usual:
             own = next((m.candidate for m in members if m.effect == c.effect), c)
             for point, sd in zip(points, table, strict=True):
-                away = np.array([_away(own, point, n) - common.get((c.effect, n), 0.0) for n in c.free])
+                apart = np.array([away(own, point, n) - common.get((c.effect, n), 0.0) for n in c.free])
                 used = sd > 0
-                total -= 0.5 * float(np.sum(np.square(away[used] / sd[used])))
+                total -= 0.5 * float(np.sum(np.square(apart[used] / sd[used])))
         if phi.size:
             total -= 0.5 * float(phi @ np.linalg.solve(self.prior(members).covariance, phi))
         return total
@@ -359,7 +360,7 @@ class Study:
                         low = min(low, neutral[name] - reach)
                         if c.effect not in present:  # beyond, it is an effect
                             low, high = max(low, neutral[name] - reach), min(high, neutral[name] + reach)
-                    here = _away(c, point, name)
+                    here = away(c, point, name)
                     values[name] = float(np.clip(neutral[name] + here + part * (goal[i] - here), low, high))
             moved.append(point.with_effects(changes))
         return tuple(moved)
@@ -372,14 +373,14 @@ class Study:
         c = member.candidate
         tried: list[tuple[float, list[Point], list[Data]]] = []
         for part in SETTINGS.steps:
-            starts, data = [_started(p, c, part * change) for p in base.points], [d.twin() for d in base.data]
+            starts, data = [started(p, c, part * change) for p in base.points], [d.twin() for d in base.data]
             with np.errstate(over="ignore", invalid="ignore"):
                 value = sum(d.loglik(p, passes=2) for d, p in zip(data, starts, strict=True))
             tried.append((value if np.isfinite(value) else -np.inf, starts, data))
             if tried[-1][0] > base.look.loglik:
                 break
         _, starts, data = max(tried, key=lambda t: t[0])
-        phi = np.concatenate([base.phi, [_away(c, starts[0], n) - _away(c, base.points[0], n) for n in c.free]])
+        phi = np.concatenate([base.phi, [away(c, starts[0], n) - away(c, base.points[0], n) for n in c.free]])
         return self.fit(data, starts, (*base.members, member), base.random, phi, near)
 
     def without_flight(self, base: Fit, index: int) -> Fit:
@@ -427,18 +428,3 @@ def _drag(fit: Fit) -> float:
         if n in CATALOGUE and CATALOGUE[n].couples_air and n in fit.effects
     ]  # fmt: skip
     return float(np.mean(values)) if values else float("nan")
-
-
-def _away(c: Candidate, point: Point, name: str) -> float:
-    """A parameter less neutral; 0 while the effect is no part of the point."""
-    neutral = c.neutral(point)[name]
-    return float(point.effects.get(c.effect, {}).get(name, neutral)) - float(neutral)
-
-
-def _started(point: Point, c: Candidate, change: NDArray) -> Point:
-    """The point with an effect put in where the linear approximation says."""
-    if c.begin:
-        return point.with_effects({c.effect: c.started(point, change.tolist())})
-    here, neutral = c.values(point), c.neutral(point)
-    values = {n: float(np.clip(here[n] + d, *c.range_of(n))) for n, d in zip(c.free, change, strict=True)}
-    return point.with_effects({c.effect: {**neutral, **here, **values}})

@@ -33,7 +33,10 @@ INERTIA = Effect(
     # What is heavy in one axis is so in the others. Usual: torque over inertia of 76 flights that are known scatters
     # between axes by 1.2 and 2.0 % (`fitting/always.py`).
     prior=Prior(
-        alike("xx yy zz", 0.3), in_turn("xx yy zz", 0.01, 0.01, 0.02), dict.fromkeys(("xx", "yy", "zz"), "neutral"), 0.9
+        alike("xx yy zz", 0.3),
+        lambda logged: in_turn("xx yy zz", *(share * logged.coarse for share in (0.01, 0.01, 0.02))),
+        dict.fromkeys(("xx", "yy", "zz"), "neutral"),
+        0.9,
     ),
     alike=0.9,  # what is heavier about one axis is so about the others: they differ by a third of what they are more
 )

@@ -18,7 +18,7 @@ def late(lag: float, before: float, *, delay: float) -> tuple[float, float]:
 
 def _clock(logged: Logged) -> Sizes:
     """Between a stamp and its effect; stamps of measured speeds come by another way (`fitting/always.py`)."""
-    return {"delay": 5e-3 if logged.measured else 2e-3}
+    return {"delay": 5e-3 if logged.measured else 2e-3 * logged.coarse}
 
 
 MOTOR_LAG = Effect(
@@ -27,7 +27,7 @@ MOTOR_LAG = Effect(
     order=22,
     timing=slow,
     # usual: sixteen flights with nothing hidden came out 3.1 ms (rms) off (`fitting/always.py`)
-    prior=Prior(own={"time_constant": 0.015}, usual={"time_constant": 3e-3}),
+    prior=Prior(own={"time_constant": 0.015}, usual=lambda logged: {"time_constant": 3e-3 * logged.coarse}),
     needs=("motor_command",),
     separates="log rotor speeds; or log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
     spared={"rotor_speed": "log rotor speeds; or "},

@@ -22,7 +22,7 @@ def damping(situation: Situation, body: Body, *, x: float, y: float, z: float) -
 
 def _sampled(logged: Logged) -> Sizes:
     """Speeds that are logged more slowly than the loop runs look like a damping (`fitting/always.py`)."""
-    return alike("x y z", 6e-6 if logged.measured else 2.5e-6)
+    return alike("x y z", 6e-6 * logged.coarse)
 
 
 VELOCITY_MOMENT = Effect(

@@ -26,6 +26,7 @@ class Logged:
         voltage: the battery's voltage was recorded.
         filed: names of the effects that the vehicle file has.
         speed: (3,) m/s, root mean square of the velocity, world axes.
+        period: s between commands (or speeds) of the rotors.
     """
 
     measured: bool = False
@@ -33,6 +34,13 @@ class Logged:
     voltage: bool = True
     filed: frozenset[str] = frozenset()
     speed: NDArray = field(default_factory=lambda: np.ones(3))
+    period: float = 0.01
+
+    @property
+    def coarse(self) -> float:
+        """Period of the commands over 10 ms, 0.5 to 2: what a loop does between two of them looks like other inertias,
+        torques, lags and dampings, the more the longer it is. Sizes at 100 Hz are those of `fitting/always.py`."""
+        return min(max(self.period / 0.01, 0.5), 2.0)
 
     @property
     def dated(self) -> bool:

@@ -67,7 +67,7 @@ TORQUE_SCALE = Effect(
     order=40,
     turning=turned,
     # usual: common to all axes of 76 flights of known torques (`fitting/always.py`)
-    prior=Prior(own={"scale": 0.2}, usual={"scale": 0.03}),
+    prior=Prior(own={"scale": 0.2}, usual=lambda logged: {"scale": 0.03 * logged.coarse}),
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum): torque over inertia is all that a flight shows",
 )
