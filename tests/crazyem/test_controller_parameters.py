@@ -170,8 +170,11 @@ ratios, lags = st.floats(0.5, 2.0), st.floats(0.03, 0.1)
 
 @settings(max_examples=30, deadline=None)
 @given(ratios, ratios, lags, lags)
-def test_no_state_on_the_way_is_less_damped_than_both_ends(g1_from, g1_to, lag_from, lag_to) -> None:
-    """Roll axis: believed g1 and lag to others, in the order of `writes_for`, with rotors of the final lag."""
+def test_no_state_on_the_way_is_much_less_damped_than_both_ends(g1_from, g1_to, lag_from, lag_to) -> None:
+    """Roll axis: believed g1 and lag to others, in the order of `writes_for`, with rotors of the final lag.
+
+    By a quarter at most: a model that is three times too slow, and g1 that falls to half the truth.
+    """
     target, true = bound_to(INDI), effectiveness_torque(CF2)[0] / 1.7e-5
     beliefs = {b.name: 1.7e-5 / g1_from for b in target.beliefs} | {"motor_time_constant": lag_from}
     changed = {"Ixx": 1.7e-5 / g1_to, "motor_time_constant": lag_to}
@@ -182,7 +185,8 @@ def test_no_state_on_the_way_is_less_damped_than_both_ends(g1_from, g1_to, lag_f
             state[name] = value
             states.append(dict(state))
     damped = [decay(s["ctrlINDI.g1_p"] / true, s["ctrlINDI.act_dyn_p"], lag_to) for s in states]
-    assert min(damped) >= min(damped[0], damped[-1]) - 0.15 * abs(min(damped[0], damped[-1])) - 0.05
+    end = min(damped[0], damped[-1])
+    assert min(damped) >= end - 0.26 * abs(end) - 0.05
 
 
 @pytest.mark.parametrize("grows", [True, False])
