@@ -35,7 +35,7 @@ TILT_LIMIT = math.radians(10.0)  # posCtrlIndi.pq_clamping: what a step of the p
 WITHIN = 0.05  # of the true g1
 SPEED = 1.5  # m/s, the highest of the figure
 MARKS = ("<!-- controllers: table -->", "<!-- /controllers -->")
-DOCS = Path(__file__).resolve().parents[1] / "docs" / "controller_parameters.md"
+DOCS = Path(__file__).resolve().parents[1] / "docs" / "results" / "controller_parameters.md"
 
 
 @dataclass(frozen=True)

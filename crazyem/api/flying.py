@@ -100,7 +100,7 @@ def fly(
     Args:
         uri: of the drone; None starts the simulated firmware.
         vehicle: the nominal model: a Vehicle, a preset's name or a file.
-        controller: "lee" or "lqg".
+        controller: "lee", "mellinger", "indi" or "lqg".
         trajectory: "hover", "figure8", "excite", ("waypoints", "FILE"), or a maker of trajectories.
         duration: of a named trajectory, s.
         push: write what was learnt to the controller: True, False, or None: to simulators only.

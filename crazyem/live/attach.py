@@ -96,7 +96,7 @@ def attach(
     Args:
         cf: an open, connected cflib Crazyflie (`scf.cf` of a SyncCrazyflie).
         vehicle: preset name, path of a vehicle file, or a Vehicle.
-        push: let the guard write mass and inertia to the controller that runs, if it takes them.
+        push: let the guard tell the controller that runs, and the onboard filter, what they take of it.
         policy: of the guard: a file's path or a Policy; None is the shipped one. What was pushed stays in the drone
             when the attachment ends: the flight is the script's.
         dry_run: with `push`, decide and tell (`session.history.guard`), but write nothing.
