@@ -249,6 +249,14 @@ def _predict(commands: Any) -> None:
         "--every", type=_integer(1, 1_000_000), default=1, metavar="K", help="samples from start to start (default: 1)"
     )
     p.add_argument("--plain", action="store_true", help="the model alone, however wrong its turning was before a start")
+    p.add_argument(
+        "--ensemble", type=_integer(2, 10_000), metavar="N", help="a band by N drones of the vehicle's [posterior]"
+    )
+    p.add_argument("--seed", type=_integer(0, 2**31 - 1), default=0, help="of --ensemble (default: 0)")
+    p.add_argument("--same-day", action="store_true", help="of --ensemble: without the spread from day to day")
+    p.add_argument(
+        "--calibrate", nargs="+", default=[], metavar="RECORDING", help="other flights, to learn disturbances from"
+    )
     p.add_argument("-o", "--output", required=True, metavar="OUT.npz", help="array `prediction`, and which starts")
     p.add_argument("--force", action="store_true", help="replace what is there (never a recording that is read)")
     _reading(p)
@@ -277,6 +285,40 @@ def _vehicle(commands: Any) -> None:
     convert.add_argument("--template", metavar="FILE", help="a file of yours, of which all that is not ours stays")
     convert.add_argument("--vehicle", metavar="NAME|FILE", help="what a simulator's file does not say")
     convert.add_argument("--flight", metavar="RECORDING", help="tell costs by this flight (default: a made one)")
+
+    check = action("check", "what is wrong in a simulator's file, by flights: in its own names and units")
+    check.add_argument("file", metavar="FILE", help="of a known simulator")
+    check.add_argument("files", nargs="+", metavar="RECORDING", help="flights of that drone")
+    check.add_argument(
+        "--held-out", nargs="+", action="extend", default=[], metavar="RECORDING", help="flights only to judge by"
+    )
+    check.add_argument("--beside", nargs="+", default=[], metavar="FILE", help="files that should say the same")
+    check.add_argument("--vehicle", metavar="NAME|FILE", help="what the file does not say (default: what was flown)")
+    check.add_argument("--mass", type=_number(1e-3, 100, " kg"), metavar="KG", help="of the whole drone, weighed")
+    check.add_argument("--candidates", metavar="A,B,...", help="effects to look for (default: the whole catalogue)")
+    check.add_argument(
+        "--tolerance", type=_number(0, 1), default=0.05, metavar="X", help="relative, of a number that may stay (0.05)"
+    )
+    check.add_argument("--write", metavar="TARGET", help="the file, corrected")
+    check.add_argument("--strict", action="store_true", help="exit code 5 if the file does not fit")
+    check.add_argument("--jobs", type=_integer(1, 64), metavar="N", help="threads (default: one a core)")
+    _reading(check)
+    _cutting(check)
+
+    sample = action("sample", "drones as a fitted vehicle may be, by its joint posterior: for domain randomisation")
+    sample.add_argument("file", metavar="FITTED.toml", help="as diagnose --write-vehicle writes it")
+    sample.add_argument("--count", type=_integer(1, 100_000), default=256, metavar="N", help="(default: 256)")
+    sample.add_argument("--seed", type=_integer(0, 2**31 - 1), default=0, help="(default: 0)")
+    sample.add_argument("-o", "--output", required=True, metavar="FILE.npz|DIR", help="arrays in SI, or a file a drone")
+    sample.add_argument("--to", metavar="FORMAT", help="of the files in DIR (default: vehicle files)")
+    sample.add_argument("--template", metavar="FILE", help="a file of yours, of which all that is not ours stays")
+    sample.add_argument("--same-day", action="store_true", help="without the spread from one day to the next")
+    sample.add_argument(
+        "--mass-sd",
+        type=_number(0, 1),
+        metavar="X",
+        help="relative, of the mass, which no flight tells (default: 0.02)",
+    )
 
 
 def _on_recordings(commands: Any) -> None:

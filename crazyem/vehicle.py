@@ -16,6 +16,10 @@ File format (all SI; `presets/*.toml` are examples):
     inertia_sd = [0.5, 0.5, 0.7]      # optional: of Ixx, Iyy, Izz (one number for all three, or three)
     motor_time_constant_sd = 0.7      # optional
     [effects.NAME]                    # fitted effects, parameter = value
+    [posterior]                       # optional, of a fitted file: how sure it is of these together
+    parameters = ["inertia.xx", ...]  # effect.parameter
+    mean = [...]
+    covariance = [[...], ...]
 """
 
 import math
@@ -30,6 +34,21 @@ from crazyem.errors import FileFormatError, UsageError
 
 GRAVITY = 9.81  # m/s^2, as the firmware has it
 LARGEST_SPREAD = 3.0  # standard deviation of a logarithm beyond which a prior says nothing
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """How sure a fit is of parameters of effects together.
+
+    Attributes:
+        parameters: (k,) "effect.parameter".
+        mean: (k,) of each, in its unit.
+        covariance: (k, k).
+    """
+
+    parameters: tuple[str, ...]
+    mean: tuple[float, ...]
+    covariance: tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -51,6 +70,7 @@ class Vehicle:
         effects: fitted effects, name -> parameter -> value.
         mass_sd, inertia_sd, motor_time_constant_sd: standard deviation of the value over the value, the estimator's
             prior; None where the file does not say (estimation/model.py has what stands then).
+        posterior: of a fitted vehicle, how sure the fit is of its effects.
     """
 
     name: str
@@ -68,6 +88,7 @@ class Vehicle:
     mass_sd: float | None = None
     inertia_sd: tuple[float, float, float] | None = None
     motor_time_constant_sd: float | None = None
+    posterior: Posterior | None = None
 
     def to_toml(self) -> str:
         """The vehicle as the text of a vehicle file; reading it back gives an equal vehicle."""
@@ -89,6 +110,10 @@ class Vehicle:
         for name, parameters in self.effects.items():
             lines += ["", f"[effects.{_quote(name)}]"]
             lines += [f"{_quote(key)} = {_toml_value(value)}" for key, value in parameters.items()]
+        if self.posterior is not None:
+            lines += ["", "[posterior]", f"parameters = {_toml_value(self.posterior.parameters)}"]
+            lines += [f"mean = {_toml_value(self.posterior.mean)}", "covariance = ["]
+            lines += [f"  {_toml_value(row)}," for row in self.posterior.covariance] + ["]"]
         return "\n".join(lines) + "\n"
 
 
@@ -128,7 +153,7 @@ def parse_vehicle(source: str, *, where: str = "vehicle") -> Vehicle:
     known = {
         "name", "mass", "inertia", "arm", "thrust_curve", "rotor_constant", "torque_per_thrust",
         "motor_time_constant", "thrust_max", "battery_compensated", "effects", "mass_sd", "inertia_sd",
-        "motor_time_constant_sd",
+        "motor_time_constant_sd", "posterior",
     }  # fmt: skip
     for key in data:
         if key not in known:
@@ -169,7 +194,28 @@ def parse_vehicle(source: str, *, where: str = "vehicle") -> Vehicle:
         mass_sd=_spread(data, "mass_sd", where, 1),
         inertia_sd=_spread(data, "inertia_sd", where, 3),
         motor_time_constant_sd=_spread(data, "motor_time_constant_sd", where, 1),
+        posterior=_posterior(data["posterior"], where) if "posterior" in data else None,
     )
+
+
+def _posterior(data: Any, where: str) -> Posterior:
+    import numpy as np
+
+    names = data.get("parameters") if isinstance(data, dict) else None
+    if not isinstance(names, list) or not all(isinstance(n, str) and n.count(".") == 1 for n in names):
+        raise FileFormatError(f"{where}: key 'posterior.parameters' must list texts like 'inertia.xx'")
+    mean, rows = data.get("mean"), data.get("covariance")
+    try:
+        values, matrix = np.array(mean, float), np.array(rows, float)
+    except (TypeError, ValueError):
+        raise FileFormatError(f"{where}: keys 'posterior.mean' and 'covariance' must hold numbers") from None
+    if values.shape != (len(names),) or matrix.shape != (len(names), len(names)):
+        raise FileFormatError(f"{where}: [posterior] needs {len(names)} means, and as many rows and columns")
+    sound = bool(np.isfinite(values).all() and np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=1e-6))
+    scale = np.sqrt(np.abs(np.diag(matrix))) if sound else values
+    if not sound or np.linalg.eigvalsh(matrix / np.maximum(np.outer(scale, scale), 1e-300))[0] < -1e-6:
+        raise FileFormatError(f"{where}: key 'posterior.covariance' is no covariance matrix")
+    return Posterior(tuple(names), tuple(values.tolist()), tuple(tuple(row) for row in matrix.tolist()))
 
 
 def _spread(data: Mapping[str, Any], key: str, where: str, count: int) -> Any:

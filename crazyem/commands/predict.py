@@ -17,6 +17,8 @@ def run(arguments: argparse.Namespace) -> int:
     """The command."""
     from crazyem.api.predicting import predict
 
+    if arguments.ensemble:
+        return _ensemble(arguments)
     recording = Path(arguments.file)
     output = targets([Found(recording)], arguments.output, ".npz", force=arguments.force)[0]
     with Progress("predict", 0, "starts") as progress:
@@ -40,6 +42,28 @@ def run(arguments: argparse.Namespace) -> int:
     if unstable:
         lines.append(f"  {unstable} predictions left the range of numbers: the model is unstable there.")
     put("\n".join(lines))
+    return 0
+
+
+def _ensemble(arguments: argparse.Namespace) -> int:
+    """A band `horizon` steps ahead, by drones as the vehicle may be."""
+    from crazyem.api.vehicles import predict_ensemble
+
+    recording = Path(arguments.file)
+    output = targets([Found(recording)], arguments.output, ".npz", force=arguments.force)[0]
+    found = predict_ensemble(
+        recording,
+        arguments.vehicle,
+        count=arguments.ensemble,
+        horizon=arguments.horizon,
+        step=arguments.step,
+        seed=arguments.seed,
+        days=not arguments.same_day,
+        calibrate=arguments.calibrate,
+        options=read_options(arguments),
+    )
+    write(output, found.arrays())
+    put(f"{output}: {found}")
     return 0
 
 

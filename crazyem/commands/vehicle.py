@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from crazyem.commands.common import say
+from crazyem.commands.files import read_options
 from crazyem.commands.output import put, replace_text
-from crazyem.errors import UsageError
+from crazyem.errors import DataError, UsageError
 from crazyem.live.summary import check_writable
 
 BY_SUFFIX = {".urdf": "gym-pybullet-drones", ".sdf": "gazebo", ".py": "rotorpy"}
@@ -15,7 +17,32 @@ BY_SUFFIX = {".urdf": "gym-pybullet-drones", ".sdf": "gazebo", ".py": "rotorpy"}
 
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
-    return {"convert": _convert}[arguments.action](arguments)
+    return {"convert": _convert, "check": _check, "sample": _sample}[arguments.action](arguments)
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from crazyem.api.vehicles import check_vehicle
+
+    if arguments.write:
+        _check_target(Path(arguments.write), arguments)
+    found = check_vehicle(
+        arguments.file,
+        arguments.files,
+        held_out=arguments.held_out,
+        name=arguments.name,
+        beside=arguments.beside,
+        base=arguments.vehicle,
+        mass=arguments.mass,
+        candidates=[n.strip() for n in (arguments.candidates or "").split(",") if n.strip()],
+        tolerance=arguments.tolerance,
+        jobs=arguments.jobs,
+        options=read_options(arguments),
+        progress=lambda text: say(f"check: {text}"),
+    )
+    if arguments.write:
+        replace_text(arguments.write, found.corrected.text)
+    _told(arguments, {**found.to_dict(), "written": arguments.write}, [str(found)])
+    return DataError.exit_code if arguments.strict and not found.fits else 0
 
 
 def _convert(arguments: argparse.Namespace) -> int:
@@ -45,6 +72,47 @@ def _convert(arguments: argparse.Namespace) -> int:
     lines += [f"  {remark}" for remark in remarks]
     lines += _listed("not held by this file:", made.lost)
     return _report(arguments, document, lines)
+
+
+def _sample(arguments: argparse.Namespace) -> int:
+    import numpy as np
+
+    from crazyem.commands.predict import write
+    from crazyem.physics import folding
+    from crazyem.simulators.convert import convert, read_text
+    from crazyem.simulators.registry import FORMATS, OWN
+    from crazyem.simulators.sampling import MASS_SD, sample
+
+    vehicle = folding.load(arguments.file)
+    mass_sd = MASS_SD if arguments.mass_sd is None else arguments.mass_sd
+    found = sample(vehicle, arguments.count, seed=arguments.seed, days=not arguments.same_day, mass_sd=mass_sd)
+    output, to = Path(arguments.output), arguments.to or OWN
+    arrays = found.arrays()
+    if output.suffix.lower() == ".npz":
+        if arguments.to:
+            raise UsageError("--to needs a folder; arrays are in SI.")
+        _check_target(output, arguments)
+        write(output, {**arrays, "draws": found.draws, "parameters": np.array(found.parameters)})
+    else:
+        template = read_text(arguments.template) if arguments.template else None
+        suffix = ".toml" if to == OWN else FORMATS[to].suffix if to in FORMATS else ""
+        output.mkdir(parents=True, exist_ok=True)
+        width = max(3, len(str(arguments.count - 1)))
+        for k, drawn in enumerate(found.vehicles):
+            target = output / f"{vehicle.name}_{k:0{width}d}{suffix}"
+            _check_target(target, arguments)
+            made = convert(drawn, to, template=template, where=arguments.template or "", name=arguments.name or "",
+                           costs=False)  # fmt: skip
+            replace_text(str(target), made.text)
+    rows = {n: [float(np.mean(v)), float(np.std(v))] for n, v in arrays.items()}
+    document = {
+        "file": arguments.file, "output": str(output), "to": to, "count": arguments.count, "seed": arguments.seed,
+        "same_day": arguments.same_day, "mass_sd": mass_sd,
+        "constants": {n: {"mean": mean, "sd": sd} for n, (mean, sd) in rows.items()},
+    }  # fmt: skip
+    lines = [f"{output}: {arguments.count} drones of {vehicle.name}, seed {arguments.seed}"]
+    lines += [f"  {n}: {mean:.4g} +- {sd:.2g}" for n, (mean, sd) in rows.items() if sd > 0.0]
+    return _told(arguments, document, lines)
 
 
 def _several(source: str, form: str | None) -> list[str]:

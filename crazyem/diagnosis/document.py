@@ -14,6 +14,7 @@ from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.flights import roles
 from crazyem.diagnosis.flights.flight import without
 from crazyem.diagnosis.flights.own import Own
+from crazyem.diagnosis.joint import posterior_of
 from crazyem.diagnosis.locating.locate import Finding, strongest
 from crazyem.diagnosis.naming.named import Named
 from crazyem.diagnosis.prediction.horizon import (
@@ -319,4 +320,6 @@ def _number(value: Any) -> float | None:
 def saved_vehicle(diagnosis: Diagnosis, name: str) -> Vehicle:
     """The fitted vehicle under a name of its own; how sure the old file was of its values says nothing of these."""
     fitted = diagnosis.fitted_vehicle
-    return replace(fitted, name=name, mass_sd=None, inertia_sd=None, motor_time_constant_sd=None)
+    return replace(
+        fitted, name=name, mass_sd=None, inertia_sd=None, motor_time_constant_sd=None, posterior=posterior_of(diagnosis)
+    )

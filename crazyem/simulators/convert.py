@@ -158,6 +158,7 @@ def convert(
     name: str = "",
     suffix: str = "",
     flight: Recording | None = None,
+    costs: bool = True,
 ) -> Converted:
     """A simulator's file of a vehicle.
 
@@ -168,6 +169,7 @@ def convert(
         name: of the drone in the file; "": the vehicle's.
         suffix: of the file that will be written: `.json` makes rotorpy's dict JSON.
         flight: costs are told by this recording instead of the made flight.
+        costs: whether to tell what the file does not hold.
 
     Raises: UsageError for an unknown format or drone; FileFormatError if the vehicle lacks what the format needs, or
         the template cannot be used.
@@ -186,8 +188,9 @@ def convert(
         raise FileFormatError(f"vehicle {vehicle.name}: {problem}")
     text = write(form, constants, template=template, where=where, name=name)
     said_there = _held(form, text, where=where, name=name)
-    lost = _lost(vehicle, constants, left, said_there, flight)
-    return Converted(text, to, vehicle, to_vehicle(said_there, replace(vehicle, effects={})), tuple(lost))
+    lost = _lost(vehicle, constants, left, said_there, flight) if costs else []
+    base = replace(vehicle, effects={}, motor_time_constant=0.0)  # who does not know of a lag has none
+    return Converted(text, to, vehicle, to_vehicle(said_there, base), tuple(lost))
 
 
 def _held(form: Format, text: str, *, where: str, name: str) -> Constants:

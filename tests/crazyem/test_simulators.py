@@ -23,6 +23,7 @@ PRODUCTS = {f"inertia_{a}" for a in ("xy", "xz", "yz")}
 CENTRE = {f"centre_{a}" for a in "xyz"}
 ARMS = {"arm_x", "arm_y"}
 DRAG = {f"drag_{a}" for a in "xyz"}
+DAMPING = {f"damping_{a}" for a in "xyz"}
 QUADRATIC = {f"quadratic_drag_{a}" for a in "xyz"}
 SPEEDS = {"thrust_per_speed2", "torque_per_thrust", "thrust_max"}
 BODY = {"mass"} | INERTIA
@@ -30,7 +31,7 @@ BODY = {"mass"} | INERTIA
 # What the table of fields of each simulator's own documentation has room for.
 HOLDS = {
     "crazyflow": BODY | PRODUCTS | ARMS | SPEEDS | DRAG | {"lag"},
-    "gym-pybullet-drones": BODY | PRODUCTS | ARMS | CENTRE | SPEEDS | DRAG,
+    "gym-pybullet-drones": BODY | ARMS | CENTRE | SPEEDS | DRAG,
     "mujoco": BODY | PRODUCTS | CENTRE | {"thrust_max"},
     "gazebo": BODY | PRODUCTS | CENTRE | ARMS | SPEEDS | {"lag", "drag_x", "drag_y"},
     "rotorpy": BODY | PRODUCTS | CENTRE | ARMS | SPEEDS | DRAG | QUADRATIC | {"lag"},
@@ -108,7 +109,7 @@ def test_what_was_written_is_read_again(name: str, drone: Constants) -> None:
     text = write(FORMATS[name], drone)
     found = read(FORMATS[name], text, where="written").constants
     assert differing(drone, found, HOLDS[name]) == []
-    assert {n for n in NUMBERS if getattr(found, n) is not None} - HOLDS[name] <= {"lag", *DRAG, *CENTRE}
+    assert {n for n in NUMBERS if getattr(found, n) is not None} - HOLDS[name] <= {"lag", *DRAG, *CENTRE, *DAMPING}
 
 
 @settings(max_examples=60, deadline=None)
@@ -238,6 +239,14 @@ def test_a_payload_is_folded_exactly() -> None:
     assert made.held.inertia_products[1] == pytest.approx(reduced * 0.02 * 0.01)
     assert made.held.effects["center_of_mass"]["x"] == pytest.approx(0.002)
     assert made.lost == ()
+
+
+def test_drag_at_the_rotors_of_rotorpy_damps_rotation() -> None:
+    """Four forces -D/4 (w x r) at the corners, written out."""
+    c = imported("rotorpy").constants
+    hover = math.sqrt(0.03 * 9.81 / 4 / 2.3e-8)
+    assert c.damping_x == pytest.approx(4 * 7.553e-7 * hover * 0.043**2 / 2)
+    assert c.damping_z == pytest.approx(4 * 10.2506e-7 * hover * 0.043**2)
 
 
 def test_what_a_file_cannot_hold_costs_something() -> None:

@@ -1,6 +1,7 @@
 """gym-pybullet-drones: a URDF with `<properties>`. kf and km are per RPM squared; rotors have no lag.
 
-Drag acts in the physics modes that have it (`pyb_drag` and its kin), by rotor speed; it is written for hover.
+Drag acts in the physics modes that have it (`pyb_drag` and its kin), by rotor speed; it is written for hover. Products
+of inertia are not written: Bullet turns the base frame to the principal axes, and the attitude would be off by that.
 """
 
 from typing import Any
@@ -27,7 +28,7 @@ def _fields(document: XmlDocument, name: str) -> list[Field]:
     ]  # fmt: skip
     return [
         Field((*_BASE, "mass", "@value"), "mass", "kg"),
-        *(Field((*_BASE, "inertia", f"@i{a}"), f"inertia_{a}", "kg m^2") for a in ("xx", "yy", "zz", "xy", "xz", "yz")),
+        *(Field((*_BASE, "inertia", f"@i{a}"), f"inertia_{a}", "kg m^2") for a in ("xx", "yy", "zz")),
         *(Field((*_BASE, "origin", "@xyz", k), f"centre_{'xyz'[k]}", "m") for k in range(3)),
         *(Field(("link[name=center_of_mass_link]", "inertial", "origin", "@xyz", k), f"centre_{'xyz'[k]}", "m")
           for k in range(3)),
@@ -42,7 +43,9 @@ def _fields(document: XmlDocument, name: str) -> list[Field]:
 
 
 def _read_more(document: XmlDocument, name: str, found: dict[str, float]) -> list[str]:
-    return [PLUS] if _is_plus(document) else []
+    products = [document.get((*_BASE, "inertia", f"@i{a}")) for a in ("xy", "xz", "yz")]
+    turned = "products of inertia are left out: with them Bullet's base frame is not the body frame"
+    return [*([PLUS] if _is_plus(document) else []), *([turned] if any(products) else [])]
 
 
 def _link(name: str, x: int = 0, y: int = 0) -> str:

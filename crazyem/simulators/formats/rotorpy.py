@@ -1,6 +1,7 @@
 """rotorpy: the dict `quad_params` of a Python module, or the same as JSON. The module is read, never executed.
 
-Rotor positions are from the centre of mass. k_d and k_z are drags per rotor speed; they are written for hover.
+Rotor positions are from the centre of mass. k_d and k_z are drags per rotor speed; they are written for hover. They act
+at the rotors, so they damp rotation as well: by drag times squared arm.
 """
 
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from crazyem.errors import FileFormatError
-from crazyem.simulators.constants import Constants
+from crazyem.simulators.constants import Constants, solved
 from crazyem.simulators.documents.literal import LiteralDocument
 from crazyem.simulators.fields import Field, Format
 from crazyem.simulators.layout import placed, read_positions
@@ -60,6 +61,11 @@ def _read_more(document: LiteralDocument, name: str, found: dict[str, float]) ->
     values, remarks = read_positions(_positions(document), where=document.where, field="rotor_pos")
     found |= values
     root = root_of(document)
+    drag = solved(found)
+    if "drag_x" in drag and "drag_z" in drag:
+        found["damping_x"] = drag["drag_z"] * found["arm_y"] ** 2
+        found["damping_y"] = drag["drag_z"] * found["arm_x"] ** 2
+        found["damping_z"] = drag["drag_x"] * (found["arm_x"] ** 2 + found["arm_y"] ** 2)
     for key, words in (("k_h", "translational lift"), ("k_flap", "flapping")):
         if document.get((*root, key)):
             remarks.append(f"{key} ({words}) is in none of crazyem's effects and is left out")

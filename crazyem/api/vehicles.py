@@ -1,0 +1,271 @@
+"""Files of simulators for scripts and notebooks: made, checked by flights, and sampled."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from crazyem.api.diagnosing import Diagnosis, diagnose
+from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, vehicle_of
+from crazyem.diagnosis.prediction.ensemble import Ensemble, ensemble
+from crazyem.diagnosis.prediction.predict import recorded
+from crazyem.errors import DataError, UsageError
+from crazyem.notebook import finite, html_table
+from crazyem.recordings.options import ReadOptions
+from crazyem.simulators.constants import NUMBERS
+from crazyem.simulators.convert import Converted, convert, load_source, read_text
+from crazyem.simulators.cost import HORIZON, errors_after, said
+from crazyem.simulators.fields import AGREE, Imported
+from crazyem.simulators.findings import GAUGE, TOLERANCE, Told, alternatives, rescaled, told_of
+from crazyem.simulators.sampling import MASS_SD, Sampled, sample
+from crazyem.vehicle import Vehicle
+
+
+def convert_vehicle(
+    source: VehicleLike,
+    to: str,
+    *,
+    template: str | Path | None = None,
+    name: str = "",
+    suffix: str = "",
+    base: VehicleLike | None = None,
+    flight: RecordingLike | None = None,
+) -> Converted:
+    """Make a simulator's file of a vehicle, or a vehicle file of a simulator's.
+
+    Args:
+        source: a Vehicle, a preset's name, a vehicle file or a simulator's file.
+        to: the format: crazyflow, gym-pybullet-drones, mujoco, gazebo, rotorpy, crazyswarm2, px4-sih, omnidrones, l2f;
+            crazyem for a vehicle file.
+        template: a file of that format, of which all else stays.
+        name: of the drone in files that have several.
+        suffix: of the file to be: ".json" makes rotorpy's dict JSON.
+        base: what a simulator's file does not say.
+        flight: tells what the file cannot hold by this flight instead of a made one.
+
+    Raises:
+        UsageError: no such file, format or drone. FileFormatError: a file cannot be used; names the field.
+    """
+    lacking = None if base is None else vehicle_of(base)
+    vehicle = source if isinstance(source, Vehicle) else load_source(source, base=lacking).vehicle
+    text = None if template is None else read_text(str(template))
+    recording = None if flight is None else recording_of(flight)
+    where = "" if template is None else str(template)
+    return convert(vehicle, to, template=text, where=where, name=name, suffix=suffix, flight=recording)
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedVehicle:
+    """What flights say of a simulator's file.
+
+    Attributes:
+        imported: the file. vehicle: what it says, with what it does not say from elsewhere.
+        diagnosis: by the flights.
+        told: each field.
+        alternatives: mass and thrust, which no flight tells apart.
+        disagreements: with other files of the same drone.
+        corrected: the file with what was found.
+        errors: after half a second of open-loop flight: "before", "after" (the corrected file), "fitted" (with all that
+            was found) -> quantity.
+        judged: by the flights of these names.
+    """
+
+    imported: Imported
+    vehicle: Vehicle
+    diagnosis: Diagnosis
+    told: tuple[Told, ...]
+    alternatives: tuple[dict[str, Any], ...]
+    disagreements: tuple[str, ...]
+    corrected: Converted
+    errors: Mapping[str, Mapping[str, float]]
+    judged: tuple[str, ...]
+
+    @property
+    def fits(self) -> bool:
+        """Whether the file agrees with itself, with others and with the flights."""
+        return not (any(t.off for t in self.told) or self.imported.contradictions or self.disagreements)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Ready for JSON."""
+        document: dict[str, Any] = finite({
+            "format": "crazyem-vehicle-check", "version": 1, "file": self.imported.where,
+            "simulator": self.imported.format, "name": self.imported.name, "fits": self.fits,
+            "fields": [t.to_json() for t in self.told], "not_told_apart": list(self.alternatives),
+            "contradictions": [c.to_json() for c in self.imported.contradictions],
+            "disagreements": list(self.disagreements), "remarks": list(self.imported.remarks),
+            "horizon_s": HORIZON, "errors": {k: dict(v) for k, v in self.errors.items()},
+            "judged_by": list(self.judged), "lost": [one.to_json() for one in self.corrected.lost],
+            "diagnosis": self.diagnosis.to_dict(),
+        })  # fmt: skip
+        return document
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.imported.where} ({self.imported.format}): {'fits' if self.fits else 'does not fit'} the flights"
+        ]
+        lines += [f"  contradiction: {c}" for c in self.imported.contradictions]
+        lines += [f"  disagreement: {d}" for d in self.disagreements]
+        lines += [f"  {remark}" for remark in self.imported.remarks]
+        lines += [f"  {'off' if t.off else '   '} {t}" for t in self.told]
+        if self.alternatives:
+            lines.append(f"  {GAUGE}")
+            for one in self.alternatives:
+                numbers = ", ".join(f"{field} {value:.4g}" for field, value in one["fields"].items())
+                lines.append(f"    if {one['if']}: {numbers}")
+        for words, key in (("before", "before"), ("with the corrected file", "after"), ("with all found", "fitted")):
+            lines.append(f"  error after {HORIZON:g} s {words}: {said(self.errors[key])}")
+        lines += [f"  not held by this file: {one}" for one in self.corrected.lost]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        rows = [(t.field, t.value, t.fitted, t.sd, t.unit, "off" if t.off else "") for t in self.told]
+        title = f"{self.imported.where}: {'fits' if self.fits else 'does not fit'}"
+        return html_table(title, ("field", "in the file", "by flights", "sd", "unit", ""), rows, [])
+
+
+def check_vehicle(
+    file: str | Path,
+    recordings: RecordingLike | Sequence[RecordingLike],
+    *,
+    held_out: RecordingLike | Sequence[RecordingLike] = (),
+    name: str | None = None,
+    beside: Sequence[str | Path] = (),
+    base: VehicleLike | None = None,
+    mass: float | None = None,
+    candidates: Sequence[str] = (),
+    tolerance: float = TOLERANCE,
+    jobs: int | None = None,
+    options: ReadOptions | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> CheckedVehicle:
+    """Find what is wrong in a simulator's file, by flights of the drone.
+
+    Args:
+        file: of any known format.
+        recordings, held_out: as for `diagnose`.
+        name: which drone of a file that has several.
+        beside: other files of the same drone, which should say the same.
+        base: what the file does not say (default: the vehicle that was flown).
+        mass: of the whole drone, where it was weighed [kg].
+        candidates: effects to look for; none: the whole catalogue.
+        tolerance: relative difference up to which a number may stay.
+
+    Raises:
+        UsageError: no such file, or `file` is a vehicle file. FileFormatError: a file cannot be used.
+        DataError: a recording cannot be used.
+    """
+    flown = [recording_of(r, options) for r in _several(recordings)]
+    kept = [recording_of(r, options) for r in _several(held_out)]
+    if not flown:
+        raise UsageError("a check needs at least one recording.")
+    lacking = vehicle_of(base, flown[0])
+    source = load_source(file, name=name, base=lacking, strict=False)
+    if source.imported is None:
+        raise UsageError(f"{file}: this is no simulator's file; diagnose judges vehicle files.")
+    others = [load_source(other, name=name, base=lacking, strict=False) for other in beside]
+    found = diagnose(
+        flown, source.vehicle, held_out=kept, candidates=candidates, jobs=jobs, progress=progress,
+    )  # fmt: skip
+    fitted = found.fitted_vehicle if mass is None else rescaled(found.fitted_vehicle, mass)
+    told = told_of(
+        source.imported, source.vehicle, fitted, found.document["effects"],
+        {n["name"]: n["reason"] for n in found.document["not_identifiable"]}, tolerance=tolerance,
+    )  # fmt: skip
+    corrected = convert(
+        fitted, source.format, template=source.text, where=str(file), name=source.imported.name,
+        flight=(kept or flown)[0],
+    )  # fmt: skip
+    judges = kept or flown
+    vehicles = {"before": source.vehicle, "after": corrected.held, "fitted": fitted}
+    choices = alternatives(source.imported, fitted, source.vehicle.mass) if mass is None else []
+    return CheckedVehicle(
+        source.imported, source.vehicle, found, tuple(told), tuple(choices),
+        tuple(d for other in others if other.imported for d in disagreements(source.imported, other.imported)),
+        corrected, _pooled([e for e in (_errors(r, vehicles) for r in judges) if e]), tuple(r.path for r in judges),
+    )  # fmt: skip
+
+
+def sample_vehicle(
+    vehicle: VehicleLike, count: int = 256, *, seed: int = 0, days: bool = True, mass_sd: float = MASS_SD
+) -> Sampled:
+    """Draw drones as a fitted vehicle may be, by the joint posterior in its file.
+
+    Args:
+        vehicle: as `diagnose` fitted it.
+        count: how many.
+        seed: the same seed gives the same drones.
+        days: other days than those of the flights.
+        mass_sd: relative standard deviation of the mass, which no flight tells; 0 where it was weighed.
+
+    Raises:
+        UsageError: no such vehicle, or it has no posterior. DataError: hardly any drone of its posterior can be.
+    """
+    return sample(vehicle_of(vehicle), count, seed=seed, days=days, mass_sd=mass_sd)
+
+
+def predict_ensemble(
+    recording: RecordingLike,
+    vehicle: VehicleLike,
+    *,
+    count: int = 256,
+    horizon: int = 50,
+    step: float | None = None,
+    seed: int = 0,
+    days: bool = True,
+    calibrate: RecordingLike | Sequence[RecordingLike] = (),
+    options: ReadOptions | None = None,
+) -> Ensemble:
+    """Predict a band by many drones of a fitted vehicle's posterior, from starts all along a flight.
+
+    Args:
+        recording: the flight.
+        vehicle: with a posterior. count: drones.
+        horizon: steps ahead. step: s each; None: the recorded samples.
+        seed: of the draws.
+        days: another day than that of the flights it was fitted to.
+        calibrate: other flights, by which disturbances are learned; without, the band is of constants alone.
+
+    Raises:
+        UsageError: no such file, or no posterior. DataError: no whole states, or no flight that is long enough.
+    """
+    flight = recording_of(recording, options)
+    fitted = vehicle_of(vehicle, flight)
+    members = sample(fitted, count, seed=seed, days=days, mass_sd=0.0).vehicles
+    period = recorded(flight, fitted).period if step is None else step
+    others = [recording_of(r, options) for r in _several(calibrate)]
+    return ensemble(flight, fitted, members, horizon=horizon * period, calibrate=others, seed=seed)
+
+
+def disagreements(first: Imported, second: Imported) -> list[str]:
+    """Sentences about the quantities in which two files of one drone differ by more than a hundredth."""
+    found = []
+    for quantity in NUMBERS:
+        a, b = getattr(first.constants, quantity), getattr(second.constants, quantity)
+        if a is None or b is None or abs(a - b) <= AGREE * max(abs(a), abs(b), 1e-12):
+            continue
+        mine, theirs = (f"{i.label(quantity)} of {i.where} is {v:.4g}" for i, v in ((first, a), (second, b)))
+        found.append(f"{mine}, but {theirs} (both in SI)")
+    return found
+
+
+def _errors(recording: Any, vehicles: Mapping[str, Vehicle]) -> dict[str, dict[str, float]] | None:
+    try:
+        return errors_after(recording, vehicles)
+    except DataError:
+        return None
+
+
+def _pooled(errors: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
+    """The root of the mean square over flights. Raises DataError if there is none."""
+    if not errors:
+        raise DataError("no flight is long enough and has whole states, so open-loop errors cannot be told")
+    return {
+        which: {q: float(np.sqrt(np.mean([e[which][q] ** 2 for e in errors]))) for q in errors[0][which]}
+        for which in errors[0]
+    }
+
+
+def _several(given: RecordingLike | Sequence[RecordingLike]) -> Sequence[RecordingLike]:
+    return given if isinstance(given, Sequence) and not isinstance(given, str) else [given]

@@ -1,0 +1,197 @@
+"""What flights say of a simulator's file, in its own names and units: each field, the pairs that no flight tells apart,
+and how far a file may be off before it no longer fits."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from crazyem.simulators.constants import Constants, from_vehicle, value_of
+from crazyem.simulators.fields import Field, Imported
+from crazyem.vehicle import Vehicle
+
+SURE = 1.96  # standard deviations of a 95 % interval
+TOLERANCE = 0.05  # relative, of a number in a file: less is no reason to change it
+# Effects that are recordings' or days' own, and in no simulator's file
+GAUGE = (
+    "flights tell thrust over mass and torque over inertia, not each alone: mass, inertia, thrust and drag may all be "
+    "larger by one factor; weigh the drone and say --mass"
+)
+# Which effect of the catalogue is about a quantity.
+ABOUT = {
+    "mass": ("payload", "thrust_scale"), "thrust_per_speed2": ("thrust_scale", "payload"),
+    "thrust_max": ("thrust_scale",),
+    "torque_per_thrust": ("torque_scale", "inertia"), "lag": ("motor_lag",), "inertia": ("inertia", "torque_scale"),
+    "arm": ("torque_scale",), "centre": ("center_of_mass", "payload"), "drag": ("linear_drag",),
+    "quadratic": ("quadratic_drag",), "damping": ("rate_damping",),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Told:
+    """A field of a file, and what flights say of it.
+
+    Attributes:
+        field, unit: as the file has them. quantity: in SI words.
+        value: in the file; NaN where it is not said.
+        fitted, sd: by the flights, in the file's unit; sd is NaN where flights say nothing.
+        off: whether the file's value lies outside the 95 % interval, and by more than `tolerance`.
+        why: what there is to know, "" if nothing.
+    """
+
+    field: str
+    unit: str
+    quantity: str
+    value: float
+    fitted: float
+    sd: float
+    off: bool
+    why: str = ""
+
+    @property
+    def known(self) -> bool:
+        """Whether flights say anything of it."""
+        return math.isfinite(self.sd)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 %."""
+        return self.fitted - SURE * self.sd, self.fitted + SURE * self.sd
+
+    def __str__(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        if not self.known:
+            return f"{self.field} {self.value:.4g}{unit}: {self.why or 'nothing speaks against it'}"
+        low, high = self.interval
+        change = f"{self.value:.4g} -> " if math.isfinite(self.value) else "not set -> "
+        return f"{self.field} {change}{self.fitted:.4g}{unit} (95 %: {low:.4g} to {high:.4g})" + (
+            f"; {self.why}" if self.why else ""
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """For programs."""
+        known = self.known
+        return {
+            "field": self.field, "unit": self.unit, "quantity": self.quantity,
+            "value": self.value if math.isfinite(self.value) else None, "fitted": self.fitted if known else None,
+            "sd": self.sd if known else None, "ci95": list(self.interval) if known else None, "off": self.off,
+            "why": self.why,
+        }  # fmt: skip
+
+
+def told_of(
+    imported: Imported,
+    before: Vehicle,
+    fitted: Vehicle,
+    effects: Sequence[Mapping[str, Any]],
+    not_identifiable: Mapping[str, str],
+    *,
+    tolerance: float = TOLERANCE,
+) -> list[Told]:
+    """Every quantity of a file once, with what flights say.
+
+    Args:
+        before: the vehicle of the file. fitted: with what was found.
+        effects: of the diagnosis' document: name, and parameters with value and sd.
+        not_identifiable: effect -> why flights say nothing of it.
+    """
+    old, new = from_vehicle(before)[0], from_vehicle(fitted)[0]
+    moved = _moved(fitted, effects)
+    found = []
+    for f in _once(imported.fields):
+        value, now = value_of(old, f.quantity), value_of(new, f.quantity)
+        if math.isnan(value):
+            continue
+        sd = math.hypot(*(value_of(c, f.quantity) - now for c in moved)) if moved else 0.0
+        changed = abs(now - value) > 1e-9 * max(abs(now), abs(value)) or sd > 1e-9 * abs(now)
+        shown, fits = f.written(value, None), f.written(now, None)
+        if not changed:
+            reason = _reason(f.quantity, not_identifiable)
+            found.append(Told(f.label, f.unit, f.quantity, shown, shown, math.nan, False, reason))
+            continue
+        spread = abs(f.factor) * sd
+        off = abs(fits - shown) > max(SURE * spread, tolerance * max(abs(shown), abs(fits)))
+        found.append(Told(f.label, f.unit, f.quantity, shown, fits, spread, off))
+    return found
+
+
+def _once(fields: Sequence[Field]) -> list[Field]:
+    """The first field of each quantity; of two quantities that are one (m g and m) the one that gives it."""
+    seen: dict[str, Field] = {}
+    for f in fields:
+        if f.checked and f.given:
+            seen.setdefault(f.quantity, f)
+    return list(seen.values())
+
+
+def _moved(fitted: Vehicle, effects: Sequence[Mapping[str, Any]]) -> list[Constants]:
+    """The fitted constants with each parameter that was found one standard deviation further."""
+    found = []
+    for effect in effects:
+        present = fitted.effects.get(effect["name"])
+        if present is None:
+            continue
+        for name, number in effect["parameters"].items():
+            if number.get("chosen") or not number.get("sd"):
+                continue
+            further = {**present, name: present.get(name, number["value"]) + number["sd"]}
+            found.append(from_vehicle(replace(fitted, effects={**fitted.effects, effect["name"]: further}))[0])
+    return found
+
+
+def _reason(quantity: str, not_identifiable: Mapping[str, str]) -> str:
+    names = ABOUT.get(quantity) or ABOUT.get(quantity.partition("_")[0], ())
+    return next((f"flights do not tell: {not_identifiable[n]}" for n in names if n in not_identifiable), "")
+
+
+def rescaled(vehicle: Vehicle, mass: float) -> Vehicle:
+    """The same motion with another mass: inertia, thrust, drag and damping change by the same factor.
+
+    Args:
+        mass: of the whole drone, as it was weighed [kg].
+    """
+    constants, left = from_vehicle(vehicle)
+    assert constants.mass is not None
+    factor = mass / constants.mass
+    effects = {n: dict(v) for n, v in vehicle.effects.items() if n in left}
+    scaled = {
+        n: dict(v) for n, v in vehicle.effects.items() if n not in left and n not in ("motor_lag", "torque_scale")
+    }
+    for name, values in scaled.items():
+        keys = {"payload": ("mass",), "thrust_scale": (), "center_of_mass": ()}.get(name, tuple(values))
+        scaled[name] = {k: v * factor if k in keys else v for k, v in values.items()}
+    kept = {n: dict(v) for n, v in vehicle.effects.items() if n in ("motor_lag", "torque_scale")}
+    constant = vehicle.rotor_constant
+    return replace(
+        vehicle,
+        mass=vehicle.mass * factor,
+        inertia=(vehicle.inertia[0] * factor, vehicle.inertia[1] * factor, vehicle.inertia[2] * factor),
+        inertia_products=(
+            vehicle.inertia_products[0] * factor, vehicle.inertia_products[1] * factor,
+            vehicle.inertia_products[2] * factor,
+        ),
+        thrust_curve=tuple(c * factor for c in vehicle.thrust_curve),
+        rotor_constant=None if constant is None else constant * factor,
+        thrust_max=vehicle.thrust_max * factor,
+        effects={**effects, **scaled, **kept},
+    )  # fmt: skip
+
+
+def alternatives(imported: Imported, fitted: Vehicle, mass: float) -> list[dict[str, Any]]:
+    """The fitted constants of a file with its own mass, and with the mass that leaves its thrust as it is."""
+    old, new = imported.constants, from_vehicle(fitted)[0]
+    if old.thrust_per_speed2 is None or new.thrust_per_speed2 is None or new.mass is None:
+        return []
+    of_thrust = new.mass * old.thrust_per_speed2 / new.thrust_per_speed2
+    found = []
+    for words, total in (("the mass of the file is right", mass), ("the thrust of the file is right", of_thrust)):
+        c = from_vehicle(rescaled(fitted, total))[0]
+        numbers = {
+            f.label: f.written(value_of(c, f.quantity), None)
+            for f in _once(imported.fields) if f.quantity in ("mass", "thrust_per_speed2") or f.quantity in _MOMENTS
+        }  # fmt: skip
+        found.append({"if": words, "fields": numbers})
+    return found
+
+
+_MOMENTS = ("inertia_xx", "inertia_yy", "inertia_zz")

@@ -1,0 +1,147 @@
+"""Drones as they may be, by the joint posterior of a fitted vehicle: for domain randomisation and for ensembles.
+
+What flights know stays together (thrust over mass, torque over inertia), what they do not know is spread (the mass
+alone). From one day to the next a drone differs by more than a fit is unsure of: thrust, trim, the lag of its rotors.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.fitting.always import DAILY_LAG_SD, THRUST_SD
+from crazyem.diagnosis.fitting.sampling import TRIM_SD
+from crazyem.errors import DataError, UsageError
+from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.motion import vehicle_values
+from crazyem.simulators.constants import NUMBERS, from_vehicle
+from crazyem.simulators.findings import rescaled
+from crazyem.simulators.plausible import impossible
+from crazyem.vehicle import Posterior, Vehicle
+
+Array = NDArray[np.float64]
+MASS_SD = 0.02  # relative: a battery, a deck or markers more or less that nobody weighed
+USUAL_LAG = 0.05  # s, of the file for which `DAILY_LAG_SD` was found; a lag is positive, so it spreads by a factor
+TRIES = 200  # draws of one drone until it is one that can be
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """Drones that were drawn.
+
+    Attributes:
+        vehicles: each.
+        parameters: of the posterior. draws: (n, k) of them. seed: of the draws.
+    """
+
+    vehicles: tuple[Vehicle, ...]
+    parameters: tuple[str, ...]
+    draws: Array
+    seed: int
+
+    def arrays(self) -> dict[str, Array]:
+        """Constants in SI, (n,) each by their names in `Constants`, and parameters of effects that are in none."""
+        rows = [from_vehicle(v)[0] for v in self.vehicles]
+        found = {n: np.array([r.or_(n, math.nan) for r in rows]) for n in NUMBERS}
+        found = {n: v for n, v in found.items() if np.isfinite(v).all()}
+        left = from_vehicle(self.vehicles[0])[1]
+        for effect in left:
+            for name, value in self.vehicles[0].effects[effect].items():
+                if isinstance(value, int | float) and not isinstance(value, bool):
+                    found[f"{effect}.{name}"] = np.array([v.effects[effect][name] for v in self.vehicles], float)
+        return found
+
+
+def sample(vehicle: Vehicle, count: int, *, seed: int = 0, days: bool = True, mass_sd: float = MASS_SD) -> Sampled:
+    """Draw drones from the posterior of a fitted vehicle.
+
+    Args:
+        count: how many.
+        seed: the same seed gives the same drones.
+        days: other days than those of the flights: thrust, trim and lag differ as they do from day to day.
+        mass_sd: relative standard deviation of the mass, with which inertia, thrust and drag go; 0 where it was
+            weighed.
+
+    Raises:
+        UsageError: the vehicle has no posterior. DataError: hardly any drone of its posterior can be.
+    """
+    posterior = vehicle.posterior
+    if posterior is None:
+        raise UsageError(f"vehicle {vehicle.name} has no [posterior]; diagnose --write-vehicle writes one.")
+    _check(posterior, vehicle)
+    rng = np.random.default_rng(seed)
+    root = _root(np.array(posterior.covariance, float))
+    mean = np.array(posterior.mean, float)
+    vehicles, draws = [], []
+    for _ in range(count):
+        for _ in range(TRIES):
+            theta = mean + root @ rng.standard_normal(mean.size)
+            drawn = _drawn(vehicle, posterior.parameters, theta)
+            if days:
+                drawn = _another_day(drawn, rng)
+            drawn = rescaled(drawn, from_mass(drawn) * math.exp(mass_sd * rng.standard_normal()))
+            if _possible(drawn):
+                break
+        else:
+            raise DataError(
+                f"vehicle {vehicle.name}: hardly any drone of its posterior has a possible inertia and effects"
+            )
+        vehicles.append(drawn)
+        draws.append(theta)
+    return Sampled(tuple(vehicles), posterior.parameters, np.array(draws), seed)
+
+
+def from_mass(vehicle: Vehicle) -> float:
+    """The mass of the whole drone [kg]."""
+    return from_vehicle(vehicle)[0].or_("mass", vehicle.mass)
+
+
+def _check(posterior: Posterior, vehicle: Vehicle) -> None:
+    for key in posterior.parameters:
+        effect, _, name = key.partition(".")
+        if effect not in CATALOGUE or name not in {p.name for p in CATALOGUE[effect].parameters}:
+            raise UsageError(f"vehicle {vehicle.name}: its [posterior] has an unknown parameter '{key}'.")
+
+
+def _root(covariance: Array) -> Array:
+    values, vectors = np.linalg.eigh(covariance)
+    found: Array = vectors * np.sqrt(np.maximum(values, 0.0))
+    return found
+
+
+def _drawn(vehicle: Vehicle, parameters: Sequence[str], theta: Array) -> Vehicle:
+    own = vehicle_values(vehicle)
+    effects = {n: dict(v) for n, v in vehicle.effects.items()}
+    for key, value in zip(parameters, theta, strict=True):
+        effect, _, name = key.partition(".")
+        if effect not in effects:
+            effects[effect] = CATALOGUE[effect].complete({}, own.get(effect, {}))
+        effects[effect][name] = float(value)
+    return replace(vehicle, effects=effects, posterior=None)
+
+
+def _another_day(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
+    """The same drone on another day; sources of the spreads: `fitting/always.py`, `fitting/sampling.py`."""
+    effects = {n: dict(v) for n, v in vehicle.effects.items()}
+    scale = effects.setdefault("thrust_scale", {"scale": 1.0})
+    scale["scale"] *= 1.0 + THRUST_SD * rng.standard_normal()
+    trim = effects.setdefault("trim", dict.fromkeys("xyz", 0.0))
+    for axis, sd in zip("xyz", TRIM_SD, strict=True):
+        trim[axis] = trim.get(axis, 0.0) + sd * rng.standard_normal()
+    lag = effects.get("motor_lag", {}).get("time_constant", vehicle.motor_time_constant)
+    if lag > 0.0:
+        effects["motor_lag"] = {"time_constant": lag * math.exp(DAILY_LAG_SD / USUAL_LAG * rng.standard_normal())}
+    return replace(vehicle, effects=effects)
+
+
+def _possible(vehicle: Vehicle) -> bool:
+    for name, values in vehicle.effects.items():
+        for p in CATALOGUE[name].parameters:
+            value = values.get(p.name)
+            if isinstance(value, float) and not p.low <= value <= p.high:
+                return False
+    constants = from_vehicle(vehicle)[0]
+    moments = [constants.or_(f"inertia_{a}", 0.0) for a in ("xx", "yy", "zz")]
+    return min(moments) > 0.0 and not impossible(constants, str)
