@@ -47,7 +47,7 @@ def document_of(
     *,
     withhold: Sequence[str] = (),
 ) -> tuple[dict[str, Any], dict[str, Series]]:
-    """The JSON document of a diagnosis (names as in docs/reference/diagnosis_json.md), and pictures.
+    """The JSON document of a diagnosis (names as in docs/reference/json.md), and pictures.
 
     Args:
         recordings, held_out: as they were given to `diagnose`.

@@ -32,7 +32,7 @@ class Own:
     notices: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """As docs/reference/diagnosis_json.md has it."""
+        """As docs/reference/json.md has it."""
         clock, frame = self.alignment, self.frame
         return {
             "recording": self.recording,

@@ -32,7 +32,7 @@ class Free:
     usual: float
 
     def to_json(self) -> dict[str, Any]:
-        """As docs/reference/diagnosis_json.md has it."""
+        """As docs/reference/json.md has it."""
         return {
             "name": self.name, "words": self.words, "parameter": self.parameter, "value": self.value, "sd": self.sd,
             "unit": self.unit, "expected": self.expected, "usual": self.usual,
