@@ -9,7 +9,7 @@ WARM   := $(VENV)/.compiled
 # Modules are compiled once: the tests start some hundred processes, each of which would compile all of them again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: fly test slow lint bench concealed paper paper-docs cfclient-test clean setup oldest
+.PHONY: fly test slow lint bench docs concealed paper paper-docs cfclient-test clean setup oldest
 
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable
 
@@ -51,6 +51,10 @@ lint: $(READY)
 
 bench: $(READY)  ## speed against named peers (those installed: pip install -e '.[bench]')
 	$(BIN)/python benchmarks/speed.py
+
+docs: $(READY)  ## the pages as a site, with strict links, and the notebooks
+	$(BIN)/mkdocs build --strict
+	$(BIN)/python -m pytest -q -m slow tests/test_docs.py
 
 concealed: $(READY)  ## physics hidden in the simulator, and whether diagnose finds it; goes on where it was stopped
 	$(BIN)/python -m benchmarks.concealed draw --cases 320 --seed 2048 --out out/concealed

@@ -205,12 +205,6 @@ def page(table: dict[str, Any]) -> str:
         if key.endswith("mass_error"):
             values = ["-" if v is None else f"{100 * v:.1f}" for v in values]
         lines.append(f"| {label} | {' | '.join('-' if v is None else str(v) for v in values)} |")
-    kinds = sorted({k for arm in names for k in table[arm]["faults"]})
-    lines += ["", "| fault | guarded flights | of which crashed | flights without a guard | of which crashed |"]
-    lines.append("|---|---|---|---|---|")
-    for kind in kinds:
-        counts = [table[arm][which].get(kind, 0) for arm in ("guarded", "unguarded") for which in ("faults", "fell")]
-        lines.append(f"| {kind.replace('_', ' ')} | {' | '.join(map(str, counts))} |")
     for arm, what in (("guarded", "With the guard"), ("unguarded", "Without it")):
         seeds = ", ".join(map(str, table[arm]["seeds_of_those"]))
         lines += ["", f"{what}, seeds that crashed and did not without writes: {seeds or 'none'}."]

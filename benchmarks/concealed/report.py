@@ -106,7 +106,7 @@ def _number(value: float | None, text: str) -> str:
 
 
 def table(f: dict[str, Any], *, brief: bool = False) -> str:
-    """The figures as Markdown; brief: without the tables of effects, confidence and cases."""
+    """The figures as Markdown; brief: figures with an aim, without the other tables."""
     cases, p, s, o = f["cases"], f["parameters"], f["single"], f["outside"]
     calibration = f["confidence"]["expected_calibration_error"]
     rows = [
@@ -130,6 +130,8 @@ def table(f: dict[str, Any], *, brief: bool = False) -> str:
         ("confidence: expected calibration error", _number(calibration, "{:.3f}"), ""),
         ("seconds for a case: median", _number(f["seconds"]["median"], "{:.1f}"), "under 60"),
     ]  # fmt: skip
+    if brief:
+        rows = [row for row in rows if row[2] and not row[0].startswith(("the same", "cases with"))]
     lines = [
         f"{sum(cases.values())} cases: {cases['nothing']} with nothing hidden, {cases['single']} single effects "
         f"({s['detectable']['n']} detectable), {cases['pair']} pairs, {cases['outside']} outside the catalogue; "
