@@ -41,7 +41,7 @@ def _check(arguments: argparse.Namespace) -> int:
     )
     if arguments.write:
         replace_text(arguments.write, found.corrected.text)
-    _told(arguments, {**found.to_dict(), "written": arguments.write}, [str(found)])
+    _report(arguments, {**found.to_dict(), "written": arguments.write}, [str(found)])
     return DataError.exit_code if arguments.strict and not found.fits else 0
 
 
@@ -112,7 +112,7 @@ def _sample(arguments: argparse.Namespace) -> int:
     }  # fmt: skip
     lines = [f"{output}: {arguments.count} drones of {vehicle.name}, seed {arguments.seed}"]
     lines += [f"  {n}: {mean:.4g} +- {sd:.2g}" for n, (mean, sd) in rows.items() if sd > 0.0]
-    return _told(arguments, document, lines)
+    return _report(arguments, document, lines)
 
 
 def _several(source: str, form: str | None) -> list[str]:
