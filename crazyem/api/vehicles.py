@@ -13,7 +13,7 @@ from crazyem.diagnosis.prediction.ensemble import Ensemble, ensemble
 from crazyem.diagnosis.prediction.predict import recorded
 from crazyem.errors import DataError, UsageError
 from crazyem.notebook import finite, html_table
-from crazyem.recordings.options import ReadOptions
+from crazyem.recordings.contents import ReadOptions
 from crazyem.simulators.constants import NUMBERS
 from crazyem.simulators.convert import Converted, convert, load_source, read_text
 from crazyem.simulators.cost import HORIZON, errors_after, said
