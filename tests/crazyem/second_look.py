@@ -431,7 +431,7 @@ def real_firmware(path: Path) -> Facts:
     facts["mixer_share"] = on_grid(duty)
     code = d[d["name"] == "stateEstimateZ.quat"]["value"].to_numpy().astype(np.int64)
     facts["tilt_max_deg"] = max(tilt_of_code(int(c)) for c in code)
-    volts = d[d["name"] == "pm.vbatMV"]["value"].to_numpy() / 1e3
+    volts = (d[d["name"] == "pm.vbatMV"]["value"].to_numpy() + 0.5) / 1e3  # whole mV, cut off
     facts |= {"voltage_min_V": float(volts.min()), "voltage_max_V": float(volts.max())}
     state = {k: d[d["name"] == f"stateEstimateZ.{k}"]["value"].to_numpy() / 1e3 for k in ("z", "vx", "vy", "vz")}
     facts["altitude_max_m"] = float(state["z"].max())
