@@ -15,7 +15,7 @@ settings.register_profile(
     "steady", derandomize=True, database=None, max_examples=15, deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
 )  # fmt: skip
-settings.register_profile("deep", settings.get_profile("steady"), derandomize=False, max_examples=50, print_blob=True)
+settings.register_profile("deep", settings.get_profile("steady"), derandomize=False, max_examples=30, print_blob=True)
 settings.load_profile("steady")  # --hypothesis-profile deep loads the other
 
 
