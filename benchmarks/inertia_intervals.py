@@ -23,6 +23,7 @@ import numpy as np
 
 from benchmarks.wire_flight import Log, fly
 from crazyem.control.trajectories import Trajectory, excite, figure8, hover
+from crazyem.estimation.in_step import PERIOD
 from crazyem.estimation.online import ATTITUDE_PERIOD, OnlineEstimator
 from crazyem.vehicle import load_vehicle
 from firmware_sim.scenario import Scenario, parse_scenario
@@ -107,7 +108,7 @@ def fly_all(cases: Iterable[Case], folder: Path) -> None:
 def lines(case: Case, log: Log, *, every: int = 4) -> list[dict[str, Any]]:
     """What the estimator says once a second of the trajectory."""
     vehicle = replace(load_vehicle(VEHICLES[case.vehicle][0]), motor_time_constant=FILE_LAG)
-    estimator = OnlineEstimator(vehicle, attitude_period=ATTITUDE_PERIOD, every=every)
+    estimator = OnlineEstimator(vehicle, attitude_period=ATTITUDE_PERIOD, prediction_period=PERIOD, every=every)
     said: list[dict[str, Any]] = []
     due = log.start + SETTLING + 2.0
     values = truth(case)

@@ -13,7 +13,7 @@ from crazyem.physics import folding
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Finding, Grade
-from crazyem.recordings.recording import Recording, onboard_attitude
+from crazyem.recordings.recording import Recording, crazyflie_attitude, onboard_attitude
 from crazyem.recordings.thrust import kind_objection, signal_for, weight_objection
 from crazyem.signals.sample import ESTIMATOR_SIGNALS
 from crazyem.vehicle import Vehicle
@@ -57,7 +57,8 @@ def replay(
     # a live flight takes what comes first, and a replay must do the same; but never what says nothing
     unfit = [n for n in ("rotor_speed", "motor_command") if n in recording.signals and n != thrust_from]
     estimator = estimator_for(
-        nominal, onboard=onboard_attitude(recording), **_window_of(recording, window, every),
+        nominal, onboard=onboard_attitude(recording), crazyflie=crazyflie_attitude(recording),
+        **_window_of(recording, window, every),
         input_signal=thrust_from if unfit or thrust_from == "wrench_command" else None,
     )  # fmt: skip
     pipeline = Pipeline(estimator, history=history)

@@ -102,11 +102,11 @@ def raise_after(error: BaseException | None) -> None:
         raise error
 
 
-def new_estimator(vehicle: Vehicle, arguments: argparse.Namespace) -> Any:
-    """The estimator with the window of the command line."""
+def new_estimator(vehicle: Vehicle, arguments: argparse.Namespace, *, crazyflie: bool = True) -> Any:
+    """The estimator with the window of the command line; `crazyflie`: its filter makes the attitudes."""
     from crazyem.estimation.steps import estimator_for
 
-    return estimator_for(vehicle, window=arguments.window, every=arguments.every)
+    return estimator_for(vehicle, window=arguments.window, every=arguments.every, crazyflie=crazyflie)
 
 
 def compile_kernels(vehicle: Vehicle) -> None:

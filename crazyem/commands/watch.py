@@ -59,7 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
         }  # fmt: skip
         session = open_session(
             stack, link, vehicle=vehicle, left_out=left_out, configuration=configuration,
-            estimator=new_estimator(vehicle, arguments), record=arguments.record, append=arguments.append,
+            estimator=new_estimator(vehicle, arguments, crazyflie=not arguments.uri.startswith("mavlink:")),
+            record=arguments.record, append=arguments.append,
             rate=arguments.rate, reconnect=arguments.reconnect, wrap=streams.with_stream,
         )  # fmt: skip
         try:

@@ -40,6 +40,7 @@ class Information:
         noise_sd: (11,) standard deviations of the logarithms of the noise scales, zero where known.
         noise_step: (11,) scoring step of these logarithms.
         shift: (9,) by which the values are corrected before they are told (`in_step.py`); None: not at all.
+        open_sd: (9,) what unknown torques leave open beside the covariance, one more standard deviation.
     """
 
     matrix: NDArray
@@ -51,6 +52,7 @@ class Information:
     noise_sd: NDArray
     noise_step: NDArray
     shift: NDArray | None = None
+    open_sd: NDArray | None = None
 
     @cached_property
     def sd(self) -> NDArray:
@@ -218,6 +220,15 @@ class WindowEM:
             first, last, t.time, t.kind, t.usable, t.force, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
             t.thrust_delay, t.torque_delay, p.theta, setup.unit, inertia, p.inverse, p.noise.q,
             p.noise.measurement[4] ** 2, setup.lead, t.xf, t.gain, t.s, t.e, t.blocks, t.middle, t.score,
+        )  # fmt: skip
+
+    def torque_sensitivities(self, first: int, last: int, shapes: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Torques shapes (last, 3, K) of unknown size: information with theta (9, K), among them (K, K), score (K,)."""
+        t, p, setup = self.tape, self.parameters, self.setup
+        return kernels.torque_sensitivities(
+            first, last, t.time, t.kind, t.usable, t.force, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
+            t.thrust_delay, t.torque_delay, p.theta, setup.unit, p.inertia, p.inverse, p.noise.q,
+            p.noise.measurement[4] ** 2, setup.lead, t.xf, t.gain, t.s, t.e, t.blocks, t.middle, shapes,
         )  # fmt: skip
 
     def information(self, first: int, last: int, *, of_noise: NDArray | None = None) -> Information:

@@ -99,8 +99,8 @@ class OnlineEstimator:
         accelerometer: whether to use specific_force, the mean over the step that ends at its stamp. Off by default: a
             real one measures the vibration of its frame.
         known_noise: noise that is known and not estimated.
-        attitude_period: s between attitudes that are used where body rates are there as well; 0 uses all. An onboard
-            filter integrates its gyro: its attitude errs as its rates do, and for longer than a sample lasts.
+        attitude_period: s between attitudes that are used where body rates are there as well; 0 uses all (see above).
+        prediction_period: s between predictions of an onboard estimate, still meanwhile; 0: not known (in_step.py).
 
     Attributes:
         every: samples between updates; may be changed on the way.
@@ -124,6 +124,7 @@ class OnlineEstimator:
         accelerometer: bool = False,
         known_noise: KnownNoise | None = None,
         attitude_period: float = 0.0,
+        prediction_period: float = 0.0,
     ) -> None:
         if window < 20:
             raise UsageError(f"a window of {window} samples is too short to estimate from (at least 20)")
@@ -142,7 +143,7 @@ class OnlineEstimator:
             setup_for, vehicle, mass=mass, inertia=inertia, integration=integration, known_noise=known_noise
         )
         self._measured = {**_COLUMNS, "specific_force": slice(13, 16)} if accelerometer else _COLUMNS
-        self._attitude_period = attitude_period
+        self._attitude_period, self._prediction_period = attitude_period, prediction_period
         self._attitude_time = self._rate_time = -math.inf  # of the newest attitude that is used, of the newest rates
         self._setup: Setup | None = None
         self._em: WindowEM | None = None
@@ -420,8 +421,8 @@ class OnlineEstimator:
     def _with_ages(self, em: WindowEM, first: int, last: int, information: Information) -> Information:
         """With what commands that are sampled in step with an onboard estimate may hide."""
         stamps, _ = self._inputs.between(self._tape.time[first], self._tape.time[last - 1])
-        onboard = self._attitude_period > 0.0 and em.setup.free[4]
-        return corrected(em, first, last, information) if onboard and in_step(stamps) else information
+        period = self._prediction_period if em.setup.free[4] else 0.0
+        return corrected(em, first, last, information) if in_step(stamps, period) else information
 
     def _moved(self, em: WindowEM) -> bool:
         """Whether a parameter has moved since the last full passes by more than older rows' expectations can bear."""

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.estimation.in_step import PERIOD
 from crazyem.estimation.online import ATTITUDE_PERIOD, OnlineEstimator
 from crazyem.estimation.result import Estimate, Step
 from crazyem.signals.sample import Sample
@@ -248,19 +249,31 @@ class StepAwareEstimator:
 
 
 def estimator_for(
-    vehicle: Vehicle, *, window: int = 800, every: int = 4, onboard: bool = True, input_signal: str | None = None
+    vehicle: Vehicle,
+    *,
+    window: int = 800,
+    every: int = 4,
+    onboard: bool = True,
+    crazyflie: bool = True,
+    input_signal: str | None = None,
 ) -> StepAwareEstimator:
     """The estimator of a flight or a replay; its window begins anew when the mass steps.
 
     Args:
         window, every: newest samples used; samples between updates.
-        onboard: attitudes come from a filter on board, as those of every link do.
+        onboard: attitudes come from a filter on board, as those of every link do; crazyflie: from a Crazyflie's.
         input_signal: what thrust is computed from; None takes what comes first.
 
     Raises:
         UsageError: a window too short to estimate from.
     """
-    period = ATTITUDE_PERIOD if onboard else 0.0
     return StepAwareEstimator(
-        OnlineEstimator(vehicle, window=window, every=every, attitude_period=period, input_signal=input_signal)
+        OnlineEstimator(
+            vehicle,
+            window=window,
+            every=every,
+            attitude_period=ATTITUDE_PERIOD if onboard else 0.0,
+            prediction_period=PERIOD if onboard and crazyflie else 0.0,
+            input_signal=input_signal,
+        )
     )

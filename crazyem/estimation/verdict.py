@@ -48,8 +48,10 @@ def estimate_of(
     else:
         theta, sd = displaced(parameters.theta, marginal.shift, unit), marginal.sd
         below, above = marginal.low - marginal.shift, marginal.high - marginal.shift
-    if information.shift is not None:
+    if information.shift is not None and information.open_sd is not None:
         theta = displaced(theta, information.shift, unit)
+        wider = information.open_sd
+        sd, below, above = np.hypot(sd, wider), -np.hypot(below, 1.96 * wider), np.hypot(above, 1.96 * wider)
     # An inertia that the prior all but excludes says that the model does not hold here, not that the drone is odd.
     deviation = np.abs(offset(theta, prior.centre, unit))
     implausible = deviation > IMPLAUSIBLE * prior.sd

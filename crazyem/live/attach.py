@@ -105,8 +105,7 @@ def attach(
     Raises:
         UsageError: unknown vehicle, no such policy, not connected, or a log variable is missing. LinkError: no answer.
     """
-    from crazyem.estimation.online import OnlineEstimator
-    from crazyem.estimation.steps import StepAwareEstimator
+    from crazyem.estimation.steps import estimator_for
     from crazyem.links.crazyflie import CrazyflieLink
     from crazyem.live.warm_up import warm_up
 
@@ -114,7 +113,7 @@ def attach(
     model, left_out = folding.fold(vehicle if isinstance(vehicle, Vehicle) else folding.load(vehicle))
     warm_up(model)
     link = CrazyflieLink.from_crazyflie(cf)
-    estimator = StepAwareEstimator(OnlineEstimator(model, window=window, every=every))
+    estimator = estimator_for(model, window=window, every=every)
     session = Session(link, vehicle=model, estimator=estimator)
     session.history.notice(folding.notice(left_out))
     try:

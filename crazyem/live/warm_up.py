@@ -4,6 +4,7 @@ import math
 import time
 
 from crazyem.errors import CrazyemError
+from crazyem.estimation.in_step import PERIOD
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.kernel_cache import compilations
 from crazyem.signals.sample import Sample
@@ -13,11 +14,11 @@ from crazyem.vehicle import Vehicle
 def warm_up(vehicle: Vehicle) -> float:
     """Run every kernel once; returns the seconds it took if any was compiled, 0.0 if all came from the disk."""
     begun, before = time.monotonic(), compilations()
-    estimator = OnlineEstimator(vehicle, window=100, every=4)
+    estimator = OnlineEstimator(vehicle, window=100, every=4, prediction_period=PERIOD)
     hover = 0.5
     try:
         for i in range(160):
-            t = 0.01 * i
+            t = PERIOD * i
             s = 0.01 * math.sin(7 * t)
             for name, value in (
                 ("flying", (1.0,)),

@@ -233,7 +233,8 @@ def collect(samples: Iterable[tuple[Sample, bool]]) -> dict[str, SignalArray]:
 
 
 # What names of attitudes that a filter on board made begin with, beside those of MAVLink: the Crazyflie's, ULog's.
-ONBOARD_PREFIXES = ("stateEstimate", "kalman.", "vehicle_attitude.")
+CRAZYFLIE_PREFIXES = ("stateEstimate", "kalman.")
+ONBOARD_PREFIXES = (*CRAZYFLIE_PREFIXES, "vehicle_attitude.")
 
 
 def onboard_attitude(recording: Recording) -> bool:
@@ -243,6 +244,13 @@ def onboard_attitude(recording: Recording) -> bool:
     if attitude is None:
         return False
     claimed = recording.metadata.get("claims", {}).get("attitude") == "onboard" or "mavlink" in recording.metadata
-    return claimed or any(
-        s.rsplit("/", 1)[-1].startswith(ONBOARD_PREFIXES) or carries_attitude(s) for s in attitude.source
-    )
+    return claimed or _named(attitude, ONBOARD_PREFIXES) or any(carries_attitude(s) for s in attitude.source)
+
+
+def crazyflie_attitude(recording: Recording) -> bool:
+    """Whether the attitude is that of a Crazyflie's own filter: by its name, whatever the rate."""
+    return "attitude" in recording.signals and _named(recording.signals["attitude"], CRAZYFLIE_PREFIXES)
+
+
+def _named(attitude: SignalArray, prefixes: tuple[str, ...]) -> bool:
+    return any(s.rsplit("/", 1)[-1].startswith(prefixes) for s in attitude.source)

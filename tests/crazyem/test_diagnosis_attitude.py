@@ -13,7 +13,7 @@ from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.flights.flight import APART, Flight, flight_of
 from crazyem.estimation import steps
-from crazyem.recordings.recording import Recording, onboard_attitude
+from crazyem.recordings.recording import Recording, crazyflie_attitude, onboard_attitude
 from crazyem.signals.vocabulary import MAVLINK_SOURCES, SOURCES
 
 PULL, TILT = 0.04, 4e-3  # s, rad: how long an error lasts, and its standard deviation
@@ -65,7 +65,10 @@ def test_attitudes_of_motion_capture_are_all_used() -> None:
 def test_attitudes_that_a_filter_on_board_made(
     source: str, metadata: dict[str, dict[str, str]], expected: bool
 ) -> None:
-    assert onboard_attitude(replace(onboard(fly(seconds=2.0), source=source), metadata=metadata)) is expected
+    flown = replace(onboard(fly(seconds=2.0), source=source), metadata=metadata)
+    assert onboard_attitude(flown) is expected
+    # which filter: a Crazyflie's is told by its names, at the same 100 Hz as an autopilot's
+    assert crazyflie_attitude(flown) is source.startswith(("stateEstimateZ", "kalman"))
 
 
 def test_every_attitude_that_a_link_gives_is_of_a_filter_on_board() -> None:
@@ -78,15 +81,19 @@ def test_every_attitude_that_a_link_gives_is_of_a_filter_on_board() -> None:
         assert onboard_attitude(replace(flown, signals={**flown.signals, "attitude": signal})), variables
 
 
-@pytest.mark.parametrize(("onboard", "period"), [(True, 0.05), (False, 0.0)])
+@pytest.mark.parametrize(
+    ("onboard", "crazyflie", "period", "predicted"),
+    [(True, True, 0.05, 0.01), (True, False, 0.05, 0.0), (False, False, 0.0, 0.0)],
+)
 def test_the_estimator_of_the_commands_thins_attitudes_of_filters_on_board_and_no_others(
-    monkeypatch: pytest.MonkeyPatch, onboard: bool, period: float
+    monkeypatch: pytest.MonkeyPatch, onboard: bool, crazyflie: bool, period: float, predicted: float
 ) -> None:
     made = []
     monkeypatch.setattr(steps, "OnlineEstimator", lambda vehicle, **given: made.append(given) or SimpleNamespace())
     monkeypatch.setattr(steps, "StepAwareEstimator", lambda estimator: estimator)
-    steps.estimator_for(DRONE, onboard=onboard)
-    assert made == [{"window": 800, "every": 4, "attitude_period": period, "input_signal": None}]
+    steps.estimator_for(DRONE, onboard=onboard, crazyflie=crazyflie)
+    expected = {"window": 800, "every": 4, "attitude_period": period, "prediction_period": predicted}
+    assert made == [{**expected, "input_signal": None}]
 
 
 def test_of_onboard_attitudes_one_in_so_many_is_used_and_none_is_lost() -> None:

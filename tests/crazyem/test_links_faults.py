@@ -1,6 +1,7 @@
 """The link behind a relay that harms packets: what it survives, and that its accounts are right."""
 
 import contextlib
+import itertools
 import struct
 import threading
 import time
@@ -14,6 +15,7 @@ from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import LinkLost, Packet
 from crazyem.links.connection import _Progress, new_crazyflie
 from crazyem.links.crazyflie import CrazyflieLink
+from crazyem.live.session import LOG_RATE
 from crazyem.signals.vocabulary import STATE_VARIABLES, standard_variables
 
 NAMES = ("stateEstimateZ.x", "stateEstimateZ.y", "stateEstimateZ.z", "pm.vbat")
@@ -208,11 +210,27 @@ def test_faster_than_a_hundred_hertz(simulator, rate, period):
     assert (stamps[-1] - stamps[0]) / (len(stamps) - 1) == pytest.approx(period, rel=0.02)
 
 
-def test_firmware_that_cannot_start_by_the_millisecond(fake_peer):
+@pytest.fixture
+def older_peer(fake_peer):
+    """Firmware that cannot start a block by the millisecond."""
     answer = fake_peer._answer
     fake_peer._answer = lambda r: [b"\x5d\x08" + r[2:3] + b"\x08"] if r[0] | 0x0C == 0x5D and r[1] == 8 else answer(r)
-    with connected(fake_peer.uri) as link, pytest.raises(UsageError, match="cannot log every 4 ms"):
+    return fake_peer
+
+
+def test_firmware_that_cannot_start_by_the_millisecond(older_peer):
+    with connected(older_peer.uri) as link, pytest.raises(UsageError, match="cannot log every 4 ms"):
         link.subscribe(NAMES, 250.0)
+
+
+def test_a_session_logs_every_10_ms_where_11_are_refused(older_peer):
+    with connected(older_peer.uri) as link:
+        blocks = link.subscribe(NAMES, LOG_RATE)
+        stamps = [p.firmware_time_ms for p in take(link, 0.3)]
+        running = list(link._blocks._running)
+    assert [b.period_ms for b in blocks] == [10]
+    assert running == [blocks[0].identifier]  # nothing is left of the block that was refused
+    assert {b - a for a, b in itertools.pairwise(stamps)} == {10}
 
 
 # --- accounts -------------------------------------------------------------------------------------------------------

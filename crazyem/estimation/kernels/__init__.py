@@ -31,7 +31,7 @@ from crazyem.estimation.kernels.layout import (
     SIZE,
 )
 from crazyem.estimation.kernels.noise import noise_information
-from crazyem.estimation.kernels.sensitivity import sensitivities
+from crazyem.estimation.kernels.sensitivity import sensitivities, torque_sensitivities
 from crazyem.estimation.kernels.smoother import backward, total
 
 __all__ = [
@@ -54,5 +54,6 @@ __all__ = [
     "forward",
     "noise_information",
     "sensitivities",
+    "torque_sensitivities",
     "total",
 ]
