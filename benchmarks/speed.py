@@ -32,6 +32,7 @@ from window import Window
 
 from crazyem.estimation import kernels, reference
 from crazyem.estimation.em import WindowEM
+from crazyem.estimation.in_step import corrected
 from crazyem.estimation.model import Parameters
 from crazyem.estimation.online import OnlineEstimator
 
@@ -76,12 +77,14 @@ def window_of(em: WindowEM, first: int, last: int) -> Window:
     )  # fmt: skip
 
 
-def scored_pass(em: WindowEM, first: int, last: int) -> Parameters:
-    """The same with the Fisher information of all parameters and a step of the noise scales."""
+def scored_pass(em: WindowEM, first: int, last: int, *, in_step: bool = False) -> Parameters:
+    """A full pass that also gets score and information; `in_step`: of a log sampled in step with predictions."""
     em.refill_inputs(first, last)
     em.forward(first, last, restart=True)
     em.backward(first, last)
-    em.information(first, last)
+    information = em.information(first, last)
+    if in_step:
+        corrected(em, first, last, information)
     return em.maximise(first, last)
 
 
@@ -183,6 +186,7 @@ def measure_speed(*, seed: int, window: int, rounds: int, seconds: float, with_p
         Contender("crazyem: full EM pass", lambda: full_pass(em, first, last)),
         Contender("crazyem: its E-step alone", lambda: e_step(em, first, last)),
         Contender("crazyem: full pass with score and information", lambda: scored_pass(em, first, last)),
+        Contender("crazyem: the same, commands in step", lambda: scored_pass(em, first, last, in_step=True)),
         Contender("crazyem: converged from the nominal vehicle", FromNominal(em, first, last), stride=slow),
     ]
     start = em.setup.prior.centre

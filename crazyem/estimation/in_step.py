@@ -9,7 +9,7 @@ with the age d of the sample less the mean age (-5 to 5 ms, unknown, drifting ov
 that the log does not tell. For the filter these are torques of known shape and unknown size: nuisance parameters,
 found together with theta by one scoring step. Logs of another period visit every age, and the mean is right.
 
-In simulated flights (36, logged every 10 ms, seed 3) a third to a half of the error is not of these shapes, and adds up
+In five simulated quiet flights logged every 10 ms, a third to a half of the error is not of these shapes and adds up
 like the rest. So what the step corrects counts as one more standard deviation.
 """
 
