@@ -8,9 +8,9 @@ from effects_cases import CF2, ROTORS, G, still, wild
 from scipy.spatial.transform import Rotation
 
 from crazyem.physics.effects.effect import Effects, Situation
-from crazyem.physics.effects.rotation import axes, rotation_between
 from crazyem.physics.effects.rotor_inertia import TYPICAL_ROTOR_CONSTANT
 from crazyem.physics.motion import RotorInput, measured, motion, rotor_thrust
+from crazyem.physics.rotations import axes, rotation_between
 
 M = CF2.mass
 IXX, IYY, IZZ = CF2.inertia

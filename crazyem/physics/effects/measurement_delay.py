@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
 from crazyem.physics.effects.fused_attitude import attitude_error
 from crazyem.physics.effects.prior import Prior
-from crazyem.physics.effects.rotation import rotation_between
 from crazyem.physics.effects.stretches import stretches
+from crazyem.physics.rotations import rotation_between
 
 SHOWN = {  # which of position, velocity, attitude, rate, specific force a stream shows
     "state": ("position", "velocity", "attitude"),

@@ -1,11 +1,11 @@
-"""attitude_misalignment, accelerometer_misalignment, gyro_bias, velocity_scale: what sensors show beyond the truth."""
+"""attitude_misalignment, accelerometer_misalignment, gyro_bias, velocity_scale, rotor_sensor: what sensors show."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
 from crazyem.physics.effects.prior import Logged, Prior, Sizes, alike, in_turn
-from crazyem.physics.effects.rotation import axes
-from crazyem.physics.rotations import quaternion_from_euler, rotation_vector_from_quaternion
+from crazyem.physics.rotations import axes, quaternion_from_euler, rotation_vector_from_quaternion
 
 
 def tilted_pose(situation: Situation, *, roll: float, pitch: float, yaw: float) -> Offset:
@@ -96,4 +96,27 @@ VELOCITY_SCALE = Effect(
     words="velocity scale of the onboard estimate",
     belongs_to="recording",  # in a vehicle it cost 27 % of position error on other flights of the same drone
     separates="log position from motion capture or beacons, and fly straight legs of known length",
+)
+
+
+def recounted(thrust: NDArray, *, rotor: int, scale: float) -> NDArray:
+    """The reported speed is scale times the true one, so the true thrust is what it reads as over scale squared."""
+    true = thrust.copy()
+    true[:, int(rotor) - 1] /= scale**2
+    return true
+
+
+ROTOR_SENSOR = Effect(
+    "rotor_sensor",
+    (
+        Parameter("rotor", "", 1, 1, 4, 1, chosen=(1, 2, 3, 4), phrase="of rotor {}"),
+        Parameter("scale", "", 1.0, 0.1, 3.0, 0.01),
+    ),
+    order=24,
+    speed=recounted,
+    prior=Prior(own={"scale": 0.05}),
+    needs=("rotor_speed",),
+    words="wrong speed sensor",
+    separates="log the motor commands beside the speeds, or point an optical tachometer at each rotor in hover",
+    spared={"motor_command": "log the motor commands beside the speeds, or "},
 )

@@ -1,10 +1,15 @@
-"""thrust_scale, rotor_fault, torque_scale: rotors that give more or less than they should at the same speed."""
+"""thrust_scale, rotor_fault, torque_scale, ground_effect, trim: rotors that give more or less than they should.
+
+trim is the steady torque that every real drone needs. No four rotors are equal or upright, and no battery sits in the
+middle. The trim goes with the thrust, so nothing acts on a drone with its rotors at rest. For a vehicle file that has
+a trim, the day's differs a little from the file's; how much is in `crazyem/diagnosis/fitting/always.py`.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.physics.effects.effect import Effect, Parameter, Situation
-from crazyem.physics.effects.prior import Logged, Prior, Sizes
+from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
+from crazyem.physics.effects.prior import Logged, Prior, Sizes, in_turn
 
 
 def scaled(situation: Situation, *, scale: float) -> NDArray:
@@ -70,4 +75,47 @@ TORQUE_SCALE = Effect(
     prior=Prior(own={"scale": 0.2}, usual=lambda logged: {"scale": 0.03 * logged.coarse}),
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum): torque over inertia is all that a flight shows",
+)
+
+
+def lifted(situation: Situation, *, strength: float, height: float) -> NDArray:
+    """All thrusts times 1 + strength exp(-z/height), z the height of O above the floor [m]."""
+    return situation.thrust * (1 + strength * np.exp(-np.maximum(situation.height, 0.0) / height))[:, None]
+
+
+GROUND_EFFECT = Effect(
+    "ground_effect",
+    (
+        Parameter("strength", "", 0.0, 0.0, 2.0, 0.02),
+        Parameter("height", "m", 0.1, 0.005, 10.0, 0.01),
+    ),
+    order=32,
+    rotors=lifted,
+    prior=Prior(own={"strength": 0.3, "height": 0.1}),
+    needs=("position",),
+    separates="hover for 5 s at each of several heights, from 3 cm to 1 m",
+    nudge={"strength": 0.02},
+    amplitude="strength",
+    beginnings={"height": (0.03, 0.1, 0.3)},
+)
+
+
+def trimmed(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
+    """Torque (x, y, z) [m, that is N m per N] times the thrust of all rotors, body axes."""
+    total = situation.thrust.sum(axis=1)[:, None]
+    return Wrench(np.zeros((situation.size, 3)), np.array([x, y, z]) * total)
+
+
+def _of_the_day(logged: Logged) -> Sizes:
+    """As healthy and damaged flights of two drones on several days scatter (docs/results/diagnosis_real.md)."""
+    return in_turn("x y z", 5e-4, 5e-4, 1.6e-4) if logged.dated else {}
+
+
+TRIM = Effect(
+    "trim",
+    tuple(Parameter(axis, "m", 0.0, -0.02, 0.02, 1e-4) for axis in "xyz"),
+    order=41,
+    external=trimmed,
+    prior=Prior(usual=_of_the_day),
+    separates="fly the drone while it is well and judge by the vehicle file written from that: its trim is in there",
 )

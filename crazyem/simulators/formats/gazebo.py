@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
-from crazyem.physics.effects.payload import steiner
+from crazyem.physics.effects.mass_properties import steiner
 from crazyem.simulators.constants import Constants, inertia_of
 from crazyem.simulators.documents.xml import Element, XmlDocument
 from crazyem.simulators.fields import Field, Format

@@ -1,9 +1,46 @@
-"""velocity_moment and rate_damping: torques of the air against motion and rotation."""
+"""linear_drag, quadratic_drag, velocity_moment, rate_damping: what the air does against motion."""
 
 import numpy as np
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
-from crazyem.physics.effects.prior import Logged, Prior, Sizes, alike
+from crazyem.physics.effects.prior import Logged, Prior, Sizes, alike, in_turn
+
+
+def linear_force(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
+    """-D v: x, y, z [N s/m] along body axes."""
+    return Wrench(-np.array([x, y, z]) * situation.airspeed, np.zeros((situation.size, 3)))
+
+
+LINEAR_DRAG = Effect(
+    "linear_drag",
+    tuple(Parameter(axis, "N s/m", 0.0, 0.0, 0.5, 1e-3) for axis in "xyz"),
+    order=60,
+    external=linear_force,
+    couples_air=True,
+    # usual: an attitude 1 ms late is a force of 3e-4 N s/m; along z thrust is a little wrong (`fitting/always.py`)
+    prior=Prior(alike("x y z", 0.012), in_turn("x y z", 5e-4, 5e-4, 1e-3)),
+    needs=("velocity", "position"),
+    separates="fly straight legs of different speeds in opposite directions",
+)
+
+
+def quadratic_force(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
+    """-Q |v| v: the whole airspeed times each component; x, y, z [N s^2/m^2] along body axes."""
+    airspeed = situation.airspeed
+    speed = np.sqrt(np.einsum("ni,ni->n", airspeed, airspeed))[:, None]
+    return Wrench(-np.array([x, y, z]) * speed * airspeed, np.zeros((situation.size, 3)))
+
+
+QUADRATIC_DRAG = Effect(
+    "quadratic_drag",
+    tuple(Parameter(axis, "N s^2/m^2", 0.0, 0.0, 0.1, 5e-4) for axis in "xyz"),
+    order=61,
+    external=quadratic_force,
+    couples_air=True,
+    prior=Prior(alike("x y z", 0.012), in_turn("x y z", 3e-4, 3e-4, 1e-3)),  # usual: as that of a linear drag
+    needs=("velocity", "position"),
+    separates="fly straight legs at 0.5, 1 and 2 m/s: linear drag doubles with speed, this one goes up four times",
+)
 
 
 def flapping(situation: Situation, body: Body, *, roll_per_vy: float, pitch_per_vx: float) -> Wrench:

@@ -1,7 +1,9 @@
-"""inertia and inertia_products: the bare body's inertia matrix, elements where the vehicle file is wrong."""
+"""inertia, inertia_products, center_of_mass, payload: the body's mass and a point mass on it."""
 
 import math
 from dataclasses import replace
+
+import numpy as np
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter
 from crazyem.physics.effects.prior import Prior, alike, in_turn
@@ -50,4 +52,54 @@ INERTIA_PRODUCTS = Effect(
     separates="excite one axis at a time: roll, pitch and yaw for 5 s each at 2 Hz",
     # usual: a third of a degree between the axes of the gyro and those of the rotors looks like it
     prior=Prior(alike("xy xz yz", 0.15), alike("xy xz yz", 0.006), dict.fromkeys(("xy", "xz", "yz"), "inertia")),
+)
+
+
+def shifted(body: Body, *, x: float, y: float, z: float) -> Body:
+    """Centre of mass at x, y, z [m] from O; mass and inertia about the centre of mass stay."""
+    return replace(body, centre=np.array([x, y, z]))
+
+
+CENTER_OF_MASS = Effect(
+    "center_of_mass",
+    tuple(Parameter(axis, "m", 0.0, -0.1, 0.1, 5e-4) for axis in "xyz"),
+    order=12,
+    words="shift of the centre of mass",
+    body=shifted,
+    # own: a battery of a third of the weight, put in some millimetres off; usual height: what velocities of filters on
+    # board look like (`fitting/always.py`)
+    prior=Prior(alike("x y z", 1.5e-3), in_turn("x y z", 3e-5, 3e-5, 7e-4)),
+    separates=(
+        "balance the drone on an edge, or log the accelerometer and yaw for 5 s at 2 Hz; for z fly hard sideways steps"
+    ),
+)
+
+
+def steiner(mass: float, offset: np.ndarray) -> np.ndarray:
+    """(3, 3) kg m^2: what a mass [kg] at an offset (3,) [m] adds to the inertia matrix."""
+    return mass * (offset @ offset * np.eye(3) - np.outer(offset, offset))
+
+
+def loaded(body: Body, *, mass: float, x: float, y: float, z: float) -> Body:
+    """The body with a point mass [kg] at x, y, z [m] from O; inertia about the new centre by Steiner for both parts."""
+    place = np.array([x, y, z])
+    total = body.mass + mass
+    centre = (body.mass * body.centre + mass * place) / total
+    inertia = body.inertia + steiner(body.mass, body.centre - centre) + steiner(mass, place - centre)
+    return Body(total, inertia, centre)
+
+
+PAYLOAD = Effect(
+    "payload",
+    (
+        Parameter("mass", "kg", 0.0, 0.0, 1.0, 5e-4),
+        *(Parameter(axis, "m", 0.0, -0.3, 0.3, 2e-3) for axis in "xyz"),
+    ),
+    order=13,
+    body=loaded,
+    # own: what a drone of this class carries; within its frame
+    prior=Prior(in_turn("mass x y z", 0.08, 0.01, 0.01, 0.01), per={"mass": "mass"}),
+    separates="weigh the drone",
+    nudge={"mass": 5e-4},
+    amplitude="mass",
 )
