@@ -4,7 +4,7 @@ Acceleration over a step between two samples is compared with the mean thrust an
 delay. Its residual is whitened by an autoregression fitted to it (generalised least squares), so that the standard
 deviations are those of an efficient estimator under the noise that this flight really has (the Cramer-Rao bound of the
 linearised model), and widened for what correlation is left (Newey and West 1987). What noise in sampled commands costs
-is counted as in crazyem.estimation.aliasing: commands of a 500 Hz loop, logged slower, are partly noise that never
+is counted as in crazyem.estimation.inflation: commands of a 500 Hz loop, logged slower, are partly noise that never
 acted. Priors on lag, delay and offsets are the estimator's; the parameter in question has none.
 """
 
@@ -271,7 +271,7 @@ def _command_noise_score(inputs: Inputs, steps: Steps, system: _RotationSystem, 
 
 
 def _white_variance(command: Array, rate: Array, *, rate_variance: float) -> float:
-    """Variance of what in command samples (n,) does not persist: see crazyem.estimation.aliasing, same arithmetic."""
+    """Variance of what in command samples (n,) does not persist: see crazyem.estimation.inflation, same arithmetic."""
     du, dw = np.convolve(command, _THIRD_DIFFERENCE, "valid"), np.convolve(rate, _THIRD_DIFFERENCE, "valid")
     power = float(dw @ dw)
     gain = float(du @ dw) / power if power > 0.0 else 0.0

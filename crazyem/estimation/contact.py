@@ -2,9 +2,9 @@
 
 import math
 
-CLEARANCE = 0.08  # m above the last resting height before a sample counts as flying
-CONTACT = 0.05  # m above it below which a sample counts as contact again
-CONFIRM = 3  # heights in a row above the clearance: one alone may be noise of the sensor
+CLEARANCE_HEIGHT = 0.08  # m above the last resting height before a sample counts as flying
+CONTACT_HEIGHT = 0.05  # m above it below which a sample counts as contact again
+CONFIRMING_HEIGHTS = 3  # heights in a row above the clearance: one alone may be noise of the sensor
 OFF_FRACTION = 0.1  # of the largest thrust: below it the rotors are off or idling
 
 
@@ -12,9 +12,9 @@ class ContactGate:
     """Remembers the height at which the drone last rested with its rotors off.
 
     A drone that was on the ground flies when it is seen well above it (twice the clearance), or above the clearance
-    `CONFIRM` times in a row. With 14 mm of noise in the position and one reading of the resting height, some sample on
-    the floor is above the clearance in 1 of 400 take-offs on a slow ramp of thrust, and three in a row in none of
-    100 000.
+    `CONFIRMING_HEIGHTS` times in a row. With 14 mm of noise in the position and one reading of the resting height, some
+    sample on the floor is above the clearance in 1 of 400 take-offs on a slow ramp of thrust, and three in a row in
+    none of 100 000.
     """
 
     def __init__(self, thrust_max: float) -> None:
@@ -49,8 +49,8 @@ class ContactGate:
     def _judge(self, above: float) -> None:
         """By the height above the resting height, rotors turning."""
         if self.airborne:
-            self._above, flies = 0, above >= CONTACT
+            self._above, flies = 0, above >= CONTACT_HEIGHT
         else:
-            self._above = self._above + 1 if above >= CLEARANCE else 0
-            flies = self._above >= CONFIRM or above >= 2 * CLEARANCE
+            self._above = self._above + 1 if above >= CLEARANCE_HEIGHT else 0
+            flies = self._above >= CONFIRMING_HEIGHTS or above >= 2 * CLEARANCE_HEIGHT
         self.airborne, self.reason = flies, "" if flies else "on the ground"

@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.estimation import kernels
-from crazyem.estimation.aliasing import innovation_noise, steady_gain, white_variance
+from crazyem.estimation.inflation import innovation_noise, long_run, steady_gain, white_variance
 from crazyem.estimation.inputs import InputHistory
 from crazyem.estimation.model import Noise, Parameters, Setup
 from crazyem.estimation.mstep import maximise
-from crazyem.estimation.spectra import long_run
 from crazyem.estimation.tape import START_VARIANCE, Tape
 
-TOLERANCE = 0.02  # converged when the next scoring step is shorter than this many standard deviations
-NOISY = 1.0  # standard deviations that a noise scale seems off, from which its information is computed, not guessed
+CONVERGED_DECREMENT = 0.02  # converged when the next scoring step is shorter than this many standard deviations
+# standard deviations that a noise scale seems off, from which its information is computed, not guessed
+INEXACT_SCALE_SD = 1.0
 
 
 @dataclass(frozen=True)
@@ -301,7 +301,7 @@ class WindowEM:
             score[5] -= weight * m_delay * unit[5]
         return score
 
-    def converge(self, first: int, last: int, *, passes: int, tolerance: float = TOLERANCE) -> Information:
+    def converge(self, first: int, last: int, *, passes: int, tolerance: float = CONVERGED_DECREMENT) -> Information:
         """Full passes until no step would be longer than `tolerance` standard deviations, at most `passes`.
 
         EM while far, scoring when near.
@@ -313,7 +313,7 @@ class WindowEM:
             self.forward(first, last, restart=True)
             self.backward(first, last)
             info = self.information(first, last)
-            if info.noise_length > NOISY:  # the guess is too sure of a scale that others can stand for
+            if info.noise_length > INEXACT_SCALE_SD:  # the guess is too sure of a scale that others can stand for
                 info = self.information(first, last, of_noise=self.noise_information(first, last))
             noise_step = info.noise_step
             longer = np.minimum(1.3 * self._damping, 1.0)

@@ -8,7 +8,7 @@ from crazyem.physics.lag import CAUSAL, fit_predictor, hold_predictor, lagged_me
 
 MAX_GAP = 0.1  # s without an input beyond which a step cannot be trusted
 _RECENT = 8  # inputs looked at one by one, newest first, before the rest is searched
-SETTLE = 5.0  # time constants after which a lag has forgotten where it started
+SETTLED_TIME_CONSTANTS = 5.0  # time constants after which a lag has forgotten where it started
 
 
 class InputHistory:
@@ -100,7 +100,7 @@ class InputHistory:
 
     def refill(self, tape: Tape, first: int, last: int, theta: NDArray) -> None:
         """Recompute the means of rows first+1..last-1 for other parameters theta (9,)."""
-        start = tape.time[first] - theta[5] - 2 * SETTLE * max(theta[4], 0.02)
+        start = tape.time[first] - theta[5] - 2 * SETTLED_TIME_CONSTANTS * max(theta[4], 0.02)
         at = max(0, int(np.searchsorted(self.times[: self.size], start, "right")) - 1)
         if self.mode == CAUSAL:
             self.predictor = fit_predictor(self.between(tape.time[first], tape.time[last - 1])[1])

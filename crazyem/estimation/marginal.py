@@ -18,15 +18,15 @@ from scipy.special import ndtr
 
 from crazyem.estimation.em import Information, WindowEM, offset
 from crazyem.estimation.model import Noise, Parameters
-from crazyem.estimation.scoring import NONE, P, Point, log_posterior, log_prior, point
+from crazyem.estimation.scoring import NOTHING_HELD, P, Point, log_posterior, log_prior, point
 
-SCALES = (2, 3, 4, 5)  # thrust, torque about x, y, z
-WEAK = 0.3  # standard deviation of log s beyond which it is integrated over
-WIDE = 4.0  # that of its prior then
-SPACING = 1.2  # standard deviations between nodes
-TAIL = 4.5  # nodes end where the posterior of log s has fallen by so much
-MOST = 7  # nodes on a side
-REST = 8  # refreshes until a scale that was found to be determined is looked at again
+MARGINAL_SCALES = (2, 3, 4, 5)  # thrust, torque about x, y, z
+WEAK_SCALE_SD = 0.3  # standard deviation of log s beyond which it is integrated over
+WIDE_PRIOR_SD = 4.0  # that of its prior then
+NODE_SPACING = 1.2  # standard deviations between nodes
+NODE_TAIL = 4.5  # nodes end where the posterior of log s has fallen by so much
+MOST_NODES = 7  # nodes on a side
+REST_REFRESHES = 8  # refreshes until a scale that was found to be determined is looked at again
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def marginalise(em: WindowEM, first: int, last: int, best: Point, information: I
         best: the maximum.
         information: there.
     """
-    weak = [j for j in SCALES if best.sd[P + j] > WEAK]
+    weak = [j for j in MARGINAL_SCALES if best.sd[P + j] > WEAK_SCALE_SD]
     if not weak:
         return None
     grids = [_grid(em, first, last, best, j) for j in weak]
@@ -82,9 +82,9 @@ def marginalise(em: WindowEM, first: int, last: int, best: Point, information: I
 
 def _grid(em: WindowEM, first: int, last: int, best: Point, scale: int) -> list[Node]:
     """Nodes on both sides of the maximum until the posterior of the scale has faded."""
-    held = NONE.copy()
+    held = NOTHING_HELD.copy()
     held[P + scale] = True
-    spacing = SPACING * best.sd[P + scale]
+    spacing = NODE_SPACING * best.sd[P + scale]
 
     def node(count: int) -> Node:
         there = shifted(best.parameters, scale, count * spacing)
@@ -94,9 +94,9 @@ def _grid(em: WindowEM, first: int, last: int, best: Point, scale: int) -> list[
 
     nodes = [node(0)]
     for side in (-1, 1):
-        for count in range(1, MOST + 1):
+        for count in range(1, MOST_NODES + 1):
             nodes.append(node(side * count))
-            if nodes[-1].weight < nodes[0].weight - TAIL:
+            if nodes[-1].weight < nodes[0].weight - NODE_TAIL:
                 break
     return nodes
 
@@ -116,7 +116,7 @@ def node_of(em: WindowEM, value: float, score: NDArray, information: NDArray, sc
     step = np.linalg.solve(information, score)
     prior = em.setup.prior
     far = em.parameters.noise.logs[scale] - prior.noise.logs[scale]
-    widened = 0.5 * far**2 * (prior.noise_sd**-2 - WIDE**-2)
+    widened = 0.5 * far**2 * (prior.noise_sd**-2 - WIDE_PRIOR_SD**-2)
     volume = 0.5 * float(np.linalg.slogdet(information)[1])
     sd = np.sqrt(np.diag(np.linalg.inv(information)))[:P] * em.setup.free
     return Node(float(value + widened + 0.5 * (score @ step) - volume), step[:P], sd)
@@ -146,7 +146,7 @@ def combine(grids: list[list[Node]], information: Information, *, scales: tuple[
     return Marginal(shift, np.sqrt(variance), low, high, scales)
 
 
-class Refreshed:
+class MarginalRefresh:
     """The same for the running estimator: three nodes a scale, one of them renewed a refresh, in bounded time.
 
     The nodes lie about sqrt(3) standard deviations of log s off the estimate, which with the posterior's own weights is
@@ -154,19 +154,19 @@ class Refreshed:
     """
 
     def __init__(self) -> None:
-        self._distance = dict.fromkeys(SCALES, 1.0)
-        self._rest = dict.fromkeys(SCALES, 0)
+        self._distance = dict.fromkeys(MARGINAL_SCALES, 1.0)
+        self._rest = dict.fromkeys(MARGINAL_SCALES, 0)
         self._round: dict[int, list[Node]] = {}  # first nodes of a pair that is not complete yet
         self._pairs: dict[int, list[Node]] = {}
         self._turn = 0
 
     def refresh(self, em: WindowEM, first: int, last: int, information: Information) -> Marginal | None:
         """Renew one node; the window must have been filtered and scored where `em` is, and is left so."""
-        for j in SCALES:
+        for j in MARGINAL_SCALES:
             self._rest[j] = max(0, self._rest[j] - 1)
-            if information.noise_sd[j] <= WEAK:
+            if information.noise_sd[j] <= WEAK_SCALE_SD:
                 self._forget(j)
-        weak = [j for j in SCALES if information.noise_sd[j] > WEAK and not self._rest[j]]
+        weak = [j for j in MARGINAL_SCALES if information.noise_sd[j] > WEAK_SCALE_SD and not self._rest[j]]
         if weak:
             self._turn += 1
             self._renew(em, first, last, information, weak[(self._turn // 2) % len(weak)])
@@ -193,9 +193,9 @@ class Refreshed:
         del self._round[scale]
         fall = -0.5 * (done[0].weight + done[1].weight)
         width = self._distance[scale] / np.sqrt(2 * max(fall, 0.05))
-        if width <= WEAK:
+        if width <= WEAK_SCALE_SD:
             self._forget(scale)
-            self._rest[scale] = REST
+            self._rest[scale] = REST_REFRESHES
         else:
             self._pairs[scale] = done
         self._distance[scale] = float(np.clip(np.sqrt(3) * width, 0.4, 2.6))

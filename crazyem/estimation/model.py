@@ -240,7 +240,7 @@ DELAY_UNIT = 1e-3  # s
 # Rotors are never equal and the centre of mass is never in their middle, so a drone in trim commands a torque that
 # accelerates nothing. Taken for torque that acts it would read as a huge inertia. Standard deviation of the prior, as a
 # shift of the centre of mass over the arm.
-TRIM = 0.05
+TRIM_SD = 0.05
 
 
 # How far a drone may be from its vehicle file, where the file does not say: standard deviations of the logarithms of
@@ -302,7 +302,7 @@ def setup_for(
         noise=Noise(np.array([0.02, 0.02, 0.05, 0.5, 0.5, 0.5]), TYPICAL_MEASUREMENT.copy()),
     )
     free = np.array([True, True, True, True, has_lag, timed, timed, timed, timed])
-    offset = max(TRIM * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
+    offset = max(TRIM_SD * vehicle.mass * GRAVITY * max(vehicle.arm), 1e-9)
     unit = np.array([1.0, 1.0, 1.0, 1.0, 1.0, DELAY_UNIT, offset, offset, offset])
     bare = Setup(Parameters(start, noise, vehicle.inertia_products), prior, free, unit)
     setup = replace(bare, lead=INTEGRATION[integration], known=known_noise)

@@ -17,11 +17,11 @@ from crazyem.errors import DataError, UsageError
 from crazyem.estimation.contact import ContactGate
 from crazyem.estimation.em import Information, WindowEM, offset
 from crazyem.estimation.in_step import corrected, in_step
-from crazyem.estimation.inputs import MAX_GAP, SETTLE, InputHistory
-from crazyem.estimation.marginal import Marginal, Refreshed
+from crazyem.estimation.inputs import MAX_GAP, SETTLED_TIME_CONSTANTS, InputHistory
+from crazyem.estimation.marginal import Marginal, MarginalRefresh
+from crazyem.estimation.maximum import PASSED_SCORE_TEST, Maximum, maximise_posterior
 from crazyem.estimation.model import INTEGRATION, KnownNoise, Parameters, Setup, setup_for
 from crazyem.estimation.result import Estimate
-from crazyem.estimation.settling import PASSED, Settled, settle
 from crazyem.estimation.tape import Tape
 from crazyem.estimation.verdict import estimate_of, nothing_known
 from crazyem.physics.lag import CAUSAL, HOLD, LINEAR
@@ -161,11 +161,11 @@ class OnlineEstimator:
         self._updates = 0
         self._information: Information | None = None
         self._reference: Parameters | None = None  # parameters of the last full pass
-        self._refreshed = Refreshed()
+        self._refreshed = MarginalRefresh()
         self._marginal: Marginal | None = None
         self._converged = False
         self._last_time = math.nan
-        self.settled: Settled | None = None
+        self.settled: Maximum | None = None
         self.counters = Counters()
         self.update_seconds: list[float] = []
         self.full_updates = 0
@@ -239,7 +239,7 @@ class OnlineEstimator:
             if self._fresh < self._tape.size:
                 self._em.incremental(first, self._fresh, self._tape.size, lookback=LOOKBACK)
                 self._fresh = self._tape.size
-            self.settled = settle(self._em, first, self._tape.size)
+            self.settled = maximise_posterior(self._em, first, self._tape.size)
             self._information = self._with_ages(self._em, first, self._tape.size, self.settled.information)
             self._marginal = self.settled.marginal
             self._converged = self.settled.converged
@@ -368,7 +368,11 @@ class OnlineEstimator:
         dropped = tape.append(node.time, node.y[:13], starts=starts, keep=keep)
         tape.force[tape.size - 1] = node.y[13:]
         self._fresh -= dropped
-        if node.time - inputs.gap_end < SETTLE * max(tau, 0.02) and self._setup is not None and self._setup.free[4]:
+        if (
+            node.time - inputs.gap_end < SETTLED_TIME_CONSTANTS * max(tau, 0.02)
+            and self._setup is not None
+            and self._setup.free[4]
+        ):
             tape.usable[tape.size - 1] = False
         self._since += 1
         if self._since < self.every:
@@ -415,7 +419,9 @@ class OnlineEstimator:
         self.full_updates += 1
         self._information = self._with_ages(em, first, last, em.converge(first, last, passes=passes, tolerance=CLOSE))
         self._reference = em.parameters
-        self._converged = self._information.decrement < PASSED and self._information.noise_length < PASSED_NOISE
+        self._converged = (
+            self._information.decrement < PASSED_SCORE_TEST and self._information.noise_length < PASSED_NOISE
+        )
         self._marginal = self._refreshed.refresh(em, first, last, self._information)
 
     def _with_ages(self, em: WindowEM, first: int, last: int, information: Information) -> Information:

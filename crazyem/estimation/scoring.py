@@ -17,19 +17,22 @@ from crazyem.estimation.em import WindowEM, displaced, offset
 from crazyem.estimation.model import Parameters
 
 P = kernels.PARAMETERS
-ALL = P + 11  # coordinates: theta's, then the logarithms of the noise scales
+COORDINATES = P + 11  # coordinates: theta's, then the logarithms of the noise scales
 STEP_THETA, STEP_NOISE = 0.5, 1.5  # longest step of a logarithm (or of a linear parameter in its unit)
 STEP_LAG = 0.2  # the mean inputs are linear in lag and delay only nearby
-CHANGE = -0.1  # of log s, by which the dependence of the score on it is measured
-NEAR = 0.2  # standard deviations from the maximum within which curvature is learnt from the scores on the way only,
-FAR = 3.0  # and so it is after a step from a point within these
-GAIN = 0.1  # share of the expected gain that a step must bring; without that steps can leap to and fro over a ridge
-SLACK = 0.01  # of log-posterior that a step may lose: the score is that of a linearised filter
-ALIKE = 0.05  # of log s, within which the information about the noise scales is not computed again,
-ALIKE_FAR = 0.5  # and where the maximum is still far: steps are tested there whatever curvature they are taken with
-LEAST = 0.05  # eigenvalue of a curvature that is used (the prior alone gives a noise scale 0.44)
-ATTEMPTS = 8  # at one step, each more strongly damped
-NONE = np.zeros(ALL, bool)
+SCORE_DIFFERENCE_STEP = -0.1  # of log s, by which the dependence of the score on it is measured
+# standard deviations from the maximum within which curvature is learnt from the scores on the way only,
+NEAR_MAXIMUM = 0.2
+FAR_FROM_MAXIMUM = 3.0  # and so it is after a step from a point within these
+# share of the expected gain that a step must bring; without that steps can leap to and fro over a ridge
+LEAST_GAIN_SHARE = 0.1
+POSTERIOR_SLACK = 0.01  # of log-posterior that a step may lose: the score is that of a linearised filter
+REUSED_WITHIN = 0.05  # of log s, within which the information about the noise scales is not computed again,
+# and where the maximum is still far: steps are tested there whatever curvature they are taken with
+REUSED_WITHIN_FAR = 0.5
+SMALLEST_EIGENVALUE = 0.05  # eigenvalue of a curvature that is used (the prior alone gives a noise scale 0.44)
+DAMPING_ATTEMPTS = 8  # at one step, each more strongly damped
+NOTHING_HELD = np.zeros(COORDINATES, bool)
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Stop:
+class PathPoint:
     """A point on the way: theta (9,), and the length of the joint scoring step there in standard deviations."""
 
     theta: NDArray
@@ -89,7 +92,7 @@ def log_prior(em: WindowEM) -> float:
 
 
 def point(
-    em: WindowEM, first: int, last: int, value: float, *, of_noise: NDArray | None = None, held: NDArray = NONE
+    em: WindowEM, first: int, last: int, value: float, *, of_noise: NDArray | None = None, held: NDArray = NOTHING_HELD
 ) -> Point:
     """Score and information where the window was just filtered; it is smoothed, too.
 
@@ -109,7 +112,7 @@ def point(
     noise_score = em.noise_terms(first, last).sum(0)
     # scales that are known in newtons move with mass and inertia
     carried = setup.carried
-    score, information = np.zeros(ALL), np.zeros((ALL, ALL))
+    score, information = np.zeros(COORDINATES), np.zeros((COORDINATES, COORDINATES))
     score[:P] = em.tape.score[first:last].sum(0) + carried.T @ noise_score
     score[:P] -= prior.precision * offset(p.theta, prior.centre, setup.unit)
     score[P:] = noise_score + (prior.noise.logs - p.noise.logs) / prior.noise_sd**2
@@ -134,7 +137,7 @@ def moved(em: WindowEM, start: Parameters, step: NDArray) -> Parameters:
     return Parameters(theta, setup.noise_at(theta, logs), start.inertia_products)
 
 
-def climb(
+def scoring_steps(
     em: WindowEM,
     first: int,
     last: int,
@@ -142,9 +145,9 @@ def climb(
     steps: int,
     tolerance: float,
     of_noise: NDArray | None = None,
-    held: NDArray = NONE,
-    path: list[Stop] | None = None,
-    alike: float = ALIKE,
+    held: NDArray = NOTHING_HELD,
+    path: list[PathPoint] | None = None,
+    reused_within: float = REUSED_WITHIN,
 ) -> Point:
     """Damped scoring steps from the present point until the next would be shorter than `tolerance`, at most `steps`.
 
@@ -161,40 +164,52 @@ def climb(
         given = of_noise
         if given is None and known is not None:
             change = em.parameters.noise.logs - known.parameters.noise.logs
-            given = known.of_noise if np.max(np.abs(change)) < alike else None
+            given = known.of_noise if np.max(np.abs(change)) < reused_within else None
         there = point(em, first, last, value, of_noise=given, held=held)
         known = there if given is None else known
         return there
 
     here = at(log_posterior(em, first, last, em.parameters))
-    path.append(Stop(here.parameters.theta, here.decrement))
-    damping, correction = 0.0, np.zeros((ALL, ALL))
+    path.append(PathPoint(here.parameters.theta, here.decrement))
+    damping, correction = 0.0, np.zeros((COORDINATES, COORDINATES))
     before: Point | None = None
-    step = np.zeros(ALL)
+    step = np.zeros(COORDINATES)
     while len(path) - begin <= steps and path[-1].length >= tolerance:
-        if path[-1].length > NEAR and (before is None or before.decrement > FAR):
+        if path[-1].length > NEAR_MAXIMUM and (before is None or before.decrement > FAR_FROM_MAXIMUM):
             correction = _observed(em, first, last, here)
         if before is not None:
             correction = _secant(correction, before, here, step)
-        for attempt in range(ATTEMPTS):
-            curvature = here.information + (correction if attempt == 0 else 0.0)
-            if attempt == 0 and np.linalg.eigvalsh(curvature)[0] <= LEAST:
-                curvature = here.information
-            step = limited(np.linalg.solve((1.0 + damping) * curvature, here.score))
-            value = log_posterior(em, first, last, moved(em, here.parameters, step))
-            expected = max(float(here.score @ step - 0.5 * step @ here.information @ step), 0.0)
-            if value > here.value + GAIN * expected - SLACK:
-                break
-            if attempt:
-                damping = max(3.0 * damping, 1.0)
-        else:
+        taken = _damped_step(em, first, last, here, correction, damping)
+        if taken is None:
             log_posterior(em, first, last, here.parameters)
             em.backward(first, last)
             break
+        step, value, damping = taken
         damping = 0.0 if damping < 0.5 else 0.2 * damping
         before, here = here, at(value)
-        path.append(Stop(here.parameters.theta, here.decrement))
+        path.append(PathPoint(here.parameters.theta, here.decrement))
     return here
+
+
+def _damped_step(
+    em: WindowEM, first: int, last: int, here: Point, correction: NDArray, damping: float
+) -> tuple[NDArray, float, float] | None:
+    """Step, log-posterior after it and damping of the first step that gains enough; None after `DAMPING_ATTEMPTS`.
+
+    The first attempt uses the observed curvature, the others the expected one, each more strongly damped.
+    """
+    for attempt in range(DAMPING_ATTEMPTS):
+        curvature = here.information + (correction if attempt == 0 else 0.0)
+        if attempt == 0 and np.linalg.eigvalsh(curvature)[0] <= SMALLEST_EIGENVALUE:
+            curvature = here.information
+        step = limit_step(np.linalg.solve((1.0 + damping) * curvature, here.score))
+        value = log_posterior(em, first, last, moved(em, here.parameters, step))
+        expected = max(float(here.score @ step - 0.5 * step @ here.information @ step), 0.0)
+        if value > here.value + LEAST_GAIN_SHARE * expected - POSTERIOR_SLACK:
+            return step, value, damping
+        if attempt:
+            damping = max(3.0 * damping, 1.0)
+    return None
 
 
 def _observed(em: WindowEM, first: int, last: int, here: Point) -> NDArray:
@@ -204,25 +219,25 @@ def _observed(em: WindowEM, first: int, last: int, here: Point) -> NDArray:
     right: a filter that trusts the model too little puts measurement noise that came back in the torque into inertia,
     and steps of the two undo each other. And of a scale that the data hardly resolve, expectation says little.
     """
-    out = np.zeros((ALL, ALL))
+    out = np.zeros((COORDINATES, COORDINATES))
     scales = np.arange(P, P + 6)[here.free[P : P + 6]]
     for j in scales:
-        there = moved(em, here.parameters, CHANGE * np.eye(ALL)[j])
+        there = moved(em, here.parameters, SCORE_DIFFERENCE_STEP * np.eye(COORDINATES)[j])
         value = log_posterior(em, first, last, there)
         score = point(em, first, last, value, of_noise=here.of_noise, held=~here.free).score
-        out[:, j] = (here.score - score) / CHANGE - here.information[:, j]
+        out[:, j] = (here.score - score) / SCORE_DIFFERENCE_STEP - here.information[:, j]
     out[np.ix_(scales, scales)] *= 0.5
-    rest = np.setdiff1d(np.arange(ALL), scales)
+    rest = np.setdiff1d(np.arange(COORDINATES), scales)
     out[np.ix_(rest, rest)] = 0.0
     out += out.T
     for _ in range(6):
-        if np.linalg.eigvalsh(here.information + out)[0] > LEAST:
+        if np.linalg.eigvalsh(here.information + out)[0] > SMALLEST_EIGENVALUE:
             return out
         out *= 0.5
-    return np.zeros((ALL, ALL))
+    return np.zeros((COORDINATES, COORDINATES))
 
 
-def limited(step: NDArray) -> NDArray:
+def limit_step(step: NDArray) -> NDArray:
     """A scoring step made safe, in the coordinates in which the data are linear or quadratic.
 
     Accelerations are linear in 1/m and 1/I. Innovations have variances that are linear in those of the noise: where a

@@ -26,27 +26,36 @@ from crazyem.estimation.result import Estimate, Step
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle
 
-VERTICAL = 5  # of the innovations: velocity along world z
-DRIFT = 0.4  # standard deviations that the mean may be off without being summed up; a step of 3 % is 0.75 in hover
-MOST = 3.0  # standard deviations that one innovation may add: a single outlier is no step
-THRESHOLD = 14.0  # sum that is a step; calm simulated flights without one reach 9
-BATCH, BATCHES, ENOUGH = 25, 32, 8  # innovations in a mean; means that are kept, and that must be known
-WHITE = 1.3  # least standard deviation of innovations: those of an onboard estimate are never quite white
-CALM = 2.0  # s in the air, and after a step, within which none is looked for: the filter has to know itself first
-EARLIEST, DECIDED = 0.4, 1.0  # s after it was noticed when a step can be called one, and when it is one or is not
-REAL = 0.018  # relative change of mass that counts as one in a calm flight; more by the flight's own wandering
-SURE = 3.0  # standard deviations that it has to be, those of the new mass and of the flight's own wandering
-JUMP = 0.15  # of the logarithm of thrust between two commands, lasting: setpoints that jump make 0.12 at most
-ONSET = 2.0  # s before a step seems to have begun in which a jump is looked for: as long as none is looked for itself
-ADJACENT = 0.025  # s between commands of which one follows the other; after a gap nobody knows what was in it
-LASTING = 5  # commands before and after a jump that are compared, too
-SHORTEST = 8  # samples that a window has at least
+VERTICAL_VELOCITY = 5  # of the innovations: velocity along world z
+# standard deviations that the mean may be off without being summed up; a step of 3 % is 0.75 in hover
+MEAN_TOLERANCE = 0.4
+LARGEST_INCREMENT = 3.0  # standard deviations that one innovation may add: a single outlier is no step
+STEP_THRESHOLD = 14.0  # sum that is a step; calm simulated flights without one reach 9
+# innovations in a mean; means that are kept, and that must be known
+BATCH_INNOVATIONS, MOST_BATCHES, FEWEST_BATCHES = 25, 32, 8
+LEAST_INNOVATION_SD = 1.3  # least standard deviation of innovations: those of an onboard estimate are never quite white
+# s in the air, and after a step, within which none is looked for: the filter has to know itself first
+CALM_SECONDS = 2.0
+# s after it was noticed when a step can be called one, and when it is one or is not
+EARLIEST_DECISION, LATEST_DECISION = 0.4, 1.0
+# relative change of mass that counts as one in a calm flight; more by the flight's own wandering
+LEAST_MASS_STEP = 0.018
+# standard deviations that it has to be, those of the new mass and of the flight's own wandering
+STEP_CONFIDENCE_SD = 3.0
+THRUST_JUMP = 0.15  # of the logarithm of thrust between two commands, lasting: setpoints that jump make 0.12 at most
+# s before a step seems to have begun in which a jump is looked for: as long as none is looked for itself
+ONSET_SECONDS = 2.0
+ADJACENT_SECONDS = 0.025  # s between commands of which one follows the other; after a gap nobody knows what was in it
+LASTING_COMMANDS = 5  # commands before and after a jump that are compared, too
+SHORTEST_WINDOW = 8  # samples that a window has at least
 
 
 class CumulativeSum:
     """Two-sided; `add` returns when the present excursion began once it is beyond the threshold."""
 
-    def __init__(self, *, drift: float = DRIFT, threshold: float = THRESHOLD, most: float = MOST) -> None:
+    def __init__(
+        self, *, drift: float = MEAN_TOLERANCE, threshold: float = STEP_THRESHOLD, most: float = LARGEST_INCREMENT
+    ) -> None:
         self.drift, self.threshold, self.most = drift, threshold, most
         self.reset()
 
@@ -73,24 +82,24 @@ class Wandering:
     """How much means over a batch of innovations vary, as the standard deviation of a single white one."""
 
     def __init__(self) -> None:
-        self._sums: deque[float] = deque(maxlen=BATCHES)
+        self._sums: deque[float] = deque(maxlen=MOST_BATCHES)
         self._sum, self._count = 0.0, 0
-        self.sd = WHITE
+        self.sd = LEAST_INNOVATION_SD
 
     @property
     def known(self) -> bool:
         """Whether enough was seen."""
-        return len(self._sums) >= ENOUGH
+        return len(self._sums) >= FEWEST_BATCHES
 
     def add(self, value: float) -> None:
         """One normalised innovation."""
         self._sum += value
         self._count += 1
-        if self._count == BATCH:
+        if self._count == BATCH_INNOVATIONS:
             self._sums.append(abs(self._sum))
             self._sum, self._count = 0.0, 0
             # a median: a step that is in some of the batches does not hide itself
-            self.sd = max(WHITE, 1.4826 * float(np.median(self._sums)) / math.sqrt(BATCH))
+            self.sd = max(LEAST_INNOVATION_SD, 1.4826 * float(np.median(self._sums)) / math.sqrt(BATCH_INNOVATIONS))
 
 
 def largest_jump(times: NDArray[np.float64], wrenches: NDArray[np.float64], *, since: float) -> float:
@@ -103,10 +112,12 @@ def largest_jump(times: NDArray[np.float64], wrenches: NDArray[np.float64], *, s
     thrust = np.log(np.maximum(wrenches[:, 0], 1e-6))
     best = 0.0
     for k in range(1, len(times)):
-        if times[k] < since or times[k] - times[k - 1] > ADJACENT:
+        if times[k] < since or times[k] - times[k - 1] > ADJACENT_SECONDS:
             continue
         step = float(thrust[k] - thrust[k - 1])
-        lasting = float(np.median(thrust[k : k + LASTING]) - np.median(thrust[max(k - LASTING, 0) : k]))
+        lasting = float(
+            np.median(thrust[k : k + LASTING_COMMANDS]) - np.median(thrust[max(k - LASTING_COMMANDS, 0) : k])
+        )
         size = min(abs(step), abs(lasting)) if step * lasting > 0 else 0.0
         if size > abs(best):
             best = math.copysign(size, step)
@@ -188,10 +199,10 @@ class StepAwareEstimator:
             self._quiet_until = math.nan
             return estimate
         if math.isnan(self._quiet_until):
-            self._quiet_until = estimate.time + CALM
+            self._quiet_until = estimate.time + CALM_SECONDS
         if self.adapting:
             # Not since it began: if it was a gust, what it did until it was found must not be taken for mass.
-            self.inner.window = min(self.window, max(self._rows_since(self.steps[-1].found), SHORTEST))
+            self.inner.window = min(self.window, max(self._rows_since(self.steps[-1].found), SHORTEST_WINDOW))
         if self.deciding:
             self._decide(self.steps[-1], estimate)
         began = self._look(estimate.time)
@@ -213,9 +224,9 @@ class StepAwareEstimator:
         began = None
         for k in range(first, last):
             self._seen = float(tape.time[k])
-            if tape.kind[k] or not tape.s[k, VERTICAL] > 0.0:
+            if tape.kind[k] or not tape.s[k, VERTICAL_VELOCITY] > 0.0:
                 continue
-            value = float(tape.e[k, VERTICAL] / math.sqrt(tape.s[k, VERTICAL]))
+            value = float(tape.e[k, VERTICAL_VELOCITY] / math.sqrt(tape.s[k, VERTICAL_VELOCITY]))
             if not math.isfinite(value):
                 continue
             ready = self._wandering.known and now >= self._quiet_until and not self.deciding
@@ -226,20 +237,22 @@ class StepAwareEstimator:
 
     def _begin_anew(self, began: float, estimate: Estimate) -> None:
         self._sum.reset()
-        self._quiet_until = estimate.time + CALM
+        self._quiet_until = estimate.time + CALM_SECONDS
         # the newest values may have felt the step already
         before = next((m for t, m in reversed(self._mass) if t < began), estimate["mass"].value)
         self.steps.append(Step(began, estimate.time, before))
-        self.inner.window = SHORTEST
-        self._jump = largest_jump(*self.inner._inputs.between(began - ONSET - 0.2, estimate.time), since=began - ONSET)
+        self.inner.window = SHORTEST_WINDOW
+        self._jump = largest_jump(
+            *self.inner._inputs.between(began - ONSET_SECONDS - 0.2, estimate.time), since=began - ONSET_SECONDS
+        )
 
     def _decide(self, step: Step, estimate: Estimate) -> None:
         since, mass = estimate.time - step.found, estimate["mass"]
         change = abs(mass.value / step.before - 1.0)
-        enough = max(REAL, SURE * mass.relative_sd) * self._wandering.sd / WHITE
-        if (since >= EARLIEST and change > enough and mass.identifiable) or since >= DECIDED:
+        enough = max(LEAST_MASS_STEP, STEP_CONFIDENCE_SD * mass.relative_sd) * self._wandering.sd / LEAST_INNOVATION_SD
+        if (since >= EARLIEST_DECISION and change > enough and mass.identifiable) or since >= LATEST_DECISION:
             ratio = math.log(mass.value / step.before) if mass.value > 0 < step.before else 0.0
-            jumped = change > enough and abs(self._jump) > JUMP and self._jump / ratio > 0.5
+            jumped = change > enough and abs(self._jump) > THRUST_JUMP and self._jump / ratio > 0.5
             self._settle(step, mass.value, real=change > enough and not jumped, jumped=jumped)
 
     def _settle(self, step: Step, mass: float, *, real: bool, jumped: bool = False) -> None:

@@ -12,8 +12,8 @@ from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstima
 from crazyem.vehicle import Vehicle
 
 IDENTIFIABLE = 0.15  # largest standard deviation of a logarithm that counts as identified
-IMPLAUSIBLE = 3.0  # prior standard deviations beyond which an inertia is not believed
-FEWEST = 20  # samples in flight before anything counts as identified
+IMPLAUSIBLE_SD = 3.0  # prior standard deviations beyond which an inertia is not believed
+FEWEST_SAMPLES = 20  # samples in flight before anything counts as identified
 _INERTIA = (np.arange(len(NAMES)) > 0) & (np.arange(len(NAMES)) < LAG)
 _LOGARITHMIC = np.arange(len(NAMES)) < DELAY
 
@@ -54,7 +54,7 @@ def estimate_of(
         sd, below, above = np.hypot(sd, wider), -np.hypot(below, 1.96 * wider), np.hypot(above, 1.96 * wider)
     # An inertia that the prior all but excludes says that the model does not hold here, not that the drone is odd.
     deviation = np.abs(offset(theta, prior.centre, unit))
-    implausible = deviation > IMPLAUSIBLE * prior.sd
+    implausible = deviation > IMPLAUSIBLE_SD * prior.sd
     distrusted = implausible & _INERTIA
     if distrusted.any():
         sd = np.where(distrusted, np.maximum(sd, deviation), sd)
@@ -90,7 +90,7 @@ def _objection(
         return "the inputs already include the rotor lag" if i == LAG else "held fixed"
     if i >= DELAY:
         return "" if sd < 0.7 * setup.prior.sd[i] else "the data say no more than the prior does"
-    if samples < FEWEST:
+    if samples < FEWEST_SAMPLES:
         return f"only {samples} samples in flight"
     if implausible and inertia:
         return "the data ask for an inertia far from any such drone's: the logged commands do not explain its rotation"

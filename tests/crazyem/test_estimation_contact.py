@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crazyem.estimation.contact import CLEARANCE, CONFIRM, CONTACT, OFF_FRACTION, ContactGate
+from crazyem.estimation.contact import CLEARANCE_HEIGHT, CONFIRMING_HEIGHTS, CONTACT_HEIGHT, OFF_FRACTION, ContactGate
 
 MAX = 0.48  # N, four rotors of 0.12 N
 HOVER = 0.28
@@ -34,18 +34,23 @@ def test_height_counts_from_where_it_rested():
 
 
 def test_a_slow_take_off_is_believed_when_it_is_seen_again_and_again():
-    low = [(CLEARANCE + 0.001, HOVER)]
-    assert run((0.0, 0.0), *low * (CONFIRM + 1)) == [False] * CONFIRM + [True, True]
+    low = [(CLEARANCE_HEIGHT + 0.001, HOVER)]
+    assert run((0.0, 0.0), *low * (CONFIRMING_HEIGHTS + 1)) == [False] * CONFIRMING_HEIGHTS + [True, True]
     # one reading below starts the count anew, one that is missing does not
-    interrupted = [*low * (CONFIRM - 1), (0.07, HOVER), *low * (CONFIRM - 1), (nan, HOVER), *low]
+    interrupted = [*low * (CONFIRMING_HEIGHTS - 1), (0.07, HOVER), *low * (CONFIRMING_HEIGHTS - 1), (nan, HOVER), *low]
     assert run((0.0, 0.0), *interrupted) == [False] * (1 + len(interrupted) - 1) + [True]
     # what was counted before a touch-down does not count after it
-    down = [(0.5, HOVER), (0.0, HOVER), *low * CONFIRM]
-    assert run((0.0, 0.0), *low * CONFIRM, *down)[CONFIRM + 1 :] == [True, False, *[False] * (CONFIRM - 1), True]
+    down = [(0.5, HOVER), (0.0, HOVER), *low * CONFIRMING_HEIGHTS]
+    assert run((0.0, 0.0), *low * CONFIRMING_HEIGHTS, *down)[CONFIRMING_HEIGHTS + 1 :] == [
+        True,
+        False,
+        *[False] * (CONFIRMING_HEIGHTS - 1),
+        True,
+    ]
 
 
 def test_far_above_is_flight_at_once():
-    assert run((0.0, 0.0), (2 * CLEARANCE, HOVER)) == [False, True]
+    assert run((0.0, 0.0), (2 * CLEARANCE_HEIGHT, HOVER)) == [False, True]
 
 
 def test_a_recording_that_begins_in_flight():
@@ -69,7 +74,7 @@ def test_the_firmware_has_the_last_word_when_it_says_not_flying():
 
 
 def test_the_gap_between_clearance_and_contact_keeps_noise_from_toggling():
-    between = (CLEARANCE + CONTACT) / 2
+    between = (CLEARANCE_HEIGHT + CONTACT_HEIGHT) / 2
     rising = run((0.0, 0.0), *[(between + 0.01 * (-1) ** k, HOVER) for k in range(10)])
     assert not any(rising)
     falling = run((0.0, 0.0), (0.5, HOVER), *[(between + 0.01 * (-1) ** k, HOVER) for k in range(10)])
@@ -111,10 +116,10 @@ def test_a_noisy_height_lets_no_sample_on_the_floor_through(seed, noise):
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.014), st.floats(0.2, 3.0))
-def test_a_noisy_height_hides_no_flight_for_long(seed, noise, climb):
+def test_a_noisy_height_hides_no_flight_for_long(seed, noise, scoring_steps):
     """Climbing at 0.2 m/s and more, the drone is known to fly before it is a quarter of a metre up, and remains so."""
     rng = np.random.default_rng(seed)
-    heights = np.concatenate([[0.0], climb * 0.005 * np.arange(400)])
+    heights = np.concatenate([[0.0], scoring_steps * 0.005 * np.arange(400)])
     verdicts = run(*((h + noise * rng.normal(), float(k > 0)) for k, h in enumerate(heights)), thrust_max=math.inf)
     flies = heights > 0.25
     assert all(v for v, f in zip(verdicts, flies) if f)

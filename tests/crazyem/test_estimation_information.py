@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crazyem.estimation.aliasing import innovation_noise, steady_gain, white_variance
-from crazyem.estimation.spectra import MIN_ROWS, long_run
+from crazyem.estimation.inflation import FEWEST_ROWS, innovation_noise, long_run, steady_gain, white_variance
 
 
 def bartlett(terms, lags):
@@ -20,7 +19,7 @@ def bartlett(terms, lags):
 @given(st.integers(0, 2**32 - 1), st.integers(1, 900))
 def test_long_run_is_the_bartlett_estimate(seed, n):
     terms = np.random.default_rng(seed).normal(size=(n, 3)).cumsum(0)
-    lags = min(n // 8, 100) if n >= MIN_ROWS else 0
+    lags = min(n // 8, 100) if n >= FEWEST_ROWS else 0
     np.testing.assert_allclose(long_run(terms), bartlett(terms, lags), rtol=1e-9)
 
 

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from scipy.stats import binom
 from test_estimation_scoring import FORCE, TORQUE, put, true_noise, window
 
-from crazyem.estimation import starting
+from crazyem.estimation import initial_state
 from crazyem.estimation.em import Information
-from crazyem.estimation.marginal import WIDE, Marginal, Node, Refreshed, combine, shifted
+from crazyem.estimation.marginal import WIDE_PRIOR_SD, Marginal, MarginalRefresh, Node, combine, shifted
+from crazyem.estimation.maximum import maximise_posterior
 from crazyem.estimation.model import NAMES, KnownNoise
 from crazyem.estimation.online import OnlineEstimator
-from crazyem.estimation.scoring import P, climb, log_posterior
-from crazyem.estimation.settling import settle
+from crazyem.estimation.scoring import P, log_posterior, scoring_steps
 from crazyem.estimation.verdict import estimate_of
 from crazyem.vehicle import load_vehicle
 
@@ -82,21 +82,21 @@ def test_the_integral_is_that_of_a_fine_grid_with_everything_refitted():
     flight = zhao_flight.fly(seed=21)
     em, n = window(flight), len(flight.time)
     put(em, zhao_flight.TRUE, true_noise(FORCE, TORQUE))
-    settled = settle(em, 0, n)
+    settled = maximise_posterior(em, 0, n)
     assert settled.marginal is not None
     assert settled.marginal.scales == (2,)
     best, prior, scale = em.parameters, em.setup.prior, 2
     held = np.zeros(P + 11, bool)
     held[P + scale] = True
     weights, means, sds = [], [], []
-    with starting.beginning(em, 0, n) as begin:
+    with initial_state.known_initial_state(em, 0, n) as begin:
         begin()
         for shift in np.linspace(-4, 3, 25):
             em.parameters = shifted(best, scale, shift)
-            end = climb(em, 0, n, steps=10, tolerance=0.02, held=held)
+            end = scoring_steps(em, 0, n, steps=10, tolerance=0.02, held=held)
             far = end.parameters.noise.logs[scale] - prior.noise.logs[scale]
             volume = 0.5 * np.linalg.slogdet(end.information)[1]
-            weights.append(end.value + 0.5 * far**2 * (prior.noise_sd**-2 - WIDE**-2) - volume)
+            weights.append(end.value + 0.5 * far**2 * (prior.noise_sd**-2 - WIDE_PRIOR_SD**-2) - volume)
             means.append(np.log(end.parameters.theta[0] / best.theta[0]))
             sds.append(end.sd[0])
     weights, means, sds = (np.array(a) for a in (weights, means, sds))
@@ -113,14 +113,14 @@ def test_nothing_is_integrated_where_the_data_determine_the_noise():
     flight = zhao_flight.fly(seed=22, force=0.005, torque=0.002)
     em, n = window(flight, signals=("position", "velocity", "body_rate")), len(flight.time)
     put(em, zhao_flight.TRUE, true_noise(0.005, 0.002))
-    assert settle(em, 0, n).marginal is None
+    assert maximise_posterior(em, 0, n).marginal is None
 
 
 def test_nothing_is_integrated_where_the_noise_is_known():
     flight = zhao_flight.fly(seed=21, seconds=2.0)
     em, n = window(flight, known=KnownNoise(force=FORCE, torque=TORQUE)), len(flight.time)
     put(em, zhao_flight.TRUE, true_noise(FORCE, TORQUE))
-    assert settle(em, 0, n).marginal is None
+    assert maximise_posterior(em, 0, n).marginal is None
 
 
 def test_the_estimate_says_the_integrated_interval():
@@ -147,7 +147,7 @@ def test_refreshing_leaves_the_estimator_where_it_was():
     best, state = em.parameters, em.tape.xf[n - 1].copy()
     value = log_posterior(em, 0, n, best)
     em.sensitivities(0, n)
-    refreshed = Refreshed()
+    refreshed = MarginalRefresh()
     marginals = []
     for _ in range(10):
         marginals.append(refreshed.refresh(em, 0, n, info))
@@ -158,7 +158,7 @@ def test_refreshing_leaves_the_estimator_where_it_was():
     assert marginals[0] is None  # one node is no pair
     assert marginals[-1] is not None
     assert 2 in marginals[-1].scales
-    full = settle(em, 0, n)
+    full = maximise_posterior(em, 0, n)
     assert full.marginal is not None
     assert marginals[-1].sd[0] == pytest.approx(full.marginal.sd[0], rel=0.5)
 
@@ -198,7 +198,7 @@ def test_intervals_cover(regime):
         em, n = window(flight, signals=signals, known=known), len(flight.time)
         noise = true_noise(1.3 * force, 1.3 * torque)
         put(em, zhao_flight.TRUE * [1.2, 0.7, 1.3, 0.7], noise)
-        settled = settle(em, 0, n)
+        settled = maximise_posterior(em, 0, n)
         estimate = estimate_of(
             em.parameters, em.setup, settled.information, time=0.0, samples=n, updates=1, converged=settled.converged,
             marginal=settled.marginal,

@@ -12,13 +12,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.errors import UsageError
-from crazyem.estimation import reference, starting
+from crazyem.estimation import initial_state, reference
 from crazyem.estimation.em import WindowEM, displaced
 from crazyem.estimation.inputs import InputHistory
+from crazyem.estimation.maximum import Maximum, maximise_posterior
 from crazyem.estimation.model import NAMES, KnownNoise, Noise, Parameters, setup_for
 from crazyem.estimation.online import OnlineEstimator
-from crazyem.estimation.scoring import ALL, SLACK, P, climb, limited, log_posterior, moved, point
-from crazyem.estimation.settling import Settled, settle
+from crazyem.estimation.scoring import (
+    COORDINATES,
+    POSTERIOR_SLACK,
+    P,
+    limit_step,
+    log_posterior,
+    moved,
+    point,
+    scoring_steps,
+)
 from crazyem.estimation.tape import Tape
 from crazyem.physics.lag import HOLD
 from crazyem.vehicle import load_vehicle
@@ -71,10 +80,12 @@ def test_the_score_is_the_slope_of_the_posterior(known, signals):
     em = window(flight, signals=signals, known=known)
     n = len(flight.time)
     start = put(em, zhao_flight.TRUE * [1.01, 0.97, 1.03, 0.98], Noise(*(1.3 * s for s in _scales())))
-    with starting.beginning(em, 0, n):  # with an attitude known to 20 degrees only, no filter is linear
+    with initial_state.known_initial_state(em, 0, n):  # with an attitude known to 20 degrees only, no filter is linear
         here = point(em, 0, n, log_posterior(em, 0, n, start))
         for i in np.flatnonzero(here.free):
-            values = [log_posterior(em, 0, n, moved(em, start, sign * 1e-3 * np.eye(ALL)[i])) for sign in (1, -1)]
+            values = [
+                log_posterior(em, 0, n, moved(em, start, sign * 1e-3 * np.eye(COORDINATES)[i])) for sign in (1, -1)
+            ]
             slope = (values[0] - values[1]) / 2e-3
             sd = 1 / np.sqrt(here.information[i, i])
             assert here.score[i] * sd == pytest.approx(slope * sd, abs=0.1, rel=0.02), i  # an extended filter
@@ -90,7 +101,7 @@ def test_known_scales_are_not_free_and_follow_mass_and_inertia():
     start = put(em, zhao_flight.TRUE, true_noise(1.0, 1.0))
     assert start.noise.impulse[2] == pytest.approx(FORCE / zhao_flight.MASS)
     np.testing.assert_allclose(start.noise.impulse[3:], TORQUE / zhao_flight.INERTIA)
-    heavier = moved(em, start, np.log(2.0) * np.eye(ALL)[0])
+    heavier = moved(em, start, np.log(2.0) * np.eye(COORDINATES)[0])
     assert heavier.noise.impulse[2] == pytest.approx(0.5 * FORCE / zhao_flight.MASS)
     assert heavier.noise.impulse[0] == pytest.approx(0.5 * 3e-4 / zhao_flight.MASS)
     here = point(em, 0, 100, log_posterior(em, 0, 100, start))
@@ -152,26 +163,26 @@ def test_an_accelerometer_out_of_its_range_is_a_missing_one():
     assert estimator.counters.missing == 1
 
 
-@given(st.lists(st.floats(-50, 50), min_size=ALL, max_size=ALL))
+@given(st.lists(st.floats(-50, 50), min_size=COORDINATES, max_size=COORDINATES))
 def test_steps_are_bounded_and_keep_their_direction(step):
     step = np.array(step)
-    out = limited(step)
+    out = limit_step(step)
     assert np.all(np.abs(out) <= 1.5)
     assert np.all(np.abs(out[:P]) <= 0.5)
     assert np.all(np.sign(out) * np.sign(step) >= 0)
 
 
 def test_short_steps_stay_what_they_are():
-    step = 1e-4 * np.linspace(-1, 1, ALL)
-    np.testing.assert_allclose(limited(step), step, atol=2e-8)
+    step = 1e-4 * np.linspace(-1, 1, COORDINATES)
+    np.testing.assert_allclose(limit_step(step), step, atol=2e-8)
 
 
-def settled_from_afar(seed: int) -> tuple[Settled, np.ndarray]:
+def settled_from_afar(seed: int) -> tuple[Maximum, np.ndarray]:
     """A window with little process noise, begun 30 % off in parameters and scales; its end, errors in sds (4,)."""
     flight = zhao_flight.fly(seed=seed)
     em, n = window(flight), len(flight.time)
     put(em, zhao_flight.TRUE * OFF, Noise(*(1.3 * s for s in _scales())))
-    settled = settle(em, 0, n)
+    settled = maximise_posterior(em, 0, n)
     sd = np.sqrt(np.diag(settled.information.covariance))[:4]
     return settled, np.log(em.parameters.theta[:4] / zhao_flight.TRUE) / sd
 
@@ -194,10 +205,10 @@ def test_the_end_is_a_maximum():
     flight = zhao_flight.fly(seed=4)
     em, n = window(flight), len(flight.time)
     put(em, zhao_flight.TRUE, Noise(*_scales()))
-    end = climb(em, 0, n, steps=25, tolerance=0.02)
+    end = scoring_steps(em, 0, n, steps=25, tolerance=0.02)
     for i in np.flatnonzero(end.free):
         for sign in (0.5, -0.5):
-            step = sign / np.sqrt(end.information[i, i]) * np.eye(ALL)[i]
+            step = sign / np.sqrt(end.information[i, i]) * np.eye(COORDINATES)[i]
             fall = end.value - log_posterior(em, 0, n, moved(em, end.parameters, step))
             assert fall > 0, i
             if i < 4:
@@ -210,8 +221,8 @@ def test_no_step_loses_what_it_must_not():
     put(em, zhao_flight.TRUE * OFF, true_noise(0.1, 0.1))
     values = [log_posterior(em, 0, n, em.parameters)]
     for _ in range(12):
-        values.append(climb(em, 0, n, steps=1, tolerance=0.0).value)
-    assert np.all(np.diff(values) > -SLACK)
+        values.append(scoring_steps(em, 0, n, steps=1, tolerance=0.0).value)
+    assert np.all(np.diff(values) > -POSTERIOR_SLACK)
 
 
 @pytest.mark.slow
@@ -223,7 +234,7 @@ def test_known_noise_reaches_its_bound_and_the_bound_is_lower():
         sds = []
         for known in (None, KnownNoise(force=0.005, torque=0.002, lateral_force=0.0)):
             em, n = window(flight, signals=("position", "velocity", "body_rate"), known=known), len(flight.time)
-            settled = settle(em, 0, n)
+            settled = maximise_posterior(em, 0, n)
             assert settled.converged
             sds.append(np.sqrt(np.diag(settled.information.covariance))[:4])
         z.append(np.log(em.parameters.theta[:4] / zhao_flight.TRUE) / sds[1])
@@ -247,7 +258,7 @@ def test_em_with_known_noise_ends_where_scoring_ends():
         em.backward(0, n)
         em.parameters = em.maximise(0, n)
     by_em = em.parameters.theta[:4]
-    end = climb(em, 0, n, steps=25, tolerance=1e-3)
+    end = scoring_steps(em, 0, n, steps=25, tolerance=1e-3)
     assert np.all(np.abs(np.log(end.parameters.theta[:4] / by_em)) < 0.1 * end.sd[:4])
 
 
@@ -259,10 +270,10 @@ def test_the_smoothed_start_is_that_of_rauch_tung_striebel():
     em, n = window(flight), len(flight.time)
     put(em, zhao_flight.TRUE, true_noise(FORCE, TORQUE))
     t, p = em.tape, em.parameters
-    with starting.beginning(em, 0, n):  # so that nothing is far from linear
+    with initial_state.known_initial_state(em, 0, n):  # so that nothing is far from linear
         em.forward(0, n, restart=True)
         covariance = np.empty((12, 12))
-        error = starting.smoothed_error(0, n, t.time, t.kind, 0.0, t.gain, t.s, t.e, t.blocks, t.pf, covariance)
+        error = initial_state.smoothed_error(0, n, t.time, t.kind, 0.0, t.gain, t.s, t.e, t.blocks, t.pf, covariance)
     filtered = reference.extended_kalman_filter(
         t.time, t.y, t.thrust, t.torque, prior=reference.state_of(t.xp[0]), prior_cov=t.pp[0],
         mass=p.theta[0], inertia=p.inertia, q=p.noise.q, r=p.noise.r, lead=0.0,
@@ -282,7 +293,7 @@ def test_a_blind_window_begins_where_it_has_its_attitude():
     em, n = window(part), len(part.time)
     put(em, zhao_flight.TRUE, true_noise(FORCE, TORQUE))
     assert abs(part.x[0, 6]) > 0.05
-    with starting.beginning(em, 0, n):
+    with initial_state.known_initial_state(em, 0, n):
         up = em.tape.xp[0, 6:10]
         tilt = np.array([2 * (up[0] * up[2] + up[1] * up[3]), 2 * (up[1] * up[2] - up[0] * up[3])])
     q = part.x[0, 6:10]
@@ -295,7 +306,7 @@ def test_a_window_with_attitude_begins_as_measured():
     flight = zhao_flight.fly(seed=9, seconds=0.5)
     em = window(flight, signals=("position", "velocity", "attitude", "body_rate"))
     before = em.tape.xp[0].copy()
-    with starting.beginning(em, 0, len(flight.time)) as begin:
+    with initial_state.known_initial_state(em, 0, len(flight.time)) as begin:
         begin()
         np.testing.assert_array_equal(em.tape.xp[0], before)
 
@@ -303,14 +314,14 @@ def test_a_window_with_attitude_begins_as_measured():
 def test_settling_reports_its_way():
     flight = zhao_flight.fly(seed=10)
     em, n = window(flight), len(flight.time)
-    settled = settle(em, 0, n)
+    settled = maximise_posterior(em, 0, n)
     assert settled.converged
     assert 0 <= settled.maps <= 3
     assert 0 < settled.steps <= 15
     assert len(settled.path) >= settled.maps + settled.steps + 1
     np.testing.assert_array_equal(settled.path[-1].theta, em.parameters.theta)
     # where it ended is a fixed point: settling again takes no step
-    again = settle(em, 0, n)
+    again = maximise_posterior(em, 0, n)
     assert (again.maps, again.steps) == (0, 0)
     assert np.all(np.abs(np.log(again.path[-1].theta[:4] / settled.path[-1].theta[:4])) < 1e-3)
 
@@ -318,9 +329,9 @@ def test_settling_reports_its_way():
 def test_points_are_displaced_as_theta_is():
     em = window(zhao_flight.fly(seed=2, seconds=0.3))
     start = put(em, zhao_flight.TRUE, true_noise(FORCE, TORQUE))
-    step = np.zeros(ALL)
+    step = np.zeros(COORDINATES)
     step[:4] = 0.1, -0.2, 0.3, 0.05
     there = moved(em, start, step)
     np.testing.assert_array_equal(there.theta, displaced(start.theta, step[:P], em.setup.unit))
-    low = moved(em, replace(start, noise=Noise.from_logs(start.noise.logs)), -100 * np.eye(ALL)[P + 2])
+    low = moved(em, replace(start, noise=Noise.from_logs(start.noise.logs)), -100 * np.eye(COORDINATES)[P + 2])
     assert low.noise.impulse[2] == pytest.approx(em.setup.prior.impulse_floor[2])

@@ -9,7 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.estimation.online import OnlineEstimator
-from crazyem.estimation.steps import DRIFT, MOST, THRESHOLD, CumulativeSum, StepAwareEstimator
+from crazyem.estimation.steps import (
+    LARGEST_INCREMENT,
+    MEAN_TOLERANCE,
+    STEP_THRESHOLD,
+    CumulativeSum,
+    StepAwareEstimator,
+)
 from crazyem.vehicle import Vehicle
 
 VEHICLE = Vehicle("hovering", 0.029, INERTIA, motor_time_constant=0.05)
@@ -73,8 +79,17 @@ def plainly(values):
     """Where and when it must alarm: the largest sum of any tail, minus drift, on either side."""
     for k in range(len(values)):
         for sign in (1, -1):
-            tails = [(sum(min(max(sign * v, -MOST), MOST) - DRIFT for v in values[j : k + 1]), j) for j in range(k + 1)]
-            if max(tails)[0] > THRESHOLD:
+            tails = [
+                (
+                    sum(
+                        min(max(sign * v, -LARGEST_INCREMENT), LARGEST_INCREMENT) - MEAN_TOLERANCE
+                        for v in values[j : k + 1]
+                    ),
+                    j,
+                )
+                for j in range(k + 1)
+            ]
+            if max(tails)[0] > STEP_THRESHOLD:
                 return k
     return None
 

@@ -11,7 +11,7 @@ import pytest
 from crazyem.control.trajectories import hover
 from crazyem.errors import CrazyemError, LinkError
 from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstimate
-from crazyem.estimation.steps import DECIDED
+from crazyem.estimation.steps import LATEST_DECISION
 from crazyem.live.controllers import LEE
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
 from crazyem.live.policy import EndRules, HealthLimits, MonitorLimits, Policy
@@ -306,8 +306,8 @@ def test_a_healthy_drone_has_no_objection():
 
 
 def test_an_estimate_from_before_a_payload_could_be_noticed_is_too_old():
-    assert healthy()[0].objection(age=DECIDED) == ""
-    assert "1.1 s old" in healthy()[0].objection(age=DECIDED + 0.1)
+    assert healthy()[0].objection(age=LATEST_DECISION) == ""
+    assert "1.1 s old" in healthy()[0].objection(age=LATEST_DECISION + 0.1)
 
 
 @pytest.mark.parametrize(

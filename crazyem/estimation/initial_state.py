@@ -17,9 +17,9 @@ from crazyem.estimation.kernels.algebra import apply_transposed
 from crazyem.estimation.tape import BREAK, START_VARIANCE
 from crazyem.physics.rotations import quaternion_from_rotation_vector, quaternion_product
 
-ITERATIONS = 4
-SHARE = 0.03  # of the information of the window about its first state that the start is given
-SETTLED = 1e-3  # rad
+SMOOTHING_ITERATIONS = 4
+START_INFORMATION_SHARE = 0.03  # of the information of the window about its first state that the start is given
+SETTLED_ANGLE = 1e-3  # rad
 
 
 @compiled
@@ -69,7 +69,7 @@ def smoothed_error(first, last, time, kind, lead, gain, s, e, blocks, pf, covari
     return error
 
 
-def blind(em: WindowEM, first: int) -> bool:
+def starts_without_attitude(em: WindowEM, first: int) -> bool:
     """Whether the state starts anew at row `first` without a measured attitude."""
     return bool(em.tape.kind[first] == BREAK and np.isnan(em.tape.y[first, 6]))
 
@@ -79,7 +79,7 @@ def find(em: WindowEM, first: int, last: int) -> None:
     t = em.tape
     vague = np.diag(1.0 / START_VARIANCE)
     covariance = np.empty((12, 12))
-    for _ in range(ITERATIONS):
+    for _ in range(SMOOTHING_ITERATIONS):
         em.forward(first, last, restart=True)
         error = smoothed_error(
             first, last, t.time, t.kind, em.setup.lead, t.gain, t.s, t.e, t.blocks, t.pf, covariance
@@ -89,8 +89,8 @@ def find(em: WindowEM, first: int, last: int) -> None:
         moved = np.linalg.norm(start[6:10] - t.xp[first, 6:10])
         seen = np.linalg.inv(covariance) - before  # what the data say of the start
         t.xp[first] = start
-        t.pp[first] = np.linalg.inv(vague + SHARE * 0.5 * (seen + seen.T))
-        if moved < SETTLED:
+        t.pp[first] = np.linalg.inv(vague + START_INFORMATION_SHARE * 0.5 * (seen + seen.T))
+        if moved < SETTLED_ANGLE:
             break
 
 
@@ -103,12 +103,12 @@ def _turned(state: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 @contextmanager
-def beginning(em: WindowEM, first: int, last: int) -> Iterator[Callable[[], None]]:
+def known_initial_state(em: WindowEM, first: int, last: int) -> Iterator[Callable[[], None]]:
     """For the time of the context, a window that begins blindly begins where the window has it.
 
     Yields a function that looks for it again, with better parameters.
     """
-    if not blind(em, first):
+    if not starts_without_attitude(em, first):
         yield lambda: None
         return
     em.tape.kind[first] = 0  # its prior is the one on the tape from now on

@@ -1,10 +1,11 @@
-"""How far the logged commands can be trusted between their stamps.
+"""Why the information alone claims too much: noise in sampled commands, and disturbances with memory.
 
-A controller runs at 500 Hz and feeds the noise of its sensors straight into the command; a log at 100 Hz catches single
+A controller runs at 500 Hz and feeds the noise of its sensors straight into the command. A log at 100 Hz catches single
 values of that, each standing in for the 10 ms around it. What is noise in these values is not torque that acted. An
 estimate that takes it for such finds the drone too sluggish (errors in variables): inertia too large, and the time
-constant and delay, which are told from the same commands, wrong with it. The bias is computed here from the noise and
-counted as uncertainty: the data cannot remove it.
+constant and delay, which come from the same commands, wrong with it. The bias is computed here from the noise and
+counted as uncertainty: the data cannot remove it. Terms of the score that are correlated in time have a sum whose
+variance is larger than the sum of their variances: the long-run variance.
 """
 
 import math
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from crazyem.compiled import compiled
 from crazyem.physics.lag import CAUSAL, hold_predictor, lagged_means
 
 _DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])  # third difference: blind to what is smooth, 20 times white variance
@@ -84,3 +86,28 @@ def steady_gain(process: float, measurement: float) -> tuple[float, float]:
     predicted = 0.5 * (process + math.sqrt(process**2 + 4.0 * process * measurement))
     innovation = predicted + measurement
     return predicted / innovation, innovation
+
+
+FEWEST_ROWS = 32  # fewer say nothing about correlation in time
+LONGEST_LAG = 100
+
+
+@compiled
+def long_run(terms):
+    """Variance of the column sums of terms (n, p), Bartlett kernel (Newey and West 1987). Returns (p,).
+
+    The weights 1 - lag/length of the kernel are those of a running sum of that length, of which this is the mean
+    square: a few additions a term, however many lags.
+    """
+    n, p = terms.shape
+    length = (min(n // 8, LONGEST_LAG) if n >= FEWEST_ROWS else 0) + 1
+    out = np.zeros(p)
+    running = np.zeros(p)
+    for k in range(n + length - 1):
+        for c in range(p):
+            if k < n:
+                running[c] += terms[k, c]
+            if k >= length:
+                running[c] -= terms[k - length, c]
+            out[c] += running[c] * running[c]
+    return out / length
