@@ -67,6 +67,7 @@ class Shared:
     Attributes:
         score: (c,). information: (c, c).
         nothing: log evidence with phi = 0 [nats].
+        blocks: (b, c) scores of all blocks at the point, without what differs from flight to flight.
         scatter: (c,) variance of the blocks' scores over what the model says of it, at least 1.
     """
 
@@ -93,7 +94,8 @@ class Shared:
             # blocks' scores at the point, without what the deviations take
             left = flight.score - flight.score[:, free] @ (d[:, None] * solved[:, :-1])
             rest.append(left)
-        self.scatter = _scatter(np.concatenate(rest), np.diag(self.information))
+        self.blocks = np.concatenate(rest)
+        self.scatter = _scatter(self.blocks, np.diag(self.information))
 
     def posterior(self, at: Sequence[int], prior: Gaussian) -> Posterior:
         """Of the columns `at` (k,), the others 0."""
