@@ -101,7 +101,7 @@ def rotor_thrust(
     `breaks`: rows at which a new stretch begins (their step means nothing). Returns (n, 4) N and (n, 4) N/s.
     """
     thrust, lag, delay = settled(inputs, vehicle=vehicle, effects=effects)
-    mode = LINEAR if inputs.measured else (CAUSAL if lag > 0 and inputs.aged else HOLD)
+    mode = CAUSAL if inputs.aged and (inputs.measured or lag > 0) else LINEAR if inputs.measured else HOLD
     mean, rate = np.zeros((len(nodes), 4)), np.zeros((len(nodes), 4))
     unused = np.zeros((0, 4))
     predictor = fit_predictor(thrust) if mode == CAUSAL else hold_predictor()
