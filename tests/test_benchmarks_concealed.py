@@ -50,7 +50,7 @@ def test_shares_are_as_promised_and_every_effect_is_there(cases: int, seed: int)
     assert abs(kinds["outside"] - 0.1 * cases) <= 1
     alone = Counter(name for c in found if c["kind"] == "single" for name in c["effects"])
     # a trim is not drawn: every real drone has one, and none that is simulated here; nor is what every log has
-    assert set(alone) == set(CATALOGUE) == set(EFFECTS) - {"trim", "onboard_filter"}
+    assert set(alone) == set(CATALOGUE) == set(EFFECTS) - {"trim", "onboard_filter", "sampled_commands"}
     assert max(alone.values()) - min(alone.values()) <= 1
     assert {n for c in found for n in c["hidden"]} == set(OUTSIDE) == set(HIDDEN)
     assert all(len(c["effects"]) == 2 for c in found if c["kind"] == "pair")

@@ -39,13 +39,18 @@ def test_the_offset_is_that_of_a_slow_low_pass():
         specific_force=turned.inv().apply(acceleration), angular_acceleration=np.gradient(rate, step, axis=0)[at],
         thrust=np.zeros((n, 4)), thrust_rate=np.zeros((n, 4)), voltage=np.zeros(n), rotor_constant=np.nan, air=none,
     )  # fmt: skip
-    offset = filtered(situation, rate_lag=lag, velocity_lag=lag).state
+    offset = filtered(situation, rate_lag=lag, velocity_lag=lag, attitude_lag=0.0).state
     wanted = (shown - np.hstack([velocity, rate]))[at]
     second_order = (pulse * lag) ** 2
     assert np.abs(offset[:, 9:] - wanted[:, 3:]).max() < 1.5 * second_order
     assert np.abs(offset[:, 3:6] - wanted[:, :3]).max() < 1.5 * 0.3 * second_order
     assert np.abs(wanted).max() > 10 * second_order  # not a comparison of nothings
     assert not offset[:, [0, 1, 2, 6, 7, 8]].any()
+    spin = np.array([0.5, -1.0, 2.0])  # rad/s, all the time: then the attitude of 2 ms ago is a turn back by 2 ms of it
+    turning = replace(situation, body_rate=np.tile(spin, (n, 1)))
+    late = filtered(turning, rate_lag=0.0, velocity_lag=0.0, attitude_lag=lag).state[0, 6:9]
+    now, before = (turned * Rotation.from_rotvec(spin * t) for t in (1.0, 1.0 - lag))
+    np.testing.assert_allclose(late, (now.inv() * before).as_rotvec(), atol=1e-12)
 
 
 def behind(recording: Recording, name: str, lag: float) -> Recording:

@@ -27,7 +27,8 @@ AGREED = {  # issue 5: names are an interface
     "rotor_inertia": "inertia", "inertia": "xx yy zz", "inertia_products": "xy xz yz", "torque_scale": "scale",
     "suspended_load": "mass length", "rotor_sensor": "rotor scale",
     "trim": "x y z",  # not of the issue: what real drones need
-    "onboard_filter": "rate_lag velocity_lag",  # nor this: what every log needs
+    "sampled_commands": "tilt turn",  # nor this
+    "onboard_filter": "rate_lag velocity_lag attitude_lag",  # nor this: what every log needs
     "force_by_place": "x y z xx xy xz yx yy yz zx zy zz",  # nor this: a rival of named ones, never named itself
 }  # fmt: skip
 

@@ -85,6 +85,7 @@ def predicted(path, effects: Effects) -> tuple[np.ndarray, np.ndarray]:
     return world[SETTLED:], found.angular_acceleration[SETTLED:]
 
 
+OF_A_DIAGNOSIS = ("force_by_place", "sampled_commands")
 CASES: dict[str, Effects] = {
     "none": {},
     "payload": {"payload": {"mass": 0.004, "x": 0.003, "y": -0.004, "z": -0.02}},
@@ -159,7 +160,7 @@ def test_host_and_simulated_sensors_are_turned_alike(angles: tuple[float, float,
 def test_every_effect_that_moves_the_drone_is_compared() -> None:
     compared = {name for effects in CASES.values() for name in effects}
     moving = {name for name, e in CATALOGUE.items() if e.measured is None and e.speed is None}
-    assert compared == moving - {"gusts", "force_by_place"}  # no mean motion; never part of a vehicle
+    assert compared == moving - {"gusts", *OF_A_DIAGNOSIS}  # no mean motion; never part of a vehicle
 
 
 def test_the_simulator_flies_whatever_a_fit_may_find():
@@ -167,7 +168,7 @@ def test_the_simulator_flies_whatever_a_fit_may_find():
     narrower = [
         (name, ours.name)
         for name, effect in CATALOGUE.items()
-        if name not in ("onboard_filter", "force_by_place")  # no fit puts them into a vehicle
+        if name not in (*OF_A_DIAGNOSIS, "onboard_filter")  # no fit puts them into a vehicle
         for ours in effect.parameters
         for theirs in EFFECTS[name].parameters
         if theirs.name == ours.name != "onset_time" and not theirs.low <= ours.low <= ours.high <= theirs.high

@@ -17,7 +17,7 @@ ON_BOARD = 0.04  # m from the middle of the rotors: no part of a Crazyflie is fu
 STRONGEST = 1.1  # a worn, cut or bent propeller pulls less than the others; a new one among worn ones a little more,
 NO_STRONGER = 1.0  # and none gets stronger in flight
 # judged by themselves: gusts.py, accelerometer.py, imitated.py; of every log: always.py
-ASIDE = ("gusts", "accelerometer_misalignment", "onboard_filter", "force_by_place")
+ASIDE = ("gusts", "accelerometer_misalignment", "onboard_filter", "sampled_commands", "force_by_place")
 TRIM = "trim"
 ASKED = (TRIM,)  # looked for only if asked for: near every effect that brings a steady torque
 
