@@ -1,4 +1,4 @@
-"""Attitudes that an onboard filter made: one in 80 ms is used, because their errors hang together."""
+"""Attitudes that an onboard filter made: all are used, with errors that have a memory."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -11,7 +11,7 @@ from made_flight import array_of
 from crazyem.diagnosis.fitting.always import refine_base
 from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.flights.flight import APART, Flight, flight_of
+from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.estimation import steps
 from crazyem.recordings.recording import Recording, crazyflie_attitude, onboard_attitude
 from crazyem.signals.vocabulary import MAVLINK_SOURCES, SOURCES
@@ -38,15 +38,13 @@ def onboard(recording: Recording, *, source: str = "stateEstimateZ.quat", wrong:
     return replace(recording, signals={**recording.signals, "attitude": shown})
 
 
-def seen(flight: Flight) -> np.ndarray:
-    return flight.time[np.isfinite(flight.y[:, 6])]
-
-
-def test_attitudes_of_motion_capture_are_all_used() -> None:
+def test_who_made_the_attitudes_is_known_and_all_are_used() -> None:
     recording = fly(seconds=6.0)
-    flight = flight_of(onboard(recording, source="qx"), DRONE)
-    assert flight.attitude is None
-    assert seen(flight).size == flight.time.size
+    captured, made = (flight_of(onboard(recording, source=s), DRONE) for s in ("qx", "stateEstimateZ.quat"))
+    assert made.fused
+    assert not captured.fused
+    assert np.array_equal(made.y, captured.y, equal_nan=True)
+    assert np.isfinite(made.y[:, 6]).all()
 
 
 @pytest.mark.parametrize(
@@ -96,52 +94,15 @@ def test_the_estimator_of_the_commands_thins_attitudes_of_filters_on_board_and_n
     assert made == [{**expected, "input_signal": None}]
 
 
-def test_of_onboard_attitudes_one_in_so_many_is_used_and_none_is_lost() -> None:
-    recording = fly(seconds=6.0)
-    whole, flight = flight_of(onboard(recording, source="qx"), DRONE), flight_of(onboard(recording), DRONE)
-    assert flight.attitude is not None
-    assert np.array_equal(flight.attitude, whole.y[:, 6:10])
-    assert np.allclose(np.diff(seen(flight)), APART, atol=0.011)
-    assert np.isfinite(flight.y[flight.starts, 6]).all()
-    at = np.isfinite(flight.y[:, 6])
-    assert np.array_equal(flight.y[at], whole.y[at])
-    assert np.array_equal(flight.y[:, 10:], whole.y[:, 10:])
-
-
-@pytest.mark.parametrize("late", [0.0, 2e-3, 4e-3, 5e-3, 8e-3])
-def test_attitudes_in_a_log_block_of_their_own_are_not_lost(late: float) -> None:
-    """Blocks have stamps of their own: of rows that begin with the others, none may hold an attitude."""
-    recording = onboard(fly(seconds=6.0))
-    signal = recording.signals["attitude"]
-    apart = replace(recording, signals={**recording.signals, "attitude": replace(signal, time=signal.time + late)})
-    flight = flight_of(apart, DRONE)
-    assert np.allclose(np.diff(seen(flight)), APART, atol=0.011)
-
-
-def test_where_the_filter_begins_anew_there_is_an_attitude() -> None:
-    flight = flight_of(onboard(fly(seconds=6.0)), DRONE)
-    starts = flight.starts.copy()
-    starts[[101, 103, 250]] = True
-    begun = flight.started(starts)
-    assert np.isfinite(begun.y[starts, 6]).all()
-    some = flight.rows(np.arange(flight.time.size) % 100 > 3)
-    assert some.starts.sum() > 3
-    assert np.isfinite(some.y[some.starts, 6]).all()
-    assert np.array_equal(some.rows(np.ones(some.time.size, bool)).y, some.y, equal_nan=True)
-
-
 @pytest.mark.slow
-def test_errors_that_last_are_no_shaking_and_no_noise_of_the_gyro() -> None:
-    """A filter that takes them for white noise at 100 Hz finds a gyro more than twice as noisy and a drone that is
-    shaken less; one attitude in 80 ms leaves both as they are by an attitude without such errors."""
+def test_errors_that_last_are_found_and_are_no_noise_of_the_gyro() -> None:
+    """Errors of 4 mrad about two of three axes that last 0.04 s: gyro and shaking stay as without such errors."""
     recording = fly(seconds=15.0, seed=5, rate_noise=2e-3, shake=0.3)
-    gyro, shaken = [], []
-    for source, wrong in (("qx", False), ("qx", True), ("stateEstimateZ.quat", True)):
-        data = Data([flight_of(onboard(recording, source=source, wrong=wrong), DRONE)])
-        found = refine_base(data, nominal(data, starting_point(Point(DRONE, {}, None))), ()).point  # type: ignore[arg-type]
-        gyro.append(float(found.noise.measurement[3]))
-        shaken.append(found.noise.impulse[3:])
-    assert gyro[1] > 2 * gyro[0]
-    assert gyro[2] == pytest.approx(gyro[0], rel=0.3)
-    assert np.all(shaken[1] < 0.93 * shaken[0])
-    assert shaken[2] == pytest.approx(shaken[0], rel=0.02)
+    right, wrong = (
+        refine_base(data, nominal(data, starting_point(Point(DRONE, {}, None))), ()).point.noise  # type: ignore[arg-type]
+        for data in (Data([flight_of(onboard(recording, wrong=w), DRONE)]) for w in (False, True))
+    )
+    assert wrong.measurement[3] == pytest.approx(right.measurement[3], rel=0.1)
+    np.testing.assert_allclose(wrong.impulse[3:], right.impulse[3:], rtol=0.05)
+    assert wrong.coloured[2] == pytest.approx(TILT * np.sqrt(2 / 3), rel=0.15)
+    assert wrong.recall[2] == pytest.approx(PULL, rel=0.35)

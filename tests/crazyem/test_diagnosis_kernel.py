@@ -34,7 +34,10 @@ class Given:
     p0: Array
 
 
-def made(seed: int, *, rows: int = 60, disturbed: bool = False, missing: float = 0.0, torques: bool = False) -> Given:
+def made(
+    seed: int, *, rows: int = 60, disturbed: bool = False, missing: float = 0.0, torques: bool = False,
+    coloured: tuple[int, ...] = (),
+) -> Given:  # fmt: skip
     """A short flight that tumbles a little, with steps of unequal length and noise on all that is measured."""
     rng = np.random.default_rng(seed)
     time = np.cumsum(rng.uniform(0.004, 0.012, rows))
@@ -44,7 +47,7 @@ def made(seed: int, *, rows: int = 60, disturbed: bool = False, missing: float =
     angular = np.array([8.0, 7.0, 3.0]) * wave[:, 3:]
     r = np.repeat(np.square([2e-3, 1e-2, 4e-3, 2e-2]), 3)
     x = np.concatenate([[0.1, -0.2, 1.0, 0.2, 0.1, -0.1], Rotation.from_euler("xyz", [0.1, -0.2, 0.5]).as_quat(),
-                        [0.4, -0.3, 0.6], np.zeros(6)])  # fmt: skip
+                        [0.4, -0.3, 0.6], np.zeros(18)])  # fmt: skip
     y = np.zeros((rows, 13))
     starts = np.zeros(rows, bool)
     starts[[0, rows // 2]] = True
@@ -64,14 +67,15 @@ def made(seed: int, *, rows: int = 60, disturbed: bool = False, missing: float =
         y[lost, columns] = np.nan
     return Given(
         time, starts, y, specific, angular, 0.01 * rng.normal(size=(rows, 12)), rng.uniform(0.5, 2, 6) ** 2 * [0.1] * 6,
-        r, np.square([0.2, 0.1, 0.3, 1.0, 2.0, 0.5]) * (np.arange(6) >= 3 * torques) * disturbed,
-        np.array([0.3, 0.2, 0.5, 0.05, 0.1, 1.0]),
+        r, np.concatenate([np.square([0.2, 0.1, 0.3, 1.0, 2.0, 0.5]) * (np.arange(6) >= 3 * torques) * disturbed,
+                           4.0 * r * np.repeat(np.isin(np.arange(4), coloured), 3)]),
+        np.concatenate([[0.3, 0.2, 0.5, 0.05, 0.1, 1.0], np.repeat([0.03, 0.1, 0.05, 0.01], 3)]),
         np.square([1.0] * 3 + [2.0] * 3 + [0.5] * 3 + [3.0] * 3),
     )  # fmt: skip
 
 
 def stepped(x: Array, dt: float, specific: Array, angular: Array, memory: Array) -> Array:
-    """States (..., 19) a step later: velocity by the attitude in the middle, position and attitude by mean rates."""
+    """States (..., 31) a step later: velocity by the attitude in the middle, position and attitude by mean rates."""
     turn = Rotation.from_quat(x[..., 6:10])
     middle = turn * Rotation.from_rotvec(x[..., 10:13] * dt / 2)
     v = x[..., 3:6] + dt * (middle.apply(specific + x[..., 13:16]) - [0, 0, G])
@@ -82,27 +86,27 @@ def stepped(x: Array, dt: float, specific: Array, angular: Array, memory: Array)
 
 
 def plus(x: Array, error: Array) -> Array:
-    """The state (19,) moved by errors (..., 18), the attitude by rotation vectors on the right."""
+    """The state (31,) moved by errors (..., 30), the attitude by rotation vectors on the right."""
     turned = (Rotation.from_quat(x[6:10]) * Rotation.from_rotvec(error[..., 6:9])).as_quat()
     return np.concatenate([x[:6] + error[..., :6], turned, x[10:] + error[..., 9:]], axis=-1)
 
 
 def minus(a: Array, b: Array) -> Array:
-    """The errors (..., 18) that lead from b (19,) to a."""
+    """The errors (..., 30) that lead from b (31,) to a."""
     turned = (Rotation.from_quat(b[6:10]).inv() * Rotation.from_quat(a[..., 6:10])).as_rotvec()
     return np.concatenate([a[..., :6] - b[:6], turned, a[..., 10:] - b[10:]], axis=-1)
 
 
 def process_noise(given: Given, x: Array, end: Array, dt: float) -> Array:
-    """Covariance (18, 18) of white accelerations over a step, integrated by Gauss and Legendre."""
+    """Covariance (30, 30) of white accelerations over a step, integrated by Gauss and Legendre."""
     middle = (Rotation.from_quat(x[6:10]) * Rotation.from_rotvec(x[10:13] * dt / 2)).as_matrix()
     turn = Rotation.from_rotvec(dt * (x[10:13] + end[10:13]) / 2)
     jacobian = (turn.inv() * Rotation.from_rotvec(turn.as_rotvec() + 1e-6 * np.eye(3))).as_rotvec().T / 1e-6
-    total = np.zeros((18, 18))
+    total = np.zeros((30, 30))
     points, weights = np.polynomial.legendre.leggauss(3)
     for point, weight in zip(points, weights, strict=True):
         left = dt * (1 - point) / 2
-        g = np.zeros((18, 6))
+        g = np.zeros((30, 6))
         g[0:3, 0:3], g[3:6, 0:3] = left * middle, middle
         g[6:9, 3:6], g[9:12, 3:6] = left * jacobian, np.eye(3)
         total += 0.5 * dt * weight * g @ np.diag(given.q) @ g.T
@@ -123,13 +127,19 @@ class Plain:
 def plain(given: Given) -> Plain:
     """An extended Kalman filter as it stands in textbooks."""
     n = len(given.time)
-    e, s, filtered, loglik = np.zeros((n, 12)), np.zeros((n, 12)), np.zeros((n, 19)), 0.0
-    x, p = np.zeros(19), np.zeros((18, 18))
+    e, s, filtered, loglik = np.zeros((n, 12)), np.zeros((n, 12)), np.zeros((n, 31)), 0.0
+    x, p = np.zeros(31), np.zeros((30, 30))
     for k in range(n):
         known = np.isfinite(given.y[k][[0, 1, 2, 3, 4, 5, 6, 6, 6, 10, 11, 12]])
         if given.starts[k]:
             x = begun(given.y[k], given.offset[k])
             p = np.diag(np.concatenate([np.where(known, given.r, given.p0), given.disturbance]))
+            shared = np.diag(
+                np.where(known, given.disturbance[6:], 0.0)
+            )  # the state is what was measured less its errors
+            p[:12, :12] += shared
+            p[:12, 18:] -= shared
+            p[18:, :12] -= shared
             filtered[k] = x
             continue
         dt = given.time[k] - given.time[k - 1]
@@ -139,18 +149,18 @@ def plain(given: Given) -> Plain:
 
         end = move(x)
         width = 1e-6
-        both = minus(move(plus(x, width * np.concatenate([np.eye(18), -np.eye(18)]))), end)
-        transition = (both[:18] - both[18:]).T / (2 * width)
+        both = minus(move(plus(x, width * np.concatenate([np.eye(30), -np.eye(30)]))), end)
+        transition = (both[:30] - both[30:]).T / (2 * width)
         p = transition @ p @ transition.T + process_noise(given, x, end, dt)
         x = end
         if not known.any():
             filtered[k] = x
             continue
-        y = np.concatenate([given.y[k], np.zeros(6)])
+        y = np.concatenate([given.y[k], np.zeros(18)])
         if not known[6]:
             y[6:10] = x[6:10]
-        innovation = (minus(y, x)[:12] - given.offset[k])[known]
-        h = np.eye(18)[:12][known]
+        innovation = (minus(y, x)[:12] - given.offset[k] - x[19:])[known]
+        h = (np.eye(12, 30) + np.eye(12, 30, 18))[known]
         joint = h @ p @ h.T + np.diag(given.r[known])
         lower = np.linalg.cholesky(joint)
         e[k, known] = np.linalg.solve(lower, innovation) * np.diag(lower)
@@ -158,7 +168,7 @@ def plain(given: Given) -> Plain:
         loglik -= 0.5 * float(innovation @ np.linalg.solve(joint, innovation) + np.linalg.slogdet(2 * np.pi * joint)[1])
         gain = p @ h.T @ np.linalg.inv(joint)
         x = plus(x, gain @ innovation)
-        p = (np.eye(18) - gain @ h) @ p
+        p = (np.eye(30) - gain @ h) @ p
         p = 0.5 * (p + p.T)
         filtered[k] = x
     return Plain(e, s, filtered, loglik)
@@ -166,7 +176,7 @@ def plain(given: Given) -> Plain:
 
 def begun(y: Array, offset: Array) -> Array:
     """What was measured, less what the sensors show beyond it; the rest is zero."""
-    x = np.zeros(19)
+    x = np.zeros(31)
     x[9] = 1.0
     for place in (slice(0, 3), slice(3, 6)):
         if np.isfinite(y[place]).all():
@@ -199,23 +209,26 @@ def swept(
     showing = np.zeros((n, 12, 0)) if showing is None else showing
     block = np.zeros(n, np.int64) if block is None else block
     m, blocks = acting.shape[2] + showing.shape[2], int(block[-1]) + 1
-    predicted, filtered, e, s = np.zeros((n, 19)), np.zeros((n, 19)), np.zeros((n, 12)), np.zeros((n, 12))
+    predicted, filtered, e, s = np.zeros((n, 31)), np.zeros((n, 31)), np.zeros((n, 12)), np.zeros((n, 12))
     rows, score, information = np.zeros(n), np.zeros((blocks, m)), np.zeros((blocks, m, m))
     loglik = sweep(
         given.time, given.starts, given.y, given.specific, given.angular, given.offset, acting, showing, given.q,
         given.r, given.disturbance, given.memory, given.p0, block, predicted, filtered, e, s, rows, score, information,
-        np.zeros((0, 12, 12)), np.zeros((0, 18, 12)),
+        np.zeros((0, 12, 12)), np.zeros((0, 18, 12)), np.zeros((0, 0, 12)),
     )  # fmt: skip
     return Result(filtered, e, s, rows, loglik, score, information)
 
 
 @pytest.mark.parametrize(
-    ("disturbed", "missing", "torques"),
-    [(False, 0.0, False), (True, 0.0, False), (True, 0.4, False), (True, 0.2, True)],
-)
-def test_innovations_and_likelihood_are_those_of_a_plain_filter(disturbed: bool, missing: float, torques: bool) -> None:
+    ("disturbed", "missing", "torques", "coloured"),
+    [(False, 0.0, False, ()), (True, 0.0, False, ()), (True, 0.4, False, ()), (True, 0.2, True, ()),
+     (False, 0.2, False, (2,)), (True, 0.2, True, (0, 1, 2, 3)), (True, 0.2, False, (1, 3))],
+)  # fmt: skip
+def test_innovations_and_likelihood_are_those_of_a_plain_filter(
+    disturbed: bool, missing: float, torques: bool, coloured: tuple[int, ...]
+) -> None:
     """To a thousandth of a standard deviation: how the attitude in the middle turns with the rate is first order."""
-    given = made(1, disturbed=disturbed, missing=missing, torques=torques)
+    given = made(1, disturbed=disturbed, missing=missing, torques=torques, coloured=coloured)
     slow, fast = plain(given), swept(given)
     seen = slow.s > 0
     assert np.array_equal(fast.s > 0, seen)
@@ -226,7 +239,7 @@ def test_innovations_and_likelihood_are_those_of_a_plain_filter(disturbed: bool,
     assert np.all(fast.rows[given.starts] == 0)
     errors = np.array([minus(a, b) for a, b in zip(fast.filtered, slow.filtered, strict=True)])
     assert np.max(np.abs(errors[:, :12]) / np.sqrt(given.r)) < 1e-3
-    if disturbed:
+    if disturbed or coloured:
         assert np.max(np.abs(errors[:, 12:]) / np.sqrt(np.maximum(given.disturbance, 1e-20))) < 1e-3
 
 
@@ -254,13 +267,15 @@ def displaced(given: Given, acting: Array, showing: Array, column: int, by: floa
     return replace(given, offset=given.offset + by * showing[:, :, column - acting.shape[2]])
 
 
-@pytest.mark.parametrize(("disturbed", "missing"), [(False, 0.0), (True, 0.3)])
-def test_score_and_information_are_differences_of_the_plain_filter(disturbed: bool, missing: float) -> None:
+@pytest.mark.parametrize(("disturbed", "missing", "coloured"), [(False, 0.0, ()), (True, 0.3, ()), (True, 0.3, (0, 2))])
+def test_score_and_information_are_differences_of_the_plain_filter(
+    disturbed: bool, missing: float, coloured: tuple[int, ...]
+) -> None:
     """Scores within 0.02 standard deviations, information within 1 %.
 
     Of an attitude that is shown turned, within 0.1: it turns the filter's gains and variances too, which is left out.
     """
-    given = made(2, disturbed=disturbed, missing=missing)
+    given = made(2, disturbed=disturbed, missing=missing, coloured=coloured)
     acting, showing = columns_of(given)
     block = (np.arange(len(given.time)) // 15).astype(np.int64)
     found = swept(given, acting, showing, block)
@@ -335,9 +350,10 @@ def test_a_row_without_a_measurement_only_predicts() -> None:
     assert np.max(np.abs(minus(found.filtered[10], expected))) < 1e-12
 
 
-def test_white_innovations_where_model_and_noise_are_true() -> None:
+@pytest.mark.parametrize("coloured", [(), (0, 1, 2, 3)])
+def test_white_innovations_where_model_and_noise_are_true(coloured: tuple[int, ...]) -> None:
     """On data drawn from the model itself, squared standardised innovations sum to a chi-squared number (5 sigma)."""
-    given = drawn(6, rows=400)
+    given = drawn(6, rows=400, coloured=coloured)
     found = swept(given)
     seen = found.s > 0
     z = found.e[seen] / np.sqrt(found.s[seen])
@@ -345,21 +361,20 @@ def test_white_innovations_where_model_and_noise_are_true() -> None:
     assert abs(z.mean()) < 5 / np.sqrt(z.size)
 
 
-def drawn(seed: int, rows: int) -> Given:
-    """Impulses, measurement noise and disturbances drawn with the given variances; 2 stretches."""
-    given = made(seed, rows=rows, disturbed=True)
+def drawn(seed: int, rows: int, coloured: tuple[int, ...] = ()) -> Given:
+    """Impulses, measurement noise, disturbances and errors with memory drawn with the given variances; 2 stretches."""
+    given = made(seed, rows=rows, disturbed=True, coloured=coloured)
     rng = np.random.default_rng(seed)
-    y, x = given.y.copy(), np.zeros(19)
+    y, x = given.y.copy(), np.zeros(31)
     for k in range(rows):
         if k == 0 or given.starts[k]:
             x = np.concatenate([begun(made(seed, rows=rows).y[0], given.offset[0])[:13],
-                                rng.normal(size=6) * np.sqrt(given.disturbance)])  # fmt: skip
+                                rng.normal(size=18) * np.sqrt(given.disturbance)])  # fmt: skip
         else:
             dt = given.time[k] - given.time[k - 1]
             end = stepped(x, dt, given.specific[k], given.angular[k], given.memory)
-            spread = np.linalg.cholesky(process_noise(given, x, end, dt) + 1e-18 * np.eye(18))
-            x = plus(end, spread @ rng.normal(size=18))
+            spread = np.linalg.cholesky(process_noise(given, x, end, dt) + 1e-18 * np.eye(30))
+            x = plus(end, spread @ rng.normal(size=30))
         noise = rng.normal(size=12) * np.sqrt(given.r)
-        shown = plus(x, np.concatenate([noise + given.offset[k], np.zeros(6)]))
-        y[k] = shown[:13]
+        y[k] = plus(x, np.concatenate([noise + given.offset[k] + x[19:], np.zeros(18)]))[:13]
     return replace(given, y=y)

@@ -8,7 +8,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.fitting.model import Noise, run_sweep, scored_sweep
-from crazyem.diagnosis.fitting.noise import LEANING_FLOOR, fit_noise, logs_of, noise_of, sample_rows
+from crazyem.diagnosis.fitting.noise import (
+    LEANING_FLOOR,
+    coloured,
+    fit_noise,
+    logs_of,
+    noise_of,
+    sample_rows,
+    without_slight,
+)
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.motion import RotorInput
 
@@ -28,7 +36,9 @@ def drawn(seed: int, noise: Noise, *, rows: int = 900, dt: float = 0.01) -> tupl
     p, v, turn, w = np.zeros(3), np.zeros(3), Rotation.identity(), np.zeros(3)
     disturbance = rng.normal(size=6) * noise.disturbance
     y = np.zeros((rows, 13))
-    sd = np.repeat(noise.measurement, 3)
+    sd, lasting, kept = (np.repeat(v, 3) for v in (noise.measurement, noise.coloured, np.exp(-dt / noise.recall)))
+    other = np.random.default_rng([seed, 1])
+    last = other.normal(size=12) * lasting
     h = dt / 10
     for k in range(rows):
         if k:
@@ -42,7 +52,8 @@ def drawn(seed: int, noise: Noise, *, rows: int = 900, dt: float = 0.01) -> tupl
                 w = w + dw
             decay = np.exp(-dt / noise.memory)
             disturbance = decay * disturbance + np.sqrt(1 - decay**2) * noise.disturbance * rng.normal(size=6)
-        error = rng.normal(size=12) * sd
+            last = kept * last + np.sqrt(1 - kept**2) * lasting * other.normal(size=12)
+        error = rng.normal(size=12) * sd + last
         y[k, :3], y[k, 3:6], y[k, 10:] = p + error[:3], v + error[3:6], w + error[9:]
         y[k, 6:10] = (turn * Rotation.from_rotvec(error[6:9])).as_quat()
     starts = np.zeros(rows, bool)
@@ -85,6 +96,20 @@ def test_disturbances_with_memory_come_back_where_they_are_asked_for() -> None:
     np.testing.assert_allclose(found.measurement, TRUE.measurement, rtol=0.25)
 
 
+def test_coloured_errors_come_back_with_their_memory() -> None:
+    """Of position, velocity and attitude, at once: 9 s hold 90 memories of 0.1 s, so one is known to a third."""
+    there = replace(TRUE, coloured=2.0 * TRUE.measurement * [1, 1, 1, 0], recall=np.array([0.05, 0.1, 0.08, 1.0]))
+    part = drawn(8, there)
+    begun = coloured(replace(START, measurement=2.0 * TRUE.measurement), [part[0]])
+    assert not begun.coloured[[0, 1, 3]].any()  # an estimate of position and velocity; a gyro of shorter memory
+    found = fit_noise([part], replace(begun, coloured=begun.measurement * [1, 1, 1, 0]))
+    np.testing.assert_allclose(found.coloured[:3], there.coloured[:3], rtol=0.25)
+    assert np.all(np.abs(np.log(found.recall / there.recall))[:3] < np.log(1.5))
+    np.testing.assert_allclose(found.measurement, TRUE.measurement, rtol=0.25)
+    white = without_slight(fit_noise([drawn(1, TRUE)], coloured(TRUE, [part[0]])), [part[0]])
+    assert not white.coloured.any()
+
+
 def test_a_scale_that_nothing_measures_stays() -> None:
     flight, acceleration, offset = drawn(5, TRUE, rows=300)
     flight.y[:, 3:6] = np.nan
@@ -119,8 +144,11 @@ def test_logarithms_and_back() -> None:
     assert not again.disturbance.any()
 
 
-@pytest.mark.parametrize("memories", [(), (3, 4, 5), (0, 1, 2, 3, 4, 5)])
-def test_the_score_is_the_slope_of_the_likelihood(memories: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(
+    ("memories", "lasting"),
+    [((), ()), ((3, 4, 5), ()), ((0, 1, 2, 3, 4, 5), ()), ((), (2,)), ((3, 4, 5), (0, 1, 2, 3)), ((0, 1, 2), (1, 3))],
+)
+def test_the_score_is_the_slope_of_the_likelihood(memories: tuple[int, ...], lasting: tuple[int, ...]) -> None:
     """By central differences; measurements missing and starts within. The filter is linear but for its attitude."""
     flight, acceleration, offset = drawn(7, TRUE, rows=300)
     y, starts = flight.y.copy(), flight.starts.copy()
@@ -128,12 +156,14 @@ def test_the_score_is_the_slope_of_the_likelihood(memories: tuple[int, ...]) -> 
     starts[[100, 101, 200]] = True
     flight = replace(flight, y=y, starts=starts)
     disturbance = np.where(np.isin(np.arange(6), memories), [0.1, 0.1, 0.2, 1.0, 2.0, 0.5], 0.0)
-    noise = replace(TRUE, disturbance=disturbance, memory=0.3)
+    errors = np.where(np.isin(np.arange(4), lasting), 1.5 * TRUE.measurement, 0.0)
+    recall = np.array([0.03, 0.1, 0.05, 0.01])
+    noise = replace(TRUE, disturbance=disturbance, memory=0.3, coloured=errors, recall=recall)
     score = scored_sweep(flight, acceleration, offset, noise)[1]
     nothing = np.zeros((300, 6, 0)), np.zeros((300, 12, 0))
     for i in np.flatnonzero(np.isfinite(logs_of(noise))):
         up, down = (
-            run_sweep(flight, acceleration, offset, *nothing, noise_of(logs_of(noise) + d * np.eye(16)[i], 0.3)).loglik
+            run_sweep(flight, acceleration, offset, *nothing, noise_of(logs_of(noise) + d * np.eye(24)[i], 0.3)).loglik
             for d in (1e-4, -1e-4)
         )
         assert score[i] == pytest.approx((up - down) / 2e-4, rel=2e-3, abs=0.05)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import OWN, Column, Model, Point, Swept
-from crazyem.diagnosis.fitting.noise import ROWS, Informed, first_guess, fit_noise
+from crazyem.diagnosis.fitting.noise import ROWS, Informed, coloured, first_guess, fit_noise, without_slight
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.workers import Workers
 from crazyem.errors import DataError
@@ -162,7 +162,7 @@ class Data:
             wild[1:] |= wild[:-1].copy()
             if wild.any():
                 count += int(wild.sum())
-                flight = model.flight.started(model.flight.starts | wild)
+                flight = replace(model.flight, starts=model.flight.starts | wild)
                 self.models[i] = Model(flight)
         return count
 
@@ -194,6 +194,8 @@ def nominal(data: Data, point: Point) -> Point:
     """The nominal model with noise scales fitted, torques with memory if the flights ask for them."""
     data.settle(point)
     fitted = data.fit_noise(point)
+    fitted = data.fit_noise(replace(fitted, noise=coloured(fitted.noise, data.flights)), near=True)
+    fitted = replace(fitted, noise=without_slight(fitted.noise, data.flights))
     if data.leave_out_wild(fitted):
         data.settle(fitted)
         fitted = data.fit_noise(fitted)

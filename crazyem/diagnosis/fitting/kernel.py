@@ -1,7 +1,8 @@
 """The innovations of a flight under given accelerations, and what they say about any number of parameters at once.
 
 An extended Kalman filter on position, velocity, attitude, body rate and, where wanted, two disturbances with memory
-(specific force and angular acceleration, body axes, Ornstein-Uhlenbeck). Specific force and angular acceleration of
+(specific force and angular acceleration, body axes) and errors of measurements with memory (Bryson and Henrikson 1968),
+all Ornstein-Uhlenbeck. Specific force and angular acceleration of
 each step are inputs, computed beforehand by `physics.motion` at the filter's own states: the kernel knows no parameter.
 It carries along the derivative of the state with respect to every column (a change of the accelerations, or of what
 the sensors show): the recursion of the innovations' sensitivities, with which the score and the information of all
@@ -15,10 +16,12 @@ from crazyem.compiled import compiled
 from crazyem.estimation.kernels.algebra import half_turn, log, matrix, product, right_jacobian
 from crazyem.vehicle import GRAVITY
 
-# Of the filter: position, velocity, attitude, body rate; then, where wanted, disturbing angular acceleration, and then
-# disturbing specific force. Torques with memory alone are what most flights need, so they come first.
-STATES = 18
+# Of the filter: position, velocity, attitude, body rate; then, where wanted, disturbing angular acceleration, then
+# disturbing specific force, then errors of measurements with memory. Torques with memory alone are what most flights
+# need, so they come first.
+STATES = 30
 MEASURED = 12
+DISTURBED = 6  # disturbances; they and the errors are the states with memory
 # Inner loops run over rows of a multiple of 4, of 16 at least: what a vector does not fill is done number by number,
 # and takes three times as long.
 LANES, LEAST = 4, 16
@@ -27,8 +30,9 @@ PRODUCT, MOST_ROWS = 200_000, 600
 
 
 @compiled
-def _transition(dt, decay, turned, rate_turn, middle, specific, jr, x, out):
-    """out = Phi x for x (12, 15 or 18, m): error states of one step by the midpoint rule; decay (6,) of the last six.
+def _transition(dt, pushed, decay, turned, rate_turn, middle, specific, jr, x, out):
+    """out = Phi x for x (size, m): error states of one step by the midpoint rule; `pushed`: 12, and how many of the
+    states after these are disturbances; decay: of all after the first 12.
 
     turned (3, 3): -dt middle skew(specific) of the attitude at the start; rate_turn (3, 3): its turn, transposed.
     """
@@ -38,9 +42,9 @@ def _transition(dt, decay, turned, rate_turn, middle, specific, jr, x, out):
     for j in range(x.shape[1]):
         t0, t1, t2 = x[6, j], x[7, j], x[8, j]
         w0, w1, w2 = x[9, j], x[10, j], x[11, j]
-        if size > 12:
+        if pushed > 12:
             a0, a1, a2 = x[12, j], x[13, j], x[14, j]
-        if size > 15:
+        if pushed > 15:
             f0, f1, f2 = x[15, j], x[16, j], x[17, j]
         # attitude in the middle of the step, by the half turn
         for i in range(3):
@@ -72,6 +76,36 @@ def _transition(dt, decay, turned, rate_turn, middle, specific, jr, x, out):
 
 
 @compiled
+def layout(disturbance):
+    """Which disturbance or error (0 to 17) each state after the first 12 is, in the filter's order, and which state is
+    the error of each measured scalar (12,); 0: it has none."""
+    which, own = np.zeros(18, np.int64), np.zeros(MEASURED, np.int64)
+    count = 0
+    force, torque = False, False
+    for i in range(3):
+        force = force or disturbance[i] > 0.0
+        torque = torque or disturbance[3 + i] > 0.0
+    if force or torque:
+        for i in range(3):
+            which[count + i] = 3 + i
+        count += 3
+    if force:
+        for i in range(3):
+            which[count + i] = i
+        count += 3
+    for first in range(0, MEASURED, 3):
+        shown = False
+        for i in range(first, first + 3):
+            shown = shown or disturbance[DISTURBED + i] > 0.0
+        if shown:
+            for i in range(first, first + 3):
+                which[count] = DISTURBED + i
+                own[i] = 12 + count
+                count += 1
+    return which[:count], own
+
+
+@compiled
 def _take_away(x, scale, left, right):
     """x (n, m) -= scale left right'; left (n or more,), right (m,)."""
     for i in range(x.shape[0]):
@@ -98,7 +132,7 @@ def _add_products(shown, total):
 
 @compiled
 def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, disturbance, memory, p0, block,
-          xp, xf, e, s, loglik, score, information, gains, steps):  # fmt: skip
+          xp, xf, e, s, loglik, score, information, gains, steps, known):  # fmt: skip
     """One pass; returns the log-likelihood.
 
     Args:
@@ -111,27 +145,28 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
         showing: (n, 12, d) derivative of the offset by the other d columns.
         q: (6,) variances per second of specific-force and angular-acceleration impulses, body.
         r: (12,) variances of the measurements.
-        disturbance: (6,) stationary variances of the disturbances with memory; 0 leaves them out.
-        memory: (6,) s, their correlation times.
+        disturbance: (18,) stationary variances of what has a memory: specific force and angular acceleration (6),
+            errors of what is measured (12); 0 leaves them out.
+        memory: (18,) s, their correlation times.
         p0: (12,) variances at a start of what is not measured there.
         block: (n,) int, to which block of `score` and `information` a row adds.
-        xp, xf: (n, 19) receive predicted and filtered state (13) and disturbances (6).
+        xp, xf: (n, 31) receive predicted and filtered state (13), disturbances (6) and errors with memory (12).
         e, s: (n, 12) receive innovations and their variances, sequential scalars; s is 0 where nothing was measured.
         loglik: (n,) receives log-likelihoods.
         score: (b, c + d) sums of derivative times innovation over variance are added here, by block.
         information: (b, c + d, c + d) likewise, products of derivatives over variance.
         gains, steps: (n, 12, size), (n, size + 6, size) receive the gain of each scalar, the transition of each step
             and below that `middle` and `jr` in the first three columns, for `noise_score`; with 0 rows they do not.
+        known: (n, size - 12, size) receives the covariances of the states with memory, likewise.
     """
     n = len(time)
     c, d = acting.shape[2], showing.shape[2]
     m = c + d
-    size = 12
-    for i in range(6):
-        if disturbance[i] > 0.0:
-            size = max(size, 15 if i >= 3 else 18)
-    which = np.array([3, 4, 5, 0, 1, 2])  # of the disturbances, in the filter's order
-    decay = np.empty(6)
+    which, own = layout(disturbance)
+    size, pushed = 12 + len(which), 12
+    while pushed < size and which[pushed - 12] < DISTURBED:
+        pushed += 1
+    decay = np.empty(size - 12)
     wide, broad = _padded(size), _padded(m)
     rows = max(MEASURED, min(MOST_ROWS, PRODUCT // (broad * broad)))
     cov = np.zeros((size, wide))
@@ -162,7 +197,7 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
         if starts[k] or k == 0:
             for i in range(13):
                 x[i] = 0.0 if np.isnan(y[k, i]) else y[k, i]
-            for i in range(13, 19):
+            for i in range(13, 31):
                 x[i] = 0.0
             if np.isnan(y[k, 6]):
                 x[6], x[7], x[8], x[9] = 0.0, 0.0, 0.0, 1.0
@@ -176,18 +211,24 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
             for i in range(12):
                 column = i if i < 6 else i + 1
                 if i >= 6 and i < 9:
-                    known = not np.isnan(y[k, 6])
+                    measured = not np.isnan(y[k, 6])
                 else:
-                    known = not np.isnan(y[k, column])
-                    if known:
+                    measured = not np.isnan(y[k, column])
+                    if measured:
                         x[column] -= offset[k, i]
-                cov[i, i] = r[i] if known else p0[i]
-                if known:
+                cov[i, i] = r[i] if measured else p0[i]
+                if measured and own[i]:  # the state is what was measured, less an error that goes on
+                    cov[i, i] += disturbance[DISTURBED + i]
+                    cov[i, own[i]] = -disturbance[DISTURBED + i]
+                    cov[own[i], i] = -disturbance[DISTURBED + i]
+                if measured:
                     for j in range(d):
                         sens[i, c + j] = -showing[k, i, j]
             for i in range(size - 12):
                 cov[12 + i, 12 + i] = disturbance[which[i]]
-            for i in range(19):
+            if len(known):
+                known[k] = cov[12:, :size]
+            for i in range(31):
                 xf[k, i] = x[i]
             for i in range(12):
                 e[k, i] = 0.0
@@ -196,7 +237,7 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
             continue
         dt = time[k] - time[k - 1]
         h = 0.5 * dt
-        for i in range(6):
+        for i in range(size - 12):
             decay[i] = np.exp(-dt / memory[which[i]])
         w = xf[k - 1, 10:13]
         half_turn(w, h, quat)
@@ -217,7 +258,9 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
             phi[i] = h * (w[i] + x[10 + i])
         half_turn(phi, 1.0, quat)
         product(xf[k - 1, 6:10], quat, x[6:10])
-        for i in range(6):
+        for i in range(13, 31):
+            x[i] = 0.0
+        for i in range(size - 12):
             x[13 + which[i]] = decay[i] * xf[k - 1, 13 + which[i]]
         # how velocity turns with attitude (at the start) and with body rate (through the middle)
         for i in range(3):
@@ -233,13 +276,13 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
             for j in range(3):
                 rate_turn[i, j] = turn[j, i]
         right_jacobian(phi, jr)
-        _transition(dt, decay, turned, rate_turn, middle, by_rate, jr, cov, tmp)
+        _transition(dt, pushed, decay, turned, rate_turn, middle, by_rate, jr, cov, tmp)
         for i in range(size):
             for j in range(size):
                 tra[i, j] = tmp[j, i]
-        _transition(dt, decay, turned, rate_turn, middle, by_rate, jr, tra, cov)
+        _transition(dt, pushed, decay, turned, rate_turn, middle, by_rate, jr, tra, cov)
         if len(steps):
-            _transition(dt, decay, turned, rate_turn, middle, by_rate, jr, unit, steps[k])
+            _transition(dt, pushed, decay, turned, rate_turn, middle, by_rate, jr, unit, steps[k])
             for i in range(3):
                 for j in range(3):
                     steps[k, size + i, j] = middle[i, j]
@@ -266,7 +309,7 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
         for i in range(size - 12):
             cov[12 + i, 12 + i] += (1.0 - decay[i] * decay[i]) * disturbance[which[i]]
         if m:
-            _transition(dt, decay, turned, rate_turn, middle, by_rate, jr, sens, new)
+            _transition(dt, pushed, decay, turned, rate_turn, middle, by_rate, jr, sens, new)
             for j in range(c):
                 f0, f1, f2 = acting[k, 0, j], acting[k, 1, j], acting[k, 2, j]
                 a0, a1, a2 = acting[k, 3, j], acting[k, 4, j], acting[k, 5, j]
@@ -281,16 +324,16 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
             sens[:] = new
         # measurements, one scalar after the other
         for i in range(6):
-            innov[i] = y[k, i] - x[i] - offset[k, i]
+            innov[i] = y[k, i] - x[i] - offset[k, i] - x[19 + i]
             innov[6 + i] = np.nan
         if not np.isnan(y[k, 6]):
             quat[0], quat[1], quat[2], quat[3] = -x[6], -x[7], -x[8], x[9]
             product(quat, y[k, 6:10], quat)
             log(quat, innov[6:9])
             for i in range(3):
-                innov[6 + i] -= offset[k, 6 + i]
+                innov[6 + i] -= offset[k, 6 + i] + x[25 + i]
         for i in range(3):
-            innov[9 + i] = y[k, 10 + i] - x[10 + i] - offset[k, 9 + i]
+            innov[9 + i] = y[k, 10 + i] - x[10 + i] - offset[k, 9 + i] - x[28 + i]
         correction[:] = 0.0
         ll = 0.0
         bl = block[k]
@@ -303,13 +346,19 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
                 s[k, i] = 0.0
                 e[k, i] = 0.0
                 continue
-            var = cov[i, i] + r[i]
-            err = innov[i] - correction[i]
+            o = own[i]
+            for j in range(wide):
+                gain[j] = cov[i, j]
+            if o:
+                for j in range(wide):
+                    gain[j] += cov[o, j]
+            var = gain[i] + gain[o] + r[i] if o else gain[i] + r[i]
+            err = innov[i] - correction[i] - correction[o] if o else innov[i] - correction[i]
             inv = 1.0 / var
             s[k, i] = var
             e[k, i] = err
             for j in range(wide):
-                gain[j] = cov[i, j] * inv
+                gain[j] *= inv
             for j in range(size):
                 correction[j] += gain[j] * err
                 if len(gains):
@@ -318,6 +367,9 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
             if m:
                 for j in range(broad):
                     z[j] = sens[i, j]
+                if o:
+                    for j in range(broad):
+                        z[j] += sens[o, j]
                 for j in range(d):
                     z[c + j] += showing[k, i, j]
                 _take_away(sens, 1.0, gain, z)
@@ -332,6 +384,7 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
         total += ll
         for i in range(6):
             xf[k, i] = x[i] + correction[i]
+        for i in range(size - 12):
             xf[k, 13 + which[i]] = x[13 + which[i]] + correction[12 + i]
         for i in range(3):
             xf[k, 10 + i] = x[10 + i] + correction[9 + i]
@@ -342,6 +395,8 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
                 v = 0.5 * (cov[i, j] + cov[j, i])
                 cov[i, j] = v
                 cov[j, i] = v
+        if len(known):
+            known[k] = cov[12:, :size]
     if seen:
         _add_products(shown[:seen], information[filled])
     return total

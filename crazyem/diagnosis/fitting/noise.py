@@ -6,7 +6,8 @@ made once, and what steps tell of the curvature is added to it (BFGS; Nocedal an
 ch. 6).
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,26 +21,64 @@ STRETCH = 750  # rows each: short ones begin too often at what was measured, and
 FEW, SHORT = 900, 150  # the same for the way there
 PRIOR_SD = 2.0  # of the logarithm of a scale about its typical value
 MOST_STEPS = 40
+FIRST = (0, 3, 6, 10)  # columns of `Flight.y` at which position, velocity, attitude and body rate begin
 STEP = 0.02  # in the logarithm, for differences
 LARGEST = 1.5  # step of scoring in the logarithm
-TYPICAL = Noise(np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), np.array([1e-3, 1e-2, 3e-3, 1e-2]))
-FLOOR = np.log(np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2, 1e-5, 1e-4, 1e-4, 1e-4, *[1e-4] * 3, *[1e-3] * 3]))
+# s: correlation times of errors. Fixes draw an onboard estimate back within some 0.04 s; markers and calibrations of
+# motion capture stay wrong for longer; a gyro is low-passed at 80 Hz.
+RECALL, RECALL_SD = np.array([0.06, 0.06, 0.06, 2.5e-3]), np.array([1.0, 1.0, 1.0, 0.3])  # sd: of the logarithm
+SHORT_MEMORY = 3.0  # correlation times between two samples, from which an error is white
+SLIGHT = 0.6  # share of the white error's root density below which that of one with a memory is left out
+TYPICAL = Noise(
+    np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), np.array([1e-3, 1e-2, 3e-3, 1e-2]),
+    np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), coloured=np.array([1e-3, 1e-2, 3e-3, 1e-2]), recall=RECALL,
+)  # fmt: skip
+LEAST = Noise(
+    np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2]), np.array([1e-5, 1e-4, 1e-4, 1e-4]),
+    np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3]), coloured=np.array([1e-5, 1e-4, 1e-4, 1e-4]), recall=0.2 * RECALL,
+)  # fmt: skip
+WIDTH = np.append(np.full(20, PRIOR_SD), RECALL_SD)  # standard deviations of the logarithms about typical ones
 # rad: no attitude made from an acceleration is better; in quiet flights 4 to 5 mrad. Believed to 0.5 mrad, every tremor
 # of the acceleration is a torque, and a steady one (a weak rotor) is lost among these.
 LEANING_FLOOR = 3e-3
-TYPICAL_DISTURBANCE = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
 
 
 def logs_of(noise: Noise) -> NDArray:
-    """(16,) logarithms: impulses, measurements, disturbances (of 0: -inf)."""
+    """(24,) logarithms: impulses, measurements, disturbances, coloured errors (of 0: -inf), their correlation times."""
     with np.errstate(divide="ignore"):
-        return np.log(np.concatenate([noise.impulse, noise.measurement, noise.disturbance]))
+        scales = [noise.impulse, noise.measurement, noise.disturbance, noise.coloured, noise.recall]
+        return np.log(np.concatenate(scales))
 
 
 def noise_of(logs: NDArray, memory: float | NDArray) -> Noise:
     """Inverse of `logs_of`."""
     scales = np.exp(logs)
-    return Noise(scales[:6], scales[6:10], scales[10:], memory)
+    return Noise(scales[:6], scales[6:10], scales[10:16], memory, scales[16:20], scales[20:])
+
+
+def coloured(noise: Noise, flights: Sequence[Flight]) -> Noise:
+    """The noise with as much coloured as white error of what the flights measure often enough for that to show.
+
+    Not of position and velocity together: they come from a filter whose errors in the two belong together and to the
+    motion, and what are errors of their own looks like a velocity of another scale.
+    """
+    periods = np.array([_period(flights, c) for c in FIRST])
+    lasting = periods < SHORT_MEMORY * RECALL
+    lasting[:2] &= not np.isfinite(periods[:2]).all()
+    return replace(noise, coloured=np.where(lasting, noise.measurement, 0.0), recall=RECALL.copy())
+
+
+def without_slight(noise: Noise, flights: Sequence[Flight]) -> Noise:
+    """The noise without coloured errors that are as good as none at any frequency: each makes every pass longer."""
+    periods = np.array([_period(flights, c) for c in FIRST])
+    density = noise.coloured * np.sqrt(1.0 + 2.0 * noise.recall / periods)
+    return replace(noise, coloured=np.where(density < SLIGHT * noise.measurement, 0.0, noise.coloured))
+
+
+def _period(flights: Sequence[Flight], column: int) -> float:
+    """s between two measurements, the shortest of the flights'; infinite where there are none."""
+    times = [f.time[np.isfinite(f.y[:, column])] for f in flights]
+    return min((float(np.median(np.diff(t))) for t in times if t.size > 1), default=np.inf)
 
 
 def sample_rows(flight: Flight, *, rows: int = ROWS, stretch: int = STRETCH) -> NDArray:
@@ -101,23 +140,24 @@ def _scored(
 ) -> Noise:
     measured = np.zeros(4, bool)
     for flight, _, _ in chosen:
-        measured |= np.array([np.isfinite(flight.y[:, c]).any() for c in (0, 3, 6, 10)])
-    free = np.concatenate([np.ones(6, bool), measured, start.disturbance > 0])
+        measured |= np.array([np.isfinite(flight.y[:, c]).any() for c in FIRST])
+    lasting = measured & (start.coloured > 0)
+    free = np.concatenate([np.ones(6, bool), measured, start.disturbance > 0, lasting, lasting])
     free[10 + np.array(held, int)] = False
-    logs, memory, floor = logs_of(start), start.memory, FLOOR.copy()
+    logs, memory, floor = logs_of(start), start.memory, logs_of(LEAST)
     if any("attitude" not in f.signals and np.isfinite(f.y[:, 6]).any() for f, _, _ in chosen):
         floor[8] = np.log(LEANING_FLOOR)
     logs = np.maximum(logs, np.where(free, floor, -np.inf))
-    typical = logs_of(Noise(TYPICAL.impulse, TYPICAL.measurement, TYPICAL_DISTURBANCE))
-    index = np.flatnonzero(free)
+    typical, index = logs_of(TYPICAL), np.flatnonzero(free)
+    weight = WIDTH[index] ** -2.0
     key = (*(f.time.size for f, _, _ in chosen), *index.tolist(), *np.atleast_1d(memory).tolist())
 
     def look(at: NDArray) -> tuple[float, NDArray, list[Swept]]:
         """Log posterior density, its score and the passes of the flights."""
         found = workers.map(lambda part: scored_sweep(*part, noise_of(at, memory)), chosen)
         away = (at - typical)[index]
-        value = sum(swept.loglik for swept, _ in found) - 0.5 * float(away @ away) / PRIOR_SD**2
-        slope = np.sum([score[index] for _, score in found], axis=0) - away / PRIOR_SD**2
+        value = sum(swept.loglik for swept, _ in found) - 0.5 * float(weight @ np.square(away))
+        slope = np.sum([score[index] for _, score in found], axis=0) - weight * away
         return value, slope, [swept for swept, _ in found]
 
     value, score, swept = look(logs)
@@ -125,7 +165,7 @@ def _scored(
         fresh = key not in informed.known
         if fresh:
             information = _information(chosen, swept, logs, memory, index, workers)
-            informed.known[key] = information + np.eye(index.size) / PRIOR_SD**2
+            informed.known[key] = information + np.diag(weight)
         curvature = informed.known[key]
         step = np.clip(np.linalg.solve(curvature, score), -LARGEST, LARGEST)
         for _ in range(5):

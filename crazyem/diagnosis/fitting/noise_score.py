@@ -9,19 +9,24 @@ Biometrika 79, 1992). It costs what two passes of the filter cost, for any numbe
 import numpy as np
 
 from crazyem.compiled import compiled
+from crazyem.diagnosis.fitting.kernel import DISTURBED, layout
 
 
 @compiled
-def noise_score(time, starts, measured, disturbance, memory, e, s, gains, steps, out):
-    """Adds the derivatives of the log-likelihood by q (6,), r (12,), disturbance (6,) of `kernel.sweep` to out (24,).
+def noise_score(time, starts, measured, disturbance, memory, xf, e, s, gains, steps, known, out):
+    """Adds the derivatives of the log-likelihood by q (6,), r (12,), disturbance (18,) and the logarithms of memory
+    (18,) of `kernel.sweep` to out (54,).
 
-    measured: (n, 12) bool, what was measured at each row; e, s, gains, steps: as `sweep` gives them.
+    A memory m is in the transition phi = exp(-dt/m) of its own state and in the noise (1 - phi^2) of the step. The
+    derivative by phi is r x' - N Phi P, x and P of the state before the step given all and given its past.
+
+    measured: (n, 12) bool, what was measured at each row; xf, e, s, gains, steps, known: as `sweep` gives them.
     """
+    which, own = layout(disturbance)
     size = gains.shape[2]
     r = np.zeros(size)
     total = np.zeros((size, size))  # N
     product = np.zeros(size)
-    which = np.array([3, 4, 5, 0, 1, 2])
     for k in range(len(time) - 1, -1, -1):
         for i in range(11, -1, -1):
             if not s[k, i] > 0.0:
@@ -37,17 +42,34 @@ def noise_score(time, starts, measured, disturbance, memory, e, s, gains, steps,
             for j in range(size):
                 d += gain[j] * product[j]
             out[6 + i] += 0.5 * (u * u - d)
+            o = own[i]
             r[i] += u
             for j in range(size):
                 total[i, j] -= product[j]
                 total[j, i] -= product[j]
             total[i, i] += d
+            if o:  # the error is measured with the state
+                r[o] += u
+                for j in range(size):
+                    total[o, j] -= product[j]
+                    total[j, o] -= product[j]
+                total[o, o] += d
+                total[i, o] += d
+                total[o, i] += d
         if starts[k] or k == 0:
             for i in range(12):
                 if measured[k, i]:
                     out[6 + i] += 0.5 * (r[i] * r[i] - total[i, i])
             for i in range(size - 12):
-                out[18 + which[i]] += 0.5 * (r[12 + i] * r[12 + i] - total[12 + i, 12 + i])
+                a = which[i] - DISTURBED
+                if a < 0:
+                    out[18 + which[i]] += 0.5 * (r[12 + i] * r[12 + i] - total[12 + i, 12 + i])
+                elif measured[k, a]:
+                    both = r[12 + i] - r[a]
+                    seen = total[12 + i, 12 + i] + total[a, a] - 2.0 * total[a, 12 + i]
+                    out[18 + which[i]] += 0.5 * (both * both - seen)
+                else:
+                    out[18 + which[i]] += 0.5 * (r[12 + i] * r[12 + i] - total[12 + i, 12 + i])
             r[:] = 0.0
             total[:] = 0.0
             continue
@@ -73,5 +95,16 @@ def noise_score(time, starts, measured, disturbance, memory, e, s, gains, steps,
             decay = np.exp(-dt / memory[which[i]])
             out[18 + which[i]] += 0.5 * (1.0 - decay * decay) * (r[12 + i] * r[12 + i] - total[12 + i, 12 + i])
         phi = steps[k, :size]
-        r[:] = np.dot(phi.T, r)
-        total[:] = np.dot(phi.T, np.dot(total, phi))
+        back, turned = np.dot(phi.T, r), np.dot(total, phi)
+        for i in range(size - 12):
+            a = 12 + i
+            decay = np.exp(-dt / memory[which[i]])
+            before, spread = xf[k - 1, 13 + which[i]], 0.0  # of the state before the step, given all; of N Phi P
+            for j in range(size):
+                before += known[k - 1, i, j] * back[j]
+                spread += turned[a, j] * known[k - 1, i, j]
+            by_phi = r[a] * before - spread
+            by_phi -= decay * disturbance[which[i]] * (r[a] * r[a] - total[a, a])
+            out[36 + which[i]] += by_phi * decay * dt / memory[which[i]]
+        r[:] = back
+        total[:] = np.dot(phi.T, turned)

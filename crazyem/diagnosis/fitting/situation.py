@@ -47,7 +47,7 @@ def situation_of(flight: Flight, path: NDArray, vehicle: Vehicle, thrusts: tuple
         height=np.maximum(path[:, 2] - flight.ground, 0.0), velocity=path[:, 3:6],
         rotation=rotation_matrix(path[:, 6:10]), body_rate=path[:, 10:13], specific_force=np.zeros((n, 3)),
         angular_acceleration=np.zeros((n, 3)), thrust=thrust, thrust_rate=rate, voltage=flight.voltage,
-        rotor_constant=_rotor_constant(vehicle), air=np.zeros((n, 3)), fused=flight.attitude is not None,
+        rotor_constant=_rotor_constant(vehicle), air=np.zeros((n, 3)), fused=flight.fused,
     )  # fmt: skip
 
 

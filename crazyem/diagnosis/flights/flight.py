@@ -24,10 +24,6 @@ BLOCK, SHORT, BLOCKS = 1.0, 0.5, 40
 NEAR = 0.03  # s between samples of the accelerometer, at most, for a value between them
 SHORTEST = 4.0  # s of flight below which nothing is said
 PIECE = 60.0  # s after which the filter starts anew, so that long flights are swept in pieces
-# s between attitudes that are used where an onboard filter made them. It integrates the gyro and is drawn back by fixes
-# over 0.04 s, so its error hangs together that long. Taken for white at 100 Hz it is drone that turns: gyros then look
-# four to ten times as noisy as by one attitude in 80 ms, and torques of drones with nothing hidden 6 % too strong.
-APART = 0.08
 COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 COMMANDS = ("motor_command", "motor_request", "mixer_command")
 YAW = "stateEstimate.yaw"  # deg, right-handed
@@ -75,8 +71,7 @@ class Flight:
         block: (n,) int: consecutive stretches of about a second, of half a second in short flights.
         inputs: what the rotors were told.
         signals: names of what is measured.
-        attitude: (n, 4) all that was logged, where an onboard filter made it, of which `y` has one in `APART` seconds
-            and those at starts; None: `y` has all.
+        fused: a filter on board made the attitude.
         levelled: the voltage is not recorded, and the thrust of its beginning is the weight by assumption.
         coarse: what turned the drone is not in the commands as recorded (see `always.FAR_OUT`).
         differs: there are several recordings, and each may have a thrust of its own (see `model.OWN`).
@@ -97,7 +92,7 @@ class Flight:
     block: NDArray
     inputs: RotorInput
     signals: frozenset[str]
-    attitude: NDArray | None = None
+    fused: bool = False
     grounded: bool = True
     levelled: bool = False
     coarse: bool = False
@@ -121,25 +116,10 @@ class Flight:
         index = np.flatnonzero(keep)
         broken = np.concatenate([[True], np.diff(index) > 1])
         block = np.unique(self.block[index], return_inverse=True)[1]
-        some = replace(
+        return replace(
             self, time=self.time[index], starts=self.starts[index] | broken, gaps=self.gaps[index] | broken,
             y=self.y[index], force=self.force[index], voltage=self.voltage[index], flown=self.flown[index], block=block,
-            attitude=None if self.attitude is None else self.attitude[index],
         )  # fmt: skip
-        return some.started(some.starts)
-
-    def started(self, starts: NDArray) -> "Flight":
-        """The flight with the filter begun anew at `starts` (n,) bool, and attitudes apart from there on."""
-        if self.attitude is None:
-            return replace(self, starts=starts)
-        begun = self.time[np.maximum.accumulate(np.where(starts, np.arange(starts.size), 0))]
-        count = np.floor((self.time - begun) / APART + 1e-6) + 1e6 * np.cumsum(starts)
-        logged = np.flatnonzero(np.isfinite(self.attitude[:, 0]))  # blocks of a log have stamps of their own
-        used = logged[np.diff(count[logged], prepend=-1.0) != 0]
-        y = self.y.copy()
-        y[:, 6:10] = np.nan
-        y[used, 6:10] = self.attitude[used]
-        return replace(self, starts=starts, y=y)
 
 
 def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str] = ()) -> Flight:
@@ -190,10 +170,9 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
         flown=time - air.flown[0][0], ground=ground, block=_blocks(time), inputs=inputs,
         signals=frozenset(n for n in (*measured, "specific_force", "voltage", "rotor_speed", *COMMANDS)
                           if n in recording.signals or (n == "body_rate" and n in measured)),
-        attitude=y[:, 6:10].copy() if onboard_attitude(recording) else None, grounded=bool(np.isfinite(air.ground)),
+        fused=onboard_attitude(recording), grounded=bool(np.isfinite(air.ground)),
         levelled=found.level is not None, alignment=found.alignment, notices=found.notices,
     )  # fmt: skip
-    flight = flight.started(flight.starts)
     if flight.duration < SHORTEST:
         raise DataError(
             f"{recording.path}: {flight.duration:.1f} of {air.seconds:.1f} s in the air have samples no more than "

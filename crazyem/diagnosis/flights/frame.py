@@ -49,7 +49,7 @@ def alike(flights: Sequence[Flight], kept_apart: Sequence[Flight]) -> tuple[list
 
 def tilt_of(flight: Flight) -> tuple[NDArray, NDArray] | None:
     """Roll and pitch (2,) rad of the pose frame in the body, and their standard deviations; None if not told."""
-    if flight.attitude is not None or not {"position", "attitude"} <= flight.signals:
+    if flight.fused or not {"position", "attitude"} <= flight.signals:
         return None
     rows = [_across(flight, part) for part in _stretches(flight)]
     rows = [r for r in rows if r.size]

@@ -87,12 +87,11 @@ def _told(every: _Turns, other: _Turns | None, data: Data) -> Finding | None:
 
 def _turns(flight: Flight) -> _Turns | None:
     """Turns over windows of a flight; None where too few are whole."""
-    y = flight.y if flight.attitude is None else np.hstack([flight.y[:, :6], flight.attitude, flight.y[:, 10:]])
-    known = np.isfinite(y[:, [0, 6, 10]]).all(axis=1)
+    known = np.isfinite(flight.y[:, [0, 6, 10]]).all(axis=1)
     rows = np.flatnonzero(known)
     if rows.size < FEWEST:
         return None
-    time, y = flight.time[rows], y[rows]
+    time, y = flight.time[rows], flight.y[rows]
     torn = np.cumsum(flight.gaps)[rows]
     rate = np.einsum("nij,nj->ni", rotation_matrix(y[:, 6:10]), y[:, 10:13])  # world
     angle = np.zeros_like(rate)

@@ -93,7 +93,7 @@ def logged(flight: Flight, vehicle: Vehicle) -> Logged:
     seen = np.isfinite(flight.y[:, 3])
     speed = np.sqrt(np.mean(np.square(flight.y[seen, 3:6]), axis=0)) if seen.any() else np.ones(3)
     return Logged(
-        measured=flight.inputs.measured, onboard=flight.attitude is not None, voltage="voltage" in flight.signals,
+        measured=flight.inputs.measured, onboard=flight.fused, voltage="voltage" in flight.signals,
         filed=frozenset(vehicle.effects), speed=speed, period=float(np.median(np.diff(flight.inputs.time))),
     )  # fmt: skip
 
