@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.fitting.model import Noise, run_sweep, scored_sweep
 from crazyem.diagnosis.fitting.noise import (
     LEANING_FLOOR,
     coloured,
@@ -17,6 +16,7 @@ from crazyem.diagnosis.fitting.noise import (
     sample_rows,
     without_slight,
 )
+from crazyem.diagnosis.fitting.sweeps import Noise, run_sweep, scored_sweep
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.motion import RotorInput
 

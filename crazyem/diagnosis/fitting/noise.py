@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting.model import Noise, Swept, run_sweep, scored_sweep
+from crazyem.diagnosis.fitting.sweeps import Noise, Swept, run_sweep, scored_sweep
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.workers import Workers
 
