@@ -39,7 +39,7 @@ GYRO_SD = 2.8e-3
 VELOCITY_SD, JITTER = 2e-3, 3e-3  # relative: no onboard filter is better; m/s, see `jittery`
 # s: rates behind the attitude, velocities behind the position, by the filters of the firmware; in 80 flights with
 # nothing hidden 0.0 to 2.4 and 0.0 to 1.6 ms, most in quick ones.
-FILTER, FILTER_SD = (("rate_lag", 1.2e-3), ("velocity_lag", 0.6e-3), ("attitude_lag", 0.0)), 0.7e-3
+FILTER, FILTER_SD = (("rate_lag", 1.2e-3), ("velocity_lag", 0.6e-3)), 0.7e-3
 # Share of what is new in a logged command that acts for less than a sample (physics/effects/sampled_commands.py): some.
 SHARE_SD = 0.4
 # Relative: in ten flights with nothing hidden, with the lag free, torques look 2 +- 2 % too strong (-0.5 to +4 %); a
@@ -135,9 +135,7 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
             found.append((Candidate("motor_lag", (), ("time_constant",)), (LAG_SD**-2,)))
     if "velocity" in data.signals and "position" in data.signals:
         found.append((Candidate("velocity_scale", (), ("x", "y", "z")), tuple((VELOCITY_SD + jittery(data)) ** -2.0)))
-    shown = [
-        f for f, stream in zip(FILTER, ("body_rate", "velocity", "attitude"), strict=True) if stream in data.signals
-    ]
+    shown = [f for f, stream in zip(FILTER, ("body_rate", "velocity"), strict=True) if stream in data.signals]
     if shown and ("attitude" in data.signals or "position" in data.signals):
         found.append(
             (Candidate("onboard_filter", tuple(shown), tuple(n for n, _ in shown)), (FILTER_SD**-2,) * len(shown))
