@@ -106,6 +106,17 @@ def test_a_box_far_out_keeps_its_digits() -> None:
     assert 0.0 < covariance[0, 0] < 0.06**2
 
 
+def test_the_maximum_is_where_scores_and_priors_balance() -> None:
+    """Evidence is the same from any point of a parabola; scores at the maximum are those of the prior."""
+    flight, usual = made_pass(9, 3), np.array([[0.3, 0.2, 0.0]])
+    shared, phi = Shared([flight], usual), np.array([0.0, 0.0, 0.4])
+    (there,) = shared.there([flight], phi)
+    again = Shared([there], usual)
+    assert again.nothing == pytest.approx(shared.nothing)
+    assert again.score == pytest.approx(shared.score)
+    assert there.score.sum(0)[:2] == pytest.approx((there.here - phi)[:2] / usual[0, :2] ** 2)
+
+
 def test_scatter_of_blocks_is_one_where_the_model_holds() -> None:
     random, ratio, none = np.random.default_rng(7), [], np.zeros((1, 2))
     for _ in range(40):

@@ -55,12 +55,14 @@ def _felt(effect: Effect, study: Study, fit: Fit) -> Felt | None:
     for data in fit.data:
         sizes = effect.prior.usual_in(logged(data.flights[0], study.vehicle))
         usual.append([*(sizes.get(n, 0.0) for n in names), BIAS_SD, BIAS_SD, BIAS_SD, LAG_SD])
-    shared = Shared([p for p in passes if p], np.array(usual))
+    known = [p for p in passes if p is not None]
+    shared = Shared(known, np.array(usual))
     neutral = candidate.neutral(fit.points[0])
     low, high = (np.array([candidate.range_of(n)[k] - neutral[n] for n in names]) for k in (0, 1))
     prior = Gaussian(np.diag(np.square([effect.prior.own[n] for n in names])), low, high)
     posterior = shared.posterior(range(len(names)), prior)
-    scatter = float(np.mean(shared.scatter[: len(names)]))
+    phi = np.concatenate([posterior.mean, np.zeros(4)])
+    scatter = float(np.median(Shared(shared.there(known, phi), np.array(usual)).scatter[: len(names)]))
     found = replace(posterior, covariance=scatter * posterior.covariance)
     return Felt(candidate, posterior.gain / scatter + prior_odds(), found)
 

@@ -117,6 +117,16 @@ class Shared:
         sd = self.usual[flight][free]
         return free, np.linalg.inv(inner) * np.outer(sd, sd)
 
+    def there(self, flights: Sequence[Pass], phi: NDArray) -> list[Pass]:
+        """The flights at the maximum with phi (c,) given, where their scores scatter by noise alone."""
+        found = []
+        for flight, theta in zip(flights, self.parameters(phi), strict=True):
+            away = theta - flight.here
+            gain = float(flight.score.sum(0) @ away - 0.5 * away @ flight.information.sum(0) @ away)
+            score = flight.score - flight.information @ away
+            found.append(Pass(flight.loglik + gain, score, flight.information, theta))
+        return found
+
     def parameters(self, phi: NDArray) -> list[NDArray]:
         """(c,) by flight: parameters less neutral at the maximum, with phi (c,) given."""
         found = []
