@@ -10,7 +10,7 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.prior import Logged
 
 FILES = sorted(Path(package.__file__).parent.glob("*.py"))
-LONGEST = 1600  # lines of the package
+LONGEST = 1620  # lines of the package
 
 
 def texts(tree: ast.AST) -> list[str]:

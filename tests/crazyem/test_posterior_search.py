@@ -50,6 +50,7 @@ class Shared:
 
 class Look:
     shared = Shared()
+    passes = ()
 
     def __init__(self, members: Any) -> None:
         self.places = {m.candidate: (0,) for m in members}

@@ -95,7 +95,7 @@ class Shared:
             left = flight.score - flight.score[:, free] @ (d[:, None] * solved[:, :-1])
             rest.append(left)
         self.blocks = np.concatenate(rest)
-        self.scatter = _scatter(self.blocks, np.diag(self.information))
+        self.scatter = scatter_of(self.blocks, np.diag(self.information))
 
     def posterior(self, at: Sequence[int], prior: Gaussian) -> Posterior:
         """Of the columns `at` (k,), the others 0."""
@@ -137,7 +137,7 @@ class Shared:
         return found
 
 
-def _scatter(scores: NDArray, information: NDArray) -> NDArray:
+def scatter_of(scores: NDArray, information: NDArray) -> NDArray:
     """Variance of the sum of blocks' scores (b, c), neighbours alike, over the information (c,)."""
     r = scores - scores.mean(0)
     spread = np.sum(r * r, axis=0) + np.maximum(2.0 * np.sum(r[1:] * r[:-1], axis=0), 0.0)

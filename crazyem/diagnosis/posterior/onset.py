@@ -1,12 +1,12 @@
 """Effects that begin in mid-flight: one more variant for every block of the flight at which they may begin."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.posterior.evidence import Pass, Shared
+from crazyem.diagnosis.posterior.evidence import Pass, Shared, scatter_of
 from crazyem.diagnosis.posterior.members import Member, Slopes
 from crazyem.diagnosis.posterior.study import Fit, Look, Study
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -21,9 +21,18 @@ def onset_parameter(effect: str) -> str:
     return next((p.name for p in known.parameters if p.neutral is None and not p.chosen), "") if known else ""
 
 
-def begun_later(study: Study, fit: Fit, look: Look, member: Member) -> tuple[Member, float, NDArray] | None:
-    """The likeliest onset of an effect with one amplitude: the member, its log evidence over that of the fit, and its
-    change; None where nothing may begin, or where several recordings have clocks of their own."""
+@dataclass(frozen=True)
+class Later:
+    """A member that begins in mid-flight: log evidence over that of nothing, tempered by scatter; change (1,)."""
+
+    member: Member
+    gain: float
+    change: NDArray
+
+
+def begun_later(study: Study, fit: Fit, look: Look, member: Member) -> Later | None:
+    """The likeliest onset of an effect with one amplitude; None where nothing may begin, or where several recordings
+    have clocks of their own."""
     name = onset_parameter(member.effect)
     if not name or len(look.passes) != 1 or len(look.places[member.candidate]) != 1:
         return None
@@ -51,7 +60,10 @@ def begun_later(study: Study, fit: Fit, look: Look, member: Member) -> tuple[Mem
     begin = float(flight.time[np.flatnonzero(flight.block == onsets[k])[0]])
     dated = replace(member.candidate, fixed=(*member.candidate.fixed, (name, begin)))
     later = replace(member, candidate=dated, odds=member.odds - math.log(len(onsets)))
-    return later, found[k].gain, found[k].mean[-1:]
+    change, before = found[k].mean[-1:], study.posterior(look, fit.members).gain
+    rest = score[:, [n + k]] - information[:, n + k, n + k][:, None] * change
+    scatter = float(scatter_of(rest, information[:, n + k, n + k].sum(keepdims=True))[0])
+    return Later(later, before + (found[k].gain - before) / scatter, change)
 
 
 def dated(study: Study, fit: Fit, near: Slopes) -> Fit:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.fit import DivergedError
+from crazyem.diagnosis.posterior.evidence import scatter_of
 from crazyem.diagnosis.posterior.members import Member, Slopes
 from crazyem.diagnosis.posterior.onset import begun_later, dated
 from crazyem.diagnosis.posterior.settings import SETTINGS
@@ -96,31 +97,25 @@ class Search:
             if m.effect in fit.effects:
                 continue
             there = study.posterior(look, (*fit.members, m), nudged=(m,))
-            scatter = float(np.median(look.shared.scatter[list(look.places[m.candidate])]))
-            gain = (there.gain - base) / scatter + m.odds
-            loud[m.effect] = max(loud.get(m.effect, gain), gain, self._of(quiet, fit, m, bare))
+            gain = (there.gain - base) / _scatter(look, m, there.mean[size:]) + m.odds
+            still = study.posterior(quiet, (*fit.members, m), nudged=(m,))
+            loud[m.effect] = max(
+                loud.get(m.effect, gain), gain, (still.gain - bare) / _scatter(quiet, m, still.mean[size:]) + m.odds
+            )
             if m.effect not in found or gain > found[m.effect].gain:
                 # of an effect of many beginnings only the amplitude was looked at; the rest is where it begins
                 change = np.zeros(len(whole.candidate.free))
                 change[[whole.candidate.free.index(n) for n in m.candidate.free]] = there.mean[size:]
                 found[m.effect] = Neighbour(whole, m.effect, gain, change)
             later = begun_later(study, fit, look, m)
-            if later is not None:
-                gain = (later[1] - base) / scatter + later[0].odds
-                if gain > found[m.effect].gain:
-                    found[m.effect] = Neighbour(later[0], m.effect, gain, later[2])
+            if later is not None and later.gain - base + later.member.odds > found[m.effect].gain:
+                found[m.effect] = Neighbour(later.member, m.effect, later.gain - base + later.member.odds, later.change)
         for effect in study.pool.random:
             if effect.name not in fit.effects and fit.held:
                 found[effect.name] = Neighbour(None, effect.name, np.inf, np.zeros(0))
         most = [replace(n, most=max(n.gain, loud.get(n.effect, n.gain))) for n in found.values()]
         self._looked[fit.effects] = sorted(most, key=lambda n: -n.most)
         return self._looked[fit.effects]
-
-    def _of(self, look: Look, fit: Fit, member: Member, base: float) -> float:
-        """Log posterior odds of a member by another look, by how its scores scatter there."""
-        scatter = float(np.median(look.shared.scatter[list(look.places[member.candidate])]))
-        there = self.study.posterior(look, (*fit.members, member), nudged=(member,))
-        return (there.gain - base) / scatter + member.odds
 
     def _fitted(self, base: Fit, neighbour: Neighbour) -> Fit | None:
         """A neighbour, fitted; None where it leaves the range of numbers."""
@@ -159,6 +154,17 @@ class Search:
                 continue
             self._keep(fit)
             self.say(f"  {', '.join(sorted(fit.effects))}: {fit.value - base.value:+.1f} (linear {n.gain:+.1f})")
+
+
+def _scatter(look: Look, member: Member, change: NDArray) -> float:
+    """Variance of the blocks' scores of a member, taken after its change, over what the model says of it."""
+    at = list(look.places[member.candidate])
+    if not look.passes:
+        return 1.0
+    inner = [p.information[:, at][:, :, at] for p in look.passes]
+    rest = [p.score[:, at] - a @ change for p, a in zip(look.passes, inner, strict=True)]
+    size = np.sum([np.einsum("bii->i", a) for a in inner], axis=0)
+    return float(np.median(scatter_of(np.concatenate(rest), size)))
 
 
 def tempered(best: Fit, other: Fit) -> float:
