@@ -59,7 +59,6 @@ class Told:
     effects: tuple[Named, ...]
     groups: tuple[tuple[str, ...], ...]
     separate: tuple[str, ...]
-    unnamed: bool
 
 
 def told(study: Study, models: Sequence[Fit], felt: Sequence[Felt]) -> Told:
@@ -67,7 +66,6 @@ def told(study: Study, models: Sequence[Fit], felt: Sequence[Felt]) -> Told:
     best, beliefs = models[0], beliefs_of(models)
     found: list[tuple[float, Named]] = []
     groups: list[tuple[str, ...]] = []
-    unnamed = False
     for effect in best.effects:
         rivals = beliefs.instead(effect, best.effects)
         group = [r for r, p in sorted(rivals.items(), key=lambda r: -r[1]) if p > SETTINGS.rival]
@@ -75,10 +73,7 @@ def told(study: Study, models: Sequence[Fit], felt: Sequence[Felt]) -> Told:
         together = probability + sum(
             p for s, p in beliefs.models if effect not in s and any(r in s for r in group)
         )  # fmt: skip
-        if together < SETTINGS.told:
-            continue
-        if CATALOGUE[effect].prior.unnamed:
-            unnamed = True
+        if together < SETTINGS.told or CATALOGUE[effect].prior.unnamed:
             continue
         odds = _gain(effect, models)
         found.append((odds, named(study, best, effect, probability, odds)))
@@ -96,7 +91,7 @@ def told(study: Study, models: Sequence[Fit], felt: Sequence[Felt]) -> Told:
             found.append((one.odds, _entry(name, one.candidate.label, values, {}, probability, one.odds)))
     found.sort(key=lambda entry: -entry[0])
     separate = dict.fromkeys(CATALOGUE[n].separates for g in groups for n in g if CATALOGUE[n].separates)
-    return Told(tuple(n for _, n in found), tuple(groups), tuple(separate), unnamed)
+    return Told(tuple(n for _, n in found), tuple(groups), tuple(separate))
 
 
 def _gain(effect: str, models: Sequence[Fit]) -> float:

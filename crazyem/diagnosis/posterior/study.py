@@ -100,7 +100,6 @@ class Study:
             data.append(one)
             points.append(point)
         self.data, self.points = tuple(data), tuple(points)
-        self.passes = 0
 
     # noise
 
@@ -218,7 +217,6 @@ class Study:
                 )
             here = np.array([away(c, point, c.free[0]) for c in columns])
             passes.append(Pass(loglik, gram.score, gram.information, here))
-        self.passes += 1
         return Look(places, usual, Shared(passes, sd), sum(p.loglik for p in passes), tuple(passes))
 
     def slopes(
