@@ -108,7 +108,7 @@ class CheckedVehicle:
         lines += [f"  contradiction: {c}" for c in self.imported.contradictions]
         lines += [f"  disagreement: {d}" for d in self.disagreements]
         lines += [f"  {remark}" for remark in self.imported.remarks]
-        lines += [f"  {'off' if t.off else '   '} {t}" for t in self.told]
+        lines += [f"  {'off' if t.off else '   '} {t}" for t in self.told if t.known or t.value]
         if self.alternatives:
             lines.append(f"  {GAUGE}")
             for one in self.alternatives:
@@ -171,7 +171,9 @@ def check_vehicle(
     fitted = found.fitted_vehicle if mass is None else rescaled(found.fitted_vehicle, mass)
     told = told_of(
         source.imported, source.vehicle, fitted, found.document["effects"],
-        {n["name"]: n["reason"] for n in found.document["not_identifiable"]}, tolerance=tolerance,
+        {n["name"]: n["reason"] for n in found.document["not_identifiable"]},
+        looked_for={*(r["name"] for r in found.document["ranking"]), *(e["name"] for e in found.document["effects"])},
+        tolerance=tolerance,
     )  # fmt: skip
     corrected = convert(
         fitted, source.format, template=source.text, where=str(file), name=source.imported.name,

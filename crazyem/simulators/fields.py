@@ -256,6 +256,8 @@ def write(form: Format, constants: Constants, *, template: str | None = None, wh
             continue  # what is not said is nothing
         if now is None or abs(number - now) > SAME * max(abs(number), abs(now)):
             document.put(f.path, number)
+    if before is not None and math.isclose(before.or_("lag", -1.0), constants.or_("lag", -2.0), rel_tol=SAME):
+        constants = replace(constants, lag=None)  # as it stands there, whatever other numbers it depends on
     form.write_more(document, drone, constants)
     return str(document.text)
 

@@ -2,7 +2,7 @@
 and how far a file may be off before it no longer fits."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -86,6 +86,7 @@ def told_of(
     effects: Sequence[Mapping[str, Any]],
     not_identifiable: Mapping[str, str],
     *,
+    looked_for: Collection[str] | None = None,
     tolerance: float = TOLERANCE,
 ) -> list[Told]:
     """Every quantity of a file once, with what flights say.
@@ -94,6 +95,7 @@ def told_of(
         before: the vehicle of the file. fitted: with what was found.
         effects: of the diagnosis' document: name, and parameters with value and sd.
         not_identifiable: effect -> why flights say nothing of it.
+        looked_for: effects that were tried; None: all.
     """
     old, new = from_vehicle(before)[0], from_vehicle(fitted)[0]
     moved = _moved(fitted, effects)
@@ -106,7 +108,7 @@ def told_of(
         changed = abs(now - value) > 1e-9 * max(abs(now), abs(value)) or sd > 1e-9 * abs(now)
         shown, fits = f.written(value, None), f.written(now, None)
         if not changed:
-            reason = _reason(f.quantity, not_identifiable)
+            reason = _reason(f.quantity, not_identifiable, looked_for)
             found.append(Told(f.label, f.unit, f.quantity, shown, shown, math.nan, False, reason))
             continue
         spread = abs(f.factor) * sd
@@ -139,9 +141,11 @@ def _moved(fitted: Vehicle, effects: Sequence[Mapping[str, Any]]) -> list[Consta
     return found
 
 
-def _reason(quantity: str, not_identifiable: Mapping[str, str]) -> str:
+def _reason(quantity: str, not_identifiable: Mapping[str, str], looked_for: Collection[str] | None) -> str:
     names = ABOUT.get(quantity) or ABOUT.get(quantity.partition("_")[0], ())
-    return next((f"flights do not tell: {not_identifiable[n]}" for n in names if n in not_identifiable), "")
+    reason = next((f"flights do not tell: {not_identifiable[n]}" for n in names if n in not_identifiable), "")
+    unasked = looked_for is not None and not any(n in looked_for for n in names)
+    return reason or ("not looked for" if unasked else "")
 
 
 def rescaled(vehicle: Vehicle, mass: float) -> Vehicle:

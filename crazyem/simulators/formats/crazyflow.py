@@ -26,9 +26,9 @@ def _fields(document: Any, name: str) -> list[Field]:
         *(Field((name, "J", i, j), f"inertia_{''.join(sorted(_AXES[i] + _AXES[j]))}", "kg m^2") for i, j in matrix),
         Field((name, "L"), "arm", "m"),
         Field((name, "thrust_max"), "thrust_max", "N"),
-        Field((name, "rpm2thrust", 2), "thrust_per_speed2", "N/RPM^2", factor=PER_RPM2, own=True),
-        Field((name, "rpm2torque", 2), "torque_per_speed2", "N m/RPM^2", factor=PER_RPM2, own=True),
-        Field((name, "rotor_dyn_coef", 0), "lag", "1/s", own=True),
+        Field((name, "rpm2thrust, at hover"), "thrust_per_speed2", "N/RPM^2", factor=PER_RPM2, own=True),
+        Field((name, "rpm2torque, at hover"), "torque_per_speed2", "N m/RPM^2", factor=PER_RPM2, own=True),
+        Field((name, "rotor_dyn_coef, as one lag"), "lag", "s", own=True),
         *(Field((name, "drag_matrix", i, i), f"drag_{_AXES[i]}", "N s/m", factor=-1.0) for i in range(3)),
     ]
 

@@ -132,7 +132,7 @@ def _fields(document: XmlDocument, name: str) -> list[Field]:
             Field((*motor, "motorConstant", "#"), "thrust_per_speed2", "N/(rad/s)^2"),
             Field((*motor, "momentConstant", "#"), "torque_per_thrust", "m"),
             Field((*motor, "maxRotVelocity", "#"), "speed_max", "rad/s"),
-            Field((*motor, "timeConstantUp", "#"), "lag", "s", own=True),
+            Field((*motor, "timeConstantUp and Down, as one lag"), "lag", "s", own=True),
             Field((*motor, "rotorDragCoefficient", "#"), "rotor_drag_xy", "N/(m/s)/(rad/s)"),
         ]
     for k, plugin in enumerate(model.all("plugin")):

@@ -36,9 +36,9 @@ def _fields(document: LiteralDocument, name: str) -> list[Field]:
         *(Field((*root, "J", i, j), f"inertia_{''.join(sorted(_AXES[i] + _AXES[j]))}", "kg m^2") for i, j in matrix),
         *(Field((*root, "rotor_positions", 0, k), f"{what}_{_AXES[k]}", "m", own=True)
           for what, axes in (("arm", 2), ("centre", 3)) for k in range(axes)),
-        Field((*root, "rotor_thrust_coefficients", 0, 2), "thrust_max", "N", own=True),
+        Field((*root, "rotor_thrust_coefficients, at full command"), "thrust_max", "N", own=True),
         *(Field((*root, "rotor_torque_constants", k), "torque_per_thrust", "m") for k in range(4)),
-        Field((*root, _LAGS[0], 0), "lag", "s", own=True),
+        Field((*root, "rotor_time_constants, as one lag"), "lag", "s", own=True),
     ]  # fmt: skip
 
 
