@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from crazyem.api.flying import fly
     from crazyem.api.predicting import predict
     from crazyem.api.replaying import replay
+    from crazyem.api.vehicles import CheckedVehicle, check_vehicle, convert_vehicle, predict_ensemble, sample_vehicle
     from crazyem.diagnosis.prediction.predict import Prediction
     from crazyem.errors import CrazyemError
     from crazyem.estimation.online import OnlineEstimator
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     __version__: str
 
 _HOME = {
+    "CheckedVehicle": "api.vehicles",
     "CrazyemError": "errors",
     "Diagnosis": "api.diagnosing",
     "Estimate": "estimation.result",
@@ -42,16 +44,21 @@ _HOME = {
     "Sample": "signals.sample",
     "Vehicle": "vehicle",
     "attach": "live.attach",
+    "check_vehicle": "api.vehicles",
+    "convert_vehicle": "api.vehicles",
     "diagnose": "api.diagnosing",
     "fly": "api.flying",
     "load_policy": "live.policy",
     "load_vehicle": "vehicle",
     "open_recording": "recordings.registry",
     "predict": "api.predicting",
+    "predict_ensemble": "api.vehicles",
     "replay": "api.replaying",
+    "sample_vehicle": "api.vehicles",
 }
 
 __all__ = [
+    "CheckedVehicle",
     "CrazyemError",
     "Diagnosis",
     "Estimate",
@@ -66,13 +73,17 @@ __all__ = [
     "Vehicle",
     "__version__",
     "attach",
+    "check_vehicle",
+    "convert_vehicle",
     "diagnose",
     "fly",
     "load_policy",
     "load_vehicle",
     "open_recording",
     "predict",
+    "predict_ensemble",
     "replay",
+    "sample_vehicle",
 ]
 
 

@@ -186,11 +186,32 @@ def convert(
     named = "'{}'".format
     if problem := objection(constants, named) or impossible(constants, named):
         raise FileFormatError(f"vehicle {vehicle.name}: {problem}")
+    if template is None and (lacking := _lacking(form, constants, name)):
+        raise FileFormatError(
+            f"vehicle {vehicle.name}: no {lacking}, which {form.words} needs (or a template that has it)"
+        )
     text = write(form, constants, template=template, where=where, name=name)
     said_there = _held(form, text, where=where, name=name)
     lost = _lost(vehicle, constants, left, said_there, flight) if costs else []
     base = replace(vehicle, effects={}, motor_time_constant=0.0)  # who does not know of a lag has none
     return Converted(text, to, vehicle, to_vehicle(said_there, base), tuple(lost))
+
+
+# Key of a vehicle file -> quantity that it gives, and quantities of files that are nothing without it.
+NEEDED = {
+    "rotor_constant": ("thrust_per_speed2", ("thrust_per_speed2",)),
+    "arm": ("arm_x", ("arm", "arm_x", "arm_length")),
+    "torque_per_thrust": ("torque_per_thrust", ("torque_per_thrust", "torque_per_speed2", "torque_max")),
+    "thrust_max": ("thrust_max", ("thrust_max", "speed_max", "thrust_to_weight")),
+}
+
+
+def _lacking(form: Format, constants: Constants, name: str) -> str:
+    """A key that a vehicle does not have and a new file cannot be without; "" if there is none."""
+    document = form.open(form.skeleton(name or constants.name), "")
+    drones = form.names(document)
+    used = {f.quantity for f in form.fields(document, drones[0] if drones else "")}
+    return next((k for k, (q, uses) in NEEDED.items() if getattr(constants, q) is None and used & {*uses}), "")
 
 
 def _held(form: Format, text: str, *, where: str, name: str) -> Constants:

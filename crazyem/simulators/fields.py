@@ -248,8 +248,11 @@ def write(form: Format, constants: Constants, *, template: str | None = None, wh
     )
     before = _said_before(form, text, document.where, drone)
     for f in form.fields(document, drone):
-        value, now = value_of(constants, f.quantity), document.get(f.path)
-        if f.own or math.isnan(value) or (now is not None and _stays(f, now, value, before)):
+        value = value_of(constants, f.quantity)
+        if f.own or math.isnan(value):
+            continue
+        now = document.get(f.path)
+        if now is not None and _stays(f, now, value, before):
             continue
         number = f.written(value, now)
         if now is None and number == 0.0:

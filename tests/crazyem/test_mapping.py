@@ -264,7 +264,8 @@ def test_turning_there_and_back(tmp_path_factory, q, v):
 
 def test_shipped_mappings_load():
     names = {m.name for m in known_mappings()}
-    assert names == {"nanobench", "nanodrone_raw", "nanodrone_processed", "crazyflie_long"}
+    recorded = {"nanobench", "nanodrone_raw", "nanodrone_processed", "crazyflie_long"}
+    assert names == recorded | {"crazyflow", "gym_pybullet_drones"}
 
 
 @pytest.mark.parametrize(

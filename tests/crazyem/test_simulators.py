@@ -333,6 +333,14 @@ def test_which_drone_is_asked() -> None:
         read(FORMATS["crazyflow"], PUBLISHED["crazyflow"], where="params.toml", name="x")
 
 
+def test_a_vehicle_without_rotor_constant_needs_a_template() -> None:
+    with pytest.raises(FileFormatError, match="vehicle cf2: no rotor_constant, which a URDF"):
+        convert(load_vehicle("cf2"), "gym-pybullet-drones")
+    made = convert(load_vehicle("cf2"), "gym-pybullet-drones", template=PUBLISHED["gym-pybullet-drones"])
+    assert 'kf="3.16e-10"' in made.text
+    assert '<mass value="0.029"/>' in made.text
+
+
 def test_a_vehicle_without_rotors_makes_a_body() -> None:
     bare = Vehicle("bare", 0.18, (2.5e-4, 3.1e-4, 2.0e-4))
     assert convert(bare, "mujoco").held.inertia == pytest.approx(bare.inertia)

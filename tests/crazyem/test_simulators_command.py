@@ -46,6 +46,7 @@ def test_rotorpy_is_json_where_the_name_says_so(tmp_path: Path) -> None:
         (["nowhere.urdf", "-o", "x.sdf"], "cannot read nowhere.urdf", 2),
         (["cf2", "-o", "x.toml"], "--to says which", 2),
         (["cf2", "-o", "x.sdf", "--to", "webots"], "unknown format 'webots'", 2),
+        (["cf2", "-o", "x.sdf"], "no rotor_constant", 3),
         (["bad.urdf", "-o", "x.sdf"], "kf", 3),
         (["noise.bin", "-o", "x.sdf"], "not a text file", 3),
         (["cf2", "-o", "here.sdf"], "exists already", 2),

@@ -37,7 +37,9 @@ def test_states_of_a_simulator_are_a_recording(simulator: str, tmp_path: Path) -
     if simulator == "crazyflow":
         assert np.allclose(found.signals["rotor_speed"].value, [1000.0, 1100.0, 1200.0, 1300.0])
     other = tmp_path / "other.csv"
-    table(other, head, t, MOTION.position(t) + [0.1, 0.0, 0.0], turn.as_quat(), MOTION.velocity(t), rate, speeds)
+    table(
+        other, head, t, MOTION.position(t) + np.array([0.1, 0.0, 0.0]), turn.as_quat(), MOTION.velocity(t), rate, speeds
+    )
     against = compare(found, open_recording(other))
     assert against["signals"]["position"]["rms"] == pytest.approx(0.1)
     assert against["signals"]["body_rate"]["rms"] == pytest.approx(0.0, abs=1e-9)
