@@ -88,5 +88,5 @@ def test_the_notebooks_run(path, tmp_path):
     assert shown, "results show themselves as tables"
 
 
-def test_there_are_two_notebooks():
-    assert len(NOTEBOOKS) == 2
+def test_there_are_three_notebooks():
+    assert len(NOTEBOOKS) == 3
