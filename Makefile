@@ -13,7 +13,7 @@ SHARED := -n 3 --dist worksteal
 # Modules are compiled once: the tests start some hundred processes, each of which would compile all of them again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: fly test slow lint bench docs concealed paper paper-docs cfclient-test clean setup oldest
+.PHONY: fly test slow lint bench docs concealed paper paper-docs cfclient-test simulators clean setup oldest
 
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable
 
@@ -71,6 +71,12 @@ paper: $(READY)  ## Zhao's paper again: its tables and figures, by its method an
 
 paper-docs: paper  ## the numbers of that run into docs/explanation/paper.md, and the drift test
 	$(BIN)/python -m crazyem.paper.docs paper/results.json --small tests/crazyem/expectations/paper_small.json
+
+simulators:  ## our files in real simulators, in an environment of their own
+	$(PYTHON) -m venv .venv-simulators
+	.venv-simulators/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[test]' \
+		'crazyflow>=0.4' 'mujoco>=3.2' 'rotorpy>=3.0' 'pybullet>=3.2.7'
+	.venv-simulators/bin/python -m pytest -q -m slow tests/crazyem/test_simulators_real.py
 
 cfclient-test: $(READY)  ## the graphical client against the simulator, in an environment of its own
 	$(PYTHON) -m venv .venv-cfclient
