@@ -84,4 +84,4 @@ cfclient-test: $(READY)  ## the graphical client against the simulator, in an en
 	CFCLIENT_PYTHON=.venv-cfclient/bin/python $(BIN)/python -m pytest -q -m slow tests/firmware_sim/test_cfclient.py
 
 clean:
-	rm -rf $(VENV) .venv-cfclient .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-cfclient .venv-simulators .pytest_cache .mypy_cache .ruff_cache

@@ -253,7 +253,7 @@ def _predict(commands: Any) -> None:
         "--ensemble", type=_integer(2, 10_000), metavar="N", help="a band by N drones of the vehicle's [posterior]"
     )
     p.add_argument("--seed", type=_integer(0, 2**31 - 1), default=0, help="of --ensemble (default: 0)")
-    p.add_argument("--same-day", action="store_true", help="of --ensemble: without the spread from day to day")
+    p.add_argument("--other-day", action="store_true", help="of --ensemble: thrust, trim and lag of another day")
     p.add_argument(
         "--calibrate", nargs="+", default=[], metavar="RECORDING", help="other flights, to learn disturbances from"
     )

@@ -215,7 +215,7 @@ def predict_ensemble(
     horizon: int = 50,
     step: float | None = None,
     seed: int = 0,
-    days: bool = True,
+    days: bool = False,
     calibrate: RecordingLike | Sequence[RecordingLike] = (),
     options: ReadOptions | None = None,
 ) -> Ensemble:
@@ -226,7 +226,7 @@ def predict_ensemble(
         vehicle: with a posterior. count: drones.
         horizon: steps ahead. step: s each; None: the recorded samples.
         seed: of the draws.
-        days: another day than that of the flights it was fitted to.
+        days: the trim, thrust and lag of another day: far wider, as recorded commands answer to the trim of theirs.
         calibrate: other flights, by which disturbances are learned; without, the band is of constants alone.
 
     Raises:

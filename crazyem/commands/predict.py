@@ -58,7 +58,7 @@ def _ensemble(arguments: argparse.Namespace) -> int:
         horizon=arguments.horizon,
         step=arguments.step,
         seed=arguments.seed,
-        days=not arguments.same_day,
+        days=arguments.other_day,
         calibrate=arguments.calibrate,
         options=read_options(arguments),
     )

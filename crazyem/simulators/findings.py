@@ -6,17 +6,18 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.simulators.constants import Constants, from_vehicle, value_of
 from crazyem.simulators.fields import Field, Imported
 from crazyem.vehicle import Vehicle
 
 SURE = 1.96  # standard deviations of a 95 % interval
 TOLERANCE = 0.05  # relative, of a number in a file: less is no reason to change it
-# Effects that are recordings' or days' own, and in no simulator's file
 GAUGE = (
     "flights tell thrust over mass and torque over inertia, not each alone: mass, inertia, thrust and drag may all be "
     "larger by one factor; weigh the drone and say --mass"
 )
+HEAVY = ("N", "kg")  # units that have a mass in them
 # Which effect of the catalogue is about a quantity.
 ABOUT = {
     "mass": ("payload", "thrust_scale"), "thrust_per_speed2": ("thrust_scale", "payload"),
@@ -149,22 +150,20 @@ def _reason(quantity: str, not_identifiable: Mapping[str, str], looked_for: Coll
 
 
 def rescaled(vehicle: Vehicle, mass: float) -> Vehicle:
-    """The same motion with another mass: inertia, thrust, drag and damping change by the same factor.
+    """The same motion with another mass: every force, torque and inertia changes by the same factor.
 
     Args:
         mass: of the whole drone, as it was weighed [kg].
     """
-    constants, left = from_vehicle(vehicle)
-    assert constants.mass is not None
-    factor = mass / constants.mass
-    effects = {n: dict(v) for n, v in vehicle.effects.items() if n in left}
-    scaled = {
-        n: dict(v) for n, v in vehicle.effects.items() if n not in left and n not in ("motor_lag", "torque_scale")
+    factor = mass / from_vehicle(vehicle)[0].or_("mass", vehicle.mass)
+    units = {(e.name, p.name): p.unit for e in CATALOGUE.values() for p in e.parameters}
+    effects = {
+        name: {
+            key: value * factor if value is not None and units[name, key].startswith(HEAVY) else value
+            for key, value in values.items()
+        }
+        for name, values in vehicle.effects.items()
     }
-    for name, values in scaled.items():
-        keys = {"payload": ("mass",), "thrust_scale": (), "center_of_mass": ()}.get(name, tuple(values))
-        scaled[name] = {k: v * factor if k in keys else v for k, v in values.items()}
-    kept = {n: dict(v) for n, v in vehicle.effects.items() if n in ("motor_lag", "torque_scale")}
     constant = vehicle.rotor_constant
     return replace(
         vehicle,
@@ -177,7 +176,7 @@ def rescaled(vehicle: Vehicle, mass: float) -> Vehicle:
         thrust_curve=tuple(c * factor for c in vehicle.thrust_curve),
         rotor_constant=None if constant is None else constant * factor,
         thrust_max=vehicle.thrust_max * factor,
-        effects={**effects, **scaled, **kept},
+        effects=effects,
     )  # fmt: skip
 
 

@@ -17,7 +17,8 @@ from crazyem.simulators.cost import apart, errors_after, flown, reference_flight
 from crazyem.simulators.fields import Imported, read
 from crazyem.simulators.findings import alternatives, rescaled, told_of
 from crazyem.simulators.registry import FORMATS
-from crazyem.vehicle import Vehicle, load_vehicle
+from crazyem.simulators.sampling import sample
+from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
 
 RPM = 60.0 / (2.0 * math.pi)
 SCALE = {"name": "thrust_scale", "parameters": {"scale": {"value": 0.9, "sd": 0.01, "unit": ""}}}
@@ -74,7 +75,8 @@ def test_a_vehicle_with_another_mass_flies_the_same() -> None:
         effects={
             "payload": {"mass": 0.004, "x": 0.01, "y": 0.0, "z": 0.0}, "linear_drag": {"x": 0.01, "y": 0.01, "z": 0.01},
             "rate_damping": {"x": 1e-6, "y": 1e-6, "z": 1e-6}, "motor_lag": {"time_constant": 0.03},
-            "center_of_mass": {"x": 0.001, "y": 0.0, "z": 0.0},
+            "center_of_mass": {"x": 0.001, "y": 0.0, "z": 0.0}, "trim": {"x": 1e-4, "y": 0.0, "z": 0.0},
+            "velocity_moment": {"roll_per_vy": 1e-5, "pitch_per_vx": -1e-5},
         },
     )  # fmt: skip
     reference = reference_flight(vehicle)
@@ -113,6 +115,14 @@ def test_a_wrong_file_is_corrected_by_a_flight(tmp_path: Path) -> None:
     best = errors_after(flight, {"right": right})["right"]  # what is left is the noise of the recorded speeds
     assert found.errors["before"]["velocity"] > 1.3 * best["velocity"]
     assert found.errors["after"]["velocity"] < 1.02 * best["velocity"]
+    fitted = found.diagnosis.named_vehicle("fitted")
+    assert fitted.posterior is not None
+    assert parse_vehicle(fitted.to_toml()) == fitted
+    row = fitted.posterior.parameters.index("thrust_scale.scale")
+    sd = found.diagnosis.effects[0].parameters["scale"].sd
+    assert np.sqrt(fitted.posterior.covariance[row][row]) == pytest.approx(sd, rel=1e-3)
+    drawn = sample(fitted, 20, days=False, mass_sd=0.0).arrays()["thrust_per_speed2"]
+    assert np.isclose(drawn.mean(), ROTOR_CONSTANT, rtol=0.02)
     document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert document["simulator"] == "gym-pybullet-drones"
     again = read(FORMATS["gym-pybullet-drones"], found.corrected.text, where="new")
