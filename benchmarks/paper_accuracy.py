@@ -80,7 +80,7 @@ def blocks(found: Mapping[str, Any]) -> dict[str, str]:
     """What stands between the markers of the docs, by part: the last sensor whole, a line for each."""
     out = {}
     for part, sensors in found.items():
-        lines = [table(list(sensors.items())[-1:]), ""]
+        lines = [_narrow(table(list(sensors.items())[-1:])), ""]
         for sensor, s in sensors.items():
             said = len(s["missed"]) or "none"
             lines.append(
@@ -91,6 +91,13 @@ def blocks(found: Mapping[str, Any]) -> dict[str, str]:
             lines.append("")
         out[part] = "\n".join(lines).strip()
     return out
+
+
+def _narrow(text: str) -> str:
+    """A table without the columns that a page has no room for."""
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.split("\n")]
+    shown = [i for i, name in enumerate(rows[0]) if name not in ("n", "excess / bound", "claimed / bound")]
+    return "\n".join(f"| {' | '.join(row[i] for i in shown)} |" for row in rows)
 
 
 def filled(text: str, found: Mapping[str, Any]) -> str:
