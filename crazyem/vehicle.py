@@ -23,7 +23,6 @@ File format (all SI; `presets/*.toml` are examples):
 """
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
@@ -31,6 +30,7 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 from crazyem.errors import FileFormatError, UsageError
+from crazyem.toml_file import parse_toml, read_text
 
 GRAVITY = 9.81  # m/s^2, as the firmware has it
 LARGEST_SPREAD = 3.0  # standard deviation of a logarithm beyond which a prior says nothing
@@ -127,7 +127,7 @@ def load_vehicle(name_or_path: str | Path) -> Vehicle:
     """Read a shipped preset by name, or a vehicle file by path (anything that ends in .toml or names a file).
 
     Raises:
-        UsageError: no preset and no file of that name.
+        UsageError: no preset and no file of that name, or the file cannot be read.
         FileFormatError: the file is not a vehicle file; the message names the key.
     """
     text = str(name_or_path)
@@ -137,19 +137,12 @@ def load_vehicle(name_or_path: str | Path) -> Vehicle:
     path = Path(text)
     if not path.is_file():
         raise UsageError(f"unknown vehicle '{text}': no such file, and the presets are {', '.join(preset_names())}")
-    try:
-        source = path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"{path}: cannot be read as a vehicle file ({error})") from None
-    return parse_vehicle(source, where=str(path))
+    return parse_vehicle(read_text(path, what="vehicle file"), where=str(path))
 
 
 def parse_vehicle(source: str, *, where: str = "vehicle") -> Vehicle:
     """Vehicle from the text of a vehicle file; `where` names it in errors (FileFormatError)."""
-    try:
-        data = tomllib.loads(source)
-    except tomllib.TOMLDecodeError as error:
-        raise FileFormatError(f"{where}: not valid TOML: {error}") from None
+    data = parse_toml(source, where=where)
     known = {
         "name", "mass", "inertia", "arm", "thrust_curve", "rotor_constant", "torque_per_thrust",
         "motor_time_constant", "thrust_max", "battery_compensated", "effects", "mass_sd", "inertia_sd",

@@ -2,7 +2,6 @@
 
 import csv
 import math
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from scipy.interpolate import make_interp_spline
 
 from crazyem.control.trajectories import Reference, Trajectory, Vector
 from crazyem.errors import FileFormatError
+from crazyem.toml_file import parse_toml, read_text
 
 DEFAULT_SPEED = 0.5  # m/s
 MAX_ACCELERATION = 8.0  # m/s^2; beyond this a Crazyflie runs out of thrust or of the setpoint's range
@@ -26,20 +26,13 @@ def read_waypoints(path: str | Path) -> list[dict[str, float]]:
     point]. TOML: an array of tables `[[waypoints]]` with the same keys.
 
     Raises:
-        FileFormatError: naming the file and the row or key.
+        UsageError: no such file. FileFormatError: naming the file and the row or key.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as e:
-        raise FileFormatError(f"cannot read the waypoint file {path}: {getattr(e, 'strerror', None) or e}.") from None
+    text = read_text(path, what="waypoint file")
     rows: list[dict[str, object]]
     if path.suffix.lower() == ".toml":
-        try:
-            table = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as e:
-            raise FileFormatError(f"waypoint file {path} is not valid TOML: {e}.") from None
-        found = table.get("waypoints")
+        found = parse_toml(text, where=f"waypoint file {path}").get("waypoints")
         if not isinstance(found, list) or not all(isinstance(r, dict) for r in found):
             raise FileFormatError(f"waypoint file {path} has no [[waypoints]] tables.")
         rows = found

@@ -4,15 +4,15 @@
 """
 
 import math
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from crazyem.errors import FileFormatError, UsageError
+from crazyem.errors import FileFormatError
 from crazyem.live.guard import WRITABLE_ESTIMATES, Limits
+from crazyem.toml_file import parse_toml, read_text
 
 LARGEST_POLICY_FILE = 65536  # bytes
 END_RULES = ("keep", "good", "restore")
@@ -254,27 +254,12 @@ def load_policy(path: str | Path | None = None) -> Policy:
     """
     if path is None:
         return parse_policy(default_text(), where="the default policy")
-    try:
-        with Path(path).open("rb") as file:
-            data = file.read(LARGEST_POLICY_FILE + 1)
-    except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else str(error)
-        raise UsageError(f"cannot read the policy {path}: {why}.") from None
-    if len(data) > LARGEST_POLICY_FILE:
-        raise FileFormatError(f"{path}: not a policy file: larger than {LARGEST_POLICY_FILE} bytes.")
-    try:
-        source = data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: not a policy file: not UTF-8 at byte {error.start}.") from None
-    return parse_policy(source, where=str(path))
+    return parse_policy(read_text(path, what="policy", largest=LARGEST_POLICY_FILE), where=str(path))
 
 
 def parse_policy(source: str, *, where: str = "policy") -> Policy:
     """Policy from the text of a file; `where` names it in errors (FileFormatError)."""
-    try:
-        data = tomllib.loads(source)
-    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise FileFormatError(f"{where}: not valid TOML: {error}") from None
+    data = parse_toml(source, where=where)
     name = data.pop("name", "unnamed")
     if not isinstance(name, str) or not name.isprintable() or len(name) > 100:
         raise FileFormatError(f"{where}: key 'name' must be a short text")

@@ -14,7 +14,6 @@ import itertools
 import math
 import re
 import sys
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +23,7 @@ import numpy as np
 
 from crazyem.control.trajectories import Reference, Trajectory, Vector, smooth_step
 from crazyem.errors import FileFormatError, UsageError
+from crazyem.toml_file import read_toml
 
 MOST_DRONES = 100  # drones
 LARGEST_SWARM_FILE = 1 << 18  # bytes
@@ -83,17 +83,7 @@ def read_swarm(path: str | Path, *, vehicle: str, trajectory: Sequence[str]) -> 
     Raises:
         FileFormatError: not a swarm file; names the drone and the key. UsageError: no such file.
     """
-    try:
-        with open(path, "rb") as file:
-            data = file.read(LARGEST_SWARM_FILE + 1)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}.") from None
-    if len(data) > LARGEST_SWARM_FILE:
-        raise FileFormatError(f"{path}: larger than {LARGEST_SWARM_FILE} bytes, not a swarm file.")
-    try:
-        table = tomllib.loads(data.decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise FileFormatError(f"{path}: not a TOML file ({error}).") from None
+    table = read_toml(path, what="swarm file", largest=LARGEST_SWARM_FILE)
     entries = table.pop("drone", None)
     if table:
         raise FileFormatError(f"{path}: {next(iter(table))} is not part of a swarm (only [[drone]] is).")

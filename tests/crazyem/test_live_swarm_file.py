@@ -55,8 +55,8 @@ def test_a_swarm_file_says_what_differs_from_the_command_line(tmp_path):
         ("[[drone]]\nuri = 'u'\n" * 2, "two drones have the uri u"),
         ("[[drone]]\nuri = 'u'\nname = 'a'\n[[drone]]\nuri = 'v'\nname = 'a'", "two drones have the name a"),
         ("".join(f"[[drone]]\nuri = '{i}'\n" for i in range(101)), "at most 100"),
-        ("[[drone", "not a TOML file"),
-        ("x = " + "[" * 5000, "not a TOML file"),
+        ("[[drone", "not valid TOML"),
+        ("x = " + "[" * 5000, "not valid TOML"),
     ],
 )
 def test_wrong_swarm_files_are_named_with_drone_and_key(tmp_path, text, says):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from crazyem.control.trajectories import EXCITE_X, EXCITE_Y, EXCITE_YAW, EXCITE_Z, excite, figure8, hover, smooth_step
 from crazyem.control.waypoints import waypoints
-from crazyem.errors import FileFormatError
+from crazyem.errors import FileFormatError, UsageError
 
 HOME = (0.2, -0.1, 1.0)
 
@@ -137,5 +137,5 @@ def test_bad_waypoint_files_are_named(tmp_path, text, name, says):
 
 
 def test_missing_waypoint_file(tmp_path):
-    with pytest.raises(FileFormatError, match="cannot read"):
+    with pytest.raises(UsageError, match="cannot read"):
         waypoints(path=tmp_path / "none.csv", position=HOME)

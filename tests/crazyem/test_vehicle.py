@@ -203,7 +203,7 @@ def test_not_toml_not_text_not_there(tmp_path: Path):
     with pytest.raises(FileFormatError, match="not valid TOML"):
         load_vehicle(path)
     path.write_bytes(b"\xff\xfe\x00mass")
-    with pytest.raises(FileFormatError, match="cannot be read"):
+    with pytest.raises(FileFormatError, match="not UTF-8"):
         load_vehicle(path)
     with pytest.raises(UsageError, match=r"unknown vehicle 'cf3'.*cf2, .*cf2-legacy"):
         load_vehicle("cf3")

@@ -2,7 +2,6 @@
 
 import functools
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
@@ -21,11 +20,11 @@ from crazyem.recordings.csv.mapping_units import (
     unit_offset,
 )
 from crazyem.signals.sample import SIGNALS, components
+from crazyem.toml_file import parse_toml, read_text
 
 BODY_AXES, WORLD_AXES = ("FLU", "FRD"), ("ENU", "NED")
 _MOTOR_SIGNALS = ("motor_command", "motor_request", "rotor_speed")
 _ANGLE_SIGNALS = ("euler", "setpoint_euler")
-_LARGEST_MAPPING = 1_000_000  # bytes of a mapping file: nobody writes more by hand
 
 _TOP_KEYS = {
     "name", "title", "layout", "recognise", "time", "claims", "units", "packets", "signals", "host_signals", "columns",
@@ -122,10 +121,7 @@ class CsvMapping:
 
 def load_mapping(text: str, where: str) -> CsvMapping:
     """A mapping from its TOML text; `where` names it in error messages. Raises FileFormatError naming the key."""
-    try:
-        table = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise FileFormatError(f"{where}: not valid TOML ({error}).") from error
+    table = parse_toml(text, where=where)
     _known(table, _TOP_KEYS, where)
     layout = _get(table, "layout", str, where, "wide")
     if layout not in ("wide", "long"):
@@ -205,17 +201,9 @@ def mapping_for(header: tuple[str, ...], given: str | None, path: Path) -> CsvMa
 
 def _text_of(path: Path, shipped: Mapping[str, CsvMapping]) -> str:
     try:
-        with path.open("rb") as file:
-            raw = file.read(_LARGEST_MAPPING + 1)
-        if len(raw) > _LARGEST_MAPPING:
-            raise FileFormatError(f"{path}: no mapping is larger than {_LARGEST_MAPPING} bytes.")
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: not a text file (byte {error.start} is not UTF-8).") from error
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        names = ", ".join(shipped)
-        raise UsageError(f"{path}: this mapping cannot be read ({reason}); shipped ones are {names}.") from error
+        return read_text(path, what="mapping")
+    except UsageError as error:
+        raise UsageError(f"{error} Shipped ones are {', '.join(shipped)}.") from None
 
 
 def _claimed(entry: Mapping[str, Any]) -> dict[str, Any]:

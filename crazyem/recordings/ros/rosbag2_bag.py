@@ -7,7 +7,6 @@ IMRCLab/crazyswarm2 (crazyflie_interfaces/msg, crazyflie/src/crazyflie_server.cp
 """
 
 import re
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +24,7 @@ from crazyem.recordings.recording import Recording
 from crazyem.recordings.ros.ros2_messages import LARGEST_MESSAGE, MessageType, message_type, standard_definition
 from crazyem.recordings.ros.rosbag2_signals import ROBOT_TYPES, WORLD_TOPICS, BagMapping, BagTopic, recording_of
 from crazyem.recordings.topics import text_of
+from crazyem.toml_file import read_toml
 
 _SQLITE = b"SQLite format 3\0"
 _LARGEST_RATIO = 200  # unpacked bytes a packed byte, beyond the first gibibyte
@@ -283,12 +283,7 @@ def _user_mapping(file: str | None) -> BagMapping:
     """What the user's mapping file says of a bag. Raises UsageError or FileFormatError."""
     if file is None:
         return BagMapping()
-    try:
-        table = tomllib.loads(Path(file).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"{file} cannot be read: {error.strerror or error}.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise FileFormatError(f"{file}: not valid TOML ({error}).") from error
+    table = read_toml(file, what="mapping")
     for key, value in table.items():
         if key not in _MAPPING_KEYS or not isinstance(value, _MAPPING_KEYS[key]):
             known = "robot and twist (texts) and topics (a table)"
