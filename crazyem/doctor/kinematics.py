@@ -9,6 +9,7 @@ import weakref
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +60,7 @@ def measurements(recording: Recording, quantity: str) -> dict[str, SignalArray]:
 
 
 # The last signals that were made light, as long as their values live: seven checks ask for the same ones.
-_light: OrderedDict[tuple[int, int, str], tuple[weakref.ref, weakref.ref, SignalArray]] = OrderedDict()
+_light: OrderedDict[tuple[int, int, str], tuple[weakref.ref[Any], weakref.ref[Any], SignalArray]] = OrderedDict()
 _CACHED_RECORDINGS = 32
 
 

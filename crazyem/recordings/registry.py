@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 from crazyem.errors import FileFormatError, KnownFileError, UsageError
 from crazyem.recordings.contents import ReadOptions
@@ -50,7 +51,7 @@ class Reader:
         parts = screened_parts(self._module().read_parts(path, options, seconds=seconds))
         return cut_parts(parts, options.start, options.end)
 
-    def _module(self):
+    def _module(self) -> ModuleType:
         return importlib.import_module(f"crazyem.recordings.{self.module}")
 
 

@@ -28,7 +28,9 @@ from crazyem.signals.mavlink import RPM_IN_RAD_PER_S, mapping
 ARMED = 128  # in HEARTBEAT.base_mode
 
 
-def _scaled(factor: float, turned: Callable[[Columns], NDArray[np.float64]] = stacked) -> Callable:
+def _scaled(
+    factor: float, turned: Callable[[Columns], NDArray[np.float64]] = stacked
+) -> Callable[[Columns], NDArray[np.float64]]:
     return lambda columns: turned(columns) * factor
 
 
