@@ -16,6 +16,7 @@ from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
 
 _BODY = ("inertia", "inertia_products", "payload")
 _SCALES = ("thrust_scale", "torque_scale")
+_FOR_CONTROLLERS = ("rotor_inertia",)  # the estimator does not know it, INDI does (ctrlINDI.g2)
 
 
 def load(name_or_path: str | Path) -> Vehicle:
@@ -38,6 +39,8 @@ def _checked(vehicle: Vehicle, where: str) -> Vehicle:
 def fold(vehicle: Vehicle) -> tuple[Vehicle, list[str]]:
     """A vehicle without effects that is as near as one can be, and the names of effects that it leaves out.
 
+    What a controller can be told of stays in it.
+
     Folded: payload, inertia and inertia_products into mass and inertia (about the common centre of mass; that it lies
     off the middle is the estimator's torque offset), thrust_scale into the rotors' thrust, torque_scale into the arms,
     motor_lag into the time constant. Without rotors thrust and torque are inputs, and there is nothing to scale.
@@ -53,7 +56,7 @@ def fold(vehicle: Vehicle) -> tuple[Vehicle, list[str]]:
         mass=float(body.mass),
         inertia=(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[2, 2])),
         inertia_products=(float(matrix[0, 1]), float(matrix[0, 2]), float(matrix[1, 2])),
-        effects={},
+        effects={name: vehicle.effects[name] for name in _FOR_CONTROLLERS if name in vehicle.effects},
     )
     if "motor_lag" in values:
         plain = replace(plain, motor_time_constant=float(values["motor_lag"]["time_constant"]))

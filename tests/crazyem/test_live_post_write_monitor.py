@@ -103,6 +103,42 @@ def test_a_setpoint_that_begins_to_move_explains_some_lag():
     assert fly(written(), WRITE, 10.0, wanted=circle, error=0.5)[0] == "worse"
 
 
+def test_a_drone_that_flies_faster_is_not_judged_by_what_the_model_leaves_out():
+    """Drag: innovations of 3.5 where the setpoint moves by 2 m/s and did not before; they count where it stands."""
+
+    def circle(t):
+        return (math.cos(2 * t), math.sin(2 * t), 1.0)
+
+    assert fly(written(), WRITE, 10.0, wanted=circle, innovation=3.5)[0] == "good"
+    assert fly(written(), WRITE, 10.0, innovation=3.5)[0] == "worse"
+
+
+def test_a_high_pass_of_6_hz_tells_trembling_from_an_excitation():
+    """2 Hz and 9 Hz of 1.2 rad/s each: with the limits for INDI only the second is worse."""
+    limits = MonitorLimits(oscillation=0.5, high_pass=0.027, oscillation_ratio=1.0)
+    for hertz, verdict in ((2.0, "good"), (9.0, "worse")):
+        watch = PostWriteMonitor(limits)
+        for n in range(1200):
+            t = 0.01 * n
+            rate = 1.2 * math.sin(2 * math.pi * hertz * t) if t > WRITE else 0.0
+            watch.take(Sample("body_rate", t, (rate, 0.0, 0.0)))
+            if n == round(100 * WRITE):
+                watch.on_write(t, t)
+        assert watch.judge(12.0)[0] == verdict
+
+
+def test_a_setpoint_that_leads_by_a_second_explains_its_distance():
+    """INDI's places: 1 m ahead at 1 m/s."""
+
+    def line(t):
+        return (max(t - WRITE, 0.0), 0.0, 1.0)
+
+    watch = PostWriteMonitor(MonitorLimits(lead=1.0))
+    fly(watch, 0.0, WRITE, error=0.05)
+    watch.on_write(WRITE, WRITE)
+    assert fly(watch, WRITE, 10.0, wanted=line, error=0.9)[0] == "good"
+
+
 def test_writes_that_follow_each_other_are_judged_against_the_time_before_the_first():
     watch = written()
     assert fly(watch, WRITE, 0.5, error=0.13)[0] == ""
