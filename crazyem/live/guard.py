@@ -257,7 +257,10 @@ class Guard:
             self._history.popleft()
 
     def _found(self, estimate: Estimate, name: str) -> ParameterEstimate:
-        """What is known of an estimate: by the flight, or by the vehicle file once the flight has shown the mass."""
+        """What is known of an estimate: by the flight, or by the vehicle file once the flight has shown the mass.
+
+        The mass need not have settled to its last digit: that it is seen shows that thrust is what the file says.
+        """
         p = estimate.parameters.get(name)
         if p is not None:
             return p
@@ -265,7 +268,8 @@ class Guard:
         if known is None:
             return ParameterEstimate(math.nan, math.inf, (math.nan, math.nan), "", False, "not estimated")
         mass = estimate["mass"]
-        return ParameterEstimate(known, 0.0, (known, known), "", mass.identifiable, mass.reason)
+        seen = mass.identifiable or 1.96 * mass.relative_sd <= self.limits.mass_half_width
+        return ParameterEstimate(known, 0.0, (known, known), "", seen, "" if seen else mass.reason)
 
     def _fault(self, estimate: Estimate, name: str) -> str:
         p = self._found(estimate, name)

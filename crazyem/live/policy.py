@@ -38,7 +38,8 @@ class MonitorLimits:
     """What counts as worse after a write than before.
 
     Attributes:
-        lead: s by which a setpoint may be ahead of a drone without that being an error.
+        lead: s by which a setpoint may be ahead of a drone without that being an error. place_lead: s of the drone's
+            own speed by which a controller has to be given places ahead (INDI).
         high_pass: s, time constant of the high-pass on body rates: 1.6 Hz, above what trajectories ask for.
         before, settle, after: s, lengths of the stretches.
         unjudged: sets of writes that may follow each other before they were judged.
@@ -50,7 +51,8 @@ class MonitorLimits:
     """
 
     enabled: bool = True
-    lead: float = 0.1  # no key of a policy, like the next one: they belong to the controller
+    lead: float = 0.1  # no key of a policy, like the next two: they belong to the controller
+    place_lead: float = 0.0
     high_pass: float = 0.1
     before: float = 2.0
     settle: float = 0.5

@@ -81,6 +81,7 @@ class PostWriteMonitor:
         self._tracking, self._speed = _Series(), _Series()
         self._innovation, self._oscillation = _Series(), _Series()
         self._setpoints: deque[tuple[float, tuple[float, ...]]] = deque(maxlen=64)
+        self._velocity: tuple[float, ...] = (0.0, 0.0, 0.0)
         self._rate: tuple[float, tuple[float, ...]] | None = None
         self._slow: tuple[float, ...] = (0.0, 0.0, 0.0)
         self._tilt = 0.0
@@ -102,6 +103,8 @@ class PostWriteMonitor:
                 self._setpoint(sample.time, sample.value)
             elif sample.signal == "position":
                 self._position(sample.time, sample.value)
+            elif sample.signal == "velocity":
+                self._velocity = sample.value
             elif sample.signal == "body_rate":
                 self._body_rate(sample.time, sample.value)
             elif sample.signal == "attitude":
@@ -145,7 +148,9 @@ class PostWriteMonitor:
 
     def _position(self, time: float, position: tuple[float, ...]) -> None:
         if self._setpoints and abs(time - self._setpoints[-1][0]) <= SPEED_SPAN:
-            square = math.dist(position, self._setpoints[-1][1]) ** 2
+            ahead = self.limits.place_lead
+            there = tuple(p + ahead * v for p, v in zip(position, self._velocity))
+            square = math.dist(there, self._setpoints[-1][1]) ** 2
             self._raw.add(time, square)
             if not self._is_excused(time):
                 self._tracking.add(time, square)

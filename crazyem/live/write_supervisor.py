@@ -23,7 +23,8 @@ from crazyem.live.push import Pusher
 from crazyem.live.write_gate import WriteGate
 from crazyem.signals.sample import Sample
 
-INDI_LEAD = 1.0  # s, 1/posCtrlIndi.K_xi: INDI follows a place by its speed only where the place is so far ahead
+# s: INDI flies as fast as a place is ahead, times posCtrlIndi.K_xi, and turns as its error in speed, times K_dxi, says.
+INDI_PLACE_LEAD, INDI_LEAD = 1.0, 0.4
 # s, 6 Hz: with a loop gain that is too high INDI trembles with 7 to 12 Hz (docs/guard.md), an excitation has 1 to 4 Hz.
 INDI_HIGH_PASS = 0.027
 MONITOR_PERIOD = 0.04  # s between looks of the watch
@@ -93,6 +94,7 @@ class WriteSupervisor:
                 limits,
                 oscillation=limits.incremental_oscillation,
                 lead=INDI_LEAD,
+                place_lead=INDI_PLACE_LEAD,
                 high_pass=INDI_HIGH_PASS,
             )
         self.watch = PostWriteMonitor(limits)

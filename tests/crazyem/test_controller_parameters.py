@@ -103,12 +103,14 @@ def test_mellinger_gets_the_thrust_scale_of_the_vehicle_and_keeps_its_mass() -> 
 
 
 def test_mass_thrust_waits_for_a_mass_that_is_seen() -> None:
-    def blind(t):
-        e = estimate(t)
-        mass = replace(e["mass"], identifiable=False, reason="on the ground")
+    def blind(t, sd=0.01):
+        e = estimate(t, mass=BRUSHLESS.mass)
+        mass = replace(e["mass"], sd=sd, identifiable=False, reason="not converged yet")
         return Estimate(t, {**e.parameters, "mass": mass})
 
     assert decided(guard_of(bound_to(MELLINGER, BRUSHLESS), BRUSHLESS), make=blind) == []
+    narrow = decided(guard_of(bound_to(MELLINGER, BRUSHLESS), BRUSHLESS), make=lambda t: blind(t, sd=1e-4))
+    assert {n for d in narrow for n, _ in d.writes} == {"ctrlMel.massThrust"}
 
 
 def test_drag_comes_from_nothing_in_steps_and_only_where_it_is_seen() -> None:
