@@ -25,7 +25,7 @@ from crazyem.signals.sample import Sample
 
 # s: INDI flies as fast as a place is ahead, times posCtrlIndi.K_xi, and turns as its error in speed, times K_dxi, says.
 INDI_PLACE_LEAD, INDI_LEAD = 1.0, 0.4
-# s, 6 Hz: with a loop gain that is too high INDI trembles with 7 to 12 Hz (docs/guard.md), an excitation has 1 to 4 Hz.
+# s, 6 Hz: with a loop gain that is too high INDI trembles with 7 to 12 Hz, an excitation has 1 to 4 Hz.
 INDI_HIGH_PASS = 0.027
 MONITOR_PERIOD = 0.04  # s between looks of the watch
 GROUNDED_WITHIN = 3.0  # s; the firmware says that it flies for 2 s after its motors stopped
