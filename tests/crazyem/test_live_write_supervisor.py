@@ -306,8 +306,8 @@ def test_a_healthy_drone_has_no_objection():
 
 
 def test_an_estimate_from_before_a_payload_could_be_noticed_is_too_old():
-    assert healthy()[0].objection(age=LATEST_DECISION) == ""
-    assert "1.1 s old" in healthy()[0].objection(age=LATEST_DECISION + 0.1)
+    assert healthy()[0].health_objection(age=LATEST_DECISION) == ""
+    assert "1.1 s old" in healthy()[0].health_objection(age=LATEST_DECISION + 0.1)
 
 
 @pytest.mark.parametrize(
