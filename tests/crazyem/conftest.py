@@ -31,7 +31,7 @@ def shared_recordings() -> Path:
 class Simulator:
     """`python -m firmware_sim` as a child process; `uri` is where it listens."""
 
-    def __init__(self, *arguments: str, timeout: float = 240.0) -> None:  # a fresh clone compiles first
+    def __init__(self, *arguments: str, timeout: float = 1800.0) -> None:  # s, for one that hangs
         command = [sys.executable, "-m", "firmware_sim", "--port", "0", *arguments]
         self.process = subprocess.Popen(
             command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True

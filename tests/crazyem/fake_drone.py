@@ -66,6 +66,7 @@ class FakeLink:
         self._landing = False
         self._silent_since = None
         self._session = self._flight = None
+        self._free_until = 0  # ms of its clock: until then it waits for nobody
         self._stop = threading.Event()
         self._thread = None
 
@@ -158,11 +159,13 @@ class FakeLink:
         return seen >= 0.0 and self.fm / 1000.0 - seen > AHEAD  # not while it has seen nothing at all
 
     def _wait(self):
+        if self.fm < self._free_until:
+            return
         for _ in range(PATIENCE):
             if self._stop.is_set() or not self._outruns():
                 return
             time.sleep(0.001)
-        self._session = None  # it does not catch up, perhaps because it waits for the drone
+        self._free_until = self.fm + 1000  # ms; it does not catch up, perhaps because it waits for the drone
 
     def _run(self):
         while not self._stop.is_set():
