@@ -43,7 +43,7 @@ class Watch:
         def follow(session, *arguments):
             self.started.set()
             if way == "exception":
-                self.broken.wait(fake.PATIENCE / 1000)
+                self.broken.wait(fake.PATIENCE)
                 raise ValueError("of the command")
             watch_follow(session, *arguments)
 
@@ -58,14 +58,14 @@ class Watch:
         monkeypatch.setattr(watch, "open_link", lambda uri: self.link)
         monkeypatch.setattr(runner, "open_link", lambda uri: self.link)
         monkeypatch.setattr(watch, "compile_kernels", lambda vehicle: None)
-        monkeypatch.setattr(watch, "new_estimator", lambda vehicle, arguments: estimator)
+        monkeypatch.setattr(watch, "new_estimator", lambda vehicle, arguments, **_: estimator)
         monkeypatch.setattr(runner, "Session", make_session)
         monkeypatch.setattr(watch, "follow", follow)
         monkeypatch.setattr(watch, "live_view", live_view)
 
     def fly(self):
         """The one who flies: 4 s in the air, down where the way says so, then what ends the command."""
-        assert self.started.wait(fake.PATIENCE / 1000)
+        assert self.started.wait(fake.PATIENCE)
         link, session = self.link, self.session
         link.pass_time(session, 0.5, height=0.0, motors=False)
         link.pass_time(session, 4.0, height=1.0)
