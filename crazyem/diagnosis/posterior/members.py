@@ -19,6 +19,7 @@ from crazyem.physics.effects.prior import Logged, Sizes
 from crazyem.vehicle import Vehicle
 
 FELT = ("specific_force",)  # needs of an effect that the accelerometer alone shows (`accelerometer.py`)
+HIDDEN = "in such recordings it differs by as much as it may be off"
 FEW = 5  # beginnings of an effect up to which all of its parameters are looked at from each
 REACH = 4.0  # usual spreads within which a recording stays, also beyond the range of a drone: a delay counted too long
 
@@ -127,7 +128,11 @@ def pool_of(flights: Sequence[Flight], point: Point, wanted: Sequence[str] = ())
             if names:
                 usual.append((replace(found[0], free=names, fixed=()), table))
         if effect.prior.own and (not wanted or name in wanted or effect.prior.unnamed):
-            found = [replace(c, free=tuple(n for n in c.free if n in effect.prior.own)) for c in found]
+            told = _told(effect, spreads)
+            found = [replace(c, free=tuple(n for n in c.free if n in told)) for c in found]
+            found = [c for c in found if c.free]
+            if not found:
+                left_out[name] = HIDDEN
             count = len({(c.fixed, c.free) for c in found})
             odds = prior_odds() - math.log(count)
             many = max((len(v) for v in effect.beginnings.values()), default=0) > FEW
@@ -141,6 +146,11 @@ def pool_of(flights: Sequence[Flight], point: Point, wanted: Sequence[str] = ())
 def prior_odds() -> float:
     """Log odds that an effect is missing."""
     return math.log(SETTINGS.missing / (1.0 - SETTINGS.missing))
+
+
+def _told(effect: Effect, spreads: Sequence[Sizes]) -> set[str]:
+    """Parameters of which recordings differ by less than what is asked for, in one of them at least."""
+    return {n for n, own in effect.prior.own.items() if min(s.get(n, 0.0) for s in spreads) < own}
 
 
 def _sizes(effect: Effect, candidate: Candidate, sizes: Sizes, point: Point) -> NDArray:

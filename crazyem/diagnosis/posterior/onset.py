@@ -23,11 +23,13 @@ def onset_parameter(effect: str) -> str:
 
 @dataclass(frozen=True)
 class Later:
-    """A member that begins in mid-flight: log evidence over that of nothing, tempered by scatter; change (1,)."""
+    """A member that begins in mid-flight: log evidence over that of nothing, change (1,), and by how much its scores
+    scatter then."""
 
     member: Member
     gain: float
     change: NDArray
+    scatter: float
 
 
 def begun_later(study: Study, fit: Fit, look: Look, member: Member) -> Later | None:
@@ -60,10 +62,10 @@ def begun_later(study: Study, fit: Fit, look: Look, member: Member) -> Later | N
     begin = float(flight.time[np.flatnonzero(flight.block == onsets[k])[0]])
     dated = replace(member.candidate, fixed=(*member.candidate.fixed, (name, begin)))
     later = replace(member, candidate=dated, odds=member.odds - math.log(len(onsets)))
-    change, before = found[k].mean[-1:], study.posterior(look, fit.members).gain
+    change = found[k].mean[-1:]
     rest = score[:, [n + k]] - information[:, n + k, n + k][:, None] * change
     scatter = float(scatter_of(rest, information[:, n + k, n + k].sum(keepdims=True))[0])
-    return Later(later, before + (found[k].gain - before) / scatter, change)
+    return Later(later, found[k].gain, change, scatter)
 
 
 def dated(study: Study, fit: Fit, near: Slopes) -> Fit:

@@ -85,6 +85,7 @@ class Search:
         study = self.study
         found: dict[str, Neighbour] = {}
         loud: dict[str, float] = {}
+        raws: dict[str, float] = {}
         data = [d.twin() for d in fit.data]
         near = study.slopes(data, fit.points, fit.members, study.pool.looks)
         look = study.look(data, fit.points, fit.members, near, study.pool.looks)
@@ -97,19 +98,23 @@ class Search:
             if m.effect in fit.effects:
                 continue
             there = study.posterior(look, (*fit.members, m), nudged=(m,))
-            gain = (there.gain - base) / _scatter(look, m, there.mean[size:]) + m.odds
             still = study.posterior(quiet, (*fit.members, m), nudged=(m,))
-            loud[m.effect] = max(
-                loud.get(m.effect, gain), gain, (still.gain - bare) / _scatter(quiet, m, still.mean[size:]) + m.odds
-            )
-            if m.effect not in found or gain > found[m.effect].gain:
-                # of an effect of many beginnings only the amplitude was looked at; the rest is where it begins
-                change = np.zeros(len(whole.candidate.free))
-                change[[whole.candidate.free.index(n) for n in m.candidate.free]] = there.mean[size:]
-                found[m.effect] = Neighbour(whole, m.effect, gain, change)
+            gain = (there.gain - base) / _scatter(look, m, there.mean[size:]) + m.odds
+            bared = (still.gain - bare) / _scatter(quiet, m, still.mean[size:]) + m.odds
+            loud[m.effect] = max(loud.get(m.effect, gain), gain, bared)
+            # of an effect of many beginnings only the amplitude was looked at; the rest is where it begins
+            change = np.zeros(len(whole.candidate.free))
+            change[[whole.candidate.free.index(n) for n in m.candidate.free]] = there.mean[size:]
+            variants = [(there.gain - base + m.odds, Neighbour(whole, m.effect, gain, change))]
             later = begun_later(study, fit, look, m)
-            if later is not None and later.gain - base + later.member.odds > found[m.effect].gain:
-                found[m.effect] = Neighbour(later.member, m.effect, later.gain - base + later.member.odds, later.change)
+            if later is not None:
+                gain = (later.gain - base) / later.scatter + later.member.odds
+                loud[m.effect] = max(loud[m.effect], gain)
+                raw = later.gain - base + later.member.odds
+                variants.append((raw, Neighbour(later.member, m.effect, gain, later.change)))
+            for raw, one in variants:  # scatter tells what to fit, and not which rotor it is
+                if m.effect not in found or raw > raws[m.effect]:
+                    found[m.effect], raws[m.effect] = one, raw
         for effect in study.pool.random:
             if effect.name not in fit.effects and fit.held:
                 found[effect.name] = Neighbour(None, effect.name, np.inf, np.zeros(0))

@@ -89,6 +89,7 @@ class Study:
         bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, first_guess())
         self.workers, self.vehicle = workers, vehicle
         self.pool = pool_of(flights, bare, wanted)
+        self.effects = {m.effect for m in self.pool.members}
         self.calm = np.array([self._calm(e, bare) for e in self.pool.random]).min(initial=np.inf)
         data, points = [], []
         for flight in flights:
@@ -356,7 +357,8 @@ class Study:
                     if table is not None and table[f, k] > 0:
                         reach = REACH * table[f, k]
                         low = min(low, neutral[name] - reach)
-                        if c.effect not in present:  # beyond, it is an effect
+                        asked = CATALOGUE[c.effect].prior.own.get(name, 0.0) > 0.0 and c.effect in self.effects
+                        if asked and c.effect not in present:  # beyond, it is an effect
                             low, high = max(low, neutral[name] - reach), min(high, neutral[name] + reach)
                     here = away(c, point, name)
                     values[name] = float(np.clip(neutral[name] + here + part * (goal[i] - here), low, high))
