@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from crazyem.api.flying import fly
     from crazyem.api.predicting import predict
     from crazyem.api.replaying import replay
-    from crazyem.api.vehicles import CheckedVehicle, check_vehicle, convert_vehicle, predict_ensemble, sample_vehicle
+    from crazyem.api.vehicles import VehicleCheck, check_vehicle, convert_vehicle, predict_ensemble, sample_vehicle
     from crazyem.diagnosis.prediction.predict import Prediction
     from crazyem.errors import CrazyemError
     from crazyem.estimation.online import OnlineEstimator
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     __version__: str
 
 _HOME = {
-    "CheckedVehicle": "api.vehicles",
+    "VehicleCheck": "api.vehicles",
     "CrazyemError": "errors",
     "Diagnosis": "api.diagnosing",
     "Estimate": "estimation.result",
@@ -58,7 +58,6 @@ _HOME = {
 }
 
 __all__ = [
-    "CheckedVehicle",
     "CrazyemError",
     "Diagnosis",
     "Estimate",
@@ -71,6 +70,7 @@ __all__ = [
     "Recording",
     "Sample",
     "Vehicle",
+    "VehicleCheck",
     "__version__",
     "attach",
     "check_vehicle",

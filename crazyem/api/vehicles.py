@@ -15,11 +15,11 @@ from crazyem.errors import DataError, UsageError
 from crazyem.notebook import finite, html_table
 from crazyem.recordings.contents import ReadOptions
 from crazyem.simulators.constants import NUMBERS
-from crazyem.simulators.convert import Converted, convert, load_source, read_text
+from crazyem.simulators.convert import Conversion, convert, load_source, read_text
 from crazyem.simulators.cost import HORIZON, errors_after, said
-from crazyem.simulators.fields import AGREE, Imported
-from crazyem.simulators.findings import GAUGE, TOLERANCE, Told, alternatives, rescaled, told_of
-from crazyem.simulators.sampling import MASS_SD, Sampled, sample
+from crazyem.simulators.fields import AGREE, SimulatorFile
+from crazyem.simulators.findings import GAUGE, TOLERANCE, FieldFinding, alternatives, field_findings, rescaled
+from crazyem.simulators.sampling import MASS_SD, VehicleSample, sample
 from crazyem.vehicle import Vehicle
 
 
@@ -32,7 +32,7 @@ def convert_vehicle(
     suffix: str = "",
     base: VehicleLike | None = None,
     flight: RecordingLike | None = None,
-) -> Converted:
+) -> Conversion:
     """Make a simulator's file of a vehicle, or a vehicle file of a simulator's.
 
     Args:
@@ -57,13 +57,13 @@ def convert_vehicle(
 
 
 @dataclass(frozen=True, eq=False)
-class CheckedVehicle:
+class VehicleCheck:
     """What flights say of a simulator's file.
 
     Attributes:
         imported: the file. vehicle: what it says, with what it does not say from elsewhere.
         diagnosis: by the flights.
-        told: each field.
+        fields: each field of the file.
         alternatives: mass and thrust, which no flight tells apart.
         disagreements: with other files of the same drone.
         corrected: the file with what was found.
@@ -72,31 +72,31 @@ class CheckedVehicle:
         judged: by the flights of these names.
     """
 
-    imported: Imported
+    imported: SimulatorFile
     vehicle: Vehicle
     diagnosis: Diagnosis
-    told: tuple[Told, ...]
+    fields: tuple[FieldFinding, ...]
     alternatives: tuple[dict[str, Any], ...]
     disagreements: tuple[str, ...]
-    corrected: Converted
+    corrected: Conversion
     errors: Mapping[str, Mapping[str, float]]
     judged: tuple[str, ...]
 
     @property
     def fits(self) -> bool:
         """Whether the file agrees with itself, with others and with the flights."""
-        return not (any(t.off for t in self.told) or self.imported.contradictions or self.disagreements)
+        return not (any(t.off for t in self.fields) or self.imported.contradictions or self.disagreements)
 
     def to_dict(self) -> dict[str, Any]:
         """Ready for JSON."""
         document: dict[str, Any] = finite({
             "format": "crazyem-vehicle-check", "version": 1, "file": self.imported.where,
             "simulator": self.imported.format, "name": self.imported.name, "fits": self.fits,
-            "fields": [t.to_json() for t in self.told], "not_told_apart": list(self.alternatives),
+            "fields": [t.to_json() for t in self.fields], "alternatives": list(self.alternatives),
             "contradictions": [c.to_json() for c in self.imported.contradictions],
             "disagreements": list(self.disagreements), "remarks": list(self.imported.remarks),
             "horizon_s": HORIZON, "errors": {k: dict(v) for k, v in self.errors.items()},
-            "judged_by": list(self.judged), "lost": [one.to_json() for one in self.corrected.lost],
+            "judged_by": list(self.judged), "omissions": [one.to_json() for one in self.corrected.omissions],
             "diagnosis": self.diagnosis.to_dict(),
         })  # fmt: skip
         return document
@@ -108,7 +108,7 @@ class CheckedVehicle:
         lines += [f"  contradiction: {c}" for c in self.imported.contradictions]
         lines += [f"  disagreement: {d}" for d in self.disagreements]
         lines += [f"  {remark}" for remark in self.imported.remarks]
-        lines += [f"  {'off' if t.off else '   '} {t}" for t in self.told if t.known or t.value]
+        lines += [f"  {'off' if t.off else '   '} {t}" for t in self.fields if t.known or t.value]
         if self.alternatives:
             lines.append(f"  {GAUGE}")
             for one in self.alternatives:
@@ -116,11 +116,11 @@ class CheckedVehicle:
                 lines.append(f"    if {one['if']}: {numbers}")
         for words, key in (("before", "before"), ("with the corrected file", "after"), ("with all found", "fitted")):
             lines.append(f"  error after {HORIZON:g} s {words}: {said(self.errors[key])}")
-        lines += [f"  not held by this file: {one}" for one in self.corrected.lost]
+        lines += [f"  not held by this file: {one}" for one in self.corrected.omissions]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        rows = [(t.field, t.value, t.fitted, t.sd, t.unit, "off" if t.off else "") for t in self.told]
+        rows = [(t.field, t.value, t.fitted, t.sd, t.unit, "off" if t.off else "") for t in self.fields]
         title = f"{self.imported.where}: {'fits' if self.fits else 'does not fit'}"
         return html_table(title, ("field", "in the file", "by flights", "sd", "unit", ""), rows, [])
 
@@ -139,7 +139,7 @@ def check_vehicle(
     jobs: int | None = None,
     options: ReadOptions | None = None,
     progress: Callable[[str], None] | None = None,
-) -> CheckedVehicle:
+) -> VehicleCheck:
     """Find what is wrong in a simulator's file, by flights of the drone.
 
     Args:
@@ -169,7 +169,7 @@ def check_vehicle(
         flown, source.vehicle, held_out=kept, candidates=candidates, jobs=jobs, progress=progress,
     )  # fmt: skip
     fitted = found.fitted_vehicle if mass is None else rescaled(found.fitted_vehicle, mass)
-    told = told_of(
+    findings = field_findings(
         source.imported, source.vehicle, fitted, found.document["effects"],
         {n["name"]: n["reason"] for n in found.document["not_identifiable"]},
         looked_for={*(r["name"] for r in found.document["ranking"]), *(e["name"] for e in found.document["effects"])},
@@ -182,8 +182,8 @@ def check_vehicle(
     judges = kept or flown
     vehicles = {"before": source.vehicle, "after": corrected.held, "fitted": fitted}
     choices = alternatives(source.imported, fitted, source.vehicle.mass) if mass is None else []
-    return CheckedVehicle(
-        source.imported, source.vehicle, found, tuple(told), tuple(choices),
+    return VehicleCheck(
+        source.imported, source.vehicle, found, tuple(findings), tuple(choices),
         tuple(d for other in others if other.imported for d in disagreements(source.imported, other.imported)),
         corrected, _pooled([e for e in (_errors(r, vehicles) for r in judges) if e]), tuple(r.path for r in judges),
     )  # fmt: skip
@@ -191,7 +191,7 @@ def check_vehicle(
 
 def sample_vehicle(
     vehicle: VehicleLike, count: int = 256, *, seed: int = 0, days: bool = True, mass_sd: float = MASS_SD
-) -> Sampled:
+) -> VehicleSample:
     """Draw drones as a fitted vehicle may be, by the joint posterior in its file.
 
     Args:
@@ -240,7 +240,7 @@ def predict_ensemble(
     return ensemble(flight, fitted, members, horizon=horizon * period, calibrate=others, seed=seed)
 
 
-def disagreements(first: Imported, second: Imported) -> list[str]:
+def disagreements(first: SimulatorFile, second: SimulatorFile) -> list[str]:
     """Sentences about the quantities in which two files of one drone differ by more than a hundredth."""
     found = []
     for quantity in NUMBERS:

@@ -70,7 +70,7 @@ def _convert(arguments: argparse.Namespace) -> int:
     document["remarks"] = remarks
     lines = [f"{output}: {to}, from {arguments.source} ({source.format}), vehicle {source.vehicle.name}"]
     lines += [f"  {remark}" for remark in remarks]
-    lines += _listed("not held by this file:", made.lost)
+    lines += _listed("not held by this file:", made.omissions)
     return _report(arguments, document, lines)
 
 

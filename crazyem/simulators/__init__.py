@@ -6,6 +6,6 @@
 '<robot name="cf2">'
 """
 
-from crazyem.simulators.convert import Converted, Lost, Source, convert, known_formats, load_source
+from crazyem.simulators.convert import Conversion, Omission, Source, convert, known_formats, load_source
 
-__all__ = ["Converted", "Lost", "Source", "convert", "known_formats", "load_source"]
+__all__ = ["Conversion", "Omission", "Source", "convert", "known_formats", "load_source"]

@@ -10,13 +10,13 @@ from crazyem.physics import folding
 from crazyem.recordings.recording import Recording
 from crazyem.simulators.constants import AIR, Constants, from_vehicle, to_vehicle
 from crazyem.simulators.cost import HORIZON, apart, errors_after, flown, reference_flight, said, to_json
-from crazyem.simulators.fields import Contradiction, Format, Imported, read, write
+from crazyem.simulators.fields import Contradiction, Format, SimulatorFile, read, write
 from crazyem.simulators.formats.rotorpy import ROTORPY, ROTORPY_JSON
 from crazyem.simulators.plausible import impossible, objection
 from crazyem.simulators.registry import FORMATS, OWN, format_named, format_of
 from crazyem.vehicle import Vehicle, preset_names
 
-# What is held or lost together: words, and the quantities.
+# What is held or left out together: words, and the quantities.
 GROUPS: dict[str, tuple[str, tuple[str, ...]]] = {
     "motor_lag": ("rotor lag", ("lag",)),
     "center_of_mass": ("centre of mass", ("centre_x", "centre_y", "centre_z")),
@@ -36,7 +36,7 @@ TOLERANCE_OF_NOTHING = {"centre": 1e-9, "lag": 1e-3}  # m, s: as good as none
 
 
 @dataclass(frozen=True)
-class Lost:
+class Omission:
     """Something that a file does not hold.
 
     Attributes:
@@ -77,18 +77,18 @@ class Source:
 
     vehicle: Vehicle
     format: str
-    imported: Imported | None
+    imported: SimulatorFile | None
     text: str
 
 
 @dataclass(frozen=True)
-class Converted:
+class Conversion:
     """A file that was made.
 
     Attributes:
         text: of it. format: by name.
         vehicle: what was to be written. held: what the file says of it.
-        lost: what it does not hold.
+        omissions: what it does not hold.
         contradictions, remarks: of the source.
     """
 
@@ -96,14 +96,14 @@ class Converted:
     format: str
     vehicle: Vehicle
     held: Vehicle
-    lost: tuple[Lost, ...]
+    omissions: tuple[Omission, ...]
     contradictions: tuple[Contradiction, ...] = ()
     remarks: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """For programs."""
         return {
-            "format": self.format, "vehicle": self.vehicle.name, "lost": [one.to_json() for one in self.lost],
+            "format": self.format, "vehicle": self.vehicle.name, "omissions": [one.to_json() for one in self.omissions],
             "contradictions": [c.to_json() for c in self.contradictions], "remarks": list(self.remarks),
         }  # fmt: skip
 
@@ -159,7 +159,7 @@ def convert(
     suffix: str = "",
     flight: Recording | None = None,
     costs: bool = True,
-) -> Converted:
+) -> Conversion:
     """A simulator's file of a vehicle.
 
     Args:
@@ -179,7 +179,7 @@ def convert(
         plain = to_vehicle(constants, replace(vehicle, effects={}))
         kept = {n: v for n, v in vehicle.effects.items() if n in left}
         held = replace(plain, effects={**plain.effects, **kept}, name=name or vehicle.name)
-        return Converted(held.to_toml(), OWN, vehicle, held, ())
+        return Conversion(held.to_toml(), OWN, vehicle, held, ())
     form = format_named(to)
     if form is ROTORPY and template is None and suffix == ".json":
         form = ROTORPY_JSON
@@ -192,9 +192,9 @@ def convert(
         )
     text = write(form, constants, template=template, where=where, name=name)
     said_there = _held(form, text, where=where, name=name)
-    lost = _lost(vehicle, constants, left, said_there, flight) if costs else []
+    omissions = _omissions(vehicle, constants, left, said_there, flight) if costs else []
     base = replace(vehicle, effects={}, motor_time_constant=0.0)  # who does not know of a lag has none
-    return Converted(text, to, vehicle, to_vehicle(said_there, base), tuple(lost))
+    return Conversion(text, to, vehicle, to_vehicle(said_there, base), tuple(omissions))
 
 
 # Key of a vehicle file -> quantity that it gives, and quantities of files that are nothing without it.
@@ -219,7 +219,9 @@ def _held(form: Format, text: str, *, where: str, name: str) -> Constants:
     return read(form, text, where=where or f"the {form.name} file", name=name or None, strict=False).constants
 
 
-def _lost(vehicle: Vehicle, full: Constants, left: list[str], held: Constants, flight: Recording | None) -> list[Lost]:
+def _omissions(
+    vehicle: Vehicle, full: Constants, left: list[str], held: Constants, flight: Recording | None
+) -> list[Omission]:
     """What a file lacks of a vehicle, each with its cost: with all, against with all but this."""
     base = replace(vehicle, effects={})
     kept = {n: vehicle.effects[n] for n in left}
@@ -242,15 +244,15 @@ def _lost(vehicle: Vehicle, full: Constants, left: list[str], held: Constants, f
     found = []
     for name, words, why, without in variants:
         cost, errors = _cost(with_left(full), without, flight)
-        found.append(Lost(name, words, cost, why, errors))
+        found.append(Omission(name, words, cost, why, errors))
     for quantity, words in OF_ROTORS.items():
         value, other = getattr(full, quantity), getattr(held, quantity)
         if value is not None and (other is None or not math.isclose(value, other, rel_tol=HELD)):
             why = "not in this file" if other is None else f"the file says {other:.4g}"
-            found.append(Lost(quantity, words, None, why))
+            found.append(Omission(quantity, words, None, why))
     if vehicle.thrust_curve:
         why = "a simulator is told rotor speeds or thrusts; the law from command and voltage stays in the vehicle file"
-        found.append(Lost("thrust_curve", "battery and thrust curve", None, why))
+        found.append(Omission("thrust_curve", "battery and thrust curve", None, why))
     return found
 
 
@@ -283,4 +285,4 @@ def known_formats() -> dict[str, str]:
     return {n: f.words for n, f in FORMATS.items() if n != ROTORPY_JSON.name}
 
 
-__all__ = ["AIR", "Converted", "Lost", "Source", "convert", "known_formats", "load_source", "read_text"]
+__all__ = ["AIR", "Conversion", "Omission", "Source", "convert", "known_formats", "load_source", "read_text"]

@@ -5,7 +5,7 @@ quantity gives it, further ones must agree, all of them are written.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -92,7 +92,7 @@ class Contradiction:
 
 
 @dataclass(frozen=True)
-class Imported:
+class SimulatorFile:
     """A file that was read.
 
     Attributes:
@@ -165,7 +165,7 @@ class Format:
     write_more: Callable[[Any, str, Constants], None] = field(default=lambda document, name, constants: None)
 
 
-def read(form: Format, text: str, *, where: str, name: str | None = None, strict: bool = True) -> Imported:
+def read(form: Format, text: str, *, where: str, name: str | None = None, strict: bool = True) -> SimulatorFile:
     """The constants that a file says.
 
     Args:
@@ -199,7 +199,7 @@ def read(form: Format, text: str, *, where: str, name: str | None = None, strict
     contradictions = tuple(_contradictions(document, fields, constants))
     if contradictions and strict:
         raise FileFormatError(f"{where}: {contradictions[0]}")
-    return Imported(form.name, where, drone, constants, tuple(fields), contradictions, tuple(remarks))
+    return SimulatorFile(form.name, where, drone, constants, tuple(fields), contradictions, tuple(remarks))
 
 
 def _contradictions(document: Document, fields: Sequence[Field], constants: Constants) -> list[Contradiction]:
@@ -295,8 +295,3 @@ def drone_of(form: Format, document: Any, name: str | None) -> str:
 
 def _stem(where: str) -> str:
     return where.replace("\\", "/").rsplit("/", 1)[-1].split(".")[0] or "drone"
-
-
-def unread(found: Mapping[str, float], quantity: str) -> bool:
-    """Whether a file says nothing of a quantity, nor of what it follows from."""
-    return quantity not in solved(found)

@@ -8,7 +8,7 @@ from typing import Any
 
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.simulators.constants import Constants, from_vehicle, value_of
-from crazyem.simulators.fields import Field, Imported
+from crazyem.simulators.fields import Field, SimulatorFile
 from crazyem.vehicle import Vehicle
 
 SURE = 1.96  # standard deviations of a 95 % interval
@@ -29,7 +29,7 @@ ABOUT = {
 
 
 @dataclass(frozen=True)
-class Told:
+class FieldFinding:
     """A field of a file, and what flights say of it.
 
     Attributes:
@@ -80,8 +80,8 @@ class Told:
         }  # fmt: skip
 
 
-def told_of(
-    imported: Imported,
+def field_findings(
+    imported: SimulatorFile,
     before: Vehicle,
     fitted: Vehicle,
     effects: Sequence[Mapping[str, Any]],
@@ -89,7 +89,7 @@ def told_of(
     *,
     looked_for: Collection[str] | None = None,
     tolerance: float = TOLERANCE,
-) -> list[Told]:
+) -> list[FieldFinding]:
     """Every quantity of a file once, with what flights say.
 
     Args:
@@ -110,11 +110,11 @@ def told_of(
         shown, fits = f.written(value, None), f.written(now, None)
         if not changed:
             reason = _reason(f.quantity, not_identifiable, looked_for)
-            found.append(Told(f.label, f.unit, f.quantity, shown, shown, math.nan, False, reason))
+            found.append(FieldFinding(f.label, f.unit, f.quantity, shown, shown, math.nan, False, reason))
             continue
         spread = abs(f.factor) * sd
         off = abs(fits - shown) > max(SURE * spread, tolerance * max(abs(shown), abs(fits)))
-        found.append(Told(f.label, f.unit, f.quantity, shown, fits, spread, off))
+        found.append(FieldFinding(f.label, f.unit, f.quantity, shown, fits, spread, off))
     return found
 
 
@@ -180,7 +180,7 @@ def rescaled(vehicle: Vehicle, mass: float) -> Vehicle:
     )  # fmt: skip
 
 
-def alternatives(imported: Imported, fitted: Vehicle, mass: float) -> list[dict[str, Any]]:
+def alternatives(imported: SimulatorFile, fitted: Vehicle, mass: float) -> list[dict[str, Any]]:
     """The fitted constants of a file with its own mass, and with the mass that leaves its thrust as it is."""
     old, new = imported.constants, from_vehicle(fitted)[0]
     if old.thrust_per_speed2 is None or new.thrust_per_speed2 is None or new.mass is None:

@@ -28,7 +28,7 @@ TRIES = 200  # draws of one drone until it is one that can be
 
 
 @dataclass(frozen=True, eq=False)
-class Sampled:
+class VehicleSample:
     """Drones that were drawn.
 
     Attributes:
@@ -54,7 +54,9 @@ class Sampled:
         return found
 
 
-def sample(vehicle: Vehicle, count: int, *, seed: int = 0, days: bool = True, mass_sd: float = MASS_SD) -> Sampled:
+def sample(
+    vehicle: Vehicle, count: int, *, seed: int = 0, days: bool = True, mass_sd: float = MASS_SD
+) -> VehicleSample:
     """Draw drones from the posterior of a fitted vehicle.
 
     Args:
@@ -90,7 +92,7 @@ def sample(vehicle: Vehicle, count: int, *, seed: int = 0, days: bool = True, ma
             )
         vehicles.append(drawn)
         draws.append(theta)
-    return Sampled(tuple(vehicles), posterior.parameters, np.array(draws), seed)
+    return VehicleSample(tuple(vehicles), posterior.parameters, np.array(draws), seed)
 
 
 def from_mass(vehicle: Vehicle) -> float:

@@ -13,7 +13,7 @@ from simulator_files import DRONE, PUBLISHED
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.simulators.constants import NUMBERS, Constants, from_vehicle, to_vehicle
 from crazyem.simulators.convert import convert
-from crazyem.simulators.fields import Imported, read, write
+from crazyem.simulators.fields import SimulatorFile, read, write
 from crazyem.simulators.registry import FORMATS, NAMES, OWN, format_of
 from crazyem.vehicle import Vehicle, load_vehicle
 
@@ -130,7 +130,7 @@ def test_a_vehicle_file_is_told_by_its_content() -> None:
     assert set(PUBLISHED) | {OWN} == set(NAMES)
 
 
-def imported(name: str, text: str | None = None, *, strict: bool = True) -> Imported:
+def imported(name: str, text: str | None = None, *, strict: bool = True) -> SimulatorFile:
     source = PUBLISHED[name] if text is None else text
     return read(FORMATS[name], source, where=f"{name}.file", name=DRONE.get(name), strict=strict)
 
@@ -238,7 +238,7 @@ def test_a_payload_is_folded_exactly() -> None:
     assert made.held.inertia[1] == pytest.approx(plain.inertia[1] + reduced * (0.02**2 + 0.01**2))
     assert made.held.inertia_products[1] == pytest.approx(reduced * 0.02 * 0.01)
     assert made.held.effects["center_of_mass"]["x"] == pytest.approx(0.002)
-    assert made.lost == ()
+    assert made.omissions == ()
 
 
 def test_drag_at_the_rotors_of_rotorpy_damps_rotation() -> None:
@@ -251,11 +251,11 @@ def test_drag_at_the_rotors_of_rotorpy_damps_rotation() -> None:
 
 def test_what_a_file_cannot_hold_costs_something() -> None:
     vehicle = replace(load_vehicle("cf21bl"), effects={"linear_drag": {"x": 0.02, "y": 0.02, "z": 0.02}})
-    lost = {one.name: one for one in convert(vehicle, "gym-pybullet-drones").lost}
+    lost = {one.name: one for one in convert(vehicle, "gym-pybullet-drones").omissions}
     assert set(lost) == {"motor_lag", "thrust_curve"}
     assert lost["motor_lag"].cost is not None
     assert lost["motor_lag"].cost["velocity"] > 0.05
-    lost = {one.name: one for one in convert(vehicle, "mujoco").lost}
+    lost = {one.name: one for one in convert(vehicle, "mujoco").omissions}
     # 0.02 N s/m slow 1.5/sqrt(2) m/s (root mean square of the made flight) by about a quarter in half a second
     assert lost["linear_drag"].cost is not None
     assert 0.1 < lost["linear_drag"].cost["velocity"] < 0.4

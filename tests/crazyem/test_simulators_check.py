@@ -14,8 +14,8 @@ from crazyem.api.vehicles import check_vehicle, disagreements
 from crazyem.cli import main
 from crazyem.simulators.convert import convert, load_source
 from crazyem.simulators.cost import apart, errors_after, flown, reference_flight
-from crazyem.simulators.fields import Imported, read
-from crazyem.simulators.findings import alternatives, rescaled, told_of
+from crazyem.simulators.fields import SimulatorFile, read
+from crazyem.simulators.findings import alternatives, field_findings, rescaled
 from crazyem.simulators.registry import FORMATS
 from crazyem.simulators.sampling import sample
 from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
@@ -25,7 +25,7 @@ SCALE = {"name": "thrust_scale", "parameters": {"scale": {"value": 0.9, "sd": 0.
 
 
 @pytest.fixture
-def urdf(tmp_path: Path) -> tuple[Imported, Vehicle]:
+def urdf(tmp_path: Path) -> tuple[SimulatorFile, Vehicle]:
     path = tmp_path / "cf2x.urdf"
     path.write_text(PUBLISHED["gym-pybullet-drones"])
     source = load_source(path)
@@ -33,10 +33,10 @@ def urdf(tmp_path: Path) -> tuple[Imported, Vehicle]:
     return source.imported, source.vehicle
 
 
-def test_a_thrust_scale_is_told_as_kf(urdf: tuple[Imported, Vehicle]) -> None:
+def test_a_thrust_scale_is_told_as_kf(urdf: tuple[SimulatorFile, Vehicle]) -> None:
     imported, vehicle = urdf
     fitted = replace(vehicle, effects={**vehicle.effects, "thrust_scale": {"scale": 0.9}})
-    told = {t.field: t for t in told_of(imported, vehicle, fitted, [SCALE], {"inertia": "it hovers"})}
+    told = {t.field: t for t in field_findings(imported, vehicle, fitted, [SCALE], {"inertia": "it hovers"})}
     kf = told["properties.kf"]
     assert kf.unit == "N/RPM^2"
     assert kf.value == pytest.approx(3.16e-10)
@@ -50,15 +50,15 @@ def test_a_thrust_scale_is_told_as_kf(urdf: tuple[Imported, Vehicle]) -> None:
     assert "it hovers" in str(told["link[name=base_link].inertial.inertia.ixx"])
 
 
-def test_less_than_the_tolerance_may_stay(urdf: tuple[Imported, Vehicle]) -> None:
+def test_less_than_the_tolerance_may_stay(urdf: tuple[SimulatorFile, Vehicle]) -> None:
     imported, vehicle = urdf
     fitted = replace(vehicle, effects={**vehicle.effects, "thrust_scale": {"scale": 0.97}})
-    (kf,) = (t for t in told_of(imported, vehicle, fitted, [SCALE], {}) if t.field == "properties.kf")
+    (kf,) = (t for t in field_findings(imported, vehicle, fitted, [SCALE], {}) if t.field == "properties.kf")
     assert kf.known
     assert not kf.off
 
 
-def test_mass_and_thrust_are_not_told_apart(urdf: tuple[Imported, Vehicle]) -> None:
+def test_mass_and_thrust_are_not_told_apart(urdf: tuple[SimulatorFile, Vehicle]) -> None:
     imported, vehicle = urdf
     fitted = replace(vehicle, effects={**vehicle.effects, "thrust_scale": {"scale": 0.9}})
     first, second = (one["fields"] for one in alternatives(imported, fitted, vehicle.mass))
@@ -106,7 +106,7 @@ def test_a_wrong_file_is_corrected_by_a_flight(tmp_path: Path) -> None:
     wrong = replace(load_vehicle("cf2"), mass=0.036, rotor_constant=1.1 * ROTOR_CONSTANT)
     path.write_text(convert(wrong, "gym-pybullet-drones").text)
     found = check_vehicle(path, flight, candidates=["thrust_scale", "linear_drag"])
-    told = {t.field: t for t in found.told}
+    told = {t.field: t for t in found.fields}
     low, high = told["properties.kf"].interval
     assert low < ROTOR_CONSTANT / RPM**2 < high
     assert told["properties.kf"].off

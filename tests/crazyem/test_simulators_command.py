@@ -28,7 +28,7 @@ def test_convert_edits_a_template_and_tells_in_json(tmp_path: Path, capsys: pyte
     assert main(words) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["format"] == "mujoco"
-    assert {one["name"] for one in told["lost"]} >= {"motor_lag", "thrust_per_speed2"}
+    assert {one["name"] for one in told["omissions"]} >= {"motor_lag", "thrust_per_speed2"}
     assert (
         '<!-- the drone hovers -->\n    <key name="hover" qpos="0 0 0.3 1 0 0 0" ctrl="0.385533' in target.read_text()
     )

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from crazyem.physics.rotors import wrench
-from crazyem.simulators.convert import Converted, convert
+from crazyem.simulators.convert import Conversion, convert
 from crazyem.simulators.cost import HORIZON, STEP, Reference, flown, reference_flight
 from crazyem.vehicle import Vehicle
 
@@ -44,7 +44,7 @@ DRONE = Vehicle(
 State = tuple[Array, Array, Array, Array, Array]  # position, velocity, attitude x y z w, rate, rotors: all (n, ...)
 
 
-def case(form: str, **changes: Any) -> tuple[Converted, Vehicle, Reference, Array]:
+def case(form: str, **changes: Any) -> tuple[Conversion, Vehicle, Reference, Array]:
     """A file, the vehicle that it says, the reference flight, and (n, k, 4) thrusts commanded after each start [N]."""
     vehicle = replace(DRONE, **changes)
     suffix = ".json" if form == "rotorpy" else ""

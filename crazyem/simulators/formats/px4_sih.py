@@ -3,7 +3,6 @@
 SIH has one drag and one damping for all axes. Of products of inertia Ixy and Ixz change their sign with the axes.
 """
 
-from crazyem.simulators.constants import Constants
 from crazyem.simulators.documents.params import ParamDocument
 from crazyem.simulators.fields import Field, Format
 
@@ -53,10 +52,6 @@ def _skeleton(name: str) -> str:
     return text + "\nparam set SIH_VEHICLE_TYPE 0\n"
 
 
-def _write_more(document: ParamDocument, name: str, c: Constants) -> None:
-    return
-
-
 PX4_SIH = Format(
     name="px4-sih",
     suffix="",
@@ -66,6 +61,5 @@ PX4_SIH = Format(
     fields=_fields,
     skeleton=_skeleton,
     read_more=_read_more,
-    write_more=_write_more,
     source="PX4, simulator_sih/sih.cpp (generate_force_and_torques, equations_of_motion, read_motors)",
 )
