@@ -237,37 +237,30 @@ def table(done: dict[int, dict[str, Any]]) -> str:
         v = np.array([x for x in values if math.isfinite(x)]) * scale
         return f"{np.median(v):.2f} ({np.quantile(v, 0.1):.2f} to {np.quantile(v, 0.9):.2f}) {unit}" if v.size else "-"
 
-    lines = ["| | n | median (10 to 90 %) | share |", "|---|---|---|---|"]
-    for name, what in (("low", "INDI, g1 at 0.5 of the true"), ("high", "INDI, g1 at 1.5 of the true")):
-        n, within, error = len(of(name, "crashed")), of(name, "within_s"), of(name, "error_2s")
-        lines.append(f"| {what}: all three within 5 %, s of excitation | {n} | {said(within, 's')} "
-                     f"| within 2 s: {sum(w <= 2.0 for w in within)} of {n} |")  # fmt: skip
-        lines.append(f"| the same: largest error after 2 s | {n} | {said(error, '%', 100)} | "
-                     f"under 5 %: {sum(e <= WITHIN for e in error)} of {n} |")  # fmt: skip
+    def row(what: str, result: str, met: str, hits: Sequence[bool]) -> str:
+        return f"|{what}|{result}|{met} {sum(hits)}/{len(hits)}|"
+
+    lines = ["|flights|median (10 to 90 %)|met|", "|---|---|---|"]
+    for name, start in (("low", 0.5), ("high", 1.5)):
+        within, error, what = of(name, "within_s"), of(name, "error_2s"), f"INDI, g1 × {start}:"
+        lines.append(row(f"{what} 5 % reached", said(within, "s"), "2 s", [w <= 2.0 for w in within]))
+        lines.append(row(f"{what} error at 2 s", said(error, "%", 100), "5 %", [e <= WITHIN for e in error]))
         both = [r[name]["overshoot"] - r["ideal"]["overshoot"] for r in done.values() if {name, "ideal"} <= set(r)]
-        lines.append(f"| the same: overshoot of a step of tilt over the ideal's | {len(both)} | {said(both, '%', 100)} "
-                     f"| within 10 %: {sum(abs(b) <= 0.1 for b in both)} of {len(both)}; crashed: "
-                     f"{int(sum(of(name, 'crashed')))} |")  # fmt: skip
-    for name, what in (("lie unguarded", "inertia wrong 1.4 to 5 times, written at once"),
-                       ("lie guarded", "the same estimate, through the guard")):  # fmt: skip
-        n, worst = len(of(name, "crashed")), of(name, "worst_error")
-        lines.append(f"| INDI, {what}: largest error of g1 | {n} | {said(worst, '%', 100)} | crashed: "
-                     f"{int(sum(of(name, 'crashed')))}, taken back: {int(sum(of(name, 'reverted')))} |")  # fmt: skip
-    for name, what in (("no drag", "nothing pushed"), ("drag", "kalman.dragB_* pushed")):
-        lines.append(f"| figure 8 at {SPEED} m/s, Lee, {what}: error of the onboard velocity | "
-                     f"{len(of(name, 'crashed'))} | {said(of(name, 'error_m_s'), 'cm/s', 100)} | crashed: "
-                     f"{int(sum(of(name, 'crashed')))} |")  # fmt: skip
-    falls = [
-        1 - r["drag"]["error_m_s"] / r["no drag"]["error_m_s"] for r in done.values() if {"drag", "no drag"} <= set(r)
-    ]
-    lines.append(f"| the same: the error falls by | {len(falls)} | {said(falls, '%', 100)} "
-                 f"| by a third or more: {sum(f >= 1 / 3 for f in falls)} of {len(falls)} |")  # fmt: skip
-    for name, what in (("no massThrust", "nothing pushed"), ("massThrust", "massThrust pushed")):
+        lines.append(row(f"{what} overshoot less ideal", said(both, "%", 100), "10 %", [abs(b) <= 0.1 for b in both]))
+    for name in ("low", "high", "lie unguarded", "lie guarded"):
+        worst = said(of(name, "worst_error"), "%", 100)
+        lines.append(row(f"INDI, {name}: worst g1", worst, "crashed", [bool(c) for c in of(name, "crashed")]))
+    for name in ("no drag", "drag"):
+        lines.append(row(f"{name} pushed: velocity error", said(of(name, "error_m_s"), "cm/s", 100), "crashed",
+                         [bool(c) for c in of(name, "crashed")]))  # fmt: skip
+    pairs = [r for r in done.values() if {"drag", "no drag"} <= set(r)]
+    falls = [1 - r["drag"]["error_m_s"] / r["no drag"]["error_m_s"] for r in pairs]
+    lines.append(row("the error falls by", said(falls, "%", 100), "a third", [f >= 1 / 3 for f in falls]))
+    for name in ("no massThrust", "massThrust"):
         height = of(name, "height_m")
-        n = len(height)
-        lines.append(f"| Mellinger, brushless, massThrust 132000, {what}: height error | {n} "
-                     f"| {said(height, 'cm', 100)} | under 2 cm: {sum(abs(h) < 0.02 for h in height)} of {n}; "
-                     f"mass over 1 % wrong: {sum(abs(m) > 0.01 for m in of(name, 'mass_error'))} |")  # fmt: skip
+        lines.append(row(f"{name} pushed: height", said(height, "cm", 100), "2 cm", [abs(h) < 0.02 for h in height]))
+    masses = [abs(m) <= 0.01 for m in of("massThrust", "mass_error")]
+    lines.append(row("the same: mass error", said(of("massThrust", "mass_error"), "%", 100), "1 %", masses))
     return "\n".join(lines)
 
 

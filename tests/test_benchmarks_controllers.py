@@ -24,9 +24,8 @@ def test_the_table_says_what_came_out() -> None:
         "worst_error": 0.5,
     }
     text = table({1: {"low": low, "ideal": {**low, "overshoot": -0.12}}})
-    assert "| INDI, g1 at 0.5 of the true: all three within 5 %, s of excitation | 1 | 1.50" in text
-    assert "within 2 s: 1 of 1" in text
-    assert "| 1 | 2.00 (2.00 to 2.00) % | within 10 %: 1 of 1; crashed: 0 |" in text
+    assert "|INDI, g1 × 0.5: 5 % reached|1.50 (1.50 to 1.50) s|2 s 1/1|" in text
+    assert "|INDI, g1 × 0.5: overshoot less ideal|2.00 (2.00 to 2.00) %|10 % 1/1|" in text
 
 
 @pytest.mark.slow
