@@ -1,4 +1,7 @@
-"""The inputs of the rigid body: commanded thrust and torque as logged, turned into means over the steps of the tape."""
+"""The inputs of the rigid body: commanded thrust and torque as logged, turned into means over the steps of the tape;
+and which samples cannot be true."""
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +12,22 @@ from crazyem.physics.lag import CAUSAL, fit_predictor, hold_predictor, lagged_me
 MAX_GAP = 0.1  # s without an input beyond which a step cannot be trusted
 _RECENT = 8  # inputs looked at one by one, newest first, before the rest is searched
 SETTLED_TIME_CONSTANTS = 5.0  # time constants after which a lag has forgotten where it started
+
+# No drone is faster, further or stronger (SI): a sample beyond is an error of transmission, used as missing.
+LARGEST_VALUE = {
+    "position": 1e4, "velocity": 1e2, "attitude": 2.0, "body_rate": 2e2,
+    "motor_command": 1.5, "rotor_speed": 8e3, "wrench_command": 1e3,
+    "specific_force": 1e3,
+}  # fmt: skip
+
+
+def is_plausible(signal: str, value: tuple[float, ...]) -> bool:
+    """Whether every component is a number that can be true (a NaN is not, nor a quaternion far from unit length)."""
+    limit = LARGEST_VALUE[signal]
+    for v in value:  # plain loops and Python floats in what runs for every sample: numpy costs more than it saves there
+        if not -limit < v < limit:
+            return False
+    return signal != "attitude" or 0.5 < math.hypot(*value) < 2.0
 
 
 class InputHistory:

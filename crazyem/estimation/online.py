@@ -17,7 +17,7 @@ from crazyem.errors import DataError, UsageError
 from crazyem.estimation.contact import ContactGate
 from crazyem.estimation.em import Information, WindowEM, offset
 from crazyem.estimation.in_step import corrected, in_step
-from crazyem.estimation.inputs import MAX_GAP, SETTLED_TIME_CONSTANTS, InputHistory
+from crazyem.estimation.inputs import LARGEST_VALUE, MAX_GAP, SETTLED_TIME_CONSTANTS, InputHistory, is_plausible
 from crazyem.estimation.marginal import Marginal, MarginalRefresh
 from crazyem.estimation.maximum import PASSED_SCORE_TEST, Maximum, maximise_posterior
 from crazyem.estimation.model import INTEGRATION, KnownNoise, Parameters, Setup, setup_for
@@ -41,13 +41,6 @@ CLOSE = 0.1  # standard deviations from the maximum at which full passes end
 PASSED_NOISE = 2.0
 # Change of a parameter's logarithm that calls for full passes: a share of its standard deviation, between two limits.
 MOVED_SD, MOVED, MOVED_FAR = 0.5, 0.02, 0.1
-
-# No drone is faster, further or stronger (SI): a sample beyond is an error of transmission, used as missing.
-SANE = {
-    "position": 1e4, "velocity": 1e2, "attitude": 2.0, "body_rate": 2e2,
-    "motor_command": 1.5, "rotor_speed": 8e3, "wrench_command": 1e3,
-    "specific_force": 1e3,
-}  # fmt: skip
 
 # s between attitudes of a filter on board that are used. It integrates its gyro and takes a fix now and then, so its
 # attitude errs as its rates do and for far longer than a sample lasts: as ten independent attitudes in 0.1 s they
@@ -74,15 +67,6 @@ class Counters:
 class _Node:
     time: float
     y: NDArray[np.float64] = field(default_factory=lambda: np.full(16, np.nan))  # 13 of the tape, specific force
-
-
-def _sane(signal: str, value: tuple[float, ...]) -> bool:
-    """Whether every component is a number that can be true (a NaN is not, nor a quaternion far from unit length)."""
-    limit = SANE[signal]
-    for v in value:  # plain loops and Python floats in what runs for every sample: numpy costs more than it saves there
-        if not -limit < v < limit:
-            return False
-    return signal != "attitude" or 0.5 < math.hypot(*value) < 2.0
 
 
 class OnlineEstimator:
@@ -274,7 +258,7 @@ class OnlineEstimator:
             self._input = seen[0]
         if self._input not in group:
             return
-        if not _sane(self._input, group[self._input]):
+        if not is_plausible(self._input, group[self._input]):
             self.counters.missing += 1
             return
         value = group[self._input]
@@ -307,13 +291,13 @@ class OnlineEstimator:
         for name, columns in self._measured.items():
             if name in group:
                 value = group[name]
-                if _sane(name, value):
+                if is_plausible(name, value):
                     node.y[columns] = value
                     known = True
                     continue
                 self.counters.missing += 1
                 if name != "attitude":  # half an attitude is none
-                    node.y[columns] = part = [v if abs(v) < SANE[name] else math.nan for v in value]
+                    node.y[columns] = part = [v if abs(v) < LARGEST_VALUE[name] else math.nan for v in value]
                     known = known or not all(math.isnan(v) for v in part)
         if known and not joins:
             self._pending.append(node)
