@@ -232,6 +232,9 @@ def test_what_is_set_aside_is_neither_an_alarm_nor_a_find() -> None:
     assert not without({**answer, "effects": [{"name": "linear_drag"}]}, ["linear_drag"])["mismatch"]
     left = {**answer, "effects": [{"name": "linear_drag"}], "unexplained": [{"axis": "x"}]}
     assert without(left, ["linear_drag"])["mismatch"]
+    alone = {**answer, "effects": [{"name": "linear_drag"}]}  # as a document of the diagnosis has it
+    assert not without({**alone, "unexplained": {"found": False, "where": []}}, ["linear_drag"])["mismatch"]
+    assert without({**alone, "unexplained": {"found": True, "where": []}}, ["linear_drag"])["mismatch"]
     assert without({**answer, "effects": []}, ["linear_drag"])["mismatch"]  # an alarm without a name stays one
 
 

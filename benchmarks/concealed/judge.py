@@ -23,11 +23,16 @@ def without(result: Document, aside: Collection[str]) -> dict[str, Any]:
     """
     effects = [e for e in result.get("effects") or [] if e.get("name") not in aside]
     groups = [[n for n in group if n not in aside] for group in result.get("indistinguishable") or []]
-    unexplained = bool(result.get("unexplained"))
     removed = len(effects) < len(result.get("effects") or [])
-    mismatch = bool(result.get("mismatch")) and (bool(effects) or unexplained or not removed)
+    mismatch = bool(result.get("mismatch")) and (bool(effects) or leaves_structure(result) or not removed)
     kept = [g for g in groups if len(g) > 1]
     return {**result, "effects": effects, "indistinguishable": kept, "mismatch": mismatch}
+
+
+def leaves_structure(result: Document) -> bool:
+    """Whether an answer reports something that no effect explains: `found` of `unexplained`, or any entry of a list."""
+    left = result.get("unexplained")
+    return bool(left.get("found", left.get("where"))) if isinstance(left, Mapping) else bool(left)
 
 
 def named(result: Document | None) -> list[str]:
@@ -173,7 +178,7 @@ def places(document: Any) -> list[tuple[str, str]]:
 def outside(name: str, result: Document | None) -> dict[str, bool]:
     """What is right about an answer to something outside the catalogue: unexplained, axis, regime, wrong name."""
     wanted = (OUTSIDE | FOREIGN_OUTSIDE)[name]
-    said = bool(result and result.get("mismatch") and result.get("unexplained"))
+    said = bool(result and result.get("mismatch") and leaves_structure(result))
     found = places((result or {}).get("unexplained")) or places((result or {}).get("where"))
     right = [regime for axis, regime in found if axis in wanted.axes]
     confident = [
