@@ -35,7 +35,7 @@ def test_the_flight_is_reproducible_and_flies(speed: ModuleType) -> None:
 def test_contenders_run_on_the_same_window_and_agree_on_its_likelihood(speed: ModuleType) -> None:
     result = speed.measure_speed(seed=1, window=60, rounds=2, seconds=1.2, with_peers=False)
     assert {row["n"] for row in result["rows"]} == {2}
-    assert len(result["rows"]) == 5
+    assert len(result["rows"]) == 6
     em = speed.settled(seed=1, window=60, seconds=1.2)
     first, last = em.tape.size - 60, em.tape.size
     window = speed.window_of(em, first, last)

@@ -69,8 +69,10 @@ def schema(document: dict[str, Any], *, held_out: bool) -> None:
     for effect in document["effects"]:
         assert effect["name"] in CATALOGUE
         assert 0 <= effect["confidence"] <= 1
-        assert set(effect["evidence"]) == {"held_out_nats", "p_value"}
-        assert all(isinstance(v, NUMBER) for v in effect["evidence"].values())
+        assert set(effect["evidence"]) == {"held_out_nats", "p_value", "log_odds"}
+        assert isinstance(effect["evidence"]["held_out_nats"], NUMBER)
+        assert isinstance(effect["evidence"]["p_value"], NUMBER)
+        assert effect["evidence"]["log_odds"] is None  # by `--method stages`
         known = {p.name: p.unit for p in CATALOGUE[effect["name"]].parameters}
         for name, parameter in effect["parameters"].items():
             assert name in known

@@ -62,7 +62,7 @@ def test_frames_are_turned_to_the_mean_of_those_fitted() -> None:
 def test_one_flight_or_a_filter_on_board_tells_nothing() -> None:
     alone = flight(0, 0.05, 0.0)
     assert alike([alone], []) == ([alone], [])
-    onboard = replace(alone, attitude=alone.y[:, 6:10].copy())
+    onboard = replace(alone, fused=True)
     assert tilt_of(onboard) is None
     still = replace(flight(1), signals=frozenset({"attitude", "velocity"}))
     assert tilt_of(still) is None

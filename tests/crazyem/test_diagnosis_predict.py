@@ -187,7 +187,7 @@ def test_measured_speeds_give_the_thrust_that_the_diagnosis_sees() -> None:
     """Where nothing is held back, both ways from speeds to mean thrust are one."""
     rng = np.random.default_rng(3)
     stamps = np.arange(0.0, 2.0, 0.01)
-    inputs = inputs_of(stamps, rng.uniform(0.05, 0.15, (stamps.size, 4)), measured=True)
+    inputs = replace(inputs_of(stamps, rng.uniform(0.05, 0.15, (stamps.size, 4)), measured=True), aged=False)
     effects = {"input_delay": {"delay": 0.007}, "rotor_sensor": {"rotor": 3, "scale": 1.1}}
     nodes = np.arange(0.5, 1.5, 0.013)
     mean, _ = rotor_thrust(inputs, nodes, vehicle=DRONE, effects=effects)

@@ -9,7 +9,7 @@ import pytest
 from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fitting import model as modelling
+from crazyem.diagnosis.fitting import sweeps
 from crazyem.diagnosis.fitting.always import refine_base
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, nominal
@@ -220,14 +220,14 @@ def test_noise_under_which_a_variance_is_none_is_not_likely(monkeypatch) -> None
     data = Data([flight])
     point = point_of(DRONE)
     assert np.isfinite(data.loglik(point))
-    kernel = modelling.sweep
+    kernel = sweeps.sweep
 
     def lost(*arrays: Any) -> float:
         value = kernel(*arrays)
         arrays[17][3, 0] = -1e299  # a variance
         return float(value) + 1e6  # as likely as it then seems
 
-    monkeypatch.setattr(modelling, "sweep", lost)
+    monkeypatch.setattr(sweeps, "sweep", lost)
     assert data.loglik(point) == -np.inf
     with pytest.raises(DivergedError):
         refine_base(data, point, ())

@@ -199,7 +199,7 @@ def test_drones_are_watched_together_and_commanded_never(fake):
     [
         (["fly", "--uri", "udp://h:1", "--uri", "udp://h:1"], "given twice"),
         (["fly", "--uri", "udp://h:1", "--swarm", "s.toml"], "not both"),
-        (["fly", "--swarm", "no.toml"], "cannot read no.toml"),
+        (["fly", "--swarm", "no.toml"], "cannot read the swarm file no.toml"),
         (["fly", "--uri", "udp://h:1", "--seed", "3"], "built-in simulator"),
         (["fly", "--uri", "mavlink:udpin:h:1"], "ground station"),
         (["watch", "--uri", "udp://h:1", "--push"], "watched only"),
