@@ -154,7 +154,7 @@ def forces(path: Path, vehicle: str, withhold: Sequence[str], *, learned: bool =
     the force that was missing before each start; else the model alone. (A voltage that is withheld is that of the
     first 3 s for the position, at earlier starts too.)"""
     from crazyem.diagnosis.flights.flight import without
-    from crazyem.diagnosis.prediction.earned import earned
+    from crazyem.diagnosis.prediction.bias_correction import correction_weights
     from crazyem.diagnosis.prediction.horizon import errors, open_loop, windows
     from crazyem.diagnosis.prediction.predict import predict, recorded, turned_by
     from crazyem.recordings import open_recording
@@ -162,7 +162,7 @@ def forces(path: Path, vehicle: str, withhold: Sequence[str], *, learned: bool =
 
     shown = recorded(without(open_recording(path), withhold), load_vehicle(vehicle))
     at = windows(shown)
-    weights = earned(turned_by(shown), at.times[:, 0], horizon=at.horizons[-1]) if learned else None
+    weights = correction_weights(turned_by(shown), at.times[:, 0], horizon=at.horizons[-1]) if learned else None
     position = errors(open_loop(shown, at, measured_attitude=True, weights=weights), at)
     step = 0.01  # one step from every sample: the model's acceleration
     if learned:

@@ -4,37 +4,37 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from crazyem.diagnosis.fitting.always import abstained, differing, steadied, unlike_a_body
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.fit import nominal as nominal_of
 from crazyem.diagnosis.fitting.model import Point, deviations
 from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.nuisances import abstained, differing, unlike_a_body, with_trim_noise
 from crazyem.diagnosis.fitting.sampling import of_a_real_drone
-from crazyem.diagnosis.flights import roles
+from crazyem.diagnosis.flights import held_out as held_out_roles
 from crazyem.diagnosis.flights.flight import Flight, flight_of
 from crazyem.diagnosis.flights.floor import on_one_floor
 from crazyem.diagnosis.flights.frame import alike as in_one_frame
-from crazyem.diagnosis.flights.own import Own, owned
+from crazyem.diagnosis.flights.recording_nuisances import RecordingNuisances, owned
 from crazyem.diagnosis.locating.heading import heading_by_place
 from crazyem.diagnosis.locating.locate import Located, locate
 from crazyem.diagnosis.locating.place import depends_on_place
+from crazyem.diagnosis.naming.alternatives import exchanged, named_again
+from crazyem.diagnosis.naming.answer import MEASURED_LATE, Answer, answer_of, strongest_first
 from crazyem.diagnosis.naming.balance import by_balance, hidden_by_the_day
-from crazyem.diagnosis.naming.beside import beside_the_regression, late_rotors
+from crazyem.diagnosis.naming.corroboration import TELLING, false_speed, late_measurements
 from crazyem.diagnosis.naming.determined import determined, without_undetermined
-from crazyem.diagnosis.naming.exchange import exchanged, named_again
-from crazyem.diagnosis.naming.foretold import with_found, without_what_misleads
 from crazyem.diagnosis.naming.free import Free, left_free
-from crazyem.diagnosis.naming.imitated import by_place
+from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, as_load, as_two
 from crazyem.diagnosis.naming.named import Named
+from crazyem.diagnosis.naming.other_likelihoods import late_rotors, other_likelihoods
+from crazyem.diagnosis.naming.place_rivals import by_place
+from crazyem.diagnosis.naming.prediction_check import with_found, without_what_misleads
 from crazyem.diagnosis.naming.rotor_response import answers, disobedient
 from crazyem.diagnosis.naming.select import select
-from crazyem.diagnosis.naming.split import LOAD, WEAKER, as_load, as_two
-from crazyem.diagnosis.naming.steady import left_as_trim, with_its_thrust, with_whole_torques
-from crazyem.diagnosis.naming.told import MEASURED_LATE, Told, strongest_first, tell
+from crazyem.diagnosis.naming.steady import left_as_trim, with_exact_torques, with_its_thrust
 from crazyem.diagnosis.naming.trials import Selection, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained, unexplained
-from crazyem.diagnosis.naming.witness import TELLING, false_speed, late_measurements
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording
@@ -52,7 +52,7 @@ class Diagnosis:
         fitted_vehicle: the drone, with what was found and belongs to it; `as_flown` has what belongs to the recordings
             as well.
         free: what was free beside the effects.
-        swapped: `recordings` are those that were held out (see `flights/roles.py`).
+        swapped: `recordings` are those that were held out (see `flights/held_out.py`).
         by_others: of several recordings with none held out, for each the vehicle fitted to the others.
         selection: by stages; None: by one posterior, whose `ranking` of single effects is as the document has it.
     """
@@ -73,7 +73,7 @@ class Diagnosis:
     left_out: dict[str, str]
     explained: float
     free: tuple[Free, ...]
-    own: tuple[Own, ...]
+    own: tuple[RecordingNuisances, ...]
     swapped: bool = False
     ranking: tuple[dict[str, Any], ...] = ()
     by_others: tuple[Vehicle, ...] = ()
@@ -94,21 +94,21 @@ def diagnose(
 
     Args:
         held_out: flights that confirm what is found; where the recordings only hover and these do not, it is the other
-            way round (`flights/roles.py`), unless `strict`.
+            way round (`flights/held_out.py`), unless `strict`.
         jobs: threads that share the candidates; None: one a core. The result is the same for any number.
 
     Raises:
         DataError: a recording cannot be used (no flight, no inputs, too short).
         UsageError: an unknown effect among those wanted.
     """
-    asked = _asked(recordings, vehicle, held_out, wanted, withhold, strict=strict, say=say)
+    asked = _request_of(recordings, vehicle, held_out, wanted, withhold, strict=strict, say=say)
     workers = Workers(jobs)
     say(f"nominal model of {vehicle.name}: {sum(f.duration for f in asked.flights):.0f} s of flight")
     chosen = _chosen(asked, workers, say)
     data, apart = chosen.data, chosen.apart
     selection, pull = by_place(data, apart, chosen.selection, say)
-    selection, witnessed = _heard(data, apart, selection, asked.recordings)
-    selection, balance = by_balance(data, with_whole_torques(data, selection))
+    selection, witnessed = _corroborated(data, apart, selection, asked.recordings)
+    selection, balance = by_balance(data, with_exact_torques(data, selection))
     judges = asked.held_out or asked.recordings
     selection = without_what_misleads(data, selection, asked.vehicle, judges, withhold=withhold, say=say)
     besides = {c.effect for c in asked.besides}
@@ -117,13 +117,13 @@ def diagnose(
     place = depends_on_place(data, apart, selection.final)
     remains = unexplained(data, selection, after, apart)
     for finding in (pull, place and place.finding, heading_by_place(data, apart)):
-        remains = remains.beside(finding) if finding else remains
+        remains = remains.with_finding(finding) if finding else remains
     left_out = {**chosen.left_out, **hidden_by_the_day(data, selection, chosen.candidates)}
     pulled = pull is not None or (place is not None and not place.pushed)
-    beside = beside_the_regression(data, apart, selection.final, remains, wanted, left_out, pulled, say)
+    beside = other_likelihoods(data, apart, selection.final, remains, wanted, left_out, pulled, say)
     if any(e.name == "gusts" for e in beside):
         remains = remains.without_force()
-    told = tell(
+    told = answer_of(
         data, selection, remains, witnessed=witnessed, in_place=_in_place(data, apart, selection), balance=balance,
         apart=apart is not None,
     )  # fmt: skip
@@ -162,7 +162,7 @@ def diagnose(
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _Request:
     """What is asked: recordings to fit and their flights, those held out, the vehicle that is assumed to begin with."""
 
     recordings: Sequence[Recording]
@@ -180,7 +180,7 @@ class _Chosen:
     """What the flights ask for: `asked` with these as they were used, the selection, the candidates for it, and what
     the flights cannot speak of and why."""
 
-    asked: _Asked
+    asked: _Request
     data: Data
     apart: Data | None
     selection: Selection
@@ -188,7 +188,7 @@ class _Chosen:
     left_out: dict[str, str]
 
 
-def _asked(
+def _request_of(
     recordings: Sequence[Recording],
     vehicle: Vehicle,
     held_out: Sequence[Recording],
@@ -197,22 +197,22 @@ def _asked(
     *,
     strict: bool,
     say: Say,
-) -> _Asked:
+) -> _Request:
     """The flights of the recordings, in one frame; those held out are fitted where the others only hover."""
     flights = [flight_of(r, vehicle, withhold=withhold) for r in recordings]
     kept_apart = [flight_of(r, vehicle, withhold=withhold) for r in held_out]
-    swapped = not strict and roles.swapped(flights, kept_apart)
+    swapped = not strict and held_out_roles.swapped(flights, kept_apart)
     if swapped:
         flights, kept_apart, recordings, held_out = kept_apart, flights, held_out, recordings
-        say(roles.told([r.path for r in recordings], [r.path for r in held_out]))
+        say(held_out_roles.swap_sentence([r.path for r in recordings], [r.path for r in held_out]))
     assumed = of_a_real_drone(flights, vehicle)
     untrimmed = assumed is not vehicle and not wanted  # its trim is looked for, too
     flights, kept_apart = differing(*in_one_frame(*on_one_floor(flights, kept_apart)), assumed)
     besides = [Candidate(TRIM, (), ("x", "y", "z"))] if untrimmed else []
-    return _Asked(recordings, held_out, flights, kept_apart, assumed, wanted, besides, swapped)
+    return _Request(recordings, held_out, flights, kept_apart, assumed, wanted, besides, swapped)
 
 
-def _chosen(asked: _Asked, workers: Workers, say: Say) -> _Chosen:
+def _chosen(asked: _Request, workers: Workers, say: Say) -> _Chosen:
     """The selection by the flights as they are, or, where these turn no body, without what is fast; under its last
     names, with what there is room for beside these."""
     chosen = _selected(asked, workers, say)
@@ -230,7 +230,7 @@ def _chosen(asked: _Asked, workers: Workers, say: Say) -> _Chosen:
     return replace(chosen, selection=selection)
 
 
-def _selected(asked: _Asked, workers: Workers, say: Say) -> _Chosen:
+def _selected(asked: _Request, workers: Workers, say: Say) -> _Chosen:
     """The selection by the flights, from all that they can speak of."""
     data, apart = Data(asked.flights, workers), Data(asked.kept_apart, workers) if asked.kept_apart else None
     vehicle = asked.vehicle
@@ -244,7 +244,7 @@ def _selected(asked: _Asked, workers: Workers, say: Say) -> _Chosen:
         nominal, data.signals, measured_speeds=asked.flights[0].inputs.measured, wanted=asked.wanted
     )
     candidates, left_out = abstained(data, nominal, [*candidates, *asked.besides], left_out)
-    nominal = steadied(data, nominal)
+    nominal = with_trim_noise(data, nominal)
     selection = select(data, nominal, candidates, held_out=apart, say=say)
     return _Chosen(asked, data, apart, selection, candidates, left_out)
 
@@ -278,13 +278,13 @@ def _in_place(data: Data, apart: Data | None, selection: Selection) -> dict[str,
 
 
 def _late_rotors(
-    asked: _Asked, vehicle: Vehicle, told: Told, remains: Unexplained, left_out: dict[str, str]
-) -> tuple[Told, list[Named], Unexplained]:
+    asked: _Request, vehicle: Vehicle, told: Answer, remains: Unexplained, left_out: dict[str, str]
+) -> tuple[Answer, list[Named], Unexplained]:
     """What is told, what is found beside it, and what remains, with what measured rotor speeds say of the commands."""
     here, there = answers(asked.recordings, vehicle), answers(asked.held_out, vehicle)
     # the body answers to the speeds that were measured, so this says nothing against what was told of it
     deaf = disobedient([*here, *there])
-    remains = remains.beside(deaf) if deaf else remains
+    remains = remains.with_finding(deaf) if deaf else remains
     if any(e.name == "input_delay" for e in told.effects):
         return told, [], remains
     late, alike = late_rotors(here, there, vehicle, asked.wanted, left_out, deaf=deaf is not None)
@@ -293,7 +293,7 @@ def _late_rotors(
     return told, late, remains
 
 
-def _heard(
+def _corroborated(
     data: Data, apart: Data | None, selection: Selection, recordings: Sequence[Recording]
 ) -> tuple[Selection, frozenset[str]]:
     """The selection after the witnesses were heard, and the names of effects that they told from their look-alikes.

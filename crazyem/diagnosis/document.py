@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.diagnose import Diagnosis
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.flights import roles
+from crazyem.diagnosis.flights import held_out as held_out_roles
 from crazyem.diagnosis.flights.flight import without
-from crazyem.diagnosis.flights.own import Own
+from crazyem.diagnosis.flights.recording_nuisances import RecordingNuisances
 from crazyem.diagnosis.joint import posterior_of
 from crazyem.diagnosis.locating.locate import Finding, strongest
 from crazyem.diagnosis.naming.named import Named
@@ -93,7 +93,7 @@ def document_of(
         "of_recordings": [own.to_json() for own in diagnosis.own],
         "left_free": _left_free(diagnosis),
         "notices": [
-            *([roles.told(diagnosis.recordings, diagnosis.held_out)] if diagnosis.swapped else []),
+            *([held_out_roles.swap_sentence(diagnosis.recordings, diagnosis.held_out)] if diagnosis.swapped else []),
             *_of_recordings(diagnosis.effects),
             *notices_of(diagnosis.own),
         ],
@@ -129,7 +129,7 @@ def _of_recordings(effects: Sequence[Named]) -> list[str]:
     ]
 
 
-def notices_of(own: Sequence[Own]) -> list[str]:
+def notices_of(own: Sequence[RecordingNuisances]) -> list[str]:
     """What is told of each recording, with its name where there are several."""
     return [_named(o.recording, text, len(own) > 1) for o in own for text in o.notices]
 

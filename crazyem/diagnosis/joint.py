@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from crazyem.diagnosis.diagnose import Diagnosis
-from crazyem.diagnosis.fitting.always import solved
+from crazyem.diagnosis.fitting.nuisances import solved
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.vehicle import Posterior
 

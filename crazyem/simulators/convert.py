@@ -9,7 +9,7 @@ from crazyem.errors import FileFormatError, UsageError
 from crazyem.physics import folding
 from crazyem.recordings.recording import Recording
 from crazyem.simulators.constants import AIR, Constants, from_vehicle, to_vehicle
-from crazyem.simulators.cost import HORIZON, apart, errors_after, flown, reference_flight, said, to_json
+from crazyem.simulators.cost import HORIZON, errors_after, flown, reference_flight, rms_distance, said, to_json
 from crazyem.simulators.fields import Contradiction, Format, SimulatorFile, read, write
 from crazyem.simulators.formats.rotorpy import ROTORPY, ROTORPY_JSON
 from crazyem.simulators.plausible import impossible, objection
@@ -263,7 +263,7 @@ def _cost(
         errors = errors_after(flight, {"with": vehicle, "without": without})
         return {q: errors["without"][q] - errors["with"][q] for q in errors["with"]}, errors
     reference = reference_flight(vehicle)
-    return apart(flown(reference, vehicle), flown(reference, without)), None
+    return rms_distance(flown(reference, vehicle), flown(reference, without)), None
 
 
 def same(first: Constants, second: Constants, quantities: tuple[str, ...]) -> bool:

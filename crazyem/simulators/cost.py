@@ -65,7 +65,7 @@ def flown(reference: Reference, vehicle: Vehicle) -> Array:
     return Simulator(reference.inputs, vehicle=vehicle).run(reference.state, reference.times)
 
 
-def apart(first: Array, second: Array) -> dict[str, float]:
+def rms_distance(first: Array, second: Array) -> dict[str, float]:
     """Root mean square distance of two predictions at their last moments, by quantity [m, m/s, rad, rad/s]."""
     found = {}
     for name, columns in _COLUMNS.items():

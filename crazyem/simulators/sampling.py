@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting.always import DAILY_LAG_SD, THRUST_SD
+from crazyem.diagnosis.fitting.nuisances import DAILY_LAG_SD, THRUST_SD
 from crazyem.diagnosis.fitting.sampling import TRIM_SD
 from crazyem.errors import DataError, UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -125,7 +125,7 @@ def _drawn(vehicle: Vehicle, parameters: Sequence[str], theta: Array) -> Vehicle
 
 
 def _another_day(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
-    """The same drone on another day; sources of the spreads: `fitting/always.py`, `fitting/sampling.py`."""
+    """The same drone on another day; sources of the spreads: `fitting/nuisances.py`, `fitting/sampling.py`."""
     effects = {n: dict(v) for n, v in vehicle.effects.items()}
     scale = effects.setdefault("thrust_scale", {"scale": 1.0})
     scale["scale"] *= 1.0 + THRUST_SD * rng.standard_normal()

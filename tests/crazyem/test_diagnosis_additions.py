@@ -72,7 +72,7 @@ def test_what_explains_nearly_as_much_is_compared_with_noise_of_its_own(monkeypa
     def sharpened(basis: Any, own: Any, t: Trial) -> Trial:
         return replace(t, gain=gained[t.candidate.effect], value=gained[t.candidate.effect])
 
-    monkeypatch.setattr(select, "sharpened", sharpened)
+    monkeypatch.setattr(select, "with_noise_refit", sharpened)
     basis: Any = SimpleNamespace(held_out=None, point=POINT, data=SimpleNamespace(workers=Workers(1)))
     first = [
         replace(trial(effect, gain), value=gain, blocks=np.full(20, gain / 20))
@@ -94,7 +94,7 @@ def test_what_turns_the_drone_as_well_is_compared_with_noise_of_its_own_however_
         asked.append(t.candidate.effect)
         return t
 
-    monkeypatch.setattr(select, "sharpened", sharpened)
+    monkeypatch.setattr(select, "with_noise_refit", sharpened)
     basis: Any = SimpleNamespace(held_out=None, point=POINT, data=SimpleNamespace(workers=Workers(1)))
     first = [
         replace(trial(effect, gain), value=gain, blocks=np.full(20, gain / 20))

@@ -12,20 +12,20 @@ from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fitting import always
-from crazyem.diagnosis.fitting.always import COARSE_REASON, FAST, refine_base
+from crazyem.diagnosis.fitting import nuisances
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.nuisances import COARSE_REASON, FAST, refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Finding
-from crazyem.diagnosis.locating.restless import AT_RANDOM
+from crazyem.diagnosis.locating.random_torques import AT_RANDOM
+from crazyem.diagnosis.naming import answer
 from crazyem.diagnosis.naming import select as selecting
-from crazyem.diagnosis.naming import told
+from crazyem.diagnosis.naming.answer import BY_FORCE
 from crazyem.diagnosis.naming.named import DOUBTFUL, trust
 from crazyem.diagnosis.naming.select import select
-from crazyem.diagnosis.naming.told import BY_FORCE
 from crazyem.diagnosis.naming.trials import Selection
 from crazyem.diagnosis.naming.unexplained import Unexplained, notable
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -47,7 +47,7 @@ def test_an_inertia_that_no_body_has_leaves_open_what_turns_the_drone(slow_to_tu
     found = diagnose([slow_to_turn], DRONE, wanted=wanted)
     assert {e.name for e in found.effects} == {"inertia", "linear_drag"}
     assert not found.left_out
-    monkeypatch.setattr(always, "FAR_OUT", 0.1)  # as if the drone were that much smaller than what it needs
+    monkeypatch.setattr(nuisances, "FAR_OUT", 0.1)  # as if the drone were that much smaller than what it needs
     said = []
     again = diagnose([slow_to_turn], DRONE, wanted=wanted, say=said.append)
     assert [e.name for e in again.effects] == ["linear_drag"]
@@ -128,7 +128,7 @@ def test_where_torques_say_nothing_they_say_nothing_against_what_forces_tell():
     remains = Unexplained((left("torque", 300.0), left("body_rate", 90.0)), 900.0)
     assert trust(remains) == DOUBTFUL
     assert trust(remains.of_forces()) == 1.0
-    assert trust(remains.beside(left("force", 100.0)).of_forces()) == DOUBTFUL
+    assert trust(remains.with_finding(left("force", 100.0)).of_forces()) == DOUBTFUL
 
 
 def test_a_rotor_that_pushes_at_random_says_nothing_against_forces_that_last():
@@ -140,7 +140,7 @@ def test_a_rotor_that_pushes_at_random_says_nothing_against_forces_that_last():
     assert trust(remains.without_random_rotor()) == 1.0
     assert trust(remains.without_random_rotor(4)) == 1.0  # nor against its being weak
     assert trust(remains.without_random_rotor(1)) == DOUBTFUL
-    assert trust(remains.beside(shaken).without_random_rotor()) == DOUBTFUL  # a loop that swings feigns a drag
+    assert trust(remains.with_finding(shaken).without_random_rotor()) == DOUBTFUL  # a loop that swings feigns a drag
     assert set(BY_FORCE) <= set(CATALOGUE)
     assert not set(BY_FORCE) & set(FAST) - {"thrust_curve"}
     data = SimpleNamespace(coarse=False)
@@ -148,4 +148,4 @@ def test_a_rotor_that_pushes_at_random_says_nothing_against_forces_that_last():
         ("linear_drag", 0, False), ("inertia_products", 0, True), ("rotor_fault", 4, False), ("rotor_fault", 1, True),
     ):  # fmt: skip
         candidate = Candidate(name, (("rotor", rotor),) if rotor else (), ("x",))
-        assert told._against(remains, candidate, data).found == against  # type: ignore[arg-type]
+        assert answer._against(remains, candidate, data).found == against  # type: ignore[arg-type]

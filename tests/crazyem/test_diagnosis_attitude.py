@@ -8,9 +8,9 @@ import pytest
 from closed_loop import DRONE, fly
 from made_flight import array_of
 
-from crazyem.diagnosis.fitting.always import refine_base
 from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.estimation import steps
 from crazyem.recordings.recording import Recording, crazyflie_attitude, onboard_attitude

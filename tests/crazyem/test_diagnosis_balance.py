@@ -18,20 +18,20 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import balance as balancing
+from crazyem.diagnosis.naming.answer import _by_the_day, _steady_rivals
 from crazyem.diagnosis.naming.balance import (
     DAYS,
     FREE,
     Balance,
+    balance_loglik,
     balance_of,
     by_balance,
     hidden_by_the_day,
     how_weak,
     prefers,
     steady,
-    weighed,
     without_each,
 )
-from crazyem.diagnosis.naming.told import _by_the_day, _steady_rivals
 from crazyem.diagnosis.naming.trials import Trial
 from crazyem.vehicle import Vehicle
 
@@ -68,7 +68,7 @@ def loaded(share: float, x: float, y: float) -> NDArray:
 def test_a_weak_rotor_is_told_from_every_other_and_from_a_load_by_its_drag(number: int) -> None:
     shown = balance(0.3 * EACH[number - 1])
     assert how_weak(shown, number)[0] == pytest.approx(0.3)
-    assert weighed(shown, "rotor_fault", {"rotor": number}) == pytest.approx(-1.0)
+    assert balance_loglik(shown, "rotor_fault", {"rotor": number}) == pytest.approx(-1.0)
     for other in (*(rotor(k) for k in (1, 2, 3, 4) if k != number), WIND, STRONG):
         told = prefers(shown, rotor(number), other)
         assert told is not None
@@ -84,24 +84,25 @@ def test_a_load_by_two_rotors_is_none_of_them() -> None:
         told = prefers(shown, LOAD, rotor(number))
         assert told is not None
         assert told > 3.0
-    assert weighed(shown, "payload", {}) == pytest.approx(-3.0, abs=1e-3)
+    assert balance_loglik(shown, "payload", {}) == pytest.approx(-3.0, abs=1e-3)
 
 
 def test_no_load_is_further_out_than_the_drone() -> None:
     """2.3 mm of torque over thrust with no thrust missing: 40 mm from the middle it would be 6 % of the weight."""
     distance = 0.0023 / 0.04
     nearest = min(((m / SD[0]) ** 2 + (0.0023 - 0.04 * m) ** 2 / SD[1] ** 2) for m in np.linspace(0.0, distance, 2000))
-    found = weighed(balance(np.array([0.0, -0.0023, 0.0, 0.0])), "payload", {})
+    found = balance_loglik(balance(np.array([0.0, -0.0023, 0.0, 0.0])), "payload", {})
     assert found == pytest.approx(-0.5 * (DAYS + 4) * np.log1p(nearest / DAYS) - 3.0, abs=1e-3)
     assert found < -4.0
 
 
 def test_a_healthy_drone_is_best_explained_by_nothing_and_two_weak_rotors_by_a_load() -> None:
     assert all(
-        weighed(balance(np.zeros(4)), name, {"rotor": 1}) == pytest.approx(-n, abs=1e-6) for name, n in FREE.items()
+        balance_loglik(balance(np.zeros(4)), name, {"rotor": 1}) == pytest.approx(-n, abs=1e-6)
+        for name, n in FREE.items()
     )
     two = balance(0.2 * (EACH[2] + EACH[3]))
-    assert weighed(two, "payload", {}) == pytest.approx(-3.0, abs=1e-3)  # left rotors: their drags cancel
+    assert balance_loglik(two, "payload", {}) == pytest.approx(-3.0, abs=1e-3)  # left rotors: their drags cancel
 
 
 @given(st.floats(0.0, 0.3), st.floats(-0.04, 0.04), st.floats(-0.04, 0.04), st.floats(-3, 3), st.floats(-3, 3))
@@ -110,7 +111,7 @@ def test_the_nearest_load_is_as_near_as_any_on_a_grid(share, x, y, thrust, twist
     shares, xs, ys = np.meshgrid(np.linspace(0, 0.49, 50), np.linspace(-0.04, 0.04, 41), np.linspace(-0.04, 0.04, 41))
     tried = np.stack([shares, -shares * ys, shares * xs, np.zeros_like(xs)], -1)
     distance = float(np.square((shown.lack - tried) / SD).sum(-1).min())
-    found = weighed(shown, "payload", {})
+    found = balance_loglik(shown, "payload", {})
     assert found is not None
     assert found >= -0.5 * (DAYS + 4) * np.log1p(distance / DAYS) - 3.0 - 1e-3
     assert found <= -3.0 + 1e-9
@@ -121,11 +122,11 @@ def test_rotors_relabelled_by_a_mirror_weigh_as_the_relabelled(days) -> None:
     """Left and right: torques about x and z change their sign, rotors 1 and 4, 2 and 3 their places."""
     here, there = balance(SD * days), balance(SD * days * [1, -1, 1, -1])
     for one, other in ((1, 4), (2, 3), (3, 2), (4, 1)):
-        assert weighed(here, "rotor_fault", {"rotor": one}) == pytest.approx(
-            weighed(there, "rotor_fault", {"rotor": other})
+        assert balance_loglik(here, "rotor_fault", {"rotor": one}) == pytest.approx(
+            balance_loglik(there, "rotor_fault", {"rotor": other})
         )
     for name in ("payload", "wind", "thrust_scale"):
-        assert weighed(here, name, {}) == pytest.approx(weighed(there, name, {}), abs=1e-3)
+        assert balance_loglik(here, name, {}) == pytest.approx(balance_loglik(there, name, {}), abs=1e-3)
 
 
 def test_days_are_drawn_with_the_uncertainty_that_is_told() -> None:
@@ -141,7 +142,7 @@ def test_days_are_drawn_with_the_uncertainty_that_is_told() -> None:
 
 def test_what_moves_no_balance_or_sets_in_later_is_not_weighed() -> None:
     shown = balance(0.2 * EACH[0])
-    assert weighed(shown, "linear_drag", {}) is None
+    assert balance_loglik(shown, "linear_drag", {}) is None
     assert prefers(shown, rotor(1), DRAG) is None
     assert prefers(shown, rotor(1, onset=4.0), LOAD) is None
     assert not steady(rotor(1, onset=4.0))

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from crazyem.diagnosis.diagnose import Diagnosis, diagnose
 from crazyem.diagnosis.document import document_of
-from crazyem.diagnosis.fitting.always import refine_base
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming.determined import determined, without_undetermined
 from crazyem.diagnosis.naming.named import Named, Value, around

@@ -12,7 +12,7 @@ from crazyem.diagnosis.fitting.fit import Data, DivergedError, refine
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.diagnosis.naming.select import Basis, tried
+from crazyem.diagnosis.naming.select import Basis, fitted_trial
 from crazyem.diagnosis.naming.trials import Trial
 from crazyem.errors import DataError
 
@@ -54,6 +54,6 @@ def test_a_candidate_that_diverges_is_no_explanation(wild: tuple[Data, Point], m
     basis = Basis(data, None, Point(DRONE, {}, point.noise), (), 0.0, 0.0)
     linear = Trial(DRAG, 50.0, 50.0, 1.0, 1e-9, 49.0)
     solution: Any = SimpleNamespace(theta=np.array([0.1, 0.1, 0.1]))
-    found = tried(basis, linear, solution, say=lambda text: None)
+    found = fitted_trial(basis, linear, solution, say=lambda text: None)
     assert found.p_value == 1.0
     assert found.fitted is None

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from crazyem.cli import main
 from crazyem.diagnosis.diagnose import Diagnosis, diagnose
 from crazyem.diagnosis.document import document_of
-from crazyem.diagnosis.fitting.always import refine_base
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, starting_point
 from crazyem.diagnosis.fitting.model import Noise, Point
+from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.prediction.horizon import UNITS
 from crazyem.physics.effects.catalogue import CATALOGUE

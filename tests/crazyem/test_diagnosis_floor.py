@@ -9,7 +9,7 @@ from made_flight import made_flight
 
 from crazyem.diagnosis.flights.flight import Flight, flight_of
 from crazyem.diagnosis.flights.floor import on_one_floor
-from crazyem.diagnosis.flights.own import owned
+from crazyem.diagnosis.flights.recording_nuisances import owned
 
 FLOORS = (0.05, 0.056, 0.06)
 

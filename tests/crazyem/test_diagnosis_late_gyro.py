@@ -12,13 +12,13 @@ from closed_loop import DRONE, fly
 from made_flight import array_of
 from scipy.interpolate import CubicSpline
 
-from crazyem.diagnosis.fitting.always import refine_base
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.diagnosis.naming.least import matters
+from crazyem.diagnosis.naming.detection_limits import matters
 
 GYRO = Candidate("measurement_delay", (("streams", ("gyro",)),), ("delay",))
 

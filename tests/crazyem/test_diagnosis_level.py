@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_flight import Motion, changed, made_flight, without
 
-from crazyem.diagnosis.fitting.always import abstained
 from crazyem.diagnosis.fitting.candidates import candidates_for
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.nuisances import abstained
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.flights.inputs import NOMINAL_VOLTAGE, inputs_of
 from crazyem.diagnosis.prediction.predict import predict, recorded

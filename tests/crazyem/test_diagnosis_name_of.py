@@ -15,7 +15,7 @@ from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.naming import select
 from crazyem.diagnosis.naming.evidence import known_of, tuning
 from crazyem.diagnosis.naming.select import group_of, may_join, name_of
-from crazyem.diagnosis.naming.trials import BEATEN, Step, Trial, better, preferred, told_apart
+from crazyem.diagnosis.naming.trials import BEATEN, Step, Trial, better, distinguishable, preferred
 from crazyem.diagnosis.workers import Workers
 
 NOISE = np.random.default_rng(0).normal(size=40)
@@ -39,7 +39,7 @@ def test_what_is_beaten_does_not_however_simple():
     """Three inertias better by 3.7 nats than a factor on all torques, steadily from block to block: the factor was told
     first, with a confidence of 0.02."""
     inertia, torque = trial("inertia", "xyz", 105.7), trial("torque_scale", "s", 100.0, scatter=0.25)
-    assert not told_apart(inertia, torque)  # by less than 4 nats
+    assert not distinguishable(inertia, torque)  # by less than 4 nats
     assert better(torque, inertia) < BEATEN
     assert name_of([inertia, torque], counted=False) is inertia
     unsteady = trial("torque_scale", "s", 100.0, scatter=1.0)
@@ -54,8 +54,8 @@ def test_recordings_that_differ_widen_the_group_but_do_not_give_the_name():
     lags, late = trial("motor_lag", "xyz", 100.0), trial("input_delay", "d", 100.0)
     best = replace(lags, blocks=lags.blocks + apart, value=100.0 + apart.sum() + 2.0, recording=of)
     other = replace(late, recording=of)
-    assert not told_apart(best, other)
-    assert told_apart(best, other, recordings=False)
+    assert not distinguishable(best, other)
+    assert distinguishable(best, other, recordings=False)
     assert name_of([best, other], counted=False) is best
     assert 0.8 < preferred(best, [other]) < 0.95
 
@@ -65,9 +65,9 @@ def test_the_group_is_that_of_the_name():
     ground = trial("ground_effect", "sh", 130.0)
     late = trial("input_delay", "d", 100.0, scatter=8.0)
     lag = replace(trial("motor_lag", "t", 90.0), blocks=late.blocks - 0.25 - 2.0 * NOISE)
-    assert not told_apart(ground, late)
-    assert told_apart(ground, replace(lag, blocks=ground.blocks - 1.0))
-    assert not told_apart(late, lag)
+    assert not distinguishable(ground, late)
+    assert distinguishable(ground, replace(lag, blocks=ground.blocks - 1.0))
+    assert not distinguishable(late, lag)
     equals = [ground, late]
     assert name_of(equals, counted=False) is late
     assert group_of(late, equals, [*equals, lag], counted=False) == (ground, lag)
@@ -120,9 +120,9 @@ def test_the_better_explanation_of_all_flights_leads_whichever_ruins_those_held_
     point = Point(DRONE, {}, first_guess())
     basis = SimpleNamespace(held_out=object(), point=point, data=SimpleNamespace(workers=Workers(1)))
     own, given = object(), []
-    monkeypatch.setattr(select, "noise_apart", lambda basis, trial: own)
-    monkeypatch.setattr(select, "sharpened", lambda basis, noise, trial: given.append(noise) or trial)
-    monkeypatch.setattr(select, "weighed", lambda trials, counted: sorted(trials, key=lambda t: -t.evidence))
+    monkeypatch.setattr(select, "held_out_noise", lambda basis, trial: own)
+    monkeypatch.setattr(select, "with_noise_refit", lambda basis, noise, trial: given.append(noise) or trial)
+    monkeypatch.setattr(select, "by_evidence", lambda trials, counted: sorted(trials, key=lambda t: -t.evidence))
     trials, equals = select.compared_again(basis, [linear, quadratic], say=lambda text: None)
     assert trials[0] is linear
     assert equals == [quadratic]
@@ -179,9 +179,9 @@ def test_a_load_that_must_sit_in_the_middle_is_told_from_weak_rotors() -> None:
     """As likely with four numbers as with one, but two of them must be 0 within 0.1 mm of some 10: that it happens to
     sit there costs more than another nat for each."""
     weak, load = replace(trial("thrust_scale", "s", 100.0), tuned=5.0), trial("payload", "mxyz", 100.5, scatter=0.1)
-    assert not told_apart(weak, replace(load, tuned=None, value=103.5))
+    assert not distinguishable(weak, replace(load, tuned=None, value=103.5))
     scaled = np.diag(np.square([1e-5, 1e-4, 1e-4, 1.0]))
     at = Candidate("payload", (), ("mass", "x", "y", "z"))
     cost = tuning([at], known_of([at], np.linalg.inv(scaled)))
     assert cost == pytest.approx(np.log(2.5e-3 / 1e-5) + 2 * np.log(1e-2 / 1e-4), abs=0.01)
-    assert told_apart(weak, replace(load, tuned=cost))
+    assert distinguishable(weak, replace(load, tuned=cost))

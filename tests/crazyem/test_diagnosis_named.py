@@ -11,17 +11,17 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fitting.always import LAG_OFF, by_a_wrong_lag, nuisances, refine_base, unsure
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.nuisances import LAG_OFF, by_a_wrong_lag, nuisances, refine_base, systematic_sd
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Finding
-from crazyem.diagnosis.naming import told
+from crazyem.diagnosis.naming import answer
+from crazyem.diagnosis.naming.answer import _numbers, _rivals, _uncertainty, strongest_first
 from crazyem.diagnosis.naming.named import CALIBRATED, DOUBTFUL, SELDOM, Named, at_most, one_factor, trust
-from crazyem.diagnosis.naming.told import _numbers, _rivals, _uncertainty, strongest_first
 from crazyem.diagnosis.naming.trials import Step, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained
 
@@ -46,8 +46,8 @@ def test_chance_tells_one_factor_as_several_in_one_of_twenty():
 def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_asked(monkeypatch):
     flown = fly(Hidden(torque=0.7), seconds=20.0, seed=6)
     held_out, brought = [], []
-    monkeypatch.setattr(told, "trust", lambda remains, nats: brought.append(nats) or 1.0)
-    monkeypatch.setattr(told, "at_most", lambda held, p_value, *, apart: held_out.append(apart) or 0.123)
+    monkeypatch.setattr(answer, "trust", lambda remains, nats: brought.append(nats) or 1.0)
+    monkeypatch.setattr(answer, "at_most", lambda held, p_value, *, apart: held_out.append(apart) or 0.123)
     found = diagnose([flown], DRONE, wanted=["inertia"])
     assert [(e.name, e.confidence) for e in found.effects] == [("inertia", 0.123)]
     assert held_out == [False]  # it is one flight alone
@@ -147,15 +147,15 @@ def test_intervals_count_by_how_much_flights_differ_where_there_are_many() -> No
 
 def test_what_no_scatter_shows_is_part_of_an_interval() -> None:
     data = Data([flight_of(fly(seconds=6.0), DRONE)])
-    never = unsure(data, point_of(suspended_load={"mass": 0.002, "length": 0.4}))
+    never = systematic_sd(data, point_of(suspended_load={"mass": 0.002, "length": 0.4}))
     assert never["suspended_load", "length"] == pytest.approx(0.002)
     assert never["suspended_load", "mass"] == pytest.approx(3e-3 * DRONE.mass)
     assert never["thrust_curve", "slope_error"] == pytest.approx(0.02)
     data.models[0]._strays["suspended_load"] = True
-    shaken = unsure(data, point_of(suspended_load={"mass": 0.002, "length": 0.4}))
+    shaken = systematic_sd(data, point_of(suspended_load={"mass": 0.002, "length": 0.4}))
     assert shaken["suspended_load", "length"] == pytest.approx(0.008)
     assert shaken["suspended_load", "mass"] == never["suspended_load", "mass"]
-    assert unsure(data, point_of())["suspended_load", "length"] == 0.0
+    assert systematic_sd(data, point_of())["suspended_load", "length"] == 0.0
 
 
 def test_inertias_are_as_unsure_as_a_lag_that_is_a_little_wrong_makes_them() -> None:

@@ -9,10 +9,10 @@ from made_flight import array_of
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from crazyem.diagnosis.fitting.always import refine_base
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.physics.effects.effect import Situation
 from crazyem.physics.effects.onboard_filter import filtered

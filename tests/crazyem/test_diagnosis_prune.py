@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
-from crazyem.diagnosis.fitting.always import on_held_out, refine_base
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.nuisances import on_held_out, refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import prune
-from crazyem.diagnosis.naming.least import at_the_end, matters
+from crazyem.diagnosis.naming.detection_limits import at_the_end, matters
 from crazyem.diagnosis.naming.select import shortlist, with_started
 from crazyem.diagnosis.naming.trials import LIKELY, SURE, Step, Trial, significance
 from crazyem.diagnosis.workers import Workers

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from made_flight import array_of
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting import felt
+from crazyem.diagnosis.fitting import specific_force
 from crazyem.diagnosis.flights.alignment import Alignment
 from crazyem.diagnosis.flights.flight import Flight, controlled_rates, flight_of, without
 from crazyem.diagnosis.flights.inputs import inputs_of
-from crazyem.diagnosis.flights.own import owned
+from crazyem.diagnosis.flights.recording_nuisances import owned
 from crazyem.diagnosis.prediction.predict import predict, recorded
 from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
@@ -172,9 +172,9 @@ def felt_flight(force: NDArray, *, position: bool = False) -> Flight:
 
 def test_the_accelerometer_counts_only_where_nothing_else_shows_forces() -> None:
     force = np.zeros((300, 3))
-    assert felt.is_needed(felt_flight(force))
-    assert not felt.is_needed(felt_flight(force, position=True))
-    assert not felt.is_needed(felt_flight(np.full((300, 3), np.nan)))
+    assert specific_force.is_needed(felt_flight(force))
+    assert not specific_force.is_needed(felt_flight(force, position=True))
+    assert not specific_force.is_needed(felt_flight(np.full((300, 3), np.nan)))
 
 
 def test_score_and_information_are_derivatives_of_its_likelihood() -> None:
@@ -186,9 +186,9 @@ def test_score_and_information_are_derivatives_of_its_likelihood() -> None:
     noise, bias = np.array([0.8, 1.0, 1.3]), np.array([0.1, -0.2, 0.0])
 
     def loglik(theta: NDArray) -> float:
-        return felt.evidence(flight, model + acting @ theta, acting[:, :, :0], noise, bias)[0]
+        return specific_force.evidence(flight, model + acting @ theta, acting[:, :, :0], noise, bias)[0]
 
-    _, score, information = felt.evidence(flight, model, acting, noise, bias)
+    _, score, information = specific_force.evidence(flight, model, acting, noise, bias)
     h = 1e-4
     for i in range(4):
         e = np.eye(4)[i] * h
@@ -201,7 +201,7 @@ def test_vibration_is_what_is_faster_than_motion() -> None:
     rng = np.random.default_rng(3)
     slow = np.sin(np.arange(3000) * 0.01)[:, None] * np.array([1.0, 2.0, 3.0])
     quiet = felt_flight(slow + 0.3 * rng.standard_normal((3000, 3)))
-    assert felt.vibration(quiet, np.zeros((3000, 3))) == pytest.approx([0.3, 0.3, 0.3], rel=0.1)
+    assert specific_force.vibration(quiet, np.zeros((3000, 3))) == pytest.approx([0.3, 0.3, 0.3], rel=0.1)
 
 
 # -- real recordings ---------------------------------------------------------------------------------------------------

@@ -10,8 +10,8 @@ from made_flight import array_of
 
 from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis.flights.inputs import inputs_of
-from crazyem.diagnosis.naming.beside import late_rotors
 from crazyem.diagnosis.naming.named import CALIBRATED, DOUBTFUL, SELDOM
+from crazyem.diagnosis.naming.other_likelihoods import late_rotors
 from crazyem.diagnosis.naming.rotor_response import (
     DELAY_SD,
     ENOUGH,
@@ -21,7 +21,7 @@ from crazyem.diagnosis.naming.rotor_response import (
     Response,
     answers,
     disobedient,
-    judged,
+    late_response,
     response,
 )
 from crazyem.recordings.recording import Recording
@@ -101,23 +101,23 @@ def found(lag: float, delay: float, sd: float = 1.4e-3) -> Response:
 
 
 def test_a_lag_or_a_delay_or_both_are_named():
-    assert judged(found(0.031, 0.0005), None, ROTORS) is None
-    slow = judged(found(0.045, 0.0), found(0.044, 0.001), ROTORS)
+    assert late_response(found(0.031, 0.0005), None, ROTORS) is None
+    slow = late_response(found(0.045, 0.0), found(0.044, 0.001), ROTORS)
     assert slow is not None
     assert slow.values == {"motor_lag": (pytest.approx(0.045), pytest.approx(1.4e-3))}
     assert slow.nats == pytest.approx(0.5 * (0.015 / 1.4e-3) ** 2)
-    late = judged(found(0.03, 0.008), None, ROTORS)
+    late = late_response(found(0.03, 0.008), None, ROTORS)
     assert late is not None
     assert list(late.values) == ["input_delay"]
-    both = judged(found(0.045, 0.008), None, ROTORS)
+    both = late_response(found(0.045, 0.008), None, ROTORS)
     assert both is not None
     assert set(both.values) == {"motor_lag", "input_delay"}
-    assert judged(found(0.03, -0.008), None, ROTORS) is None  # no rotor answers before it is told to
+    assert late_response(found(0.03, -0.008), None, ROTORS) is None  # no rotor answers before it is told to
 
 
 def test_flights_held_out_must_agree():
-    assert judged(found(0.045, 0.0), found(0.03, 0.0), ROTORS) is None
-    agreed = judged(found(0.045, 0.0), found(0.045, 0.0), ROTORS)
+    assert late_response(found(0.045, 0.0), found(0.03, 0.0), ROTORS) is None
+    agreed = late_response(found(0.045, 0.0), found(0.045, 0.0), ROTORS)
     assert agreed is not None
     assert agreed.held_out > ENOUGH
 
@@ -127,7 +127,7 @@ def test_where_one_is_as_good_as_the_other_both_are_said():
     either alone explains all but 4.5."""
     sd = np.array([1.5e-3, 1e-3])
     response = Response(0.0345, 0.003, np.outer(sd, sd) * [[1.0, -0.5], [-0.5, 1.0]])
-    said = judged(response, None, ROTORS)
+    said = late_response(response, None, ROTORS)
     assert said is not None
     assert said.alike
     assert list(said.values) == ["motor_lag"]
@@ -137,7 +137,7 @@ def test_where_one_is_as_good_as_the_other_both_are_said():
 
 def test_rotors_slow_and_seemingly_early_are_slow():
     """A lag 10 deviations up and a delay below nothing: the lag is named alone."""
-    said = judged(found(0.044, -0.006), None, ROTORS)
+    said = late_response(found(0.044, -0.006), None, ROTORS)
     assert said is not None
     assert list(said.values) == ["motor_lag"]
     assert not said.alike

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
-from crazyem.diagnosis.fitting.always import on_held_out, refine_base
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, remembering, remembering_anew
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.nuisances import on_held_out, refine_base
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.diagnosis.locating.restless import peaks
+from crazyem.diagnosis.locating.random_torques import peaks
 from crazyem.diagnosis.naming.evidence import gain_of_both
 from crazyem.diagnosis.naming.onset import ONSET, date
 from crazyem.diagnosis.naming.prune import shaken
-from crazyem.diagnosis.naming.select import Basis, compared, noise_apart
+from crazyem.diagnosis.naming.select import Basis, compared, held_out_noise
 from crazyem.diagnosis.naming.trials import Trial
 
 ONSET_TIME = 4.37  # s
@@ -127,7 +127,7 @@ def test_noise_of_another_flight_does_not_decide_between_two_names() -> None:
     louder = replace(fitted.point, noise=replace(noise, impulse=1.3 * noise.impulse))
     basis = Basis(data, apart, point, (), 0.0, 0.0)
     trial = Trial(candidate, 0.0, 0.0, 1.0, 0.0, 0.0, fitted=fitted)
-    own = noise_apart(basis, trial)
+    own = held_out_noise(basis, trial)
     assert own is not None
     assert own.gain > 0.0
     fits = fitted, replace(fitted, point=louder)
@@ -143,5 +143,5 @@ def test_noise_stays_where_a_file_has_a_trim() -> None:
     point = Point(vehicle, dict(vehicle.effects), first_guess())
     data = Data([flight_of(fly(seconds=5.0), DRONE)])
     trial = Trial(INERTIA, 0.0, 0.0, 1.0, 0.0, 0.0)
-    assert noise_apart(Basis(data, data.twin(), point, (), 0.0, 0.0), trial) is None
-    assert noise_apart(Basis(data, None, replace(point, vehicle=DRONE), (), 0.0, 0.0), trial) is None
+    assert held_out_noise(Basis(data, data.twin(), point, (), 0.0, 0.0), trial) is None
+    assert held_out_noise(Basis(data, None, replace(point, vehicle=DRONE), (), 0.0, 0.0), trial) is None

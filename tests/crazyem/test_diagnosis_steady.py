@@ -10,21 +10,21 @@ from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fitting import sweeps
-from crazyem.diagnosis.fitting.always import refine_base
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, nominal
 from crazyem.diagnosis.fitting.model import Noise, Point
 from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.fitting.sampling import held
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import prune as pruning
 from crazyem.diagnosis.naming import select as selecting
 from crazyem.diagnosis.naming import steady as steadying
+from crazyem.diagnosis.naming.detection_limits import matters
 from crazyem.diagnosis.naming.evidence import _inverse
 from crazyem.diagnosis.naming.gusts import PUSH, push_of
-from crazyem.diagnosis.naming.least import matters
 from crazyem.diagnosis.naming.select import Basis, shortlist, step_of
-from crazyem.diagnosis.naming.steady import as_steady, beside_a_trim, by_onsets, with_whole_torques
+from crazyem.diagnosis.naming.steady import as_steady, by_onsets, with_exact_torques, without_trim_rivals
 from crazyem.diagnosis.naming.trials import SURE, SURE_DAILY, Selection, Trial, preferred, sure_enough
 from crazyem.diagnosis.workers import Workers
 from crazyem.recordings.recording import Recording
@@ -105,7 +105,7 @@ def test_a_centre_of_mass_is_where_the_mean_commands_are_balanced(torque: float)
     fitted = refine_base(data, nominal(data, Point(DRONE, {"center_of_mass": {"y": 1e-3}}, first_guess())), [shifted])
     selection: Any = Selection(fitted.point, fitted.point, (), (shifted,), fitted, 1)
     loose = fitted.point.effects["center_of_mass"]
-    whole = with_whole_torques(data, selection).final.effects["center_of_mass"]
+    whole = with_exact_torques(data, selection).final.effects["center_of_mass"]
     assert whole["y"] == pytest.approx(along_x, rel=0.015)
     assert whole["x"] == pytest.approx(-along_y, abs=2e-5)
     assert abs(loose["y"] - along_x) > 2 * abs(whole["y"] - along_x)
@@ -126,11 +126,11 @@ def test_what_keeps_the_freedom_of_all_torques(monkeypatch) -> None:
     monkeypatch.setattr(steadying, "nuisances", lambda data, point, accepted: [])
     for accepted, vehicle in (((shifted, torques), DRONE), ((WEAK,), DRONE), ((), DRONE), ((shifted,), filed)):
         kept: Any = SimpleNamespace(accepted=accepted, final=point_of(vehicle))
-        assert with_whole_torques(data, kept) is kept
+        assert with_exact_torques(data, kept) is kept
     assert not asked
     for name in ("center_of_mass", "payload"):
         tried: Any = SimpleNamespace(accepted=(replace(shifted, effect=name),), final=point_of(DRONE))
-        assert with_whole_torques(data, tried) is tried
+        assert with_exact_torques(data, tried) is tried
     assert len(asked) == 2
 
 
@@ -149,7 +149,7 @@ def test_a_trim_that_is_asked_for_is_fitted_and_taken_before_a_better_weak_rotor
     others = [trial(Candidate(n, (), ("x",)), 150.0) for n in ("linear_drag", "wind", "gyro_bias", "velocity_scale")]
     linear: Any = [(t, None) for t in (*better, *others, trial(ASKED, 60.0))]
     assert sum(t.candidate.effect == TRIM for t, _ in shortlist(linear)) == 1
-    monkeypatch.setattr(selecting, "tried", lambda basis, entry, solution, *, say: entry)
+    monkeypatch.setattr(selecting, "fitted_trial", lambda basis, entry, solution, *, say: entry)
     data: Any = SimpleNamespace(workers=Workers(1))
     step = step_of(Basis(data, None, filed, (), 0.0, 0.0), linear, say=lambda text: None)
     assert step.taken is not None
@@ -163,8 +163,8 @@ def test_a_trim_that_is_asked_for_is_fitted_and_taken_before_a_better_weak_rotor
 
 
 def test_beside_a_trim_neither_a_weak_rotor_nor_the_place_of_a_load_is_asked_for() -> None:
-    assert beside_a_trim([WEAK, LATE, LOAD], []) == [WEAK, LATE, LOAD]
-    assert beside_a_trim([WEAK, LATE, LOAD], [ASKED]) == [LATE, replace(LOAD, free=("mass",))]
+    assert without_trim_rivals([WEAK, LATE, LOAD], []) == [WEAK, LATE, LOAD]
+    assert without_trim_rivals([WEAK, LATE, LOAD], [ASKED]) == [LATE, replace(LOAD, free=("mass",))]
 
 
 def test_with_a_trim_in_the_file_an_effect_must_be_surer_and_a_date_pays_for_the_search() -> None:

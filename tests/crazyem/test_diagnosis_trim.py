@@ -9,7 +9,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fitting.always import (
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
+from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.model import Noise, Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.nuisances import (
     FAST,
     abstained,
     nuisances,
@@ -17,10 +21,6 @@ from crazyem.diagnosis.fitting.always import (
     usual_gusts,
     without,
 )
-from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
-from crazyem.diagnosis.fitting.fit import Data, nominal
-from crazyem.diagnosis.fitting.model import Noise, Point
-from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.sampling import coarsely_sampled, fast_share, held, of_a_real_drone
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming.select import linear_trials

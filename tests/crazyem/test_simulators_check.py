@@ -13,7 +13,7 @@ from simulator_files import PUBLISHED
 from crazyem.api.vehicles import check_vehicle, disagreements
 from crazyem.cli import main
 from crazyem.simulators.convert import convert, load_source
-from crazyem.simulators.cost import apart, errors_after, flown, reference_flight
+from crazyem.simulators.cost import errors_after, flown, reference_flight, rms_distance
 from crazyem.simulators.fields import SimulatorFile, read
 from crazyem.simulators.findings import alternatives, field_findings, rescaled
 from crazyem.simulators.registry import FORMATS
@@ -84,7 +84,7 @@ def test_a_vehicle_with_another_mass_flies_the_same() -> None:
     heavier = replace(reference, inputs=replace(
         reference.inputs, rotor=replace(reference.inputs.rotor, thrust=reference.inputs.rotor.thrust * 0.05 / 0.034)
     ))  # fmt: skip
-    assert max(apart(flown(reference, vehicle), flown(heavier, other)).values()) < 1e-9
+    assert max(rms_distance(flown(reference, vehicle), flown(heavier, other)).values()) < 1e-9
 
 
 def test_two_files_of_a_drone_that_disagree() -> None:

@@ -16,7 +16,7 @@ from crazyem.physics.motion import vehicle_values
 ON_BOARD = 0.04  # m from the middle of the rotors: no part of a Crazyflie is further away
 STRONGEST = 1.1  # a worn, cut or bent propeller pulls less than the others; a new one among worn ones a little more,
 NO_STRONGER = 1.0  # and none gets stronger in flight
-# judged by themselves: gusts.py, accelerometer.py, imitated.py; of every log: always.py
+# judged by themselves: gusts.py, accelerometer.py, place_rivals.py; of every log: nuisances.py
 ASIDE = ("gusts", "accelerometer_misalignment", "onboard_filter", "sampled_commands", "force_by_place")
 TRIM = "trim"
 ASKED = (TRIM,)  # looked for only if asked for: near every effect that brings a steady torque
@@ -207,7 +207,7 @@ def variants(effect: Effect, point: Point, signals: frozenset[str]) -> list[Cand
         for free in effect.alternatives or (tuple(continuous),):
             if not all(name in continuous for name in free):
                 continue
-            for begin in _beginnings(effect):
+            for begin in _starting_values(effect):
                 found.append(Candidate(effect.name, fixed, tuple(free), begin))
     return found
 
@@ -218,7 +218,7 @@ def _fitted(parameter: Parameter, signals: frozenset[str]) -> bool:
     return parameter.neutral is not None and parameter.scale > 0 and math.isfinite(parameter.scale)
 
 
-def _beginnings(effect: Effect) -> list[tuple[tuple[str, float], ...]]:
+def _starting_values(effect: Effect) -> list[tuple[tuple[str, float], ...]]:
     names = list(effect.beginnings)
     grid: list[Mapping[str, float]] = [
         dict(zip(names, values, strict=True)) for values in product(*(effect.beginnings[n] for n in names))

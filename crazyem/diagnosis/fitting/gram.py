@@ -106,7 +106,7 @@ class Gram:
         if low is not None and high is not None and which.size < k:
             # Whatever speaks against an effect's absence while the others are free speaks against it within bounds,
             # too; beside others that a bound holds fast there may be more
-            rest, fast = _beside(curvature, total, low, high, which)
+            rest, fast = _without_columns(curvature, total, low, high, which)
             if fast.any():
                 p_value = min(p_value, self._p_value(rest, infos, curvature, meat, which, fast, len(scores)))
         return Solution(theta, gain, held, p_value, covariance, dispersion)
@@ -196,7 +196,7 @@ def _inverse(curvature: NDArray) -> NDArray:
     return inverse
 
 
-def _beside(a: NDArray, b: NDArray, low: NDArray, high: NDArray, which: NDArray) -> tuple[NDArray, NDArray]:
+def _without_columns(a: NDArray, b: NDArray, low: NDArray, high: NDArray, which: NDArray) -> tuple[NDArray, NDArray]:
     """The score (k,) at the maximum within bounds without the columns `which`, and what bounds hold fast there (k,)."""
     absent = np.isin(np.arange(b.size), which)
     low, high = np.where(absent, 0.0, low), np.where(absent, 0.0, high)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from crazyem.diagnosis.fitting import felt
-from crazyem.diagnosis.fitting.astray import strays
+from crazyem.diagnosis.fitting import specific_force
+from crazyem.diagnosis.fitting.divergence import diverges
 from crazyem.diagnosis.fitting.situation import (
     causal_middle,
     impulses,
@@ -166,15 +166,15 @@ class Model:
             self._there = situation_of(self.flight, path, point.vehicle, thrusts)
         situation = with_rotors(self._there, point.vehicle, thrusts)
         # where the path tells well enough, the drift of an attitude would be taken for a pull
-        if self.seen is not None and any(_ties(name) and self.strays(name, point.vehicle) for name in effects):
+        if self.seen is not None and any(_ties(name) and self.diverges(name, point.vehicle) for name in effects):
             situation = replace(situation, seen=self.seen, unrest=unrest(point.noise))
         moved = motion(situation, vehicle=point.vehicle, effects=effects)
         return np.concatenate([moved.specific_force, moved.angular_acceleration], axis=1), situation
 
-    def strays(self, name: str, vehicle: Vehicle) -> bool:
-        """Whether the flight drives what an effect does into chaos (`astray.strays`); remembered."""
+    def diverges(self, name: str, vehicle: Vehicle) -> bool:
+        """Whether the flight drives what an effect does into chaos (`divergence.diverges`); remembered."""
         if name not in self._strays:
-            self._strays[name] = strays(self.flight, vehicle, name)
+            self._strays[name] = diverges(self.flight, vehicle, name)
         return self._strays[name]
 
     def offsets(self, point: Point, accelerations: NDArray, effects: Effects | None = None) -> NDArray:
@@ -228,8 +228,8 @@ class Model:
         offset = self.offsets(point, acceleration)
         acting, showing, order = self.derivatives(point, columns, acceleration, offset, workers or Workers(1))
         swept = run_sweep(flight, acceleration, offset, acting, showing, point.noise)
-        if self._is_felt():
-            swept = self._felt(swept, acceleration, acting)
+        if self._needs_specific_force():
+            swept = self._with_specific_force(swept, acceleration, acting)
         if order is not None:
             swept = _in_order(swept, order)
         self._there = self._as_shown = None
@@ -244,17 +244,17 @@ class Model:
         self.seen = seen_force(acceleration, *found)
         return swept
 
-    def _is_felt(self) -> bool:
+    def _needs_specific_force(self) -> bool:
         if self._felt_alone is None:
-            self._felt_alone = felt.is_needed(self.flight)
+            self._felt_alone = specific_force.is_needed(self.flight)
         return self._felt_alone
 
-    def _felt(self, swept: Swept, acceleration: NDArray, acting: NDArray) -> Swept:
+    def _with_specific_force(self, swept: Swept, acceleration: NDArray, acting: NDArray) -> Swept:
         """With the accelerometer's evidence added, where nothing else shows forces."""
         if self._vibration is None:
-            self._vibration = felt.vibration(self.flight, acceleration[:, :3])
+            self._vibration = specific_force.vibration(self.flight, acceleration[:, :3])
         bias = np.append(np.nanmedian(self.flight.force[:, :2] - acceleration[:, :2], axis=0), 0.0)
-        loglik, score, information = felt.evidence(
+        loglik, score, information = specific_force.evidence(
             self.flight, acceleration[:, :3], acting[:, :3], self._vibration, bias
         )
         if acting.shape[2] and swept.score.size:

@@ -109,7 +109,7 @@ def align(recording: Recording, thrust_time: NDArray, thrust: NDArray, flight: A
     block = np.unique(((time[index] - time[0]) / BLOCK).astype(int), return_inverse=True)[1]
     delays = np.arange(-REACH, REACH + STEP / 2, STEP)
     sums = np.stack([_sums(index, block, acceleration, shaken, beside, d) for d in delays], 2)  # axis, block, delay
-    return _judged(delays, sums, time[index], block)
+    return _accepted(delays, sums, time[index], block)
 
 
 def _fresh(time: NDArray, value: NDArray) -> tuple[NDArray, NDArray]:
@@ -204,7 +204,7 @@ def _unhit(delays: NDArray, sums: NDArray) -> NDArray:
     return kept
 
 
-def _judged(delays: NDArray, sums: NDArray, time: NDArray, block: NDArray) -> Alignment | None:
+def _accepted(delays: NDArray, sums: NDArray, time: NDArray, block: NDArray) -> Alignment | None:
     count = sums.shape[1]
     if count < LEAST:
         return None

@@ -47,10 +47,10 @@ def heading_by_place(data: Data, apart: Data | None) -> Finding | None:
         return None
     fitted, others = _seen(data), None if apart is None else _seen(apart)
     if fitted is None or apart is None:
-        return None if fitted is None else _told(fitted, None, data)
+        return None if fitted is None else _finding(fitted, None, data)
     if others is None:
         return None
-    return _told(fitted, others, data) or _told(others, fitted, apart)
+    return _finding(fitted, others, data) or _finding(others, fitted, apart)
 
 
 def _seen(data: Data) -> _Turns | None:
@@ -59,12 +59,12 @@ def _seen(data: Data) -> _Turns | None:
     return _Turns(*(np.concatenate([getattr(t, n) for t in turns]) for n in _Turns.__annotations__)) if turns else None
 
 
-def _told(every: _Turns, other: _Turns | None, data: Data) -> Finding | None:
+def _finding(every: _Turns, other: _Turns | None, data: Data) -> Finding | None:
     """What flights show, where others do as well; where there are none or they hardly move, every other second of
     those that show it."""
     middle = np.median(every.place, axis=0)
     shapes = _shapes(every, middle)
-    theta = _least(shapes, every)
+    theta = _ridge_fit(shapes, every)
     gained = _nats(shapes, every, theta) - _used(_without(every.usual, shapes))
     asked = None if other is None else _shapes(other, middle)
     # a hover has biases of its own, by which it speaks against a tenth of what a flight shows that goes somewhere
@@ -73,7 +73,7 @@ def _told(every: _Turns, other: _Turns | None, data: Data) -> Finding | None:
     else:
         second = (np.arange(len(shapes)) * WINDOW).astype(int) % 2 == 0
         one, two = (_Turns(*(getattr(every, n)[s] for n in _Turns.__annotations__)) for s in (second, ~second))
-        held = _nats(shapes[~second], two, _least(shapes[second], one))
+        held = _nats(shapes[~second], two, _ridge_fit(shapes[second], one))
     waves = _waves(every.place - middle)
     error = waves @ theta
     if gained < NATS or held < HELD or error.std() < SMALLEST:
@@ -134,7 +134,7 @@ def _used(x: NDArray) -> float:
     return float(np.trace(np.linalg.solve(_ridge(x), x.T @ x)))
 
 
-def _least(shapes: NDArray, turns: _Turns) -> NDArray:
+def _ridge_fit(shapes: NDArray, turns: _Turns) -> NDArray:
     x, y = _without(turns.usual, shapes), _without(turns.usual, turns.turned[:, None])[:, 0]
     return np.linalg.solve(_ridge(x), x.T @ y)
 

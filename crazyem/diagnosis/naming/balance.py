@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import lsq_linear, minimize_scalar
 
-from crazyem.diagnosis.fitting.always import THRUST_SD, nuisances, solved, with_nuisances
 from crazyem.diagnosis.fitting.candidates import ON_BOARD, TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, refine
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.nuisances import THRUST_SD, nuisances, solved, with_nuisances
 from crazyem.diagnosis.fitting.sampling import TRIM_SD
-from crazyem.diagnosis.naming.exchange import exchanged
+from crazyem.diagnosis.naming.alternatives import exchanged
+from crazyem.diagnosis.naming.corroboration import TELLING
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
-from crazyem.diagnosis.naming.witness import TELLING
 from crazyem.physics.rotors import wrench
 
 # Degrees of freedom of the day's covariance: known from some twelve days of two drones, four numbers each. Normal tails
@@ -76,7 +76,7 @@ def without_each(data: Data, point: Point) -> NDArray:
     return np.column_stack([-lost[:, 0], lost[:, 1:]])
 
 
-def weighed(balance: Balance, effect: str, fixed: Mapping[str, Any]) -> float | None:
+def balance_loglik(balance: Balance, effect: str, fixed: Mapping[str, Any]) -> float | None:
     """Log-likelihood [nats] of the balance with an effect, at its best, less the number of numbers it moves; None where
     nothing is known of what it does to it."""
     if effect not in FREE:
@@ -115,7 +115,7 @@ def _loaded(root: NDArray, lack: NDArray) -> float:
 
 def prefers(balance: Balance, one: Candidate, other: Candidate) -> float | None:
     """Nats by which the balance prefers one explanation; None where it says nothing of one of them."""
-    mine, its = (weighed(balance, c.effect, dict(c.fixed)) if steady(c) else None for c in (one, other))
+    mine, its = (balance_loglik(balance, c.effect, dict(c.fixed)) if steady(c) else None for c in (one, other))
     return None if mine is None or its is None else mine - its
 
 

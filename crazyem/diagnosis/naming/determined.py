@@ -9,15 +9,15 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
-from crazyem.diagnosis.fitting.always import refine_base
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.nuisances import refine_base
+from crazyem.diagnosis.naming.answer import numbers_of
 from crazyem.diagnosis.naming.balance import Balance, by_balance
 from crazyem.diagnosis.naming.named import Named, Value
 from crazyem.diagnosis.naming.prune import left_out
-from crazyem.diagnosis.naming.steady import with_whole_torques
-from crazyem.diagnosis.naming.told import numbers_of
+from crazyem.diagnosis.naming.steady import with_exact_torques
 from crazyem.diagnosis.naming.trials import Selection
 from crazyem.physics.effects.catalogue import CATALOGUE
 
@@ -117,7 +117,7 @@ def without_undetermined(
             selection = replace(
                 selection, final=fitted.point, fitted=fitted, accepted=tuple(accepted), steps=tuple(steps)
             )
-        selection, balance = by_balance(data, with_whole_torques(data, selection))
+        selection, balance = by_balance(data, with_exact_torques(data, selection))
 
 
 def _without_ends(candidate: Candidate, found: Mapping[str, Value], point: Point) -> Candidate | None:

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting.always import nuisances
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, bounds_of, held_near, moved
 from crazyem.diagnosis.fitting.gram import bounded
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.nuisances import nuisances
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 FAR = 20.0  # nats that one step is believed to bring without looking

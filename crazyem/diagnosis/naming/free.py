@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from crazyem.diagnosis.fitting.always import solved
 from crazyem.diagnosis.fitting.fit import Fitted
+from crazyem.diagnosis.fitting.nuisances import solved
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 

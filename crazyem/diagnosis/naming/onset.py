@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from crazyem.diagnosis.fitting.always import refine_base
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted
 from crazyem.diagnosis.fitting.gram import Gram
+from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 ONSET = "onset_time"  # of effects that may begin in mid-flight

@@ -6,13 +6,13 @@ from functools import partial
 
 import numpy as np
 
-from crazyem.diagnosis.fitting.always import nuisances, on_held_out, refine_base, without
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import TORQUES, Data, Fitted
 from crazyem.diagnosis.fitting.gram import used
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.locating.restless import beside_peaks, peaks
-from crazyem.diagnosis.naming.least import at_the_end
+from crazyem.diagnosis.fitting.nuisances import nuisances, on_held_out, refine_base, without
+from crazyem.diagnosis.locating.random_torques import off_peak_gram, peaks
+from crazyem.diagnosis.naming.detection_limits import at_the_end
 from crazyem.diagnosis.naming.trials import LIKELY, SURE, Step, both, significance, wald
 
 ADMITTED = 8.0  # nats of evidence that an effect must bring
@@ -177,7 +177,7 @@ def shaken(
     away = np.where(fitted.precision > 0, here, 0.0)
     whole, beside = (
         (g, g.solve(range(g.size), precision=fitted.precision, prior=-away, effective=True))
-        for g in (data.gram(fitted.point, columns), beside_peaks(data, fitted.point, columns, found))
+        for g in (data.gram(fitted.point, columns), off_peak_gram(data, fitted.point, columns, found))
     )
     information = beside[0].total(range(beside[0].size))[1]
     taken = used(information, information + np.diag(fitted.precision))  # what priors say takes no block

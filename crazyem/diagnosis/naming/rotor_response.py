@@ -179,7 +179,7 @@ class Late:
     alike: bool
 
 
-def judged(found: Response, apart: Response | None, vehicle: Vehicle) -> Late | None:
+def late_response(found: Response, apart: Response | None, vehicle: Vehicle) -> Late | None:
     """What of it is not as the vehicle file says; None where all is, or where flights held out do not agree.
 
     Args:

@@ -13,7 +13,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting.always import (
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, held_near
+from crazyem.diagnosis.fitting.gram import Solution
+from crazyem.diagnosis.fitting.model import Column, Noise, Point
+from crazyem.diagnosis.fitting.nuisances import (
     by_gain,
     nuisances,
     on_held_out,
@@ -22,28 +26,24 @@ from crazyem.diagnosis.fitting.always import (
     unlike_a_body,
     with_nuisances,
 )
-from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
-from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, held_near
-from crazyem.diagnosis.fitting.gram import Solution
-from crazyem.diagnosis.fitting.model import Column, Noise, Point
-from crazyem.diagnosis.naming.beginnings import best_begun
+from crazyem.diagnosis.naming.detection_limits import at_the_end, matters
 from crazyem.diagnosis.naming.evidence import gain_of_both, known_by, tuning
-from crazyem.diagnosis.naming.least import at_the_end, matters
 from crazyem.diagnosis.naming.onset import date, onset_of
 from crazyem.diagnosis.naming.prune import ADMITTED, drop, shaken, survive
-from crazyem.diagnosis.naming.steady import as_steady, beside_a_trim, by_onsets
+from crazyem.diagnosis.naming.starting_points import best_begun
+from crazyem.diagnosis.naming.steady import as_steady, by_onsets, without_trim_rivals
 from crazyem.diagnosis.naming.trials import (
     SURE,
     Selection,
     Step,
     Trial,
     both,
+    by_evidence,
+    distinguishable,
     not_beaten,
-    own_evidence,
+    separate_evidence,
     significance,
     sure_enough,
-    told_apart,
-    weighed,
 )
 
 SHORTLIST = 6
@@ -149,7 +149,7 @@ class Basis:
     held_value: float
 
 
-def tried(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str], None]) -> Trial:
+def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str], None]) -> Trial:
     """The trial of the linear approximation after a fit without it; changes nothing of the basis."""
     point = basis.point
     say(f"  fitting {trial.candidate.label}")
@@ -162,14 +162,14 @@ def tried(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str]
 
 
 @dataclass(frozen=True)
-class Apart:
+class HeldOutNoise:
     """Noise of the flights held out as they have it themselves, and what it gains there [nats]."""
 
     noise: Noise
     gain: float
 
 
-def noise_apart(basis: Basis, trial: Trial) -> Apart | None:
+def held_out_noise(basis: Basis, trial: Trial) -> HeldOutNoise | None:
     """The noise of the flights held out under a trial; None where it stays that of the flights fitted."""
     if basis.held_out is None or TRIM in basis.point.vehicle.effects:
         return None
@@ -178,10 +178,10 @@ def noise_apart(basis: Basis, trial: Trial) -> Apart | None:
     there = on_held_out(apart, trial.fitted.point, [*basis.accepted, trial.candidate])
     own = apart.fit_noise(there.point)
     gain = apart.loglik(own) - apart.loglik(there.point)
-    return Apart(own.noise, gain) if np.isfinite(gain) else None
+    return HeldOutNoise(own.noise, gain) if np.isfinite(gain) else None
 
 
-def sharpened(basis: Basis, own: Apart | None, trial: Trial) -> Trial:
+def with_noise_refit(basis: Basis, own: HeldOutNoise | None, trial: Trial) -> Trial:
     """A trial with noise scales of its own: under those of the model before it, the right explanation gains little."""
     assert trial.fitted is not None
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
@@ -192,7 +192,7 @@ def sharpened(basis: Basis, own: Apart | None, trial: Trial) -> Trial:
         return trial
 
 
-def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted, *, own: Apart | None = None) -> Trial:
+def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted, *, own: HeldOutNoise | None = None) -> Trial:
     """The trial with what its fit gains, on the flights fitted (`data`, where the fit is) and on those held out.
 
     With `own` its value is that with noise of their own: under that of the flights fitted, a few per cent in scales
@@ -241,8 +241,8 @@ def may_join(effect: str, found: set[str]) -> bool:
 def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Callable[[str], None]) -> Step:
     """One turn of the selection: the promising are fitted, and the best is taken if it is sure enough."""
     counted = basis.held_out is not None
-    fitted = basis.data.workers.map(lambda entry: tried(basis, *entry, say=say), shortlist(linear))
-    trials = weighed(fitted, counted=counted)
+    fitted = basis.data.workers.map(lambda entry: fitted_trial(basis, *entry, say=say), shortlist(linear))
+    trials = by_evidence(fitted, counted=counted)
     rest = [t for t, _ in linear if all(t.candidate is not p.candidate for p in trials)]
     if trim := next((t for t in trials if t.candidate.effect == TRIM and admitted(basis, t)), None):
         return Step((*trials, *rest), trim, as_steady(trim, [t for t in trials if rivals(t, counted=counted)]))
@@ -255,7 +255,7 @@ def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Call
 
 def admitted(basis: Basis, trial: Trial) -> bool:
     """Whether a trial is sure enough to be taken."""
-    enough = own_evidence(trial, counted=basis.held_out is not None) > ADMITTED
+    enough = separate_evidence(trial, counted=basis.held_out is not None) > ADMITTED
     return enough and sure_enough(basis.point, trial.p_value)
 
 
@@ -280,7 +280,7 @@ def select(
     first = len(accepted)
     while True:
         rest = [c for c in candidates if may_join(c.effect, {a.effect for a in accepted})]
-        rest = beside_a_trim(rest, accepted)
+        rest = without_trim_rivals(rest, accepted)
         say(f"looking for effect {len(accepted) + 1} among {len(rest)} candidates")
         linear = linear_trials(data, point, accepted, best_begun(data, point, accepted, rest))
         if len(accepted) > first:
@@ -392,9 +392,9 @@ def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], No
     if len(equals) == 1:
         return trials, equals
     say(f"  comparing {', '.join(t.candidate.label for t in equals)}")
-    again = basis.data.workers.map(partial(sharpened, basis, noise_apart(basis, trials[0])), equals)
+    again = basis.data.workers.map(partial(with_noise_refit, basis, held_out_noise(basis, trials[0])), equals)
     rest = [t for t in trials if all(t is not e for e in equals)]
-    trials = weighed([*again, *rest], counted=counted)
+    trials = by_evidence([*again, *rest], counted=counted)
     close = [t for t in trials if any(t.candidate is a.candidate for a in again)]
     explain = [t for t in close if t is close[0] or admitted(basis, t)]
     # as fitted to all flights: a drag fitted to slow flight is by chance what ruins a quick one least
@@ -405,7 +405,7 @@ def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], No
 def alike_with(best: Trial, trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
     """The best, and what is not told apart from it."""
     others = [t for t in trials if t is not best and rivals(t, counted=counted)]
-    return [best, *(t for t in others if not told_apart(best, t))]
+    return [best, *(t for t in others if not distinguishable(best, t))]
 
 
 def group_of(taken: Trial, equals: Sequence[Trial], trials: Sequence[Trial], *, counted: bool) -> tuple[Trial, ...]:
@@ -422,14 +422,14 @@ def name_of(equals: Sequence[Trial], *, counted: bool) -> Trial:
     By the scatter over blocks alone: how recordings differ widens a group, but is known from few of them, and a name
     that loses by hundreds of nats is none because of that.
     """
-    near = [t for t in equals if t is equals[0] or not told_apart(equals[0], t, recordings=False)]
+    near = [t for t in equals if t is equals[0] or not distinguishable(equals[0], t, recordings=False)]
     simplest = min(not_beaten(near), key=lambda t: (len(t.candidate.free), -t.evidence), default=equals[0])
-    return simplest if own_evidence(simplest, counted=counted) > ADMITTED else equals[0]
+    return simplest if separate_evidence(simplest, counted=counted) > ADMITTED else equals[0]
 
 
 def rivals(trial: Trial, *, counted: bool) -> bool:
     """Whether a candidate that was fitted is an explanation at all: significant, or with evidence enough; and of some
     use on all flights together."""
-    evidence = own_evidence(trial, counted=counted)
+    evidence = separate_evidence(trial, counted=counted)
     sure = trial.p_value < SURE or (trial.p_value < 1.0 and evidence > ADMITTED)
     return trial.fitted is not None and sure and evidence > 0

@@ -12,13 +12,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from crazyem.diagnosis.fitting.always import nuisances, refine_base, steadied, with_nuisances, without
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, nominal, refine
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.nuisances import nuisances, refine_base, with_nuisances, with_trim_noise, without
 from crazyem.diagnosis.flights.flight import Flight
-from crazyem.diagnosis.naming.trials import Selection, Trial, told_apart
+from crazyem.diagnosis.naming.trials import Selection, Trial, distinguishable
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.diagnosis.workers import Workers
 from crazyem.vehicle import Vehicle
@@ -37,7 +37,7 @@ def left_as_trim(flights: Sequence[Flight], vehicle: Vehicle, remains: Unexplain
     untrimmed = replace(vehicle, effects={**vehicle.effects, TRIM: dict.fromkeys(trim.free, 0.0)})
     data = Data(flights, workers)
     point = nominal(data, Point(untrimmed, {n: dict(v) for n, v in untrimmed.effects.items()}, first_guess()))
-    found = refine_base(data, steadied(data, point), [trim, THRUST]).point.effects
+    found = refine_base(data, with_trim_noise(data, point), [trim, THRUST]).point.effects
     steady_now = {TRIM: {n: float(found[TRIM][n]) for n in trim.free}, THRUST.effect: _scale_of(found)}
     return replace(vehicle, effects={**vehicle.effects, **steady_now})
 
@@ -56,7 +56,7 @@ def _scale_of(effects: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
     return {"scale": float(effects[THRUST.effect]["scale"])}
 
 
-def with_whole_torques(data: Data, selection: Selection) -> Selection:
+def with_exact_torques(data: Data, selection: Selection) -> Selection:
     """The selection fitted with the rotors' torques as the file has them, where a centre of mass is to be known.
 
     All torques are free within 3 %, because what acts between two logged commands makes quick ones look wrong. A drone
@@ -83,10 +83,10 @@ def as_steady(trim: Trial, rivals: Sequence[Trial]) -> tuple[Trial, ...]:
     middle is told by a file that knows it, which a flight of the healthy drone gives.
     """
     others = (t for t in rivals if t.candidate.effect in STEADY)
-    return tuple(t for t in others if not told_apart(trim, t))
+    return tuple(t for t in others if not distinguishable(trim, t))
 
 
-def beside_a_trim(candidates: Sequence[Candidate], accepted: Sequence[Candidate]) -> list[Candidate]:
+def without_trim_rivals(candidates: Sequence[Candidate], accepted: Sequence[Candidate]) -> list[Candidate]:
     """The candidates without what a fitted trim is, too: a rotor that is weak all the time, and where a load is."""
     if all(c.effect != TRIM for c in accepted):
         return list(candidates)

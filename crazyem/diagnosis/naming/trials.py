@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import expit
 
-from crazyem.diagnosis.fitting.always import solved
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Fitted
 from crazyem.diagnosis.fitting.gram import MANY, Gram
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.nuisances import solved
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 SURE = 1e-3  # p-value of the score test, before counting candidates,
@@ -155,13 +155,13 @@ def between(differences: NDArray, recording: NDArray) -> float:
     return float(np.sqrt(away @ away * length.size / (length.size - 1)))
 
 
-def told_apart(best: Trial, other: Trial, *, recordings: bool = True) -> bool:
+def distinguishable(best: Trial, other: Trial, *, recordings: bool = True) -> bool:
     """Whether the flights prefer the one by more than chance."""
     nats, sd = margin(best, other, recordings=recordings)
     return nats > CLOSE and nats > TOLD * sd
 
 
-def weighed(trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
+def by_evidence(trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
     """Evidence of each, the same dispersion for all so that likelihoods are compared and not scatters; best first."""
     if not trials:
         return []
@@ -181,7 +181,7 @@ def both(p_value: float, held: float) -> float:
     return p_value * float(np.exp(-max(held, 0.0))) if p_value < LIKELY else p_value
 
 
-def own_evidence(trial: Trial, *, counted: bool) -> float:
+def separate_evidence(trial: Trial, *, counted: bool) -> float:
     """Evidence by the candidate's own scatter: what it must bring to be admitted."""
     return (trial.gain + (trial.held_out if counted else 0.0)) / trial.dispersion - len(trial.candidate.free)
 

@@ -9,7 +9,7 @@ from crazyem.diagnosis.fitting.candidates import TRIM
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point, Swept
 from crazyem.diagnosis.locating.locate import AXES, Finding, Located, strongest
-from crazyem.diagnosis.locating.restless import AT_RANDOM, erratic_rotor, humps, memoryless
+from crazyem.diagnosis.locating.random_torques import AT_RANDOM, erratic_rotor, humps, memoryless
 from crazyem.diagnosis.naming.trials import Selection
 from crazyem.vehicle import GRAVITY
 
@@ -17,7 +17,7 @@ STRUCTURE = 25.0  # nats of structure left over that count as unexplained
 # Smaller than this is what onboard filters and sampled commands leave in every flight: share of weight, share of the
 # weight times the arm, rad, m/s.
 TOLERANCE = {"force": 0.01, "torque": 0.0004, "attitude": 5e-3, "velocity": 0.05}
-DAILY = 2.0  # times that, where trims, thrust and leaning differ by 2 % from day to day or flight to flight (always.py)
+DAILY = 2.0  # times that, where trims, thrust and leaning differ by 2 % from day to day or flight to flight
 SLOWEST = 1.5  # Hz: below, onboard filters wander
 LINE = 25.0  # nats: peak of the spectrum over its surroundings (power), the number of frequencies allowed for
 SHAKEN = 0.3  # of what an unknown torque would leave of a swing
@@ -59,7 +59,7 @@ class Unexplained:
             (f.nats for f in self.findings if f.signal == "force" and f.variable not in ("", "time")), default=0.0
         )
 
-    def beside(self, finding: Finding) -> "Unexplained":
+    def with_finding(self, finding: Finding) -> "Unexplained":
         """The same with one more finding."""
         return Unexplained(tuple(sorted((*self.findings, finding), key=lambda f: -f.nats)), self.gained)
 

@@ -25,7 +25,7 @@ RESOLUTION = 1e-3  # m/s^2
 
 
 @dataclass(frozen=True)
-class Felt:
+class AccelerometerEffect:
     """An effect that the accelerometer alone shows: log posterior odds, and its parameters."""
 
     candidate: Candidate
@@ -33,19 +33,19 @@ class Felt:
     posterior: Posterior
 
 
-def felt(study: Study, fit: Fit) -> list[Felt]:
+def accelerometer_effects(study: Study, fit: Fit) -> list[AccelerometerEffect]:
     """Every effect that the accelerometer alone shows, beside a fitted model."""
     found = []
     for effect in CATALOGUE.values():
         if effect.needs != FELT or not effect.prior.own:
             continue
         if all("specific_force" in d.signals for d in fit.data):
-            one = _felt(effect, study, fit)
+            one = _accelerometer_effect(effect, study, fit)
             found += [one] if one else []
     return found
 
 
-def _felt(effect: Effect, study: Study, fit: Fit) -> Felt | None:
+def _accelerometer_effect(effect: Effect, study: Study, fit: Fit) -> AccelerometerEffect | None:
     names = tuple(effect.prior.own)
     candidate = Candidate(effect.name, (), names)
     passes = [_pass(effect, names, d.models[0], p) for d, p in zip(fit.data, fit.points, strict=True)]
@@ -64,7 +64,7 @@ def _felt(effect: Effect, study: Study, fit: Fit) -> Felt | None:
     phi = np.concatenate([posterior.mean, np.zeros(4)])
     scatter = float(np.median(Shared(shared.there(known, phi), np.array(usual)).scatter[: len(names)]))
     found = replace(posterior, covariance=scatter * posterior.covariance)
-    return Felt(candidate, posterior.gain / scatter + prior_odds(), found)
+    return AccelerometerEffect(candidate, posterior.gain / scatter + prior_odds(), found)
 
 
 def _pass(effect: Effect, names: Sequence[str], model: Model, point: Point) -> Pass | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from crazyem.diagnosis.naming.free import Free
 from crazyem.diagnosis.naming.named import Named, Value
-from crazyem.diagnosis.posterior.accelerometer import Felt
+from crazyem.diagnosis.posterior.accelerometer import AccelerometerEffect
 from crazyem.diagnosis.posterior.members import prior_odds
 from crazyem.diagnosis.posterior.search import Neighbour, probabilities
 from crazyem.diagnosis.posterior.settings import SETTINGS
@@ -53,7 +53,7 @@ def log_odds(probability: float, bound: float = 700.0) -> float:
 
 
 @dataclass(frozen=True)
-class Told:
+class PosteriorAnswer:
     """Effects, strongest first; groups that are not told apart; what would tell them apart; reasons for the rest."""
 
     effects: tuple[Named, ...]
@@ -61,7 +61,7 @@ class Told:
     separate: tuple[str, ...]
 
 
-def told(study: Study, models: Sequence[Fit], felt: Sequence[Felt]) -> Told:
+def answer_of(study: Study, models: Sequence[Fit], felt: Sequence[AccelerometerEffect]) -> PosteriorAnswer:
     """What a posterior over models says."""
     best, beliefs = models[0], beliefs_of(models)
     found: list[tuple[float, Named]] = []
@@ -91,7 +91,7 @@ def told(study: Study, models: Sequence[Fit], felt: Sequence[Felt]) -> Told:
             found.append((one.odds, _entry(name, one.candidate.label, values, {}, probability, one.odds)))
     found.sort(key=lambda entry: -entry[0])
     separate = dict.fromkeys(CATALOGUE[n].separates for g in groups for n in g if CATALOGUE[n].separates)
-    return Told(tuple(n for _, n in found), tuple(groups), tuple(separate))
+    return PosteriorAnswer(tuple(n for _, n in found), tuple(groups), tuple(separate))
 
 
 def _gain(effect: str, models: Sequence[Fit]) -> float:

@@ -8,11 +8,11 @@ from crazyem.diagnosis.fitting.fit import DivergedError
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.flights.floor import on_one_floor
 from crazyem.diagnosis.flights.frame import alike as in_one_frame
-from crazyem.diagnosis.flights.own import owned
+from crazyem.diagnosis.flights.recording_nuisances import owned
 from crazyem.diagnosis.naming.determined import determined
 from crazyem.diagnosis.naming.named import Named
-from crazyem.diagnosis.posterior.accelerometer import felt
-from crazyem.diagnosis.posterior.answer import Told, fitted_vehicle, left_free, named, ranking, told
+from crazyem.diagnosis.posterior.accelerometer import accelerometer_effects
+from crazyem.diagnosis.posterior.answer import PosteriorAnswer, answer_of, fitted_vehicle, left_free, named, ranking
 from crazyem.diagnosis.posterior.remains import located, remains
 from crazyem.diagnosis.posterior.search import Search
 from crazyem.diagnosis.posterior.study import Fit, Study
@@ -53,7 +53,7 @@ def diagnose(
     search = Search(study, say)
     models = search.run()
     best, nothing = models[0], search.visited[frozenset()]
-    found = told(study, models, felt(study, best))
+    found = answer_of(study, models, accelerometer_effects(study, best))
     say("where the nominal model fails")
     before = located(nothing)
     say("what remains")
@@ -102,7 +102,7 @@ def _by_others(study: Study, models: Sequence[Fit], index: int, effects: Sequenc
     return replace(study.vehicle, effects=fitted_vehicle(study.vehicle, known, ("vehicle",)))
 
 
-def _kept(found: Told, impossible: dict[str, str]) -> Told:
+def _kept(found: PosteriorAnswer, impossible: dict[str, str]) -> PosteriorAnswer:
     """Without groups of names that are not told."""
     return replace(found, groups=tuple(g for g in found.groups if g[0] not in impossible))
 

@@ -128,7 +128,7 @@ def pool_of(flights: Sequence[Flight], point: Point, wanted: Sequence[str] = ())
             if names:
                 usual.append((replace(found[0], free=names, fixed=()), table))
         if effect.prior.own and (not wanted or name in wanted or effect.prior.unnamed):
-            told = _told(effect, spreads)
+            told = _distinct(effect, spreads)
             found = [replace(c, free=tuple(n for n in c.free if n in told)) for c in found]
             found = [c for c in found if c.free]
             if not found:
@@ -148,7 +148,7 @@ def prior_odds() -> float:
     return math.log(SETTINGS.missing / (1.0 - SETTINGS.missing))
 
 
-def _told(effect: Effect, spreads: Sequence[Sizes]) -> set[str]:
+def _distinct(effect: Effect, spreads: Sequence[Sizes]) -> set[str]:
     """Parameters of which recordings differ by less than what is asked for, in one of them at least."""
     return {n for n, own in effect.prior.own.items() if min(s.get(n, 0.0) for s in spreads) < own}
 

@@ -9,7 +9,7 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.locating.heading import heading_by_place
 from crazyem.diagnosis.locating.locate import AXES, Finding, Located, locate, strongest
 from crazyem.diagnosis.locating.place import slope_finding
-from crazyem.diagnosis.locating.restless import erratic_rotor, humps, memoryless
+from crazyem.diagnosis.locating.random_torques import erratic_rotor, humps, memoryless
 from crazyem.diagnosis.naming.unexplained import STRUCTURE, Unexplained, lines, notable
 from crazyem.diagnosis.posterior.study import Fit, Study
 from crazyem.physics.effects.catalogue import CATALOGUE

@@ -62,7 +62,7 @@ class Search:
             best = self.best
             self._grow(best)
             if self.best is best:
-                self._exchange(best)
+                self._swap(best)
             if self.best is best:
                 break
         return sorted(self.visited.values(), key=lambda f: -f.value)
@@ -140,7 +140,7 @@ class Search:
         wanted = [n for k, n in enumerate(near) if n.most > least or k < SETTINGS.few][:most]
         self._fit_all(base, [n for n in wanted if base.effects | {n.effect} not in self.visited])
 
-    def _exchange(self, best: Fit) -> None:
+    def _swap(self, best: Fit) -> None:
         """Fit the model without each of its effects, and with another one in its place."""
         for effect in sorted(best.effects):
             less = best.effects - {effect}

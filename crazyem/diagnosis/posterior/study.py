@@ -149,7 +149,7 @@ class Study:
             replace(p, noise=replace(p.noise, disturbance=SETTINGS.quiet * p.noise.disturbance)) for p in points
         ]  # fmt: skip
 
-    def restless(self, fit: Fit) -> float:
+    def random_log_prior(self, fit: Fit) -> float:
         """Log of how much probability the spread of its random effects takes of their prior."""
         total = 0.0
         for effect in self.pool.random:
@@ -320,7 +320,7 @@ class Study:
             np.any(p.noise.disturbance[list(FORCES)] >= 0.999 * self.calm) for p in points
         )
         fit = Fit(tuple(members), random, phi, points, data, 0.0, blocks, posterior, look, held)
-        value = look.shared.nothing + posterior.gain + sum(m.odds for m in members) + self.restless(fit)
+        value = look.shared.nothing + posterior.gain + sum(m.odds for m in members) + self.random_log_prior(fit)
         return replace(fit, value=float(value))
 
     def _aim(self, look: Look, members: Sequence[Member]) -> tuple[NDArray, list[NDArray]]:

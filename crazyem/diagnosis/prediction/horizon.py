@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.prediction.earned import Weights
+from crazyem.diagnosis.prediction.bias_correction import Weights
 from crazyem.diagnosis.prediction.predict import SAME, Recorded, start_rows
 from crazyem.diagnosis.prediction.simulate import Simulator
 from crazyem.errors import DataError

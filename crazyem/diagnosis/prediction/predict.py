@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.inputs import Inputs, inputs_of
 from crazyem.diagnosis.flights.level import LOOKS
-from crazyem.diagnosis.prediction.earned import Turned, earned, remembered
+from crazyem.diagnosis.prediction.bias_correction import Turned, correction_weights, remembered
 from crazyem.diagnosis.prediction.simulate import Simulator
 from crazyem.errors import DataError
 from crazyem.notebook import finite, html_table, new_figure, saved
@@ -252,7 +252,7 @@ def predict(
         )
     pieces, done = [], 0
     for known, those in _by_knowledge(shown, rows):
-        weights = None if plain else earned(turned_by(known), known.time[those], horizon=span)
+        weights = None if plain else correction_weights(turned_by(known), known.time[those], horizon=span)
         simulator = Simulator(known.inputs)
         swings = simulator.swings(known.time, known.state, known.airborne)
         at = 0

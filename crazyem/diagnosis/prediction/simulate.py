@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.inputs import Inputs
+from crazyem.diagnosis.prediction.bias_correction import Weights
 from crazyem.diagnosis.prediction.course import ThrustCourse
-from crazyem.diagnosis.prediction.earned import Weights
 from crazyem.physics.effects.effect import Effects, Situation
 from crazyem.physics.effects.fused_attitude import MEMORY_SECONDS, disturbs_attitude
 from crazyem.physics.effects.pendulum import swing_along, swing_on, watched_along

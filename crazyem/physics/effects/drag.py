@@ -17,7 +17,7 @@ LINEAR_DRAG = Effect(
     order=60,
     external=linear_force,
     couples_air=True,
-    # usual: an attitude 1 ms late is a force of 3e-4 N s/m; along z thrust is a little wrong (`fitting/always.py`)
+    # usual: an attitude 1 ms late is a force of 3e-4 N s/m; along z thrust is a little wrong (`fitting/nuisances.py`)
     prior=Prior(alike("x y z", 0.012), in_turn("x y z", 5e-4, 5e-4, 1e-3)),
     needs=("velocity", "position"),
     separates="fly straight legs of different speeds in opposite directions",
@@ -58,7 +58,7 @@ def damping(situation: Situation, body: Body, *, x: float, y: float, z: float) -
 
 
 def _sampled(logged: Logged) -> Sizes:
-    """Speeds that are logged more slowly than the loop runs look like a damping (`fitting/always.py`)."""
+    """Speeds that are logged more slowly than the loop runs look like a damping (`fitting/nuisances.py`)."""
     return alike("x y z", 6e-6 * logged.coarse)
 
 

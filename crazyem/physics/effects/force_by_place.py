@@ -2,7 +2,7 @@
 
 A cable, a fan or the draught of a wall to first order: a constant and a slope for each world axis. It is no finding and
 never part of a vehicle file; it stands against named effects that would have to imitate it
-(`crazyem/diagnosis/naming/imitated.py`).
+(`crazyem/diagnosis/naming/place_rivals.py`).
 """
 
 import numpy as np

@@ -17,7 +17,7 @@ def late(lag: float, before: float, *, delay: float) -> tuple[float, float]:
 
 
 def _clock(logged: Logged) -> Sizes:
-    """Between a stamp and its effect; stamps of measured speeds come by another way (`fitting/always.py`)."""
+    """Between a stamp and its effect; stamps of measured speeds come by another way (`fitting/nuisances.py`)."""
     return {"delay": 5e-3 if logged.measured else 2e-3 * logged.coarse}
 
 
@@ -26,7 +26,7 @@ MOTOR_LAG = Effect(
     (Parameter("time_constant", "s", math.nan, 0.0, 1.0, 2e-3),),
     order=22,
     timing=slow,
-    # usual: sixteen flights with nothing hidden came out 3.1 ms (rms) off (`fitting/always.py`)
+    # usual: sixteen flights with nothing hidden came out 3.1 ms (rms) off (`fitting/nuisances.py`)
     prior=Prior(own={"time_constant": 0.015}, usual=lambda logged: {"time_constant": 3e-3 * logged.coarse}),
     needs=("motor_command",),
     separates="log rotor speeds; or log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",

@@ -33,7 +33,7 @@ INERTIA = Effect(
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum), or measure the rotors' torque on a stand",
     # What is heavy in one axis is so in the others. Usual: torque over inertia of 76 flights that are known scatters
-    # between axes by 1.2 and 2.0 % (`fitting/always.py`).
+    # between axes by 1.2 and 2.0 % (`fitting/nuisances.py`).
     prior=Prior(
         alike("xx yy zz", 0.3),
         lambda logged: in_turn("xx yy zz", *(share * logged.coarse for share in (0.01, 0.01, 0.02))),
@@ -67,7 +67,7 @@ CENTER_OF_MASS = Effect(
     words="shift of the centre of mass",
     body=shifted,
     # own: a battery of a third of the weight, put in some millimetres off; usual height: what velocities of filters on
-    # board look like (`fitting/always.py`)
+    # board look like (`fitting/nuisances.py`)
     prior=Prior(alike("x y z", 1.5e-3), in_turn("x y z", 3e-5, 3e-5, 7e-4)),
     separates=(
         "balance the drone on an edge, or log the accelerometer and yaw for 5 s at 2 Hz; for z fly hard sideways steps"

@@ -6,7 +6,7 @@ and position, which the fixes show, are later by less, but from one fix to the n
 gyro. So rates are behind the attitude, velocities behind the position;
 and an attitude made on board of that gyro is off where the drone turns fast (`fused_attitude.py`).
 It belongs to the log and not to the drone: no vehicle file needs it, and diagnosis leaves it free
-(`crazyem/diagnosis/fitting/always.py`).
+(`crazyem/diagnosis/fitting/nuisances.py`).
 """
 
 import numpy as np
@@ -39,7 +39,7 @@ ONBOARD_FILTER = Effect(
     ),
     order=85,
     measured=filtered,
-    # usual: 0.0 to 2.4 and 0.0 to 1.6 ms in 80 flights with nothing hidden (`fitting/always.py`); attitudes 1.3 to
+    # usual: 0.0 to 2.4 and 0.0 to 1.6 ms in 80 flights with nothing hidden (`fitting/nuisances.py`); attitudes 1.3 to
     # 4.2 ms late in three more
     prior=Prior(usual={"rate_lag": 1.3e-3, "velocity_lag": 7e-4, "attitude_lag": 2.5e-3}),
     needs=("velocity", "body_rate"),

@@ -39,7 +39,7 @@ class Logged:
     @property
     def coarse(self) -> float:
         """Period of the commands over 10 ms, 0.5 to 2: what a loop does between two of them looks like other inertias,
-        torques, lags and dampings, the more the longer it is. Sizes at 100 Hz are those of `fitting/always.py`."""
+        torques, lags and dampings, the more the longer it is. Sizes at 100 Hz are those of `fitting/nuisances.py`."""
         return min(max(self.period / 0.01, 0.5), 2.0)
 
     @property

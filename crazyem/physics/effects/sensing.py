@@ -41,13 +41,13 @@ def _nothing(situation: Situation) -> Offset:
 
 
 def _leaning(logged: Logged) -> Sizes:
-    """A filter on board is off by a gyro's bias times the time in which fixes draw it back (`fitting/always.py`)."""
+    """A filter on board is off by a gyro's bias times the time in which fixes draw it back (`fitting/nuisances.py`)."""
     return alike("roll pitch yaw", 1.5e-3 if logged.onboard else 7e-4)
 
 
 def _jittery(logged: Logged) -> Sizes:
     """Errors of an estimate's position and velocity hang together, so a drone that hardly moves seems to move faster
-    than it does, by 1 to 3 mm/s (`fitting/always.py`)."""
+    than it does, by 1 to 3 mm/s (`fitting/nuisances.py`)."""
     return in_turn("x y z", *(2e-3 + 3e-3 / np.maximum(logged.speed, 0.01)))
 
 

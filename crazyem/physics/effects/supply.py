@@ -38,7 +38,7 @@ THRUST_CURVE = Effect(
     order=20,
     commanded=steeper,
     needs=("motor_command",),
-    # usual: slopes of drones with nothing hidden come out up to 0.02 too large (`fitting/always.py`)
+    # usual: slopes of drones with nothing hidden come out up to 0.02 too large (`fitting/nuisances.py`)
     prior=Prior(own={"slope_error": 0.25}, usual={"slope_error": 0.02}),
     separates="climb and sink hard with the same battery, or measure thrust over command on a stand",
 )

@@ -2,7 +2,7 @@
 
 trim is the steady torque that every real drone needs. No four rotors are equal or upright, and no battery sits in the
 middle. The trim goes with the thrust, so nothing acts on a drone with its rotors at rest. For a vehicle file that has
-a trim, the day's differs a little from the file's; how much is in `crazyem/diagnosis/fitting/always.py`.
+a trim, the day's differs a little from the file's; how much is in `crazyem/diagnosis/fitting/nuisances.py`.
 """
 
 import numpy as np
@@ -71,7 +71,7 @@ TORQUE_SCALE = Effect(
     (Parameter("scale", "", 1.0, 0.0, 5.0, 0.02),),
     order=40,
     turning=turned,
-    # usual: common to all axes of 76 flights of known torques (`fitting/always.py`)
+    # usual: common to all axes of 76 flights of known torques (`fitting/nuisances.py`)
     prior=Prior(own={"scale": 0.2}, usual=lambda logged: {"scale": 0.03 * logged.coarse}),
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum): torque over inertia is all that a flight shows",

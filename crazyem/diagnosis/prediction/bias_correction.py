@@ -106,7 +106,7 @@ class Turned:
         return self.time[last], model[last] - model[rows], self.rate[last] - self.rate[rows], rows
 
 
-def earned(turned: Turned, starts: NDArray, *, horizon: float) -> Weights:
+def correction_weights(turned: Turned, starts: NDArray, *, horizon: float) -> Weights:
     """The weights of starts (n,) s by the flight before them, for times ahead up to `horizon` s."""
     lags = np.linspace(0.0, horizon, LAGS + 1)
     weight, added = np.ones((starts.size, lags.size, 3)), np.zeros((starts.size, lags.size, 3))

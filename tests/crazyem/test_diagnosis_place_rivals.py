@@ -11,7 +11,7 @@ from crazyem.diagnosis.diagnose import Diagnosis, diagnose
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.naming import imitated
+from crazyem.diagnosis.naming import place_rivals
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.effect import Body
@@ -79,14 +79,14 @@ def asked(
     data.twin = lambda: data
 
     def fitted(flights, at, accepted):
-        assert list(accepted) == ([WIND, DRAG] if "wind" in at.effects else [DRAG, imitated.FORCE])
+        assert list(accepted) == ([WIND, DRAG] if "wind" in at.effects else [DRAG, place_rivals.FORCE])
         return SimpleNamespace(point=at, candidates=tuple(accepted), loglik=named if WIND in accepted else force)
 
-    monkeypatch.setattr(imitated, "left_by_place", lambda data, point: left)
-    monkeypatch.setattr(imitated, "refine_base", fitted)
-    monkeypatch.setattr(imitated, "remembering_anew", lambda data, at: at)
-    monkeypatch.setattr(imitated, "_finding", lambda data, found, nats: SimpleNamespace(nats=nats))
-    found, finding = imitated.by_place(data, None, selection)  # type: ignore[arg-type]
+    monkeypatch.setattr(place_rivals, "left_by_place", lambda data, point: left)
+    monkeypatch.setattr(place_rivals, "refine_base", fitted)
+    monkeypatch.setattr(place_rivals, "remembering_anew", lambda data, at: at)
+    monkeypatch.setattr(place_rivals, "_finding", lambda data, found, nats: SimpleNamespace(nats=nats))
+    found, finding = place_rivals.by_place(data, None, selection)  # type: ignore[arg-type]
     assert (finding is None) == (found is selection)
     assert finding is None or finding.nats == force - named - 9  # twelve parameters against three
     return found

@@ -12,7 +12,7 @@ WORTH_TELLING = 0.005  # of the thrust
 
 
 @dataclass(frozen=True, eq=False)
-class Own:
+class RecordingNuisances:
     """Found in a recording, taken off or fitted beside what all share; never written into a vehicle file.
 
     Attributes:
@@ -61,19 +61,19 @@ class Own:
 
 def owned(
     flights: Sequence[Flight], kept_apart: Sequence[Flight], strengths: Mapping[str, float] | None = None
-) -> tuple[Own, ...]:
+) -> tuple[RecordingNuisances, ...]:
     """Of all flights, those kept apart last; `strengths` by name."""
     return tuple(
-        _own(f, apart, (strengths or {}).get(f.name))
+        _nuisances_of(f, apart, (strengths or {}).get(f.name))
         for part, apart in ((flights, False), (kept_apart, True))
         for f in part
     )
 
 
-def _own(flight: Flight, held_out: bool, strength: float | None) -> Own:
+def _nuisances_of(flight: Flight, held_out: bool, strength: float | None) -> RecordingNuisances:
     notices = [*flight.notices]
     if flight.frame:
         notices.append(flight.frame.said())
     if strength is not None and abs(strength - 1.0) > WORTH_TELLING:
         notices.append(f"the thrust of this recording differs by {100.0 * (strength - 1.0):+.1f} % from the vehicle's")
-    return Own(flight.name, held_out, flight.alignment, flight.frame, strength, tuple(notices))
+    return RecordingNuisances(flight.name, held_out, flight.alignment, flight.frame, strength, tuple(notices))

@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.diagnosis.fitting.always import by_a_wrong_lag, solved, unsure
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.nuisances import by_a_wrong_lag, solved, systematic_sd
 from crazyem.diagnosis.naming.balance import DAYS, Balance, how_weak, prefers
 from crazyem.diagnosis.naming.balance import steady as steadily
+from crazyem.diagnosis.naming.corroboration import TELLING
+from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, instead_of_a_load
 from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, at_most, one_factor, share, trust
-from crazyem.diagnosis.naming.split import LOAD, WEAKER, instead_of_a_load
-from crazyem.diagnosis.naming.trials import Selection, Step, Trial, preferred, told_apart, wald
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, preferred, wald
 from crazyem.diagnosis.naming.unexplained import Unexplained
-from crazyem.diagnosis.naming.witness import TELLING
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 WITHIN = 0.05  # p-value from which an effect's own uncertainty holds that there is none of it
@@ -38,7 +38,7 @@ SAME = {"input_delay": (MEASURED_LATE,)}
 
 
 @dataclass(frozen=True)
-class Told:
+class Answer:
     """The effects, strongest first; groups of names that these flights cannot tell apart, and what would."""
 
     effects: tuple[Named, ...] = ()
@@ -46,7 +46,7 @@ class Told:
     separate: tuple[str, ...] = ()
 
 
-def tell(
+def answer_of(
     data: Data,
     selection: Selection,
     remains: Unexplained,
@@ -55,7 +55,7 @@ def tell(
     in_place: Mapping[str, tuple[Trial, Trial] | None],
     apart: bool,
     balance: Balance | None = None,
-) -> Told:
+) -> Answer:
     """The selected effects as they are told.
 
     Args:
@@ -66,7 +66,7 @@ def tell(
         balance: what is steady, by which names are told apart where a file has a trim.
     """
     if not selection.accepted:
-        return Told()
+        return Answer()
     point, gram = selection.final, selection.fitted.gram
     _, _, all_covariance, used = _uncertainty(selection.fitted)
     numbers = numbers_of(data, selection, balance)
@@ -116,13 +116,13 @@ def tell(
         elif candidate.effect == "thrust_scale":
             separate.append(HEAVIER.format(1.0 / candidate.values(point)["scale"]))
     found.sort(key=lambda entry: -entry[0])
-    return Told(tuple(n for _, n in found), tuple(groups), tuple(dict.fromkeys(separate)))
+    return Answer(tuple(n for _, n in found), tuple(groups), tuple(dict.fromkeys(separate)))
 
 
 def numbers_of(data: Data, selection: Selection, balance: Balance | None) -> list[dict[str, Value]]:
     """What is told of the free parameters of each effect that was selected, in their order."""
     sd, width, _, _ = _uncertainty(selection.fitted)
-    never = unsure(data, selection.final)
+    never = systematic_sd(data, selection.final)
     never |= {
         name: float(np.hypot(never.get(name, 0.0), off)) for name, off in by_a_wrong_lag(data, selection.fitted).items()
     }
@@ -239,7 +239,7 @@ def _in_place(
 ) -> Sequence[str]:
     """A load, or what stands in its place, where neither explains more."""
     pair = in_place.get(candidate.effect)
-    if pair is None or told_apart(*pair):
+    if pair is None or distinguishable(*pair):
         return ()
     return [c.effect for c in instead_of_a_load(selection.final.vehicle)] if candidate.effect == LOAD else [LOAD]
 

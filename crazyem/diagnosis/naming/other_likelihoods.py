@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from crazyem.diagnosis.fitting.always import usual_gusts
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.nuisances import usual_gusts
 from crazyem.diagnosis.naming import accelerometer, rotor_response
 from crazyem.diagnosis.naming.gusts import find_gusts
 from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, around, at_most, share, trust
@@ -21,7 +21,7 @@ from crazyem.vehicle import Vehicle
 FIXED = 0.3  # share of the gain of gusts that a force which depends on place or motion may have beside it
 
 
-def beside_the_regression(
+def other_likelihoods(
     data: Data,
     apart: Data | None,
     point: Point,
@@ -92,7 +92,7 @@ def late_rotors(
     if found is None:
         return [], ()
     left_out.pop("motor_lag", None)
-    late = rotor_response.judged(found, rotor_response.response(held_out), vehicle)
+    late = rotor_response.late_response(found, rotor_response.response(held_out), vehicle)
     if late is None or (wanted and not set(late.values) & set(wanted)):
         return [], ()
     named = []

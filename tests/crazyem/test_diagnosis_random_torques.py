@@ -13,14 +13,14 @@ from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Noise, Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.diagnosis.locating.restless import (
+from crazyem.diagnosis.locating.random_torques import (
     FARTHEST,
     amplitude_of,
-    beside_peaks,
     erratic_rotor,
     hump,
     humps,
     memoryless,
+    off_peak_gram,
     peaks,
     reach_of,
     spectrum,
@@ -108,8 +108,8 @@ def test_a_flight_that_shakes() -> None:
         assert f.effect_size == pytest.approx(3.0 * inertia, rel=0.3)
     assert amplitude_of(data.models[0], point, 2, 6.0)[0] < 0.5
     columns = Candidate("torque_scale", (), ("scale",)).columns(point)
-    whole = beside_peaks(data, point, columns, [[]])
-    beside = beside_peaks(data, point, columns, [peaks(data.models[0], point)])
+    whole = off_peak_gram(data, point, columns, [[]])
+    beside = off_peak_gram(data, point, columns, [peaks(data.models[0], point)])
     assert 0 < beside.information.sum() < whole.information.sum()
 
 

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from crazyem.cli import main
-from crazyem.diagnosis.prediction.earned import (
+from crazyem.diagnosis.prediction.bias_correction import (
     FEEDBACK_SD,
     FORCE_SD,
     LEAST_TIME,
     MEMORY,
     Turned,
     Weights,
-    earned,
+    correction_weights,
     regressed,
     remembered,
 )
@@ -45,7 +45,7 @@ def flight(seed: int, *, seconds: float, weight: float, offset: float, error: fl
 
 def test_weight_and_offset_are_found_by_the_past() -> None:
     turned = flight(0, seconds=30.0, weight=0.4, offset=1.5, error=0.01)
-    found = earned(turned, np.array([0.5, 29.0]), horizon=0.5)
+    found = correction_weights(turned, np.array([0.5, 29.0]), horizon=0.5)
     assert np.array_equal(found.weight[0], np.ones((11, 3)))  # nothing was seen yet
     assert np.array_equal(found.added[0], np.zeros((11, 3)))
     assert found.weight[1, 4:] == pytest.approx(0.4, abs=0.03)
@@ -53,7 +53,9 @@ def test_weight_and_offset_are_found_by_the_past() -> None:
 
 
 def test_a_model_that_is_right_is_believed() -> None:
-    found = earned(flight(1, seconds=30.0, weight=1.0, offset=0.0, error=0.02), np.array([29.0]), horizon=0.5)
+    found = correction_weights(
+        flight(1, seconds=30.0, weight=1.0, offset=0.0, error=0.02), np.array([29.0]), horizon=0.5
+    )
     assert found.weight[0, 2:] == pytest.approx(1.0, abs=0.05)
     assert np.abs(found.added[0]).max() < 0.05
 
@@ -71,7 +73,7 @@ def test_nothing_after_a_start_counts(seed: int, start: float) -> None:
         turned.flying & ~(turned.time > start + 0.3),
         np.where((turned.time > start - STEP / 2)[:, None], 5.0, turned.lacking),
     )
-    one, other = (earned(t, np.array([start]), horizon=0.5) for t in (turned, changed))
+    one, other = (correction_weights(t, np.array([start]), horizon=0.5) for t in (turned, changed))
     assert np.array_equal(one.weight, other.weight)
     assert np.array_equal(one.added, other.added)
     assert np.array_equal(one.force, other.force)
@@ -105,7 +107,7 @@ def test_a_loop_that_takes_rates_back_is_learned() -> None:
     nothing, flying = np.zeros((time.size, 3)), np.ones(time.size, bool)
     turned = Turned(time, rate, nothing, start, flying, nothing)
     rows = np.arange(2000, 3900)
-    found = earned(turned, time[rows], horizon=0.5)
+    found = correction_weights(turned, time[rows], horizon=0.5)
     for lag, k in ((0.1, 2), (0.5, 10)):
         came = rate[rows + round(lag / STEP)] - rate[rows]
         best = (np.exp(-lag / 0.2) - 1.0) * rate[rows]  # what can be known
@@ -175,7 +177,7 @@ def test_gaps_and_missing_rates_are_left_out() -> None:
     rate[900:1100] += 50.0  # a jump on either side of what is not known
     rate[898:900] = np.nan
     rate[1100:1102] = np.nan
-    found = earned(replace(turned, rate=rate), np.array([19.9]), horizon=0.5)
+    found = correction_weights(replace(turned, rate=rate), np.array([19.9]), horizon=0.5)
     assert found.weight[0, 3:] == pytest.approx(0.6, abs=0.03)
 
 
@@ -184,7 +186,7 @@ def test_a_force_that_the_model_lacks_is_the_mean_of_what_it_lacked() -> None:
     draw = np.random.default_rng(4)
     lacking = np.array([0.1, -0.2, 0.6]) + 0.3 * draw.standard_normal((turned.time.size, 3))
     lacking[turned.time < 15.0] += 1.0  # long forgotten
-    found = earned(replace(turned, lacking=lacking), np.array([0.2, 0.6, 39.9]), horizon=0.5)
+    found = correction_weights(replace(turned, lacking=lacking), np.array([0.2, 0.6, 39.9]), horizon=0.5)
     assert np.array_equal(found.force[0], np.zeros(3))
     early = lacking[:60].mean(0) / (1.0 + lacking[:60].var(0) * 10.0 / (60.0 * FORCE_SD**2))  # ten rows say the same
     assert found.force[1] == pytest.approx(early, rel=0.02)
@@ -221,7 +223,7 @@ def test_between_lags_weights_are_interpolated() -> None:
 
 def test_a_short_flight_says_nothing() -> None:
     turned = flight(3, seconds=LEAST_TIME, weight=0.1, offset=0.0, error=0.0)
-    found = earned(turned, turned.time[-1:], horizon=0.5)
+    found = correction_weights(turned, turned.time[-1:], horizon=0.5)
     assert np.array_equal(found.weight, np.ones((1, 11, 3)))
 
 

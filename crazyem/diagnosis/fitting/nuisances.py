@@ -231,7 +231,7 @@ def _without_height(candidate: Candidate) -> tuple[str, ...]:
     return tuple(n for n in candidate.free if candidate.effect not in HIGH_OR_LOW or n != "z")
 
 
-def steadied(data: Data, point: Point) -> Point:
+def with_trim_noise(data: Data, point: Point) -> Point:
     """The point with the noise of a drone whose trim is unknown: what is steady must not pass for noise.
 
     A weak rotor is a steady torque many times that of a day's trim. Before it is found, noise scales would grow until
@@ -296,7 +296,7 @@ def without(point: Point, effect: str) -> Point:
     return replace(point, effects=rest)
 
 
-def unsure(data: Data, point: Point) -> dict[tuple[str, str], float]:
+def systematic_sd(data: Data, point: Point) -> dict[tuple[str, str], float]:
     """(effect, parameter) -> standard deviation within which it is never known, whatever a fit says.
 
     That of what is always free, and of what the same log shows in another way: see `SYSTEMATIC`.
@@ -309,7 +309,7 @@ def unsure(data: Data, point: Point) -> dict[tuple[str, str], float]:
     inertia = point.effects.get("rotor_inertia", {}).get("inertia", 0.0)
     hanging = {"mass": point.vehicle.mass, "length": point.effects.get("suspended_load", {}).get("length", 0.0)}
     relative = HANGING_SD
-    if hanging["length"] and any(model.strays("suspended_load", point.vehicle) for model in data.models):
+    if hanging["length"] and any(model.diverges("suspended_load", point.vehicle) for model in data.models):
         relative = {**HANGING_SD, "length": ASTRAY_LENGTH_SD}
     of_a_load = {("suspended_load", name): sd * hanging[name] for name, sd in relative.items()}
     return {**SYSTEMATIC, **of_a_load, ("rotor_inertia", "inertia"): AT_ONCE_SD * inertia, **free}

@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from crazyem.diagnosis.fitting.always import refine_base, solved, without
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, remembering_anew
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.nuisances import refine_base, solved, without
 from crazyem.diagnosis.locating.locate import AXES, Finding
 from crazyem.diagnosis.locating.place import NATS, left_by_place, slope_finding
 from crazyem.diagnosis.naming.trials import TOLD, Selection, scatter

@@ -12,15 +12,15 @@ from closed_loop import DRONE, Hidden, fly
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crazyem.diagnosis.fitting.always import refine_base
-from crazyem.diagnosis.fitting.astray import strays
 from crazyem.diagnosis.fitting.candidates import Candidate, variants
+from crazyem.diagnosis.fitting.divergence import diverges
 from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
 from crazyem.diagnosis.fitting.model import Model, Point
+from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.diagnosis.naming import beginnings
-from crazyem.diagnosis.naming.beginnings import KEPT, best_begun, larger, peaks
+from crazyem.diagnosis.naming import starting_points
 from crazyem.diagnosis.naming.select import shortlist, with_started
+from crazyem.diagnosis.naming.starting_points import KEPT, best_begun, larger, peaks
 from crazyem.diagnosis.naming.trials import Trial
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -116,7 +116,7 @@ def test_where_a_flight_drives_loads_astray_the_likeliest_is_begun_with_alone(mo
     data.models[0]._strays["suspended_load"] = chaotic
     family = variants(LOAD, point, data.signals)
     likeliest = replace(family[7], begin=(*family[7].begin, ("mass", 0.004)))
-    monkeypatch.setattr(beginnings, "larger", lambda data, point, family: likeliest)
+    monkeypatch.setattr(starting_points, "larger", lambda data, point, family: likeliest)
     begun = best_begun(data, point, (), family)
     assert (begun == [likeliest]) == chaotic
     assert chaotic or set(begun) <= set(family)
@@ -129,8 +129,8 @@ def test_only_a_load_that_is_shaken_strays_from_its_path(shaken, chaotic):
         y = flight.y.copy()
         y[:, 3:6] = shaken * np.sin([5.6, 6.1, 9.0] * flight.time[:, None] + [0.0, 1.0, 0.0]) * [1, 1, 0.2]
         flight = replace(flight, y=y)
-    assert strays(flight, DRONE, "suspended_load") == chaotic
-    assert not strays(flight, DRONE, "payload")  # nothing to be lost
+    assert diverges(flight, DRONE, "suspended_load") == chaotic
+    assert not diverges(flight, DRONE, "payload")  # nothing to be lost
 
 
 @pytest.mark.parametrize("chaotic", [False, True])

@@ -166,7 +166,7 @@ def reach_of(frequency: NDArray, power: NDArray, k: int, ratio: float) -> float:
     return float(np.clip(max(left, right), 0.5, FARTHEST))
 
 
-def beside_peaks(data: Data, point: Point, columns: Sequence[Column], found: Sequence[Sequence[Peak]]) -> Gram:
+def off_peak_gram(data: Data, point: Point, columns: Sequence[Column], found: Sequence[Sequence[Peak]]) -> Gram:
     """Score and information of columns by what is outside the humps of each flight.
 
     A torque at the frequencies of the humps, its amplitude and phase free in every second, is profiled out.

@@ -10,17 +10,17 @@ import pytest
 from closed_loop import DRONE, Hidden, fly
 from made_flight import array_of
 
-from crazyem.diagnosis.diagnose import _heard
-from crazyem.diagnosis.fitting.always import refine_base
+from crazyem.diagnosis.diagnose import _corroborated
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, remembering, starting_point
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.place import depends_on_place
-from crazyem.diagnosis.naming.told import tell
-from crazyem.diagnosis.naming.trials import Selection, Step, Trial, between, both, margin, scatter, told_apart
+from crazyem.diagnosis.naming.answer import answer_of
+from crazyem.diagnosis.naming.corroboration import TELLING, false_speed, late_measurements
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial, between, both, distinguishable, margin, scatter
 from crazyem.diagnosis.naming.unexplained import Unexplained
-from crazyem.diagnosis.naming.witness import TELLING, false_speed, late_measurements
 from crazyem.recordings.recording import Recording
 
 
@@ -112,10 +112,10 @@ def test_a_witness_is_heard_on_the_flights_held_out_too(sudden: Recording) -> No
     final = nominal.with_effects({"input_delay": {"delay": 0.020}})
     fitted = Fitted(final, (late,), 0.0, data.gram(final, late.columns(final)), np.zeros(1))
     selection = Selection(nominal, final, (), (late,), fitted, 1)
-    assert _heard(data, None, selection, [silent])[1] == frozenset()
+    assert _corroborated(data, None, selection, [silent])[1] == frozenset()
     for seconds, told in ((0.0, {"measurement_delay", "input_delay"}), (0.020, {"input_delay"})):
         apart = Data([flight_of(felt(sudden, seconds), DRONE)])
-        assert _heard(data, apart, selection, [silent])[1] == told
+        assert _corroborated(data, apart, selection, [silent])[1] == told
 
 
 def test_a_group_holds_the_name_that_is_told(recording: Recording) -> None:
@@ -133,7 +133,9 @@ def test_a_group_holds_the_name_that_is_told(recording: Recording) -> None:
         ({"input_delay"}, "input_delay", ("input_delay", "motor_lag")),
         (set(), "input_delay", ("input_delay", "motor_lag", "measurement_delay")),
     ):
-        told = tell(data, selection, Unexplained((), 50.0), witnessed=frozenset(witnessed), apart=True, in_place={})
+        told = answer_of(
+            data, selection, Unexplained((), 50.0), witnessed=frozenset(witnessed), apart=True, in_place={}
+        )
         assert [e.name for e in told.effects] == [name]
         assert told.groups == (group,)
 
@@ -184,9 +186,9 @@ def test_what_two_explanations_share_does_not_blur_their_difference() -> None:
     nats, sd = margin(better, trial(shared))
     assert nats == pytest.approx(15.0, abs=3.0)
     assert sd < 2.0
-    assert told_apart(better, trial(shared))
-    assert not told_apart(trial(shared), trial(shared))
-    assert not told_apart(trial(shared + 2.0 * rng.normal(size=50) + 0.1), trial(shared))
+    assert distinguishable(better, trial(shared))
+    assert not distinguishable(trial(shared), trial(shared))
+    assert not distinguishable(trial(shared + 2.0 * rng.normal(size=50) + 0.1), trial(shared))
     assert margin(trial(shared, 3), trial(shared, 1))[0] == pytest.approx(-2.0)  # a parameter costs a nat
 
 
@@ -214,8 +216,8 @@ def test_few_recordings_do_not_tell_how_they_differ() -> None:
     assert between(apart, np.zeros(0, int)) == 0.0
     of = np.repeat(np.arange(5), 8)
     one, other = trial(np.repeat([5.0, -2.0, 5.0, -2.0, 4.0], 8)), trial(np.zeros(40))
-    assert told_apart(one, other)
-    assert not told_apart(replace(one, recording=of), replace(other, recording=of))
+    assert distinguishable(one, other)
+    assert not distinguishable(replace(one, recording=of), replace(other, recording=of))
 
 
 def test_flights_held_out_lower_a_p_value_that_is_small_already() -> None:

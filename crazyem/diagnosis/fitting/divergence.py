@@ -17,7 +17,7 @@ CHANGED, SWINGING = 0.3, 0.2
 FEWER = 6  # of an effect's beginnings one in so many is asked
 
 
-def strays(flight: Flight, vehicle: Vehicle, name: str) -> bool:
+def diverges(flight: Flight, vehicle: Vehicle, name: str) -> bool:
     """Whether a flight, as it was measured, drives an effect that has sizes astray, from any of some beginnings."""
     known = initial_path(flight)
     off = known.copy()

@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting.always import on_held_out, refine_base, without
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.nuisances import on_held_out, refine_base, without
 from crazyem.diagnosis.naming.evidence import gain_of_both, known_by, tuning
 from crazyem.diagnosis.naming.trials import Selection, Trial
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -42,7 +42,7 @@ def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Tri
         return None
     most = instead_of_a_load(selection.final.vehicle)
     try:
-        value, blocks, known = judged(data, held_out, selection.final, selection.accepted)
+        value, blocks, known = refitted(data, held_out, selection.final, selection.accepted)
         others = [_in_place_of_a_load(data, held_out, selection, most[:n]) for n in range(1, len(most) + 1)]
     except DivergedError:
         return None
@@ -55,7 +55,7 @@ def _in_place_of_a_load(data: Data, held_out: Data | None, selection: Selection,
     rest = [c for c in selection.accepted if c.effect not in {LOAD, *(t.effect for t in instead)}]
     bare = without(selection.final, LOAD)
     bare = bare.with_effects({c.effect: c.neutral(bare) for c in instead})
-    value, blocks, known = judged(data, held_out, bare, [*rest, *instead])
+    value, blocks, known = refitted(data, held_out, bare, [*rest, *instead])
     free = tuple(f"{c.effect}.{n}" for c in instead for n in c.free)  # counted, and no more
     cost = tuning(instead, known[-len(free) :, -len(free) :]) + np.log(len(CATALOGUE)) * (len(instead) - 1)
     return _stands(Candidate(WEAKER.effect, (), free), value, blocks, float(cost))
@@ -82,15 +82,15 @@ def as_load(data: Data, held_out: Data | None, selection: Selection) -> tuple[Tr
     mass = selection.final.vehicle.mass * (1.0 / share - 1.0)
     loaded = bare.with_effects({LOAD: {**HEAVIER.neutral(bare), "mass": mass}})
     try:
-        value, blocks, known = judged(data, held_out, selection.final, selection.accepted)
-        other, others, known_load = judged(data, held_out, loaded, [*rest, HEAVIER])
+        value, blocks, known = refitted(data, held_out, selection.final, selection.accepted)
+        other, others, known_load = refitted(data, held_out, loaded, [*rest, HEAVIER])
     except DivergedError:
         return None
     taken = replace(step.taken, value=value, blocks=blocks, tuned=tuned_of(weaker, selection.accepted, known))
     return taken, _stands(HEAVIER, other, others, tuned_of(HEAVIER, [*rest, HEAVIER], known_load))
 
 
-def judged(
+def refitted(
     data: Data, held_out: Data | None, start: Point, candidates: Sequence[Candidate]
 ) -> tuple[float, NDArray, NDArray]:
     """Log-likelihood as fitted to all flights, also by blocks; what is known of the candidates' parameters (k, k)."""

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, fly
 
-from crazyem.diagnosis.fitting.always import refine_base
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.diagnosis.naming.foretold import WORSE, ratio, with_found, without_what_misleads
+from crazyem.diagnosis.naming.prediction_check import WORSE, ratio, with_found, without_what_misleads
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.prediction.horizon import UNITS, HorizonErrors
 

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from crazyem.diagnosis.fitting.always import HANGING_SD, THRUST_SD, jittery, usual_wind
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.nuisances import HANGING_SD, THRUST_SD, jittery, usual_wind
 from crazyem.diagnosis.fitting.sampling import TRIM_SD
 
 # Smaller than this, these are not told from what filters, sampling and the air of a room do: s, s, s, 1, rad, rad/s, 1,

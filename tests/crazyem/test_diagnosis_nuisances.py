@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, fly
 
-from crazyem.diagnosis.fitting.always import (
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
+from crazyem.diagnosis.fitting.fit import Data, starting_point
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.nuisances import (
     AT_ONCE_DAMPING_SD,
     AT_ONCE_SD,
     COARSE_REASON,
@@ -23,14 +27,10 @@ from crazyem.diagnosis.fitting.always import (
     nuisances,
     refine_anew,
     refine_base,
+    systematic_sd,
     unlike_a_body,
-    unsure,
     usual_wind,
 )
-from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
-from crazyem.diagnosis.fitting.fit import Data, starting_point
-from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import _blocks, flight_of
 
 POINT = Point(DRONE, {}, first_guess())
@@ -95,7 +95,7 @@ def test_beside_heavy_rotors_a_damping_of_yaw_is_free_as_well_and_goes_with_them
 
 def test_intervals_hold_what_no_scatter_shows():
     heavy = POINT.with_effects({"rotor_inertia": {"inertia": 2e-8}})
-    never = unsure(flown(speed=0.7), heavy)  # type: ignore[arg-type]
+    never = systematic_sd(flown(speed=0.7), heavy)  # type: ignore[arg-type]
     # an attitude 1 ms late, at 3.1 rad/s: force over velocity = mass * rate^2 * delay
     assert never["linear_drag", "y"] == pytest.approx(DRONE.mass * 3.1**2 * 1e-3, rel=0.3)
     assert never["rotor_inertia", "inertia"] == pytest.approx(AT_ONCE_SD * 2e-8)

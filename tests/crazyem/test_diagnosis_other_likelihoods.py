@@ -18,9 +18,9 @@ from crazyem.diagnosis.flights.flight import flight_of, without
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.locating.place import Place
 from crazyem.diagnosis.naming import accelerometer
-from crazyem.diagnosis.naming.beside import beside_the_regression
 from crazyem.diagnosis.naming.gusts import Gusts, find_gusts
 from crazyem.diagnosis.naming.named import DOUBTFUL
+from crazyem.diagnosis.naming.other_likelihoods import other_likelihoods
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.errors import DataError
 from crazyem.recordings import open_recording
@@ -71,7 +71,7 @@ def test_a_yaw_that_nothing_shows_is_no_tilt(recording, monkeypatch, roll, told)
     monkeypatch.setattr(accelerometer, "tilt", lambda data, point: (tilted, gram))
     monkeypatch.setattr(accelerometer, "held_out_gain", lambda *given, **more: 50.0)
     remains = Unexplained((), 0.0)
-    found = beside_the_regression(data, None, point, remains, [accelerometer.EFFECT], {}, False, lambda text: None)
+    found = other_likelihoods(data, None, point, remains, [accelerometer.EFFECT], {}, False, lambda text: None)
     assert [f.name for f in found] == [accelerometer.EFFECT] * told
 
 
@@ -110,10 +110,10 @@ def test_a_calm_flight_has_no_gusts(recording):
 def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(monkeypatch):
     """As in a recording whose forces last for one sample each: the logarithm's error was 30 000."""
     found = Gusts(5000.0, np.ones(3), 0.25, 3e4, True, 1.6, 0.05)
-    monkeypatch.setattr("crazyem.diagnosis.naming.beside.find_gusts", lambda data, point: found)
+    monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.find_gusts", lambda data, point: found)
     vehicle, remains = load_vehicle("cf2"), Unexplained((), 0.0)
     data, point = Data(()), starting_point(Point(vehicle, {}, None))
-    (named,) = beside_the_regression(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
+    (named,) = other_likelihoods(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
     assert named.parameters["correlation_time"].ci95 == (0.01, 100.0)
     assert named.parameters["standard_deviation"].ci95 == pytest.approx((1.502, 1.698))
 
@@ -124,11 +124,11 @@ def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(m
 def test_gusts_are_as_sure_as_what_they_leave_allows(monkeypatch, nats, confidence):
     """Where gusts are all there is the regression explains nothing, which says nothing of them (told with 0 once)."""
     air = Gusts(5000.0, np.ones(3), 0.25, 0.1, True, 1.6, 0.05)
-    monkeypatch.setattr("crazyem.diagnosis.naming.beside.find_gusts", lambda data, point: air)
+    monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.find_gusts", lambda data, point: air)
     where = Finding("attitude", "y", "changes at 7 s", "time", (7.0, 28.0), 0.04, 0.005, "rad", nats, 1e-7)
     remains = Unexplained((where,) if nats else (), 0.0)
     data, point = Data(()), starting_point(Point(load_vehicle("cf2"), {}, None))
-    (named,) = beside_the_regression(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
+    (named,) = other_likelihoods(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
     assert named.confidence == pytest.approx(confidence, abs=1e-3)
 
 
@@ -149,7 +149,7 @@ def test_a_diagnosis_leaves_to_gusts_what_pushes_away_and_keeps_what_pulls_back(
     where = Finding("force", "x", "x position", "x", (0.0, 20.0), size, 1e-3, "N", 30.0, 0.0)
     air = Gusts(5000.0, np.ones(3), 1.0, 0.1, True, 1.6, 0.05)
     monkeypatch.setattr("crazyem.diagnosis.diagnose.depends_on_place", lambda *_: Place(30.0, 300.0, where))
-    monkeypatch.setattr("crazyem.diagnosis.naming.beside.find_gusts", lambda data, point: air)
+    monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.find_gusts", lambda data, point: air)
     found = diagnose([recording], load_vehicle("cf2"), wanted=["gusts"])
     assert ("gusts" in [e.name for e in found.effects]) == gusts
     assert (where in found.unexplained.findings) == (not gusts)
@@ -161,10 +161,10 @@ def test_gusts_explain_every_force_and_nothing_else():
         Finding(signal, "x", "always", "", (0.0, 20.0), 0.01, 1e-3, unit, 30.0, 0.0)
         for signal, unit in (("force", "N"), ("torque", "N m"))
     )
-    remains = Unexplained((), 0.0).beside(force)
+    remains = Unexplained((), 0.0).with_finding(force)
     assert (remains.explained, remains.without_force()) == (0.0, Unexplained((), 0.0))
     assert remains.without_force().explained == 1.0
-    assert remains.beside(torque).without_force().findings == (torque,)
+    assert remains.with_finding(torque).without_force().findings == (torque,)
     assert Unexplained((force,), 90.0).explained == pytest.approx(0.75)
 
 

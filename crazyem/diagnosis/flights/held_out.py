@@ -10,7 +10,7 @@ from crazyem.diagnosis.flights.flight import Flight
 
 # Below these a flight hovers [m/s, horizontal; rad/s]: simulated hovers have 0.006 to 0.08 and 0.08 to 0.4 (in gusts),
 # small shakes from 0.128 and 0.74 on. There velocities are mostly the jitter of the onboard estimate (see
-# `always.jittery`), and a drag is whatever that looks like.
+# `nuisances.jittery`), and a drag is whatever that looks like.
 STILL, STEADY = 0.1, 0.5
 LIVELIER = 3.0  # times as quick, at least: rooms are never still, and flights of a kind differ by chance
 
@@ -28,7 +28,7 @@ def swapped(fitted: Sequence[Flight], kept_apart: Sequence[Flight]) -> bool:
     return hovers and bool(np.any(there[:, 0] > max(STILL, LIVELIER * float(here[:, 0].max()))))
 
 
-def told(fitted: Sequence[str], kept_apart: Sequence[str]) -> str:
+def swap_sentence(fitted: Sequence[str], kept_apart: Sequence[str]) -> str:
     """The sentence that says so, of what is fitted now and what was named first."""
     now, first = (", ".join(Path(p).name for p in part) for part in (fitted, kept_apart))
     here = f"physics is fitted to what was held out, {now}, and confirmed by it"

@@ -13,11 +13,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting.always import nuisances, with_nuisances
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Column, Point
+from crazyem.diagnosis.fitting.nuisances import nuisances, with_nuisances
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 FEW = 5  # beginnings that are all tried in full; of more,
@@ -48,7 +48,7 @@ def best_begun(
         gains = [_gain(gram, weights, at + i) for i in range(len(family))]
         at += len(family)
         best = peaks(gains)
-        astray = max(gains) > SEEN and any(model.strays(family[0].effect, point.vehicle) for model in data.models)
+        astray = max(gains) > SEEN and any(model.diverges(family[0].effect, point.vehicle) for model in data.models)
         found = larger(data, point, family) if astray else None
         dropped |= set(family) - ({family[i] for i in best} if found is None else set())
         added += [found] if found is not None else []

@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from crazyem.diagnosis.fitting.always import refine_anew, refine_base, without
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError
-from crazyem.diagnosis.naming.least import at_the_end, matters
-from crazyem.diagnosis.naming.split import judged, tuned_of
-from crazyem.diagnosis.naming.trials import SURE, Selection, Step, Trial, margin, not_beaten, told_apart
+from crazyem.diagnosis.fitting.nuisances import refine_anew, refine_base, without
+from crazyem.diagnosis.naming.detection_limits import at_the_end, matters
+from crazyem.diagnosis.naming.load_or_rotors import refitted, tuned_of
+from crazyem.diagnosis.naming.trials import SURE, Selection, Step, Trial, distinguishable, margin, not_beaten
 
 NEAR = 100.0  # nats by which a rival may have been worse when it was tried
 
@@ -31,13 +31,13 @@ def named_again(
         return selection
     for name in [c.effect for c in selection.accepted]:
         try:
-            selection = _asked_again(data, held_out, selection, name, say)
+            selection = _reselected(data, held_out, selection, name, say)
         except DivergedError:  # one of the rivals leaves the range of numbers beside the others: the name stays
             continue
     return selection
 
 
-def nearly_as_good(step: Step, accepted: Sequence[Candidate], *, near: float = NEAR) -> list[Trial]:
+def close_alternatives(step: Step, accepted: Sequence[Candidate], *, near: float = NEAR) -> list[Trial]:
     """What else was within `near` nats when the effect was taken, and is not part of the model by now."""
     taken, names = step.taken, {c.effect for c in accepted}
     assert taken is not None
@@ -45,13 +45,13 @@ def nearly_as_good(step: Step, accepted: Sequence[Candidate], *, near: float = N
     return [t for t in tried if t.candidate.effect not in names and t.p_value < SURE and margin(taken, t)[0] < near]
 
 
-def _asked_again(
+def _reselected(
     data: Data, held_out: Data | None, selection: Selection, name: str, say: Callable[[str], None]
 ) -> Selection:
     step = next(s for s in selection.steps if s.taken and s.taken.candidate.effect == name)
     mine = next(c for c in selection.accepted if c.effect == name)
     ended = at_the_end(selection.final, mine)  # beside the others: it stands for something else, whatever that is worth
-    others = nearly_as_good(step, selection.accepted, near=np.inf if ended else NEAR)
+    others = close_alternatives(step, selection.accepted, near=np.inf if ended else NEAR)
     if not others:
         return selection
     say(f"  asking again: {mine.label} or {', '.join(t.candidate.label for t in others)}")
@@ -62,7 +62,7 @@ def _asked_again(
         assert rival.fitted is not None
         point = bare.with_effects({rival.candidate.effect: rival.candidate.values(rival.fitted.point)})
         starts.append((point, _in_place(selection.accepted, mine, rival.candidate)))
-    found = data.workers.map(lambda start: judged(data, held_out, *start), starts)
+    found = data.workers.map(lambda start: refitted(data, held_out, *start), starts)
     tried = [
         replace(trial, candidate=c, value=value, blocks=blocks, tuned=tuned_of(c, accepted, known))
         for trial, c, (_, accepted), (value, blocks, known) in zip(
@@ -72,8 +72,8 @@ def _asked_again(
     now, tried = tried[0], tried[1:]
     asked = tried if ended else [now, *tried]
     best = max(asked, key=lambda t: t.worth)
-    equals = [t for t in asked if t is best or not told_apart(best, t, recordings=False)]
-    group = [t for t in asked if t is best or not told_apart(best, t)]
+    equals = [t for t in asked if t is best or not distinguishable(best, t, recordings=False)]
+    group = [t for t in asked if t is best or not distinguishable(best, t)]
     unbeaten = not_beaten(equals)
     chosen = min(unbeaten, key=lambda t: (len(t.candidate.free), -t.value), default=best)
     rest = [t for t in step.trials if t is not step.taken and all(t.candidate is not r.candidate for r in tried)]

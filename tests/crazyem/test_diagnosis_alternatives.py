@@ -11,7 +11,7 @@ from unknown_effects import unknown
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.naming import exchange
+from crazyem.diagnosis.naming import alternatives
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.workers import Workers
 
@@ -44,9 +44,9 @@ def asked(monkeypatch: pytest.MonkeyPatch, *, load: float, weaker: float, was: f
         assert start.effects["thrust_scale"]["scale"] == 0.9
         return weaker, BLOCKS + weaker / 20, unknown(candidates)
 
-    monkeypatch.setattr(exchange, "judged", judged)
-    monkeypatch.setattr(exchange, "refine_anew", lambda data, point, accepted: SimpleNamespace(point=point))
-    return exchange.named_again(SimpleNamespace(workers=Workers(1)), None, selection)  # type: ignore[arg-type]
+    monkeypatch.setattr(alternatives, "refitted", judged)
+    monkeypatch.setattr(alternatives, "refine_anew", lambda data, point, accepted: SimpleNamespace(point=point))
+    return alternatives.named_again(SimpleNamespace(workers=Workers(1)), None, selection)  # type: ignore[arg-type]
 
 
 def names(selection: Selection) -> list[str]:
@@ -86,15 +86,15 @@ def test_a_name_that_is_still_the_best_stays(monkeypatch):
 
 
 def test_what_was_far_worse_is_not_asked(monkeypatch):
-    monkeypatch.setattr(exchange, "NEAR", 20.0)
+    monkeypatch.setattr(alternatives, "NEAR", 20.0)
     assert names(asked(monkeypatch, load=100.0, weaker=130.0)) == ["payload", "velocity_moment"]
 
 
 def test_one_effect_alone_is_not_asked_again(monkeypatch):
-    monkeypatch.setattr(exchange, "judged", lambda *a: pytest.fail("nothing is new"))
+    monkeypatch.setattr(alternatives, "refitted", lambda *a: pytest.fail("nothing is new"))
     taken = trial(LOAD, 100.0, POINT)
     alone = Selection(BARE, POINT, (Step((taken, trial(WEAKER, 99.0, THERE)), taken),), (LOAD,), SimpleNamespace(), 34)  # type: ignore[arg-type]
-    assert exchange.named_again(SimpleNamespace(workers=Workers(1)), None, alone) is alone  # type: ignore[arg-type]
+    assert alternatives.named_again(SimpleNamespace(workers=Workers(1)), None, alone) is alone  # type: ignore[arg-type]
     assert replace(alone) == alone
 
 
@@ -108,9 +108,9 @@ def test_what_ended_where_its_range_ends_gives_way_to_whatever_is_next(monkeypat
         taken, other = trial(slope, 1000.0, point), trial(WEAKER, 100.0, THERE)
         steps = (Step((taken, other), taken), Step((), trial(FLAPPING, 20.0, point)))
         selection = Selection(BARE, point, steps, (slope, FLAPPING), SimpleNamespace(), 34)  # type: ignore[arg-type]
-        monkeypatch.setattr(exchange, "judged", lambda data, held_out, start, candidates: (
+        monkeypatch.setattr(alternatives, "refitted", lambda data, held_out, start, candidates: (
             (1000.0 if candidates[0] is slope else 100.0), BLOCKS, unknown(candidates)))  # fmt: skip
-        monkeypatch.setattr(exchange, "refine_anew", lambda data, point, accepted: SimpleNamespace(point=point))
-        found = exchange.named_again(SimpleNamespace(workers=Workers(1)), None, selection)  # type: ignore[arg-type]
+        monkeypatch.setattr(alternatives, "refine_anew", lambda data, point, accepted: SimpleNamespace(point=point))
+        found = alternatives.named_again(SimpleNamespace(workers=Workers(1)), None, selection)  # type: ignore[arg-type]
         assert names(found) == [name, "velocity_moment"]
         assert (slope in [t.candidate for t in found.steps[0].trials]) == (name == "thrust_curve")
