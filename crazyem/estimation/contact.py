@@ -25,6 +25,11 @@ class ContactGate:
         self.airborne = False
         self.reason = "no samples yet"
 
+    @property
+    def rest_height(self) -> float:
+        """m in the world, NaN where the drone was not seen at rest."""
+        return self._rest_height
+
     def update(self, *, height: float, thrust: float, flying: bool | None) -> bool:
         """Decide for one sample.
 

@@ -3,8 +3,11 @@
 import math
 from dataclasses import dataclass, field
 
-from crazyem.estimation.contact import ContactGate
+from crazyem.estimation.contact import CONTACT_HEIGHT, ContactGate
 from crazyem.signals.sample import Sample
+
+# s: telemetry is late, and so is what is sent; a drone that at its present descent is down by then is landing
+LANDING_SECONDS = 0.3
 
 # supervisor.info, firmware supervisor.c
 CAN_ARM, ARMED, AUTO_ARM, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << i for i in range(8))
@@ -19,12 +22,14 @@ class Telemetry:
         heard: s since the epoch, host time at which the newest `info` arrived; -inf before any, and once the
             link is lost.
         position: m, world. yaw: rad. voltage: V. setpoint: m, world.
+        climb: m/s, vertical velocity in the world; 0 where none is logged.
     """
 
     info: int | None = None
     heard: float = -math.inf
     position: tuple[float, float, float] | None = None
     yaw: float = 0.0
+    climb: float = 0.0
     voltage: float = math.nan
     setpoint: tuple[float, float, float] | None = None
     _duty: float = math.inf  # of the fastest rotor, 0..1; inf where nothing is known
@@ -42,6 +47,8 @@ class Telemetry:
         elif sample.signal == "attitude":
             x, y, z, w = v
             self.yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        elif sample.signal == "velocity":
+            self.climb = v[2] if math.isfinite(v[2]) else 0.0
         elif sample.signal == "voltage":
             self.voltage = v[0]
         elif sample.signal == "setpoint_position":
@@ -58,6 +65,11 @@ class Telemetry:
         """Whether the drone is in the air: the firmware says that it flies (and goes on to say so for 2 s after its
         motors stopped), its rotors turn, and it is not down where it stood before, by the estimator's own rule."""
         return self.has(FLYING) and self._contact.airborne
+
+    @property
+    def landing(self) -> bool:
+        """Whether it is down within `LANDING_SECONDS` at its present descent; False where its floor is unknown."""
+        return self.height - self._contact.rest_height + min(self.climb, 0.0) * LANDING_SECONDS < CONTACT_HEIGHT
 
     def has(self, bit: int) -> bool:
         """Whether a bit of supervisor.info is set (False until it was seen)."""

@@ -57,7 +57,9 @@ class WriteGate:
         """Why a write for this purpose (`Push.purpose`) does not belong where the drone is, one clause; else ""."""
         if purpose == "restore":
             return "the drone still flies" if self.telemetry.has(FLYING) else ""
-        return "" if self.telemetry.airborne else "the drone is not in the air"
+        if not self.telemetry.airborne:
+            return "the drone is not in the air"
+        return "the drone is about to land" if self.telemetry.landing else ""
 
     def objection(self, purpose: str) -> str:
         """Why a write must not be sent now, one clause; "" if it may."""
