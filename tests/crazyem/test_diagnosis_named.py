@@ -174,8 +174,7 @@ def test_inertias_are_as_unsure_as_a_lag_that_is_a_little_wrong_makes_them() -> 
         theta.append(fitted.gram.solve(range(size), precision=fitted.precision, low=low, high=high).theta)
     for k, name in enumerate(inertia.free):
         assert off["inertia", name] == pytest.approx(abs(theta[1][k] - theta[0][k]), rel=1e-3)
-    share = [off["inertia", name] / DRONE.inertia[k] for k, name in enumerate(inertia.free)]
-    assert max(share[:2]) > 0.002  # about z, what is new in sampled commands has the same column
+        assert off["inertia", name] > 0.003 * DRONE.inertia[k]
     assert len(off) == 3
     assert (
         by_a_wrong_lag(data, refine_base(data, start, [Candidate("motor_lag", (), ("time_constant",))], rounds=1)) == {}

@@ -40,8 +40,6 @@ VELOCITY_SD, JITTER = 2e-3, 3e-3  # relative: no onboard filter is better; m/s, 
 # s: rates behind the attitude, velocities behind the position, by the filters of the firmware; in 80 flights with
 # nothing hidden 0.0 to 2.4 and 0.0 to 1.6 ms, most in quick ones.
 FILTER, FILTER_SD = (("rate_lag", 1.2e-3), ("velocity_lag", 0.6e-3)), 0.7e-3
-# Share of what is new in a logged command that acts for less than a sample (physics/effects/sampled_commands.py): some.
-SHARE_SD = 0.4
 # Relative: in ten flights with nothing hidden, with the lag free, torques look 2 +- 2 % too strong (-0.5 to +4 %); a
 # longer lag with more torque is nearly the same to a loop whose commands are sampled.
 TORQUE_SD = 0.03
@@ -140,9 +138,6 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
         found.append(
             (Candidate("onboard_filter", tuple(shown), tuple(n for n, _ in shown)), (FILTER_SD**-2,) * len(shown))
         )
-    if not measured:
-        own = of_recordings("sampled_commands", ("tilt", "turn"), data.flights)
-        found.append((own, (SHARE_SD**-2,) * len(own.free)))
     if "body_rate" in data.signals:
         offsets = of_recordings("gyro_bias", ("x", "y", "z"), data.flights)
         found.append((offsets, (GYRO_SD**-2,) * len(offsets.free)))
