@@ -61,16 +61,6 @@ def thrust_per_unit(vehicle: Vehicle, *, thrust: float, volts: float) -> float:
     return _slope(vehicle, motor_volts(vehicle, thrust)) * volts / FULL
 
 
-def effectiveness(vehicle: Vehicle, per_unit: float, inertia: tuple[float, float, float]) -> tuple[float, float, float]:
-    """ctrlINDI.g1_p, g1_q, g1_r: angular acceleration about each axis per unit of its command [rad/s^2].
-
-    Args:
-        per_unit: see `thrust_per_unit` [N]. inertia: Ixx, Iyy, Izz [kg m^2].
-    """
-    torque = unit_torque(vehicle, per_unit)
-    return torque[0] / inertia[0], torque[1] / inertia[1], torque[2] / inertia[2]
-
-
 def unit_torque(vehicle: Vehicle, per_unit: float) -> tuple[float, float, float]:
     """Torque about x, y, z of one unit of roll, pitch, yaw command [N m]: four rotors, half a unit each but in yaw."""
     along_x, along_y = vehicle.arm

@@ -113,10 +113,6 @@ class Parameters:
         """Inverse of the inertia matrix."""
         return np.linalg.inv(self.inertia)
 
-    def with_theta(self, theta: NDArray) -> "Parameters":
-        """The same with another theta."""
-        return replace(self, theta=theta)
-
 
 @dataclass(frozen=True)
 class KnownNoise:

@@ -125,10 +125,7 @@ class PostWriteMonitor:
         """
         with self._lock:
             if real is None:
-                self._excused = (
-                    began,
-                    now + RETURN_SECONDS,
-                )  # not for ever: the estimator that has to decide may stall
+                self._excused = (began, now + RETURN_SECONDS)  # an end, because the estimator that decides may stall
                 self._tracking.forget(began)
                 self._innovation.forget(began)
                 self.unjudged = min(self.unjudged, self.limits.unjudged - 1)  # the new mass does not wait for verdicts

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 from crazyem.control.command_units import (
     LOOP,
-    effectiveness,
     lag_of,
     lag_share,
     mass_thrust,
     motor_volts,
     rotor_reaction,
     thrust_per_unit,
+    unit_torque,
 )
 from crazyem.physics.rotors import wrench_from_command
 from crazyem.vehicle import load_vehicle
@@ -40,21 +40,21 @@ def wrench_of(vehicle, thrust, roll, pitch, yaw, volts):
 
 @pytest.mark.parametrize("vehicle", [CF2, BRUSHLESS, UNCOMPENSATED], ids=["cf2", "cf21bl", "uncompensated"])
 @pytest.mark.parametrize("volts", [3.5, 4.1])
-def test_effectiveness_is_the_derivative_of_the_torque_by_the_command(vehicle, volts) -> None:
+def test_unit_torque_is_the_derivative_of_the_torque_by_the_command(vehicle, volts) -> None:
     """Body y and z are the other way in the mixer's pitch and yaw."""
     thrust = vehicle.mass * 9.81 / 4
     hover = mass_thrust(vehicle, force=4 * thrust, volts=volts) * 4 * thrust
-    g1 = effectiveness(vehicle, thrust_per_unit(vehicle, thrust=thrust, volts=volts), vehicle.inertia)
+    torque = unit_torque(vehicle, thrust_per_unit(vehicle, thrust=thrust, volts=volts))
     for axis, sign in enumerate((1.0, -1.0, -1.0)):
         step = np.zeros(3)
         step[axis] = 1.0
         up, down = (wrench_of(vehicle, hover, *(s * step), volts)[1 + axis] for s in (1.0, -1.0))
-        assert g1[axis] == pytest.approx(sign * (up - down) / 2 / vehicle.inertia[axis], rel=1e-5)
+        assert torque[axis] == pytest.approx(sign * (up - down) / 2, rel=1e-5)
 
 
 def test_of_a_crazyflie_they_are_near_the_firmwares_own() -> None:
     """controller_indi.h: 0.0066146, 0.0052125, 0.001497 (other propellers, other years); act_dyn 0.03149 is 62.5 ms."""
-    g1 = effectiveness(CF2, thrust_per_unit(CF2, thrust=0.07, volts=4.0), CF2.inertia)
+    g1 = np.array(unit_torque(CF2, thrust_per_unit(CF2, thrust=0.07, volts=4.0))) / CF2.inertia
     assert g1 == pytest.approx((0.00719, 0.00715, 0.00175), rel=2e-3)
     assert lag_of(0.03149) == pytest.approx(0.0625, rel=1e-3)
 

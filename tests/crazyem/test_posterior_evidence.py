@@ -26,22 +26,32 @@ def normal(x: float, sd: float) -> float:
     return float(np.exp(-0.5 * (x / sd) ** 2) / (np.sqrt(2 * np.pi) * sd))
 
 
-@pytest.mark.parametrize(("low", "high"), [((-9.0, -9.0), (9.0, 9.0)), ((0.0, -9.0), (9.0, 0.15))])
-def test_evidence_is_the_integral_over_a_bounded_prior(low, high) -> None:
+@pytest.mark.parametrize(
+    ("low", "high", "together"),
+    [
+        ((-9.0, -9.0), (9.0, 9.0), 0.0),
+        ((0.0, -9.0), (9.0, 0.15), 0.0),
+        ((0.0, -9.0), (9.0, 0.15), 0.9),  # a box that cuts a correlated prior
+        ((-0.1, -0.1), (9.0, 9.0), -0.8),
+    ],
+)
+def test_evidence_is_the_integral_over_a_bounded_prior(low, high, together) -> None:
     flight, own = made_pass(1, 2), np.array([0.5, 0.8])
+    covariance = np.array([[1.0, together], [together, 1.0]]) * np.outer(own, own)
     shared = Shared([flight], np.zeros((1, 2)))
-    found = shared.posterior([0, 1], Gaussian(np.diag(own**2), np.array(low), np.array(high)))
-    base = loglik(flight, np.zeros(2))
-
-    def density(y: float, x: float) -> float:
-        return np.exp(loglik(flight, np.array([x, y])) - base) * normal(x, own[0]) * normal(y, own[1])
+    found = shared.posterior([0, 1], Gaussian(covariance, np.array(low), np.array(high)))
+    base, precision = loglik(flight, np.zeros(2)), np.linalg.inv(covariance)
 
     def prior(y: float, x: float) -> float:
-        return normal(x, own[0]) * normal(y, own[1])
+        theta = np.array([x, y])
+        return float(np.exp(-0.5 * theta @ precision @ theta) / (2 * np.pi * np.sqrt(np.linalg.det(covariance))))
+
+    def density(y: float, x: float) -> float:
+        return np.exp(loglik(flight, np.array([x, y])) - base) * prior(y, x)
 
     ends = [(max(lo, -6 * s), min(hi, 6 * s)) for lo, hi, s in zip(low, high, own, strict=True)]
     area, inside = (
-        integrate.dblquad(f, *ends[0], *ends[1], epsabs=1e-12, epsrel=1e-8)[0] for f in (density, prior)
+        integrate.dblquad(f, *ends[0], *ends[1], epsabs=1e-10, epsrel=1e-6)[0] for f in (density, prior)
     )  # fmt: skip
     assert found.gain == pytest.approx(np.log(area / inside), abs=0.02)
     assert shared.nothing == pytest.approx(base)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.model import Model, Point
 from crazyem.diagnosis.posterior.evidence import Gaussian, Pass, Posterior, Shared
-from crazyem.diagnosis.posterior.members import FELT, logged, prior_odds
+from crazyem.diagnosis.posterior.members import ACCELEROMETER_NEEDS, logged, prior_odds
 from crazyem.diagnosis.posterior.study import Fit, Study
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effect
@@ -37,7 +37,7 @@ def accelerometer_effects(study: Study, fit: Fit) -> list[AccelerometerEffect]:
     """Every effect that the accelerometer alone shows, beside a fitted model."""
     found = []
     for effect in CATALOGUE.values():
-        if effect.needs != FELT or not effect.prior.own:
+        if effect.needs != ACCELEROMETER_NEEDS or not effect.prior.own:
             continue
         if all("specific_force" in d.signals for d in fit.data):
             one = _accelerometer_effect(effect, study, fit)

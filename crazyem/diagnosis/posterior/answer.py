@@ -68,20 +68,20 @@ def answer_of(study: Study, models: Sequence[Fit], felt: Sequence[AccelerometerE
     groups: list[tuple[str, ...]] = []
     for effect in best.effects:
         rivals = beliefs.instead(effect, best.effects)
-        group = [r for r, p in sorted(rivals.items(), key=lambda r: -r[1]) if p > SETTINGS.rival]
+        group = [r for r, p in sorted(rivals.items(), key=lambda r: -r[1]) if p > SETTINGS.look_alike_probability]
         probability = beliefs.of(effect)
         together = probability + sum(
             p for s, p in beliefs.models if effect not in s and any(r in s for r in group)
         )  # fmt: skip
-        if together < SETTINGS.told or CATALOGUE[effect].prior.unnamed:
+        if together < SETTINGS.naming_probability or CATALOGUE[effect].prior.unnamed:
             continue
         odds = _gain(effect, models)
         found.append((odds, named(study, best, effect, probability, odds)))
         known = [r for r in group if not CATALOGUE[r].prior.unnamed]
-        if known and probability < SETTINGS.sure:
+        if known and probability < SETTINGS.separate_probability:
             groups.append((effect, *known))
     for one in felt:
-        if one.odds > log_odds(SETTINGS.told):
+        if one.odds > log_odds(SETTINGS.naming_probability):
             probability = 1.0 / (1.0 + math.exp(-min(one.odds, 50.0)))
             mean, sd = one.posterior.mean, np.sqrt(np.diag(one.posterior.covariance))
             values = {
@@ -121,7 +121,7 @@ def named(study: Study, best: Fit, effect: str, probability: float = math.nan, o
 def _random(study: Study, best: Fit, effect: str, probability: float, odds: float) -> Named:
     values = study.size_of(CATALOGUE[effect], best)
     seconds = sum(f.duration for d in best.data for f in d.flights)
-    told = {n: 1.0 / math.sqrt(max(3.0 * seconds / SETTINGS.memory, 2.0)) for n in values}
+    told = {n: 1.0 / math.sqrt(max(3.0 * seconds / SETTINGS.correlation_time, 2.0)) for n in values}
     found = {}
     for p in CATALOGUE[effect].parameters:
         value, sd = values[p.name], values[p.name] * (told[p.name] if p.name == CATALOGUE[effect].amplitude else 0.5)

@@ -109,7 +109,8 @@ class Shared:
         mean = covariance @ s
         gain = 0.5 * float(s @ mean) - 0.5 * float(np.linalg.slogdet(white)[1])
         inside, mean, covariance = box(mean, covariance, prior.low, prior.high)
-        return Posterior(gain + inside - _marginal(prior), mean, covariance)
+        before, _, _ = box(np.zeros(index.size), prior.covariance, prior.low, prior.high)
+        return Posterior(gain + inside - before, mean, covariance)
 
     def deviations(self, flight: int) -> tuple[NDArray, NDArray]:
         """Columns (d,) that differ in a flight, and their covariance (d, d) about what all share."""
@@ -143,12 +144,6 @@ def scatter_of(scores: NDArray, information: NDArray) -> NDArray:
     spread = np.sum(r * r, axis=0) + np.maximum(2.0 * np.sum(r[1:] * r[:-1], axis=0), 0.0)
     ratio = np.divide(spread, information, out=np.ones_like(spread), where=information > 0)
     return np.maximum(ratio, 1.0)
-
-
-def _marginal(prior: Gaussian) -> float:
-    """Log probability of the box under the prior, parameter by parameter."""
-    sd = np.sqrt(np.diag(prior.covariance))
-    return float(sum(_cut(0.0, s * s, lo, hi)[0] for s, lo, hi in zip(sd, prior.low, prior.high, strict=True)))
 
 
 def box(mean: NDArray, covariance: NDArray, low: NDArray, high: NDArray) -> tuple[float, NDArray, NDArray]:

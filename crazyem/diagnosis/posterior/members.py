@@ -18,10 +18,8 @@ from crazyem.physics.effects.effect import Effect
 from crazyem.physics.effects.prior import Logged, Sizes
 from crazyem.vehicle import Vehicle
 
-FELT = ("specific_force",)  # needs of an effect that the accelerometer alone shows (`accelerometer.py`)
-HIDDEN = "in such recordings it differs by as much as it may be off"
-FEW = 5  # beginnings of an effect up to which all of its parameters are looked at from each
-REACH = 4.0  # usual spreads within which a recording stays, also beyond the range of a drone: a delay counted too long
+ACCELEROMETER_NEEDS = ("specific_force",)  # needs of an effect that the accelerometer alone shows (`accelerometer.py`)
+INDISTINCT = "in such recordings it differs by as much as it may be off"
 
 Key = tuple[str, Any, Any, str]  # of a column: effect, choices, beginning, parameter
 Slopes = Mapping[Key, tuple[Column, ...]]  # derivatives by column, one a flight
@@ -118,7 +116,7 @@ def pool_of(flights: Sequence[Flight], point: Point, wanted: Sequence[str] = ())
         if effect.random is not None:
             random.append(effect)
             continue
-        if effect.needs == FELT:
+        if effect.needs == ACCELEROMETER_NEEDS:
             continue
         found = variants(effect, point, signals)
         spreads = [effect.prior.usual_in(fact) for fact in facts]
@@ -132,10 +130,10 @@ def pool_of(flights: Sequence[Flight], point: Point, wanted: Sequence[str] = ())
             found = [replace(c, free=tuple(n for n in c.free if n in told)) for c in found]
             found = [c for c in found if c.free]
             if not found:
-                left_out[name] = HIDDEN
+                left_out[name] = INDISTINCT
             count = len({(c.fixed, c.free) for c in found})
             odds = prior_odds() - math.log(count)
-            many = max((len(v) for v in effect.beginnings.values()), default=0) > FEW
+            many = max((len(v) for v in effect.beginnings.values()), default=0) > SETTINGS.max_full_starts
             for c in found:
                 members.append(Member(c, _sizes(effect, c, effect.prior.own, point), odds))
                 first = replace(c, free=(effect.amplitude,)) if many else c
@@ -145,7 +143,7 @@ def pool_of(flights: Sequence[Flight], point: Point, wanted: Sequence[str] = ())
 
 def prior_odds() -> float:
     """Log odds that an effect is missing."""
-    return math.log(SETTINGS.missing / (1.0 - SETTINGS.missing))
+    return math.log(SETTINGS.prior_missing / (1.0 - SETTINGS.prior_missing))
 
 
 def _distinct(effect: Effect, spreads: Sequence[Sizes]) -> set[str]:

@@ -57,8 +57,8 @@ class Search:
             nothing = study.fit([d.twin() for d in study.data], still, (), frozenset(), np.zeros(0), {})
         self._keep(nothing)
         self.say(f"nothing missing: {nothing.value:.1f}, scatter {np.median(nothing.look.shared.scatter):.2f}")
-        self._grow(nothing, least=SETTINGS.asked, most=None)
-        for _ in range(SETTINGS.turns):
+        self._grow(nothing, least=SETTINGS.single_log_odds, most=None)
+        for _ in range(SETTINGS.max_turns):
             best = self.best
             self._grow(best)
             if self.best is best:
@@ -132,12 +132,12 @@ class Search:
         except (DivergedError, np.linalg.LinAlgError):
             return None
 
-    def _grow(self, base: Fit, *, least: float | None = None, most: int | None = SETTINGS.most) -> None:
+    def _grow(self, base: Fit, *, least: float | None = None, most: int | None = SETTINGS.max_neighbours) -> None:
         """Fit neighbours with one effect more, of which as much is expected; a few in any case."""
         near = self.neighbours(base)
         top = max((n.most for n in near if np.isfinite(n.most)), default=0.0)
-        least = min(top - SETTINGS.near, SETTINGS.worth * top) if least is None else least
-        wanted = [n for k, n in enumerate(near) if n.most > least or k < SETTINGS.few][:most]
+        least = min(top - SETTINGS.gain_margin, SETTINGS.gain_share * top) if least is None else least
+        wanted = [n for k, n in enumerate(near) if n.most > least or k < SETTINGS.min_neighbours][:most]
         self._fit_all(base, [n for n in wanted if base.effects | {n.effect} not in self.visited])
 
     def _swap(self, best: Fit) -> None:
@@ -151,7 +151,7 @@ class Search:
                 except (DivergedError, np.linalg.LinAlgError):
                     continue
             if less:  # rivals of an effect that brings much must bring some of that, too
-                self._grow(self.visited[less], least=SETTINGS.worth * (best.value - self.visited[less].value))
+                self._grow(self.visited[less], least=SETTINGS.gain_share * (best.value - self.visited[less].value))
 
     def _fit_all(self, base: Fit, wanted: Sequence[Neighbour]) -> None:
         for n, fit in zip(wanted, self.study.workers.map(lambda n: self._fitted(base, n), wanted), strict=True):

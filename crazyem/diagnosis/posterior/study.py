@@ -19,7 +19,7 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.posterior.evidence import Gaussian, Pass, Posterior, Shared
-from crazyem.diagnosis.posterior.members import REACH, Key, Member, Slopes, away, key_of, pool_of, prior_odds, started
+from crazyem.diagnosis.posterior.members import Key, Member, Slopes, away, key_of, pool_of, prior_odds, started
 from crazyem.diagnosis.posterior.settings import SETTINGS
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -107,7 +107,7 @@ class Study:
     def _calm(self, effect: Effect, point: Point) -> float:
         """m/s^2: the spread of a force with memory that is usual."""
         assert effect.random is not None
-        one = effect.random(np.ones(6), SETTINGS.memory, mass=point.vehicle.mass, drag=float("nan"))
+        one = effect.random(np.ones(6), SETTINGS.correlation_time, mass=point.vehicle.mass, drag=float("nan"))
         return effect.prior.usual_in(Logged())[effect.amplitude] / one[effect.amplitude]
 
     def _moving(self, point: Point) -> Point:
@@ -116,14 +116,14 @@ class Study:
             return point
         old = point.noise
         memory = np.broadcast_to(np.asarray(old.memory, float), (6,)).copy()
-        memory[list(FORCES)] = SETTINGS.memory
+        memory[list(FORCES)] = SETTINGS.correlation_time
         disturbance = old.disturbance.copy()
         disturbance[list(FORCES)] = 0.5 * self.calm
         return replace(point, noise=replace(old, disturbance=disturbance, memory=memory))
 
     def noisy(self, data: Data, point: Point, random: frozenset[str], *, near: bool = True) -> Point:
         """Noise scales that fit; forces with memory no larger than is usual where the model has no random effect."""
-        found = data.fit_noise(point, near=near, rows=SETTINGS.rows)
+        found = data.fit_noise(point, near=near, rows=SETTINGS.noise_rows)
         if random or not np.isfinite(self.calm):
             return found
         large = tuple(i for i in FORCES if found.noise.disturbance[i] > self.calm)
@@ -132,11 +132,11 @@ class Study:
         disturbance = found.noise.disturbance.copy()
         disturbance[list(large)] = self.calm
         held = replace(found, noise=replace(found.noise, disturbance=disturbance))
-        return data.fit_noise(held, near=near, rows=SETTINGS.rows, held=large)
+        return data.fit_noise(held, near=near, rows=SETTINGS.noise_rows, held=large)
 
     def stilled(self, points: Sequence[Point]) -> tuple[Point, ...]:
         """The points without a force that has a memory, where it is far below what is usual in all of them."""
-        if any(np.any(p.noise.disturbance[list(FORCES)] > SETTINGS.still * self.calm) for p in points):
+        if any(np.any(p.noise.disturbance[list(FORCES)] > SETTINGS.negligible_share * self.calm) for p in points):
             return tuple(points)
         turns = [np.where(np.isin(range(6), FORCES), 0.0, p.noise.disturbance) for p in points]
         return tuple(
@@ -146,7 +146,7 @@ class Study:
     def quiet(self, points: Sequence[Point]) -> list[Point]:
         """The points with little of the noise that has a memory."""
         return [
-            replace(p, noise=replace(p.noise, disturbance=SETTINGS.quiet * p.noise.disturbance)) for p in points
+            replace(p, noise=replace(p.noise, disturbance=SETTINGS.reduced_share * p.noise.disturbance)) for p in points
         ]  # fmt: skip
 
     def random_log_prior(self, fit: Fit) -> float:
@@ -158,7 +158,7 @@ class Study:
             value = self.size_of(effect, fit)[effect.amplitude]
             own = effect.prior.own[effect.amplitude]
             seconds = sum(f.duration for d in fit.data for f in d.flights)
-            told = 1.0 / np.sqrt(max(3.0 * seconds / SETTINGS.memory, 2.0))  # relative; three axes
+            told = 1.0 / np.sqrt(max(3.0 * seconds / SETTINGS.correlation_time, 2.0))  # relative; three axes
             total += float(np.log(2.0 * value * told / own) - 0.5 * (value / own) ** 2) + prior_odds()
         return total
 
@@ -167,7 +167,7 @@ class Study:
         spread = np.median([p.noise.disturbance for p in fit.points], axis=0)
         drag = _drag(fit)
         assert effect.random is not None
-        return effect.random(spread, SETTINGS.memory, mass=self.vehicle.mass, drag=drag)
+        return effect.random(spread, SETTINGS.correlation_time, mass=self.vehicle.mass, drag=drag)
 
     # one pass
 
@@ -288,10 +288,10 @@ class Study:
         for one, point in zip(data, points, strict=True):
             one.settle(point)
         height, look = seen(points, phi)
-        for turn in range(SETTINGS.rounds):
+        for turn in range(SETTINGS.max_rounds):
             before = height
             aim, wanted = self._aim(look, members)
-            for part in SETTINGS.steps:
+            for part in SETTINGS.step_shares:
                 there = self._moved(points, members, look, wanted, part), phi + part * (aim - phi)
                 try:
                     found, slopes = seen(*there)
@@ -300,12 +300,12 @@ class Study:
                 if found > height - 1e-3:
                     (points, phi), height, look = there, found, slopes
                     break
-            if turn < 1 or height - before > SETTINGS.much:
+            if turn < 1 or height - before > SETTINGS.noise_refit:
                 noisy = tuple(self.noisy(d, p, random) for d, p in zip(data, points, strict=True))
                 found, slopes = seen(noisy, phi)
                 if found > height or turn == 0:
                     points, height, look = noisy, found, slopes
-            if abs(height - before) < SETTINGS.enough:
+            if abs(height - before) < SETTINGS.convergence:
                 break
         return self.fitted(data, points, members, random, phi, look)
 
@@ -355,7 +355,7 @@ class Study:
                 for k, (name, i) in enumerate(where.items()):
                     low, high = c.range_of(name)
                     if table is not None and table[f, k] > 0:
-                        reach = REACH * table[f, k]
+                        reach = SETTINGS.deviation_range * table[f, k]
                         low = min(low, neutral[name] - reach)
                         asked = CATALOGUE[c.effect].prior.own.get(name, 0.0) > 0.0 and c.effect in self.effects
                         if asked and c.effect not in present:  # beyond, it is an effect
@@ -372,7 +372,7 @@ class Study:
         """
         c = member.candidate
         tried: list[tuple[float, list[Point], list[Data]]] = []
-        for part in SETTINGS.steps:
+        for part in SETTINGS.step_shares:
             starts, data = [started(p, c, part * change) for p in base.points], [d.twin() for d in base.data]
             with np.errstate(over="ignore", invalid="ignore"):
                 value = sum(d.loglik(p, passes=2) for d, p in zip(data, starts, strict=True))
