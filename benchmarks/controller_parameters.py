@@ -40,7 +40,7 @@ DOCS = Path(__file__).resolve().parents[1] / "docs" / "results" / "controller_pa
 
 @dataclass(frozen=True)
 class World:
-    """What a seed draws: SI. `lie`: inertia estimated over the true one in the flights with a wrong estimate."""
+    """What a seed draws: SI. `inertia_factor`: estimated over true inertia in the flights with a wrong estimate."""
 
     mass: float
     inertia: tuple[float, float, float]
@@ -48,7 +48,7 @@ class World:
     payload: float
     place: tuple[float, float, float]
     drag: tuple[float, float]
-    lie: float
+    inertia_factor: float
 
     def table(self, platform: str = "cf2") -> dict[str, Any]:
         """The scenario's keys."""
@@ -75,7 +75,7 @@ def draw(seed: int) -> World:
         payload=r.uniform(0.001, 0.006),
         place=(r.uniform(-0.004, 0.004), r.uniform(-0.004, 0.004), r.uniform(-0.02, 0.01)),
         drag=(r.uniform(0.006, 0.018), r.uniform(0.006, 0.018)),
-        lie=math.exp(r.choice((-1, 1)) * r.uniform(math.log(1.4), math.log(5.0))),
+        inertia_factor=math.exp(r.choice((-1, 1)) * r.uniform(math.log(1.4), math.log(5.0))),
     )
 
 
@@ -112,7 +112,9 @@ def overshoot(flight: GuardedFlight) -> float:
     return max(seen) / TILT_LIMIT - 1.0 if seen and not flight.crashed else math.nan
 
 
-def indi(seed: int, start: float, *, push: bool = True, lie: float | None = None, guard: bool = True) -> dict[str, Any]:
+def indi(
+    seed: int, start: float, *, push: bool = True, inertia_factor: float | None = None, guard: bool = True
+) -> dict[str, Any]:
     """One flight of INDI whose g1 is `start` times the true one at take-off, and what came of it."""
     world, vehicle = draw(seed), load_vehicle("cf2")
     scenario = parse_scenario(world.table(), f"seed {seed}")
@@ -120,16 +122,16 @@ def indi(seed: int, start: float, *, push: bool = True, lie: float | None = None
     told = {f"ctrlINDI.g1_{a}": start * g for a, g in zip(AXES, true)}
     if not push:
         told |= {f"ctrlINDI.act_dyn_{a}": lag_share(world.lag) for a in AXES}
-    tamper = None if lie is None else lambda e: scaled(e, ("Ixx", "Iyy", "Izz"), lie)
+    tamper = None if inertia_factor is None else lambda e: scaled(e, ("Ixx", "Iyy", "Izz"), inertia_factor)
     flight = GuardedFlight(scenario, seed, vehicle, INDI, told, push=push and guard, tamper=tamper)
     errors: list[tuple[float, float]] = []  # s, largest error of the three
     at_once: list[float] = []
 
     def look(f: GuardedFlight) -> None:
-        if lie is not None and not guard and not at_once and f.seconds > 1.0:
+        if inertia_factor is not None and not guard and not at_once and f.seconds > 1.0:
             at_once.append(f.seconds)
             for a, g in zip(AXES, true):
-                f.client.set(f"ctrlINDI.g1_{a}", g / lie)
+                f.client.set(f"ctrlINDI.g1_{a}", g / inertia_factor)
         errors.append((f.seconds, max(abs(f.read(f"ctrlINDI.g1_{a}") / g - 1.0) for a, g in zip(AXES, true))))
 
     flight.fly(excite_and_step(), each=look, push_for=EXCITED + 0.9 * REST)
@@ -188,13 +190,13 @@ def mass_thrust(seed: int, *, push: bool) -> dict[str, Any]:
 
 def flights(seed: int) -> dict[str, Callable[[], dict[str, Any]]]:
     """Name -> flight."""
-    lie = draw(seed).lie
+    inertia_factor = draw(seed).inertia_factor
     return {
         "ideal": lambda: indi(seed, 1.0, push=False),
         "low": lambda: indi(seed, 0.5),
         "high": lambda: indi(seed, 1.5),
-        "lie guarded": lambda: indi(seed, 1.0, lie=lie),
-        "lie unguarded": lambda: indi(seed, 1.0, lie=lie, guard=False),
+        "wrong inertia guarded": lambda: indi(seed, 1.0, inertia_factor=inertia_factor),
+        "wrong inertia unguarded": lambda: indi(seed, 1.0, inertia_factor=inertia_factor, guard=False),
         "drag": lambda: onboard_drag(seed, push=True),
         "no drag": lambda: onboard_drag(seed, push=False),
         "massThrust": lambda: mass_thrust(seed, push=True),
@@ -247,7 +249,7 @@ def table(done: dict[int, dict[str, Any]]) -> str:
         lines.append(row(f"{what} error at 2 s", said(error, "%", 100), "5 %", [e <= WITHIN for e in error]))
         both = [r[name]["overshoot"] - r["ideal"]["overshoot"] for r in done.values() if {name, "ideal"} <= set(r)]
         lines.append(row(f"{what} overshoot less ideal", said(both, "%", 100), "10 %", [abs(b) <= 0.1 for b in both]))
-    for name in ("low", "high", "lie unguarded", "lie guarded"):
+    for name in ("low", "high", "wrong inertia unguarded", "wrong inertia guarded"):
         worst = said(of(name, "worst_error"), "%", 100)
         lines.append(row(f"INDI, {name}: worst g1", worst, "crashed", [bool(c) for c in of(name, "crashed")]))
     for name in ("no drag", "drag"):

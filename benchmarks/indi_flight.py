@@ -66,7 +66,7 @@ class GuardedFlight:
 
     Args:
         controller: stabilizer.controller. parameters: at boot, beside the scenario's.
-        tamper: what becomes of an estimate before it reaches the guard (a lie), or None.
+        tamper: what becomes of an estimate before it reaches the guard, or None.
     """
 
     scenario: Scenario

@@ -39,7 +39,7 @@ def test_the_velocity_errs_less_with_the_drag_and_the_height_with_mass_thrust() 
 @pytest.mark.slow
 def test_without_a_guard_a_wrong_inertia_crashes_it_and_with_one_nothing_is_written() -> None:
     """Seed 9001: inertia estimated at 0.3 of the true one, so g1 3.4 times too large."""
-    assert flights(9001)["lie unguarded"]()["crashed"]
-    guarded = flights(9001)["lie guarded"]()
+    assert flights(9001)["wrong inertia unguarded"]()["crashed"]
+    guarded = flights(9001)["wrong inertia guarded"]()
     assert not guarded["crashed"]
     assert guarded["worst_error"] < 0.05
