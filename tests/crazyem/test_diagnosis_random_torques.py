@@ -16,6 +16,7 @@ from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.random_torques import (
     FARTHEST,
     amplitude_of,
+    block_covariances,
     erratic_rotor,
     hump,
     humps,
@@ -66,6 +67,29 @@ def test_all_rotors_alike_are_noise() -> None:
     rng = np.random.default_rng(0)
     each = rng.normal(size=(ROWS, 4)) @ SIGNS.T
     assert erratic_rotor([model_of(each)], POINT) is None
+
+
+@pytest.mark.parametrize("rotor", [0, 1, 2, 3])
+def test_the_trim_of_another_day_is_no_random_torque(rotor: int) -> None:
+    """A steady torque of one rotor in one of two flights, twice the innovations' standard deviation."""
+    first, second = np.random.default_rng(rotor).normal(size=(2, ROWS, 3))
+    steady = 2.0 * SIGNS[:, rotor]
+    assert erratic_rotor([model_of(first), model_of(second + steady)], POINT) is None
+    erratic = 0.35 * np.random.default_rng(9).normal(size=(ROWS, 1)) * SIGNS[:, rotor]
+    found = erratic_rotor([model_of(first + erratic), model_of(second + erratic - steady)], POINT)
+    assert found is not None
+    assert found.regime == f"rotor {rotor + 1} at random"
+
+
+def test_covariances_of_blocks_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(3)
+    z, block = rng.normal((5.0, -3.0, 1.0), size=(60, 3)), np.repeat(np.arange(3), 20)
+    seen = rng.random(60) < 0.8
+    found = block_covariances(z, seen, block, 3)
+    for b in range(3):
+        rows = z[seen & (block == b)]
+        slow = np.cov(rows.T, ddof=0) * len(rows)
+        np.testing.assert_allclose(found[b], [slow[0, 1], slow[0, 2], slow[1, 2]], rtol=1e-10)
 
 
 def test_a_spectrum_holds_the_variance() -> None:

@@ -34,6 +34,7 @@ HUMP = 10.0  # power over that of the surroundings; drones with nothing hidden h
 FOOT, FARTHEST = 3.0, 2.0  # of the surroundings; Hz
 SHAKEN = 0.15  # of the angular acceleration in that band: less is a loop that swings under a model a little wrong
 SMALLEST = 0.0004  # of weight times arm
+PAIRS = ((0, 1), (0, 2), (1, 2))  # of axes
 
 
 def standardised(model: Model, point: Point, turned: NDArray | None = None) -> tuple[NDArray, NDArray]:
@@ -65,12 +66,10 @@ def erratic_rotor(models: Sequence[Model], point: Point) -> Finding | None:
     torques, not of what turns: products of inertia turn the torques of all rotors into rates that go together.
     """
     inertia = body_of(point.vehicle, point.effects).inertia
-    pairs = ((0, 1), (0, 2), (1, 2))
     sums, count = [], 0
     for model in models:
         z, seen = standardised(model, point, inertia / np.max(inertia))
-        block = model.flight.block
-        sums.append(np.stack([np.bincount(block, z[:, i] * z[:, j], model.flight.blocks) for i, j in pairs], 1))
+        sums.append(block_covariances(z, seen, model.flight.block, model.flight.blocks))
         count += int(seen.sum())
     scores = np.concatenate(sums)
     if count == 0 or len(scores) < 8:
@@ -79,7 +78,7 @@ def erratic_rotor(models: Sequence[Model], point: Point) -> Finding | None:
     torque = wrench(np.eye(4), arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust)[:, 1:]
     best: tuple[float, int, float] = (0.0, 0, 0.0)
     for rotor in range(4):
-        sign = np.array([np.sign(torque[rotor, i] * torque[rotor, j]) for i, j in pairs])
+        sign = np.array([np.sign(torque[rotor, i] * torque[rotor, j]) for i, j in PAIRS])
         turned = scores * sign
         tilt, yaw, all_three = (_t(s) for s in (turned[:, 0], turned[:, 1:].sum(1), turned.sum(1)))
         if min(tilt, yaw) > EACH and all_three > best[0]:
@@ -95,6 +94,18 @@ def erratic_rotor(models: Sequence[Model], point: Point) -> Finding | None:
     time = models[0].flight.time
     return Finding("torque", "x", f"rotor {rotor + 1} at random", AT_RANDOM, (float(time[0]), float(time[-1])), size,
                    size / (2 * t), "N m", float(-np.log(max(chance, 1e-300))), chance)  # fmt: skip
+
+
+def block_covariances(z: NDArray, seen: NDArray, block: NDArray, blocks: int) -> NDArray:
+    """(blocks, 3) sums of products of (n, 3) innovations for each of `PAIRS`, about their means in each block.
+
+    A torque that lasts (the trim of another day, wind) is a mean. It is no random torque.
+    """
+    rows = np.where(seen[:, None], z, 0.0)
+    count = np.maximum(np.bincount(block, seen, blocks), 1.0)
+    mean = np.stack([np.bincount(block, rows[:, i], blocks) / count for i in range(3)], axis=1)
+    away = np.where(seen[:, None], z - mean[block], 0.0)
+    return np.stack([np.bincount(block, away[:, i] * away[:, j], blocks) for i, j in PAIRS], axis=1)
 
 
 def _t(sums: NDArray) -> float:
