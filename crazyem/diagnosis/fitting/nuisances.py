@@ -1,5 +1,6 @@
 """What a vehicle file never says exactly, and is therefore always free, with priors; fits that leave it free."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, of_recordings
 from crazyem.diagnosis.fitting.fit import Data, Fitted, refine, remembering, remembering_anew
 from crazyem.diagnosis.fitting.gram import Solution, used
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.sampling import TRIM_SD, coarsely_sampled
+from crazyem.diagnosis.fitting.sampling import TRIM_SD, coarsely_sampled, interval, unlogged_share
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.vehicle import GRAVITY, Vehicle
 
@@ -108,19 +109,22 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
     """What is always free, with the precisions of its priors about neutral."""
     measured, daily = data.flights[0].inputs.measured, TRIM in point.vehicle.effects
     lags = not measured and point.vehicle.motor_time_constant > 0
-    found: Nuisances = [(Candidate("input_delay", (), ("delay",), both_ways=True), (DELAY_SD[measured] ** -2,))]
+    unlogged = unlogged_share(data.flights, point.vehicle)
+    late = math.hypot(DELAY_SD[measured], unlogged * max(interval(f) for f in data.flights))
+    found: Nuisances = [(Candidate("input_delay", (), ("delay",), both_ways=True), (late**-2,))]
     if "body_rate" in data.signals or "attitude" in data.signals:
         coarse = coarsely_sampled(data, point)
-        share = COARSE_INERTIA_SD if coarse else INERTIA_SD
+        share = COARSE_INERTIA_SD if coarse else np.hypot(INERTIA_SD, COARSE_INERTIA_SD * unlogged)
         heavy = not coarse and not measured and point.effects.get("rotor_inertia", {}).get("inertia", 0.0) > 0.0
         if heavy:
-            share = np.array([*INERTIA_SD[:2], AT_ONCE_SD])
+            share = np.array([*share[:2], AT_ONCE_SD])
         moments = tuple((share * np.array(point.vehicle.inertia)) ** -2.0)
         found.append((Candidate("inertia", (), ("xx", "yy", "zz")), moments))
         if not coarse:
             found.append((Candidate("torque_scale", (), ("scale",)), (TORQUE_SD**-2,)))
-        if coarse or measured or heavy:
-            tilting = COARSE_DAMPING_SD if coarse else DAMPING_SD
+        if coarse or measured or heavy or unlogged > 0.0:
+            own = DAMPING_SD if measured or heavy else 0.0
+            tilting = COARSE_DAMPING_SD if coarse else math.hypot(own, COARSE_DAMPING_SD * unlogged)
             turning = AT_ONCE_DAMPING_SD if heavy else tilting
             damped = Candidate("rate_damping", (), ("x", "y", "z"))
             found.append((damped, (tilting**-2, tilting**-2, turning**-2)))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from crazyem.vehicle import Vehicle
 # for 2 ms only, and what acts was not logged. That is an error in the input, under which every fit makes the drone look
 # heavy and damped. Share of the power of roll and pitch torques above half of the Nyquist frequency (white: a half):
 COARSE = 0.2  # simulated flights have up to 0.12, whatever is wrong with the drone
+LOOP = 2e-3  # s between commands of the loop (500 Hz, crazyflie-firmware stabilizer.c)
 EDGE, SLOW = 0.5, 1.0  # s left out at either end; Hz below which torques say nothing of sampling
 # m, torque per thrust: by how much the trim of a drone whose file has one differs from one day to the next. Healthy and
 # damaged flights of two drones on several days scatter like this (docs/results/diagnosis_real.md).
@@ -35,6 +37,26 @@ def shaken_commands(flights: Sequence[Flight], vehicle: Vehicle) -> bool:
     """Whether the commands of most flights are faster than their sampling (see `COARSE`)."""
     shares = [fast_share(f, vehicle) for f in flights if not f.inputs.measured]
     return bool(shares) and float(np.median(shares)) > COARSE
+
+
+def unlogged_share(flights: Sequence[Flight], vehicle: Vehicle) -> float:
+    """0 to 1: by how much commands that were sent between the logged ones may falsify torques, relative.
+
+    White commands have half of their power above half of the Nyquist frequency, so twice the fast share is the white
+    part. All but one in period / `LOOP` of it was never logged. An error in the input biases a fit by its power times
+    the weight that the fit gives to that power (Fuller, Measurement Error Models, 1987, 1.1), hence the square.
+    """
+    shares = [0.0]
+    for flight in flights:
+        if not flight.inputs.measured:
+            missed = max(0.0, 1.0 - LOOP / interval(flight))
+            shares.append(min(1.0, 4.0 * missed * fast_share(flight, vehicle) ** 2))
+    return max(shares)
+
+
+def interval(flight: Flight) -> float:
+    """s between commands that the model uses: a step from sample to sample knows those before it (`physics/lag.py`)."""
+    return float(max(np.median(np.diff(flight.inputs.time)), np.median(np.diff(flight.time))))
 
 
 def of_a_real_drone(flights: Sequence[Flight], vehicle: Vehicle) -> Vehicle:
@@ -60,12 +82,17 @@ def held(flight: Flight, vehicle: Vehicle) -> NDArray:
 
 def fast_share(flight: Flight, vehicle: Vehicle) -> float:
     """Share of the power of the commanded roll and pitch torques above half of the Nyquist frequency, the larger."""
+    return _fast_share(flight, vehicle.arm, vehicle.torque_per_thrust)
+
+
+@lru_cache(maxsize=64)
+def _fast_share(flight: Flight, arm: tuple[float, float], torque_per_thrust: float) -> float:
     time = flight.inputs.time
     inside = (time > flight.time[0] + EDGE) & (time < flight.time[-1] - EDGE)
     if inside.sum() < 100:
         return 0.0
-    period = float(np.median(np.diff(time[inside])))
-    torque = wrench(flight.inputs.thrust[inside], arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust)[:, 1:3]
+    period = interval(flight)
+    torque = wrench(flight.inputs.thrust[inside], arm=arm, torque_per_thrust=torque_per_thrust)[:, 1:3]
     grid = np.arange(time[inside][0], time[inside][-1], period)
     even = np.stack([np.interp(grid, time[inside], c) for c in torque.T])
     window = np.hanning(grid.size)

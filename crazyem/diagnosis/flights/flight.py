@@ -23,6 +23,11 @@ MAX_GAP = 0.1  # s between nodes, or between inputs, beyond which a step cannot 
 BLOCK, SHORT, BLOCKS = 1.0, 0.5, 40
 NEAR = 0.03  # s between samples of the accelerometer, at most, for a value between them
 SHORTEST = 4.0  # s of flight below which nothing is said
+# s between samples of a stream, at least. Filters of gyros and of state estimates take 2 to 5 ms (a low-pass of 80 Hz:
+# 2.8 ms, crazyflie-firmware sensors_bmi088_bmp3xx.c). Samples closer than that repeat the filter's own dynamics, which
+# the model does not have: in hover they read as a negative damping. Sampling follows the dynamics that are looked for,
+# about ten samples in a rise time (Ljung, System Identification, 1999, 13.7).
+SAMPLING = 0.01
 PIECE = 60.0  # s after which the filter starts anew, so that long flights are swept in pieces
 COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 COMMANDS = ("motor_command", "motor_request", "mixer_command")
@@ -52,7 +57,7 @@ class Frame:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Flight:
     """One flight, airborne samples only.
 
@@ -141,6 +146,7 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
         measured["attitude"] = leaning(recording)
     if "body_rate" not in measured and all(name in recording.signals for name, _ in CONTROLLED):
         measured["body_rate"] = controlled_rates(recording)
+    measured = {name: thinned(time, value) for name, (time, value) in measured.items()}
     if not measured:
         raise DataError(f"{recording.path}: no position, velocity, attitude or body rate to compare a simulation with")
     if "body_rate" not in measured and "attitude" not in measured and "velocity" not in measured:
@@ -179,6 +185,14 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
             f"{MAX_GAP:g} s apart, which is too short for a diagnosis (at least {SHORTEST:g} s)"
         )
     return flight
+
+
+def thinned(time: NDArray, value: NDArray) -> tuple[NDArray, NDArray]:
+    """The samples (n,), (n, k) of a stream that begin a new interval of `SAMPLING`; all of a slower stream."""
+    if time.size < 2 or float(np.median(np.diff(time))) > 0.75 * SAMPLING:
+        return time, value
+    keep = np.diff(np.floor(time / SAMPLING), prepend=-np.inf) > 0
+    return time[keep], value[keep]
 
 
 def leaning(recording: Recording) -> tuple[NDArray, NDArray]:
