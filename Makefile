@@ -10,6 +10,9 @@ WARM   := $(VENV)/.compiled
 # not begun: a long test at the head of one's list does not keep the rest waiting.
 SHARED := -n 3 --dist worksteal
 
+# Made-up examples of the long tests (tests/conftest.py): `new` at each run, or as `many` and always the same.
+EXAMPLES := new
+
 # Modules are compiled once: the tests start some hundred processes, each of which would compile all of them again.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -46,7 +49,7 @@ test: $(WARM)  ## everything that is not marked slow
 	$(BIN)/python -m pytest -q $(SHARED)
 
 slow: $(WARM)  ## the long ones: many seeds, many flights, and made-up examples that are many and new
-	$(BIN)/python -m pytest -q $(SHARED) -m "slow or hypothesis" --hypothesis-profile deep
+	$(BIN)/python -m pytest -q $(SHARED) -m "slow or hypothesis" --hypothesis-profile $(EXAMPLES)
 
 lint: $(READY)
 	$(BIN)/ruff check .

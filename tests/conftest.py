@@ -1,4 +1,4 @@
-"""Made-up examples: few and always the same in `make test`, many and new ones in `make slow`.
+"""Made-up examples: few in `make test`, many in `.ci/run`, always the same in both; many and new in `make slow`.
 
 No example fails for its wall-clock time, which a busy machine makes any.
 
@@ -15,8 +15,9 @@ settings.register_profile(
     "steady", derandomize=True, database=None, max_examples=15, deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
 )  # fmt: skip
-settings.register_profile("deep", settings.get_profile("steady"), derandomize=False, max_examples=30, print_blob=True)
-settings.load_profile("steady")  # --hypothesis-profile deep loads the other
+settings.register_profile("many", settings.get_profile("steady"), max_examples=30)
+settings.register_profile("new", settings.get_profile("many"), derandomize=False, print_blob=True)
+settings.load_profile("steady")  # --hypothesis-profile loads the others
 
 
 def pytest_collection_modifyitems(items: list) -> None:

@@ -10,7 +10,7 @@ from crazyem.simulators.constants import Constants
 
 Array = NDArray[np.float64]
 EQUAL = 1e-3  # relative difference of arms up to which four rotors are the corners of a rectangle
-NOTHING = 1e-10  # of an arm: a rest of arithmetic
+NOTHING = 1e-10  # of the largest arm or moment of inertia of a drone: a rest of arithmetic
 PLUS = "the rotors lie on the body axes (a plus); it is read as the same drone turned by 45 degrees"
 
 

@@ -14,6 +14,7 @@ from crazyem.physics.effects.mass_properties import steiner
 from crazyem.simulators.constants import Constants, inertia_of
 from crazyem.simulators.documents.xml import Element, XmlDocument
 from crazyem.simulators.fields import Field, Format
+from crazyem.simulators.layout import NOTHING
 
 Array = NDArray[np.float64]
 _ELEMENTS = (("ixx", 0, 0), ("iyy", 1, 1), ("izz", 2, 2), ("ixy", 0, 1), ("ixz", 0, 2), ("iyz", 1, 2))
@@ -59,6 +60,11 @@ class _Parts:
     @property
     def middle(self) -> Array:
         return np.asarray(self.places.mean(axis=0))
+
+    @property
+    def rounding(self) -> float:
+        """A distance [m] that is a rest of arithmetic with numbers of twelve digits."""
+        return NOTHING * float(np.abs(self.places - self.middle).max())
 
 
 def _pose(element: Element, document: XmlDocument) -> Array:
@@ -152,7 +158,7 @@ def _read_more(document: XmlDocument, name: str, found: dict[str, float]) -> lis
     centre = (parts.mass * parts.centre + parts.masses @ parts.places) / total
     inertia = parts.inertia + _around(parts, centre, parts.mass, parts.centre)
     found |= {f"inertia_{key[1:]}": float(inertia[i, j]) for key, i, j in _ELEMENTS}
-    shift = np.where(np.abs(centre - parts.middle) < 1e-9, 0.0, centre - parts.middle)
+    shift = np.where(np.abs(centre - parts.middle) < parts.rounding, 0.0, centre - parts.middle)
     found |= {f"centre_{a}": float(c) for a, c in zip("xyz", shift)}
     if lags := _lags(document):
         found["lag"] = float(np.sqrt(lags[0] * lags[1]))
@@ -198,14 +204,14 @@ def _write_more(document: XmlDocument, name: str, c: Constants) -> None:
     centre = parts.middle + np.array([c.or_(f"centre_{a}", 0.0) for a in "xyz"])
     place = (c.mass * centre - parts.masses @ parts.places) / (c.mass - props)
     inertial = (*path, f"link[{parts.body}]", "inertial")
-    if np.abs(place - before.centre).max() > 1e-9:
+    if np.abs(place - before.centre).max() > parts.rounding:
         link = _pose(model.all("link")[parts.body], document)[:3]
         document.put_vector((*inertial, "pose", "#"), [*(place - link), 0.0, 0.0, 0.0])
     rest = matrix - _around(parts, centre, c.mass - props, place)
     if np.linalg.eigvalsh(rest)[0] <= 0.0:
         raise FileFormatError(f"{document.where}: the propellers of this template leave the body no inertia of its own")
     for key, i, j in _ELEMENTS:
-        if abs(rest[i, j] - before.inertia[i, j]) > 1e-9 * rest.max():
+        if abs(rest[i, j] - before.inertia[i, j]) > NOTHING * rest.max():
             document.put((*inertial, "inertia", key, "#"), float(rest[i, j]))
     _write_lags(document, c)
 

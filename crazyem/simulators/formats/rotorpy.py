@@ -12,7 +12,7 @@ from crazyem.errors import FileFormatError
 from crazyem.simulators.constants import Constants, solved
 from crazyem.simulators.documents.literal import LiteralDocument
 from crazyem.simulators.fields import Field, Format
-from crazyem.simulators.layout import placed, read_positions
+from crazyem.simulators.layout import NOTHING, placed, read_positions
 
 _ROTORS = ("r1", "r2", "r3", "r4")
 
@@ -79,7 +79,7 @@ def _write_more(document: LiteralDocument, name: str, c: Constants) -> None:
     wanted = placed(now, c)
     for row, rotor in enumerate(_ROTORS):
         for k in range(3):
-            if abs(wanted[row, k] - now[row, k]) > 1e-9 * np.abs(now).max():
+            if abs(wanted[row, k] - now[row, k]) > NOTHING * np.abs(wanted).max():
                 document.put((*root, "rotor_pos", rotor, k), float(wanted[row, k]))
 
 
