@@ -10,13 +10,10 @@ WARM   := $(VENV)/.compiled
 # not begun: a long test at the head of one's list does not keep the rest waiting.
 SHARED := -n 3 --dist worksteal
 
-# Made-up examples of the long tests (tests/conftest.py): `new` at each run, or as `many` and always the same.
-EXAMPLES := new
-
 # Modules are compiled once: the tests start some hundred processes, each of which would compile all of them again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: fly test slow lint bench docs concealed paper paper-docs cfclient-test simulators clean setup oldest
+.PHONY: fly test slow slow-fixed lint bench docs concealed paper paper-docs cfclient-test simulators clean setup oldest
 
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable
 
@@ -49,7 +46,10 @@ test: $(WARM)  ## everything that is not marked slow
 	$(BIN)/python -m pytest -q $(SHARED)
 
 slow: $(WARM)  ## the long ones: many seeds, many flights, and made-up examples that are many and new
-	$(BIN)/python -m pytest -q $(SHARED) -m "slow or hypothesis" --hypothesis-profile $(EXAMPLES)
+	$(BIN)/python -m pytest -q $(SHARED) -m "slow or hypothesis" --hypothesis-profile new
+
+slow-fixed: $(WARM)  ## the long ones alone, with made-up examples that are many and always the same
+	$(BIN)/python -m pytest -q $(SHARED) -m slow --hypothesis-profile many
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -19,7 +19,7 @@ from crazyem.estimation.result import Estimate, ParameterEstimate
 from crazyem.live.controllers import CONTROLLERS, for_vehicle, with_drag, writes_back
 from crazyem.live.guard import Decision, Guard
 from crazyem.live.history import History
-from crazyem.live.pipeline import Pipeline
+from crazyem.live.pipeline import Estimator, Pipeline
 from crazyem.live.policy import load_policy
 from crazyem.live.push import nominal_estimates
 from crazyem.live.session import block_plan
@@ -67,6 +67,7 @@ class GuardedFlight:
     Args:
         controller: stabilizer.controller. parameters: at boot, beside the scenario's.
         tamper: what becomes of an estimate before it reaches the guard, or None.
+        estimator: None: one that looks for no steps of mass.
     """
 
     scenario: Scenario
@@ -76,6 +77,7 @@ class GuardedFlight:
     parameters: Mapping[str, float] = field(default_factory=dict)
     push: bool = True
     tamper: Callable[[Estimate], Estimate] | None = None
+    estimator: Estimator | None = None
 
     def __post_init__(self) -> None:
         told = (
@@ -92,7 +94,7 @@ class GuardedFlight:
         self.decoders = decoders(blocks)
         self.formats = [np.dtype([(str(n), _NUMPY[t]) for n, t in enumerate(kinds)]) for kinds in types]
         self.telemetry, self.history = Telemetry(), History()
-        self.estimator = OnlineEstimator(self.vehicle, attitude_period=ATTITUDE_PERIOD)
+        self.estimator = self.estimator or OnlineEstimator(self.vehicle, attitude_period=ATTITUDE_PERIOD)
         self.pipeline = Pipeline(self.estimator, history=self.history)
         self.writes: list[tuple[float, str, float]] = []
         self.rows: list[list[float]] = []  # seconds, truth: position, velocity, quaternion, rate; estimate: velocity

@@ -1,4 +1,4 @@
-"""Made-up examples: few in `make test`, many in `.ci/run`, always the same in both; many and new in `make slow`.
+"""Made-up examples: few in `make test`, many in `make slow-fixed`, always the same; many and new in `make slow`.
 
 No example fails for its wall-clock time, which a busy machine makes any.
 
@@ -18,8 +18,3 @@ settings.register_profile(
 settings.register_profile("many", settings.get_profile("steady"), max_examples=30)
 settings.register_profile("new", settings.get_profile("many"), derandomize=False, print_blob=True)
 settings.load_profile("steady")  # --hypothesis-profile loads the others
-
-
-def pytest_collection_modifyitems(items: list) -> None:
-    """Flights in real time begin first: they take minutes, and hardly any processor time."""
-    items.sort(key=lambda item: "test_live_first_flight" not in item.nodeid)

@@ -5,7 +5,6 @@ import re
 import socket
 import struct
 import sys
-import time
 
 import pytest
 from fake_drone import FakeEstimator, FakeLink
@@ -69,19 +68,15 @@ def test_it_listens_on_this_host_only_and_a_port_in_use_is_one_sentence(server):
         assert other.connect_ex(("127.0.0.2", server.port)) != 0
 
 
-def stream_of(server, session, *, seconds, name=""):
-    """What a viewer that takes everything gets: topics announced, and (topic, data) as it came."""
+def stream_of(server, session, *, enough, name=""):
+    """What a viewer that takes everything gets until it is `enough`: topics announced, and (topic, data) as it came."""
     client = pytest.importorskip("websockets.sync.client")
     topics, got = {}, []
     session.recorder = server.recorder(name)
     session.start()
-    with client.connect(server.url, subprotocols=["foxglove.sdk.v1"]) as socket_:
-        until = time.monotonic() + seconds
-        while time.monotonic() < until:
-            try:
-                message = socket_.recv(timeout=0.5)
-            except TimeoutError:
-                continue
+    with client.connect(server.url, subprotocols=["foxglove.sdk.v1"], close_timeout=0.1) as socket_:
+        while not enough(set(topics.values()), [topic for topic, _ in got]):
+            message = socket_.recv(timeout=120.0)
             if isinstance(message, bytes):
                 kind, number, _ = struct.unpack_from("<BIQ", message)
                 if kind == 1:
@@ -107,16 +102,15 @@ def session(server):
     link.close()
 
 
-@pytest.mark.slow
 def test_a_viewer_gets_what_a_recording_would_have(server, session):
-    topics, got = stream_of(server, session, seconds=3.0)
-    names = set(topics.values())
-    assert {"/estimate", "/link", "/log/0", "/log/1", "/pose", "/tf"} <= names
+    def enough(topics, came):
+        wanted = {"/estimate", "/link", "/log/0", "/log/1", "/pose", "/tf"}
+        return wanted <= topics and came.count("/estimate") > 100 and came.count("/log/0") > 100 and "/pose" in came
+
+    _, got = stream_of(server, session, enough=enough)
     estimates = [message_class("crazyem.Estimate").FromString(d) for t, d in got if t == "/estimate"]
-    assert len(estimates) > 10
     mass = next(p for p in estimates[-1].parameters if p.name == "mass")
     assert mass.value == pytest.approx(0.036)
-    assert len([t for t, _ in got if t == "/log/0"]) > 100
     pose = message_class("foxglove.PoseInFrame").FromString(next(d for t, d in got if t == "/pose"))
     assert pose.pose.position.x == pytest.approx(0.2)
     # every topic of the shipped layout that such a session has is there
@@ -124,13 +118,12 @@ def test_a_viewer_gets_what_a_recording_would_have(server, session):
     assert all(topic in shown for topic in ("/estimate", "/link", "/pose"))
 
 
-@pytest.mark.slow
 def test_topics_and_frames_of_a_swarm_have_the_drones_name(server, session):
-    topics, got = stream_of(server, session, seconds=2.0, name="alpha")
-    assert set(topics.values()) >= {"/alpha/estimate", "/alpha/log/0", "/alpha/pose", "/tf"}
-    frame = message_class("foxglove.FrameTransform").FromString(next(d for t, d in got if t == "/tf"))
-    assert (frame.parent_frame_id, frame.child_frame_id) == ("world", "alpha")
     # what the layout of a swarm shows of a drone is announced under the same names, as far as this session has it
     shown = {m[0] for m in re.findall(r'"((/alpha/[a-z]+(/\d+)?))[."]', json.dumps(swarm_layout(["alpha", "beta"])))}
-    assert shown - set(topics.values()) <= {"/alpha/residual", "/alpha/events"}
     assert {"/alpha/pose", "/alpha/estimate", "/alpha/link", "/alpha/log/1"} <= shown
+    wanted = (shown | {"/alpha/log/0"}) - {"/alpha/residual", "/alpha/events"}
+
+    _, got = stream_of(server, session, enough=lambda topics, came: wanted <= topics and "/tf" in came, name="alpha")
+    frame = message_class("foxglove.FrameTransform").FromString(next(d for t, d in got if t == "/tf"))
+    assert (frame.parent_frame_id, frame.child_frame_id) == ("world", "alpha")
