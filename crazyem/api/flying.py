@@ -122,19 +122,13 @@ def fly(
         vehicle=vehicle_of(vehicle),
         controller=controller,
         trajectory=chosen if callable(chosen) else tuple(chosen),
-        duration=duration,
         push=push is not False,
         rules=write_rules_for(uri or "", push=push, dry_run=dry_run, policy=policy),
         record=None if record is None else str(record),
-        append=append,
         scenario=None if scenario is None else str(scenario),
-        seed=seed,
-        speed=speed,
-        rate=rate,
-        reconnect=reconnect,
-        window=window,
+        duration=duration, append=append, seed=seed, speed=speed, rate=rate, reconnect=reconnect, window=window,
         every=every,
-    )
+    )  # fmt: skip
     result, error = observed_flight(settings, FlightObserver())
     if error is not None or result is None:
         raise error or CrazyemError("the flight gave no result.")

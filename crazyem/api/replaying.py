@@ -5,7 +5,7 @@ from collections.abc import Callable
 from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, vehicle_of
 from crazyem.doctor import examine
 from crazyem.errors import DataError
-from crazyem.estimation.steps import estimator_for
+from crazyem.estimation.steps import StepAwareEstimator, estimator_for
 from crazyem.live.flight_result import FlightResult, result_of
 from crazyem.live.history import History, Push
 from crazyem.live.pipeline import Pipeline
@@ -54,13 +54,7 @@ def replay(
     findings = doctors_findings(recording)
     history = History()
     take_events(recording, history)
-    # a live flight takes what comes first, and a replay must do the same; but never what says nothing
-    unfit = [n for n in ("rotor_speed", "motor_command") if n in recording.signals and n != thrust_from]
-    estimator = estimator_for(
-        nominal, onboard=onboard_attitude(recording), crazyflie=crazyflie_attitude(recording),
-        **_window_of(recording, window, every),
-        input_signal=thrust_from if unfit or thrust_from == "wrench_command" else None,
-    )  # fmt: skip
+    estimator = _estimator_of(recording, nominal, thrust_from, **_window_of(recording, window, every))
     pipeline = Pipeline(estimator, history=history)
     pipeline.estimate_until = history.marks.get("estimate_end", pipeline.estimate_until)
     first: float | None = None
@@ -91,6 +85,17 @@ def replay(
 def _notices(recording: Recording, findings: list[Finding], left_out: str, weight: str) -> list[str]:
     said = [f"the doctor says ({f.grade}): {f.text}" for f in findings if f not in recording.findings]
     return [SCALE_NOTICE, *filter(None, [left_out, sentence(weight)]), *recording.notices, *said]
+
+
+def _estimator_of(
+    recording: Recording, nominal: Vehicle, thrust_from: str, *, window: int, every: int
+) -> StepAwareEstimator:
+    """A live flight takes the signal that comes first, and a replay must do the same; but never what says nothing."""
+    unfit = [n for n in ("rotor_speed", "motor_command") if n in recording.signals and n != thrust_from]
+    return estimator_for(
+        nominal, onboard=onboard_attitude(recording), crazyflie=crazyflie_attitude(recording), window=window,
+        every=every, input_signal=thrust_from if unfit or thrust_from == "wrench_command" else None,
+    )  # fmt: skip
 
 
 def _window_of(recording: Recording, window: int | None, every: int | None) -> dict[str, int]:

@@ -169,12 +169,7 @@ def check_vehicle(
         flown, source.vehicle, held_out=kept, candidates=candidates, jobs=jobs, progress=progress,
     )  # fmt: skip
     fitted = found.fitted_vehicle if mass is None else rescaled(found.fitted_vehicle, mass)
-    findings = field_findings(
-        source.imported, source.vehicle, fitted, found.document["effects"],
-        {n["name"]: n["reason"] for n in found.document["not_identifiable"]},
-        looked_for={*(r["name"] for r in found.document["ranking"]), *(e["name"] for e in found.document["effects"])},
-        tolerance=tolerance,
-    )  # fmt: skip
+    findings = _field_findings(source.imported, source.vehicle, fitted, found.document, tolerance)
     corrected = convert(
         fitted, source.format, template=source.text, where=str(file), name=source.imported.name,
         flight=(kept or flown)[0],
@@ -186,6 +181,17 @@ def check_vehicle(
         source.imported, source.vehicle, found, tuple(findings), tuple(choices),
         tuple(d for other in others if other.imported for d in disagreements(source.imported, other.imported)),
         corrected, _pooled([e for e in (_errors(r, vehicles) for r in judges) if e]), tuple(r.path for r in judges),
+    )  # fmt: skip
+
+
+def _field_findings(
+    imported: SimulatorFile, vehicle: Vehicle, fitted: Vehicle, document: Mapping[str, Any], tolerance: float
+) -> list[FieldFinding]:
+    return field_findings(
+        imported, vehicle, fitted, document["effects"],
+        {n["name"]: n["reason"] for n in document["not_identifiable"]},
+        looked_for={*(r["name"] for r in document["ranking"]), *(e["name"] for e in document["effects"])},
+        tolerance=tolerance,
     )  # fmt: skip
 
 

@@ -32,6 +32,51 @@ def _unpack(sums, base, n, out):
 
 
 @compiled
+def _residual(term, theta, sums, a, c, dc):
+    """The residual of F (term 0) or of M about an axis (1..3): a, c and dc = dc/dtheta of c' A c; returns its size."""
+    dc[:, :] = 0.0
+    if term == 0:
+        _unpack(sums, MASS, 4, a)
+        c[0], c[1], c[2], c[3] = theta[0], -1.0, -theta[4], -theta[5]
+        dc[0, 0] = 1.0
+        dc[2, 4] = -1.0
+        dc[3, 5] = -1.0
+        return 4
+    i = term - 1
+    j = (i + 1) % 3
+    k = (i + 2) % 3
+    _unpack(sums, AXIS + AXIS_SIZE * i, 6, a)
+    c[0], c[1], c[2] = theta[1 + i], theta[1 + k] - theta[1 + j], -1.0
+    c[3], c[4], c[5] = -theta[LAG], -theta[DELAY], -theta[OFFSET + i]
+    dc[0, 1 + i] = 1.0
+    dc[1, 1 + k] = 1.0
+    dc[1, 1 + j] = -1.0
+    dc[3, 4] = -1.0
+    dc[4, DELAY] = -1.0
+    dc[5, OFFSET + i] = -1.0
+    return 6
+
+
+@compiled
+def _prior(theta, unit, free, centre, precision, gradient, hessian):
+    """Add the prior of the free parameters, hold the others; returns minus its logarithm."""
+    value = 0.0
+    for u in range(PARAMETERS):
+        if free[u]:
+            d = np.log(theta[u] / centre[u]) if u <= LAG else (theta[u] - centre[u]) / unit[u]
+            value += 0.5 * precision[u] * d * d
+            gradient[u] += precision[u] * d
+            hessian[u, u] += precision[u]
+        else:
+            gradient[u] = 0.0
+            for v in range(PARAMETERS):
+                hessian[u, v] = 0.0
+                hessian[v, u] = 0.0
+            hessian[u, u] = 1.0
+    return value
+
+
+@compiled
 def objective(theta, unit, sums, free, centre, precision, known, gradient, hessian, squares):
     """-Q at theta (9,), its gradient and Hessian (logarithms, units); squares (4,) receives S_F, S_x, S_y, S_z.
 
@@ -54,30 +99,8 @@ def objective(theta, unit, sums, free, centre, precision, known, gradient, hessi
     for u in range(PARAMETERS):
         scale[u] = theta[u] if u <= LAG else unit[u]
     for term in range(4):
-        dc[:, :] = 0.0
-        if term == 0:
-            n = 4
-            _unpack(sums, MASS, 4, a)
-            c[0], c[1], c[2], c[3] = theta[0], -1.0, -theta[4], -theta[5]
-            dc[0, 0] = 1.0
-            dc[2, 4] = -1.0
-            dc[3, 5] = -1.0
-            value -= count * np.log(theta[0])
-        else:
-            n = 6
-            i = term - 1
-            j = (i + 1) % 3
-            k = (i + 2) % 3
-            _unpack(sums, AXIS + AXIS_SIZE * i, 6, a)
-            c[0], c[1], c[2] = theta[1 + i], theta[1 + k] - theta[1 + j], -1.0
-            c[3], c[4], c[5] = -theta[LAG], -theta[DELAY], -theta[OFFSET + i]
-            dc[0, 1 + i] = 1.0
-            dc[1, 1 + k] = 1.0
-            dc[1, 1 + j] = -1.0
-            dc[3, 4] = -1.0
-            dc[4, DELAY] = -1.0
-            dc[5, OFFSET + i] = -1.0
-            value -= count * np.log(theta[1 + i])
+        n = _residual(term, theta, sums, a, c, dc)
+        value -= count * np.log(theta[term])
         gradient[term] -= count
         s = 0.0
         for p in range(n):
@@ -116,19 +139,7 @@ def objective(theta, unit, sums, free, centre, precision, known, gradient, hessi
         value += 0.5 * s - 2.0 * count * np.log(theta[0])
         gradient[0] += s - 2.0 * count
         hessian[0, 0] += 2.0 * s
-    for u in range(PARAMETERS):
-        if free[u]:
-            d = np.log(theta[u] / centre[u]) if u <= LAG else (theta[u] - centre[u]) / unit[u]
-            value += 0.5 * precision[u] * d * d
-            gradient[u] += precision[u] * d
-            hessian[u, u] += precision[u]
-        else:
-            gradient[u] = 0.0
-            for v in range(PARAMETERS):
-                hessian[u, v] = 0.0
-                hessian[v, u] = 0.0
-            hessian[u, u] = 1.0
-    return value
+    return value + _prior(theta, unit, free, centre, precision, gradient, hessian)
 
 
 @compiled

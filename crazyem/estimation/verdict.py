@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crazyem.estimation.em import Information, displaced, offset
 from crazyem.estimation.kernels import DELAY, LAG
@@ -42,16 +43,7 @@ def estimate_of(
         marginal: with noise scales integrated out that the data leave open.
     """
     prior, unit = setup.prior, setup.unit
-    if marginal is None:
-        theta, sd = parameters.theta, information.sd
-        below, above = -1.96 * sd, 1.96 * sd
-    else:
-        theta, sd = displaced(parameters.theta, marginal.shift, unit), marginal.sd
-        below, above = marginal.low - marginal.shift, marginal.high - marginal.shift
-    if information.shift is not None and information.open_sd is not None:
-        theta = displaced(theta, information.shift, unit)
-        wider = information.open_sd
-        sd, below, above = np.hypot(sd, wider), -np.hypot(below, 1.96 * wider), np.hypot(above, 1.96 * wider)
+    theta, sd, below, above = _interval(parameters, information, unit, marginal)
     # An inertia that the prior all but excludes says that the model does not hold here, not that the drone is odd.
     deviation = np.abs(offset(theta, prior.centre, unit))
     implausible = deviation > IMPLAUSIBLE_SD * prior.sd
@@ -79,6 +71,23 @@ def estimate_of(
         updates=updates,
         converged=converged,
     )
+
+
+def _interval(
+    parameters: Parameters, information: Information, unit: NDArray, marginal: Marginal | None
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Values, and around them the standard deviations and the ends of the 95 % intervals (logarithms, units)."""
+    if marginal is None:
+        theta, sd = parameters.theta, information.sd
+        below, above = -1.96 * sd, 1.96 * sd
+    else:
+        theta, sd = displaced(parameters.theta, marginal.shift, unit), marginal.sd
+        below, above = marginal.low - marginal.shift, marginal.high - marginal.shift
+    if information.shift is not None and information.open_sd is not None:
+        theta = displaced(theta, information.shift, unit)
+        wider = information.open_sd
+        sd, below, above = np.hypot(sd, wider), -np.hypot(below, 1.96 * wider), np.hypot(above, 1.96 * wider)
+    return theta, sd, below, above
 
 
 def _objection(

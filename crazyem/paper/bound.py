@@ -99,6 +99,32 @@ def _propagate(a, dt, p, out):
 
 
 @compiled
+def _update(y, x, p, sensor_sd, before, gain, error, row):
+    """Measure y (12 of it) and fill its innovation and covariance; before, gain (12,) are scratch."""
+    for i in range(12):
+        before[i] = x[i]
+        if np.isnan(y[i]):
+            continue
+        error[i] = y[i] - x[i]
+        for j in range(12):
+            if not np.isnan(y[j]):
+                row[i, j] = p[i, j]
+        row[i, i] += sensor_sd[i // 3] ** 2
+    for i in range(12):  # one scalar after the other: the same as all at once, and nothing is inverted
+        if np.isnan(y[i]):
+            continue
+        variance = p[i, i] + sensor_sd[i // 3] ** 2
+        for j in range(12):
+            gain[j] = p[i, j] / variance
+        left = error[i] - (x[i] - before[i])
+        for j in range(12):
+            x[j] += gain[j] * left
+            f = gain[j] * variance
+            for m in range(12):
+                p[j, m] -= f * gain[m]
+
+
+@compiled
 def innovations(begin, end, y, wrench, x, p, dt, mass, inertia, process, sensor_sd, e, s):
     """Run the filter over rows begin..end-1; fill the innovations and their covariances, given the rows before.
 
@@ -154,27 +180,7 @@ def innovations(begin, end, y, wrench, x, p, dt, mass, inertia, process, sensor_
                 for j in range(3):
                     p[3 + i, 3 + j] += dt * dt * scatter * axis[i] * axis[j]
                 p[9 + i, 9 + i] += dt * (process[1 + i] / inertia[i]) ** 2
-        for i in range(12):
-            before[i] = x[i]
-            if np.isnan(y[k, i]):
-                continue
-            error[i] = y[k, i] - x[i]
-            for j in range(12):
-                if not np.isnan(y[k, j]):
-                    row[i, j] = p[i, j]
-            row[i, i] += sensor_sd[i // 3] ** 2
-        for i in range(12):  # one scalar after the other: the same as all at once, and nothing is inverted
-            if np.isnan(y[k, i]):
-                continue
-            variance = p[i, i] + sensor_sd[i // 3] ** 2
-            for j in range(12):
-                gain[j] = p[i, j] / variance
-            left = error[i] - (x[i] - before[i])
-            for j in range(12):
-                x[j] += gain[j] * left
-                f = gain[j] * variance
-                for m in range(12):
-                    p[j, m] -= f * gain[m]
+        _update(y[k], x, p, sensor_sd, before, gain, error, row)
 
 
 @dataclass(frozen=True)

@@ -150,6 +150,27 @@ def _back(t0, t1, u0, u1, t, tau, state):
 
 
 @compiled
+def _run_predicted(times, commands, i, known, last, begin, end, predictor, tau, path_times, path, guess, start, acc,
+                   junk):  # fmt: skip
+    """Carry `guess` from begin to end along the commands before `known` and what they predict; add the means to acc.
+
+    start (4,) receives the lagged command at begin. path_times, path and junk are scratch.
+    """
+    size = _predict(times, commands, i, known, end, predictor, path_times, path)
+    if known <= i + 1 and i + 1 < last and begin > times[known - 1]:
+        # the state at `begin` has been carried towards commands that are not known yet: go back to the last stamp that
+        # is, and come here again along what is known and predicted
+        here = begin
+        for j in range(i, known - 2, -1):
+            _back(times[j], times[j + 1], commands[j], commands[j + 1], here, tau, guess)
+            here = times[j]
+        _run(path_times, path, 0, size, here, begin, LINEAR, tau, guess, junk)
+        for c in range(4):
+            start[c] = guess[c]
+    _run(path_times, path, 0, size, begin, end, LINEAR, tau, guess, acc)
+
+
+@compiled
 def lagged_means(
     times, commands, first, last, predictor, nodes, node_first, node_last, mode, tau, delay, state, mean, mean_tau,
     mean_delay,
@@ -208,18 +229,8 @@ def lagged_means(
             while known > 1 and times[known - 1] > now:
                 known -= 1
             guess[:] = state
-            size = _predict(times, commands, i, known, end, predictor, path_times, path)
-            if known <= i + 1 and i + 1 < last and begin > times[known - 1]:
-                # the state at `begin` has been carried towards commands that are not known yet: go back to the last
-                # stamp that is, and come here again along what is known and predicted
-                here = begin
-                for j in range(i, known - 2, -1):
-                    _back(times[j], times[j + 1], commands[j], commands[j + 1], here, tau, guess)
-                    here = times[j]
-                _run(path_times, path, 0, size, here, begin, LINEAR, tau, guess, junk)
-                for c in range(4):
-                    start[c] = guess[c]
-            _run(path_times, path, 0, size, begin, end, LINEAR, tau, guess, acc)
+            _run_predicted(times, commands, i, known, last, begin, end, predictor, tau, path_times, path, guess, start,
+                           acc, junk)  # fmt: skip
             for c in range(4):
                 mean_delay[k, c] = -(guess[c] - start[c]) / span
             i = _run(times, commands, i, last, begin, end, LINEAR, tau, state, junk)

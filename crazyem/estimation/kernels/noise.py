@@ -162,6 +162,29 @@ def _measurements(counts, r, gain, s, after, half, flat, left, right):
 
 
 @compiled
+def _predict_half(block, dt, h, half, flat, turned):
+    """The derivatives through one step: A half A'; flat is half as a matrix, turned is scratch."""
+    apply(block, dt, h, flat, turned)
+    for i in range(12):
+        for j in range(12):
+            for a in range(WIDTH):
+                half[j, i, a] = turned[i, WIDTH * j + a]
+    apply(block, dt, h, flat, turned)
+    for i in range(12):
+        for j in range(12 * WIDTH):
+            flat[i, j] = turned[i, j]
+
+
+@compiled
+def _rotation_jacobian(w, torque, inertia, inverse, dt, h, alpha, phi, jr):
+    """The right Jacobian jr (3, 3) of the step's rotation; alpha and phi (3,) are scratch."""
+    angular_acceleration(w, torque, inertia, inverse, alpha)
+    for i in range(3):
+        phi[i] = dt * w[i] + h * dt * alpha[i]
+    right_jacobian(phi, jr)
+
+
+@compiled
 def _add_products(left, right, info):
     """info += left right', lower triangle."""
     for a in range(SCALES):
@@ -217,21 +240,9 @@ def noise_information(first, last, time, kind, usable, force, torque, inertia, i
         else:
             dt = time[k] - time[k - 1]
             h = lead * dt
-            apply(blocks[k], dt, h, flat, turned)
-            for i in range(12):
-                for j in range(12):
-                    for a in range(WIDTH):
-                        half[j, i, a] = turned[i, WIDTH * j + a]
-            apply(blocks[k], dt, h, flat, turned)
-            for i in range(12):
-                for j in range(12 * WIDTH):
-                    flat[i, j] = turned[i, j]
+            _predict_half(blocks[k], dt, h, half, flat, turned)
             if usable[k]:
-                w = xf[k - 1, 10:13]
-                angular_acceleration(w, torque[k], inertia, inverse, alpha)
-                for i in range(3):
-                    phi[i] = dt * w[i] + h * dt * alpha[i]
-                right_jacobian(phi, jr)
+                _rotation_jacobian(xf[k - 1, 10:13], torque[k], inertia, inverse, dt, h, alpha, phi, jr)
                 bridge = dt * dt / 12.0 if lead == 0.5 else 0.0
                 _step_noise(dt, h, bridge, force[k], middle[k], jr, q, r_force, big, half, info)
         _measurements(kind[k] != 1, r, gain[k], s[k], after, half, flat, left, right)
