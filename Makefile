@@ -73,7 +73,7 @@ paper: $(READY)  ## Zhao's paper again: its tables and figures, by its method an
 	$(BIN)/crazyem paper --out paper
 
 paper-docs: paper  ## the numbers of that run into docs/explanation/paper.md, and the drift test
-	$(BIN)/python -m crazyem.paper.docs paper/results.json --small tests/crazyem/expectations/paper_small.json
+	$(BIN)/python benchmarks/paper_pages.py paper/results.json --small tests/crazyem/expectations/paper_small.json
 
 simulators:  ## our files in real simulators, in an environment of their own
 	$(PYTHON) -m venv .venv-simulators

@@ -6,7 +6,7 @@
     python benchmarks/cold_start.py --check docs/results/cold_start.json --seeds 1       # flown again: is it still so?
 
 Every flight is one line of OUT/flights.jsonl, written when it has landed, so an interrupted study goes on where it was.
-Lines of an older version of the code are flown again. The judging is done in crazyem/paper/cold_start.py.
+Lines of an older version of the code are flown again. The judging is done in benchmarks/cold_start_study.py.
 """
 
 import argparse
@@ -23,8 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from crazyem.paper.cold_start import (
+from cold_start_study import (
     BANDS,
     SENSORS,
     SETTLED_SECONDS,
@@ -35,6 +34,7 @@ from crazyem.paper.cold_start import (
     cold_start,
     summarise,
 )
+
 from crazyem.paper.settings import LITERAL
 
 ROOT = Path(__file__).resolve().parents[1]

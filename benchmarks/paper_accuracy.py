@@ -17,7 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from crazyem.paper.accuracy import PARTS, Record, missed, study, summary, table
+from accuracy_study import PARTS, Record, missed, study, summary, table
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs" / "results" / "paper_accuracy.md"

@@ -25,12 +25,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))  # so that it runs as a file and as a module
 
+import reference
 import running
 from flight import simulate
 from running import e_step, full_pass, timed
 from window import Window
 
-from crazyem.estimation import kernels, reference
+from crazyem.estimation import kernels
 from crazyem.estimation.em import WindowEM
 from crazyem.estimation.in_step import corrected
 from crazyem.estimation.model import Parameters

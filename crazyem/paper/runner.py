@@ -24,9 +24,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 # What the numbers of a task come from. Tables and figures are made anew each time.
 _CODE = ("physics/**/*.py", "signals/**/*.py", "control/**/*.py", "estimation/**/*.py", "presets/zhao.toml",
          "vehicle.py", "compiled.py", "paper/*.py")  # fmt: skip
-_TEXT_MODULES = (
-    "runner tables table_text figures pages docs overrides published_values published_corrections accuracy cold_start"
-)
+_TEXT_MODULES = "runner tables table_text figures pages overrides published_values published_corrections"
 _NOT_CODE = {f"paper/{name}.py" for name in _TEXT_MODULES.split()}
 _VERSIONED_PACKAGES = ("numpy", "scipy", "numba")
 

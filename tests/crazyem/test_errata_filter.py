@@ -26,9 +26,9 @@ from errata_tools import (
     theta,
     zero,
 )  # fmt: skip
+from reference import extended_kalman_filter, rauch_tung_striebel
 from scipy.optimize import approx_fprime
 
-from crazyem.estimation.reference import extended_kalman_filter, rauch_tung_striebel
 from crazyem.paper import plant, state_filter
 from crazyem.physics.rigid_body import State
 from crazyem.vehicle import GRAVITY

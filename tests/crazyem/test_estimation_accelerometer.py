@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import reference
 import test_estimation_kernels as plain
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_estimation_kernels import INERTIA, MASS, R_FORCE, THETA, Q, R, filled_tape, scaled
 
-from crazyem.estimation import kernels, reference
+from crazyem.estimation import kernels
 from crazyem.physics.rigid_body import State, step
 from crazyem.vehicle import GRAVITY
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+import reference
 import test_estimation_kernels as midpoint
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from test_estimation_kernels import INERTIA, MASS, Q, R, filled_tape, scaled
 
-from crazyem.estimation import reference
 from crazyem.physics.rigid_body import State, angular_acceleration, bridge_covariance, step, step_jacobians
 from crazyem.vehicle import GRAVITY
 

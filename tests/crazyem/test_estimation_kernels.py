@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import reference
 import synthetic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from crazyem.estimation import kernels, reference
+from crazyem.estimation import kernels
 from crazyem.estimation.tape import BREAK, START_VARIANCE, Tape
 
 MASS = 0.036

@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import reference
 import zhao_flight
 from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.errors import UsageError
-from crazyem.estimation import initial_state, reference
+from crazyem.estimation import initial_state
 from crazyem.estimation.em import WindowEM, displaced
 from crazyem.estimation.inputs import InputHistory
 from crazyem.estimation.maximum import Maximum, maximise_posterior

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from accuracy_study import PARTS, Record, missed, settings_of, stretches, study, summary, table
 from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.errors import UsageError
-from crazyem.paper.accuracy import PARTS, Record, missed, settings_of, stretches, study, summary, table
 from crazyem.paper.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[2]

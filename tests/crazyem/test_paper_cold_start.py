@@ -9,11 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-
-from crazyem.errors import UsageError
-from crazyem.paper.cold_start import (
+from cold_start_study import (
     BANDS,
     NAMES,
     SETTLED_SECONDS,
@@ -26,6 +22,10 @@ from crazyem.paper.cold_start import (
     spread,
     summarise,
 )
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crazyem.errors import UsageError
 from crazyem.paper.flight import LIFTED_HEIGHT, THRUST_RAMP, Flight
 from crazyem.paper.product import estimator_for
 from crazyem.paper.settings import P5

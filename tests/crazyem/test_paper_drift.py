@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from paper_pages import SMALL_SEEDS, STORED_FIELDS, STORED_RESULTS
 
-from crazyem.paper.docs import SMALL_SEEDS, STORED_FIELDS, STORED_RESULTS
 from crazyem.paper.experiments import Task, plan, run_task
 from crazyem.paper.settings import Settings
 

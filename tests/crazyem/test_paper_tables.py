@@ -8,13 +8,13 @@ import re
 from pathlib import Path
 
 import numpy as np
+import paper_pages as docs
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from made_paper import BOUND, TRUE, offline, online, results_of, table1, whole_run
 
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.paper import docs
 from crazyem.paper.experiments import short, thin, window_ends
 from crazyem.paper.pages import index_html, tables_markdown
 from crazyem.paper.published_values import FIGURES, PARAMETERS, PUBLISHED_RANGES, SENSORS, TABLE_I

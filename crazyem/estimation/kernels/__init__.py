@@ -3,7 +3,7 @@
 All matrices are 12 x 12 or smaller, so everything is explicit loops over contiguous rows. Every measured
 quantity is one component of the error state (position, velocity, attitude error, body rate), so measurements
 enter one scalar at a time and no matrix is ever inverted. The smoother is the modified Bryson-Frazier
-recursion: it gives the smoothed moments of Rauch-Tung-Striebel (reference.py is that, in textbook form; the
+recursion: it gives the smoothed moments of Rauch-Tung-Striebel (benchmarks/reference.py is that, in textbook form; the
 tests compare them), and yields the smoothed process noise, all that the M-step needs, without inverting the
 prediction covariance.
 

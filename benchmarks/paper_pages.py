@@ -1,4 +1,4 @@
-"""`python -m crazyem.paper.docs RESULTS.json`: the numbers of docs: paper.md and of the table in README.md, from a run.
+"""`python benchmarks/paper_pages.py RESULTS.json`: the numbers of docs: paper.md and of README.md, from a run.
 
 A page holds blocks between `<!-- paper:NAME -->` and `<!-- /paper:NAME -->`. What is written there comes from
 docs: paper_results.json, the run without its single flights, so that a test can tell whether a page has drifted.
@@ -270,7 +270,7 @@ BLOCKS: dict[str, Callable[[Record], str]] = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Write docs/explanation/paper_results.json and every page that has blocks; returns the exit code."""
     parser = argparse.ArgumentParser(
-        prog="python -m crazyem.paper.docs", description=__doc__.split("\n", maxsplit=1)[0]
+        prog="python benchmarks/paper_pages.py", description=__doc__.split("\n", maxsplit=1)[0]
     )
     parser.add_argument("results", nargs="?", help="results.json of a run (default: what is kept of the last one)")
     parser.add_argument("--small", metavar="FILE", help="also write the first two seeds there (needs results)")
