@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.kernel_cache import kernel
+from crazyem.compiled import kernel
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle, load_vehicle
 

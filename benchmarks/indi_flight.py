@@ -12,7 +12,7 @@ from struct import pack
 import numpy as np
 
 from benchmarks.wire_flight import LOG_PERIOD, SETPOINT_JITTER, SETPOINT_PERIOD, Client
-from crazyem.control.indi_setpoint import IndiGains, place_ahead
+from crazyem.control.command_units import IndiGains, place_ahead
 from crazyem.control.trajectories import Trajectory, after_hover
 from crazyem.estimation.online import ATTITUDE_PERIOD, OnlineEstimator
 from crazyem.estimation.result import Estimate, ParameterEstimate
@@ -26,7 +26,7 @@ from crazyem.live.session import block_plan
 from crazyem.live.telemetry import Telemetry
 from crazyem.live.write_gate import WriteGate
 from crazyem.live.write_supervisor import WriteRules, WriteSupervisor
-from crazyem.signals.packet import Block, Packet, Variable
+from crazyem.signals.sample import Block, Packet, Variable
 from crazyem.signals.vocabulary import compress_quaternion, decoders
 from crazyem.vehicle import Vehicle
 from firmware_sim import wire

@@ -33,8 +33,7 @@ from crazyem.live.policy import load_policy
 from crazyem.live.telemetry import CAN_FLY, FLYING, Telemetry
 from crazyem.live.write_gate import WriteGate
 from crazyem.live.write_supervisor import WriteRules, WriteSupervisor
-from crazyem.signals.packet import Block, Packet, Variable
-from crazyem.signals.sample import Sample
+from crazyem.signals.sample import Block, Packet, Sample, Variable
 from crazyem.signals.vocabulary import STATE_VARIABLES, decoders
 from crazyem.vehicle import load_vehicle
 from firmware_sim.commander import setpoint as sp

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from crazyem.control.trajectories import Reference, Trajectory, after_hover
 from crazyem.live.session import LOG_RATE
-from crazyem.signals.packet import Block, Packet, Variable
-from crazyem.signals.sample import Sample
+from crazyem.signals.sample import Block, Packet, Sample, Variable
 from crazyem.signals.vocabulary import block_plan, compress_quaternion, decoders
 from firmware_sim import wire
 from firmware_sim.firmware import Firmware

@@ -8,9 +8,8 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from crazyem.api.diagnosing import Diagnosis, diagnose
+    from crazyem.api.diagnosing import Diagnosis, diagnose, predict
     from crazyem.api.flying import fly
-    from crazyem.api.predicting import predict
     from crazyem.api.replaying import replay
     from crazyem.api.vehicles import VehicleCheck, check_vehicle, convert_vehicle, predict_ensemble, sample_vehicle
     from crazyem.diagnosis.prediction.predict import Prediction
@@ -51,7 +50,7 @@ _HOME = {
     "load_policy": "live.policy",
     "load_vehicle": "vehicle",
     "open_recording": "recordings.registry",
-    "predict": "api.predicting",
+    "predict": "api.diagnosing",
     "predict_ensemble": "api.vehicles",
     "replay": "api.replaying",
     "sample_vehicle": "api.vehicles",

@@ -83,7 +83,7 @@ def _run(arguments: argparse.Namespace) -> None:
         sock = stack.enter_context(contextlib.closing(bind(arguments.host, arguments.port)))
         from firmware_sim.flight import Flight  # here: compiled code takes a while to load, a port in use should not
         from firmware_sim.scenario import load_scenario
-        from firmware_sim.services.storage import Storage
+        from firmware_sim.services.memory import Storage
 
         scenario = load_scenario(arguments.scenario)
         storage = Storage(arguments.storage)

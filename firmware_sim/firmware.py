@@ -15,17 +15,14 @@ from firmware_sim.commander.setpoint import HIGH_LEVEL, Arbiter
 from firmware_sim.commander.supervisor import PERIOD as SUPERVISOR_PERIOD
 from firmware_sim.commander.supervisor import Supervisor
 from firmware_sim.errors import ScenarioError
-from firmware_sim.services import console, link
-from firmware_sim.services import supervisor as supervisor_port
-from firmware_sim.services.high_level import PERIOD as HIGH_LEVEL_PERIOD
-from firmware_sim.services.high_level import HighLevelService
+from firmware_sim.services import ports
+from firmware_sim.services.commander import PERIOD as HIGH_LEVEL_PERIOD
+from firmware_sim.services.commander import HighLevelService, SetpointService
 from firmware_sim.services.localisation import LocalisationService
 from firmware_sim.services.log import DATA, LogService
-from firmware_sim.services.memory import MemoryService
+from firmware_sim.services.memory import MemoryService, Storage
 from firmware_sim.services.param import ParamService
-from firmware_sim.services.platform import FIRMWARE_VERSION, PlatformService
-from firmware_sim.services.setpoint import SetpointService
-from firmware_sim.services.storage import Storage
+from firmware_sim.services.ports import FIRMWARE_VERSION, PlatformService
 from firmware_sim.tables import Slot
 
 # Log variables that stand still here and are not 0 on the ground of a desk: rates [Hz] of the loops, and the state of
@@ -145,7 +142,7 @@ class Firmware:
         port, channel, data = packet
         tick, allowed = self.flight.tick, self.supervisor.can_fly
         if port == wire.LINK:
-            return link.handle(channel, data)
+            return ports.link(channel, data)
         if port == wire.PARAM:
             return self.param.handle(channel, data)
         if port == wire.LOG:
@@ -159,7 +156,7 @@ class Firmware:
         if port == wire.LOCALISATION:
             return self.localisation.handle(channel, data)
         if port == wire.SUPERVISOR:
-            return supervisor_port.handle(self.supervisor, channel, data)
+            return ports.supervise(self.supervisor, channel, data)
         if port == wire.MEMORY:
             return self.memory.handle(channel, data)
         if port == wire.PLATFORM:
@@ -176,7 +173,7 @@ class Firmware:
     def _flush_console(self) -> None:
         """Console text goes out after the replies, and only once there is a client to hear it."""
         for text in self._console:
-            for chunk in console.text_chunks(text):
+            for chunk in ports.text_chunks(text):
                 self._send(wire.encode(wire.CONSOLE, 0, chunk))
         self._console.clear()
 

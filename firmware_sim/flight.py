@@ -11,18 +11,16 @@ import numpy as np
 
 from firmware_sim.commander import setpoint as sp
 from firmware_sim.controllers import layout as mem
-from firmware_sim.controllers import lqg_design, parameters, variables
+from firmware_sim.controllers import lqg, parameters, variables
 from firmware_sim.controllers import variables as lv
 from firmware_sim.controllers.externalise import RPM_UNREADABLE
-from firmware_sim.controllers.tick import tick_step
-from firmware_sim.controllers.tick_with_effects import tick_step_with_effects
+from firmware_sim.controllers.tick import tick_step, tick_step_with_effects
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.drive import present_wrench
 from firmware_sim.plant.effects.motion import origin
 from firmware_sim.plant.effects.sensing import seen_pose
-from firmware_sim.plant.noise import NoiseSource
 from firmware_sim.plant.rotors import wrench
-from firmware_sim.plant.sensors import ACC_CUTOFF, settle
+from firmware_sim.plant.sensors import ACC_CUTOFF, NoiseSource, settle
 from firmware_sim.scenario import Scenario
 
 DEFAULT_CONTROLLER = 1  # PID, as in the firmware
@@ -90,7 +88,7 @@ class Flight:
     def _design_lqg(self) -> None:
         """New gains from the weights; weights that have no solution leave the old gains."""
         weights = {n: float(self._param[parameters.PARAMETER_INDEX[f"ctrlLqg.{n}"]]) for n in parameters.LQG_WEIGHTS}
-        gains = lqg_design.design(**weights)
+        gains = lqg.design(**weights)
         if gains is not None:
             self._memory[mem.LQG_GAIN_POS : mem.LQG_GAIN_POS + 8] = gains
 

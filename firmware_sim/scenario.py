@@ -16,9 +16,9 @@ from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.body import Body, loaded_body, replaced
 from firmware_sim.plant.effects.catalogue import Values, parse_effects
 from firmware_sim.plant.effects.constants import fill_effects, rotation
-from firmware_sim.plant.ground import GRAVITY
 from firmware_sim.plant.payload_events import PayloadChanges, PayloadEvent, PointMass, carried, parse_events
 from firmware_sim.plant.platforms import PLATFORMS, SQRT_HALF
+from firmware_sim.plant.rigid_body import GRAVITY
 from firmware_sim.plant.rotors import open_circuit
 from firmware_sim.vehicle_file import read_toml, vehicle_tables
 

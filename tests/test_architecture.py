@@ -22,8 +22,7 @@ BASE = ("errors", "extras", "notebook", "deprecated", "toml_file")
 # What the parts of crazyem may import of crazyem, besides themselves and `BASE`. Nothing here is circular.
 ALLOWED: dict[str, set[str]] = {
     **{name: set() for name in BASE},
-    "kernel_cache": set(),
-    "compiled": {"kernel_cache"},
+    "compiled": set(),
     "vehicle": set(),
     "physics": {"vehicle", "compiled"},
     "signals": set(),
@@ -35,7 +34,7 @@ ALLOWED: dict[str, set[str]] = {
     "diagnosis": {"vehicle", "compiled", "physics", "signals", "estimation", "recordings"},
     "simulators": {"vehicle", "physics", "recordings", "diagnosis"},
     "paper": {"vehicle", "compiled", "physics", "signals", "control", "estimation"},
-    "live": {"kernel_cache", "vehicle", "physics", "signals", "control", "links", "estimation", "recordings"},
+    "live": {"compiled", "vehicle", "physics", "signals", "control", "links", "estimation", "recordings"},
     "api": {
         *("vehicle", "physics", "signals", "control", "links", "estimation", "recordings", "doctor", "diagnosis"),
         *("live", "simulators"),

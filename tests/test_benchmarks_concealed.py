@@ -66,7 +66,7 @@ def test_every_drawn_scenario_is_one_the_simulator_takes_and_every_path_one_that
     from benchmarks.concealed.draw import write_cases
     from benchmarks.concealed.fly import _words
     from benchmarks.concealed.paths import Study, read
-    from crazyem.control.waypoints import waypoints
+    from crazyem.control.named_trajectories import waypoints
     from firmware_sim.scenario import load_scenario
 
     study = Study(tmp_path)

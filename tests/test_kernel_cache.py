@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crazyem import kernel_cache
+from crazyem import compiled as kernels
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TOY = """
 import sys
 import numpy as np
-from crazyem.kernel_cache import compilations, kernel
+from crazyem.compiled import compilations, kernel
 
 @kernel
 def inner(x, n):
@@ -59,7 +59,7 @@ def run(program: Path, *arguments: str, cache: Path) -> dict[str, str]:
 def test_no_function_can_be_taken_from_another_library() -> None:
     """Symbols that are weak in a library are taken from whichever library was loaded first."""
 
-    @kernel_cache.kernel
+    @kernels.kernel
     def inner(x, n):
         s = 0.0
         for i in range(n):
@@ -68,7 +68,7 @@ def test_no_function_can_be_taken_from_another_library() -> None:
                 s -= np.cos(x[i])
         return s
 
-    @kernel_cache.kernel
+    @kernels.kernel
     def outer(x):
         return inner(x, 3) + inner(x, x.size) + inner(x[2:], 2)
 
@@ -92,11 +92,11 @@ def test_processes_that_compile_at_once_leave_a_whole_cache(toy: Path, tmp_path:
 
 BACKWARDS = """
 import sys
-from crazyem import kernel_cache
+from crazyem import compiled as kernels
 import crazyem.commands.replay, crazyem.estimation.online, crazyem.estimation.steps
 from crazyem.cli import main
 
-for kernel in reversed(kernel_cache._KERNELS):
+for kernel in reversed(kernels._KERNELS):
     for signature, *_ in kernel._cache._cache_file._load_index():
         kernel.compile(signature)  # loads
 main(["replay", *sys.argv[1:]])

@@ -28,8 +28,7 @@ from crazyem.live.flight import Flight, FlightPlan
 from crazyem.live.recorder import open_recorder
 from crazyem.live.session import Session
 from crazyem.recordings.registry import open_recording
-from crazyem.signals.packet import Packet
-from crazyem.signals.sample import Sample
+from crazyem.signals.sample import Packet, Sample
 from crazyem.vehicle import load_vehicle
 
 from .draw import DURATION

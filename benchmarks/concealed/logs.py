@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from crazyem.recordings.mcap.writer import RecordingWriter
-from crazyem.signals.packet import Block, Packet, Variable
+from crazyem.signals.sample import Block, Packet, Variable
 from firmware_sim.tables import Table as Contents
 from firmware_sim.tables import pack, unpack
 from firmware_sim.wire import Air

@@ -15,7 +15,7 @@ from crazyem.errors import UsageError
 
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
-    from crazyem.api.predicting import predict
+    from crazyem.api.diagnosing import predict
 
     if arguments.ensemble:
         return _ensemble(arguments)

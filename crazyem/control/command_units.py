@@ -1,14 +1,22 @@
-"""From a drone's constants to what controllers in command units believe: INDI's ctrlINDI.*, Mellinger's massThrust.
+"""What the firmware's controllers take: INDI's and Mellinger's parameters in command units, and INDI's setpoints.
 
 PID, Mellinger and INDI command in units of the firmware's legacy mixer (powerDistributionLegacy in
 power_distribution_quadrotor.c): a unit of thrust or yaw is one of every rotor, two units of roll or pitch are. 65535
 units are the firmware's THRUST_MAX where it compensates the battery voltage (motors.c, motorsCompensateBatteryVoltage),
 else full duty.
+
+Of a setpoint with a place INDI takes place and heading only. Its outer loop (position_controller_indi.c) wants the
+acceleration K_dxi (K_xi (place - p) - v), and its inner one the yaw rate ref_err_r (heading - yaw). A place ahead of
+the reference by (v + a/K_dxi)/K_xi asks for the reference's acceleration where the drone is on it; a heading ahead by
+its rate over ref_err_r does the same for yaw.
 """
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 
-from crazyem.physics.effects.rotor_inertia import TYPICAL_ROTOR_CONSTANT
+from crazyem.control.trajectories import Reference
+from crazyem.physics.effects.rotors import TYPICAL_ROTOR_CONSTANT
 from crazyem.vehicle import GRAVITY, Vehicle
 
 FULL = 65535.0  # units
@@ -124,3 +132,46 @@ def rotor_reaction_factor(vehicle: Vehicle, rotor_inertia: float) -> float:
     per_unit = thrust_per_unit(vehicle, thrust=0.0, volts=0.0)
     thrust = vehicle.mass * GRAVITY / 4.0
     return rotor_reaction(per_unit, thrust=thrust, rotor_constant=constant, rotor_inertia=rotor_inertia, izz=1.0)
+
+
+_AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class IndiGains:
+    """The firmware's gains, 1/s: of places, of velocities, of the heading. Defaults: those at boot."""
+
+    place: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    velocity: tuple[float, float, float] = (5.0, 5.0, 5.0)
+    heading: float = 5.0
+
+    @classmethod
+    def of(cls, values: Mapping[str, float]) -> "IndiGains":
+        """From parameter values; see `PARAMETERS`. A gain that is not positive counts as the one at boot."""
+        plain = cls()
+
+        def positive(name: str, otherwise: float) -> float:
+            return values[name] if values.get(name, 0.0) > 0.0 else otherwise
+
+        place = [positive(f"posCtrlIndi.K_xi_{a}", g) for a, g in zip(_AXES, plain.place)]
+        velocity = [positive(f"posCtrlIndi.K_dxi_{a}", g) for a, g in zip(_AXES, plain.velocity)]
+        return cls(
+            (place[0], place[1], place[2]),
+            (velocity[0], velocity[1], velocity[2]),
+            positive("ctrlINDI.ref_err_r", plain.heading),
+        )
+
+
+PARAMETERS = (
+    *(f"posCtrlIndi.{gain}_{a}" for gain in ("K_xi", "K_dxi") for a in _AXES),
+    "ctrlINDI.ref_err_r",
+)
+
+
+def place_ahead(r: Reference, gains: IndiGains) -> tuple[float, float, float, float]:
+    """x, y, z [m, world] and heading [rad] to send for a reference."""
+    x, y, z = (
+        p + (v + a / k_v) / k_p
+        for p, v, a, k_p, k_v in zip(r.position, r.velocity, r.acceleration, gains.place, gains.velocity)
+    )
+    return x, y, z, r.yaw + r.yaw_rate / gains.heading

@@ -1,11 +1,135 @@
-"""Trajectories by the words that name them, on a command line, in a script or in a swarm file."""
+"""Trajectories by the words that name them, on a command line, in a script or in a swarm file; and waypoint files.
 
+A waypoint file (CSV or TOML) becomes a quintic spline through its points, at rest at both ends.
+"""
+
+import csv
 import math
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
-from crazyem.control.trajectories import Trajectory, Vector, excite, figure8, hover
-from crazyem.control.waypoints import read_waypoints, waypoints
-from crazyem.errors import UsageError
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+
+from crazyem.control.trajectories import Reference, Trajectory, Vector, excite, figure8, hover
+from crazyem.errors import FileFormatError, UsageError
+from crazyem.toml_file import parse_toml, read_text
+
+DEFAULT_SPEED = 0.5  # m/s
+MAX_ACCELERATION = 8.0  # m/s^2; beyond this a Crazyflie runs out of thrust or of the setpoint's range
+MAX_POSITION = 32.767  # m, the range of a full-state setpoint
+WAYPOINT_COLUMNS = {"x", "y", "z", "yaw", "time", "speed"}
+
+
+def read_waypoints(path: str | Path) -> list[dict[str, float]]:
+    """Rows of a waypoint file.
+
+    CSV: a header with x, y, z [m, world] and optionally yaw [rad], time [s since the start] or speed [m/s towards this
+    point]. TOML: an array of tables `[[waypoints]]` with the same keys.
+
+    Raises:
+        UsageError: no such file. FileFormatError: naming the file and the row or key.
+    """
+    path = Path(path)
+    text = read_text(path, what="waypoint file")
+    rows: list[dict[str, object]]
+    if path.suffix.lower() == ".toml":
+        found = parse_toml(text, where=f"waypoint file {path}").get("waypoints")
+        if not isinstance(found, list) or not all(isinstance(r, dict) for r in found):
+            raise FileFormatError(f"waypoint file {path} has no [[waypoints]] tables.")
+        rows = found
+    else:
+        reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
+        rows = [{str(k).strip(): v for k, v in r.items() if v not in (None, "")} for r in reader]
+    out = []
+    for i, row in enumerate(rows, start=1):
+        unknown = set(row) - WAYPOINT_COLUMNS
+        if unknown:
+            raise FileFormatError(f"waypoint file {path} has the unknown column '{sorted(unknown)[0]}'.")
+        missing = [k for k in ("x", "y", "z") if k not in row]
+        if missing:
+            raise FileFormatError(f"waypoint file {path}, point {i}: '{missing[0]}' is missing.")
+        values: dict[str, float] = {}
+        for key, raw in row.items():
+            try:
+                value = float(str(raw))
+            except ValueError:
+                value = math.nan
+            if not math.isfinite(value):
+                raise FileFormatError(f"waypoint file {path}, point {i}: '{key}' is not a number.")
+            values[key] = value
+        if abs(values["x"]) > MAX_POSITION or abs(values["y"]) > MAX_POSITION or not 0.1 <= values["z"] <= MAX_POSITION:
+            raise FileFormatError(
+                f"waypoint file {path}, point {i} is out of range (|x|, |y| up to {MAX_POSITION} m, z from 0.1 m)."
+            )
+        if values.get("speed", 1.0) <= 0:
+            raise FileFormatError(f"waypoint file {path}, point {i}: 'speed' must be positive.")
+        out.append(values)
+    if not out:
+        raise FileFormatError(f"waypoint file {path} has no waypoints.")
+    return out
+
+
+def _times(points: NDArray[np.float64], rows: Sequence[dict[str, float]], path: str | Path) -> NDArray[np.float64]:
+    """Time at each of points (n, 3); the first is the start at 0, `rows` are the others."""
+    times = [0.0]
+    for i, row in enumerate(rows):
+        distance = float(np.linalg.norm(points[i + 1] - points[i]))
+        if "time" in row:
+            times.append(row["time"])
+        else:
+            # Start and end at rest need longer than the cruise speed suggests.
+            rest = 1.0 if i in (0, len(rows) - 1) else 0.0
+            times.append(times[-1] + max(distance / row.get("speed", DEFAULT_SPEED), 0.5) + rest)
+    if not np.all(np.diff(times) > 0.05):
+        raise FileFormatError(f"the times in waypoint file {path} do not increase (first point after 0 s).")
+    return np.array(times)
+
+
+def waypoints(*, path: str | Path, position: Vector, yaw: float = 0.0) -> Trajectory:
+    """A smooth path from `position` [m, world] and `yaw` [rad], where the drone hovers, through the points of a file.
+
+    Raises:
+        FileFormatError: a file that cannot be used, or a path that asks for more than `MAX_ACCELERATION`.
+    """
+    rows = read_waypoints(path)
+    points = np.array([position, *([r["x"], r["y"], r["z"]] for r in rows)])
+    yaws = [yaw]
+    for r in rows:
+        yaws.append(r.get("yaw", yaws[-1]))
+    times = _times(points, rows, path)
+    rest = [(1, 0.0), (2, 0.0)]
+    columns = np.column_stack([points, np.unwrap(yaws)])
+    ends = [(order, np.zeros(4)) for order, _ in rest]
+    spline = make_interp_spline(times, columns, k=5, bc_type=(ends, ends))
+    derivatives = [spline, spline.derivative(1), spline.derivative(2), spline.derivative(3)]
+    duration = float(times[-1])
+
+    grid = np.linspace(0.0, duration, 500)
+    worst = float(np.abs(derivatives[2](grid)[:, :3]).max())
+    if worst > MAX_ACCELERATION:
+        raise FileFormatError(
+            f"the path in waypoint file {path} asks for {worst:.1f} m/s^2 (at most {MAX_ACCELERATION:g}): "
+            "give it more time or less speed."
+        )
+    if float(spline(grid)[:, 2].min()) < 0.05:
+        raise FileFormatError(f"the smooth path through waypoint file {path} would touch the ground: slow it down.")
+
+    def at(t: float) -> Reference:
+        t = min(max(t, 0.0), duration)
+        p, v, a, j = (d(t) for d in derivatives)
+        return Reference(
+            position=(float(p[0]), float(p[1]), float(p[2])),
+            velocity=(float(v[0]), float(v[1]), float(v[2])),
+            acceleration=(float(a[0]), float(a[1]), float(a[2])),
+            jerk=(float(j[0]), float(j[1]), float(j[2])),
+            yaw=float(p[3]),
+            yaw_rate=float(v[3]),
+        )
+
+    return Trajectory(f"waypoints {Path(path).name}", duration, at)
+
 
 DEFAULT_HEIGHT = 1.0  # m above the take-off point, at which every named trajectory begins
 TrajectoryMaker = Callable[[Vector, float], Trajectory]  # from the position [m, world] and heading [rad] at its begin

@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 
 from crazyem.errors import LinkError
 from crazyem.links.clock import ClockFit
-from crazyem.signals.packet import Block, Packet, Variable
+from crazyem.signals.sample import Block, Packet, Variable
 
 __all__ = [
     "AccountingLink",

@@ -16,7 +16,7 @@ from crazyem.links.clock import ClockFit, ClockRelation, LossCounter, StampUnwra
 from crazyem.links.log_control import LogControl
 from crazyem.links.packing import PERIOD_UNIT_MS, pack, period_of
 from crazyem.links.requests import RequestClient
-from crazyem.signals.packet import Block, Packet
+from crazyem.signals.sample import Block, Packet
 
 LATE_AFTER = 0.1  # s behind the least-delayed packets after which a packet counts as late
 _START_ATTEMPT = 0.5  # s to wait for a block's first packet beyond its period, before asking again

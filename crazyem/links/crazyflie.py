@@ -20,7 +20,7 @@ from crazyem.links.connection import connect, quiet_cflib, shut
 from crazyem.links.parameters import ParameterClient
 from crazyem.links.reconnection import Reconnector
 from crazyem.links.requests import land_command, send_until_confirmed
-from crazyem.signals.packet import Block, Packet
+from crazyem.signals.sample import Block, Packet
 
 SILENT_AFTER = 2.0  # s without log data, while blocks run, after which the drone counts as lost
 _ECHO = (15, 0)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from crazyem.errors import UsageError
-from crazyem.signals.packet import CTYPE_SIZES, Block, Variable
+from crazyem.signals.sample import CTYPE_SIZES, Block, Variable
 from crazyem.signals.vocabulary import sampled_together
 
 MAX_BYTES = 26  # log data of one packet: 30 bytes less block id and 24-bit stamp

@@ -3,10 +3,10 @@
 import math
 import time
 
+from crazyem.compiled import compilations
 from crazyem.errors import CrazyemError
 from crazyem.estimation.in_step import PERIOD
 from crazyem.estimation.online import OnlineEstimator
-from crazyem.kernel_cache import compilations
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle
 

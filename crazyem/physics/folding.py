@@ -11,12 +11,10 @@ import numpy as np
 
 from crazyem.errors import FileFormatError
 from crazyem.physics.effects.catalogue import CATALOGUE, check_effects
-from crazyem.physics.motion import active, body_of
+from crazyem.physics.effects.mass_properties import CENTER_OF_MASS
+from crazyem.physics.effects.timing import MOTOR_LAG
+from crazyem.physics.motion import active, body_of, gain
 from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
-
-_BODY = ("inertia", "inertia_products", "payload")
-_SCALES = ("thrust_scale", "torque_scale")
-_FOR_CONTROLLERS = ("rotor_inertia",)  # the estimator does not know it, INDI does (ctrlINDI.g2)
 
 
 def load(name_or_path: str | Path) -> Vehicle:
@@ -47,27 +45,25 @@ def fold(vehicle: Vehicle) -> tuple[Vehicle, list[str]]:
     """
     if not vehicle.effects:
         return vehicle, []
-    values = {effect.name: found for effect, found in active(vehicle.effects, vehicle)}
-    used = {name for name in (*_BODY, *_SCALES, "motor_lag") if name in values}
-    body = body_of(vehicle, {name: values[name] for name in _BODY if name in values})
+    found = active(vehicle.effects, vehicle)
+    bodies = {effect.name: values for effect, values in found if effect.body and effect is not CENTER_OF_MASS}
+    used = {*bodies, *(effect.name for effect, _ in found if effect.gain or effect is MOTOR_LAG)}
+    body = body_of(vehicle, bodies)
     matrix = body.inertia
     plain = replace(
         vehicle,
         mass=float(body.mass),
         inertia=(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[2, 2])),
         inertia_products=(float(matrix[0, 1]), float(matrix[0, 2]), float(matrix[1, 2])),
-        effects={name: vehicle.effects[name] for name in _FOR_CONTROLLERS if name in vehicle.effects},
+        effects={name: values for name, values in vehicle.effects.items() if CATALOGUE[name].controllers},
     )
-    if "motor_lag" in values:
-        plain = replace(plain, motor_time_constant=float(values["motor_lag"]["time_constant"]))
+    for effect, values in found:
+        if effect is MOTOR_LAG:
+            plain = replace(plain, motor_time_constant=float(values["time_constant"]))
     if not vehicle.thrust_curve and vehicle.rotor_constant is None:
-        used -= set(_SCALES)
+        used -= {effect.name for effect, _ in found if effect.gain}
     else:
-        plain = _scaled(
-            plain,
-            thrust=float(values.get("thrust_scale", {}).get("scale", 1.0)),
-            torque=float(values.get("torque_scale", {}).get("scale", 1.0)),
-        )
+        plain = _scaled(plain, thrust=gain(found, "thrust"), torque=gain(found, "torque"))
     return plain, [name for name in CATALOGUE if name in vehicle.effects and name not in used]
 
 

@@ -8,6 +8,7 @@ With the centre of mass at c from O (middle of the rotors; positions and velocit
 about the centre of mass, and the specific force at O is F/m - alpha x c - w x (w x c).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -56,19 +57,18 @@ class Motion:
 
 def vehicle_values(vehicle: Vehicle) -> dict[str, dict[str, float]]:
     """The vehicle's own values for parameters whose neutral value is the vehicle's."""
-    xx, yy, zz = vehicle.inertia
-    xy, xz, yz = vehicle.inertia_products
-    return {
-        "inertia": {"xx": xx, "yy": yy, "zz": zz},
-        "inertia_products": {"xy": xy, "xz": xz, "yz": yz},
-        "motor_lag": {"time_constant": vehicle.motor_time_constant},
-    }
+    return {effect.name: effect.own(vehicle) for effect in CATALOGUE.values() if effect.own is not None}
 
 
 def active(effects: Effects, vehicle: Vehicle) -> list[tuple[Effect, dict]]:
     """Effects with complete parameters, in the order of the catalogue."""
     own = vehicle_values(vehicle)
     return [(CATALOGUE[n], CATALOGUE[n].complete(effects[n], own.get(n, {}))) for n in CATALOGUE if n in effects]
+
+
+def gain(found: list[tuple[Effect, dict]], what: str) -> float:
+    """By what effects (as `active` gives them) multiply the "thrust" or "torque" of all rotors."""
+    return math.prod(float(values[effect.parameters[0].name]) for effect, values in found if effect.gain == what)
 
 
 def settled(inputs: RotorInput, *, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, float, float]:

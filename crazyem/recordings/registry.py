@@ -52,19 +52,19 @@ class Reader:
         return cut_parts(parts, options.start, options.end)
 
     def _module(self) -> ModuleType:
-        return importlib.import_module(f"crazyem.recordings.{self.module}")
+        return importlib.import_module(self.module)
 
 
 # Most specific first.
 READERS: tuple[Reader, ...] = (
-    Reader("MCAP", "mcap.file"),
-    Reader("rosbag2", "ros.rosbag2_file"),
-    Reader("uSD card log", "usd.file"),
-    Reader("ULog", "autopilots.ulog_file"),
-    Reader("exported CSV", "csv.exported"),
-    Reader("cfclient CSV", "csv.cfclient"),
-    Reader("CSV", "csv.file"),
-    Reader("MAVLink tlog", "autopilots.tlog_file"),
+    Reader("MCAP", "crazyem.recordings.mcap.file"),
+    Reader("rosbag2", "crazyem.recordings.ros.rosbag2_file"),
+    Reader("uSD card log", "crazyem.recordings.usd.file"),
+    Reader("ULog", "crazyem.recordings.autopilots.ulog_file"),
+    Reader("exported CSV", "crazyem.recordings.csv.exported"),
+    Reader("cfclient CSV", "crazyem.recordings.csv.cfclient"),
+    Reader("CSV", "crazyem.recordings.csv.file"),
+    Reader("MAVLink tlog", "crazyem.recordings.autopilots.tlog_file"),
 )
 
 

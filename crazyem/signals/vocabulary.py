@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from crazyem.errors import UsageError
 from crazyem.signals.mavlink import MAPPINGS
-from crazyem.signals.packet import Block, Packet
-from crazyem.signals.sample import ESTIMATOR_SIGNALS, SIGNALS, Sample
+from crazyem.signals.sample import ESTIMATOR_SIGNALS, SIGNALS, Block, Packet, Sample
 
 STANDARD_GRAVITY = 9.81  # m/s^2, the constant the firmware multiplies and divides by
 _RPM_IN_RAD_PER_S = 2.0 * math.pi / 60.0

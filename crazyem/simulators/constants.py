@@ -6,13 +6,11 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from crazyem.physics.motion import active, body_of
+from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.motion import active, body_of, gain, vehicle_values
 from crazyem.vehicle import GRAVITY, Vehicle
 
 SHORTEST_LAG = 1e-3  # s: simulators divide by the lag, so none is written as this one, and this one is read as none
-BODY = ("inertia", "inertia_products", "center_of_mass", "payload")  # effects that a body holds, exactly
-ROTORS = ("thrust_scale", "torque_scale", "motor_lag")  # effects that the constants of rotors hold, exactly
-AIR = ("linear_drag", "quadratic_drag", "rate_damping")  # effects with constants of their own
 
 
 @dataclass(frozen=True)
@@ -159,10 +157,10 @@ def from_vehicle(vehicle: Vehicle) -> tuple[Constants, list[str]]:
 
     Exact: inertia, centre of mass and payload as one body, scales of thrust and torque, the lag, drags and damping.
     """
-    values = {effect.name: found for effect, found in active(vehicle.effects, vehicle)}
-    body = body_of(vehicle, {n: values[n] for n in BODY if n in values})
-    thrust = float(values.get("thrust_scale", {}).get("scale", 1.0))
-    torque = float(values.get("torque_scale", {}).get("scale", 1.0))
+    effects = active(vehicle.effects, vehicle)
+    values, own = {effect.name: given for effect, given in effects}, vehicle_values(vehicle)
+    body = body_of(vehicle, {effect.name: given for effect, given in effects if effect.body})
+    thrust, torque = gain(effects, "thrust"), gain(effects, "torque")
     has_rotors = bool(vehicle.thrust_curve) or vehicle.rotor_constant is not None
     constant, limit = vehicle.rotor_constant, vehicle.thrust_max
     matrix = body.inertia
@@ -175,11 +173,12 @@ def from_vehicle(vehicle: Vehicle) -> tuple[Constants, list[str]]:
         "thrust_per_speed2": None if constant is None else constant * thrust,
         "torque_per_thrust": vehicle.torque_per_thrust * torque if has_rotors else None,
         "thrust_max": limit * thrust if math.isfinite(limit) else None,
-        "lag": values.get("motor_lag", {}).get("time_constant", vehicle.motor_time_constant),
     }
-    for effect, prefix in zip(AIR, ("drag", "quadratic_drag", "damping"), strict=True):
-        found |= {f"{prefix}_{a}": values.get(effect, {}).get(a, 0.0) for a in "xyz"}
-    left = [n for n in values if n not in (*BODY, *ROTORS, *AIR)]
+    for effect in CATALOGUE.values():
+        if effect.body is None:
+            complete = values.get(effect.name) or effect.complete({}, own.get(effect.name, {}))
+            found |= {constant: complete[name] for name, constant in effect.constants.items()}
+    left = [effect.name for effect, _ in effects if not (effect.body or effect.gain or effect.constants)]
     return Constants(vehicle.name, **{n: None if v is None else float(v) for n, v in found.items()}), left
 
 
@@ -196,10 +195,10 @@ def to_vehicle(c: Constants, base: Vehicle | None = None) -> Vehicle:
     if base is not None and c.thrust_per_speed2 is None:
         plain = replace(plain, rotor_constant=base.rotor_constant)
     effects: dict[str, dict[str, float]] = {}
-    for effect, prefix in (("center_of_mass", "centre"), *zip(AIR, ("drag", "quadratic_drag", "damping"), strict=True)):
-        axes = {a: c.or_(f"{prefix}_{a}", 0.0) for a in "xyz"}
-        if any(axes.values()):
-            effects[effect] = axes
+    for effect in CATALOGUE.values():
+        values = {name: c.or_(constant, 0.0) for name, constant in effect.constants.items()}
+        if effect.own is None and any(values.values()):
+            effects[effect.name] = values
     return replace(
         plain,
         name=c.name,

@@ -7,8 +7,9 @@ from typing import Any
 
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.physics import folding
+from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording
-from crazyem.simulators.constants import AIR, Constants, from_vehicle, to_vehicle
+from crazyem.simulators.constants import Constants, from_vehicle, to_vehicle
 from crazyem.simulators.cost import HORIZON, errors_after, flown, reference_flight, rms_distance, said, to_json
 from crazyem.simulators.fields import Contradiction, Format, SimulatorFile, read, write
 from crazyem.simulators.formats.rotorpy import ROTORPY, ROTORPY_JSON
@@ -17,16 +18,17 @@ from crazyem.simulators.registry import FORMATS, OWN, format_named, format_of
 from crazyem.vehicle import Vehicle, preset_names
 
 # What is held or left out together: words, and the quantities.
-GROUPS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "motor_lag": ("rotor lag", ("lag",)),
-    "center_of_mass": ("centre of mass", ("centre_x", "centre_y", "centre_z")),
-    "inertia": ("inertia", ("inertia_xx", "inertia_yy", "inertia_zz")),
-    "inertia_products": ("products of inertia", ("inertia_xy", "inertia_xz", "inertia_yz")),
-    "arm": ("arms", ("arm_x", "arm_y")),
-    "linear_drag": ("drag by axis", ("drag_x", "drag_y", "drag_z")),
-    "quadratic_drag": ("quadratic drag", ("quadratic_drag_x", "quadratic_drag_y", "quadratic_drag_z")),
-    "rate_damping": ("damping of rotation", ("damping_x", "damping_y", "damping_z")),
-}
+GROUPS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("rotor lag", ("lag",)),
+    ("centre of mass", ("centre_x", "centre_y", "centre_z")),
+    ("inertia", ("inertia_xx", "inertia_yy", "inertia_zz")),
+    ("products of inertia", ("inertia_xy", "inertia_xz", "inertia_yz")),
+    ("arms", ("arm_x", "arm_y")),
+    ("drag by axis", ("drag_x", "drag_y", "drag_z")),
+    ("quadratic drag", ("quadratic_drag_x", "quadratic_drag_y", "quadratic_drag_z")),
+    ("damping of rotation", ("damping_x", "damping_y", "damping_z")),
+)
+EFFECT_OF = {constant: e.name for e in CATALOGUE.values() for constant in e.constants.values()}
 OF_ROTORS = {
     "thrust_per_speed2": "thrust per squared rotor speed", "torque_per_thrust": "torque per thrust",
     "thrust_max": "largest thrust",
@@ -231,7 +233,8 @@ def _omissions(
         return replace(made, effects={**made.effects, **{n: v for n, v in kept.items() if n != without}})
 
     variants: list[tuple[str, str, str, Vehicle]] = []
-    for name, (words, quantities) in GROUPS.items():
+    for words, quantities in GROUPS:
+        name = EFFECT_OF.get(quantities[0], "arm")
         if same(full, held, quantities) or (name == "arm" and full.arm_x is None):
             continue
         silent = all(getattr(held, q) is None for q in quantities)
@@ -285,4 +288,4 @@ def known_formats() -> dict[str, str]:
     return {n: f.words for n, f in FORMATS.items() if n != ROTORPY_JSON.name}
 
 
-__all__ = ["AIR", "Conversion", "Omission", "Source", "convert", "known_formats", "load_source", "read_text"]
+__all__ = ["Conversion", "Omission", "Source", "convert", "known_formats", "load_source", "read_text"]

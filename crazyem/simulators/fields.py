@@ -150,6 +150,7 @@ class Format:
         read_more: document, drone and the quantities found until then -> remarks; adds to these what is no multiple of
             one number (masses of propellers, laws that are no parabola).
         write_more: the same for writing; called last.
+        order: formats are listed, and a text is compared with them, in this order (then by name).
     """
 
     name: str
@@ -163,6 +164,7 @@ class Format:
     names: Callable[[Any], list[str]] = field(default=lambda document: [])
     read_more: Callable[[Any, str, dict[str, float]], list[str]] = field(default=lambda document, name, found: [])
     write_more: Callable[[Any, str, Constants], None] = field(default=lambda document, name, constants: None)
+    order: int = 50
 
 
 def read(form: Format, text: str, *, where: str, name: str | None = None, strict: bool = True) -> SimulatorFile:

@@ -18,14 +18,6 @@ GAUGE = (
     "larger by one factor; weigh the drone and say --mass"
 )
 HEAVY = ("N", "kg")  # units that have a mass in them
-# Which effect of the catalogue is about a quantity.
-ABOUT = {
-    "mass": ("payload", "thrust_scale"), "thrust_per_speed2": ("thrust_scale", "payload"),
-    "thrust_max": ("thrust_scale",),
-    "torque_per_thrust": ("torque_scale", "inertia"), "lag": ("motor_lag",), "inertia": ("inertia", "torque_scale"),
-    "arm": ("torque_scale",), "centre": ("center_of_mass", "payload"), "drag": ("linear_drag",),
-    "quadratic": ("quadratic_drag",), "damping": ("rate_damping",),
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -143,10 +135,16 @@ def _moved(fitted: Vehicle, effects: Sequence[Mapping[str, Any]]) -> list[Consta
 
 
 def _reason(quantity: str, not_identifiable: Mapping[str, str], looked_for: Collection[str] | None) -> str:
-    names = ABOUT.get(quantity) or ABOUT.get(quantity.partition("_")[0], ())
+    names = _about(quantity) or _about(quantity.partition("_")[0])
     reason = next((f"flights do not tell: {not_identifiable[n]}" for n in names if n in not_identifiable), "")
     unasked = looked_for is not None and not any(n in looked_for for n in names)
     return reason or ("not looked for" if unasked else "")
+
+
+def _about(quantity: str) -> list[str]:
+    """Effects without which a quantity looks wrong, the nearest first."""
+    found = [(e.about.index(quantity), e.name) for e in CATALOGUE.values() if quantity in e.about]
+    return [name for _, name in sorted(found)]
 
 
 def rescaled(vehicle: Vehicle, mass: float) -> Vehicle:

@@ -1,24 +1,30 @@
-"""All formats by name, and which of them a text is."""
+"""All formats by name, and which of them a text is: a module of `formats/` that makes a `Format` is in it."""
+
+import importlib
+import pkgutil
+from collections.abc import Iterable
 
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.simulators.fields import Format
-from crazyem.simulators.formats.crazyflow import CRAZYFLOW
-from crazyem.simulators.formats.crazyswarm2 import CRAZYSWARM2
-from crazyem.simulators.formats.gazebo import GAZEBO
-from crazyem.simulators.formats.gym_pybullet_drones import GYM_PYBULLET_DRONES
-from crazyem.simulators.formats.l2f import L2F
-from crazyem.simulators.formats.mujoco import MUJOCO
-from crazyem.simulators.formats.omnidrones import OMNIDRONES
-from crazyem.simulators.formats.px4_sih import PX4_SIH
-from crazyem.simulators.formats.rotorpy import ROTORPY, ROTORPY_JSON
+from crazyem.simulators.formats.rotorpy import ROTORPY_JSON
 
 OWN = "crazyem"  # a vehicle file
-FORMATS = {
-    f.name: f
-    for f in (
-        CRAZYFLOW, GYM_PYBULLET_DRONES, MUJOCO, GAZEBO, ROTORPY, CRAZYSWARM2, PX4_SIH, OMNIDRONES, L2F, ROTORPY_JSON,
-    )
-}  # fmt: skip
+
+
+def discover(paths: Iterable[str], package: str = "") -> dict[str, Format]:
+    """Every format that the modules of some folders make, by `order` and name.
+
+    Args:
+        paths: folders.
+        package: dotted name of the package that they are; empty: top level.
+    """
+    modules = pkgutil.iter_modules(list(paths), f"{package}." if package else "")
+    found = [v for m in modules for v in vars(importlib.import_module(m.name)).values() if isinstance(v, Format)]
+    return {form.name: form for form in sorted(found, key=lambda form: (form.order, form.name))}
+
+
+_FOLDER = importlib.import_module("crazyem.simulators.formats")
+FORMATS = discover(_FOLDER.__path__, _FOLDER.__name__)
 NAMES = (*(n for n in FORMATS if n != ROTORPY_JSON.name), OWN)
 
 

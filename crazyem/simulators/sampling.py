@@ -15,6 +15,8 @@ from crazyem.diagnosis.fitting.nuisances import DAILY_LAG_SD, THRUST_SD
 from crazyem.diagnosis.fitting.sampling import TRIM_SD
 from crazyem.errors import DataError, UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.rotors import THRUST_SCALE, TRIM
+from crazyem.physics.effects.timing import MOTOR_LAG
 from crazyem.physics.motion import vehicle_values
 from crazyem.simulators.constants import NUMBERS, from_vehicle
 from crazyem.simulators.findings import rescaled
@@ -127,14 +129,14 @@ def _drawn(vehicle: Vehicle, parameters: Sequence[str], theta: Array) -> Vehicle
 def _another_day(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
     """The same drone on another day; sources of the spreads: `fitting/nuisances.py`, `fitting/sampling.py`."""
     effects = {n: dict(v) for n, v in vehicle.effects.items()}
-    scale = effects.setdefault("thrust_scale", {"scale": 1.0})
+    scale = effects.setdefault(THRUST_SCALE.name, {"scale": 1.0})
     scale["scale"] *= 1.0 + THRUST_SD * rng.standard_normal()
-    trim = effects.setdefault("trim", dict.fromkeys("xyz", 0.0))
+    trim = effects.setdefault(TRIM.name, dict.fromkeys("xyz", 0.0))
     for axis, sd in zip("xyz", TRIM_SD, strict=True):
         trim[axis] = trim.get(axis, 0.0) + sd * rng.standard_normal()
-    lag = effects.get("motor_lag", {}).get("time_constant", vehicle.motor_time_constant)
+    lag = effects.get(MOTOR_LAG.name, {}).get("time_constant", vehicle.motor_time_constant)
     if lag > 0.0:
-        effects["motor_lag"] = {"time_constant": lag * math.exp(DAILY_LAG_SD / USUAL_LAG * rng.standard_normal())}
+        effects[MOTOR_LAG.name] = {"time_constant": lag * math.exp(DAILY_LAG_SD / USUAL_LAG * rng.standard_normal())}
     return replace(vehicle, effects=effects)
 
 

@@ -10,8 +10,8 @@ from firmware_sim.controllers import parameters as pm
 from firmware_sim.controllers import variables as lv
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.ground import GRAVITY
 from firmware_sim.plant.quaternion import compress, matrix, roll_pitch_yaw
+from firmware_sim.plant.rigid_body import GRAVITY
 from firmware_sim.plant.rotors import open_circuit
 
 

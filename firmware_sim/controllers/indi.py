@@ -18,8 +18,7 @@ from firmware_sim.commander import setpoint as sp
 from firmware_sim.controllers import layout as mem
 from firmware_sim.controllers import parameters as pm
 from firmware_sim.controllers import variables as lv
-from firmware_sim.controllers.indi_position import indi_position_step
-from firmware_sim.controllers.low_pass import butterworth, design
+from firmware_sim.controllers.indi_position import butterworth, design, indi_position_step
 from firmware_sim.controllers.pid import position_step, wrap
 from firmware_sim.controllers.power_distribution import to_int
 from firmware_sim.kernel import kernel

@@ -3,6 +3,7 @@
 G [roll, pitch, T] = acceleration that is missing, with G the derivative of the thrust's acceleration by roll and pitch
 (at hover) and by thrust. K_THR [m/s^2 a unit] is compiled in: a drone of another mass only has another loop gain.
 Axes: x forward, y right, z down. A place's velocity and acceleration are ignored, and velocities count as the world's.
+Both loops filter by filter.h, init_butterworth_2_low_pass, direct form I.
 """
 
 import math
@@ -13,10 +14,32 @@ from firmware_sim.commander import setpoint as sp
 from firmware_sim.controllers import layout as mem
 from firmware_sim.controllers import parameters as pm
 from firmware_sim.controllers import variables as lv
-from firmware_sim.controllers.low_pass import butterworth
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.ground import GRAVITY
+from firmware_sim.plant.rigid_body import GRAVITY
+
+QUALITY = 0.7071  # of the filter; as in the source, not 1/sqrt(2)
+
+
+@kernel
+def design(memory, o, cutoff, rate):
+    """Coefficients a1, a2, b0 into memory[o:o+3]; cutoff and rate in Hz. b1 = 2 b0, b2 = b0."""
+    k = math.tan(math.pi * cutoff / rate)
+    poly = k * k + k / QUALITY + 1.0
+    memory[o] = 2.0 * (k * k - 1.0) / poly
+    memory[o + 1] = (k * k - k / QUALITY + 1.0) / poly
+    memory[o + 2] = k * k / poly
+
+
+@kernel
+def butterworth(memory, c, o, value):
+    """One step: coefficients memory[c:c+3], the last two inputs and outputs in memory[o:o+4]. Returns the output."""
+    a1, a2, b0 = memory[c], memory[c + 1], memory[c + 2]
+    out = b0 * (value + 2.0 * memory[o] + memory[o + 1]) - a1 * memory[o + 2] - a2 * memory[o + 3]
+    memory[o + 1], memory[o] = memory[o], value
+    memory[o + 3], memory[o + 2] = memory[o + 2], out
+    return out
+
 
 K_THR = 0.00024730  # m/s^2 a unit of thrust
 ACT_DYN = 0.03149  # of the thrust, a step; ctrlINDI.act_dyn_* does not reach it

@@ -26,8 +26,8 @@ from firmware_sim.controllers.attitude import (
 )
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.ground import GRAVITY
 from firmware_sim.plant.quaternion import matrix, roll_pitch_yaw
+from firmware_sim.plant.rigid_body import GRAVITY
 
 DT = 0.002  # s
 MANUAL_THRUST = 0.07 * 9.81  # N at full stick (70 g, controller_lee.c)

@@ -19,8 +19,8 @@ from firmware_sim.controllers.attitude import align, desired_yaw, from_angles, r
 from firmware_sim.controllers.power_distribution import to_int
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.ground import GRAVITY
 from firmware_sim.plant.quaternion import matrix, roll_pitch_yaw
+from firmware_sim.plant.rigid_body import GRAVITY
 
 DT = 0.002  # s
 LIMIT = 32000.0  # PWM units of roll, pitch and yaw

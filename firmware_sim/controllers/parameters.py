@@ -15,7 +15,7 @@ _WHOLE_GROUPS = (
 _PID = ("pid_attitude", "pid_rate", "posCtlPid", "velCtlPid")
 _GAINS = ("kp", "ki", "kd", "kff")
 
-# The out-of-tree controller: what it believes, and the weights of its cost (lqg_design.py).
+# The out-of-tree controller: what it believes, and the weights of its cost (lqg.py).
 _LQG: dict[str, float] = {
     "ctrlLqg.mass": 0.029,
     "ctrlLqg.J_x": 1.657171e-5,

@@ -15,8 +15,8 @@ from firmware_sim.controllers import variables as lv
 from firmware_sim.controllers.attitude import desired_yaw
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.ground import GRAVITY
 from firmware_sim.plant.quaternion import roll_pitch_yaw
+from firmware_sim.plant.rigid_body import GRAVITY
 from firmware_sim.plant.sensors import low_pass
 
 # The twelve regulators, each with four memories (integral, previous measurement, derivative filter) and four gains.

@@ -17,8 +17,8 @@ from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.motion import origin
 from firmware_sim.plant.effects.sensing import seen_pose
-from firmware_sim.plant.ground import GRAVITY
 from firmware_sim.plant.quaternion import matrix, turn
+from firmware_sim.plant.rigid_body import GRAVITY
 
 
 @kernel

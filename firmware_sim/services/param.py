@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 
 from firmware_sim.services.log import toc_reply
-from firmware_sim.services.storage import Storage
+from firmware_sim.services.memory import Storage
 from firmware_sim.tables import SIZE, Item, Table, pack, unpack
 from firmware_sim.wire import EACCES, EINVAL, ENOENT
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from crazyem.kernel_cache import kernel as compiled
+from crazyem.compiled import kernel as compiled
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 

@@ -3,7 +3,7 @@
 import struct
 
 from crazyem.recordings.mcap.writer import RecordingWriter
-from crazyem.signals.packet import Block, Packet, Variable
+from crazyem.signals.sample import Block, Packet, Variable
 
 MAGIC = b"\x89MCAP0\r\n"
 

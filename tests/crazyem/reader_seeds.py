@@ -56,7 +56,7 @@ def _long() -> bytes:
 
 def _ours(path: Path) -> bytes:
     from crazyem.recordings.mcap.writer import RecordingWriter
-    from crazyem.signals.packet import Block, Packet, Variable
+    from crazyem.signals.sample import Block, Packet, Variable
 
     block = Block(3, tuple(Variable(f"stateEstimate.{v}", "float") for v in ("x", "y", "z", "vx", "vy", "vz")), 10)
     with RecordingWriter(path, {"configuration": {"window": "800"}}) as writer:

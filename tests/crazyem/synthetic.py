@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crazyem.kernel_cache import kernel
+from crazyem.compiled import kernel
 
 G = 9.81  # m/s^2
 # rad/s of the dither, three sines each about x, y and z; out of step with each other

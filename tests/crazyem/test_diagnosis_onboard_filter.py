@@ -15,7 +15,7 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.physics.effects.effect import Situation
-from crazyem.physics.effects.onboard_filter import filtered
+from crazyem.physics.effects.onboard_estimate import filtered
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.recording import Recording
 

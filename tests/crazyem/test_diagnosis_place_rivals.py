@@ -15,7 +15,7 @@ from crazyem.diagnosis.naming import place_rivals
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.effect import Body
-from crazyem.physics.effects.force_by_place import FORCE_BY_PLACE, pulling
+from crazyem.physics.effects.external_force import FORCE_BY_PLACE, pulling
 from crazyem.vehicle import Vehicle
 
 AIR = ("wind", "ground_effect", "linear_drag")

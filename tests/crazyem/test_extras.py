@@ -19,8 +19,7 @@ from crazyem.live.foxglove import sdk
 from crazyem.paper.figures import draw_all
 from crazyem.recordings.autopilots import ulog_file
 from crazyem.recordings.ros import rosbag2_file
-from crazyem.simulators.documents.toml import TomlDocument
-from crazyem.simulators.documents.yaml import YamlDocument
+from crazyem.simulators.documents.tables import TomlDocument, YamlDocument
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

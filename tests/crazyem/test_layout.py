@@ -16,7 +16,7 @@ from crazyem.recordings.mcap.layout import foxglove_layout, swarm_layout, topics
 from crazyem.recordings.mcap.messages import EVENT_TOPICS
 from crazyem.recordings.mcap.signals import write_recording
 from crazyem.recordings.mcap.survey import from_summary
-from crazyem.signals.packet import Block, Variable
+from crazyem.signals.sample import Block, Variable
 from crazyem.signals.vocabulary import MOTOR_BLOCK, ROTOR_SPEED_BLOCK, block_plan
 
 PATH = re.compile(r"(?P<topic>(?:/\w+)+)\.(?P<fields>.+)")

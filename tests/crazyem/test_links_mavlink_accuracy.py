@@ -14,7 +14,7 @@ from crazyem.estimation.online import ATTITUDE_PERIOD, OnlineEstimator
 from crazyem.links.mavlink import streams
 from crazyem.links.mavlink.frames import FrameParser
 from crazyem.links.mavlink.stamps import DroneClock
-from crazyem.signals.packet import Packet
+from crazyem.signals.sample import Packet
 from crazyem.signals.vocabulary import decoders
 from crazyem.vehicle import load_vehicle
 from firmware_sim.firmware import Firmware

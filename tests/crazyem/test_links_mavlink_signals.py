@@ -16,7 +16,7 @@ from crazyem.links.mavlink.frames import FrameParser, definitions
 from crazyem.links.mavlink.motors import ARDUPILOT, PX4, Outputs
 from crazyem.recordings import open_recording
 from crazyem.signals.mavlink import MAPPINGS, mapping
-from crazyem.signals.packet import Packet
+from crazyem.signals.sample import Packet
 from crazyem.signals.vocabulary import MAVLINK_SOURCES, BlockDecoder
 
 # half a turn about x, written out

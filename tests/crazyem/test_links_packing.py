@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from crazyem.errors import UsageError
 from crazyem.links.packing import MAX_BLOCKS, MAX_BYTES, MAX_VARIABLES, pack, period_of
-from crazyem.signals.packet import CTYPE_SIZES
+from crazyem.signals.sample import CTYPE_SIZES
 from crazyem.signals.vocabulary import IMU_BLOCK, MOTOR_BLOCK, STATE_BLOCK
 
 TYPES = {

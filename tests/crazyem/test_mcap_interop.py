@@ -207,7 +207,7 @@ def test_kill_9_loses_only_what_was_not_flushed(tmp_path):
         import sys, time
         sys.path.insert(0, {str(ROOT)!r})
         from crazyem.recordings.mcap.writer import RecordingWriter
-        from crazyem.signals.packet import Block, Packet, Variable
+        from crazyem.signals.sample import Block, Packet, Variable
         writer = RecordingWriter({str(path)!r})
         writer.blocks((Block(0, (Variable("pm.vbat", "float"),), 10),))
         for k in range(300):

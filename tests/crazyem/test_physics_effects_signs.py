@@ -8,7 +8,7 @@ from effects_cases import CF2, ROTORS, G, still, wild
 from scipy.spatial.transform import Rotation
 
 from crazyem.physics.effects.effect import Effects, Situation
-from crazyem.physics.effects.rotor_inertia import TYPICAL_ROTOR_CONSTANT
+from crazyem.physics.effects.rotors import TYPICAL_ROTOR_CONSTANT
 from crazyem.physics.motion import RotorInput, measured, motion, rotor_thrust
 from crazyem.physics.rotations import axes, rotation_between
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from crazyem.physics.effects.effect import Effects
-from crazyem.physics.effects.fused_attitude import CORRECTION_SECONDS, attitude_error, disturbs_attitude
+from crazyem.physics.effects.onboard_estimate import CORRECTION_SECONDS, attitude_error, disturbs_attitude
 from crazyem.physics.motion import measured
 
 TURNING = 9.0  # rad/s: of the rates that turn to and fro

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from crazyem.physics.effects.sampled_commands import MODES, shrunk
+from crazyem.physics.effects.timing import MODES, shrunk
 from crazyem.physics.motion import RotorInput, rotor_thrust
 from crazyem.vehicle import load_vehicle
 

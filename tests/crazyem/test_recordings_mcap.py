@@ -14,7 +14,7 @@ from crazyem.links.base import ParameterWrite
 from crazyem.recordings import open_recording
 from crazyem.recordings.mcap.schemas import BlockCodec
 from crazyem.recordings.mcap.writer import RecordingWriter
-from crazyem.signals.packet import Block, Packet, Variable
+from crazyem.signals.sample import Block, Packet, Variable
 from crazyem.signals.vocabulary import decoders
 
 

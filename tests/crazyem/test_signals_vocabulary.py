@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from crazyem.recordings import open_recording
-from crazyem.signals.packet import Block, Packet, Variable
-from crazyem.signals.sample import SIGNALS, Sample
+from crazyem.signals.sample import SIGNALS, Block, Packet, Sample, Variable
 from crazyem.signals.vocabulary import (
     DUTY_SOURCES,
     IMU_BLOCK,

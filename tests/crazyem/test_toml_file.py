@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from crazyem.control.waypoints import read_waypoints
+from crazyem.control.named_trajectories import read_waypoints
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.live.policy import load_policy
 from crazyem.live.swarm import read_swarm

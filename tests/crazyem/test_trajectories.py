@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from crazyem.control.named_trajectories import waypoints
 from crazyem.control.trajectories import EXCITE_X, EXCITE_Y, EXCITE_YAW, EXCITE_Z, excite, figure8, hover, smooth_step
-from crazyem.control.waypoints import waypoints
 from crazyem.errors import FileFormatError, UsageError
 
 HOME = (0.2, -0.1, 1.0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from synthetic import matrix, turned
 
-from crazyem.kernel_cache import kernel
+from crazyem.compiled import kernel
 
 G = 9.81  # m/s^2
 MASS, INERTIA = 0.18, np.array([2.5e-4, 3.1e-4, 2.0e-4])  # kg, kg m^2

@@ -8,7 +8,7 @@ from scipy.signal import bilinear, butter, freqz, lfilter, lfilter_zi
 from scipy.spatial.transform import Rotation
 
 from firmware_sim.commander import setpoint as sp
-from firmware_sim.controllers import indi, low_pass
+from firmware_sim.controllers import indi, indi_position
 from firmware_sim.controllers import layout as mem
 from firmware_sim.controllers import parameters as pm
 from firmware_sim.controllers import variables as lv
@@ -31,8 +31,8 @@ QUIET = {"noise": {"thrust": 0.0, "torque": 0.0}}
 def test_the_low_pass_is_scipys_butterworth(cutoff: float) -> None:
     """But for a quality of 0.7071 where sqrt(1/2) is meant: 1e-5."""
     memory, given = np.zeros(7), np.random.default_rng(0).standard_normal(400)
-    low_pass.design(memory, 0, cutoff, RATE)
-    out = np.array([low_pass.butterworth(memory, 0, 3, value) for value in given])
+    indi_position.design(memory, 0, cutoff, RATE)
+    out = np.array([indi_position.butterworth(memory, 0, 3, value) for value in given])
     b, a = butter(2, cutoff, fs=RATE)
     assert memory[:3] == pytest.approx([a[1], a[2], b[0]], rel=2e-5)
     assert out == pytest.approx(lfilter(b, a, given), abs=2e-5)
@@ -40,7 +40,7 @@ def test_the_low_pass_is_scipys_butterworth(cutoff: float) -> None:
 
 def test_the_low_pass_halves_the_power_at_its_cutoff_and_leaves_what_stands_still() -> None:
     memory = np.zeros(7)
-    low_pass.design(memory, 0, 8.0, RATE)
+    indi_position.design(memory, 0, 8.0, RATE)
     a1, a2, b0 = memory[:3]
     response = freqz([b0, 2 * b0, b0], [1.0, a1, a2], worN=[0.0, 8.0], fs=RATE)[1]
     assert np.abs(response) == pytest.approx([1.0, math.sqrt(0.5)], rel=2e-5)

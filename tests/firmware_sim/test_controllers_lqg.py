@@ -6,7 +6,7 @@ import pytest
 
 from firmware_sim.commander import setpoint as sp
 from firmware_sim.controllers import layout as mem
-from firmware_sim.controllers import lqg_design, parameters, variables
+from firmware_sim.controllers import lqg, parameters, variables
 from firmware_sim.controllers.lee import lee_step
 from firmware_sim.controllers.lqg import lqg_step
 from firmware_sim.plant import layout as at
@@ -18,8 +18,8 @@ WEIGHTS = {name: DEFAULTS[f"ctrlLqg.{name}"] for name in parameters.LQG_WEIGHTS}
 def test_gains_are_those_of_python_control() -> None:
     tau = WEIGHTS["tau"]
     A = np.array([[0, 1, 0], [0, 0, 1], [0, 0, -1 / tau]])
-    system = control.c2d(control.ss(A, [[0], [0], [1 / tau]], np.eye(3), np.zeros((3, 1))), lqg_design.DT)
-    gains = lqg_design.design(**WEIGHTS)
+    system = control.c2d(control.ss(A, [[0], [0], [1 / tau]], np.eye(3), np.zeros((3, 1))), lqg.DT)
+    gains = lqg.design(**WEIGHTS)
     assert gains is not None
     for start, q, q_rate, r in ((2, "q_att", "q_rate", "r_ang"), (5, "q_yaw", "q_yawrate", "r_yaw")):
         K, _, poles = control.dlqr(system, np.diag([WEIGHTS[q], WEIGHTS[q_rate], 0.0]), [[WEIGHTS[r]]])
@@ -28,7 +28,7 @@ def test_gains_are_those_of_python_control() -> None:
 
 
 def test_position_gains_approach_the_continuous_closed_form() -> None:
-    gains = lqg_design.design(**WEIGHTS)
+    gains = lqg.design(**WEIGHTS)
     assert gains is not None
     kp = np.sqrt(WEIGHTS["q_pos"] / WEIGHTS["r_acc"])  # double integrator: k1 = sqrt(q1/r), k2 = sqrt(q2/r + 2 k1)
     assert gains[:2] == pytest.approx([kp, np.sqrt(WEIGHTS["q_vel"] / WEIGHTS["r_acc"] + 2 * kp)], rel=0.02)
@@ -36,14 +36,14 @@ def test_position_gains_approach_the_continuous_closed_form() -> None:
 
 @pytest.mark.parametrize("bad", [{"tau": 0.0}, {"r_acc": -1.0}, {"q_pos": float("nan")}, {"r_ang": 0.0}])
 def test_senseless_weights_have_no_gains(bad: dict) -> None:
-    assert lqg_design.design(**(WEIGHTS | bad)) is None
+    assert lqg.design(**(WEIGHTS | bad)) is None
 
 
 def one_step(step, changes: dict) -> np.ndarray:  # type: ignore[no-untyped-def]
     """Force and torque of one controller step for a tilted, turning, displaced drone."""
     param = np.array([(DEFAULTS | changes)[name] for name in parameters.PARAMETER_NAMES])
     memory, log = np.zeros(mem.MEMORY_SIZE), np.zeros(len(variables.ALL_VARIABLES))
-    memory[mem.LQG_GAIN_POS : mem.LQG_GAIN_POS + 8] = lqg_design.design(**WEIGHTS)
+    memory[mem.LQG_GAIN_POS : mem.LQG_GAIN_POS + 8] = lqg.design(**WEIGHTS)
     setpoint, estimate, sensor = sp.null_setpoint(), np.zeros(at.ESTIMATE_SIZE), np.zeros(at.SENSOR_SIZE)
     setpoint[sp.MODE_X : sp.MODE_Z + 1] = setpoint[sp.MODE_YAW] = sp.ABSOLUTE
     setpoint[sp.X : sp.X + 3] = 0.1, -0.2, 0.3

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from firmware_sim.controllers.tick import plant_step
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.noise import NoiseSource
 from firmware_sim.plant.quaternion import compress
 from firmware_sim.plant.rotors import lag, wrench
+from firmware_sim.plant.sensors import NoiseSource
 from firmware_sim.scenario import Scenario, parse_scenario
 
 QUIET = {"noise": {"thrust": 0.0, "torque": 0.0}, "ground": {"height": -1000.0}}

@@ -180,7 +180,7 @@ def test_boot_console_text_and_splitting():
     assert all(p.port == wire.CONSOLE and len(p.data) <= 30 for p in rest)
     text = "".join(p.data.decode() for p in rest)
     assert "up and running" in text
-    from firmware_sim.services.console import text_chunks
+    from firmware_sim.services.ports import text_chunks
 
     assert [chunk.decode() for chunk in text_chunks("ä" * 20)] == ["ä" * 15, "ä" * 5]
 

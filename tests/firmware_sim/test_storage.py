@@ -8,7 +8,7 @@ from service_client import Client
 
 from firmware_sim import contents
 from firmware_sim.errors import ServerError
-from firmware_sim.services.storage import Storage
+from firmware_sim.services.memory import Storage
 
 STORE, STATE, CLEAR, DEFAULT = b"\x03", b"\x04", b"\x05", b"\x08"
 NAME = "kalman.dragB_x"

@@ -63,7 +63,7 @@ SEVERAL = 3  # recordings whose commands are known, from which on each has a thr
 # Standard deviations that no scatter shows. An attitude 1 ms late is a force that goes with the velocity, 3e-4 N s/m of
 # drag along the quicker axis of a figure 8 (mass * (3.1 rad/s)^2 * 1 ms); along z thrust is a little wrong; a gyro's
 # bias walks; a slope of thrust came out 0.02 too large; how fast fixes draw an attitude back that is made of a late
-# gyro (physics/effects/fused_attitude.py) is roughly known. Found at these sizes in drones with known ones.
+# gyro (physics/effects/onboard_estimate.py) is roughly known. Found at these sizes in drones with known ones.
 SYSTEMATIC = {
     ("thrust_curve", "slope_error"): 0.02,
     ("measurement_delay", "delay"): 1.5e-3,

@@ -17,7 +17,7 @@ from crazyem.diagnosis.fitting.nuisances import refine_base, solved, without
 from crazyem.diagnosis.locating.locate import AXES, Finding
 from crazyem.diagnosis.locating.place import NATS, left_by_place, slope_finding
 from crazyem.diagnosis.naming.trials import TOLD, Selection, scatter
-from crazyem.physics.effects.force_by_place import FORCE_BY_PLACE
+from crazyem.physics.effects.external_force import FORCE_BY_PLACE
 
 IMITATE = ("wind", "ground_effect")
 FORCE = Candidate(FORCE_BY_PLACE.name, (), tuple(p.name for p in FORCE_BY_PLACE.parameters))

@@ -17,7 +17,7 @@ from crazyem.links.mavlink.parameters import ParameterClient
 from crazyem.links.mavlink.receiver import Receiver
 from crazyem.links.mavlink.sender import ACCEPTED, MessageSender
 from crazyem.links.mavlink.transport import open_transport, parse
-from crazyem.signals.packet import Block, Packet
+from crazyem.signals.sample import Block, Packet
 
 # s of listening after streams were asked for; at most, if something is missing
 _LISTEN_SECONDS, _LONGEST_LISTEN_SECONDS = 0.7, 5.0

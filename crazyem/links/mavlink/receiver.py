@@ -20,7 +20,7 @@ from crazyem.links.mavlink.frames import Frame, FrameParser, SequenceCounter, nu
 from crazyem.links.mavlink.sender import MessageSender
 from crazyem.links.mavlink.stamps import DroneClock, RestartedError
 from crazyem.links.mavlink.transport import Peer
-from crazyem.signals.packet import Block, Packet
+from crazyem.signals.sample import Block, Packet
 
 SILENT_AFTER = 2.0  # s
 _BEAT_EVERY, _TIME_EVERY = 1.0, 1.0  # s

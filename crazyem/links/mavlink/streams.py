@@ -10,7 +10,7 @@ from typing import Any
 
 from crazyem.links.mavlink.motors import Outputs
 from crazyem.signals.mavlink import BATTERY, INFO, MAPPINGS, OUTPUTS, ROTORS
-from crazyem.signals.packet import Block, Variable
+from crazyem.signals.sample import Block, Variable
 
 # Bits of the Crazyflie's supervisor, which everything above understands.
 CAN_ARM, ARMED, AUTO_ARM, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << i for i in range(8))

@@ -15,6 +15,8 @@ LINEAR_DRAG = Effect(
     "linear_drag",
     tuple(Parameter(axis, "N s/m", 0.0, 0.0, 0.5, 1e-3) for axis in "xyz"),
     order=60,
+    constants={a: f"drag_{a}" for a in "xyz"},
+    about=("drag",),
     external=linear_force,
     couples_air=True,
     # usual: an attitude 1 ms late is a force of 3e-4 N s/m; along z thrust is a little wrong (`fitting/nuisances.py`)
@@ -35,6 +37,8 @@ QUADRATIC_DRAG = Effect(
     "quadratic_drag",
     tuple(Parameter(axis, "N s^2/m^2", 0.0, 0.0, 0.1, 5e-4) for axis in "xyz"),
     order=61,
+    constants={a: f"quadratic_drag_{a}" for a in "xyz"},
+    about=("quadratic",),
     external=quadratic_force,
     couples_air=True,
     prior=Prior(alike("x y z", 0.012), in_turn("x y z", 3e-4, 3e-4, 1e-3)),  # usual: as that of a linear drag
@@ -80,6 +84,8 @@ RATE_DAMPING = Effect(
     "rate_damping",
     tuple(Parameter(axis, "N m s", 0.0, 0.0, 1e-3, 2e-6) for axis in "xyz"),
     order=63,
+    constants={a: f"damping_{a}" for a in "xyz"},
+    about=("damping",),
     external=damping,
     prior=Prior(alike("x y z", 2e-5), _sampled),
     needs=("body_rate", "attitude"),

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.prior import Prior
+from crazyem.vehicle import Vehicle
 
 Values = Mapping[str, Any]  # one effect: parameter -> value
 Effects = Mapping[str, Values]  # effect -> its parameters; as in a vehicle file
@@ -123,7 +124,7 @@ class Situation:
         seen: (n, 3) m/s^2, body: specific force that the drone was seen to have in each step, NaN where it was not;
             None: not known. An effect may go by rows before its own only.
         unrest: (3,) m/s^2 sqrt(s): how much of it comes and goes at random.
-        fused: whether the attitude that is shown was made on board, from the gyro (`fused_attitude.py`).
+        fused: whether the attitude that is shown was made on board, from the gyro (`onboard_estimate.py`).
     """
 
     time: NDArray
@@ -227,6 +228,11 @@ class Effect:
         prior: how large its parameters are.
         random: (spread (6,) m/s^2 and rad/s^2, body axes, and memory s of a disturbance; mass kg; drag N s/m, NaN where
             unknown) -> parameters: of an effect that is a random process and adds nothing to the mean motion.
+        gain: "thrust" or "torque" where its one parameter multiplies that of all rotors.
+        own: vehicle -> values of the parameters whose neutral value is the vehicle's.
+        constants: parameter -> the constant of a simulator's file that is the same (`simulators/constants.py`).
+        about: constants of simulators' files that look wrong without it, the nearest first.
+        controllers: whether a controller of the firmware has a parameter for it, which the online estimator has not.
     """
 
     name: str
@@ -257,6 +263,11 @@ class Effect:
     belongs_to: str = "vehicle"
     prior: Prior = field(default_factory=Prior)
     random: Callable[..., dict[str, float]] | None = None
+    gain: str = ""
+    own: Callable[[Vehicle], dict[str, float]] | None = None
+    constants: Mapping[str, str] = field(default_factory=dict)
+    about: tuple[str, ...] = ()
+    controllers: bool = False
 
     def said(self, values: Values) -> str:
         """The effect in words, with those of its values that say which: "rotor fault of rotor 3"."""

@@ -21,7 +21,7 @@ from crazyem.recordings.mcap.stream_codec import (
 from crazyem.recordings.mcap.survey import Part, parse
 from crazyem.recordings.recording import Event, SignalArray
 from crazyem.recordings.tables import Table
-from crazyem.signals.packet import Block
+from crazyem.signals.sample import Block
 
 _PLACES_PER_MESSAGE = MOST_SIGNALS + 1  # places in the processing order for each message of a stream
 _KINDS = {schema: kind for kind, (_, schema) in EVENT_TOPICS.items()}

@@ -13,7 +13,7 @@ from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-from crazyem.signals.packet import Block, Packet, Variable
+from crazyem.signals.sample import Block, Packet, Variable
 
 _F = descriptor_pb2.FieldDescriptorProto
 _TYPES = {

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.recordings.mcap import schemas
-from crazyem.signals.packet import Block
+from crazyem.signals.sample import Block
 
 MOST_SIGNALS = 60  # in one message, a bit each in `marked`
 MOST_FIELDS = 4096  # in one message; guards against metadata that claim anything

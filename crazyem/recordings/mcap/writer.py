@@ -25,8 +25,7 @@ from crazyem.recordings.mcap.messages import (
     versions,
 )
 from crazyem.recordings.mcap.output import Output
-from crazyem.signals.packet import Block, Packet
-from crazyem.signals.sample import Sample
+from crazyem.signals.sample import Block, Packet, Sample
 from crazyem.signals.vocabulary import BlockDecoder, decoders
 
 if TYPE_CHECKING:  # the recorder takes results and does not compute them

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from crazyem.simulators.constants import Constants, hover_speed
-from crazyem.simulators.documents.toml import TomlDocument
+from crazyem.simulators.documents.tables import TomlDocument
 from crazyem.simulators.fields import Field, Format
 from crazyem.simulators.plausible import RPM
 from crazyem.vehicle import GRAVITY
@@ -146,6 +146,7 @@ def _key(name: str) -> str:
 
 CRAZYFLOW = Format(
     name="crazyflow",
+    order=10,
     suffix=".toml",
     words="crazyflow's first-principles parameters (TOML)",
     open=TomlDocument,

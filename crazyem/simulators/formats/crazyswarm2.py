@@ -3,7 +3,7 @@
 Its own simulator takes no constants from here.
 """
 
-from crazyem.simulators.documents.yaml import YamlDocument
+from crazyem.simulators.documents.tables import YamlDocument
 from crazyem.simulators.fields import Field, Format
 
 
@@ -42,6 +42,7 @@ def _recognises(text: str) -> bool:
 
 CRAZYSWARM2 = Format(
     name="crazyswarm2",
+    order=60,
     suffix=".yaml",
     words="crazyswarm2's crazyflies.yaml",
     open=YamlDocument,

@@ -284,6 +284,7 @@ def _skeleton(name: str) -> str:
 
 GAZEBO = Format(
     name="gazebo",
+    order=40,
     suffix=".sdf",
     words="a Gazebo model (SDF)",
     open=XmlDocument,

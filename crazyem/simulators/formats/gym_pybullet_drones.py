@@ -96,6 +96,7 @@ def _skeleton(name: str) -> str:
 
 GYM_PYBULLET_DRONES = Format(
     name="gym-pybullet-drones",
+    order=20,
     suffix=".urdf",
     words="a URDF of gym-pybullet-drones",
     open=XmlDocument,

@@ -159,6 +159,7 @@ def _skeleton(name: str) -> str:
 
 L2F = Format(
     name="l2f",
+    order=90,
     suffix=".json",
     words="parameters of l2f (RAPTOR), JSON",
     open=LiteralDocument,

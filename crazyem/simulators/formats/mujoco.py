@@ -142,6 +142,7 @@ def _read_more(document: XmlDocument, name: str, found: dict[str, float]) -> lis
 
 MUJOCO = Format(
     name="mujoco",
+    order=30,
     suffix=".xml",
     words="a MuJoCo model (MJCF)",
     open=XmlDocument,

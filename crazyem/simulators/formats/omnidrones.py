@@ -7,7 +7,7 @@ import math
 
 from crazyem.errors import FileFormatError
 from crazyem.simulators.constants import Constants
-from crazyem.simulators.documents.yaml import YamlDocument
+from crazyem.simulators.documents.tables import YamlDocument
 from crazyem.simulators.fields import Field, Format
 from crazyem.simulators.layout import PLUS
 
@@ -86,6 +86,7 @@ def _skeleton(name: str) -> str:
 
 OMNIDRONES = Format(
     name="omnidrones",
+    order=80,
     suffix=".yaml",
     words="a drone's YAML of OmniDrones",
     open=YamlDocument,

@@ -3,7 +3,7 @@
 SIH has one drag and one damping for all axes. Of products of inertia Ixy and Ixz change their sign with the axes.
 """
 
-from crazyem.simulators.documents.params import ParamDocument
+from crazyem.simulators.documents.spliced import ParamDocument
 from crazyem.simulators.fields import Field, Format
 
 _CORNERS = ((1, 1), (-1, -1), (1, -1), (-1, 1))  # forward and right of PX4's rotors 1 to 4
@@ -54,6 +54,7 @@ def _skeleton(name: str) -> str:
 
 PX4_SIH = Format(
     name="px4-sih",
+    order=70,
     suffix="",
     words="PX4 SIH parameters",
     open=ParamDocument,

@@ -138,6 +138,7 @@ def _json(name: str) -> str:
 
 ROTORPY = Format(
     name="rotorpy",
+    order=50,
     suffix=".py",
     words="the parameters of a rotorpy vehicle (Python or JSON)",
     open=LiteralDocument,
@@ -149,7 +150,8 @@ ROTORPY = Format(
     source="rotorpy 3.0, vehicles/multirotor.py (Multirotor)",
 )
 ROTORPY_JSON = Format(
-    name="rotorpy-json", suffix=".json", words="the parameters of a rotorpy vehicle (JSON)", open=LiteralDocument,
+    name="rotorpy-json", order=100, suffix=".json", words="the parameters of a rotorpy vehicle (JSON)",
+    open=LiteralDocument,
     recognises=lambda text: False, fields=_fields, skeleton=_json, read_more=_read_more, write_more=_write_more,
     source=ROTORPY.source,
 )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.catalogue import EFFECTS, HIDDEN, Effect, Values
-from firmware_sim.plant.ground import GRAVITY
+from firmware_sim.plant.rigid_body import GRAVITY
 
 LOAD_FRICTION = 0.1  # 1/s, drag of the suspended load over its mass
 WIND_DRAG = 0.007  # N s/m: 0.92e-6 N s/m per rad/s of rotor speed (Foerster 2015), 7500 rad/s in sum at hover

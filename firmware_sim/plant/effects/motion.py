@@ -10,8 +10,8 @@ import numpy as np
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.air import air_forces, pull_cable
-from firmware_sim.plant.ground import GRAVITY, contact
 from firmware_sim.plant.quaternion import matrix
+from firmware_sim.plant.rigid_body import GRAVITY, contact
 
 
 @kernel

@@ -13,9 +13,8 @@ from firmware_sim.plant.effects.air import blow, vibrate
 from firmware_sim.plant.effects.drive import age, drive, remember
 from firmware_sim.plant.effects.motion import act, newton_euler, origin, still_forces, surroundings
 from firmware_sim.plant.effects.suspended_load import hang_still, pull_load, share_kick, straighten
-from firmware_sim.plant.ground import GRAVITY
 from firmware_sim.plant.quaternion import matrix, normalise
-from firmware_sim.plant.rigid_body import RATE_LIMIT, SPEED_LIMIT, body_step, rests
+from firmware_sim.plant.rigid_body import GRAVITY, RATE_LIMIT, SPEED_LIMIT, body_step, rests
 from firmware_sim.plant.rotors import battery_step, lag, wrench
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.motion import gyroscopic
-from firmware_sim.plant.ground import GRAVITY
+from firmware_sim.plant.rigid_body import GRAVITY
 
 SWING_LIMIT = 200.0  # 1/s; keeps absurd scenarios finite
 

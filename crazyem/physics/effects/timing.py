@@ -1,15 +1,103 @@
-"""measurement_delay: a stream of measurements shows the past."""
+"""sampled_commands, motor_lag, input_delay, measurement_delay: when commands act, and of when measurements tell.
 
+sampled_commands: a logged command stands for all that its loop sent until the next one. A loop at 500 Hz, logged at
+100 Hz, shows every fifth command. What is smooth in them acts as logged. What is new in a command, beyond what the ones
+before it led to expect, is in part noise of the loop: it acts for 2 ms and not for 10. So the torque that acts is the
+expected one and a share of what is new, as in a Kalman filter of constant gain
+
+    u = expected + (1 - share) (logged - expected),
+
+with one share for roll and pitch (tilt) and one for yaw (turn). The thrust of all rotors together is smooth.
+With all of it, torques look too weak (errors in the variables; Fuller, Measurement Error Models, 1987, ch. 1).
+It belongs to the log and not to the drone: `diagnose --method posterior` leaves it free for each recording.
+"""
+
+import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
-from crazyem.physics.effects.fused_attitude import attitude_error
-from crazyem.physics.effects.prior import Prior
+from crazyem.physics.effects.onboard_estimate import attitude_error
+from crazyem.physics.effects.prior import Logged, Prior, Sizes
 from crazyem.physics.effects.stretches import stretches
+from crazyem.physics.lag import PREDICTION_ORDER, fit_predictor
 from crazyem.physics.rotations import rotation_between
+from crazyem.physics.rotors import PITCH_SIGN, ROLL_SIGN, YAW_SIGN
+
+# Columns: all together, about x, about y, about z; orthonormal
+MODES = 0.5 * np.stack([np.ones(4), ROLL_SIGN, PITCH_SIGN, YAW_SIGN], axis=1)
+
+
+def shrunk(thrust: NDArray, *, tilt: float, turn: float, **_: Any) -> NDArray:
+    """Settled thrusts (m, 4) [N] less a share of the innovations of their torques about x and y, and about z."""
+    if not (tilt or turn) or len(thrust) <= PREDICTION_ORDER:
+        return thrust
+    modes = thrust @ MODES
+    weights = fit_predictor(np.ascontiguousarray(modes))
+    rows = len(modes) - PREDICTION_ORDER
+    expected = np.tile(weights[:, PREDICTION_ORDER], (rows, 1))
+    for j in range(PREDICTION_ORDER):
+        expected += weights[:, j] * modes[PREDICTION_ORDER - 1 - j :][:rows]
+    modes[PREDICTION_ORDER:] -= np.array([0.0, tilt, tilt, turn]) * (modes[PREDICTION_ORDER:] - expected)
+    return modes @ MODES.T
+
+
+SAMPLED_COMMANDS = Effect(
+    "sampled_commands",
+    (Parameter("tilt", "", 0.0, 0.0, 1.0, 0.05), Parameter("turn", "", 0.0, 0.0, 1.0, 0.05)),
+    order=21,
+    commanded=shrunk,
+    prior=Prior(usual={"tilt": 0.4, "turn": 0.4}),
+    needs=("motor_command",),
+    words="commands between samples",
+    belongs_to="recording",
+    separates="log motor commands at 500 Hz",
+)
+
+
+def slow(lag: float, delay: float, *, time_constant: float) -> tuple[float, float]:
+    """Replace the first-order lag of thrust [s]."""
+    return time_constant, delay
+
+
+def late(lag: float, before: float, *, delay: float) -> tuple[float, float]:
+    """The command of t acts at t + delay, before the lag [s]."""
+    return lag, before + delay
+
+
+def _clock(logged: Logged) -> Sizes:
+    """Between a stamp and its effect; stamps of measured speeds come by another way (`fitting/nuisances.py`)."""
+    return {"delay": 5e-3 if logged.measured else 2e-3 * logged.coarse}
+
+
+MOTOR_LAG = Effect(
+    "motor_lag",
+    (Parameter("time_constant", "s", math.nan, 0.0, 1.0, 2e-3),),
+    order=22,
+    own=lambda vehicle: {"time_constant": vehicle.motor_time_constant},
+    constants={"time_constant": "lag"},
+    about=("lag",),
+    timing=slow,
+    # usual: sixteen flights with nothing hidden came out 3.1 ms (rms) off (`fitting/nuisances.py`)
+    prior=Prior(own={"time_constant": 0.015}, usual=lambda logged: {"time_constant": 3e-3 * logged.coarse}),
+    needs=("motor_command",),
+    separates="log rotor speeds; or log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
+    spared={"rotor_speed": "log rotor speeds; or "},
+)
+
+INPUT_DELAY = Effect(
+    "input_delay",
+    (Parameter("delay", "s", 0.0, 0.0, 0.1, 1e-3),),
+    order=23,
+    timing=late,
+    prior=Prior(own={"delay": 8e-3}, usual=_clock),
+    needs=("motor_command", "rotor_speed"),
+    separates="log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
+)
+
 
 SHOWN = {  # which of position, velocity, attitude, rate, specific force a stream shows
     "state": ("position", "velocity", "attitude"),
@@ -19,12 +107,12 @@ SHOWN = {  # which of position, velocity, attitude, rate, specific force a strea
 }
 
 
-def late(situation: Situation, *, delay: float, streams: str | Sequence[str]) -> Offset:
+def shown_late(situation: Situation, *, delay: float, streams: str | Sequence[str]) -> Offset:
     """What was `delay` [s] ago, less what is now, for the streams "state", "pose", "gyro", "accelerometer".
 
     Interpolates between rows, which are one path broken where a step is 0 or longer than 0.1 s. Before the first row of
     a stretch the drone moved and turned as in that row. An attitude that was made on board of a late gyro is off where
-    the drone turns fast (`fused_attitude.py`). Of a filter's rates differences over some ms are half the noise
+    the drone turns fast (`onboard_estimate.py`). Of a filter's rates differences over some ms are half the noise
     of the gyro, that of the very sample which is to be explained; `Situation.turned` has none.
     """
     offset = Offset(np.zeros((situation.size, 12)), np.zeros((situation.size, 3)))
@@ -93,7 +181,7 @@ MEASUREMENT_DELAY = Effect(
         ),
     ),
     order=84,
-    measured=late,
+    measured=shown_late,
     prior=Prior(own={"delay": 0.012}),  # usual: see `onboard_filter`
     needs=("position", "velocity", "attitude", "body_rate", "specific_force"),
     belongs_to="recording",

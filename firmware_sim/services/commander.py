@@ -1,6 +1,7 @@
-"""Port 8, the high-level commander: decodes commands for the planner and turns its goals into setpoints.
+"""Ports 3, 7 and 8: setpoints, and the high-level commander, which turns its goals into setpoints.
 
-Source: crazyflie-firmware crtp_commander_high_level.c. Each command is answered with its first bytes and an error.
+Low-level setpoints (3, 7) and the notice that a stream of them has ended get no replies. Source of the high-level
+commander: crazyflie-firmware crtp_commander_high_level.c; each command is answered with its first bytes and an error.
 """
 
 import math
@@ -11,11 +12,48 @@ import numpy as np
 
 from firmware_sim import contents
 from firmware_sim.commander import setpoint as sp
+from firmware_sim.commander.decode import RpytDecoder, decode_generic
 from firmware_sim.commander.planner import Evaluation, Planner, PlannerState
 from firmware_sim.commander.polynomials import unpack_compressed, unpack_poly4d
+from firmware_sim.commander.setpoint import CRTP, Arbiter
 from firmware_sim.services.memory import TRAJECTORY_SIZE
 from firmware_sim.tables import Slot, slots
 from firmware_sim.wire import EBUSY, ENOEXEC
+
+SETPOINT, META = 0, 1
+NOTIFY_STOP = 0
+
+
+class SetpointService:
+    """Decodes setpoints and hands them to the arbiter, unless the supervisor does not allow flight."""
+
+    def __init__(self, arbiter: Arbiter, rpyt: RpytDecoder):
+        self._arbiter, self._rpyt = arbiter, rpyt
+
+    def handle_rpyt(self, channel: int, data: bytes, tick: int, *, allowed: bool) -> list[tuple[int, bytes]]:
+        """A packet on port 3: roll, pitch, yaw rate, thrust."""
+        if channel == 0 and len(data) >= 14 and allowed:
+            roll, pitch, yaw_rate, thrust = struct.unpack_from("<fffH", data)
+            setpoint = self._rpyt.decode(roll, pitch, yaw_rate, thrust, disabled=self._arbiter.disabled)
+            self._offer(setpoint, tick)
+        return []
+
+    def handle_generic(self, channel: int, data: bytes, tick: int, *, allowed: bool) -> list[tuple[int, bytes]]:
+        """A packet on port 7: a typed setpoint (channel 0) or a meta command (channel 1)."""
+        if channel == META:
+            if data[:1] == bytes((NOTIFY_STOP,)):
+                self._arbiter.relax()
+        elif channel == SETPOINT and data and allowed:
+            setpoint = decode_generic(data[0], data[1:])
+            if setpoint is not None:
+                self._offer(setpoint, tick)
+        return []
+
+    def _offer(self, setpoint: np.ndarray, tick: int) -> None:
+        """The firmware would fly into NaN; a simulator ignores what is not a number."""
+        if np.isfinite(setpoint).all():
+            self._arbiter.offer(setpoint, CRTP, tick)
+
 
 PERIOD = 10  # ms
 GROUP_MASK, TAKEOFF_V1, LAND_V1, STOP, GO_TO_V1, START_V1, DEFINE, TAKEOFF, LAND = 0, 1, 2, 3, 4, 5, 6, 7, 8

@@ -1,0 +1,97 @@
+"""onboard_filter, and the error of an attitude that is made on board of a late gyro.
+
+A gyro is low-passed before it is logged (crazyflie-firmware, sensors_bmi088_bmp3xx.c: second order at 80 Hz, 2.8 ms),
+and so are the accelerations that carry an onboard estimate of velocity from one fix of the pose to the next; attitude
+and position, which the fixes show, are later by less, but from one fix to the next an attitude is the sum of a late
+gyro. So rates are behind the attitude, velocities behind the position. It belongs to the log and not to the drone: no
+vehicle file needs it, and diagnosis leaves it free (`crazyem/diagnosis/fitting/nuisances.py`).
+
+The attitude integrates the gyro, and fixes of the pose draw it back, so its error e [rad, body axes] goes by
+
+    e' = r - e / T,    r: what the gyro shows less the rate that was [rad/s].
+
+T is that of the firmware's Kalman filter with a pose at 100 Hz; what a gyro's bias leads such attitudes to in simulated
+flights, the bias times T, says 0.038 to 0.043 s.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.compiled import compiled
+from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
+from crazyem.physics.effects.prior import Prior
+from crazyem.physics.effects.stretches import stretches
+from crazyem.vehicle import GRAVITY
+
+CORRECTION_SECONDS = 0.04  # s, T above
+MEMORY_SECONDS = 3.0 * CORRECTION_SECONDS  # s: what a gyro showed before is 5 % of an attitude's error
+
+
+@compiled
+def _relaxed(gap, broken, drive, time, out):
+    """e at every row, from drives (n, 3) that are the means over the steps that end there; 0 where a stretch begins."""
+    for k in range(len(gap)):
+        if broken[k]:
+            out[k] = 0.0
+            continue
+        left = np.exp(-gap[k] / time)
+        for i in range(3):
+            out[k, i] = left * out[k - 1, i] + time * (1.0 - left) * drive[k, i]
+
+
+def disturbs_attitude(values: Mapping[str, Any]) -> bool:
+    """Whether an effect with these values disturbs attitudes that are made on board."""
+    return "gyro" in values.get("streams", ()) or bool(values.get("rate_lag", 0.0))
+
+
+def attitude_error(situation: Situation, rate_error: NDArray, *, delay: float) -> NDArray:
+    """(n, 3) rad, body axes: how far an attitude made on board is off by a gyro's errors; 0 where it is not made so.
+
+    rate_error: (n, 3) rad/s at the rows, of a gyro that is `delay` [s] late. What it is at a row it has been since
+    `delay` after the row before: rates go straight from row to row.
+    """
+    out = np.zeros((situation.size, 3))
+    if not situation.fused or not situation.size:
+        return out
+    gap, broken = stretches(situation)
+    before = np.roll(rate_error, 1, axis=0)
+    before[broken] = 0.0
+    share = np.clip(0.5 * delay / np.where(gap > 0.0, gap, np.inf), 0.0, 0.5)[:, None]
+    drive = np.ascontiguousarray((1.0 - share) * rate_error + share * before, dtype=np.float64)
+    _relaxed(gap, broken, drive, CORRECTION_SECONDS, out)
+    return out
+
+
+def filtered(situation: Situation, *, rate_lag: float, velocity_lag: float, attitude_lag: float) -> Offset:
+    """The gyro shows w - rate_lag dw/dt, the estimate of velocity v - velocity_lag dv/dt, the attitude that of
+    attitude_lag before; lags in s."""
+    offset = Offset(np.zeros((situation.size, 12)), np.zeros((situation.size, 3)))
+    acceleration = np.einsum("nij,nj->ni", situation.rotation, situation.specific_force)
+    acceleration[:, 2] -= GRAVITY
+    offset.state[:, 3:6] = -velocity_lag * acceleration
+    offset.state[:, 9:12] = -rate_lag * situation.angular_acceleration
+    offset.state[:, 6:9] = attitude_error(situation, offset.state[:, 9:12], delay=max(rate_lag, 0.0))
+    offset.state[:, 6:9] -= attitude_lag * situation.body_rate
+    return offset
+
+
+ONBOARD_FILTER = Effect(
+    "onboard_filter",
+    (
+        Parameter("rate_lag", "s", 0.0, -0.02, 0.02, 1e-3),
+        Parameter("velocity_lag", "s", 0.0, -0.02, 0.02, 1e-3),
+        Parameter("attitude_lag", "s", 0.0, -0.02, 0.02, 1e-3, needs=("attitude",)),
+    ),
+    order=85,
+    measured=filtered,
+    # usual: 0.0 to 2.4 and 0.0 to 1.6 ms in 80 flights with nothing hidden (`fitting/nuisances.py`); attitudes 1.3 to
+    # 4.2 ms late in three more
+    prior=Prior(usual={"rate_lag": 1.3e-3, "velocity_lag": 7e-4, "attitude_lag": 2.5e-3}),
+    needs=("velocity", "body_rate"),
+    words="filters on board",
+    belongs_to="recording",
+    separates="log the pose of motion capture beside the onboard estimate",
+)
