@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from crazyem.api.diagnosing import Diagnosis, diagnose, predict
     from crazyem.api.flying import fly
+    from crazyem.api.planning import plan
     from crazyem.api.replaying import replay
     from crazyem.api.vehicles import VehicleCheck, check_vehicle, convert_vehicle, predict_ensemble, sample_vehicle
     from crazyem.diagnosis.prediction.predict import Prediction
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from crazyem.live.flight_result import FlightResult
     from crazyem.live.guard import Guard
     from crazyem.live.policy import Policy, load_policy
+    from crazyem.planning.plan import Plan
     from crazyem.recordings.contents import ReadOptions
     from crazyem.recordings.recording import Recording
     from crazyem.recordings.registry import open_recording
@@ -36,6 +38,7 @@ _HOME = {
     "FlightResult": "live.flight_result",
     "Guard": "live.guard",
     "OnlineEstimator": "estimation.online",
+    "Plan": "planning.plan",
     "Policy": "live.policy",
     "Prediction": "diagnosis.prediction.predict",
     "ReadOptions": "recordings.contents",
@@ -50,6 +53,7 @@ _HOME = {
     "load_policy": "live.policy",
     "load_vehicle": "vehicle",
     "open_recording": "recordings.registry",
+    "plan": "api.planning",
     "predict": "api.diagnosing",
     "predict_ensemble": "api.vehicles",
     "replay": "api.replaying",
@@ -63,6 +67,7 @@ __all__ = [
     "FlightResult",
     "Guard",
     "OnlineEstimator",
+    "Plan",
     "Policy",
     "Prediction",
     "ReadOptions",
@@ -79,6 +84,7 @@ __all__ = [
     "load_policy",
     "load_vehicle",
     "open_recording",
+    "plan",
     "predict",
     "predict_ensemble",
     "replay",

@@ -67,7 +67,11 @@ def parser() -> argparse.ArgumentParser:
     fly.add_argument("uri", nargs="?", metavar="URI", help="the drone; without it firmware_sim is started")
     fly.add_argument("--controller", choices=("lee", "mellinger", "indi", "lqg"), default="lee")
     fly.add_argument(
-        "--trajectory", nargs="+", default=["hover"], metavar="NAME", help="hover, figure8, excite, or waypoints FILE"
+        "--trajectory",
+        nargs="+",
+        default=["hover"],
+        metavar="NAME",
+        help="hover, figure8, excite, waypoints FILE, or plan FILE",
     )
     seconds = _number(1, 3600, " seconds")
     fly.add_argument("--duration", type=seconds, default=20.0, metavar="S", help="of the trajectory (default: 20)")
@@ -236,6 +240,35 @@ def _diagnose(commands: Any) -> None:
     _cutting(p)
 
 
+def _plan(commands: Any) -> None:
+    """Experiments."""
+    text = "the manoeuvre that most narrows intervals, or best tells two explanations apart; and what to expect of it"
+    p = commands.add_parser("plan", help=text, description=text)
+    goal = p.add_mutually_exclusive_group()
+    goal.add_argument(
+        "--for", dest="parameters", metavar="A,B,...", help="parameters to narrow (default: mass,Ixx,Iyy,Izz)"
+    )
+    goal.add_argument("--split", metavar="EFFECT,EFFECT", help="effects to tell apart")
+    goal.add_argument("--from", dest="diagnosis", metavar="DIAGNOSIS.json", help="tell its look-alikes apart")
+    p.add_argument("--vehicle", default="cf2", metavar="NAME|FILE", help="preset or vehicle file (default: cf2)")
+    p.add_argument(
+        "--box", type=_number(0.1, 20, " m"), nargs=3, default=(1.0, 1.0, 0.6), metavar=("X", "Y", "Z"),
+        help="full widths in m about the hover point (default: 1 1 0.6)",
+    )  # fmt: skip
+    p.add_argument("--tilt", type=_number(2, 45, " degrees"), default=20.0, metavar="DEG", help="at most (default: 20)")
+    p.add_argument("--time", type=_number(3, 300, " seconds"), default=10.0, metavar="S", help="(default: 10)")
+    p.add_argument(
+        "--criterion", choices=("D", "A"), default="D",
+        help="of --for: volume of the joint interval, or sum of relative variances (default: D)",
+    )  # fmt: skip
+    p.add_argument("--noise", metavar="FLIGHT.json", help="expect the noise of this flight or replay of the drone")
+    p.add_argument("--seed", type=_integer(0, 2**31 - 1), default=0, help="of the search (default: 0)")
+    p.add_argument("--json", nargs="?", const="-", metavar="FILE", help="for programs; without FILE on standard output")
+    p.add_argument(
+        "-o", "--output", required=True, metavar="PLAN.toml", help="what crazyem fly --trajectory plan flies"
+    )
+
+
 def _predict(commands: Any) -> None:
     """Open loop, for anyone's own metric."""
     text = "where a vehicle goes by its model: open-loop predictions from every recorded state, by recorded inputs"
@@ -369,6 +402,7 @@ def _on_recordings(commands: Any) -> None:
     writes(recover, "OUT.mcap", "the new file")
 
     _diagnose(commands)
+    _plan(commands)
     _predict(commands)
     _vehicle(commands)
     layout = command("layout", "a Foxglove and Lichtblick layout for recordings of ours", many=False)

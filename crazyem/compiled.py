@@ -100,6 +100,7 @@ _CALLS = {
     "physics": ("physics",),
     "estimation": ("physics", "estimation"),
     "control": ("control",),
+    "planning": ("planning",),
     "paper": ("control", "paper"),
     "diagnosis": ("physics", "estimation", "diagnosis"),
 }

@@ -32,12 +32,13 @@ ALLOWED: dict[str, set[str]] = {
     "recordings": {"vehicle", "compiled", "physics", "signals", "links", "estimation"},
     "doctor": {"vehicle", "physics", "signals", "recordings"},
     "diagnosis": {"vehicle", "compiled", "physics", "signals", "estimation", "recordings"},
+    "planning": {"vehicle", "compiled", "physics", "control", "estimation", "diagnosis"},
     "simulators": {"vehicle", "physics", "recordings", "diagnosis"},
     "paper": {"vehicle", "compiled", "physics", "signals", "control", "estimation"},
     "live": {"compiled", "vehicle", "physics", "signals", "control", "links", "estimation", "recordings"},
     "api": {
         *("vehicle", "physics", "signals", "control", "links", "estimation", "recordings", "doctor", "diagnosis"),
-        *("live", "simulators"),
+        *("live", "planning", "simulators"),
     },
     "commands": {
         *("vehicle", "physics", "signals", "control", "links", "estimation", "recordings", "doctor", "diagnosis"),
@@ -46,7 +47,7 @@ ALLOWED: dict[str, set[str]] = {
     "cli": {"commands"},
     "__main__": {"cli"},
     # the library's front door: lazily, on first use
-    "__init__": {"api", "diagnosis", "estimation", "live", "recordings", "signals", "vehicle"},
+    "__init__": {"api", "diagnosis", "estimation", "live", "planning", "recordings", "signals", "vehicle"},
 }
 
 # The same for the folders of the diagnosis, in the order in which data pass through them; `workers` serves all.

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
-from crazyem.control.trajectories import Reference, Trajectory, Vector, excite, figure8, hover
+from crazyem.control.plan_file import plan_trajectory, read_plan
+from crazyem.control.trajectories import MAX_ACCELERATION, Reference, Trajectory, Vector, excite, figure8, hover
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.toml_file import parse_toml, read_text
 
 DEFAULT_SPEED = 0.5  # m/s
-MAX_ACCELERATION = 8.0  # m/s^2; beyond this a Crazyflie runs out of thrust or of the setpoint's range
 MAX_POSITION = 32.767  # m, the range of a full-state setpoint
 WAYPOINT_COLUMNS = {"x", "y", "z", "yaw", "time", "speed"}
 
@@ -148,10 +148,10 @@ def trajectory_maker(words: Sequence[str], duration: float) -> TrajectoryMaker:
 
     Args:
         words: a name and what belongs to it.
-        duration: s; waypoints have their own.
+        duration: s; waypoints and plans have their own.
 
     Raises:
-        UsageError: an unknown name or a missing file name. FileFormatError: waypoints that cannot be used.
+        UsageError: an unknown name or a missing file name. FileFormatError: a file that cannot be used.
     """
     name, *rest = words
     if name == "waypoints":
@@ -159,14 +159,25 @@ def trajectory_maker(words: Sequence[str], duration: float) -> TrajectoryMaker:
             raise UsageError("--trajectory waypoints needs one FILE.")
         read_waypoints(rest[0])  # complain before anything is started
         return lambda position, yaw: waypoints(path=rest[0], position=position, yaw=yaw)
+    if name == "plan":
+        if len(rest) != 1:
+            raise UsageError("--trajectory plan needs one FILE.")
+        read = read_plan(rest[0])
+        return lambda position, yaw: plan_trajectory(read, path=rest[0], position=position, yaw=yaw)
     if name not in ("hover", "figure8", "excite") or rest:
-        raise UsageError(f"unknown trajectory '{' '.join(words)}' (hover, figure8, excite, or waypoints FILE).")
+        raise UsageError(
+            f"unknown trajectory '{' '.join(words)}' (hover, figure8, excite, waypoints FILE, or plan FILE)."
+        )
     return lambda position, yaw: _made(name, position, yaw, duration)
 
 
 def duration_note(words: Sequence[str], duration: float) -> str:
     """One line where the trajectory of these words takes another time than asked for, "" where it does not."""
-    made = duration if words[0] == "waypoints" else _made(words[0], (0.0, 0.0, DEFAULT_HEIGHT), 0.0, duration).duration
+    made = (
+        duration
+        if words[0] in ("waypoints", "plan")
+        else _made(words[0], (0.0, 0.0, DEFAULT_HEIGHT), 0.0, duration).duration
+    )
     if math.isclose(made, duration):
         return ""
     return f"{words[0]} flies whole periods and ends where it began: {made:g} s instead of {duration:g} s"

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 Vector = tuple[float, float, float]
+MAX_ACCELERATION = 8.0  # m/s^2; beyond this a Crazyflie runs out of thrust or of the setpoint's range
 
 
 @dataclass(frozen=True, slots=True)

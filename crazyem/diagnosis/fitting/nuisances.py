@@ -114,7 +114,7 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
     found: Nuisances = [(Candidate("input_delay", (), ("delay",), both_ways=True), (late**-2,))]
     if "body_rate" in data.signals or "attitude" in data.signals:
         coarse = coarsely_sampled(data, point)
-        share = COARSE_INERTIA_SD if coarse else np.hypot(INERTIA_SD, COARSE_INERTIA_SD * unlogged)
+        share = np.hypot(INERTIA_SD, COARSE_INERTIA_SD * (1.0 if coarse else unlogged))
         heavy = not coarse and not measured and point.effects.get("rotor_inertia", {}).get("inertia", 0.0) > 0.0
         if heavy:
             share = np.array([*share[:2], AT_ONCE_SD])
@@ -123,8 +123,8 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
         if not coarse:
             found.append((Candidate("torque_scale", (), ("scale",)), (TORQUE_SD**-2,)))
         if coarse or measured or heavy or unlogged > 0.0:
-            own = DAMPING_SD if measured or heavy else 0.0
-            tilting = COARSE_DAMPING_SD if coarse else math.hypot(own, COARSE_DAMPING_SD * unlogged)
+            usual = DAMPING_SD if measured or heavy else 0.0
+            tilting = COARSE_DAMPING_SD if coarse else math.hypot(usual, COARSE_DAMPING_SD * unlogged)
             turning = AT_ONCE_DAMPING_SD if heavy else tilting
             damped = Candidate("rate_damping", (), ("x", "y", "z"))
             found.append((damped, (tilting**-2, tilting**-2, turning**-2)))

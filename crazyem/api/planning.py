@@ -1,0 +1,123 @@
+"""Plan a flight that narrows intervals, or that tells two explanations apart."""
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from crazyem.api.inputs import VehicleLike, vehicle_of
+from crazyem.errors import FileFormatError, UsageError
+from crazyem.estimation.model import GROUPS, Noise, setup_for
+from crazyem.physics import folding
+from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.planning.limits import Limits
+from crazyem.planning.plan import DEFAULT, Plan, plan_parameters, plan_split
+from crazyem.toml_file import read_text
+from crazyem.vehicle import Vehicle
+
+LARGEST_JSON = 1 << 26  # bytes of a diagnosis or summary
+PROCESS = ("force_x", "force_y", "thrust", "torque_x", "torque_y", "torque_z")
+
+
+def plan(
+    vehicle: VehicleLike = "cf2",
+    *,
+    parameters: Sequence[str] = (),
+    split: tuple[str, str] | None = None,
+    diagnosis: str | Path | None = None,
+    box: tuple[float, float, float] = (1.0, 1.0, 0.6),
+    tilt: float = 20.0,
+    duration: float = 10.0,
+    criterion: str = "D",
+    noise: str | Path | None = None,
+    starts: int = 3,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> Plan:
+    """Plan the flight that tells most, within limits. Nothing is flown.
+
+    Args:
+        vehicle: what is flown, as far as known: a Vehicle, a preset's name or a file.
+        parameters: whose intervals are to become narrow; none of the three goals: mass, Ixx, Iyy, Izz.
+        split: two effects that are to be told apart.
+        diagnosis: JSON of a diagnosis: its first group of look-alikes is to be told apart.
+        box: m, full widths along x, y, z. tilt: deg. duration: s.
+        criterion: of parameters: "D" (volume of the joint interval) or "A" (sum of relative variances).
+        noise: JSON of an earlier flight or replay of the same drone, whose noise is expected again.
+        starts, seed: of the search; the same seed gives the same plan.
+        progress: told a line for each start.
+
+    Raises:
+        UsageError: arguments that do not fit; an unknown name. FileFormatError: a file that cannot be used.
+    """
+    say = progress or (lambda text: None)
+    if sum(map(bool, (parameters, split, diagnosis))) > 1:
+        raise UsageError("a plan has one goal: parameters, a pair to split, or a diagnosis.")
+    if criterion not in ("A", "D"):
+        raise UsageError(f"unknown criterion '{criterion}' (A or D).")
+    given = vehicle_of(vehicle)
+    limits = Limits(box=box, tilt=math.radians(tilt))
+    if not given.arm[0] or not given.torque_per_thrust:
+        raise UsageError(f"vehicle {given.name} has no rotors in its file, so nothing can be planned for it.")
+    pair = look_alikes(diagnosis)[0] if diagnosis is not None else split
+    if pair is not None:
+        return plan_split(*pair, given, limits, duration=duration, starts=starts, seed=seed, say=say)
+    nominal, _ = folding.fold(given)
+    scales = None if noise is None else noise_of(noise, nominal)
+    return plan_parameters(
+        tuple(parameters) or DEFAULT, nominal, limits, duration=duration, criterion=criterion, noise=scales,
+        starts=starts, seed=seed, say=say,
+    )  # fmt: skip
+
+
+def look_alikes(path: str | Path) -> list[tuple[str, str]]:
+    """Pairs of effects that a diagnosis could not tell apart, from its JSON.
+
+    Raises:
+        UsageError: no such file, or nothing is left to be told apart. FileFormatError: the file is no diagnosis.
+    """
+    data = _json(path, "diagnosis")
+    groups = data.get("indistinguishable") if data.get("format") == "crazyem-diagnosis" else None
+    if not isinstance(groups, list):
+        raise FileFormatError(f"{path}: not a diagnosis: no key 'indistinguishable'.")
+    pairs = [
+        (group[0], other) for group in groups if isinstance(group, list) for other in group[1:]
+        if group[0] in CATALOGUE and other in CATALOGUE and group[0] != other
+    ]  # fmt: skip
+    if not pairs:
+        raise UsageError(f"{path}: the diagnosis leaves no effects that could be told apart.")
+    return pairs
+
+
+def noise_of(path: str | Path, vehicle: Vehicle) -> Noise:
+    """Noise scales from the summary of a flight or replay, in the estimator's units of acceleration.
+
+    Raises:
+        UsageError: no such file. FileFormatError: the file has no noise.
+    """
+    data = _json(path, "summary")
+    estimate = data.get("estimate", data)
+    table = estimate.get("noise") if isinstance(estimate, dict) else None
+    keys = (*PROCESS, *GROUPS[:4])
+    if not isinstance(table, dict) or not all(
+        isinstance(table.get(k), int | float) and 0 < table[k] < math.inf for k in keys
+    ):
+        raise FileFormatError(f"{path}: no noise scales ({', '.join(keys)}) of a flight.")
+    body = np.array([vehicle.mass] * 3 + list(vehicle.inertia))
+    sensors = [float(table[k]) for k in GROUPS[:4]]
+    rest = setup_for(vehicle).prior.noise.measurement[4]
+    return Noise(np.array([float(table[k]) for k in PROCESS]) / body, np.array([*sensors, rest]))
+
+
+def _json(path: str | Path, what: str) -> dict[str, Any]:
+    text = read_text(path, what=what, largest=LARGEST_JSON)
+    try:
+        data = json.loads(text)
+    except (ValueError, RecursionError):
+        raise FileFormatError(f"{path}: not a {what}: no JSON.") from None
+    if not isinstance(data, dict):
+        raise FileFormatError(f"{path}: not a {what}: no JSON object.")
+    return data

@@ -1,0 +1,55 @@
+"""`crazyem plan --for mass,Ixx -o PLAN.toml`: the manoeuvre that tells most, and what to expect of it."""
+
+import argparse
+
+from crazyem.commands.common import say
+from crazyem.commands.output import put, replace_text
+from crazyem.errors import CrazyemError, UsageError
+from crazyem.live.summary import check_writable, write_json
+
+
+class NoManoeuvreError(CrazyemError):
+    """No manoeuvre within the limits reaches the goal."""
+
+    exit_code = 5
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Plan, say what to expect, write the file.
+
+    Raises:
+        NoManoeuvreError: none will do; the sentence says why, and what measurement would.
+    """
+    from crazyem.api.planning import plan
+
+    check_writable(arguments.json)
+    check_writable(arguments.output)
+    split = _names(arguments.split)
+    if arguments.split is not None and len(split) != 2:
+        raise UsageError("--split needs two effects, as in rotor_fault,center_of_mass.")
+    found = plan(
+        arguments.vehicle,
+        parameters=_names(arguments.parameters),
+        split=(split[0], split[1]) if split else None,
+        diagnosis=arguments.diagnosis,
+        box=tuple(arguments.box),
+        tilt=arguments.tilt,
+        duration=arguments.time,
+        criterion=arguments.criterion,
+        noise=arguments.noise,
+        seed=arguments.seed,
+        progress=say,
+    )
+    if arguments.json:
+        write_json(found.to_dict(), arguments.json)
+    if found.manoeuvre is None:
+        raise NoManoeuvreError(str(found))
+    if arguments.json != "-":
+        put(str(found))
+    replace_text(arguments.output, found.to_toml())
+    say(f"plan: {arguments.output}   fly it: crazyem fly --trajectory plan {arguments.output}")
+    return 0
+
+
+def _names(text: str | None) -> tuple[str, ...]:
+    return () if text is None else tuple(n for n in (part.strip() for part in text.split(",")) if n)

@@ -1,0 +1,1 @@
+"""Experiments: manoeuvres that narrow intervals or tell explanations apart, by the information that is expected."""

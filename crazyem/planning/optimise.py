@@ -1,0 +1,196 @@
+"""The manoeuvre of largest merit within limits: several starts, sequential quadratic programming over amplitudes.
+
+Frequencies are fixed: each axis has bands of two lines, every line with a whole number of cycles, no two axes with the
+same one, so that what belongs to different axes is uncorrelated. Free are the powers of the bands, in which information
+and squared limits are nearly linear (optimal input design; Mehra 1974). Phases are drawn for each start: they decide
+about peaks only.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from crazyem.control.harmonics import Axis, Harmonics
+from crazyem.planning.closed_loop import Flown, fly
+from crazyem.planning.limits import Limits
+from crazyem.vehicle import Vehicle
+
+# Hz: where the bands begin. Slow motion shows what goes with place, speed and heading; inertia and lag need torque,
+# which the loop makes above its attitude bandwidth of about 1 Hz, up to the resonance with the rotor lag near 5 Hz.
+BANDS = (0.0, 0.7, 1.5, 2.8)
+LINES = 2  # of a band
+RAMP = 1.0  # s
+SMALL = 0.1  # m/s^2, rad/s^2: rms of a band by which its share of the limits is found
+STEP = 0.02  # of a power, for differences
+IDLE = 1e-4  # power of a band below which the plan does without its lines
+ITERATIONS = 15  # of sequential quadratic programming from each start
+
+Merit = Callable[[Flown], float]  # to be maximised; nats
+
+
+@dataclass(frozen=True)
+class Found:
+    """The best manoeuvre: what it is, what the model flies of it, its merit, how much of each limit it uses (8,)."""
+
+    manoeuvre: Harmonics
+    flown: Flown
+    merit: float
+    used: NDArray[np.float64]
+
+
+def lines_of(duration: float) -> list[list[tuple[float, ...]]]:
+    """Frequencies [Hz] by axis (x, y, z, yaw) and band: whole cycles in the time at full amplitude, all different."""
+    base = 1.0 / duration
+    taken: set[int] = set()
+    found: list[list[tuple[float, ...]]] = [[] for _ in range(4)]
+    for begin in BANDS:
+        cycles = max(1, math.ceil(begin / base))
+        for line in range(LINES):
+            for axis in range(4):
+                while cycles in taken:
+                    cycles += 1
+                taken.add(cycles)
+                if line == 0:
+                    found[axis].append((cycles * base,))
+                else:
+                    found[axis][-1] = (*found[axis][-1], cycles * base)
+            if begin:
+                cycles += max(1, round(0.25 * begin / base))  # the second line of a band is a quarter higher
+    return found
+
+
+@dataclass(frozen=True)
+class Family:
+    """Manoeuvres of one duration with one draw of phases.
+
+    A point (16,) is the power of each band, axis by axis: its squared rms acceleration over that of `full`.
+    """
+
+    duration: float
+    ramp: float
+    lines: list[list[tuple[float, ...]]]
+    phases: NDArray[np.float64]  # (4, bands, lines) rad
+    full: NDArray[np.float64]  # (16,) rms acceleration with which a band alone reaches a limit, m/s^2 or rad/s^2
+
+    @classmethod
+    def drawn(cls, duration: float, random: np.random.Generator, vehicle: Vehicle, limits: Limits) -> "Family":
+        """With random phases."""
+        count = 4 * len(BANDS)
+        phases = random.uniform(0.0, 2.0 * math.pi, (4, len(BANDS), LINES))
+        family = cls(duration, min(RAMP, duration / 4), lines_of(duration), phases, np.full(count, SMALL))
+        full = np.empty(count)
+        for k, alone in enumerate(np.eye(count)):
+            manoeuvre = family.manoeuvre(alone)
+            full[k] = SMALL / limits.used(manoeuvre, fly(manoeuvre, vehicle), vehicle).max()
+        return replace(family, full=full)
+
+    @property
+    def size(self) -> int:
+        return 4 * len(BANDS)
+
+    def manoeuvre(self, point: NDArray[np.float64]) -> Harmonics:
+        """Of a point (16,)."""
+        axes = []
+        for a, (bands, phases) in enumerate(zip(self.lines, self.phases)):
+            frequency, cosine, sine = [], [], []
+            for b, band in enumerate(bands):
+                at = a * len(BANDS) + b
+                rms = math.sqrt(max(float(point[at]), 0.0)) * float(self.full[at])
+                for f, phase in zip(band, phases[b]) if rms > 0.0 else ():
+                    size = rms * math.sqrt(2.0 / LINES) / (2.0 * math.pi * f) ** 2
+                    frequency.append(f)
+                    cosine.append(size * math.cos(phase))
+                    sine.append(size * math.sin(phase))
+            axes.append(Axis(tuple(frequency), tuple(cosine), tuple(sine)))
+        return Harmonics(self.duration, self.ramp, (axes[0], axes[1], axes[2], axes[3]))
+
+
+def optimise(
+    merit: Merit,
+    vehicle: Vehicle,
+    limits: Limits,
+    *,
+    duration: float,
+    starts: int = 3,
+    seed: int = 0,
+    iterations: int = ITERATIONS,
+    say: Callable[[str], None] = lambda text: None,
+) -> Found:
+    """The best manoeuvre of several starts.
+
+    Args:
+        merit: of a flight of the model.
+        duration: s.
+        starts: draws of phases and of amplitudes to begin with.
+        seed: of these; the same seed gives the same plan.
+
+    Raises:
+        UsageError: the drone has no reserve of thrust.
+    """
+    random = np.random.default_rng(seed)
+    best: Found | None = None
+    for start in range(starts):
+        family = Family.drawn(duration, random, vehicle, limits)
+        begin = random.dirichlet(np.ones(family.size))
+        found = _from(begin, family, merit, vehicle, limits, iterations)
+        say(f"start {start + 1} of {starts}: merit {found.merit:.2f} nats")
+        if best is None or found.merit > best.merit:
+            best = found
+    assert best is not None
+    return best
+
+
+def _from(
+    begin: NDArray[np.float64], family: Family, merit: Merit, vehicle: Vehicle, limits: Limits, iterations: int
+) -> Found:
+    seen: dict[bytes, tuple[float, NDArray[np.float64]]] = {}
+
+    def look(point: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """Merit and squared shares of the limits."""
+        key = point.tobytes()
+        if key not in seen:
+            manoeuvre = family.manoeuvre(point)
+            flown = fly(manoeuvre, vehicle)
+            used = limits.used(manoeuvre, flown, vehicle)
+            seen[key] = merit(flown), used**2
+        return seen[key]
+
+    slopes: dict[bytes, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+
+    def slope(point: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        key = point.tobytes()
+        if key not in slopes:
+            value, used = look(point)
+            there = [look(point + STEP * e) for e in np.eye(point.size)]
+            slopes[key] = (
+                np.array([t[0] - value for t in there]) / STEP,
+                np.array([t[1] - used for t in there]).T / STEP,
+            )
+        return slopes[key]
+
+    result = minimize(
+        lambda x: -look(x)[0],
+        begin / max(1.0, float(look(begin)[1].max())),
+        jac=lambda x: -slope(x)[0],
+        method="SLSQP",
+        bounds=[(0.0, 1.0)] * family.size,
+        constraints=[{"type": "ineq", "fun": lambda x: 1.0 - look(x)[1], "jac": lambda x: -slope(x)[1]}],
+        options={"maxiter": iterations, "ftol": 1e-3},
+    )
+    point = np.asarray(result.x)
+    return within(family.manoeuvre(np.where(point < IDLE, 0.0, point)), merit, vehicle, limits)
+
+
+def within(manoeuvre: Harmonics, merit: Merit, vehicle: Vehicle, limits: Limits) -> Found:
+    """The manoeuvre, made smaller until it keeps all limits."""
+    for _ in range(20):
+        flown = fly(manoeuvre, vehicle)
+        used = limits.used(manoeuvre, flown, vehicle)
+        if used.max() <= 1.0:
+            break
+        manoeuvre = manoeuvre.scaled(0.99 / float(used.max()))
+    return Found(manoeuvre, flown, merit(flown), used)

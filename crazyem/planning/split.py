@@ -1,0 +1,208 @@
+"""Which of two explanations would a flight decide for: expected log odds between effects, by the diagnosis's own model.
+
+Under a model M with parameters theta ~ N(0, P) the score s of all columns is normal with covariance F + F_M P F_M',
+F the information with the usual nuisances integrated out. So the expected log odds between two models, where the first
+is true, are the divergence of Kullback and Leibler between two normal distributions of few dimensions (Lindley 1956;
+Box and Hill, Discrimination among mechanistic models, 1967). Effects whose columns are parallel have F of less than
+full rank, and no flight gives odds: that is seen here, before any is flown.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.fitting.model import Model, Point
+from crazyem.diagnosis.fitting.noise import TYPICAL
+from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.posterior.members import Member, pool_of
+from crazyem.errors import UsageError
+from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.motion import RotorInput
+from crazyem.planning.closed_loop import Flown
+from crazyem.planning.limits import Limits
+from crazyem.vehicle import Vehicle
+
+HEIGHT = 1.0  # m of the hover above the floor (control/named_trajectories.py, DEFAULT_HEIGHT)
+HELD = 3.5e-3  # s between a command's stamp and its effect (estimation/model.py, DELAY_OF_COMMANDS)
+THINNED = 2  # every second sample is enough for the odds
+DECIDED = math.log(20.0)  # odds of 20 to 1 decide (Kass and Raftery 1995: strong)
+DRAWS = 1000  # of drones and noise, from which the share of right decisions is found
+LIKELY = 0.8  # share of right decisions from which a manoeuvre is worth flying
+LOST = 1e-9  # eigenvalue over the largest below which a direction of the scores holds nothing
+SIGNALS = frozenset({"position", "velocity", "attitude", "body_rate", "voltage", "motor_command"})
+
+
+@dataclass(frozen=True)
+class Odds:
+    """What a flight would say about two explanations.
+
+    Attributes:
+        effects: the two.
+        expected: (2,) log odds [nats] to be expected for the first where the first is true, for the second likewise.
+        decided: (2,) share of drones for which the odds reach 20 to 1 for what is true.
+        wrong: (2,) share for which these reach 20 to 1 for the other.
+        correlation: largest correlation between a combination of the columns of the one and of the other, nuisances
+            projected out; at 1 they are parallel.
+    """
+
+    effects: tuple[str, str]
+    expected: tuple[float, float]
+    decided: tuple[float, float]
+    wrong: tuple[float, float]
+    correlation: float
+
+    @property
+    def splits(self) -> bool:
+        """Whether the flight would decide, whichever is true."""
+        return min(self.decided) >= LIKELY
+
+
+def flight_of(flown: Flown, vehicle: Vehicle, limits: Limits) -> Flight:
+    """A flight of the model as the diagnosis has recordings; without noise."""
+    n = flown.time.size
+    y = flown.state.copy()
+    y[:, 2] += HEIGHT
+    voltage = np.linspace(limits.voltage + 0.3, limits.voltage, n)  # a battery that empties on the way
+    inputs = RotorInput(
+        time=flown.time, thrust=flown.command, voltage=voltage, flown=flown.time + 2.0, measured=False, delay=HELD
+    )
+    keep = slice(None, None, THINNED)
+    time = flown.time[keep]
+    starts = np.zeros(time.size, bool)
+    starts[0] = True
+    return Flight(
+        name="plan", time=time, starts=starts, gaps=starts, y=np.ascontiguousarray(y[keep]),
+        force=np.full((time.size, 3), np.nan), voltage=voltage[keep], flown=time + 2.0, ground=0.0,
+        block=np.zeros(time.size, np.int64), inputs=inputs, signals=SIGNALS, fused=True,
+    )  # fmt: skip
+
+
+class Pair:
+    """Two effects that are to be told apart on one vehicle."""
+
+    def __init__(self, first: str, second: str, vehicle: Vehicle, limits: Limits) -> None:
+        """Raises UsageError: an effect is unknown, or a flight's log cannot show it; or both are the same."""
+        for name in (first, second):
+            if name not in CATALOGUE:
+                raise UsageError(f"unknown effect '{name}' (known: {', '.join(CATALOGUE)}).")
+            if CATALOGUE[name].random is not None:
+                raise UsageError(f"{name} is random motion of the air: it has no columns, and a plan cannot aim at it.")
+        if first == second:
+            raise UsageError("--split needs two different effects.")
+        self.effects = (first, second)
+        self.vehicle, self.limits = vehicle, limits
+        self.point = Point(vehicle, dict(vehicle.effects), TYPICAL)
+        self._members: dict[str, list[Member]] | None = None
+
+    def odds(self, flown: Flown, *, draws: int = DRAWS, seed: int = 0) -> Odds:
+        """What a flight would say; the shares by `draws` drones and noises, 0 of them gives none."""
+        first, second = self._statistics(flown)
+        random = np.random.default_rng(seed)
+        expected, decided, wrong = [], [], []
+        for mine, other in ((first, second), (second, first)):
+            means = [min(_divergence(a, b) for b in other) for a in mine]
+            expected.append(float(np.mean(means)))
+            right, false = _shares(mine, other, random, draws) if draws else (math.nan, math.nan)
+            decided.append(right)
+            wrong.append(false)
+        correlation = max(_correlation(a, b) for a in first for b in second)
+        return Odds(
+            self.effects, (expected[0], expected[1]), (decided[0], decided[1]), (wrong[0], wrong[1]), correlation
+        )
+
+    def merit(self, flown: Flown) -> float:
+        """The lesser of both expected log odds, as a logarithm so that huge ones do not rule: for the optimiser."""
+        odds = self.odds(flown, draws=0)
+        low, high = sorted(odds.expected)
+        return math.log1p(low) + 0.1 * math.log1p(high)
+
+    def _statistics(self, flown: Flown) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
+        """Of each variant of each effect (r, k): columns in the space where noise and nuisances are white, each times
+        the standard deviation of its parameter."""
+        flight = flight_of(flown, self.vehicle, self.limits)
+        pool = pool_of([flight], self.point, self.effects)
+        members = [[m for m in pool.looks if m.effect == name] for name in self.effects]
+        for name, found in zip(self.effects, members):
+            if not found:
+                raise UsageError(
+                    f"a flight cannot speak of {name}: {pool.left_out.get(name, 'nobody says how large it may be')}."
+                )
+        usual = [(replace(c, free=(n,)), float(table[0, k])) for c, table in pool.usual for k, n in enumerate(c.free)]
+        usual = [(c, sd) for c, sd in usual if sd > 0 and c.effect not in self.effects]
+        columns = [column for c, _ in usual for column in c.columns(self.point)]
+        ends = [len(columns)]
+        for m in (*members[0], *members[1]):
+            columns += m.candidate.columns(self.point)
+            ends.append(len(columns))
+        swept = Model(flight).sweep(self.point, columns)
+        information = swept.information.sum(0)
+        u = ends[0]
+        sd = np.array([s for _, s in usual])
+        inner = np.eye(u) + sd[:, None] * information[:u, :u] * sd
+        across = sd[:, None] * information[:u, u:]
+        rest = information[u:, u:] - across.T @ np.linalg.solve(inner, across)
+        root = _root(rest)
+        variants = []
+        for m, begin, end in zip((*members[0], *members[1]), ends[:-1], ends[1:]):
+            covariance = m.prior(self.point, nudged=bool(m.candidate.begin)).covariance
+            variants.append(root[:, begin - u : end - u] @ np.linalg.cholesky(covariance))
+        return variants[: len(members[0])], variants[len(members[0]) :]
+
+
+def _root(information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(r, c): R with R'R = information; directions that hold nothing left out."""
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    kept = values > LOST * max(float(values[-1]), 1e-300)
+    root: NDArray[np.float64] = (np.sqrt(values[kept])[:, None] * vectors[:, kept].T) * scale
+    return root
+
+
+def _divergence(true: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Nats between N(0, I + A A') and N(0, I + B B'), the first being true; A (r, k), B (r, l)."""
+    r = true.shape[0]
+    s, t = np.eye(r) + true @ true.T, np.eye(r) + other @ other.T
+    return 0.5 * float(np.trace(np.linalg.solve(t, s)) - r + np.linalg.slogdet(t)[1] - np.linalg.slogdet(s)[1])
+
+
+def _shares(
+    mine: Sequence[NDArray[np.float64]], other: Sequence[NDArray[np.float64]], random: np.random.Generator, draws: int
+) -> tuple[float, float]:
+    """Shares of draws under the first whose log evidence decides for the first, and for the second."""
+    each = max(1, draws // len(mine))
+    odds = []
+    for a in mine:
+        z = random.standard_normal((each, a.shape[0])) + random.standard_normal((each, a.shape[1])) @ a.T
+        odds.append(_log_evidence(mine, z) - _log_evidence(other, z))
+    found = np.concatenate(odds)
+    return float(np.mean(found > DECIDED)), float(np.mean(found < -DECIDED))
+
+
+def _log_evidence(variants: Sequence[NDArray[np.float64]], z: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) log evidence of scores z (n, r), the variants equally likely."""
+    rows = []
+    for a in variants:
+        inner = np.eye(a.shape[1]) + a.T @ a
+        projected = z @ a
+        rows.append(
+            0.5 * np.einsum("nk,kl,nl->n", projected, np.linalg.inv(inner), projected)
+            - 0.5 * float(np.linalg.slogdet(inner)[1])
+        )
+    total: NDArray[np.float64] = np.logaddexp.reduce(np.array(rows), axis=0) - math.log(len(rows))
+    return total
+
+
+def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Largest canonical correlation between the columns of A (r, k) and B (r, l); 0 where one has nothing."""
+    bases = []
+    for matrix in (a, b):
+        scale = np.linalg.norm(matrix, axis=0)
+        kept = matrix[:, scale > 1e-6 * max(float(scale.max()), 1e-300)]
+        if not kept.size or not scale.max() > 0:
+            return 0.0
+        u, s, _ = np.linalg.svd(kept / np.linalg.norm(kept, axis=0), full_matrices=False)
+        bases.append(u[:, s > 1e-3 * s[0]])
+    return min(float(np.linalg.svd(bases[0].T @ bases[1], compute_uv=False)[0]), 1.0)
