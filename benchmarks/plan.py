@@ -238,9 +238,10 @@ def report(folder: Path) -> str:
         crashed = sum("crashed" in f for f in flights[kind])
         ratio = [float(np.median(base[n]) / np.median(sd[n])) for n in NAMES[1:]]
         widths = " | ".join(f"{196 * np.median(sd[n]):.2g} %" for n in (*NAMES[1:], "mass"))
-        tilt = max(f["tilt"] for _, f in good)
+        steepest = max(f["tilt"] for _, f in good)
+        factor = float(np.exp(np.mean(np.log(ratio))))
         lines.append(
-            f"| {kind} | {widths} | {100 * np.mean(held):.0f} % | {np.exp(np.mean(np.log(ratio))):.2g} | {tilt:.0f} deg "
+            f"| {kind} | {widths} | {100 * np.mean(held):.0f} % | {factor:.2g} | {steepest:.0f} deg "
             f"| {left}, crashed {crashed} |"
         )
     lines += ["", "| expected over reached | Ixx | Iyy | Izz | mass |", "|---|---|---|---|---|"]

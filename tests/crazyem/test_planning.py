@@ -30,9 +30,8 @@ from crazyem.planning.plan import Plan
 from crazyem.vehicle import GRAVITY, load_vehicle
 
 VEHICLE = load_vehicle("cf2")
-SMALL = Harmonics(
-    6.0, 1.0, (Axis((1.0, 2.5), (0.02, 0.0), (0.0, 0.004)), Axis((1.5,), (0.01,), (0.0,)), Axis(), Axis((2.0,), (0.05,), (0.0,)))
-)  # fmt: skip
+SIDEWAYS = Axis((1.0, 2.5), (0.02, 0.0), (0.0, 0.004)), Axis((1.5,), (0.01,), (0.0,))
+SMALL = Harmonics(6.0, 1.0, (*SIDEWAYS, Axis(), Axis((2.0,), (0.05,), (0.0,))))
 
 
 # the manoeuvre
