@@ -1,5 +1,6 @@
 """A recorded flight as the arrays that diagnosis works on: nodes in free flight, what was measured there, inputs."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -23,7 +24,7 @@ MAX_GAP = 0.1  # s between nodes, or between inputs, beyond which a step cannot 
 BLOCK, SHORT, BLOCKS = 1.0, 0.5, 40
 NEAR = 0.03  # s between samples of the accelerometer, at most, for a value between them
 SHORTEST = 4.0  # s of flight below which nothing is said
-# s between samples of a stream, at least. Filters of gyros and of state estimates take 2 to 5 ms (a low-pass of 80 Hz:
+# s between samples of a stream, about. Filters of gyros and of state estimates take 2 to 5 ms (a low-pass of 80 Hz:
 # 2.8 ms, crazyflie-firmware sensors_bmi088_bmp3xx.c). Samples closer than that repeat the filter's own dynamics, which
 # the model does not have: in hover they read as a negative damping. Sampling follows the dynamics that are looked for,
 # about ten samples in a rise time (Ljung, System Identification, 1999, 13.7).
@@ -188,10 +189,15 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
 
 
 def thinned(time: NDArray, value: NDArray) -> tuple[NDArray, NDArray]:
-    """The samples (n,), (n, k) of a stream that begin a new interval of `SAMPLING`; all of a slower stream."""
-    if time.size < 2 or float(np.median(np.diff(time))) > 0.75 * SAMPLING:
+    """Every so many samples (n,), (n, k) of a stream that they are `SAMPLING` apart at most; all of a slower stream.
+
+    Counted by their stamps, so that a lost sample changes nothing of the others.
+    """
+    period = float(np.median(np.diff(time))) if time.size > 1 else SAMPLING
+    every = math.floor(SAMPLING / period + 0.1) if period > 0.0 else 1
+    if every < 2:
         return time, value
-    keep = np.diff(np.floor(time / SAMPLING), prepend=-np.inf) > 0
+    keep = np.round(time / period).astype(np.int64) % every == 0
     return time[keep], value[keep]
 
 
