@@ -104,7 +104,7 @@ def to_limits(course: Course, vehicle: Vehicle) -> Course:
 def manoeuvres(vehicle: Vehicle, *, seed: int) -> tuple[dict[str, Trajectory], dict[str, Harmonics]]:
     """What is flown, and those of these that are plans."""
     plans = {
-        kind: plan_parameters(NAMES, vehicle, LIMITS, duration=seconds, seed=seed, starts=3).manoeuvre
+        kind: plan_parameters(NAMES, vehicle, LIMITS, duration=seconds, seed=seed, starts=2).manoeuvre
         for kind, seconds in (("plan", DURATION), ("plan, a third of the time", DURATION / 3))
     }
     made = {

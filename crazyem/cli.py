@@ -71,8 +71,12 @@ def parser() -> argparse.ArgumentParser:
         nargs="+",
         default=["hover"],
         metavar="NAME",
-        help="hover, figure8, excite, waypoints FILE, or plan FILE",
+        help="hover, figure8, excite, informative, waypoints FILE, or plan FILE",
     )
+    fly.add_argument(
+        "--goal", type=_number(0.1, 100, " percent"), default=5.0, metavar="PERCENT",
+        help="of informative: ends when mass, Ixx, Iyy and Izz are known within this (95 %%; default: 5)",
+    )  # fmt: skip
     seconds = _number(1, 3600, " seconds")
     fly.add_argument("--duration", type=seconds, default=20.0, metavar="S", help="of the trajectory (default: 20)")
     _pushing(fly, "write to a drone that is not simulated (default: dry run)")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, vehicle_of
+from crazyem.api.planning import plan_commands
 from crazyem.diagnosis import diagnose as by_recordings
 from crazyem.diagnosis.compare import compare
 from crazyem.diagnosis.document import document_of, saved_vehicle, text_of
@@ -176,7 +177,11 @@ def diagnose(
     document["notices"] = [*(n for r in flown for n in r.notices), *document["notices"]]
     if against is not None:
         document["against"] = compare(flown[0], recording_of(against, options))
+    name = nominal.name if vehicle is None or isinstance(vehicle, Vehicle) else str(vehicle)
+    plans = plan_commands(found.indistinguishable, nominal, name)
+    document["would_separate"] = [*document["would_separate"], *plans]
     values = {f.name: getattr(found, f.name) for f in fields(found)}
+    values["would_separate"] = (*found.would_separate, *plans)
     return Diagnosis(**values, document=document, pictures=pictures)
 
 

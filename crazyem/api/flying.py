@@ -22,6 +22,7 @@ from crazyem.live.simulator import Simulator
 from crazyem.live.warm_up import warm_up
 from crazyem.live.write_supervisor import WriteRules
 from crazyem.physics import folding
+from crazyem.planning.informative import GOAL, SEGMENT, Informative
 from crazyem.vehicle import Vehicle
 
 Progress = Callable[[str, float], None]  # phase of the flight, and seconds in it
@@ -36,6 +37,7 @@ class FlightSettings:
     controller: str = "lee"
     trajectory: tuple[str, ...] | TrajectoryMaker = ("hover",)
     duration: float = 20.0
+    goal: float = GOAL
     push: bool = True
     rules: WriteRules = field(default_factory=WriteRules)
     record: str | None = None
@@ -80,6 +82,7 @@ def fly(
     controller: str = "lee",
     trajectory: str | Sequence[str] | TrajectoryMaker = "hover",
     duration: float = 20.0,
+    goal: float = GOAL,
     push: bool | None = None,
     dry_run: bool = False,
     policy: Policy | str | Path | None = None,
@@ -101,8 +104,10 @@ def fly(
         uri: of the drone; None starts the simulated firmware.
         vehicle: the nominal model: a Vehicle, a preset's name or a file.
         controller: "lee", "mellinger", "indi" or "lqg".
-        trajectory: "hover", "figure8", "excite", ("waypoints", "FILE"), or a maker of trajectories.
-        duration: of a named trajectory, s.
+        trajectory: "hover", "figure8", "excite", "informative", ("waypoints", "FILE"), ("plan", "FILE"), or
+            a maker of trajectories.
+        duration: of a named trajectory, s; of "informative", at most.
+        goal: of "informative": relative half width of the 95 % intervals of mass, Ixx, Iyy, Izz at which it ends.
         push: write what was learnt to the controller: True, False, or None: to simulators only.
         dry_run: decide what would be written, and write nothing.
         policy: of the guard; None: the shipped one.
@@ -126,8 +131,8 @@ def fly(
         rules=write_rules_for(uri or "", push=push, dry_run=dry_run, policy=policy),
         record=None if record is None else str(record),
         scenario=None if scenario is None else str(scenario),
-        duration=duration, append=append, seed=seed, speed=speed, rate=rate, reconnect=reconnect, window=window,
-        every=every,
+        duration=duration, goal=goal, append=append, seed=seed, speed=speed, rate=rate, reconnect=reconnect,
+        window=window, every=every,
     )  # fmt: skip
     result, error = observed_flight(settings, FlightObserver())
     if error is not None or result is None:
@@ -177,8 +182,10 @@ def observed_flight(
     nominal, left_out = folding.fold(settings.vehicle)
     settings = replace(settings, vehicle=nominal)
     words = settings.trajectory
+    informative = _informative(settings, nominal) if words == ("informative",) else None
+    maker = informative or (trajectory_maker(words, settings.duration) if isinstance(words, tuple) else words)
     plan = FlightPlan(
-        trajectory=trajectory_maker(words, settings.duration) if isinstance(words, tuple) else words,
+        trajectory=maker,
         controller=controller_named(settings.controller),
         height=DEFAULT_HEIGHT,
         push=settings.push,
@@ -186,6 +193,10 @@ def observed_flight(
     )
     estimator_for(nominal, window=settings.window, every=settings.every)  # a wrong window is refused here
     with contextlib.ExitStack() as stack:
+        if informative is not None:
+            stack.callback(informative.close)
+            observer.say("planning the first manoeuvre")
+            informative.start()
         uri, simulator = settings.uri, None
         if not uri:
             simulator = Simulator(scenario=settings.scenario, seed=settings.seed or 0, speed=settings.speed or 1.0)
@@ -197,6 +208,15 @@ def observed_flight(
             uri = simulator.start()
             observer.say(f"simulated firmware at {uri}")
         return _flown(settings, plan, observer, observer.interrupts(), str(uri), left_out)
+
+
+def _informative(settings: FlightSettings, vehicle: Vehicle) -> Informative:
+    """Raises UsageError: a flight of this length, or this vehicle, has no room for a manoeuvre."""
+    if settings.duration < SEGMENT:
+        raise UsageError(f"--trajectory informative needs at least {SEGMENT:g} s.")
+    if not vehicle.arm[0] or not vehicle.torque_per_thrust:
+        raise UsageError(f"vehicle {vehicle.name} has no rotors in its file, so nothing can be planned for it.")
+    return Informative(vehicle, duration=settings.duration, goal=settings.goal, seed=settings.seed or 0)
 
 
 def _flown(
@@ -230,6 +250,8 @@ def _flown(
             record=settings.record, append=settings.append, rate=settings.rate, reconnect=settings.reconnect,
             wrench=plan.controller.wrench, wrap=observer.recorder,
         )  # fmt: skip
+        if isinstance(plan.trajectory, Informative):
+            plan.trajectory.estimate = lambda: session.estimate
         try:
             session.start()
             with observer.progress(session, interrupts) as progress:

@@ -6,20 +6,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from crazyem.api.inputs import VehicleLike, vehicle_of
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.estimation.model import GROUPS, Noise, setup_for
+from crazyem.estimation.model import GROUPS, Noise
 from crazyem.physics import folding
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.planning.informative import PROCESS, noise_in
 from crazyem.planning.limits import Limits
-from crazyem.planning.plan import DEFAULT, Plan, plan_parameters, plan_split
+from crazyem.planning.plan import DEFAULT, Plan, could_split, plan_parameters, plan_split
 from crazyem.toml_file import read_text
 from crazyem.vehicle import Vehicle
 
 LARGEST_JSON = 1 << 26  # bytes of a diagnosis or summary
-PROCESS = ("force_x", "force_y", "thrust", "torque_x", "torque_y", "torque_z")
 
 
 def plan(
@@ -92,6 +90,24 @@ def look_alikes(path: str | Path) -> list[tuple[str, str]]:
     return pairs
 
 
+def plan_commands(groups: Sequence[Sequence[str]], vehicle: Vehicle, name: str) -> list[str]:
+    """For each group of look-alikes that a manoeuvre tells apart, a sentence with the command that plans it.
+
+    Args:
+        groups: effects, as `indistinguishable` of a diagnosis has them.
+        vehicle: of the diagnosis. name: what the command is to call it.
+    """
+    limits, found = Limits(), []
+    for group in groups:
+        for other in group[1:]:
+            if could_split(group[0], other, vehicle, limits):
+                found.append(
+                    f"fly a plan that tells {group[0]} from {other}: crazyem plan --split {group[0]},{other} "
+                    f"--vehicle {name} -o plan.toml"
+                )
+    return found
+
+
 def noise_of(path: str | Path, vehicle: Vehicle) -> Noise:
     """Noise scales from the summary of a flight or replay, in the estimator's units of acceleration.
 
@@ -100,16 +116,10 @@ def noise_of(path: str | Path, vehicle: Vehicle) -> Noise:
     """
     data = _json(path, "summary")
     estimate = data.get("estimate", data)
-    table = estimate.get("noise") if isinstance(estimate, dict) else None
-    keys = (*PROCESS, *GROUPS[:4])
-    if not isinstance(table, dict) or not all(
-        isinstance(table.get(k), int | float) and 0 < table[k] < math.inf for k in keys
-    ):
-        raise FileFormatError(f"{path}: no noise scales ({', '.join(keys)}) of a flight.")
-    body = np.array([vehicle.mass] * 3 + list(vehicle.inertia))
-    sensors = [float(table[k]) for k in GROUPS[:4]]
-    rest = setup_for(vehicle).prior.noise.measurement[4]
-    return Noise(np.array([float(table[k]) for k in PROCESS]) / body, np.array([*sensors, rest]))
+    found = noise_in(estimate.get("noise") if isinstance(estimate, dict) else None, vehicle)
+    if found is None:
+        raise FileFormatError(f"{path}: no noise scales ({', '.join((*PROCESS, *GROUPS[:4]))}) of a flight.")
+    return found
 
 
 def _json(path: str | Path, what: str) -> dict[str, Any]:

@@ -29,6 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
         controller=arguments.controller,
         trajectory=tuple(arguments.trajectory),
         duration=arguments.duration,
+        goal=arguments.goal / 100,
         push=not arguments.no_push,
         rules=write_rules(arguments),
         record=arguments.record,
@@ -41,9 +42,10 @@ def run(arguments: argparse.Namespace) -> int:
         window=arguments.window,
         every=arguments.every,
     )
-    trajectory_maker(arguments.trajectory, arguments.duration)  # a wrong one is refused here
-    if note := duration_note(arguments.trajectory, arguments.duration):
-        say(note)
+    if arguments.trajectory != ["informative"]:
+        trajectory_maker(arguments.trajectory, arguments.duration)  # a wrong one is refused here
+        if note := duration_note(arguments.trajectory, arguments.duration):
+            say(note)
     plot = plot_path(arguments, arguments.record, arguments.json)
     for path in (arguments.json, arguments.record, plot):
         check_writable(path)

@@ -159,6 +159,8 @@ def trajectory_maker(words: Sequence[str], duration: float) -> TrajectoryMaker:
             raise UsageError("--trajectory waypoints needs one FILE.")
         read_waypoints(rest[0])  # complain before anything is started
         return lambda position, yaw: waypoints(path=rest[0], position=position, yaw=yaw)
+    if name == "informative" and not rest:
+        raise UsageError("--trajectory informative is planned in flight, for one drone at a time.")
     if name == "plan":
         if len(rest) != 1:
             raise UsageError("--trajectory plan needs one FILE.")
@@ -166,7 +168,8 @@ def trajectory_maker(words: Sequence[str], duration: float) -> TrajectoryMaker:
         return lambda position, yaw: plan_trajectory(read, path=rest[0], position=position, yaw=yaw)
     if name not in ("hover", "figure8", "excite") or rest:
         raise UsageError(
-            f"unknown trajectory '{' '.join(words)}' (hover, figure8, excite, waypoints FILE, or plan FILE)."
+            f"unknown trajectory '{' '.join(words)}' "
+            "(hover, figure8, excite, informative, waypoints FILE, or plan FILE)."
         )
     return lambda position, yaw: _made(name, position, yaw, duration)
 

@@ -30,6 +30,10 @@ class Reference:
         return 0.0, 0.0, math.sin(self.yaw / 2), math.cos(self.yaw / 2)
 
 
+def _never() -> bool:
+    return False
+
+
 @dataclass(frozen=True, slots=True)
 class Trajectory:
     """A named function of time.
@@ -38,11 +42,13 @@ class Trajectory:
         name: for reports.
         duration: s; the reference is at rest at 0 and at `duration`.
         at: time since the start [s] -> Reference; times outside [0, duration] hold the end points.
+        finished: whether it is over before its duration; the reference is at rest then.
     """
 
     name: str
     duration: float
     at: Callable[[float], Reference]
+    finished: Callable[[], bool] = _never
 
 
 def smooth_step(x: float) -> tuple[float, float, float, float]:
@@ -77,7 +83,9 @@ def hover(*, position: Vector, yaw: float = 0.0, duration: float = 20.0) -> Traj
 
 def after_hover(trajectory: Trajectory, *, seconds: float) -> Trajectory:
     """The same trajectory after `seconds` of hover at its start."""
-    return Trajectory(trajectory.name, trajectory.duration + seconds, lambda t: trajectory.at(t - seconds))
+    return Trajectory(
+        trajectory.name, trajectory.duration + seconds, lambda t: trajectory.at(t - seconds), trajectory.finished
+    )
 
 
 def figure8(

@@ -214,7 +214,7 @@ class Flight:
         self._enter(path.name)
         self._mark("push_enabled", self.session.clock.newest)
         self.session.pipeline.push_from = self.session.clock.newest
-        self._wait(lambda: stream.elapsed >= path.duration, math.inf)
+        self._wait(lambda: stream.elapsed >= path.duration or path.finished(), math.inf)
         self.session.pipeline.push_until = self.session.clock.newest
         self._mark("trajectory_end", self.session.clock.newest)
 

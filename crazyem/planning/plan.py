@@ -16,7 +16,7 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.planning.closed_loop import Flown
 from crazyem.planning.information import Expectation
 from crazyem.planning.limits import Limits
-from crazyem.planning.optimise import Found, optimise
+from crazyem.planning.optimise import ITERATIONS, Family, Found, optimise, within
 from crazyem.planning.split import Odds, Pair
 from crazyem.vehicle import Vehicle
 
@@ -141,6 +141,8 @@ def plan_parameters(
     known: NDArray[np.float64] | None = None,
     starts: int = 3,
     seed: int = 0,
+    iterations: int = ITERATIONS,
+    foretold: bool = True,
     say: Say = lambda text: None,
 ) -> Plan:
     """The manoeuvre that most narrows the intervals of parameters.
@@ -150,6 +152,8 @@ def plan_parameters(
         criterion: "D": the volume of their joint interval; "A": the sum of their relative variances.
         noise: scales; None: those that the estimator expects.
         known: (9, 9) information that earlier flight has given, in the estimator's coordinates.
+        iterations: of the search from each start.
+        foretold: whether to find the widths to be expected, by noisy flights of the model.
 
     Raises:
         UsageError: an unknown name, a vehicle without rotors or without reserve, a duration that does not fit.
@@ -175,7 +179,11 @@ def plan_parameters(
             return -0.5 * len(at) * math.log(float(np.trace(block)))
         return -0.5 * float(np.linalg.slogdet(block)[1])
 
-    found = optimise(merit, vehicle, limits, duration=duration, starts=starts, seed=seed, say=say)
+    found = optimise(
+        merit, vehicle, limits, duration=duration, starts=starts, seed=seed, iterations=iterations, say=say
+    )
+    if not foretold:
+        return _plan(goal, vehicle, limits, found, {}, None, seed)
     sd = expectation.reached(found.manoeuvre)
     unit = expectation.setup.unit
     widths = {n: INTERVAL * float(sd[i] * unit[i]) for n, i in zip(names, at)}
@@ -206,6 +214,18 @@ def plan_split(
     if not odds.splits:
         return _none(goal, vehicle, limits, _alike(odds), seed, odds)
     return _plan(goal, vehicle, limits, found, {}, odds, seed)
+
+
+def could_split(first: str, second: str, vehicle: Vehicle, limits: Limits, *, duration: float = 10.0) -> bool:
+    """Whether a manoeuvre that nobody optimised tells two effects apart already, so that a plan certainly does."""
+    try:
+        pair = Pair(first, second, vehicle, limits)
+        random = np.random.default_rng(0)
+        family = Family.drawn(duration, random, vehicle, limits)
+        even = family.manoeuvre(np.full(family.size, 1.0 / family.size))
+        return pair.odds(within(even, lambda flown: 0.0, vehicle, limits).flown, draws=300).splits
+    except UsageError:  # an effect without columns, a drone without reserve
+        return False
 
 
 def _only_ratios(name: str) -> str:
