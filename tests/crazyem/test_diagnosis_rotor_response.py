@@ -188,7 +188,7 @@ def behind(time, wanted, *, lag):
     ("lag", "held_out", "deaf", "most"),
     [
         (0.06, True, False, CALIBRATED), (0.06, False, False, CALIBRATED), (0.06, True, True, DOUBTFUL),
-        (0.047, False, False, SELDOM),
+        (0.05, False, False, SELDOM),
     ],
 )  # fmt: skip
 def test_a_late_rotor_is_as_sure_as_what_speaks_for_it(lag, held_out, deaf, most):

@@ -59,6 +59,9 @@ LEANING_SD = (0.02, 0.02, 2e-3)  # rad: an attitude made from the acceleration i
 # s: a filter on board that integrates a biased gyro and is drawn back by the fixes stays off by the bias times the time
 # that takes: 0.041, 0.043, 0.041 and 0.038 s in roll and pitch of two simulated flights.
 PULL = 0.05
+# Of a battery whose voltage nobody recorded: it sags under the load, by 0.06 to 0.3 ohm of a cell and its wires, which
+# makes thrust rise less with the command (relative), and it runs down in flight (1/s, relative): 4.1 to 3.5 V in 300 s.
+SAG_SLOPE_SD, RUN_DOWN_SD = 0.15, 1.5e-3
 SEVERAL = 3  # recordings whose commands are known, from which on each has a thrust of its own
 # Standard deviations that no scatter shows. An attitude 1 ms late is a force that goes with the velocity, 3e-4 N s/m of
 # drag along the quicker axis of a figure 8 (mass * (3.1 rad/s)^2 * 1 ms); along z thrust is a little wrong; a gyro's
@@ -159,6 +162,9 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
         found.append((Candidate("attitude_misalignment", (), ANGLES), tuple(sd**-2 for sd in LEANING_SD)))
     elif "attitude" in data.signals and _bias(point) > 0:
         found.append((Candidate("attitude_misalignment", (), ANGLES), ((PULL * _bias(point)) ** -2,) * 3))
+    if all(f.levelled for f in data.flights):
+        found.append((Candidate("thrust_curve", (), ("slope_error",)), (SAG_SLOPE_SD**-2,)))
+        found.append((Candidate("battery_sag", (), ("gain_per_second",)), (RUN_DOWN_SD**-2,)))
     taken = {c.effect for c in accepted}
     if "motor_lag" in taken:  # both free, with a lag that has no prior, go along their ridge: a lag 8 ms too long
         taken.add("torque_scale")
