@@ -124,9 +124,8 @@ def diagnose(
     if any(e.name == "gusts" for e in beside):
         remains = remains.without_force()
     told = answer_of(
-        data, selection, remains, witnessed=witnessed, in_place=_in_place(data, apart, selection), balance=balance,
-        apart=apart is not None,
-    )  # fmt: skip
+        data, selection, remains, witnessed=witnessed, in_place=_in_place(data, apart, selection), balance=balance
+    )
     if asked.flights[0].inputs.measured:
         told, late, remains = _late_rotors(asked, vehicle, told, remains, left_out)
         beside += late

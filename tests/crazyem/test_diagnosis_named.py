@@ -1,5 +1,6 @@
 """What a name is said with: inertias that are one factor on the torques, and a group that says so."""
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,7 +22,8 @@ from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.naming import answer
 from crazyem.diagnosis.naming.answer import _numbers, _rivals, _uncertainty, strongest_first
-from crazyem.diagnosis.naming.named import CALIBRATED, DOUBTFUL, SELDOM, Named, at_most, one_factor, trust
+from crazyem.diagnosis.naming.determined import improbable
+from crazyem.diagnosis.naming.named import CALIBRATED, DOUBTFUL, EVEN, SLOPE, Named, one_factor, presence, trust
 from crazyem.diagnosis.naming.trials import Step, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained
 
@@ -45,12 +47,12 @@ def test_chance_tells_one_factor_as_several_in_one_of_twenty():
 
 def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_asked(monkeypatch):
     flown = fly(Hidden(torque=0.7), seconds=20.0, seed=6)
-    held_out, brought = [], []
+    brought = []
     monkeypatch.setattr(answer, "trust", lambda remains, nats: brought.append(nats) or 1.0)
-    monkeypatch.setattr(answer, "at_most", lambda held, p_value, *, apart: held_out.append(apart) or 0.123)
+    monkeypatch.setattr(answer, "presence", lambda nats: 0.123)
+    monkeypatch.setattr(answer, "preferred", lambda taken, rivals: 1.0)
     found = diagnose([flown], DRONE, wanted=["inertia"])
     assert [(e.name, e.confidence) for e in found.effects] == [("inertia", 0.123)]
-    assert held_out == [False]  # it is one flight alone
     assert brought == [found.effects[0].held_out_nats] != [0.0]  # what is weighed against what is left
     assert found.indistinguishable == (("inertia", "torque_scale"),)
 
@@ -67,21 +69,22 @@ def test_what_is_found_beside_the_selection_stands_where_its_evidence_puts_it():
     assert strongest_first((), [named("gusts", 3.0)])[0].name == "gusts"
 
 
-@given(st.floats(-100.0, 1e4), st.floats(-100.0, 1e4), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
-def test_more_evidence_never_makes_a_name_less_sure(held, more, p_value, other) -> None:
+@given(st.floats(-100.0, 1e4), st.floats(-100.0, 1e4))
+def test_more_evidence_never_makes_a_name_less_sure(held, more) -> None:
     least, most = sorted((held, more))
-    sure, unsure = sorted((p_value, other))
-    assert DOUBTFUL <= at_most(least, unsure) <= at_most(most, unsure) <= CALIBRATED
-    assert at_most(least, unsure) <= at_most(least, sure)
+    assert 0.0 <= presence(least) <= presence(most) <= CALIBRATED
 
 
-def test_a_name_that_brings_little_elsewhere_is_not_sure() -> None:
-    """Products of inertia with 8 nats and p = 0.003 were 95 % sure; what was hidden was a rotor that sticks."""
-    assert at_most(8.0, 0.003) == DOUBTFUL
-    assert at_most(8.0, 1e-6) == SELDOM
-    assert at_most(30.0, 0.003) == CALIBRATED
-    assert at_most(30.0, 0.003, apart=False) == SELDOM  # blocks of one flight share what is peculiar to it
-    assert at_most(30.0, 1e-6, apart=False) == CALIBRATED
+def test_a_name_is_as_sure_as_what_it_brings_on_flight_held_out() -> None:
+    """Log-odds that are linear in the logarithm of the nats, by a formula of its own."""
+    assert presence(-5.0) == presence(0.0) == 0.0
+    assert presence(EVEN) == pytest.approx(0.5)
+    for nats in (5.0, 30.0, 200.0):
+        odds = math.exp(SLOPE * math.log(nats / EVEN))
+        assert presence(nats) == pytest.approx(odds / (1.0 + odds))
+    assert presence(1e5) == CALIBRATED
+    assert improbable(0.9 * EVEN).startswith("not determined")
+    assert not improbable(1.1 * EVEN)
 
 
 def left(nats: float, gained: float = 1e6) -> Unexplained:

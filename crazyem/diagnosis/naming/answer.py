@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.special import logit
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted
@@ -16,7 +17,7 @@ from crazyem.diagnosis.naming.balance import DAYS, Balance, how_weak, prefers
 from crazyem.diagnosis.naming.balance import steady as steadily
 from crazyem.diagnosis.naming.corroboration import TELLING
 from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, instead_of_a_load
-from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, at_most, one_factor, share, trust
+from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, one_factor, presence, trust
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, preferred, wald
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -53,7 +54,6 @@ def answer_of(
     *,
     witnessed: frozenset[str],
     in_place: Mapping[str, tuple[Trial, Trial] | None],
-    apart: bool,
     balance: Balance | None = None,
 ) -> Answer:
     """The selected effects as they are told.
@@ -62,7 +62,6 @@ def answer_of(
         remains: the structure that they leave, beside which no name is sure.
         witnessed: names that a witness told from their look-alikes.
         in_place: for an effect the two trials, of it and of what else could stand in its place.
-        apart: whether a flight was held out.
         balance: what is steady, by which names are told apart where a file has a trim.
     """
     if not selection.accepted:
@@ -82,7 +81,8 @@ def answer_of(
         away, covariance = _away(candidate, point), all_covariance[own, own]
         rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, selection, witnessed), balance)
         heard = _against(remains, candidate, data)
-        confidence = trust(heard, step.taken.held_out) * share(step.taken.evidence, []) * preferred(step.taken, rivals)
+        there = trust(heard, step.taken.held_out) * presence(step.taken.held_out)
+        confidence = there * preferred(step.taken, rivals)
         confidence /= 1.0 + sum(float(np.exp(-nats)) for nats in steady.values())
         doubted = candidate.effect in selection.doubted
         by_day = _by_the_day(candidate, point, balance)
@@ -90,12 +90,12 @@ def answer_of(
         if doubted or none_of_it > WITHIN:
             confidence = min(confidence, DOUBTFUL)
         p_value = min(1.0, step.taken.p_value * max(1, selection.tried))
-        confidence = min(confidence, at_most(step.taken.held_out, p_value, apart=apart))
         # late inputs and late measurements are one model, so it is fitted as the first, whatever it is called
         late = candidate.effect == "input_delay" and MEASURED_LATE in witnessed
         name, label = (MEASURED_LATE, MEASURED_LATE) if late else (candidate.effect, candidate.label)
         chosen: dict[str, object] = {"streams": ("state", "gyro")} if late else dict(candidate.fixed)
-        named = Named(name, label, parameters, chosen, step.taken.held_out, p_value, confidence, candidate.effect)
+        odds = float(logit(there))
+        named = Named(name, label, parameters, chosen, step.taken.held_out, p_value, confidence, candidate.effect, odds)
         found.append((step.taken.evidence, named))
 
         if doubted:

@@ -15,12 +15,13 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.naming.answer import numbers_of
 from crazyem.diagnosis.naming.balance import Balance, by_balance
-from crazyem.diagnosis.naming.named import Named, Value
+from crazyem.diagnosis.naming.named import Named, Value, presence
 from crazyem.diagnosis.naming.prune import left_out
 from crazyem.diagnosis.naming.steady import with_exact_torques
 from crazyem.diagnosis.naming.trials import Selection
 from crazyem.physics.effects.catalogue import CATALOGUE
 
+TOLD = 0.5  # probability below which an effect is no finding
 NEAR = 1e-9  # of a range, or of its larger end: a number that close to an end is at it
 
 
@@ -33,7 +34,7 @@ def determined(effects: Sequence[Named], point: Point) -> tuple[tuple[Named, ...
     kept, gone = [], {}
     for effect in effects:
         candidate = Candidate(effect.name, tuple(effect.chosen.items()), tuple(effect.parameters))
-        reason = not_determined(candidate, effect.parameters, point)
+        reason = not_determined(candidate, effect.parameters, point) or improbable(effect.held_out_nats)
         if reason:
             gone[effect.name] = reason
         else:
@@ -67,6 +68,16 @@ def not_determined(candidate: Candidate, parameters: Mapping[str, Value], point:
     return ""
 
 
+def improbable(held_out_nats: float) -> str:
+    """Why an effect that brings so many nats on flight held out is no finding; "" if it is one."""
+    chance = presence(held_out_nats)
+    if chance >= TOLD:
+        return ""
+    return (
+        f"not determined: what it explains of flight held out, other causes explain as often (probability {chance:.2g})"
+    )
+
+
 def at_an_end(value: float, ends: tuple[float, float], neutral: float) -> bool:
     """Whether a number is where nothing more of it is admitted; none of it is no end."""
     near = NEAR * max(abs(e) for e in ends)
@@ -95,11 +106,12 @@ def without_undetermined(
     gone: dict[str, str] = {}
     while True:
         numbers = numbers_of(data, selection, balance)
-        evidence = [s.taken.evidence for s in selection.steps if s.taken]
+        taken = [s.taken for s in selection.steps if s.taken]
         doubted = [
-            (nats, candidate, found, reason)
-            for nats, candidate, found in zip(evidence, selection.accepted, numbers, strict=True)
-            if candidate.effect not in besides and (reason := not_determined(candidate, found, selection.final))
+            (trial.evidence, candidate, found, reason)
+            for trial, candidate, found in zip(taken, selection.accepted, numbers, strict=True)
+            if candidate.effect not in besides
+            and (reason := not_determined(candidate, found, selection.final) or improbable(trial.held_out))
         ]
         if not doubted:
             return selection, balance, gone

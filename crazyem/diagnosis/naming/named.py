@@ -1,6 +1,5 @@
 """An effect that was found, its numbers, and how sure it is."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,19 +9,16 @@ from scipy import stats
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
 
-CALIBRATED = 0.95  # of the names that nothing speaks against this share was right (docs/explanation/diagnosis.md)
+# Probability that a name is right, by what it brings on flight held out [nats]: log-odds are SLOPE log(nats / EVEN), at
+# most CALIBRATED. Models are approximate: on healthy flights of random worlds wrong names gain tens of nats, and their
+# gains have a heavy tail. Fitted to the names of random worlds (docs/explanation/diagnosis.md).
+EVEN, SLOPE, CALIBRATED = 60.0, 1.2, 0.95
 # Confidence at most beside structure that a name does not outweigh, or where something that shakes explains as much.
 DOUBTFUL = 0.45
-# Nats on flight held out below which a name is weak, and the p-value above which it is so twice. Of 35 weak ones that
-# nothing else spoke against, in 949 simulated drones of three seeds (2038 to 2040), 24 were right; of the 12 that were
-# weak twice, 5.
-WEAK, WEAK_TWICE = 12.0, 1e-4
-SELDOM = 0.8  # confidence of a weak name at most; of one that is so twice `DOUBTFUL`
 # Times the nats of what is left, from which a name beside it is as likely right as not. Of 88 names beside structure in
 # 1268 simulated drones of four seeds (2045 to 2048), 18 of 18 were right that brought 4 times as much or more; of 8
 # with 1 to 4 times as much 2, and 6 of 62 with less.
 OUTWEIGHS = 3.0
-TEMPER = 0.5  # evidence counts half: models are approximate, and candidates were chosen by it
 
 
 @dataclass(frozen=True)
@@ -46,7 +42,7 @@ class Named:
         p_value: of its score test, the number of candidates allowed for.
         confidence: probability that this effect is there and not a look-alike.
         fitted_as: the effect as which it was fitted; "": by its own name.
-        log_odds: log posterior odds of the best model with it over the best without it; None: not by a posterior.
+        log_odds: log posterior odds of the effect, whatever its look-alikes; None: not known.
     """
 
     name: str
@@ -89,22 +85,11 @@ def trust(remains: Unexplained, held_out_nats: float = 0.0) -> float:
     return min(explained, max(DOUBTFUL, times**2 / (times**2 + OUTWEIGHS**2)))
 
 
-def share(best: float, others: Sequence[float]) -> float:
-    """Probability of the best against its rivals and against nothing (evidence 0)."""
-    weights = np.exp(np.clip(TEMPER * (np.array([*others, 0.0]) - best), -700, 0))
-    return CALIBRATED / float(1.0 + weights.sum())
-
-
-def at_most(held_out_nats: float, p_value: float, *, apart: bool = True) -> float:
-    """The most that a name is worth by what it brings on flight held out [nats] and by its p-value.
-
-    Where no flight is `apart`, what was held out are blocks of the flight that was fitted, which share what is peculiar
-    to it: a name that is weak by its p-value is weak.
-    """
-    unsure = p_value > WEAK_TWICE
-    if held_out_nats >= WEAK:
-        return SELDOM if unsure and not apart else CALIBRATED
-    return DOUBTFUL if unsure else SELDOM
+def presence(held_out_nats: float) -> float:
+    """Probability that an effect is there, whatever its look-alikes, by what it brings on flight held out [nats]."""
+    if held_out_nats <= 0.0:
+        return 0.0
+    return min(CALIBRATED, 1.0 / (1.0 + (EVEN / held_out_nats) ** SLOPE))
 
 
 def one_factor(values: NDArray, neutral: NDArray, covariance: NDArray) -> bool:

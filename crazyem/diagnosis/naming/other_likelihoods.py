@@ -11,7 +11,7 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import usual_gusts
 from crazyem.diagnosis.naming import accelerometer, rotor_response
 from crazyem.diagnosis.naming.gusts import find_gusts
-from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, around, at_most, share, trust
+from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, around, presence, trust
 from crazyem.diagnosis.naming.prune import ADMITTED
 from crazyem.diagnosis.naming.trials import SURE
 from crazyem.diagnosis.naming.unexplained import Unexplained
@@ -56,7 +56,7 @@ def other_likelihoods(
             if held > 0:
                 # what the regression explains, nothing where gusts are all there is, says nothing of them
                 left = replace(remains.without_force(), gained=gusts.gain)
-                sure = trust(left, held) * share(min(gusts.gain, held), [])
+                sure = trust(left, held) * presence(min(gusts.gain, held))
                 found.append(Named("gusts", "gusts", values, {}, held, float(np.exp(-min(held, 700.0))), sure))
     if not wanted or accelerometer.EFFECT in wanted:
         tilted = accelerometer.tilt(data, point)
@@ -71,7 +71,7 @@ def other_likelihoods(
                 values = {n: Value(float(a), "rad", float(e), around(float(a), float(e)))
                           for n, a, e in zip(accelerometer.ANGLES, angles, sd, strict=True)}  # fmt: skip
                 found.append(Named(accelerometer.EFFECT, accelerometer.EFFECT, values, {}, held, wald,
-                                   share(min(solution.gain / max(1.0, solution.dispersion), held), [])))  # fmt: skip
+                                   presence(min(solution.gain / max(1.0, solution.dispersion), held))))  # fmt: skip
     return found
 
 
@@ -100,7 +100,7 @@ def late_rotors(
         p = CATALOGUE[name].parameters[0]
         values = {p.name: Value(value, p.unit, sd, around(value, sd))}
         p_value = float(np.exp(-min(late.nats, 700.0)))
-        sure = share(min(late.nats, late.held_out), []) * (0.5 if late.alike else 1.0)
-        most = DOUBTFUL if deaf else at_most(late.held_out, p_value, apart=bool(held_out))
-        named.append(Named(name, name, values, {}, late.held_out, p_value, min(sure, most)))
+        sure = presence(min(late.nats, late.held_out)) * (0.5 if late.alike else 1.0)
+        sure = min(sure, DOUBTFUL) if deaf else sure
+        named.append(Named(name, name, values, {}, late.held_out, p_value, sure))
     return named, (("motor_lag", "input_delay"),) if late.alike else ()
