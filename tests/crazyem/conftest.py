@@ -69,7 +69,7 @@ class Simulator:
 
     def kill(self) -> None:
         self.process.kill()
-        self.process.wait(5)
+        self.process.wait(60)
 
     def stop(self) -> None:
         if self.process.poll() is None:
@@ -77,7 +77,7 @@ class Simulator:
                 self.resume()
             self.process.terminate()
             try:
-                self.process.wait(5)
+                self.process.wait(60)
             except subprocess.TimeoutExpired:
                 self.kill()
         if self.process.stdout is not None:

@@ -17,7 +17,7 @@ def relayed(uri, *faults, seed=0):
         yield relay
     finally:
         relay.stopping = True
-        thread.join(10)
+        thread.join(60)
         assert not thread.is_alive()
 
 

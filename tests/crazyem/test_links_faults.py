@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 from fake_peer import FakePeer
+from received import packets, take, wait_for
 from relayed import down, now_on, relayed, up
 
 from crazyem.errors import LinkError, UsageError
@@ -147,35 +148,16 @@ def test_a_loss_of_a_tenth_both_ways(simulator):
     drone = simulator()
     with relayed(drone.uri, down("drop", rate=0.1), up("drop", rate=0.1)) as relay, connected(relay.uri) as link:
         blocks = link.subscribe(standard_variables(link.log_variables), 100.0)
-        packets = take(link, 2.0)
+        came = packets(link, 400)
         write = link.write_parameter("ctrlLee.mass", 0.031)
         statistics = link.statistics()
         now_on(relay)
         assert write.verified
         assert link.read_parameter("ctrlLee.mass") == write.echoed
-    assert {p.block for p in packets} == {b.identifier for b in blocks}
+    assert {p.block for p in came} == {b.identifier for b in blocks}
     share = statistics.lost / (statistics.lost + statistics.received)
     assert 0.03 < share < 0.2
     assert set(statistics.per_block) == {b.identifier for b in blocks}
-
-
-def take(link, seconds):
-    items, deadline = [], time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        if link.packets.empty():
-            time.sleep(0.005)
-        else:
-            items.append(link.packets.get_nowait())
-    return items
-
-
-def wait_for(link, kind, seconds=60.0):
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        item = link.packets.get(timeout=seconds)
-        if isinstance(item, kind):
-            return item
-    raise AssertionError(f"no {kind.__name__} came")
 
 
 # --- log blocks -----------------------------------------------------------------------------------------------------
@@ -202,8 +184,8 @@ def test_faster_than_a_hundred_hertz(simulator, rate, period):
     drone = simulator()
     with connected(drone.uri) as link:
         blocks = link.subscribe(["gyro.x", "gyro.y", "gyro.z", "acc.x", "acc.y", "acc.z"], rate)
-        take(link, 0.2)
-        stamps = [p.firmware_time_ms for p in take(link, 1.0)]
+        packets(link, 50)
+        stamps = [p.firmware_time_ms for p in packets(link, 1000 // period)]
         statistics = link.statistics()
     assert [b.period_ms for b in blocks] == [period]
     assert statistics.lost <= 2
@@ -226,7 +208,7 @@ def test_firmware_that_cannot_start_by_the_millisecond(older_peer):
 def test_a_session_logs_every_10_ms_where_11_are_refused(older_peer):
     with connected(older_peer.uri) as link:
         blocks = link.subscribe(NAMES, LOG_RATE)
-        stamps = [p.firmware_time_ms for p in take(link, 0.3)]
+        stamps = [p.firmware_time_ms for p in packets(link, 30)]
         running = list(link._blocks._running)
     assert [b.period_ms for b in blocks] == [10]
     assert running == [blocks[0].identifier]  # nothing is left of the block that was refused
@@ -242,7 +224,7 @@ def test_loss_delay_round_trip_and_clocks_are_told(fake_peer):
         (block,) = link.subscribe(NAMES, 100.0)
         take(link, 4.5)
         fake_peer.skip = lambda number: number % 10 == 3
-        take(link, 1.0)
+        packets(link, 90)
         statistics = link.statistics()
     median, p99 = statistics.delays[block.identifier]
     assert 0.005 < median < p99  # no upper bounds: a busy machine adds any delay (test_links_clock.py has the numbers)
@@ -258,12 +240,12 @@ def test_stamps_wrap_and_losses_are_counted_under_loss_reordering_and_duplicates
     faults.append(down("duplicate", kinds=["log.data"], rate=0.2))
     with relayed(fake_peer.uri, *faults, seed=2) as relay, connected(relay.uri) as link:
         link.subscribe(NAMES, 100.0)
-        packets = take(link, 2.5)
+        came = packets(link, 200)
         statistics = link.statistics()
     # The peer's values are the packets' numbers, so they tell what each stamp should have become.
-    assert all(p.firmware_time_ms == fake_peer.first_stamp + 10 * p.values[0] for p in packets)
-    assert packets[-1].firmware_time_ms > 1 << 24
-    numbers = [p.values[0] for p in packets]
+    assert all(p.firmware_time_ms == fake_peer.first_stamp + 10 * p.values[0] for p in came)
+    assert came[-1].firmware_time_ms > 1 << 24
+    numbers = [p.values[0] for p in came]
     hidden = len(numbers) - len(set(numbers))  # doubled just after a loss
     lost, early = (max(n) - min(n) + 1 - len(set(n)) for n in (numbers, numbers[:-12]))
     assert hidden < 0.1 * len(numbers)
@@ -273,9 +255,8 @@ def test_stamps_wrap_and_losses_are_counted_under_loss_reordering_and_duplicates
 
 def test_harmed_packets_raise_nothing(fake_peer):
     with connected_then(fake_peer, down("corrupt", rate=0.3, bits=4)) as link:
-        packets = take(link, 2.0)
+        packets(link, 60)
         writes = [link.write_parameter("ctrlLee.mass", 0.03 + k / 1000, timeout=30.0) for k in range(20)]
-    assert len(packets) > 50
     # An echo that is not the value's bits is no confirmation; asked again, it comes.
     assert all(w.verified == (w.echoed == struct.unpack("<f", struct.pack("<f", w.value))[0]) for w in writes)
     assert sum(w.verified for w in writes) >= 15
@@ -307,7 +288,7 @@ def test_a_link_comes_back_with_its_blocks(clock_peer, monkeypatch, faults):
     monkeypatch.setattr("crazyem.links.crazyflie.SILENT_AFTER", 0.7)
     with relayed(clock_peer.uri) as relay, connected(relay.uri) as link:
         (block,) = link.subscribe(NAMES, 100.0)
-        before = take(link, 0.5)[-1]
+        before = packets(link, 30)[-1]
         now_on(relay, *faults)
         assert isinstance(wait_for(link, LinkLost), LinkLost)
         with pytest.raises(LinkError):
@@ -336,7 +317,7 @@ def test_blocks_that_are_gone_are_created_anew(clock_peer, monkeypatch):
     monkeypatch.setattr("crazyem.links.crazyflie.SILENT_AFTER", 0.5)
     with relayed(clock_peer.uri) as relay, connected(relay.uri) as link:
         link.subscribe(NAMES, 100.0)
-        take(link, 0.3)
+        packets(link, 20)
         clock_peer._periods.clear()
         clock_peer._blocks.clear()
         wait_for(link, LinkLost)
@@ -351,7 +332,7 @@ def test_a_restarted_drone_is_not_taken_for_the_same(clock_peer, monkeypatch):
     clock_peer.first_stamp = 50_000
     with relayed(clock_peer.uri) as relay, connected(relay.uri) as link:
         link.subscribe(NAMES, 100.0)
-        take(link, 0.3)
+        packets(link, 20)
         now_on(relay, down("silence", end=1.0))
         wait_for(link, LinkLost)
         clock_peer.first_stamp = 0

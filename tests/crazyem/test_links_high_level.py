@@ -40,7 +40,7 @@ def test_the_command_is_the_firmwares():
 @pytest.mark.parametrize("lost", [0, 1, 5])
 def test_it_is_sent_until_it_is_confirmed(lost):
     drone = Drone(answers=lost + 1)
-    assert send_until_confirmed(drone, land_command(0.0, 2.0), timeout=5.0, repeat_after=0.001)
+    assert send_until_confirmed(drone, land_command(0.0, 2.0), timeout=60.0, repeat_after=0.001)
     assert drone.sent == [(8, 0, land_command(0.0, 2.0))] * (lost + 1)
     assert drone.callbacks == []
 

@@ -229,13 +229,13 @@ def relayed(drone, faults=(), **options):
         yield relay
     finally:
         relay.stopping = True
-        thread.join(5)
+        thread.join(60)
         assert not thread.is_alive()
 
 
 def host(relay):
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    sock.settimeout(5.0)
+    sock.settimeout(60.0)
     sock.connect(relay.address)
     return sock
 
@@ -363,7 +363,7 @@ def test_the_command_relays_and_counts(drone):
         line = process.stdout.readline()
         address = re.search(r"udp://([\d.]+):(\d+) ->", line)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-            sock.settimeout(5.0)
+            sock.settimeout(60.0)
             sock.connect((address[1], int(address[2])))
             for datagram in (LOG_DATA, LOG_DATA, ECHO):
                 sock.send(datagram)

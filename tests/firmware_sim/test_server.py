@@ -49,7 +49,7 @@ def connect(port):
         def new():
             sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-            sock.settimeout(5.0)
+            sock.settimeout(TIMEOUT)
             sock.connect(("127.0.0.1", port))
             return sock
 
@@ -79,7 +79,7 @@ def silent(sock):
     except BlockingIOError:
         return True
     finally:
-        sock.settimeout(5.0)
+        sock.settimeout(TIMEOUT)
 
 
 def start_log(sock):

@@ -120,7 +120,7 @@ def running(number):
 
 def client(stack, port):
     sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-    sock.settimeout(10.0)
+    sock.settimeout(60.0)
     sock.connect(("127.0.0.1", port))
     return sock
 
