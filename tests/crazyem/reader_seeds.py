@@ -144,7 +144,7 @@ def damage(data: bytes, rng: random.Random) -> bytes:
             del out[at : at + rng.randint(1, 40)]
         elif kind == 5:
             end = min(len(out), at + rng.randint(1, 200))
-            out[at:at] = out[at:end] * rng.randint(1, 3)
+            out[at:at] = rng.choice((out[at:end] * rng.randint(1, 3), rng.randbytes(rng.randint(1, 40))))
         else:
             out[at : at + 8] = struct.pack("<d", rng.choice((float("nan"), float("inf"), -1e308, 1e-320, 2.0**63)))
     return bytes(out)

@@ -412,31 +412,6 @@ def test_damage_is_named_by_its_place(tmp_path: Path) -> None:
     assert finding.evidence["offset"] <= len(content) // 3 <= finding.evidence["offset"] + finding.evidence["bytes"]
 
 
-@given(
-    place=st.integers(0, 10**6),
-    junk=st.binary(min_size=1, max_size=40),
-    mode=st.sampled_from(["overwrite", "insert", "delete"]),
-    chunk=st.sampled_from([100, 4000]),
-)
-def test_random_damage_never_ends_in_anything_but_our_error(
-    tmp_path_factory: pytest.TempPathFactory, place: int, junk: bytes, mode: str, chunk: int
-) -> None:
-    messages = motors(5)[0]
-    messages += [odometry("/cf1/odom", START + i, [0, 0, 1, 0, 0, 0, 1], [1, 0, 0]) for i in range(5)]
-    content = bag(messages, chunk=chunk, compression=CompressionType.NONE)
-    place = 8 + place % (len(content) - 8)
-    rest = {"overwrite": place + len(junk), "insert": place, "delete": place + len(junk)}[mode]
-    damaged = content[:place] + (b"" if mode == "delete" else junk) + content[rest:]
-    path = save(tmp_path_factory.mktemp("damage"), damaged)
-    recording, said = None, str(path)
-    try:
-        recording = read(path, ReadOptions())
-    except CrazyemError as error:
-        said = str(error)
-    assert recording is None or len(recording) > 0
-    assert str(path) in said
-
-
 LIES = {
     "itself": "A a",
     "each other": f"B b\n{LINE}\nMSG: x/B\nA a",

@@ -388,28 +388,6 @@ def test_a_flipped_bit_costs_one_frame(tmp_path: Path) -> None:
 
 
 @given(
-    place=st.integers(0, 10**6),
-    junk=st.binary(min_size=1, max_size=60),
-    mode=st.sampled_from(["overwrite", "insert", "delete"]),
-)
-def test_random_damage_never_ends_in_anything_but_our_error(
-    tmp_path_factory: pytest.TempPathFactory, place: int, junk: bytes, mode: str
-) -> None:
-    content, _ = flight(rows=3)
-    place %= len(content)
-    rest = {"overwrite": place + len(junk), "insert": place, "delete": place + len(junk)}[mode]
-    damaged = content[:place] + (b"" if mode == "delete" else junk) + content[rest:]
-    path = save(tmp_path_factory.mktemp("damage"), damaged)
-    recording, said = None, str(path)
-    try:
-        recording = read(path, ReadOptions())
-    except CrazyemError as error:
-        said = str(error)
-    assert recording is None or len(recording) > 0
-    assert str(path) in said
-
-
-@given(
     identifier=st.sampled_from(sorted(mavlink.mavlink_map)),
     payload=st.binary(max_size=255),
     stamp=st.integers(946_684_800_000_001, 4_102_444_799_999_999),

@@ -373,30 +373,6 @@ def test_garbage_in_the_middle_costs_only_itself(tmp_path: Path) -> None:
         assert abs(finding.evidence["offset"] - len(head + first)) <= 3
 
 
-@given(
-    place=st.integers(0, 10**6),
-    junk=st.binary(min_size=1, max_size=40),
-    mode=st.sampled_from(["overwrite", "insert", "delete"]),
-)
-def test_random_damage_never_ends_in_anything_but_our_error(
-    tmp_path_factory: pytest.TempPathFactory, place: int, junk: bytes, mode: str
-) -> None:
-    content, _ = flight(rows=4)
-    place = 7 + place % (len(content) - 7)
-    rest = {"overwrite": place + len(junk), "insert": place, "delete": place + len(junk)}[mode]
-    damaged = content[:place] + (b"" if mode == "delete" else junk) + content[rest:]
-    path = save(tmp_path_factory.mktemp("damage"), damaged)
-    recording = None
-    said = str(path)
-    try:
-        recording = read(path, ReadOptions())
-    except CrazyemError as error:
-        said = str(error)
-    assert recording is None or len(recording) > 0
-    assert str(path) in said
-    assert "\n" not in said
-
-
 @given(st.binary(max_size=400))
 def test_random_bytes_after_the_header(tmp_path_factory: pytest.TempPathFactory, junk: bytes) -> None:
     path = save(tmp_path_factory.mktemp("random"), b"ULog\x01\x12\x35" + junk)
