@@ -18,3 +18,8 @@ settings.register_profile(
 settings.register_profile("many", settings.get_profile("steady"), max_examples=30)
 settings.register_profile("new", settings.get_profile("many"), derandomize=False, print_blob=True)
 settings.load_profile("steady")  # --hypothesis-profile loads the others
+
+
+def pytest_collection_modifyitems(items: list) -> None:
+    """The longest test begins first: at the end of a list it would keep the others waiting for a minute."""
+    items.sort(key=lambda item: "test_the_first_flight_after_installation" not in item.nodeid)

@@ -23,6 +23,8 @@ from errata_tools import (
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal, norm
 
+pytestmark = pytest.mark.slow  # about the paper: no code of ours but its plant is in it
+
 F1, F2, r1, r2, d1, d2 = sp.symbols("F1 F2 r1 r2 d1 d2", positive=True)  # two steps: thrust, r, change of velocity
 
 
@@ -275,7 +277,6 @@ def test_closed_loop_printed_e_step_biases_inertia():
     assert np.allclose(middles, [0.028, 0.020, 0.042], atol=1e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0707, 0.2])
 def test_closed_loop_a_proper_e_step_does_not(noise):
     """Same flights: within 0.3 %, two standard errors and less, of what true states give."""

@@ -8,6 +8,8 @@ from scipy.stats import norm
 
 from crazyem.paper.settings import Settings
 
+pytestmark = pytest.mark.slow  # about the paper: no code of ours but its plant is in it
+
 # Tables II to V: ranges of the estimates over 20 cycles
 OFFLINE_MASS = {"A": (0.1797, 0.1802), "B": (0.1788, 0.1801), "C": (0.1896, 0.196)}
 ONLINE_MASS = {"A": (0.1795, 0.1806), "B": (0.1793, 0.1807), "C": (0.1825, 0.196)}

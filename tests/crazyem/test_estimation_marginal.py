@@ -77,6 +77,7 @@ def test_widening_for_correlation_is_kept():
     np.testing.assert_allclose(double.high, 2 * plain.high)
 
 
+@pytest.mark.slow
 def test_the_integral_is_that_of_a_fine_grid_with_everything_refitted():
     """Thrust noise on 25 points of log s, all else converged at each, against the nodes and their quadratic steps."""
     flight = zhao_flight.fly(seed=21)

@@ -121,6 +121,7 @@ def test_windows_do_not_overlap():
     assert stretches(Settings(), "flight") == [(0, 4001)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", "AC")
 def test_every_window_of_a_flight_is_estimated_as_well_as_can_be(sensor):
     rows = study("windows", sensor, 7)

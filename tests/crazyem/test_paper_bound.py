@@ -156,6 +156,7 @@ def test_inertia_with_perfect_sensors_is_known_from_the_torque_and_from_the_size
 # the score ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", "AC")
 def test_score_scatters_over_flights_as_the_information_says(sensor):
     """The information is the covariance of the score at the truth: nothing but the plant's own noise decides that."""
@@ -171,6 +172,7 @@ def test_score_scatters_over_flights_as_the_information_says(sensor):
     assert np.all(np.abs(u.mean(0)) * np.sqrt(len(u)) < 3.5)
 
 
+@pytest.mark.slow
 def test_an_efficient_estimator_errs_as_much_as_the_bound_says():
     z = []
     for seed in range(200, 224):
