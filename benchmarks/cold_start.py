@@ -50,7 +50,8 @@ Kind = tuple[str, str, str]  # start, reference, sensor
 def version() -> str:
     """Changes with any code that a flight depends on (not with its comments), and with the settings."""
     digest = hashlib.sha256(repr([astuple(settings) for settings in REFERENCES.values()]).encode())
-    of_paper = ("bound", "cold_start", "flight", "plant", "product", "settings", "state_filter")
+    digest.update(ast.dump(ast.parse(Path(__file__).with_name("cold_start_study.py").read_bytes())).encode())
+    of_paper = ("bound", "flight", "plant", "product", "settings")
     for folder in ("paper", "estimation", "control", "physics"):
         for path in sorted((ROOT / "crazyem" / folder).rglob("*.py")):
             if folder != "paper" or path.stem in of_paper:

@@ -10,8 +10,7 @@ from crazyem.commands.batch import each, processes
 from crazyem.commands.common import say
 from crazyem.commands.output import Result, put
 from crazyem.errors import UsageError
-from crazyem.paper.overrides import describe_text, settings_with
-from crazyem.paper.settings import READINGS, Settings
+from crazyem.paper.settings import READINGS, Settings, describe_text, settings_with
 
 
 def run(arguments: argparse.Namespace) -> int:

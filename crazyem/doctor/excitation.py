@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.whitening import AUTOREGRESSION_ORDER, Fit, autoregression, filtered, long_run
+from crazyem.doctor.regression import AUTOREGRESSION_ORDER, Fit, autoregression, filtered, long_run
 from crazyem.physics.lag import CAUSAL, LINEAR, fit_predictor, hold_predictor, lagged_means
 from crazyem.physics.rotations import quaternion_conjugate, quaternion_product, rotation_vector_from_quaternion
 from crazyem.recordings.airborne import Airtime

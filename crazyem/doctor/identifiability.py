@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from crazyem.doctor import excitation
 from crazyem.doctor.excitation import Steps
-from crazyem.doctor.whitening import Fit, linear_fit
+from crazyem.doctor.regression import Fit, linear_fit
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.airborne import Airtime
 from crazyem.recordings.finding import percent

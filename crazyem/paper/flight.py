@@ -14,9 +14,8 @@ from crazyem.compiled import compiled
 from crazyem.control.lqg import control, position_gains
 from crazyem.control.trajectories import smooth_step
 from crazyem.errors import UsageError
-from crazyem.paper.plant import step, thrust_axis
+from crazyem.paper.plant import filter_step, step, thrust_axis
 from crazyem.paper.settings import Settings
-from crazyem.paper.state_filter import filter_step
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import GRAVITY
 

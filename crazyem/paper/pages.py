@@ -4,8 +4,7 @@ import html
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from crazyem.paper.published_corrections import CORRECTIONS
-from crazyem.paper.published_values import CONVERGENCE, NOT_RESULTS
+from crazyem.paper.published_values import CONVERGENCE, CORRECTIONS, NOT_RESULTS
 from crazyem.paper.table_text import Grid, grids, number, percent
 
 Record = Mapping[str, Any]

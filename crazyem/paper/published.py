@@ -1,8 +1,12 @@
 """The paper's own algorithm as printed (section X), with only those corrections without which it does not run.
 
 It is here to be compared with, not to be used: the product's estimator is crazyem.estimation. What was corrected stands
-in published_corrections.CORRECTIONS, with the reasons; everything else is kept, the isotropic Q0 and R0, the Jacobian
+in published_values.CORRECTIONS, with the reasons; everything else is kept, the isotropic Q0 and R0, the Jacobian
 without the tilt (eq. 59) and the smoother that ignores it (eq. 95) included.
+
+Kernels: filter (eq. 88-93), smoother (94-98), mass (107), inertia (appendix). With isotropic P0, Q0, R0 and the
+Jacobian of eq. 59 the covariance never couples position and velocity with angles and rates, nor one axis of position
+with another, and is the same for the three: three numbers and a 6 by 6 block hold it.
 """
 
 from dataclasses import dataclass
@@ -11,11 +15,241 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.compiled import compiled
 from crazyem.errors import UsageError
 from crazyem.paper.flight import Flight
-from crazyem.paper.published_corrections import CORRECTIONS, Correction
-from crazyem.paper.published_kernels import expectation, maximisation
+from crazyem.paper.plant import derivative
+from crazyem.paper.published_values import CORRECTIONS, Correction
 from crazyem.paper.settings import Settings
+from crazyem.vehicle import GRAVITY
+
+
+@compiled
+def _blocks(x, dt, a, b):
+    """Rows of the angles in eq. 59: a (3, 3) by angles, b (3, 3) by rates."""
+    s, c = np.sin(x[6]), np.cos(x[6])
+    sp, cp = np.sin(x[7]), np.cos(x[7])
+    t = sp / cp
+    wy, wz = x[10], x[11]
+    a[0, 0] = 1.0 + dt * t * (c * wy - s * wz)
+    a[0, 1] = dt * (s * wy + c * wz) / cp**2
+    a[1, 0] = dt * (-s * wy - c * wz)
+    a[1, 1] = 1.0
+    a[2, 0] = dt * (c * wy - s * wz) / cp
+    a[2, 1] = dt * (s * wy + c * wz) * sp / cp**2
+    b[0, 0] = dt
+    b[0, 1] = dt * s * t
+    b[0, 2] = dt * c * t
+    b[1, 0] = 0.0
+    b[1, 1] = dt * c
+    b[1, 2] = -dt * s
+    b[2, 0] = 0.0
+    b[2, 1] = dt * s / cp
+    b[2, 2] = dt * c / cp
+
+
+@compiled
+def _predict_angular(p, a, b, q, half):
+    """Eq. 89 for angles and rates: p (6, 6) in place, both triangles; half (3, 6) is scratch."""
+    for i in range(3):
+        for j in range(6):
+            total = a[i, 0] * p[0, j] + a[i, 1] * p[1, j]
+            if i == 2:
+                total += p[2, j]
+            half[i, j] = total + b[i, 0] * p[3, j] + b[i, 1] * p[4, j] + b[i, 2] * p[5, j]
+    for i in range(3):
+        for j in range(i + 1):
+            total = half[i, 0] * a[j, 0] + half[i, 1] * a[j, 1]
+            if j == 2:
+                total += half[i, 2]
+            total += half[i, 3] * b[j, 0] + half[i, 4] * b[j, 1] + half[i, 5] * b[j, 2]
+            p[i, j] = total
+            p[j, i] = total
+        for j in range(3, 6):
+            p[i, j] = half[i, j]
+            p[j, i] = half[i, j]
+    for i in range(6):
+        p[i, i] += q
+
+
+@compiled
+def _correct_angular(p, x, y, r, sees_angles, gain):
+    """Eq. 91-93 for angles and rates, a scalar at a time (R is diagonal): p (6, 6) and x[6:12] in place."""
+    for c in range(0 if sees_angles else 3, 6):
+        s = 1.0 / (p[c, c] + r)
+        innovation = (y[6 + c] - x[6 + c]) * s
+        for i in range(6):
+            gain[i] = p[i, c]
+            x[6 + i] += gain[i] * innovation
+        for i in range(6):
+            scaled = gain[i] * s
+            for j in range(i + 1):
+                value = p[i, j] - scaled * gain[j]
+                p[i, j] = value
+                p[j, i] = value
+
+
+@compiled
+def _correct_linear(p, x, y, r):
+    """Eq. 91-93 for position and velocity: p (3,) variances and covariance rr, rv, vv of each axis, in place."""
+    rr, rv, vv = p[0], p[1], p[2]
+    s = 1.0 / (rr + r)
+    for i in range(3):
+        innovation = (y[i] - x[i]) * s
+        x[i] += rr * innovation
+        x[3 + i] += rv * innovation
+    vv -= rv * rv * s
+    rv -= rv * rr * s
+    rr -= rr * rr * s
+    s = 1.0 / (vv + r)
+    for i in range(3):
+        innovation = (y[3 + i] - x[3 + i]) * s
+        x[i] += rv * innovation
+        x[3 + i] += vv * innovation
+    p[0] = rr - rv * rv * s
+    p[1] = rv - rv * vv * s
+    p[2] = vv - vv * vv * s
+
+
+@compiled
+def _solve6(p, q, d, lower):
+    """(p + q 1)^-1 d for a 6 by 6 block, in place of d; lower (6, 6) is scratch. Cholesky."""
+    for j in range(6):
+        total = p[j, j] + q
+        for k in range(j):
+            total -= lower[j, k] * lower[j, k]
+        pivot = 1.0 / np.sqrt(total)
+        lower[j, j] = pivot  # its inverse
+        for i in range(j + 1, 6):
+            total = p[i, j]
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            lower[i, j] = total * pivot
+        total = d[j]
+        for k in range(j):
+            total -= lower[j, k] * d[k]
+        d[j] = total * pivot
+    for j in range(5, -1, -1):
+        total = d[j]
+        for k in range(j + 1, 6):
+            total -= lower[k, j] * d[k]
+        d[j] = total * lower[j, j]
+
+
+@compiled
+def expectation(
+    observed, wrench, first, theta, dt, p0, q, r, sees_angles, predicted, filtered, linear, angular, smoothed
+):
+    """E-step: extended Kalman filter forwards, Rauch-Tung-Striebel backwards, as printed.
+
+    Args:
+        observed: (n, 12) observations, world and body SI units as the state; the angles are not read unless
+            `sees_angles`. H is the identity otherwise.
+        wrench: (n, 4) thrust N and torque N m held from each row to the next; the last row is not used.
+        first: (12,) mean of the state at the first row before its observation.
+        theta: (4,) mass kg, inertia kg m^2.
+        dt: s.
+        p0, q, r: P0, Q0, R0 as printed, one number each.
+        predicted, filtered, smoothed: (>= n, 12) are filled; linear (>= n, 3) and angular (>= n, 6, 6) with the
+            covariance after each row (position-velocity per axis; angles and rates).
+
+    The smoothed covariance (eq. 98) is left out: neither eq. 107 nor the appendix reads it.
+    """
+    n = observed.shape[0]
+    a = np.zeros((3, 3))
+    b = np.zeros((3, 3))
+    half = np.empty((3, 6))
+    gain = np.empty(6)
+    rate = np.empty(12)
+    x = first.copy()
+    mass = theta[0]
+    inertia = theta[1:]
+    pl = np.array([p0, 0.0, p0])
+    pa = np.zeros((6, 6))
+    for i in range(6):
+        pa[i, i] = p0
+    for k in range(n):
+        if k:
+            _blocks(x, dt, a, b)
+            derivative(x, wrench[k - 1, 0], wrench[k - 1, 1:], mass, inertia, rate)
+            for i in range(12):
+                x[i] += dt * rate[i]
+            pl[0] += 2.0 * dt * pl[1] + dt * dt * pl[2] + q
+            pl[1] += dt * pl[2]
+            pl[2] += q
+            _predict_angular(pa, a, b, q, half)
+        for i in range(12):
+            predicted[k, i] = x[i]
+        _correct_linear(pl, x, observed[k], r)
+        _correct_angular(pa, x, observed[k], r, sees_angles, gain)
+        for i in range(12):
+            filtered[k, i] = x[i]
+        for i in range(3):
+            linear[k, i] = pl[i]
+        for i in range(6):
+            for j in range(6):
+                angular[k, i, j] = pa[i, j]
+    _smooth(n, q, predicted, filtered, linear, angular, smoothed)
+
+
+@compiled
+def _smooth(n, q, predicted, filtered, linear, angular, smoothed):
+    """Eq. 94-97: means backwards with the gain P (P + Q)^-1."""
+    lower = np.empty((6, 6))
+    d = np.empty(6)
+    for i in range(12):
+        smoothed[n - 1, i] = filtered[n - 1, i]
+    for k in range(n - 2, -1, -1):
+        rr, rv, vv = linear[k, 0], linear[k, 1], linear[k, 2]
+        srr, svv = rr + q, vv + q
+        det = 1.0 / (srr * svv - rv * rv)
+        for i in range(3):
+            dr = smoothed[k + 1, i] - predicted[k + 1, i]
+            dv = smoothed[k + 1, 3 + i] - predicted[k + 1, 3 + i]
+            er = (svv * dr - rv * dv) * det
+            ev = (srr * dv - rv * dr) * det
+            smoothed[k, i] = filtered[k, i] + rr * er + rv * ev
+            smoothed[k, 3 + i] = filtered[k, 3 + i] + rv * er + vv * ev
+        for i in range(6):
+            d[i] = smoothed[k + 1, 6 + i] - predicted[k + 1, 6 + i]
+        p = angular[k]
+        _solve6(p, q, d, lower)
+        for i in range(6):
+            total = filtered[k, 6 + i]
+            for j in range(6):
+                total += p[i, j] * d[j]
+            smoothed[k, 6 + i] = total
+
+
+@compiled
+def maximisation(x, wrench, theta, dt, clamp, lowest, highest, new):
+    """M-step: mass (eq. 107 without its last dt) and inertia (appendix) from means, as printed without expectations.
+
+    Args:
+        x: (n, 12) smoothed states. wrench: (n, 4) thrust N, torque N m held from each row to the next.
+        theta: (4,) the last parameters; the formula of each axis takes the others' inertia from here.
+        dt: s.
+        clamp: keep the last value where the new one is no number between lowest and highest, (4,) each.
+        new: (4,) is filled: mass kg, inertia kg m^2.
+    """
+    top = np.zeros(4)
+    low = np.zeros(4)
+    for k in range(x.shape[0] - 1):
+        force = wrench[k, 0] * np.cos(x[k, 6]) * np.cos(x[k, 7])
+        top[0] += force * force * dt
+        low[0] += force * (GRAVITY * dt + x[k + 1, 5] - x[k, 5])
+        for i in range(3):
+            j = (i + 1) % 3
+            m = (i + 2) % 3
+            torque = wrench[k, 1 + i] + (theta[1 + j] - theta[1 + m]) * x[k, 9 + j] * x[k, 9 + m]
+            top[1 + i] += torque * torque * dt
+            low[1 + i] += (x[k + 1, 9 + i] - x[k, 9 + i]) * torque
+    for i in range(4):
+        value = top[i] / low[i] if low[i] != 0.0 else np.nan
+        if clamp and not (lowest[i] < value < highest[i]):
+            value = theta[i]
+        new[i] = value
+
 
 __all__ = ["CORRECTIONS", "Correction", "PublishedFit", "PublishedOnline", "published_offline"]
 

@@ -14,8 +14,7 @@ from typing import Any
 
 from crazyem.errors import UsageError
 from crazyem.paper.experiments import Task, run_task
-from crazyem.paper.overrides import described
-from crazyem.paper.settings import Settings
+from crazyem.paper.settings import Settings, described
 
 SCHEMA = "crazyem paper 1"
 LARGEST_TASK_FILE = 20_000_000  # bytes of a task file that is ours; a whole flight of updates takes 0.1 MB
@@ -24,7 +23,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 # What the numbers of a task come from. Tables and figures are made anew each time.
 _CODE = ("physics/**/*.py", "signals/**/*.py", "control/**/*.py", "estimation/**/*.py", "presets/zhao.toml",
          "vehicle.py", "compiled.py", "paper/*.py")  # fmt: skip
-_TEXT_MODULES = "runner tables table_text figures pages overrides published_values published_corrections"
+_TEXT_MODULES = "runner tables table_text figures pages published_values"
 _NOT_CODE = {f"paper/{name}.py" for name in _TEXT_MODULES.split()}
 _VERSIONED_PACKAGES = ("numpy", "scipy", "numba")
 

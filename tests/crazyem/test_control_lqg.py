@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 from scipy.spatial.transform import Rotation
 
-from crazyem.control.flatness import reference_angles, reference_rate
-from crazyem.control.lqg import SMALLEST_TILT_COSINE, control, position_gains
+from crazyem.control.lqg import SMALLEST_TILT_COSINE, control, position_gains, reference_angles, reference_rate
 from crazyem.paper.plant import angle_rates, derivative
 
 GRAVITY = 9.81

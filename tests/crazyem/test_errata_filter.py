@@ -29,7 +29,7 @@ from errata_tools import (
 from reference import extended_kalman_filter, rauch_tung_striebel
 from scipy.optimize import approx_fprime
 
-from crazyem.paper import plant, state_filter
+from crazyem.paper import plant
 from crazyem.physics.rigid_body import State
 from crazyem.vehicle import GRAVITY
 
@@ -45,7 +45,7 @@ def test_25_the_acceleration_of_the_filter_is_not_what_an_accelerometer_reads():
     x, p = np.zeros(12), np.eye(12)
     for reading, speed in ((np.array([0.0, 0.0, G]), G * DT), (np.zeros(3), 0.0)):
         state, covariance = x.copy(), p.copy()
-        state_filter.filter_step(state, covariance, reading, np.zeros(3), np.zeros(3), DT, Q0, 1e12)
+        plant.filter_step(state, covariance, reading, np.zeros(3), np.zeros(3), DT, Q0, 1e12)
         assert state[5] == pytest.approx(speed, abs=1e-9)
     # right: v' = R f_b - g e3. The simulator gives both readings of one step
     f = flights(8)
@@ -188,7 +188,7 @@ def test_58_the_forward_pass_does_not_know_mass_or_inertia():
     change = sp.Matrix([*v, *f, *(PRINTED_47 * rate), 0, 0, 0])
     assert not change.free_symbols & {m, Ix}
     x, p = np.zeros(12), np.eye(12)
-    state_filter.filter_step(x, p, np.zeros(3), np.ones(3), np.ones(3), DT, Q0, R0)  # takes no parameters
+    plant.filter_step(x, p, np.zeros(3), np.ones(3), np.ones(3), DT, Q0, R0)  # takes no parameters
     assert np.isfinite(x).all()
     # and the torque: a body under 1e-3 N m gains 0.02 rad/s in a step, eq. 58 says 0
     assert derivative(np.zeros(12), HOVER + np.array([0, 1e-3, 0, 0]), MASS, INERTIA)[9] * DT == pytest.approx(0.02)
@@ -334,7 +334,7 @@ def test_right_59_to_70_jacobian_of_58():
     # and it is what the code has
     x0 = np.random.default_rng(0).uniform(-0.8, 0.8, 12)
     code = np.empty((12, 12))
-    state_filter.transition(x0, DT, code)
+    plant.transition(x0, DT, code)
     names = dict(zip(x, x0, strict=True))
     assert np.allclose(code, np.array(jacobian.subs(names).subs(dt, DT), float))
     assert np.allclose(code, jacobian_59(x0[None])[0])
@@ -347,7 +347,7 @@ def test_right_73_to_76_89_to_93_conditioning_of_a_gaussian():
     p, x = a @ a.T / 12, rng.uniform(-0.5, 0.5, 12)
     y = np.array([0.1, 0.2, -0.3, 0.4, -0.5, 0.6])
     state, covariance = x.copy(), p.copy()
-    state_filter.filter_step(state, covariance, np.zeros(3), y[:3], y[3:], DT, Q0, R0)
+    plant.filter_step(state, covariance, np.zeros(3), y[:3], y[3:], DT, Q0, R0)
     predicted = x + DT * np.concatenate([x[3:6], np.zeros(3), _rates(x), np.zeros(3)])
     phi_k = jacobian_59(x[None])[0]
     prior = phi_k @ p @ phi_k.T + Q0 * np.eye(12)  # 74

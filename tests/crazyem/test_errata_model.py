@@ -37,7 +37,7 @@ from errata_tools import (
 )  # fmt: skip
 from scipy.integrate import quad
 
-from crazyem.control import flatness, lqg
+from crazyem.control import lqg
 from crazyem.paper import plant
 from crazyem.physics.rotations import quaternion_from_euler, rotation_matrix
 from crazyem.vehicle import GRAVITY
@@ -190,7 +190,7 @@ def test_11_and_83_ask_for_different_thrusts():
     assert by_11 / by_83 == pytest.approx(1.122, abs=1e-3)
     # they agree once the attitude is the one that t asks for
     angles = np.empty(3)
-    specific = flatness.reference_angles(t - [0, 0, G], 0.7, angles)
+    specific = lqg.reference_angles(t - [0, 0, G], 0.7, angles)
     assert MASS * specific == pytest.approx(MASS * G / (np.cos(angles[0]) * np.cos(angles[1])))
 
 
@@ -230,7 +230,7 @@ def test_18_without_feed_forward_the_attitude_lags(feed_forward, lag):
     wanted, rates = np.zeros(3), np.empty(3)
     for k in range(2000):
         wanted[0] = k * 1e-3
-        flatness.reference_rate(np.array([angle, 0.0, 0.0]), wanted, 40.0, rates)
+        lqg.reference_rate(np.array([angle, 0.0, 0.0]), wanted, 40.0, rates)
         velocity += 1e-3 * 25.0 * (rates[0] + feed_forward - velocity)
         angle += 1e-3 * velocity
     assert wanted[0] - angle == pytest.approx(lag, abs=1.1e-3)  # one step of the loop
@@ -239,7 +239,7 @@ def test_18_without_feed_forward_the_attitude_lags(feed_forward, lag):
 def test_18_the_yaw_error_must_be_wrapped():
     """Heading 3.1, wanted -3.1 rad: printed turns back through 6.2 rad, the code on through 0.08 rad."""
     rates = np.empty(3)
-    flatness.reference_rate(np.array([0.0, 0.0, 3.1]), np.array([0.0, 0.0, -3.1]), 40.0, rates)
+    lqg.reference_rate(np.array([0.0, 0.0, 3.1]), np.array([0.0, 0.0, -3.1]), 40.0, rates)
     printed = -40.0 * (3.1 - -3.1)
     assert printed < -200
     assert rates[2] == pytest.approx(40.0 * (2 * np.pi - 6.2))
@@ -313,7 +313,7 @@ def test_right_8_to_17_flatness():
     angles = np.empty(3)
     for acceleration in rng.normal(size=(20, 3)) * 3:
         yaw = rng.uniform(-3, 3)
-        specific = flatness.reference_angles(acceleration, yaw, angles)
+        specific = lqg.reference_angles(acceleration, yaw, angles)
         assert np.allclose(specific * axis(angles), acceleration + np.array([0, 0, GRAVITY]))  # 8, 11, 14
         x_axis = rotation_matrix(quaternion_from_euler(*angles))[:, 0]
         assert np.arctan2(x_axis[1], x_axis[0]) == pytest.approx(yaw)  # 9, 10, 12
@@ -323,7 +323,7 @@ def test_right_20_21_47_rates_of_the_angles():
     assert zero(PRINTED_21 * PRINTED_47 - sp.eye(3))
     rates, error = np.empty(3), np.array([0.1, -0.2, 0.3])
     for angles in _angles(3):
-        flatness.reference_rate(angles, angles + error, 1.0, rates)  # 20
+        lqg.reference_rate(angles, angles + error, 1.0, rates)  # 20
         assert np.allclose(_rate_numbers(angles, rates), error)
         assert np.allclose(rates, np.array(PRINTED_21.subs(dict(zip((phi, theta), angles[:2]))), float) @ error)
 
@@ -349,7 +349,7 @@ def test_right_49_84_110_euler():
     x[9:] = [1.0, -2.0, 3.0]
     lqg.control(x, np.zeros(9), 0.0, np.array([4.0, 4.0, 20.0, 20.0]), 9.0, MASS, INERTIA, u)
     wanted = np.empty(3)
-    flatness.reference_rate(x[6:9], np.zeros(3), 20.0, wanted)
+    lqg.reference_rate(x[6:9], np.zeros(3), 20.0, wanted)
     commanded = -20.0 * (x[9:] - wanted)
     assert np.allclose(u[1:], INERTIA * commanded + np.cross(x[9:], INERTIA * x[9:]))  # 84
 

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.errors import UsageError
 from crazyem.paper.flight import LIFTED_HEIGHT, Flight, fly, reference
-from crazyem.paper.plant import angle_rates, derivative, step, thrust_axis
+from crazyem.paper.plant import angle_rates, derivative, filter_step, step, thrust_axis, transition
 from crazyem.paper.settings import LITERAL, P5, Settings
-from crazyem.paper.state_filter import filter_step, transition
 
 GRAVITY = 9.81
 INERTIA = np.array([2.5e-4, 3.1e-4, 2.0e-4])

@@ -10,8 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.errors import UsageError
 from crazyem.paper.flight import Flight, fly
-from crazyem.paper.published import CORRECTIONS, LARGEST_INERTIA_RATIO, PublishedOnline, published_offline
-from crazyem.paper.published_kernels import expectation, maximisation
+from crazyem.paper.published import (
+    CORRECTIONS,
+    LARGEST_INERTIA_RATIO,
+    PublishedOnline,
+    expectation,
+    maximisation,
+    published_offline,
+)
 from crazyem.paper.settings import LITERAL, Settings
 
 GRAVITY = 9.81

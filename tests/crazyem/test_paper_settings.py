@@ -13,8 +13,7 @@ from crazyem.errors import UsageError
 from crazyem.paper import experiments
 from crazyem.paper.experiments import Task, plan, run_task
 from crazyem.paper.flight import Flight, fly
-from crazyem.paper.overrides import _text, describe_text, settings_with
-from crazyem.paper.settings import LITERAL, Settings
+from crazyem.paper.settings import LITERAL, Settings, _text, describe_text, settings_with
 
 SMALL = replace(Settings(), duration=1.5, window=200, every=20)
 

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
 from crazyem.recordings.autopilots.frd_ned import vehicle_of
-from crazyem.recordings.autopilots.tlog_clock import Clocks
+from crazyem.recordings.autopilots.tlog_clock import Clocks, link
 from crazyem.recordings.autopilots.tlog_frames import MESSAGES, Frameset, columns_of, scan, units_of
-from crazyem.recordings.autopilots.tlog_link import link
 from crazyem.recordings.autopilots.tlog_signals import RAW_IMU, TLOG_SIGNALS
 from crazyem.recordings.contents import ReadOptions, contents
 from crazyem.recordings.finding import Finding, Grade, note

@@ -11,8 +11,7 @@ from crazyem.recordings.contents import ReadOptions, contents
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.tables import signals_from_tables
 from crazyem.recordings.usd import content
-from crazyem.recordings.usd.format import Header, parse_header, plausible
-from crazyem.recordings.usd.records import blank_from, gather, locate, written
+from crazyem.recordings.usd.format import Header, blank_from, gather, locate, parse_header, plausible, written
 from crazyem.recordings.usd.stretches import Survey, stretches
 
 

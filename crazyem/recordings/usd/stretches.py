@@ -16,8 +16,7 @@ from crazyem.recordings.finding import Finding
 from crazyem.recordings.motor_meaning import MOTOR_VARIABLES
 from crazyem.recordings.tables import Table
 from crazyem.recordings.usd.content import CRC_BYTES, Checksum, Clock, integrity, table
-from crazyem.recordings.usd.format import EventType, Header, parse_header
-from crazyem.recordings.usd.records import BLANK_BYTES, Records, gather, locate, written
+from crazyem.recordings.usd.format import BLANK_BYTES, EventType, Header, Records, gather, locate, parse_header, written
 
 _READ_BYTES = 1 << 22  # bytes read at a time
 _LONGEST_HEADER = 1 << 27  # bytes; what the limits of usd/format.py add up to is less
