@@ -18,7 +18,7 @@ from firmware_sim.controllers.tick import tick_step, tick_step_with_effects
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.drive import present_wrench
 from firmware_sim.plant.effects.motion import origin
-from firmware_sim.plant.effects.sensing import seen_pose
+from firmware_sim.plant.effects.sensing import fix_pose
 from firmware_sim.plant.rotors import wrench
 from firmware_sim.plant.sensors import ACC_CUTOFF, NoiseSource, settle
 from firmware_sim.scenario import Scenario
@@ -134,7 +134,7 @@ class Flight:
         """What a positioning system without noise sees now: m, world; quaternion x, y, z, w, body to world."""
         p: Any = np.empty(3)
         q: Any = np.empty(4)
-        seen_pose(self._truth, self.state, self._sensor, self.tick, p, q)
+        fix_pose(self._truth, self.state, self._sensor, self.tick, p, q)
         return p, np.roll(q, -1)
 
     def step(self) -> None:

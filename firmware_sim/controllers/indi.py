@@ -50,7 +50,7 @@ def indi_step(setpoint, estimate, sensor, param, memory, log, tick):
     roll, pitch, yaw = roll_pitch_yaw(estimate, at.E_QUAT)
     angle[0], angle[1], angle[2] = roll, -pitch, -yaw
     rate[0], rate[1], rate[2] = sensor[at.GYRO], -sensor[at.GYRO + 1], -sensor[at.GYRO + 2]
-    want_attitude(setpoint, estimate, sensor, angle, param, memory, log, tick)
+    attitude_setpoint(setpoint, estimate, sensor, angle, param, memory, log, tick)
     for i in range(3):
         goal = param[pm.INDI_ERR + i] * (memory[mem.INDI_ATTITUDE + i] - angle[i])
         if i < 2 and setpoint[sp.MODE_ROLL + i] == sp.VELOCITY:
@@ -85,7 +85,7 @@ def indi_step(setpoint, estimate, sensor, param, memory, log, tick):
 
 
 @kernel
-def want_attitude(setpoint, estimate, sensor, angle, param, memory, log, tick):
+def attitude_setpoint(setpoint, estimate, sensor, angle, param, memory, log, tick):
     """The wanted roll, pitch, yaw [rad] into INDI_ATTITUDE and the thrust into INDI_THRUST."""
     a = mem.INDI_ATTITUDE
     if setpoint[sp.MODE_YAW] == sp.VELOCITY:

@@ -57,12 +57,12 @@ def regulate(k, desired, measured, dt, limit, circular, cutoff, param, memory, l
 @kernel
 def reset(estimate, memory):
     """Forget integrals and hold the present heading."""
-    forget(estimate, memory)
+    clear_integrals(estimate, memory)
     memory[mem.PID_ATTITUDE + 2] = angles(estimate)[2]
 
 
 @kernel
-def forget(estimate, memory):
+def clear_integrals(estimate, memory):
     """Forget integrals; derivatives start from what is measured now. The heading to hold stays."""
     roll, pitch, yaw = angles(estimate)
     measured = (roll, pitch, yaw, 0.0, 0.0, 0.0)
@@ -90,7 +90,7 @@ def pid_step(setpoint, estimate, sensor, param, memory, log, tick):
         changed = changed or memory[mem.PID_MODES + i] != setpoint[i]
         memory[mem.PID_MODES + i] = setpoint[i]
     if changed:
-        forget(estimate, memory)
+        clear_integrals(estimate, memory)
     a = mem.PID_ATTITUDE
     roll, pitch, yaw = angles(estimate)
     if setpoint[sp.MODE_YAW] == sp.VELOCITY:

@@ -32,8 +32,8 @@ from firmware_sim.controllers.pid import reset as pid_reset
 from firmware_sim.controllers.power_distribution import motors_step
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.effects.sensing import be_honest, claim_velocity, go_back, sense_late
-from firmware_sim.plant.effects.step import hold_still, plant_step_with_effects
+from firmware_sim.plant.effects.sensing import delay_estimate, delay_sensors, restore_estimate, scale_velocity
+from firmware_sim.plant.effects.step import hold_step, plant_step_with_effects
 from firmware_sim.plant.onboard_estimate import estimate_step
 from firmware_sim.plant.rigid_body import body_step
 from firmware_sim.plant.rotors import battery_step, lag, wrench
@@ -71,7 +71,7 @@ def control_step(setpoint, estimate, sensor, param, memory, log, tick):
 
 
 @kernel
-def moves(truth, tick):
+def integrates(truth, tick):
     """Whether the plant moves at the end of this tick: with an integration step of n ms at the end of every n-th."""
     return (tick + 1) % int(truth[at.INTEGRATION_STEP]) == 0
 
@@ -98,7 +98,7 @@ def tick_step(
     estimate_step(truth, state, sensor, estimate, P, param, noise, tick, (flags & 4) != 0)
     control_step(setpoint, estimate, sensor, param, memory, log, tick)
     motors_step(board, state, sensor, param, memory, log, (flags & 1) != 0, (flags & 2) != 0)
-    if moves(truth, tick):
+    if integrates(truth, tick):
         plant_step(truth, state, noise, DT * truth[at.INTEGRATION_STEP])
     log_estimate(sensor, estimate, P, log)
     log_inertial(sensor, log)
@@ -116,18 +116,18 @@ def tick_step_with_effects(
 ):
     """One millisecond. flags: bit 0 motors allowed by the supervisor, bit 1 armed, bit 2 flies."""
     sensors_step(truth, state, sensor, noise, tick)
-    sense_late(truth, state, sensor, tick)
+    delay_sensors(truth, state, sensor, tick)
     estimate_step(truth, state, sensor, estimate, P, param, noise, tick, (flags & 4) != 0)
-    claim_velocity(truth, sensor, estimate)
+    scale_velocity(truth, sensor, estimate)
     control_step(setpoint, estimate, sensor, param, memory, log, tick)
     motors_step(board, state, sensor, param, memory, log, (flags & 1) != 0, (flags & 2) != 0)
-    if moves(truth, tick):
+    if integrates(truth, tick):
         plant_step_with_effects(truth, state, noise, DT * truth[at.INTEGRATION_STEP])
     else:
-        hold_still(truth, state)
-    go_back(truth, sensor, estimate, tick)
+        hold_step(truth, state)
+    delay_estimate(truth, sensor, estimate, tick)
     log_estimate(sensor, estimate, P, log)
-    be_honest(sensor, estimate)
+    restore_estimate(sensor, estimate)
     log_inertial(sensor, log)
     log_battery(sensor, log)
     log_baro(state, noise, tick, log)

@@ -16,7 +16,7 @@ from firmware_sim.controllers import parameters as pm
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.motion import origin
-from firmware_sim.plant.effects.sensing import seen_pose
+from firmware_sim.plant.effects.sensing import fix_pose
 from firmware_sim.plant.quaternion import matrix, turn
 from firmware_sim.plant.rigid_body import GRAVITY
 
@@ -26,8 +26,8 @@ def estimate_step(truth, state, sensor, estimate, P, param, noise, tick, flying)
     """One millisecond: add up the sensors, predict when it is time, and take the fixes that are due."""
     if estimate[at.E_RESET] > 0.0 or not healthy(estimate, P):
         estimate[at.E_RESET] = 0.0
-        restart(truth, state, estimate, P)
-    add_up(sensor, estimate)
+        reset_filter(truth, state, estimate, P)
+    accumulate(sensor, estimate)
     if tick >= estimate[at.E_DUE]:
         estimate[at.E_DUE] = tick + truth[at.PREDICT_PERIOD]
         if noise[at.N_SLIP] > truth[at.PREDICT_SLIP]:
@@ -40,7 +40,7 @@ def estimate_step(truth, state, sensor, estimate, P, param, noise, tick, flying)
     kind = truth[at.FIX_KIND]
     if kind > 0.0 and (tick - int(truth[at.FIX_PHASE])) % int(truth[at.FIX_PERIOD]) == 0:
         p, q = np.empty(3), np.empty(4)
-        seen_pose(truth, state, sensor, tick, p, q)
+        fix_pose(truth, state, sensor, tick, p, q)
         sd = param[pm.EXT_POS_SD]
         for i in range(3):
             fix = p[i] + truth[at.FIX_POSITION] * noise[at.N_FIX_POSITION + i]
@@ -74,7 +74,7 @@ def healthy(estimate, P):
 
 
 @kernel
-def restart(truth, state, estimate, P):
+def reset_filter(truth, state, estimate, P):
     """Start at the true position and attitude (the drone is placed and levelled by hand) with a small covariance."""
     if truth[at.EFFECT_SENSING] > 0.0:
         origin(truth, state, estimate[at.E_POS : at.E_POS + 3], estimate[at.E_VEL : at.E_VEL + 3])
@@ -94,7 +94,7 @@ def restart(truth, state, estimate, P):
 
 
 @kernel
-def add_up(sensor, estimate):
+def accumulate(sensor, estimate):
     """Gyro and accelerometer of this millisecond, for the mean that the next prediction uses."""
     for i in range(3):
         estimate[at.E_SUM + i] += sensor[at.GYRO + i]

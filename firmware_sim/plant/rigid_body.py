@@ -112,7 +112,7 @@ def body_step(truth, state, u, force, torque, noise, dt):
     k, y, total = np.empty(13), np.empty(13), np.empty(13)
     for i in range(3):
         before[i] = x[3 + i]
-    if rests(truth, state, u, force, torque):
+    if is_resting(truth, state, u, force, torque):
         matrix(x, 6, R)
         for i in range(3):
             state[at.VEL + i] = 0.0
@@ -158,7 +158,7 @@ def body_step(truth, state, u, force, torque, noise, dt):
 
 
 @kernel
-def rests(truth, state, u, force, torque):
+def is_resting(truth, state, u, force, torque):
     """True if the drone stands still on all four feet and nothing acts that could move it: it is then left alone."""
     if state[at.FEET] < 4:
         return False

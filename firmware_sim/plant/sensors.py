@@ -67,7 +67,7 @@ def settle(memory, o, value, cutoff):
 
 
 @kernel
-def counted(value, step):
+def quantised(value, step):
     """`value` in whole steps of the sensor; as it is where the step is 0."""
     return step * math.floor(value / step + 0.5) if step > 0.0 else value
 
@@ -79,10 +79,10 @@ def sensors_step(truth, state, sensor, noise, tick):
     for i in range(3):
         sensor[at.BIAS + i] += truth[at.GYRO_WALK] / math.sqrt(RATE) * noise[at.N_WALK + i]
         rate = state[at.OMEGA + i] + sensor[at.BIAS + i] + truth[at.GYRO_NOISE] * root * noise[at.N_GYRO + i]
-        rate = counted(min(max(rate, -34.9), 34.9), truth[at.GYRO_STEP])  # full scale 2000 deg/s
+        rate = quantised(min(max(rate, -34.9), 34.9), truth[at.GYRO_STEP])  # full scale 2000 deg/s
         sensor[at.GYRO + i] = low_pass(sensor, at.GYRO_FILTER + 2 * i, rate, GYRO_CUTOFF)
         acc = state[at.ACC + i] + truth[at.ACC_NOISE] * root * noise[at.N_ACC + i]
-        acc = counted(min(max(acc, -235.0), 235.0), truth[at.ACC_STEP])  # full scale 24 g
+        acc = quantised(min(max(acc, -235.0), 235.0), truth[at.ACC_STEP])  # full scale 24 g
         sensor[at.ACCEL + i] = low_pass(sensor, at.ACCEL_FILTER + 2 * i, acc, ACC_CUTOFF)
     if tick % 100 == 0:
         sensor[at.VBAT] = state[at.VOLTS] + truth[at.VBAT_NOISE] * noise[at.N_VBAT]

@@ -18,8 +18,8 @@ from crazyem.vehicle import Vehicle
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.effects.catalogue import EFFECTS
 from firmware_sim.plant.effects.motion import origin
-from firmware_sim.plant.effects.sensing import seen_pose
-from firmware_sim.plant.effects.step import feel, plant_step_with_effects
+from firmware_sim.plant.effects.sensing import fix_pose
+from firmware_sim.plant.effects.step import plant_step_with_effects, set_accelerometer
 from firmware_sim.scenario import parse_scenario
 
 N, SETTLED = 900, 700  # ms flown; from when on the host's lag has forgotten its start
@@ -147,9 +147,9 @@ def test_host_and_simulated_sensors_are_turned_alike(angles: tuple[float, float,
     body = Rotation.from_rotvec([0.5, -0.4, 1.0])
     state[at.QUAT : at.QUAT + 4] = np.roll(body.as_quat(), 1)
     position, seen = np.empty(3), np.empty(4)
-    seen_pose(truth, state, np.zeros(at.SENSOR_SIZE), 0, position, seen)
+    fix_pose(truth, state, np.zeros(at.SENSOR_SIZE), 0, position, seen)
     force = np.array([1.0, -2.0, 9.0])
-    feel(truth, state, np.eye(3), force)
+    set_accelerometer(truth, state, np.eye(3), force)
     situation = still(rotation=body.as_matrix(), specific_force=force)
     shown = measured(situation, vehicle=VEHICLE, effects=effects)
     attitude = body * Rotation.from_rotvec(shown.state[0, 6:9])

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.effects.drive import drive, present_wrench
+from firmware_sim.plant.effects.drive import present_wrench, rotors_step
 from firmware_sim.plant.effects.step import plant_step_with_effects
 from firmware_sim.plant.rotors import lag, wrench
 from firmware_sim.scenario import parse_scenario
@@ -44,7 +44,7 @@ def rotors(truth: np.ndarray, x: np.ndarray, milliseconds: int) -> np.ndarray:
     """[F, Mx, My, Mz] of every millisecond; the body does not move."""
     mean, u, rows = np.empty(4), np.empty(4), []
     for _ in range(milliseconds):
-        drive(truth, x, 1e-3, mean, u)
+        rotors_step(truth, x, 1e-3, mean, u)
         x[at.CLOCK] += 1
         rows.append(u.copy())
     return np.array(rows)

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from firmware_sim.commander import setpoint as sp
 from firmware_sim.flight import Flight
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.effects.sensing import recall, remember, seen_pose, sense_late
-from firmware_sim.plant.effects.step import feel
+from firmware_sim.plant.effects.sensing import delay_sensors, delayed_sample, fix_pose, store_sample
+from firmware_sim.plant.effects.step import set_accelerometer
 from firmware_sim.scenario import parse_scenario
 
 ANGLES = st.floats(-3.0, 3.0)
@@ -32,10 +32,10 @@ def test_misalignments_are_rotations_of_the_sensor_in_the_body(roll, pitch, yaw,
     body = Rotation.from_rotvec([tilt, 0.3, heading])
     x[at.QUAT : at.QUAT + 4] = np.roll(body.as_quat(), 1)
     p, q = np.empty(3), np.empty(4)
-    seen_pose(truth, x, np.zeros(at.SENSOR_SIZE), 0, p, q)
+    fix_pose(truth, x, np.zeros(at.SENSOR_SIZE), 0, p, q)
     expected = body * turned(roll, pitch, yaw)
     assert (Rotation.from_quat(np.roll(q, -1)) * expected.inv()).magnitude() == pytest.approx(0, abs=1e-7)
-    feel(truth, x, np.eye(3), np.array([1.0, -2.0, 9.0]))
+    set_accelerometer(truth, x, np.eye(3), np.array([1.0, -2.0, 9.0]))
     assert x[at.ACC : at.ACC + 3] == pytest.approx(turned(roll, pitch, yaw).inv().apply([1.0, -2.0, 9.0]), abs=1e-12)
 
 
@@ -43,7 +43,7 @@ def test_a_pose_frame_rolled_by_ten_degrees_shows_ten_degrees_more_roll() -> Non
     truth, x = constants({"attitude_misalignment": {"roll": np.radians(10)}})
     x[at.QUAT : at.QUAT + 4] = np.roll(turned(0.2, 0.0, 0.0).as_quat(), 1)
     p, q = np.empty(3), np.empty(4)
-    seen_pose(truth, x, np.zeros(at.SENSOR_SIZE), 0, p, q)
+    fix_pose(truth, x, np.zeros(at.SENSOR_SIZE), 0, p, q)
     assert 2 * np.arctan2(q[1], q[0]) == pytest.approx(0.2 + np.radians(10))
 
 
@@ -53,7 +53,7 @@ def test_a_fix_shows_the_geometric_origin() -> None:
     x[at.QUAT : at.QUAT + 4] = np.roll(body.as_quat(), 1)
     x[at.POS : at.POS + 3] = np.array([1.0, 2.0, 3.0]) + body.apply([0.01, 0.02, -0.03])
     p, q = np.empty(3), np.empty(4)
-    seen_pose(truth, x, np.zeros(at.SENSOR_SIZE), 0, p, q)
+    fix_pose(truth, x, np.zeros(at.SENSOR_SIZE), 0, p, q)
     assert p == pytest.approx([1.0, 2.0, 3.0], abs=1e-12)
 
 
@@ -63,7 +63,7 @@ def test_magnetic_yaw_depends_on_the_place() -> None:
     for place, extra in ((0.0, 0.0), (0.5, 0.3), (1.0, 0.0), (1.5, -0.3)):
         x[at.POS] = place
         p, q = np.empty(3), np.empty(4)
-        seen_pose(truth, x, np.zeros(at.SENSOR_SIZE), 0, p, q)
+        fix_pose(truth, x, np.zeros(at.SENSOR_SIZE), 0, p, q)
         yaw, pitch, roll = Rotation.from_quat(np.roll(q, -1)).as_euler("ZYX")
         assert (yaw, pitch, roll) == pytest.approx((0.5 + extra, 0.1, 0.2), abs=1e-12)
 
@@ -74,8 +74,8 @@ def test_delay_is_linear_interpolation_of_the_past(delay: float, seed: int) -> N
     sensor, out = np.zeros(at.SENSOR_SIZE), np.empty((300, 3))
     for tick, row in enumerate(series):
         values = row.copy()
-        remember(sensor, at.PAST_GYRO, 3, tick, values)
-        recall(sensor, at.PAST_GYRO, 3, tick, delay, values, -1)
+        store_sample(sensor, at.PAST_GYRO, 3, tick, values)
+        delayed_sample(sensor, at.PAST_GYRO, 3, tick, delay, values, -1)
         out[tick] = values
     t = np.arange(300)
     expected = np.column_stack([np.interp(t - delay, t, series[:, i]) for i in range(3)])
@@ -89,8 +89,8 @@ def test_a_delayed_pose_is_where_the_drone_was_whatever_the_sign_of_its_quaterni
         x[at.POS] = 0.002 * tick
         now = np.roll(turned(0.0, 0.0, 0.01 * tick).as_quat(), 1)
         x[at.QUAT : at.QUAT + 4] = now if tick % 2 else -now
-        sense_late(truth, x, sensor, tick)
-        seen_pose(truth, x, sensor, tick, p, q)
+        delay_sensors(truth, x, sensor, tick)
+        fix_pose(truth, x, sensor, tick, p, q)
     assert p[0] == pytest.approx(0.002 * (399 - 12.5))
     yaw = Rotation.from_quat(np.roll(q, -1)).as_euler("ZYX")[0]
     assert yaw == pytest.approx(0.01 * (399 - 12.5), abs=1e-6) or yaw == pytest.approx(3.865 - 2 * np.pi, abs=1e-6)

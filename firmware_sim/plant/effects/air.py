@@ -20,7 +20,7 @@ from firmware_sim.plant import layout as at
 
 
 @kernel
-def blow(truth, state, noise, dt):
+def gusts_step(truth, state, noise, dt):
     """Advance the gusts by dt."""
     keep = math.exp(-dt / truth[at.GUST_TIME]) if state[at.CLOCK] > 0.0 else 0.0
     kick = truth[at.GUST_SD] * math.sqrt(1.0 - keep * keep)
@@ -51,7 +51,7 @@ def air_forces(truth, R, v, w, air, force, torque):
 
 
 @kernel
-def vibrate(truth, state, dt, torque):
+def vibration_step(truth, state, dt, torque):
     """Add the vibration's mean torque [N m, body] over dt and advance its phase."""
     i = int(truth[at.VIBRATION_ROTOR]) - 1
     speed = truth[at.VIBRATION_RATIO] * math.sqrt(max(state[at.ROTOR + i], 0.0) / truth[at.ROTOR_CONSTANT])
@@ -64,7 +64,7 @@ def vibrate(truth, state, dt, torque):
 
 
 @kernel
-def pull_cable(truth, p, force):
+def add_cable_force(truth, p, force):
     """Add the spring's force [N, world] on the geometric origin at p [m, world]."""
     k = at.CABLE_POINT
     dx, dy, dz = truth[k] - p[0], truth[k + 1] - p[1], truth[k + 2] - p[2]

@@ -44,7 +44,7 @@ NOMINAL_VOLTS = 3.7  # V, where battery_sag is neutral: the nominal voltage of a
 
 
 @kernel
-def goal_thrust(truth, state, pwm):
+def settled_thrust(truth, state, pwm):
     """Thrust [N] that the lag of one rotor goes to under this command."""
     f = steady_thrust(truth, pwm, state[at.VOLTS])
     if pwm > 0.0 and truth[at.SLOPE_ERROR] != 0.0:
@@ -78,7 +78,7 @@ def acting_wrench(truth, thrust, u):
 
 
 @kernel
-def remember(truth, state):
+def store_commands(truth, state):
     """Put the commands of this millisecond (CLOCK) into the ring, the sticky rotor's as it follows them."""
     row = at.COMMANDS + 4 * (int(state[at.CLOCK]) % at.DELAY_ROWS)
     for i in range(4):
@@ -91,7 +91,7 @@ def remember(truth, state):
 
 
 @kernel
-def delayed(truth, state, i, part):
+def delayed_command(truth, state, i, part):
     """Command of motor i in part 0 (the first delay - floor(delay) ms) or part 1 (the rest) of this millisecond."""
     back = math.floor(truth[at.INPUT_DELAY]) + (1 - part)
     row = (int(state[at.CLOCK]) - back) % at.DELAY_ROWS  # not yet written, so 0, before the first command acts
@@ -99,9 +99,9 @@ def delayed(truth, state, i, part):
 
 
 @kernel
-def drive(truth, state, dt, mean, u):
+def rotors_step(truth, state, dt, mean, u):
     """Advance the rotors by dt (one tick); u = [F, Mx, My, Mz], torque about the centre of mass, over the step."""
-    remember(truth, state)
+    store_commands(truth, state)
     before = angular_momentum(truth, state, at.ROTOR)
     lag_delayed(truth, state, dt, mean)
     thrust = np.empty(4)
@@ -111,11 +111,11 @@ def drive(truth, state, dt, mean, u):
         after = angular_momentum(truth, state, at.ROTOR)
         u[3] -= (after - before) / dt
         state[at.SPIN] = 0.5 * (before + after)
-    age(state)
+    count_airborne_time(state)
 
 
 @kernel
-def age(state):
+def count_airborne_time(state):
     """One millisecond more since the feet left the floor."""
     if state[at.AIRBORNE] > 0.0 or state[at.FEET] == 0.0:
         state[at.AIRBORNE] += 1.0
@@ -132,7 +132,7 @@ def lag_delayed(truth, state, dt, mean):
             h = dt * (late if part == 0 else 1.0 - late)
             if h <= 0.0:
                 continue
-            goal = goal_thrust(truth, state, delayed(truth, state, i, part))
+            goal = settled_thrust(truth, state, delayed_command(truth, state, i, part))
             keep = math.exp(-h / tau) if tau > 0.0 else 0.0
             impulse += goal * h + (f - goal) * (1.0 - keep) * tau
             f = goal + (f - goal) * keep

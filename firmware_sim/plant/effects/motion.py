@@ -9,7 +9,7 @@ import numpy as np
 
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.effects.air import air_forces, pull_cable
+from firmware_sim.plant.effects.air import add_cable_force, air_forces
 from firmware_sim.plant.quaternion import matrix
 from firmware_sim.plant.rigid_body import GRAVITY, contact
 
@@ -29,7 +29,7 @@ def act(truth, x, u, force, torque, ambient, R, f, t, v):
         t[i] = u[1 + i] + torque[i]
     touching = contact(truth, p, v, R, w, at_origin, t)
     air_forces(truth, R, v, w, ambient, at_origin, t)
-    pull_cable(truth, p, at_origin)
+    add_cable_force(truth, p, at_origin)
     for i in range(3):
         f[i] += at_origin[i]
     gx = R[0, 0] * at_origin[0] + R[1, 0] * at_origin[1] + R[2, 0] * at_origin[2]
@@ -63,7 +63,7 @@ def origin(truth, state, p, v):
 
 
 @kernel
-def surroundings(truth, state, ambient):
+def ambient_forces(truth, state, ambient):
     """ambient = velocity of the air [m/s, world] and the rotors' angular momentum along body z [N m s]."""
     for i in range(3):
         ambient[i] = truth[at.WIND + i] + state[at.GUST + i]
@@ -71,7 +71,7 @@ def surroundings(truth, state, ambient):
 
 
 @kernel
-def still_forces(truth, state, ambient, force, torque, out_force, out_torque):
+def static_forces(truth, state, ambient, force, torque, out_force, out_torque):
     """What acts on a drone that stands still, besides floor and weight: held, of the air and of the cable."""
     R, p, v = np.empty((3, 3)), np.empty(3), np.empty(3)
     matrix(state, at.QUAT, R)
@@ -79,7 +79,7 @@ def still_forces(truth, state, ambient, force, torque, out_force, out_torque):
     for i in range(3):
         out_force[i], out_torque[i] = force[i], torque[i]
     air_forces(truth, R, v, state[at.OMEGA : at.OMEGA + 3], ambient, out_force, out_torque)
-    pull_cable(truth, p, out_force)
+    add_cable_force(truth, p, out_force)
 
 
 @kernel

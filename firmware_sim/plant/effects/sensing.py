@@ -23,7 +23,7 @@ from firmware_sim.plant.quaternion import normalise
 
 
 @kernel
-def seen_pose(truth, state, sensor, tick, p, q):
+def fix_pose(truth, state, sensor, tick, p, q):
     """p, q: position and attitude that a fix of this tick shows, before its noise."""
     if not truth[at.EFFECT_SENSING] > 0.0:
         for i in range(3):
@@ -33,9 +33,9 @@ def seen_pose(truth, state, sensor, tick, p, q):
         return
     pose = np.empty(7)
     if truth[at.DELAY_POSE] > 0.0:
-        recall(sensor, at.PAST_POSE, 7, tick, truth[at.DELAY_POSE], pose, 3)
+        delayed_sample(sensor, at.PAST_POSE, 7, tick, truth[at.DELAY_POSE], pose, 3)
     else:
-        present_pose(truth, state, pose)
+        origin_pose(truth, state, pose)
     for i in range(3):
         p[i] = pose[i]
     half = 0.5 * truth[at.YAW_AMPLITUDE] * math.sin(2.0 * math.pi * pose[0] / truth[at.YAW_WAVELENGTH])
@@ -46,7 +46,7 @@ def seen_pose(truth, state, sensor, tick, p, q):
 
 
 @kernel
-def present_pose(truth, state, pose):
+def origin_pose(truth, state, pose):
     """pose = position of the geometric origin and attitude, as they are."""
     v = np.empty(3)
     origin(truth, state, pose, v)
@@ -64,7 +64,7 @@ def multiply(a, b, c, d, w, x, y, z, out):
 
 
 @kernel
-def remember(sensor, ring, width, tick, values):
+def store_sample(sensor, ring, width, tick, values):
     """Put the `width` values of this tick into a ring."""
     row = ring + width * (tick % at.DELAY_ROWS)
     for i in range(width):
@@ -72,7 +72,7 @@ def remember(sensor, ring, width, tick, values):
 
 
 @kernel
-def recall(sensor, ring, width, tick, delay, values, quaternion):
+def delayed_sample(sensor, ring, width, tick, delay, values, quaternion):
     """values = those of `delay` ms ago; a quaternion starts at index `quaternion` (-1: none). Before enough time has
     passed, the first values stand for all earlier ones."""
     whole = math.floor(delay)
@@ -93,24 +93,24 @@ def recall(sensor, ring, width, tick, delay, values, quaternion):
 
 
 @kernel
-def sense_late(truth, state, sensor, tick):
+def delay_sensors(truth, state, sensor, tick):
     """Keep this tick's pose for fixes that come late; replace its filtered gyro and accelerometer by delayed ones."""
     if truth[at.DELAY_POSE] > 0.0:
         pose = np.empty(7)
-        present_pose(truth, state, pose)
-        remember(sensor, at.PAST_POSE, 7, tick, pose)
+        origin_pose(truth, state, pose)
+        store_sample(sensor, at.PAST_POSE, 7, tick, pose)
     gyro, acc = sensor[at.GYRO : at.GYRO + 3], sensor[at.ACCEL : at.ACCEL + 3]
     if truth[at.DELAY_GYRO] > 0.0:
-        remember(sensor, at.PAST_GYRO, 3, tick, gyro)
-        recall(sensor, at.PAST_GYRO, 3, tick, truth[at.DELAY_GYRO], gyro, -1)
+        store_sample(sensor, at.PAST_GYRO, 3, tick, gyro)
+        delayed_sample(sensor, at.PAST_GYRO, 3, tick, truth[at.DELAY_GYRO], gyro, -1)
     if truth[at.DELAY_ACC] > 0.0:
-        remember(sensor, at.PAST_ACC, 3, tick, acc)
-        recall(sensor, at.PAST_ACC, 3, tick, truth[at.DELAY_ACC], acc, -1)
+        store_sample(sensor, at.PAST_ACC, 3, tick, acc)
+        delayed_sample(sensor, at.PAST_ACC, 3, tick, truth[at.DELAY_ACC], acc, -1)
 
 
 @kernel
-def claim_velocity(truth, sensor, estimate):
-    """Keep the estimate as it is, and let it claim the scaled velocity until `be_honest`."""
+def scale_velocity(truth, sensor, estimate):
+    """Keep the estimate as it is, and let it claim the scaled velocity until `restore_estimate`."""
     for i in range(10):
         sensor[at.KEPT + i] = estimate[at.E_POS + i]
     for i in range(3):
@@ -118,8 +118,8 @@ def claim_velocity(truth, sensor, estimate):
 
 
 @kernel
-def go_back(truth, sensor, estimate, tick):
-    """Let estimate, gyro and accelerometer be those of the delayed state until `be_honest`."""
+def delay_estimate(truth, sensor, estimate, tick):
+    """Let estimate, gyro and accelerometer be those of the delayed state until `restore_estimate`."""
     values = np.empty(16)
     for i in range(10):
         values[i] = estimate[at.E_POS + i]
@@ -127,8 +127,8 @@ def go_back(truth, sensor, estimate, tick):
         values[10 + i] = sensor[at.GYRO + i]
         sensor[at.KEPT + 10 + i] = sensor[at.GYRO + i]
     if truth[at.DELAY_STATE] > 0.0:
-        remember(sensor, at.PAST_STATE, 16, tick, values)
-        recall(sensor, at.PAST_STATE, 16, tick, truth[at.DELAY_STATE], values, 6)
+        store_sample(sensor, at.PAST_STATE, 16, tick, values)
+        delayed_sample(sensor, at.PAST_STATE, 16, tick, truth[at.DELAY_STATE], values, 6)
         for i in range(10):
             estimate[at.E_POS + i] = values[i]
         for i in range(6):
@@ -136,8 +136,8 @@ def go_back(truth, sensor, estimate, tick):
 
 
 @kernel
-def be_honest(sensor, estimate):
-    """Undo `claim_velocity` and `go_back`."""
+def restore_estimate(sensor, estimate):
+    """Undo `scale_velocity` and `delay_estimate`."""
     for i in range(10):
         estimate[at.E_POS + i] = sensor[at.KEPT + i]
     for i in range(6):

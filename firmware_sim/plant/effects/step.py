@@ -9,12 +9,12 @@ import numpy as np
 
 from firmware_sim.kernel import kernel
 from firmware_sim.plant import layout as at
-from firmware_sim.plant.effects.air import blow, vibrate
-from firmware_sim.plant.effects.drive import age, drive, remember
-from firmware_sim.plant.effects.motion import act, newton_euler, origin, still_forces, surroundings
-from firmware_sim.plant.effects.suspended_load import hang_still, pull_load, share_kick, straighten
+from firmware_sim.plant.effects.air import gusts_step, vibration_step
+from firmware_sim.plant.effects.drive import count_airborne_time, rotors_step, store_commands
+from firmware_sim.plant.effects.motion import act, ambient_forces, newton_euler, origin, static_forces
+from firmware_sim.plant.effects.suspended_load import add_string_force, normalise_string, rest_load, share_impulse
 from firmware_sim.plant.quaternion import matrix, normalise
-from firmware_sim.plant.rigid_body import GRAVITY, RATE_LIMIT, SPEED_LIMIT, body_step, rests
+from firmware_sim.plant.rigid_body import GRAVITY, RATE_LIMIT, SPEED_LIMIT, body_step, is_resting
 from firmware_sim.plant.rotors import battery_step, lag, wrench
 
 
@@ -23,14 +23,14 @@ def plant_step_with_effects(truth, state, noise, dt):
     """One tick of rotors, battery and body under the present PWM; what has no effects moves as ever, to the bit."""
     mean, u, force, torque = np.empty(4), np.empty(4), np.zeros(3), np.zeros(3)
     if truth[at.EFFECT_ROTORS] > 0.0:
-        drive(truth, state, dt, mean, u)
+        rotors_step(truth, state, dt, mean, u)
     else:
         lag(truth, state, dt, mean)
         wrench(truth, mean, 0, u)
     if truth[at.GUST_SD] > 0.0:
-        blow(truth, state, noise, dt)
+        gusts_step(truth, state, noise, dt)
     if truth[at.VIBRATION_TORQUE] > 0.0:
-        vibrate(truth, state, dt, torque)
+        vibration_step(truth, state, dt, torque)
     if truth[at.EFFECT_BODY] > 0.0:
         body_step_with_effects(truth, state, u, force, torque, noise, dt)
     else:
@@ -40,11 +40,11 @@ def plant_step_with_effects(truth, state, noise, dt):
 
 
 @kernel
-def hold_still(truth, state):
+def hold_step(truth, state):
     """A tick in which the plant does not move, because its integration step is longer: commands and clocks go on."""
     if truth[at.EFFECT_ROTORS] > 0.0:
-        remember(truth, state)
-        age(state)
+        store_commands(truth, state)
+        count_airborne_time(state)
     state[at.CLOCK] += 1.0
 
 
@@ -57,31 +57,31 @@ def body_step_with_effects(truth, state, u, force, torque, noise, dt):
     """
     ambient, R, dv, dw = np.empty(4), np.empty((3, 3)), np.empty(3), np.empty(3)
     p, before, after = np.empty(3), np.empty(3), np.empty(3)
-    surroundings(truth, state, ambient)
+    ambient_forces(truth, state, ambient)
     if state[at.FEET] == 4.0:
-        still_forces(truth, state, ambient, force, torque, dv, dw)
-        if rests(truth, state, u, dv, dw):
-            stay(truth, state, R)
+        static_forces(truth, state, ambient, force, torque, dv, dw)
+        if is_resting(truth, state, u, dv, dw):
+            rest_on_floor(truth, state, R)
             return
     state[at.ASLEEP] = 0.0
     origin(truth, state, p, before)
     x = np.empty(19)
-    gather(state, x)
+    states_of(state, x)
     state[at.FEET] = runge_kutta(truth, x, u, force, torque, ambient, R, dt)
     normalise(x, 6)
     matrix(x, 6, R)
     if state[at.FEET] == 0.0:
-        kick(truth, x, R, noise, dt, dv, dw)
+        add_process_noise(truth, x, R, noise, dt, dv, dw)
     for i in range(3):  # as in rigid_body.py
         x[3 + i] = min(max(x[3 + i], -SPEED_LIMIT), SPEED_LIMIT)
         x[10 + i] = min(max(x[10 + i], -RATE_LIMIT), RATE_LIMIT)
-    straighten(x)
-    scatter(x, state)
+    normalise_string(x)
+    set_states(x, state)
     origin(truth, state, p, after)
     for i in range(3):
         after[i] = (after[i] - before[i]) / dt
     after[2] += GRAVITY
-    feel(truth, state, R, after)
+    set_accelerometer(truth, state, R, after)
 
 
 @kernel
@@ -94,7 +94,7 @@ def runge_kutta(truth, x, u, force, torque, ambient, R, dt):
         matrix(y, 6, R)
         touching = act(truth, y, u, force, torque, ambient, R, f, t, v)
         if truth[at.LOAD_MASS] > 0.0:
-            pull_load(truth, y, R, v, ambient, f, t, k)
+            add_string_force(truth, y, R, v, ambient, f, t, k)
         newton_euler(truth, y, y[10:13], f, t, k)
         if stage == 0:
             feet = touching
@@ -109,7 +109,7 @@ def runge_kutta(truth, x, u, force, torque, ambient, R, dt):
 
 
 @kernel
-def kick(truth, x, R, noise, dt, dv, dw):
+def add_process_noise(truth, x, R, noise, dt, dv, dw):
     """Process noise of thrust and torque over dt; dv (3) and dw (3) are scratch."""
     root = math.sqrt(dt)
     push = truth[at.NOISE_THRUST] / truth[at.MASS] * root * noise[at.N_THRUST]
@@ -120,26 +120,26 @@ def kick(truth, x, R, noise, dt, dv, dw):
         for j in range(3):
             dw[i] += truth[V + 3 * i + j] * truth[s + j] * root * noise[n + j]
     if truth[at.LOAD_MASS] > 0.0:
-        share_kick(truth, x, R, dv, dw)
+        share_impulse(truth, x, R, dv, dw)
     for i in range(3):
         x[3 + i] += dv[i]
         x[10 + i] += dw[i]
 
 
 @kernel
-def stay(truth, state, R):
+def rest_on_floor(truth, state, R):
     """Nothing moves: the drone stands on its feet, and its load hangs still."""
     matrix(state, at.QUAT, R)
     for i in range(3):
         state[at.VEL + i] = 0.0
         state[at.OMEGA + i] = 0.0
-    feel(truth, state, R, np.array([0.0, 0.0, GRAVITY]))
+    set_accelerometer(truth, state, R, np.array([0.0, 0.0, GRAVITY]))
     state[at.ASLEEP] = 1.0
-    hang_still(state)
+    rest_load(state)
 
 
 @kernel
-def feel(truth, state, R, force):
+def set_accelerometer(truth, state, R, force):
     """Set what the accelerometer, in its own axes, feels of a specific force [m/s^2, world]."""
     bx = R[0, 0] * force[0] + R[1, 0] * force[1] + R[2, 0] * force[2]
     by = R[0, 1] * force[0] + R[1, 1] * force[1] + R[2, 1] * force[2]
@@ -150,7 +150,7 @@ def feel(truth, state, R, force):
 
 
 @kernel
-def gather(state, x):
+def states_of(state, x):
     """x = the 19 states that are integrated."""
     for i in range(13):
         x[i] = state[i]
@@ -159,8 +159,8 @@ def gather(state, x):
 
 
 @kernel
-def scatter(x, state):
-    """The opposite of `gather`."""
+def set_states(x, state):
+    """The opposite of `states_of`."""
     for i in range(13):
         state[i] = x[i]
     for i in range(6):

@@ -23,7 +23,7 @@ SWING_LIMIT = 200.0  # 1/s; keeps absurd scenarios finite
 
 
 @kernel
-def pull_load(truth, x, R, v_hook, air, f, t, dx):
+def add_string_force(truth, x, R, v_hook, air, f, t, dx):
     """Add the tension to force f [N, world] and torque t [N m, body]; set the derivatives dx[13:19] of the load.
 
     f, t: everything else that acts on the body, without weight and gyroscopic torque; v_hook [m/s, world].
@@ -89,25 +89,25 @@ def hook_acceleration(truth, R, w, f, t, out):
 
 
 @kernel
-def share_kick(truth, x, R, dv, dw):
+def share_impulse(truth, x, R, dv, dw):
     """Let the load take its part of a sudden change dv [m/s, world], dw [rad/s, body] of the body's motion."""
     n = x[13:16]
     nu, arm, gain = np.empty(3), np.empty(3), np.empty(3)
     K = lever(truth, R, n, nu, arm, gain)
     ml, c = truth[at.LOAD_MASS], at.COM
     hook = np.empty(3)
-    hook_jump(truth[c], truth[c + 1], truth[c + 2], R, dv, dw, hook)
+    hook_impulse(truth[c], truth[c + 1], truth[c + 2], R, dv, dw, hook)
     per_mass = -(n[0] * hook[0] + n[1] * hook[1] + n[2] * hook[2]) / (1.0 + ml * K)
     for i in range(3):
         dv[i] += ml * per_mass * n[i] / truth[at.MASS]
         dw[i] += ml * per_mass * gain[i]
-    hook_jump(truth[c], truth[c + 1], truth[c + 2], R, dv, dw, hook)
+    hook_impulse(truth[c], truth[c + 1], truth[c + 2], R, dv, dw, hook)
     for i in range(3):
         x[16 + i] += (-per_mass * n[i] - hook[i]) / truth[at.LOAD_LENGTH]
 
 
 @kernel
-def hook_jump(cx, cy, cz, R, dv, dw, out):
+def hook_impulse(cx, cy, cz, R, dv, dw, out):
     """out = dv + R (dw x b), b = -(cx, cy, cz)."""
     ux, uy, uz = -dw[1] * cz + dw[2] * cy, -dw[2] * cx + dw[0] * cz, -dw[0] * cy + dw[1] * cx
     for i in range(3):
@@ -115,7 +115,7 @@ def hook_jump(cx, cy, cz, R, dv, dw, out):
 
 
 @kernel
-def straighten(x):
+def normalise_string(x):
     """Take the integration's drift out: n to unit length, dn/dt across it and within limits."""
     size = math.sqrt(x[13] ** 2 + x[14] ** 2 + x[15] ** 2)
     along = 0.0
@@ -127,7 +127,7 @@ def straighten(x):
 
 
 @kernel
-def hang_still(state):
+def rest_load(state):
     """The load straight below the hook and at rest."""
     for i in range(3):
         state[at.LOAD + i] = -1.0 if i == 2 else 0.0
