@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from crazyem import cli
-from crazyem.api.planning import look_alikes, noise_of, plan
+from crazyem.api.planning import look_alikes, noise_of, plan, plan_commands
 from crazyem.control.harmonics import Axis, Harmonics
 from crazyem.control.named_trajectories import duration_note, trajectory_maker
 from crazyem.control.plan_file import PlanFile, plan_toml, plan_trajectory, read_plan
@@ -331,6 +331,14 @@ def test_look_alikes_come_from_a_diagnosis(tmp_path: Path) -> None:
         file.write_text(text)
         with pytest.raises(FileFormatError):
             look_alikes(file)
+
+
+def test_a_diagnosis_gets_the_command_only_where_a_manoeuvre_tells() -> None:
+    groups = [["inertia", "torque_scale"], ["wind", "attitude_misalignment"], ["wind", "gusts"]]
+    told = plan_commands(groups, VEHICLE, "drone.toml")
+    assert len(told) == 1
+    assert "crazyem plan --split wind,attitude_misalignment --vehicle drone.toml -o plan.toml" in told[0]
+    assert plan_commands(groups, replace(VEHICLE, mass=0.047), "heavy.toml") == []
 
 
 def test_the_command_says_why_no_manoeuvre_will_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
