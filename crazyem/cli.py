@@ -66,19 +66,7 @@ def parser() -> argparse.ArgumentParser:
     fly = common("fly", "fly a drone, or a simulated firmware, and push what is learnt")
     fly.add_argument("uri", nargs="?", metavar="URI", help="the drone; without it firmware_sim is started")
     fly.add_argument("--controller", choices=("lee", "mellinger", "indi", "lqg"), default="lee")
-    fly.add_argument(
-        "--trajectory",
-        nargs="+",
-        default=["hover"],
-        metavar="NAME",
-        help="hover, figure8, excite, informative, waypoints FILE, or plan FILE",
-    )
-    fly.add_argument(
-        "--goal", type=_number(0.1, 100, " percent"), default=5.0, metavar="PERCENT",
-        help="of informative: ends when mass, Ixx, Iyy and Izz are known within this (95 %%; default: 5)",
-    )  # fmt: skip
-    seconds = _number(1, 3600, " seconds")
-    fly.add_argument("--duration", type=seconds, default=20.0, metavar="S", help="of the trajectory (default: 20)")
+    _flying(fly)
     _pushing(fly, "write to a drone that is not simulated (default: dry run)")
     fly.add_argument("--record", metavar="FILE.mcap", help="record everything")
     fly.add_argument("--append", action="store_true", help="to an existing recording, as its next session")
@@ -108,6 +96,20 @@ def parser() -> argparse.ArgumentParser:
     _on_recordings(commands)
     _paper(commands)
     return top
+
+
+def _flying(p: argparse.ArgumentParser) -> None:
+    """What is flown."""
+    p.add_argument(
+        "--trajectory", nargs="+", default=["hover"], metavar="NAME",
+        help="hover, figure8, excite, informative, waypoints FILE, or plan FILE",
+    )  # fmt: skip
+    p.add_argument(
+        "--goal", type=_number(0.1, 100, " percent"), default=5.0, metavar="PERCENT",
+        help="of informative: ends when mass, Ixx, Iyy and Izz are known within this (95 %%; default: 5)",
+    )  # fmt: skip
+    seconds = _number(1, 3600, " seconds")
+    p.add_argument("--duration", type=seconds, default=20.0, metavar="S", help="of the trajectory (default: 20)")
 
 
 def _pushing(p: argparse.ArgumentParser, push: str) -> None:

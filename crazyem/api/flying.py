@@ -113,8 +113,7 @@ def fly(
         policy: of the guard; None: the shipped one.
         record, append: an MCAP file for everything; continue an existing one as its next session.
         scenario, seed, speed: of the simulated firmware: file of its truth, its noise, times real time.
-        rate: of the log, Hz.
-        reconnect: how long a lost link is tried again, s.
+        rate, reconnect: of the log, Hz; how long a lost link is tried again, s.
         window, every: newest samples that an update uses; samples between updates.
 
     Raises:
@@ -123,16 +122,14 @@ def fly(
     """
     chosen = (trajectory,) if isinstance(trajectory, str) else trajectory
     settings = FlightSettings(
-        uri=uri,
         vehicle=vehicle_of(vehicle),
-        controller=controller,
         trajectory=chosen if callable(chosen) else tuple(chosen),
         push=push is not False,
         rules=write_rules_for(uri or "", push=push, dry_run=dry_run, policy=policy),
         record=None if record is None else str(record),
         scenario=None if scenario is None else str(scenario),
-        duration=duration, goal=goal, append=append, seed=seed, speed=speed, rate=rate, reconnect=reconnect,
-        window=window, every=every,
+        uri=uri, controller=controller, duration=duration, goal=goal, append=append, seed=seed, speed=speed, rate=rate,
+        reconnect=reconnect, window=window, every=every,
     )  # fmt: skip
     result, error = observed_flight(settings, FlightObserver())
     if error is not None or result is None:

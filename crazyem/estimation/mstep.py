@@ -89,15 +89,12 @@ def objective(theta, unit, sums, free, centre, precision, known, gradient, hessi
     dc = np.zeros((6, PARAMETERS))
     ac = np.zeros(6)
     adc = np.zeros((6, PARAMETERS))
-    for i in range(PARAMETERS):
-        gradient[i] = 0.0
-        for j in range(PARAMETERS):
-            hessian[i, j] = 0.0
+    gradient[:] = 0.0
+    hessian[:, :] = 0.0
     value = 0.0
     grad = np.zeros(PARAMETERS)
-    scale = np.empty(PARAMETERS)
-    for u in range(PARAMETERS):
-        scale[u] = theta[u] if u <= LAG else unit[u]
+    scale = unit.copy()
+    scale[: LAG + 1] = theta[: LAG + 1]
     for term in range(4):
         n = _residual(term, theta, sums, a, c, dc)
         value -= count * np.log(theta[term])
