@@ -24,6 +24,7 @@ from scipy.interpolate import make_interp_spline
 from benchmarks.concealed import conditions
 from benchmarks.wire_flight import HEIGHT, Log, fly
 from crazyem.control.harmonics import Harmonics
+from crazyem.control.plan_file import read_plan
 from crazyem.control.trajectories import Reference, Trajectory, excite, figure8, hover, window
 from crazyem.estimation.em import WindowEM
 from crazyem.estimation.in_step import PERIOD
@@ -101,19 +102,22 @@ def to_limits(course: Course, vehicle: Vehicle) -> Course:
     return course
 
 
-def manoeuvres(vehicle: Vehicle, *, seed: int) -> tuple[dict[str, Trajectory], dict[str, Harmonics]]:
-    """What is flown, and those of these that are plans."""
-    plans = {
-        kind: plan_parameters(NAMES, vehicle, LIMITS, duration=seconds, seed=seed, starts=2).manoeuvre
-        for kind, seconds in (("plan", DURATION), ("plan, a third of the time", DURATION / 3))
-    }
+def manoeuvres(vehicle: Vehicle, folder: Path, *, seed: int) -> tuple[dict[str, Trajectory], dict[str, Harmonics]]:
+    """What is flown, and those of these that are plans, which are kept in the folder."""
+    known = {}
+    for kind, seconds in (("plan", DURATION), ("plan, a third of the time", DURATION / 3)):
+        file = folder / f"{seconds:.0f}s.toml"
+        if not file.exists():
+            plan = plan_parameters(NAMES, vehicle, LIMITS, duration=seconds, seed=seed, starts=2)
+            print(plan, flush=True)
+            file.write_text(plan.to_toml())
+        known[kind] = read_plan(file).manoeuvre
     made = {
         "figure 8": figure8(position=PLACE, duration=DURATION, size=(0.45, 0.25), period=4.0, ramp=2.0),
         "excite": excite(position=PLACE, duration=DURATION),
         "excite, scaled": to_limits(of_trajectory(excite(position=PLACE, duration=DURATION)), vehicle).trajectory("e"),
         "chirp": to_limits(chirp(DURATION), vehicle).trajectory("chirp"),
     }
-    known = {kind: plan for kind, plan in plans.items() if plan is not None}
     return made | {kind: plan.trajectory(PLACE, 0.0) for kind, plan in known.items()}, known
 
 
@@ -211,7 +215,7 @@ def fly_all(seeds: int, first: int, folder: Path) -> None:
     """Fly what is missing."""
     folder.mkdir(parents=True, exist_ok=True)
     begun = time.process_time()
-    made, plans = manoeuvres(load_vehicle("cf2"), seed=0)
+    made, plans = manoeuvres(load_vehicle("cf2"), folder, seed=0)
     print(f"planned in {time.process_time() - begun:.1f} s of processor time", flush=True)
     for seed in range(first, first + seeds):
         file = folder / f"{seed}.json"
