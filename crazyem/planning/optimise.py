@@ -27,6 +27,7 @@ RAMP = 1.0  # s
 BESIDE = 0.3  # share of the power that a search begins with beside the chosen bands
 SMALL = 0.1  # m/s^2, rad/s^2: rms of a band by which its share of the limits is found
 STEP = 0.02  # of a power, for differences
+NEAR, CANDIDATES = 1.5, 4  # squared share of a limit up to which a point may be brought inside; how many are
 IDLE = 1e-4  # power of a band below which the plan does without its lines
 ITERATIONS = 15  # of sequential quadratic programming from each start
 
@@ -202,11 +203,11 @@ def _from(
         constraints=[{"type": "ineq", "fun": lambda x: 1.0 - look(x)[1], "jac": lambda x: -slope(x)[1]}],
         options={"maxiter": iterations, "ftol": 1e-3},
     )
-    # steps of the search may lead out of the limits, or down: the best point that was seen inside is its result
-    kept = {k: value for k, (value, used) in seen.items() if used.max() <= 1.0}
-    kept.setdefault(np.asarray(result.x).tobytes(), look(np.asarray(result.x))[0] if not kept else -math.inf)
-    point = np.frombuffer(max(kept, key=lambda k: kept[k]))
-    return within(family.manoeuvre(np.where(point < IDLE, 0.0, point)), merit, vehicle, limits)
+    # steps of the search may lead down, or out of the limits: the best points near these, brought inside, compete
+    near = sorted((value, key) for key, (value, used) in seen.items() if used.max() <= NEAR)[-CANDIDATES:]
+    points = [np.asarray(result.x), *(np.frombuffer(key) for _, key in near)]
+    inside = [within(family.manoeuvre(np.where(point < IDLE, 0.0, point)), merit, vehicle, limits) for point in points]
+    return max(inside, key=lambda found: found.merit)
 
 
 def within(manoeuvre: Harmonics, merit: Merit, vehicle: Vehicle, limits: Limits) -> Found:
