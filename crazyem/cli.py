@@ -75,11 +75,13 @@ def parser() -> argparse.ArgumentParser:
     fly.add_argument(
         "--speed", type=_number(0.05, 100), metavar="X", help="of the simulator, times real time (default: 1)"
     )
+    _monitor(fly, None)
     _logging(fly, reconnect=8.0)
     _many(fly)
 
     replay = common("replay", "run the estimator over a recording", recorded=True)
     replay.add_argument("file", metavar="FILE", help="a recording of any known format")
+    _monitor(replay, False)
     _reading(replay)
     _cutting(replay)
 
@@ -89,6 +91,7 @@ def parser() -> argparse.ArgumentParser:
     _pushing(watch, "write hover thrust to a MAVLink drone (default: dry run)")
     watch.add_argument("--record", metavar="FILE.mcap", help="record everything")
     watch.add_argument("--append", action="store_true", help="to an existing recording, as its next session")
+    _monitor(watch, None)
     _logging(watch, reconnect=30.0)
     _many(watch)
     _links(commands)
@@ -120,6 +123,13 @@ def _pushing(p: argparse.ArgumentParser, push: str) -> None:
     pushing.add_argument("--dry-run", action="store_true", help="decide and tell what would be written, write nothing")
     pushing.add_argument("--no-push", action="store_true", help="estimate only, write no parameters")
     p.add_argument("--policy", metavar="FILE.toml", help="of the guard on writes (default: see crazyem policy)")
+
+
+def _monitor(p: argparse.ArgumentParser, default: bool | None) -> None:
+    """Faults in flight."""
+    text = f"look for faults in flight (default: {'off' if default is False else 'as the policy says'})"
+    p.add_argument("--monitor", action=argparse.BooleanOptionalAction, default=default, help=text)
+    p.add_argument("--false-alarms-per-hour", type=_number(1e-6, 1000), metavar="N", help="of the monitor")
 
 
 def _logging(p: argparse.ArgumentParser, *, reconnect: float) -> None:

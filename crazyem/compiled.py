@@ -103,6 +103,7 @@ _CALLS = {
     "planning": ("planning",),
     "paper": ("control", "paper"),
     "diagnosis": ("physics", "estimation", "diagnosis"),
+    "monitoring": ("physics", "estimation", "monitoring"),
 }
 
 

@@ -30,24 +30,38 @@ ALLOWED: dict[str, set[str]] = {
     "links": {"signals"},
     "estimation": {"vehicle", "compiled", "physics", "signals"},
     "recordings": {"vehicle", "compiled", "physics", "signals", "links", "estimation"},
+    "monitoring": {"vehicle", "compiled", "physics", "estimation"},
     "doctor": {"vehicle", "physics", "signals", "recordings"},
     "diagnosis": {"vehicle", "compiled", "physics", "signals", "estimation", "recordings"},
     "planning": {"vehicle", "compiled", "physics", "control", "estimation", "diagnosis"},
     "simulators": {"vehicle", "physics", "recordings", "diagnosis"},
     "paper": {"vehicle", "compiled", "physics", "signals", "control", "estimation"},
-    "live": {"compiled", "vehicle", "physics", "signals", "control", "links", "estimation", "recordings"},
+    "live": {
+        *("compiled", "vehicle", "physics", "signals", "control", "links", "estimation", "recordings"),
+        "monitoring",
+    },
     "api": {
         *("vehicle", "physics", "signals", "control", "links", "estimation", "recordings", "doctor", "diagnosis"),
-        *("live", "planning", "simulators"),
+        *("live", "monitoring", "planning", "simulators"),
     },
     "commands": {
         *("vehicle", "physics", "signals", "control", "links", "estimation", "recordings", "doctor", "diagnosis"),
-        *("live", "paper", "api", "simulators"),
+        *("live", "monitoring", "paper", "api", "simulators"),
     },
     "cli": {"commands"},
     "__main__": {"cli"},
     # the library's front door: lazily, on first use
-    "__init__": {"api", "diagnosis", "estimation", "live", "planning", "recordings", "signals", "vehicle"},
+    "__init__": {
+        "api",
+        "diagnosis",
+        "estimation",
+        "live",
+        "monitoring",
+        "planning",
+        "recordings",
+        "signals",
+        "vehicle",
+    },
 }
 
 # The same for the folders of the diagnosis, in the order in which data pass through them; `workers` serves all.

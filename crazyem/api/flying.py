@@ -13,6 +13,7 @@ from crazyem.errors import CrazyemError, UsageError
 from crazyem.estimation.steps import estimator_for
 from crazyem.live.controllers import controller_named
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
+from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.flight_result import FlightResult
 from crazyem.live.policy import Policy, load_policy
 from crazyem.live.recorder import Recorder
@@ -21,6 +22,7 @@ from crazyem.live.session import LOG_RATE, RECONNECT_WITHIN, Session
 from crazyem.live.simulator import Simulator
 from crazyem.live.warm_up import warm_up
 from crazyem.live.write_supervisor import WriteRules
+from crazyem.monitoring.fault import Fault
 from crazyem.physics import folding
 from crazyem.planning.informative import GOAL, SEGMENT, Informative
 from crazyem.vehicle import Vehicle
@@ -49,6 +51,9 @@ class FlightSettings:
     reconnect: float = RECONNECT_WITHIN
     window: int = 800
     every: int = 4
+    monitor: bool | None = None
+    false_alarms_per_hour: float | None = None
+    on_fault: Callable[[Fault], None] | None = None
 
     @property
     def trajectory_name(self) -> str:
@@ -95,6 +100,9 @@ def fly(
     reconnect: float = RECONNECT_WITHIN,
     window: int = 800,
     every: int = 4,
+    monitor: bool | None = None,
+    false_alarms_per_hour: float | None = None,
+    on_fault: Callable[[Fault], None] | None = None,
 ) -> FlightResult:
     """Take off, fly a trajectory, land, and estimate mass and inertia all along.
 
@@ -115,6 +123,9 @@ def fly(
         scenario, seed, speed: of the simulated firmware: file of its truth, its noise, times real time.
         rate, reconnect: of the log, Hz; how long a lost link is tried again, s.
         window, every: newest samples that an update uses; samples between updates.
+        monitor: whether faults in flight are looked for; None: as the policy says.
+        false_alarms_per_hour: of the monitor; None: as the policy says.
+        on_fault: called in the estimator's thread with every report of the monitor (`Fault`); must return at once.
 
     Raises:
         UsageError: an argument that does not fit. LinkError: no drone, or the drone was lost.
@@ -130,6 +141,7 @@ def fly(
         scenario=None if scenario is None else str(scenario),
         uri=uri, controller=controller, duration=duration, goal=goal, append=append, seed=seed, speed=speed, rate=rate,
         reconnect=reconnect, window=window, every=every,
+        monitor=monitor, false_alarms_per_hour=false_alarms_per_hour, on_fault=on_fault,
     )  # fmt: skip
     result, error = observed_flight(settings, FlightObserver())
     if error is not None or result is None:
@@ -245,7 +257,11 @@ def _flown(
             stack, link, vehicle=settings.vehicle, left_out=left_out, configuration=configuration,
             estimator=estimator_for(settings.vehicle, window=settings.window, every=settings.every),
             record=settings.record, append=settings.append, rate=settings.rate, reconnect=settings.reconnect,
-            wrench=plan.controller.wrench, wrap=observer.recorder,
+            wrench=plan.controller.wrench, wrap=observer.recorder, on_fault=settings.on_fault,
+            monitor=monitor_for(
+                settings.vehicle, settings.rules.policy.monitor, enabled=settings.monitor,
+                false_alarms_per_hour=settings.false_alarms_per_hour,
+            ),
         )  # fmt: skip
         if isinstance(plan.trajectory, Informative):
             plan.trajectory.estimate = lambda: session.estimate

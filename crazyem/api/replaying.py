@@ -6,9 +6,11 @@ from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, vehicle
 from crazyem.doctor import examine
 from crazyem.errors import DataError
 from crazyem.estimation.steps import StepAwareEstimator, estimator_for
+from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.flight_result import FlightResult, result_of
 from crazyem.live.history import History, Push
 from crazyem.live.pipeline import Pipeline
+from crazyem.live.policy import FaultRules
 from crazyem.physics import folding
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.contents import ReadOptions
@@ -30,6 +32,8 @@ def replay(
     every: int | None = None,
     options: ReadOptions | None = None,
     progress: Progress | None = None,
+    monitor: bool = False,
+    false_alarms_per_hour: float | None = None,
 ) -> FlightResult:
     """Estimate mass and inertia from a recording, as the live loop would have done.
 
@@ -40,6 +44,8 @@ def replay(
         every: samples between updates; None: as in the flight, else 4.
         options: how a path is read.
         progress: called after every sample.
+        monitor: whether faults are looked for as in flight; `history.faults` has them.
+        false_alarms_per_hour: of the monitor; None: as in the shipped policy.
 
     Raises:
         UsageError: no such file or vehicle. FileFormatError: no recording, or no vehicle.
@@ -55,7 +61,8 @@ def replay(
     history = History()
     take_events(recording, history)
     estimator = _estimator_of(recording, nominal, thrust_from, **_window_of(recording, window, every))
-    pipeline = Pipeline(estimator, history=history)
+    watching = monitor_for(nominal, FaultRules(), enabled=monitor, false_alarms_per_hour=false_alarms_per_hour)
+    pipeline = Pipeline(estimator, history=history, monitor=watching)
     pipeline.estimate_until = history.marks.get("estimate_end", pipeline.estimate_until)
     first: float | None = None
     for sample in recording.samples():

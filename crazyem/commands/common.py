@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ from crazyem.extras import MissingExtraError, require
 from crazyem.live.flight_result import FlightResult
 from crazyem.live.history import History
 from crazyem.live.summary import live_line, write_json
+from crazyem.monitoring.fault import Fault
 from crazyem.vehicle import Vehicle
 
 
@@ -30,6 +31,7 @@ class LiveLine:
         self.prefix, self.quiet = prefix, quiet
         self.phase, self.seconds = "connected", 0.0
         self._steps_said = 0
+        self._faults_said: Sequence[Fault] = ()
 
     def __call__(self, phase: str, seconds: float) -> None:
         self.phase, self.seconds = phase, seconds
@@ -39,6 +41,7 @@ class LiveLine:
         if not self.quiet():
             say(self.prefix + live_line(phase, seconds, self.session.estimate, lost=lost, pushes=len(history.pushes)))
             self._steps_said = say_steps(history, self._steps_said, prefix=self.prefix)
+            self._faults_said = say_faults(history, self._faults_said, prefix=self.prefix)
 
 
 def say_steps(history: History, told: int, *, prefix: str = "") -> int:
@@ -50,6 +53,15 @@ def say_steps(history: History, told: int, *, prefix: str = "") -> int:
         if step.real:
             say(f"{prefix}{step}")
     return told
+
+
+def say_faults(history: History, told: Sequence[Fault], *, prefix: str = "") -> Sequence[Fault]:
+    """A line for each fault that is not among those `told`; one whose size has settled is told again."""
+    faults = history.faults
+    for fault in faults:
+        if fault not in told:
+            say(f"{prefix}fault: {fault}")
+    return faults
 
 
 def plot_path(arguments: argparse.Namespace, *others: str | None) -> str | None:

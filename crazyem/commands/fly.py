@@ -41,6 +41,8 @@ def run(arguments: argparse.Namespace) -> int:
         reconnect=arguments.reconnect,
         window=arguments.window,
         every=arguments.every,
+        monitor=arguments.monitor,
+        false_alarms_per_hour=arguments.false_alarms_per_hour,
     )
     if arguments.trajectory != ["informative"]:
         trajectory_maker(arguments.trajectory, arguments.duration)  # a wrong one is refused here

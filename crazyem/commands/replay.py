@@ -2,12 +2,14 @@
 
 import argparse
 import time
+from collections.abc import Sequence
 
 from crazyem.api.replaying import replay
-from crazyem.commands.common import plot_path, report, say, say_steps
+from crazyem.commands.common import plot_path, report, say, say_faults, say_steps
 from crazyem.commands.files import read_options
 from crazyem.live.history import History
 from crazyem.live.summary import check_writable, live_line
+from crazyem.monitoring.fault import Fault
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -22,6 +24,8 @@ def run(arguments: argparse.Namespace) -> int:
         every=arguments.every,
         options=read_options(arguments),
         progress=_EverySecond(),
+        monitor=arguments.monitor,
+        false_alarms_per_hour=arguments.false_alarms_per_hour,
     )
     report(arguments, result, plot=plot)
     return 0
@@ -32,6 +36,7 @@ class _EverySecond:
 
     def __init__(self) -> None:
         self._shown, self._steps = time.monotonic(), 0
+        self._faults: Sequence[Fault] = ()
 
     def __call__(self, seconds: float, history: History) -> None:
         if time.monotonic() - self._shown > 1.0:
@@ -39,3 +44,5 @@ class _EverySecond:
             newest = history.estimates[-1] if history.estimates else None
             say(live_line("replay", seconds, newest, lost=0, pushes=0))
             self._steps = say_steps(history, self._steps)
+        if history.faults is not self._faults:
+            self._faults = say_faults(history, self._faults)

@@ -21,6 +21,7 @@ from crazyem.commands.flights import confirm_in_terminal, follow, interrupts
 from crazyem.commands.view import Streams, Viewed, live_view, wants_view
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
+from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.hover_thrust import hover_afterwards
 from crazyem.live.policy import load_policy
 from crazyem.live.runner import connect, finished, open_session
@@ -41,6 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("watch needs a URI, such as radio://0/80/2M or udp://127.0.0.1:19850 (see crazyem links).")
     view = wants_view(arguments)
     rules = write_rules(arguments)
+    policy = rules.policy if rules is not None else load_policy()
     vehicle, left_out = folding.fold(folding.load(arguments.vehicle))
     plot = plot_path(arguments, arguments.record, arguments.json)
     for path in (arguments.json, arguments.record, plot):
@@ -62,6 +64,10 @@ def run(arguments: argparse.Namespace) -> int:
             estimator=new_estimator(vehicle, arguments, crazyflie=not arguments.uri.startswith("mavlink:")),
             record=arguments.record, append=arguments.append,
             rate=arguments.rate, reconnect=arguments.reconnect, wrap=streams.with_stream,
+            monitor=monitor_for(
+                vehicle, policy.monitor, enabled=arguments.monitor,
+                false_alarms_per_hour=arguments.false_alarms_per_hour,
+            ),
         )  # fmt: skip
         try:
             session.start()

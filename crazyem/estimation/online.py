@@ -7,6 +7,7 @@ incremental pass by default, full passes while the parameters still move, and ev
 
 import math
 import time as clock
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -36,8 +37,7 @@ REFRESH = 12  # updates between two full passes with information
 YOUNG = 200  # samples below which every update is a full pass
 NEWBORN = 24  # samples below which it takes as many passes as it needs: a cold start flies with what comes out
 CLOSE = 0.1  # standard deviations from the maximum at which full passes end
-# Standard deviations that a noise scale may be off where estimates count as converged: two of them are some 5 % of an
-# interval, and full passes end when the parameters have arrived.
+# standard deviations that a noise scale may be off where estimates count as converged: some 5 % of an interval
 PASSED_NOISE = 2.0
 # Change of a parameter's logarithm that calls for full passes: a share of its standard deviation, between two limits.
 MOVED_SD, MOVED, MOVED_FAR = 0.5, 0.02, 0.1
@@ -46,6 +46,8 @@ MOVED_SD, MOVED, MOVED_FAR = 0.5, 0.02, 0.1
 # attitude errs as its rates do and for far longer than a sample lasts: as ten independent attitudes in 0.1 s they
 # contradict the rates, and inertia in hover comes out too high (docs: estimator.md, docs: mavlink.md).
 ATTITUDE_PERIOD = 0.05
+
+Filtered = Callable[[WindowEM, Parameters, int, int, "NDArray[np.float64] | None"], None]
 
 _COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 _INPUTS = ("motor_command", "rotor_speed", "wrench_command")
@@ -93,6 +95,7 @@ class OnlineEstimator:
         full_updates: how many updates made full passes.
         settled: how the maximum was reached in the last `finish`.
         counters: what came in.
+        on_filtered: called with rows filtered for the first time: (em, by which parameters, first, last, sds or None).
     """
 
     def __init__(
@@ -153,6 +156,7 @@ class OnlineEstimator:
         self.counters = Counters()
         self.update_seconds: list[float] = []
         self.full_updates = 0
+        self.on_filtered: Filtered | None = None
 
     # what comes in -------------------------------------------------------------------------------------------
 
@@ -346,8 +350,7 @@ class OnlineEstimator:
         self._thin_attitude(node, starts=starts)
         if tape.size == tape.capacity and self._fresh < tape.size:
             # updates are rarer than the tape is long: what was not filtered yet must be before it falls off
-            self._em.incremental(max(0, tape.size - self.window), self._fresh, tape.size, lookback=LOOKBACK)
-            self._fresh = tape.size
+            self._filter_fresh(self._em, max(0, tape.size - self.window))
         keep = self.window + LOOKBACK + 2 * min(self.every, self.window) + 8
         dropped = tape.append(node.time, node.y[:13], starts=starts, keep=keep)
         tape.force[tape.size - 1] = node.y[13:]
@@ -385,14 +388,21 @@ class OnlineEstimator:
         self._updates += 1
         last = tape.size
         first = max(0, last - self.window)
-        em.incremental(first, self._fresh, last, lookback=LOOKBACK)
-        self._fresh = last
+        self._filter_fresh(em, first)
         young = last - first < min(YOUNG, self.window)
         refresh = self._refresh if last - first == self.window else REFRESH  # what is known grows with the window
         if young or self._moved(em) or self._updates % refresh == 0:
             self._owed = self._deferring and not young and self._information is not None
             if not self._owed:
                 self._full_passes()
+
+    def _filter_fresh(self, em: WindowEM, first: int) -> None:
+        """An incremental pass over a window that begins at row `first`."""
+        fresh, last, used = self._fresh, self._tape.size, em.parameters
+        em.incremental(first, fresh, last, lookback=LOOKBACK)
+        self._fresh = last
+        if self.on_filtered is not None:
+            self.on_filtered(em, used, fresh, last, self._information.sd if self._information else None)
 
     def _full_passes(self) -> None:
         em, last = self._em, self._tape.size

@@ -2,15 +2,17 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Protocol
 
 from crazyem.errors import DataError
 from crazyem.estimation.result import Estimate
+from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.policy import Policy, load_policy
 from crazyem.live.session import Session
 from crazyem.live.write_supervisor import WriteRules
+from crazyem.monitoring.fault import Fault
 from crazyem.physics import folding
 from crazyem.vehicle import Vehicle
 
@@ -39,6 +41,11 @@ class Attachment:
         """The newest estimate, None before the first (the drone has to fly)."""
         self.session.raise_if_failed()
         return self.session.estimate
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """What the monitor found in this flight so far."""
+        return self.session.history.faults
 
     def wait(self, parameters: Sequence[str] = ("mass",), *, timeout: float = 30.0) -> Estimate:
         """Block until all of `parameters` are identifiable; returns that estimate.
@@ -86,6 +93,9 @@ def attach(
     dry_run: bool = False,
     window: int = 800,
     every: int = 4,
+    monitor: bool | None = None,
+    false_alarms_per_hour: float | None = None,
+    on_fault: Callable[[Fault], None] | None = None,
 ) -> Attachment:
     """Estimate mass and inertia of a drone that a script already talks to.
 
@@ -101,6 +111,9 @@ def attach(
             when the attachment ends: the flight is the script's.
         dry_run: with `push`, decide and tell (`session.history.guard`), but write nothing.
         window, every: newest samples used, samples per update.
+        monitor: whether faults in flight are looked for; None: as the policy says.
+        false_alarms_per_hour: of the monitor; None: as the policy says.
+        on_fault: called with every report of the monitor, in the estimator's thread; must return at once.
 
     Raises:
         UsageError: unknown vehicle, no such policy, not connected, or a log variable is missing. LinkError: no answer.
@@ -114,7 +127,8 @@ def attach(
     warm_up(model)
     link = CrazyflieLink.from_crazyflie(cf)
     estimator = estimator_for(model, window=window, every=every)
-    session = Session(link, vehicle=model, estimator=estimator)
+    watching = monitor_for(model, rules.policy.monitor, enabled=monitor, false_alarms_per_hour=false_alarms_per_hour)
+    session = Session(link, vehicle=model, estimator=estimator, monitor=watching, on_fault=on_fault)
     session.history.notice(folding.notice(left_out))
     try:
         session.start()

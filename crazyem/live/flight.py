@@ -356,6 +356,8 @@ class Flight:
             self.session.raise_if_failed()
         if self.session.outages and self._may_fly and self.telemetry.grounded_reason():
             raise CrazyemError(f"the drone fell while the link was gone: {self.telemetry.grounded_reason()}.")
+        if self.session.landing_wanted and self.phase != "landing":
+            raise CrazyemError(f"the flight was ended because of a fault: {self.session.landing_wanted}.")
         if self._stream is not None and self._stream.failure is not None:
             raise LinkError(f"setpoints could not be sent: {self._stream.failure}.")
         if now - self._report >= REPORT_EVERY:

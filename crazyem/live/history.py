@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from crazyem.estimation.result import Estimate, Step
+from crazyem.monitoring.fault import Fault
 from crazyem.signals.sample import Sample
 
 PARAMETER_NAMES = ("mass", "Ixx", "Iyy", "Izz", "motor_time_constant")
@@ -68,6 +69,7 @@ class History:
         marks: phase -> time on the drone's clock [s]: trajectory_start, trajectory_end, push_enabled.
         notices: sentences for the user.
         steps: changes of mass that were noticed, the newest perhaps undecided.
+        faults: what the monitor found.
         guard: what the guard was told and did, empty where there was none (`WriteSupervisor.account`).
     """
 
@@ -79,6 +81,7 @@ class History:
     notices: list[str] = field(default_factory=list)
     losses: list[tuple[float, int]] = field(default_factory=list)
     steps: tuple[Step, ...] = ()
+    faults: tuple[Fault, ...] = ()
     guard: dict[str, Any] = field(default_factory=dict)
 
     def notice(self, sentence: str) -> None:

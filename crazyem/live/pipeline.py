@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from crazyem.estimation.result import Estimate, Step
+from crazyem.live.flight_monitor import FlightMonitor
 from crazyem.live.guard import Decision
 from crazyem.live.history import History
 from crazyem.signals.sample import Sample
@@ -79,6 +80,7 @@ class Pipeline:
         push: takes a decision with writes; must not block.
         on_estimate: called with every estimate (live line, recording).
         on_step: called with every step of mass when it is noticed, and again when it is decided what it was.
+        monitor: of faults in flight, or None.
     """
 
     def __init__(
@@ -90,6 +92,7 @@ class Pipeline:
         push: Callable[[Decision], None] | None = None,
         on_estimate: Callable[[Estimate], None] | None = None,
         on_step: Callable[[Step], None] | None = None,
+        monitor: FlightMonitor | None = None,
     ) -> None:
         self.estimator = estimator
         self.history = history
@@ -97,6 +100,7 @@ class Pipeline:
         self.push = push
         self.on_estimate = on_estimate
         self.on_step = on_step
+        self.monitor = monitor if monitor is not None and monitor.watch(estimator) else None
         self.push_from = math.inf  # s on the drone's clock; estimates of this time and later may be pushed
         self.push_until = math.inf
         self.paused = False  # by a person: nothing new is pushed meanwhile
@@ -108,10 +112,14 @@ class Pipeline:
         """One sample further; the estimate if one is due."""
         self.samples += 1
         self.history.take(sample)
+        if self.monitor is not None and sample.time <= self.estimate_until:
+            self.monitor.take(sample, airborne=self.estimator.airborne)
         estimate = self.estimator.feed(sample) if sample.time <= self.estimate_until else None
         if estimate is None:
             return None
         self.history.keep(estimate)
+        if self.monitor is not None:
+            self.history.faults = self.monitor.faults
         self._take_steps(estimate.time)
         if self.guard is not None:
             self.decision = self.guard.consider(
@@ -125,6 +133,10 @@ class Pipeline:
         if self.on_estimate is not None:
             self.on_estimate(estimate)
         return estimate
+
+    def fault_objection(self, time: float) -> str:
+        """Why the monitor lets nothing be pushed at `time` [s], "" where it does, or there is none."""
+        return "" if self.monitor is None else self.monitor.stops(time)
 
     def _take_steps(self, time: float) -> None:
         """Tell of what is new about steps of mass before anything is decided on the estimate."""

@@ -15,6 +15,7 @@ from crazyem.live.guard import WRITABLE_ESTIMATES, Limits
 from crazyem.toml_file import parse_toml, read_text
 
 LARGEST_POLICY_FILE = 65536  # bytes
+FAULT_ACTIONS = ("report", "stop", "land")  # tell; push nothing meanwhile; land as well, where crazyem flies
 END_RULES = ("keep", "good", "restore")
 
 
@@ -81,12 +82,29 @@ class EndRules:
 
 
 @dataclass(frozen=True)
+class FaultRules:
+    """The monitor of faults in flight.
+
+    Attributes:
+        enabled: whether it runs. false_alarms_per_hour: of flight, of all its tests together.
+        action: what follows a fault, one of `FAULT_ACTIONS`. resume: s after which pushing goes on once the model holds
+            again.
+    """
+
+    enabled: bool = False
+    false_alarms_per_hour: float = 0.1
+    action: str = "stop"
+    resume: float = 2.0
+
+
+@dataclass(frozen=True)
 class Policy:
     """The rules of the guard: what may be written to a flying drone, when, and what is taken back.
 
     Attributes:
         limits: what an estimate must be like. health: what the drone must be like.
         watch: what counts as worse after a write. end: what stays in the drone after the flight.
+        monitor: of faults in flight.
     """
 
     name: str = "default"
@@ -94,6 +112,7 @@ class Policy:
     health: HealthLimits = field(default_factory=HealthLimits)
     watch: MonitorLimits = field(default_factory=MonitorLimits)
     end: EndRules = field(default_factory=EndRules)
+    monitor: FaultRules = field(default_factory=FaultRules)
 
     def entries(self) -> dict[str, dict[str, Any]]:
         """Section -> key -> value, in the units of the file."""
@@ -174,13 +193,16 @@ def _read_names(value: Any) -> tuple[str, ...]:
     return tuple(n for n in WRITABLE_ESTIMATES if n in value)
 
 
-def _read_end(value: Any) -> str:
-    if value not in END_RULES:
-        raise ValueError(f"one of {', '.join(END_RULES)}")
-    return str(value)
+def _choice(among: tuple[str, ...]) -> _Kind:
+    def read(value: Any) -> str:
+        if value not in among:
+            raise ValueError(f"one of {', '.join(among)}")
+        return str(value)
+
+    return _Kind(read)
 
 
-_FLAG, _PARAMETERS, _END = _Kind(_read_flag), _Kind(_read_names, list), _Kind(_read_end)
+_FLAG, _PARAMETERS, _END = _Kind(_read_flag), _Kind(_read_names, list), _choice(END_RULES)
 _SECONDS, _SHARE, _RATIO = _number(0.0, 60.0), _number(0.0, 1.0), _number(1.0, 1000.0)
 _DEGREE = math.radians(1.0)
 
@@ -239,8 +261,12 @@ _POLICY_KEYS: tuple[tuple[str, str, str, str, _Kind], ...] = (
     ("end", "interrupted", "end", "interrupted", _END),
     ("end", "failed", "end", "failed", _END),
     ("end", "link_lost", "end", "link_lost", _END),
+    ("monitor", "enabled", "monitor", "enabled", _FLAG),
+    ("monitor", "false_alarms_per_hour", "monitor", "false_alarms_per_hour", _number(1e-6, 1000.0)),
+    ("monitor", "action", "monitor", "action", _choice(FAULT_ACTIONS)),
+    ("monitor", "resume_s", "monitor", "resume", _SECONDS),
 )  # fmt: skip
-_POLICY_PARTS = ("limits", "health", "watch", "end")
+_POLICY_PARTS = ("limits", "health", "watch", "end", "monitor")
 
 
 def default_text() -> str:

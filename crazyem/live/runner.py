@@ -7,10 +7,12 @@ from typing import Any
 from crazyem.errors import CrazyemError
 from crazyem.links import open_link
 from crazyem.links.base import Link
+from crazyem.live.flight_monitor import FlightMonitor
 from crazyem.live.flight_result import FlightResult, result_of
 from crazyem.live.pipeline import Estimator
 from crazyem.live.recorder import Recorder, close_recorder, open_recorder
 from crazyem.live.session import Session
+from crazyem.monitoring.fault import Fault
 from crazyem.physics import folding
 from crazyem.vehicle import Vehicle
 
@@ -37,6 +39,8 @@ def open_session(
     reconnect: float,
     wrench: str = "ctrlLee",
     wrap: Callable[[Recorder | None], Recorder | None] = lambda recorder: recorder,
+    monitor: FlightMonitor | None = None,
+    on_fault: Callable[[Fault], None] | None = None,
 ) -> Session:
     """A session with its recording, not yet started; `stack` closes both.
 
@@ -46,6 +50,7 @@ def open_session(
         record, append: path of the recording, None: none; continue an existing one.
         rate: of the log, Hz. reconnect: how long a lost link is tried again, s.
         wrench: log group of the controller whose commanded thrust and torque are recorded.
+        monitor: of faults in flight; on_fault: takes its reports.
         wrap: adds what else takes the recorder's messages, such as a live stream.
     """
     recorder = wrap(open_recorder(record, configuration=configuration, vehicle=vehicle, link=link, append=append))
@@ -59,6 +64,8 @@ def open_session(
         wrench=wrench,
         rate=rate,
         reconnect_within=reconnect,
+        monitor=monitor,
+        on_fault=on_fault,
     )
     stack.callback(session.close)
     session.history.notice(folding.notice(left_out))

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 
 from crazyem.errors import CrazyemError, DataError, LinkError
-from crazyem.estimation.result import Estimate, Step
+from crazyem.estimation.result import Estimate
 from crazyem.links.base import (
     AccountingLink,
     AnotherDroneError,
@@ -29,6 +29,7 @@ from crazyem.links.base import (
     link_account,
 )
 from crazyem.live.clock import FirmwareClock
+from crazyem.live.flight_monitor import FlightMonitor, event_lines
 from crazyem.live.guard import Guard
 from crazyem.live.history import History
 from crazyem.live.hover_thrust import hover_rules, hover_target
@@ -40,6 +41,7 @@ from crazyem.live.scheduler import Mailbox, Scheduler
 from crazyem.live.telemetry import Telemetry
 from crazyem.live.write_gate import WriteGate
 from crazyem.live.write_supervisor import WriteRules, WriteSupervisor
+from crazyem.monitoring.fault import Fault
 from crazyem.signals.sample import Sample
 from crazyem.signals.vocabulary import block_plan, decoders
 from crazyem.vehicle import Vehicle
@@ -67,6 +69,7 @@ class Session:
         reconnect_within: s for which a lost link is tried again, 0 = never. The window is kept: the estimator sees the
             gap in the stamps and begins a new stretch after it.
         scheduler: whose threads receive and estimate, where one process has many sessions; None: threads of its own.
+        monitor: of faults in flight; on_fault: called in the estimator's thread with its reports.
     """
 
     def __init__(
@@ -81,6 +84,8 @@ class Session:
         rate: float = LOG_RATE,
         reconnect_within: float = RECONNECT_WITHIN,
         scheduler: Scheduler | None = None,
+        monitor: FlightMonitor | None = None,
+        on_fault: Callable[[Fault], None] | None = None,
     ) -> None:
         self.link = link
         self.vehicle = vehicle
@@ -90,8 +95,7 @@ class Session:
         self.telemetry = Telemetry()
         self.lost: LinkLost | None = None
         self.outages: list[Outage] = []
-        self.rate = rate
-        self.reconnect_within = reconnect_within
+        self.rate, self.reconnect_within = rate, reconnect_within
         self._linked = threading.Event()
         self._linked.set()
         self.failure: CrazyemError | None = None
@@ -99,8 +103,12 @@ class Session:
         self.write_supervisor: WriteSupervisor | None = None
         self._wrench = wrench
         self._on_estimate = on_estimate
-        self.pipeline = Pipeline(estimator, history=self.history, on_estimate=self._estimated)
-        self.pipeline.on_step = self._record_step
+        self._on_fault = on_fault or (lambda fault: None)
+        self.landing_wanted = ""  # why the drone is to land at once, by the policy
+        if monitor is not None:
+            monitor.on_fault = self._found_fault
+        self.pipeline = Pipeline(estimator, history=self.history, on_estimate=self._estimated, monitor=monitor)
+        self.pipeline.on_step = lambda step: self._record_event(str(step))
         self.blocks: tuple[Block, ...] = ()
         self._samples: queue.SimpleQueue[list[Sample] | None] = queue.SimpleQueue()
         self._scheduler = scheduler
@@ -110,9 +118,8 @@ class Session:
         self._receiving_ended = False  # nothing is received any more
         self._reconnection: threading.Thread | None = None  # a lost link, for a scheduler: its thread must not wait
         self._link_recorded = -math.inf
-        self._end_wanted = False
+        self._end_wanted = self._closed = False
         self._stop = threading.Event()
-        self._closed = False
         self._threads: list[threading.Thread] = []
 
     @property
@@ -179,6 +186,7 @@ class Session:
             residual=lambda: residual_of(self.pipeline.estimator),
             enabled=lambda time: self.pipeline.push_from <= time <= self.pipeline.push_until,
             record=self._record_event,
+            fault=self.pipeline.fault_objection,
         )
         if not rules.dry_run:
             self.pusher = write_supervisor.pusher = Pusher(
@@ -274,8 +282,15 @@ class Session:
         if self._on_estimate is not None:
             self._on_estimate(estimate)
 
-    def _record_step(self, step: Step) -> None:
-        self._record_event(str(step))
+    def _found_fault(self, fault: Fault) -> None:
+        """Tell it to everybody; the settled report of a fault comes after the first."""
+        for line in event_lines(fault):
+            self._record_event(line)
+        if fault.settled:
+            self.history.notice(f"{fault}.")
+        if self.pipeline.monitor is not None and self.pipeline.monitor.wants_landing(fault):
+            self.landing_wanted = self.landing_wanted or str(fault)
+        self._on_fault(fault)
 
     def _receive(self) -> None:
         try:

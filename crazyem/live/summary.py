@@ -45,6 +45,7 @@ def build_summary(
         "pushes": [p.to_json() for p in history.pushes],
         "guard": history.guard or None,
         "steps": [step.to_json() for step in history.steps],
+        "faults": [fault.to_json() for fault in history.faults],
         "updates": estimate.updates,
         "update_ms": {
             "median": float(np.median(ms)) if ms.size else None,

@@ -190,7 +190,7 @@ class Observer:
         return self._link
 
     def _alarms(self) -> tuple[str, ...]:
-        session = self.session
+        session, history = self.session, self.session.history
         alarms = []
         if session.failure is not None:
             alarms.append(str(session.failure))
@@ -198,6 +198,8 @@ class Observer:
             alarms.append(session.lost_sentence())
         elif session.reconnecting:
             alarms.append("the link is lost and being brought back")
+        if history.faults:
+            alarms.append(str(history.faults[-1]))
         grounded = session.telemetry.grounded_reason()
         if grounded:
             alarms.append(grounded)

@@ -7,6 +7,8 @@ from crazyem.compiled import compilations
 from crazyem.errors import CrazyemError
 from crazyem.estimation.in_step import PERIOD
 from crazyem.estimation.online import OnlineEstimator
+from crazyem.live.flight_monitor import FlightMonitor
+from crazyem.live.policy import FaultRules
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle
 
@@ -15,6 +17,7 @@ def warm_up(vehicle: Vehicle) -> float:
     """Run every kernel once; returns the seconds it took if any was compiled, 0.0 if all came from the disk."""
     begun, before = time.monotonic(), compilations()
     estimator = OnlineEstimator(vehicle, window=100, every=4, prediction_period=PERIOD)
+    FlightMonitor(vehicle, FaultRules()).watch(estimator)
     hover = 0.5
     try:
         for i in range(160):

@@ -68,6 +68,7 @@ class WriteSupervisor:
         now: newest time on the drone's clock, s.
         residual: time [s], innovations and their standard deviations of the newest sample, or None.
         enabled: whether a time [s] is in a phase of the flight in which parameters are pushed.
+        fault: why the model of the flight does not hold at a time [s], "" where it does.
         tell: takes a line for the recording.
     """
 
@@ -82,6 +83,7 @@ class WriteSupervisor:
         now: Callable[[], float],
         residual: Callable[[], Any] = lambda: None,
         enabled: Callable[[float], bool] = lambda time: True,
+        fault: Callable[[float], str] = lambda time: "",
         record: Callable[[str], None] = lambda line: None,
     ) -> None:
         self.guard, self.rules = guard, rules
@@ -101,7 +103,7 @@ class WriteSupervisor:
         self.drag = DragRegression()
         guard.capped = rules.policy.watch.enabled and not rules.dry_run
         self.pusher: Pusher | None = None
-        self._residual, self._enabled = residual, enabled
+        self._residual, self._enabled, self._fault = residual, enabled, fault
         self._airborne = self._reverted = self._owed = self._restarted = False
         self._monitor_time = -math.inf
         self._residual_time = -math.inf
@@ -252,6 +254,8 @@ class WriteSupervisor:
             self.watch.innovation(newest[0], float(sum(squares) / len(squares)))
 
     def _hold(self, time: float) -> str:
+        if fault := self._fault(time):
+            return fault
         if self.pusher is not None and self.pusher.busy:
             return "the last set is still being written"
         if self._confirmation is not None and not self._allowed:

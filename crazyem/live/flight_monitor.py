@@ -1,0 +1,115 @@
+"""The monitor in a session: it sees what the estimator filters, says what changed, and stops pushing when it must.
+
+Called in the estimator's thread, like the pipeline. Nothing here reads a clock: a replay finds the same faults.
+"""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.estimation.em import WindowEM
+from crazyem.estimation.model import Parameters
+from crazyem.live.policy import FaultRules
+from crazyem.monitoring.detector import Detector
+from crazyem.monitoring.fault import Fault
+from crazyem.monitoring.repetition import RunTest
+from crazyem.notebook import finite
+from crazyem.signals.sample import Sample
+from crazyem.vehicle import Vehicle
+
+REPEATING = ("position", "velocity", "attitude", "body_rate")  # signals that a stuck sensor would repeat
+MOST_FAULTS = 1000  # that are kept
+SHARE_OF_RUNS = 0.1  # of the false alarms, for the tests of repetition; the rest is the detector's
+
+
+def event_lines(fault: Fault) -> tuple[str, str]:
+    """What a recording's events say of a fault: a sentence, and the same for programs."""
+    return f"fault: {fault}", f"fault_data {json.dumps(finite(fault.to_json()))}"
+
+
+def monitor_for(
+    vehicle: Vehicle, rules: FaultRules, *, enabled: bool | None = None, false_alarms_per_hour: float | None = None
+) -> "FlightMonitor | None":
+    """The monitor of a flight as the policy says, None where there is none; the arguments overrule the policy."""
+    if not (rules.enabled if enabled is None else enabled):
+        return None
+    if false_alarms_per_hour is not None:
+        rules = replace(rules, false_alarms_per_hour=false_alarms_per_hour)
+    return FlightMonitor(vehicle, rules)
+
+
+class FlightMonitor:
+    """Watches one flight.
+
+    Args:
+        vehicle: nominal constants. rules: what follows a fault, and how often it may be a false alarm.
+        on_fault: called with every report, from the estimator's thread.
+
+    Attributes:
+        faults: what was found, each once: the settled report takes the place of the first.
+    """
+
+    def __init__(self, vehicle: Vehicle, rules: FaultRules, *, on_fault: Callable[[Fault], None] | None = None) -> None:
+        self.rules = rules
+        self.on_fault = on_fault
+        per_hour = rules.false_alarms_per_hour
+        self._detector = Detector(vehicle, false_alarms_per_hour=(1.0 - SHARE_OF_RUNS) * per_hour)
+        self._runs = {name: RunTest(SHARE_OF_RUNS * per_hour / len(REPEATING)) for name in REPEATING}
+        self._broken = -math.inf  # s, when the model held last
+        self.faults: tuple[Fault, ...] = ()
+
+    def watch(self, estimator: Any) -> bool:
+        """Look at what an estimator filters, or the one inside it; whether there is one that can be looked at."""
+        while hasattr(estimator, "inner"):
+            estimator = estimator.inner
+        if not hasattr(estimator, "on_filtered"):
+            return False
+        estimator.on_filtered = self._filtered
+        return True
+
+    def take(self, sample: Sample, *, airborne: bool) -> None:
+        """One sample, before the estimator has it."""
+        test = self._runs.get(sample.signal)
+        if test is not None and test.add(sample.time, sample.value) and airborne:
+            self._report(
+                Fault(
+                    effect=f"stuck {sample.signal}", rotor=None, text=f"the {sample.signal.replace('_', ' ')} is stuck",
+                    onset=test.since, detected=sample.time, sizes={}, probability=1.0, look_alikes={}, settled=True,
+                )
+            )  # fmt: skip
+
+    def stops(self, time: float) -> str:
+        """Why nothing is to be pushed at `time` [s], "" where the model holds."""
+        if self.rules.action == "report":
+            return ""
+        followed = bool(self.faults) and self.faults[-1].followed
+        if self._stuck or not (self._detector.holds or followed):
+            self._broken = time
+        if time - self._broken <= self.rules.resume:
+            return "the model of the flight does not hold: " + (self.faults[-1].name if self.faults else "a change")
+        return ""
+
+    def wants_landing(self, fault: Fault) -> bool:
+        """Whether the policy says that the drone lands because of this."""
+        return self.rules.action == "land" and not fault.followed
+
+    @property
+    def _stuck(self) -> bool:
+        return any(test.alarmed for test in self._runs.values())
+
+    def _filtered(self, em: WindowEM, p: Parameters, first: int, last: int, sd: NDArray[np.float64] | None) -> None:
+        known = np.where(em.setup.free, em.setup.prior.sd, 0.0) if sd is None else sd
+        report = self._detector.take(em, p, first, last, known)
+        if report is not None:
+            self._report(report)
+
+    def _report(self, fault: Fault) -> None:
+        again = bool(self.faults) and fault.detected == self.faults[-1].detected and not self.faults[-1].settled
+        self.faults = (*(self.faults[:-1] if again else self.faults), fault)[-MOST_FAULTS:]
+        if self.on_fault is not None:
+            self.on_fault(fault)

@@ -1,0 +1,174 @@
+"""Rows of numbers from hypotheses: what each column does to the body and to the sensors in a step of the filter."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.estimation.model import Parameters
+from crazyem.estimation.tape import Tape
+from crazyem.monitoring import hypotheses as h
+from crazyem.physics.rotors import PITCH_SIGN, ROLL_SIGN, YAW_SIGN
+from crazyem.vehicle import Vehicle
+
+# Standard deviation of the drag over mass that a vehicle file does not have [1/s]: that of propellers and frame of a
+# small quadrotor, 3 to 9 mN s/m (Foerster 2015) over 30 g.
+DRAG_SD = 0.2
+# That of the delay of what is measured against the commands [s]: a period of the onboard filter.
+DELAY_SD = 0.01
+NUISANCES = 16  # parameters of the estimator, drag along x, y, z, delays of the four measured quantities
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The columns of all hypotheses side by side, and the nuisances.
+
+    Attributes:
+        columns: (C,), those of one hypothesis next to each other.
+        first: (H + 1,) index of the first column of each hypothesis.
+        block: (C,) first column of the hypothesis that a column belongs to.
+        sd: (C,) of the priors of the sizes.
+        once: (C,) whether a column acts in the first step only.
+    """
+
+    columns: tuple[h.Column, ...]
+    first: NDArray[np.int64]
+    block: NDArray[np.int64]
+    sd: NDArray[np.float64]
+    once: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, hypotheses: Sequence[h.Hypothesis]) -> "Columns":
+        """Side by side, in the order of the hypotheses."""
+        columns = tuple(c for hypothesis in hypotheses for c in hypothesis.columns)
+        first = np.cumsum([0, *(len(hypothesis.columns) for hypothesis in hypotheses)])
+        block = np.repeat(first[:-1], np.diff(first))
+        sd = np.array([c.sd for c in columns])
+        return cls(columns, first, block, sd, np.array([c.kind in h.ONCE for c in columns]))
+
+
+def mixing(vehicle: Vehicle) -> NDArray[np.float64]:
+    """(4, 4) from the thrusts of the rotors [N] to F [N] and M [N m]."""
+    x, y = vehicle.arm
+    return np.stack([np.ones(4), y * ROLL_SIGN, x * PITCH_SIGN, vehicle.torque_per_thrust * YAW_SIGN])
+
+
+class RowMaker:
+    """Makes the rows of a vehicle's columns.
+
+    Args:
+        columns: of the hypotheses. vehicle: its geometry.
+    """
+
+    def __init__(self, columns: Columns, vehicle: Vehicle) -> None:
+        self.columns = columns
+        self.mass = vehicle.mass
+        matrix = mixing(vehicle)
+        self._unmix = np.linalg.inv(matrix) if abs(np.linalg.det(matrix)) > 0 else None
+        self._mix = matrix
+
+    def rows(self, tape: Tape, p: Parameters, first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What the columns do in the steps that end at rows first..last-1.
+
+        Returns:
+            acting (n, C, 6): specific force [m/s^2] and angular acceleration [rad/s^2], body axes, for a size of one;
+            of columns that act once: changes of velocity [m/s] and rate [rad/s]. sensed (n, C, 12): what is added to
+            the measured position [m], velocity [m/s], attitude [rad, body] and body rate [rad/s].
+        """
+        n, size = last - first, len(self.columns.columns)
+        acting, sensed = np.zeros((n, size, 6)), np.zeros((n, size, 12))
+        mass, inverse = p.theta[0], p.inverse
+        force = tape.mean[first:last, 0]
+        wrench = tape.mean[first:last]
+        turn = tape.middle[first:last]  # body to world, in the middle of the step
+        thrusts = wrench @ self._unmix.T if self._unmix is not None else None
+        for c, column in enumerate(self.columns.columns):
+            kind, i = column.kind, column.index
+            if kind == h.ROTOR and thrusts is not None:
+                lost = thrusts[:, i : i + 1] * self._mix[:, i]
+                acting[:, c, 2] = -lost[:, 0] / mass
+                acting[:, c, 3:] = -lost[:, 1:] @ inverse.T
+            elif kind == h.THRUST:
+                acting[:, c, 2] = -force / mass
+                acting[:, c, 3:] = -wrench[:, 1:] @ inverse.T
+            elif kind == h.MASS:
+                acting[:, c, 2] = -force / mass**2
+            elif kind == h.CENTRE:  # thrust acts at minus the centre of mass from it: torque (-y F, x F, 0)
+                acting[:, c, 3:] = (force if i == 0 else -force)[:, None] * inverse[:, 1 - i]
+            elif kind == h.FORCE:
+                acting[:, c, :3] = turn[:, i, :] / mass
+            elif kind == h.TORQUE:
+                acting[:, c, 3:] = inverse[:, i]
+            elif kind == h.KICK:
+                acting[:, c, :3] = turn[:, i, :]
+            elif kind == h.TURN:
+                acting[:, c, 3 + i] = 1.0
+            elif h.POSITION <= kind <= h.RATE:
+                sensed[:, c, 3 * (kind - h.POSITION) + i] = 1.0
+            elif kind == h.VELOCITY_SCALE:
+                sensed[:, c, 3:6] = tape.xp[first:last, 3:6]
+            elif kind == h.RATE_SCALE:
+                sensed[:, c, 9:12] = tape.xp[first:last, 10:13]
+        return acting, sensed
+
+    def nuisances(
+        self, tape: Tape, p: Parameters, unit: NDArray[np.float64], first: int, last: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Acting (n, M, 6), sensed (n, M, 12), as `rows`, of what the model may be wrong in without a change.
+
+        The nine parameters of the estimator as it takes them (logarithms, and units of the linear ones), drag along x,
+        y, z [1/s], delays of position, velocity, attitude and rate [s].
+        """
+        acting = np.zeros((last - first, NUISANCES, 6))
+        sensed = np.zeros((last - first, NUISANCES, 12))
+        theta, inverse = p.theta, p.inverse
+        w = tape.xf[first - 1 : last - 1, 10:13]
+        acting[:, 0, 2] = -tape.thrust[first:last] / theta[0]
+        momentum = w @ p.inertia.T
+        alpha = (tape.torque[first:last] - np.cross(w, momentum)) @ inverse.T
+        for a in range(3):  # as crazyem/estimation/kernels/sensitivity.py
+            b, c = (a + 1) % 3, (a + 2) % 3
+            change = np.outer(alpha[:, a], inverse[:, a]) + w[:, a : a + 1] * (
+                np.outer(w[:, c], inverse[:, b]) - np.outer(w[:, b], inverse[:, c])
+            )
+            acting[:, 1 + a, 3:] = -theta[1 + a] * change
+        for column, scale, thrust, torque in (
+            (4, theta[4], tape.thrust_tau, tape.torque_tau),
+            (5, unit[5], tape.thrust_delay, tape.torque_delay),
+        ):
+            acting[:, column, 2] = scale * thrust[first:last] / theta[0]
+            acting[:, column, 3:] = scale * torque[first:last] @ inverse.T
+        for a in range(3):
+            acting[:, 6 + a, 3:] = unit[6 + a] * inverse[:, a]
+        velocity = np.einsum("nij,ni->nj", tape.middle[first:last], tape.xf[first - 1 : last - 1, 3:6])
+        for a in range(3):
+            acting[:, 9 + a, a] = -velocity[:, a]
+        span = (tape.time[first:last] - tape.time[first - 1 : last - 1])[:, None]
+        sensed[:, 12, 0:3] = -tape.xp[first:last, 3:6]
+        sensed[:, 13, 3:6] = -(tape.xp[first:last, 3:6] - tape.xf[first - 1 : last - 1, 3:6]) / span
+        sensed[:, 14, 6:9] = -tape.xp[first:last, 10:13]
+        sensed[:, 15, 9:12] = -(tape.xp[first:last, 10:13] - w) / span
+        return acting, sensed
+
+    def drifting(self, tape: Tape, p: Parameters, reference: Parameters, first: int, last: int) -> NDArray[np.float64]:
+        """(n, 1, 6) accelerations by parameters `p` (those on the tape), less those by `reference`."""
+        out = np.zeros((last - first, 1, 6))
+        if p is reference:
+            return out
+        lag, delay = p.theta[4] - reference.theta[4], p.theta[5] - reference.theta[5]
+        thrust = tape.thrust[first:last]
+        before = thrust - lag * tape.thrust_tau[first:last] - delay * tape.thrust_delay[first:last]
+        out[:, 0, 2] = thrust / p.theta[0] - before / reference.theta[0]
+        w = tape.xf[first - 1 : last - 1, 10:13]
+        torque = tape.torque[first:last]
+        was = torque - (p.theta[6:9] - reference.theta[6:9])
+        was = was - lag * tape.torque_tau[first:last] - delay * tape.torque_delay[first:last]
+        out[:, 0, 3:] = (torque - np.cross(w, w @ p.inertia.T)) @ p.inverse.T
+        out[:, 0, 3:] -= (was - np.cross(w, w @ reference.inertia.T)) @ reference.inverse.T
+        return out
+
+    @staticmethod
+    def precision(sd: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(M,) precisions of the nuisances, from the standard deviations (9,) of the estimator's parameters."""
+        return np.concatenate([np.maximum(sd, 1e-6), np.full(3, DRAG_SD), np.full(4, DELAY_SD)]) ** -2.0

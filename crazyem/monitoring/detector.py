@@ -1,0 +1,315 @@
+"""The running tests: windows of several lengths, each hypothesis in each; a change is named by its posterior.
+
+A window opens every `SPACING` s and is kept while it is one of the newest few or its number is divisible by a power of
+two, so that their lengths grow geometrically up to `LONGEST`. Statistics of each hypothesis and length are divided by
+their own running mean without a change: a model that errs, gusts and onboard filters make them larger than the theory
+of white innovations says. That mean is known from finitely many windows, so the statistic is a Student's rather than a
+normal one. All scales that a window uses are those from before it opened.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.estimation.em import WindowEM
+from crazyem.estimation.model import Parameters
+from crazyem.monitoring import kernels
+from crazyem.monitoring.columns import NUISANCES, Columns, RowMaker
+from crazyem.monitoring.fault import Fault, Size
+from crazyem.monitoring.hypotheses import Hypothesis, hypotheses_for
+from crazyem.monitoring.threshold import threshold_for
+from crazyem.vehicle import Vehicle
+
+SPACING = 0.04  # s between openings of windows
+LEVELS = 5  # windows are up to 4 * 2^4 openings long
+LONGEST = 4 * 2 ** (LEVELS - 1)
+WINDOWS = 32  # room for windows
+ROWS_A_SECOND = 100.0  # of a log, for the threshold
+AUTOREGRESSION_MEMORY = 20.0  # s, of mean squares and products of innovations
+SCALE_MEMORY = 60.0  # s, of the running means of the statistics
+CLIPPED = 4.0  # standard deviations as which a larger innovation counts there, and so the root of a statistic
+LEARNING, REFERENCE = 8.0, 2.0  # s in the air in which the estimator still learns; s that its parameters stay
+SCALE_BEFORE, SCALE_WEIGHT = 2.0, 10.0  # the scale before the flight: that of manoeuvres; s of flight it counts as
+SCALE_FREEDOM, REGIME = 8.0, 0.25  # degrees of freedom of the scale before the flight; s of flight that add another
+LEAST_WINDOWS = 6.0  # that must have been seen, end to end, of a length that is tested
+CALM = 3.0  # s in the air before anything is tested
+SETTLED = 1.0  # s after the onset when the size is reported again
+LEAST_SETTLING = 0.3  # s after it was found, at least
+NEAR_ONSET = 0.2  # s by which the onset may still move
+SIGNATURE_ERROR = 0.1  # by which signatures may be wrong, relative: parameters are known to some per cent
+CLEAR, UNCLEAR = 0.95, 0.2  # probability at which a change is reported; s after which it is reported anyway
+RULED_OUT = 0.05  # probability under which a hypothesis is no look-alike
+RECOVERED = 2.0  # s below every threshold after which the model holds again
+
+
+class Detector:
+    """Takes filtered rows of the tape, says what changed. The same rows give the same answers.
+
+    Args:
+        vehicle: its geometry. false_alarms_per_hour: of all hypotheses together.
+        hypotheses: what may change; None: `hypotheses_for`.
+
+    Attributes:
+        holds: whether the model holds: nothing changed, or it was found again.
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        *,
+        false_alarms_per_hour: float = 0.1,
+        hypotheses: Sequence[Hypothesis] | None = None,
+    ) -> None:
+        self.hypotheses = tuple(hypotheses or hypotheses_for(vehicle))
+        self.columns = Columns.of(self.hypotheses)
+        self._maker = RowMaker(self.columns, vehicle)
+        size, count = len(self.columns.columns), len(self.hypotheses)
+        self.freedom = np.diff(self.columns.first)
+        self._prior = self.columns.sd**-2.0
+        self._followed = np.array([h.followed for h in self.hypotheses])
+        each = false_alarms_per_hour / count
+        longest = SPACING * LONGEST * ROWS_A_SECOND
+        self.threshold = np.array([
+            threshold_for(each, int(d), shortest=1.0, longest=longest, rate=ROWS_A_SECOND) for d in self.freedom
+        ])  # fmt: skip
+        self.rows = np.zeros(WINDOWS, np.int64)
+        self.opened = np.zeros(WINDOWS)  # s, when each opened
+        self.number = np.full(WINDOWS, -1)
+        self.phi, self.weight = np.zeros((WINDOWS, 12)), np.ones((WINDOWS, 12))
+        self.d, self.d_before = np.zeros((WINDOWS, 12, size)), np.zeros((WINDOWS, 12, size))
+        self.score, self.score_n = np.zeros((WINDOWS, size)), np.zeros((WINDOWS, NUISANCES))
+        self.among, self.cross = np.zeros((WINDOWS, size, size)), np.zeros((WINDOWS, size, NUISANCES))
+        self.among_n = np.zeros((WINDOWS, NUISANCES, NUISANCES))
+        self.drift = np.zeros((12, 1))
+        self.n, self.n_before, self.n_now = (np.zeros((12, NUISANCES)) for _ in range(3))
+        self.e_before, self.e_now, self.plain_before = np.zeros(12), np.zeros(12), np.zeros(12)
+        self.square, self.product = np.ones(12), np.zeros(12)
+        self.statistic, self.determinant = np.zeros((WINDOWS, count)), np.zeros((WINDOWS, count))
+        self.size, self.variance = np.zeros((WINDOWS, size)), np.ones((WINDOWS, size))
+        d = self.freedom.astype(float)
+        before = SCALE_BEFORE * np.ones((LEVELS, 1))
+        # running means of the first three powers of the statistics
+        self.moments = np.stack([d * before, d * (d + 2) * before**2, d * (d + 2) * (d + 4) * before**3])
+        self.scale = np.full((LEVELS, count), SCALE_BEFORE)
+        self.known = np.zeros(LEVELS)  # s over which it was taken
+        self.scale_of = np.full((WINDOWS, LEVELS, count), SCALE_BEFORE)  # as it was when a window opened
+        self.known_of = np.zeros((WINDOWS, LEVELS))
+        self.holds = True
+        self._reference: Any = (-math.inf, None, None)  # since when, parameters, their standard deviations
+        self._restart(-math.inf)
+
+    def _restart(self, time: float) -> None:
+        self._open: list[int] = []
+        self._count = 0
+        self._since = time
+        self._newest = -math.inf
+        self._found: tuple[float, float] | None = None  # when a change was found, and its onset
+        self._reported = False
+        self._exceeded = -math.inf
+        self.drift[:], self.n[:], self.n_before[:], self.e_before[:], self.plain_before[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+
+    # rows -------------------------------------------------------------------------------------------------------
+
+    def take(self, em: WindowEM, p: Parameters, first: int, last: int, sd: NDArray[np.float64]) -> Fault | None:
+        """Rows first..last-1 of the tape, just filtered for the first time; a report if there is one.
+
+        Args:
+            em: its tape and setup. p: the parameters that the rows were filtered with.
+            sd: (9,) standard deviations of theta, in its coordinates.
+        """
+        tape = em.tape
+        begin = first
+        for k in range(first, last):
+            if tape.kind[k] == 1:
+                self._restart(float(tape.time[k]))
+                begin = k + 1
+        if begin >= last:
+            return None
+        now = float(tape.time[last - 1])
+        self._keep_reference(now, p, sd)
+        _, reference, sd = self._reference
+        acting, sensed = self._maker.rows(tape, reference, begin, last)
+        acting_n, sensed_n = self._maker.nuisances(tape, reference, em.setup.unit, begin, last)
+        drifting = self._maker.drifting(tape, p, reference, begin, last)
+        slots = np.array(self._open, np.int64)
+        kernels.absorb(
+            begin, last, em.setup.lead, tape.time, tape.usable, tape.gain, tape.s, tape.e, tape.blocks, tape.middle,
+            acting, sensed, acting_n, sensed_n, drifting, self.drift, self.columns.once, self.columns.block, slots,
+            self.rows, self.phi, self.weight, self.d, self.d_before, self.n, self.n_before, self.n_now, self.e_before,
+            self.e_now, self.score, self.score_n, self.among, self.cross, self.among_n,
+        )  # fmt: skip
+        if self._found is None:
+            kernels.correlate(
+                begin, last, tape.time, tape.s, tape.e, AUTOREGRESSION_MEMORY, CLIPPED, self.plain_before, self.square,
+                self.product,
+            )  # fmt: skip
+        if now - self._newest < SPACING - 1e-3:
+            return None
+        passed = min(now - self._newest, 1.0) if math.isfinite(self._newest) else SPACING
+        self._newest = now
+        report = self._judge(now, passed, sd) if len(slots) else None
+        if self._found is None:
+            self._renew(now)
+        return report
+
+    def _keep_reference(self, now: float, newest: Parameters, sd: NDArray[np.float64]) -> None:
+        """The parameters that innovations are taken by: an estimator that follows a change must not hide it.
+
+        The newest while the estimator still learns, later those of up to `REFERENCE` s ago, or of before a change.
+        """
+        young = now - self._since < LEARNING
+        if self._found is None and (young or now - self._reference[0] > REFERENCE):
+            self._reference = (now, newest, sd)
+
+    def _renew(self, now: float) -> None:
+        """Close the windows that are not kept any more, and open one."""
+        self._count += 1
+        keep = []
+        for w in self._open:
+            number = int(self.number[w])
+            step = number & -number  # largest power of two that divides it
+            if self._count - number <= 4 * min(step, 2 ** (LEVELS - 1)):
+                keep.append(w)
+        free = next(w for w in range(WINDOWS) if w not in keep)
+        self.rows[free], self.opened[free], self.number[free] = 0, now, self._count
+        correlation = np.clip(self.product / self.square, -0.95, 0.95)
+        self.phi[free] = correlation
+        self.weight[free] = 1.0 / np.sqrt(self.square * (1.0 - correlation**2))
+        for array in (self.d, self.d_before, self.score, self.score_n, self.among, self.cross, self.among_n):
+            array[free] = 0.0
+        self.scale_of[free], self.known_of[free] = self.scale, self.known
+        self._open = [*keep, free]
+
+    # decisions --------------------------------------------------------------------------------------------------
+
+    def _level(self, w: int) -> int:
+        """Which group of lengths a window belongs to: up to 4, 8, 16 ... openings."""
+        age = (self._newest - self.opened[w]) / SPACING
+        return min(max(math.ceil(math.log2(max(age, 1.0) / 4.0)), 0), LEVELS - 1)
+
+    def _judge(self, now: float, passed: float, sd: NDArray[np.float64]) -> Fault | None:
+        slots = np.array(self._open, np.int64)
+        kernels.judge(
+            slots, self.columns.first, self._prior, self._maker.precision(sd), self.score, self.score_n, self.among,
+            self.cross, self.among_n, self.statistic, self.determinant, self.size, self.variance,
+        )  # fmt: skip
+        levels = np.array([self._level(w) for w in self._open])
+        statistic = self.statistic[slots]
+        scale = self.scale_of[slots, levels]
+        freedom = SCALE_FREEDOM + self._freedom(levels, self.known_of[slots, levels])
+        normal = freedom * np.log1p(statistic / (scale * freedom))
+        seen = self.known_of[slots, levels] > LEAST_WINDOWS * SPACING * 4.0 * 2.0**levels
+        over = np.where(seen[:, None], normal / self.threshold, 0.0)
+        if self._found is not None:
+            return self._settle(now, slots, statistic, scale)
+        tested = now - self._since > CALM
+        if over.max() > 1.0 and tested:
+            self._exceeded = now
+            if self.holds:
+                self.holds = False
+                report = self._report(now, slots, statistic, scale, settled=False)
+                self._found = (now, report.onset)
+                return self._first(report, now)
+        elif not self.holds and now - self._exceeded > RECOVERED:
+            self.holds = True
+        if self.holds:
+            self._learn(levels, statistic, passed)
+        return None
+
+    @staticmethod
+    def _freedom(levels: NDArray[np.int64], known: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Degrees of freedom of the running means of each window (n, H)."""
+        lengths = np.maximum(SPACING * 4.0 * 2.0**levels, REGIME)
+        out: NDArray[np.float64] = (np.minimum(known, SCALE_MEMORY) / lengths)[:, None]
+        return out
+
+    def _learn(self, levels: NDArray[np.int64], statistic: NDArray[np.float64], passed: float) -> None:
+        """Running moments of the statistics, by length.
+
+        For chi-square times a scale, the first moment over the freedom is the scale, and so is the third over the
+        second and the freedom + 4. Where tails are heavier the latter is larger, and it is the tails that alarm.
+        """
+        d = self.freedom
+        for level in range(LEVELS):
+            mine = statistic[levels == level]
+            if not len(mine):
+                continue
+            mine = np.minimum(mine, CLIPPED**2 * self.scale[level] * d)
+            powers = np.stack([mine.mean(0), (mine**2).mean(0), (mine**3).mean(0)])
+            memory = min(SCALE_WEIGHT + self.known[level], SCALE_MEMORY)
+            self.moments[:, level] += passed / memory * (powers - self.moments[:, level])
+            first, second, third = self.moments[:, level]
+            self.scale[level] = np.maximum(np.maximum(first / d, third / (second * (d + 4.0))), 1.0)
+            self.known[level] += passed
+
+    def _settle(
+        self, now: float, slots: NDArray[np.int64], statistic: NDArray[np.float64], scale: NDArray[np.float64]
+    ) -> Fault | None:
+        assert self._found is not None
+        detected, onset = self._found
+        if not self._reported:
+            return self._first(self._report(now, slots, statistic, scale, settled=False), now)
+        if now < max(onset + SETTLED, detected + LEAST_SETTLING):
+            return None
+        report = self._report(now, slots, statistic, scale, settled=True)
+        self._restart(now)
+        self._exceeded = now
+        return report
+
+    def _first(self, report: Fault, now: float) -> Fault | None:
+        """The first report, once it is clear enough what it is, or late enough."""
+        assert self._found is not None
+        detected, _ = self._found
+        if report.probability < CLEAR and now - detected < UNCLEAR:
+            return None
+        self._reported = True
+        self._found = (detected, report.onset)
+        return report
+
+    def _report(
+        self,
+        now: float,
+        slots: NDArray[np.int64],
+        statistic: NDArray[np.float64],
+        scale: NDArray[np.float64],
+        *,
+        settled: bool,
+    ) -> Fault:
+        """The most probable hypothesis and onset. Every signature may be wrong by `SIGNATURE_ERROR`.
+
+        A hypothesis in a window counts with its own scale there, or that of the test that alarmed where that is larger.
+        The settled report keeps to onsets near the first.
+        """
+        near = np.ones(len(slots), bool)
+        if self._found is not None:
+            near = np.abs(self.opened[slots] - self._found[1]) < NEAR_ONSET
+            near |= np.abs(self.opened[slots] - self._found[1]) <= np.abs(self.opened[slots] - self._found[1]).min()
+        detected = now if self._found is None else self._found[0]
+        at, k = np.unravel_index(int(np.argmax(np.where(near[:, None], statistic / scale, 0.0))), statistic.shape)
+        noise = np.maximum(scale, scale[at, k]) + SIGNATURE_ERROR**2 * statistic[near].max()
+        determinant = np.maximum(self.determinant[slots] - self.freedom * np.log(noise), 0.0)
+        evidence = np.where(near[:, None], 0.5 * (statistic / noise - determinant), -np.inf)
+        by_hypothesis = evidence.max(0)
+        posterior = np.exp(by_hypothesis - by_hypothesis.max())
+        posterior /= posterior.sum()
+        best = int(np.argmax(by_hypothesis))
+        row = int(np.argmax(evidence[:, best]))
+        w = int(slots[row])
+        chosen = self.hypotheses[best]
+        lo = int(self.columns.first[best])
+        sizes = {}
+        for i, column in enumerate(chosen.columns):
+            value, sd = float(self.size[w, lo + i]), math.sqrt(noise[row, best] * float(self.variance[w, lo + i]))
+            sizes[column.label] = Size(value, (value - 1.96 * sd, value + 1.96 * sd), column.unit)
+        others = {
+            h.name: float(p)
+            for h, p in sorted(zip(self.hypotheses, posterior), key=lambda item: -item[1])
+            if h is not chosen and p > RULED_OUT
+        }
+        return Fault(
+            chosen.effect, chosen.rotor, chosen.text, float(self.opened[w]), detected, sizes, float(posterior[best]),
+            others, settled, followed=bool(posterior[self._followed].sum() > RULED_OUT),
+        )  # fmt: skip

@@ -1,0 +1,100 @@
+"""What may change in flight, as data: columns (what a change of size one does), and hypotheses (columns that go along).
+
+The detector knows no names: it reads these tables. Names of hypotheses are those of the catalogue of effects
+(docs: effects.md) where the catalogue has the effect. A column acts on the body (force, torque), or on what a sensor
+says, or kicks the body once.
+"""
+
+from dataclasses import dataclass
+
+from crazyem.vehicle import Vehicle
+
+# Kinds of column; the second number of a column is the axis, or the rotor.
+ROTOR, MASS, CENTRE, THRUST, FORCE, TORQUE, KICK, TURN = range(8)  # acts on the body
+POSITION, VELOCITY, ATTITUDE, RATE, VELOCITY_SCALE, RATE_SCALE = range(8, 14)  # acts on a sensor
+ONCE = (KICK, TURN)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A change of size one.
+
+    Attributes:
+        kind, index: which, and its axis (0 to 2: x, y, z) or rotor (0 to 3).
+        label: of the size in a report. unit: of the size.
+        sd: standard deviation of the prior of the size, in that unit: what such a change usually is.
+    """
+
+    kind: int
+    index: int
+    label: str
+    unit: str
+    sd: float
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Something that may change, with the columns that change together; all are equally probable before the flight.
+
+    Attributes:
+        effect: name; rotor: 1 to 4, or None. text: for a person.
+        followed: whether the estimator begins anew by itself and finds the new value: pushing need not stop.
+    """
+
+    effect: str
+    text: str
+    columns: tuple[Column, ...]
+    rotor: int | None = None
+    followed: bool = False
+
+    @property
+    def name(self) -> str:
+        """Effect and rotor in one word."""
+        return self.effect if self.rotor is None else f"{self.effect} {self.rotor}"
+
+
+def _axes(kind: int, labels: str, unit: str, sd: float) -> tuple[Column, ...]:
+    return tuple(Column(kind, i, label, unit, sd) for i, label in enumerate(labels.split()))
+
+
+def hypotheses_for(vehicle: Vehicle) -> tuple[Hypothesis, ...]:
+    """What may change on this vehicle. Rotors only where its file says where they are.
+
+    The priors of sizes are those of changes that a pilot would want to know of: a third of a rotor's thrust, a fifth
+    of the mass, wind that leans a drone by some degrees, sensors off by ten times their noise.
+    """
+    weight = vehicle.mass * 9.81
+    arm = max(vehicle.arm) or 0.05
+    rotors = tuple(
+        Hypothesis("rotor_fault", f"rotor {k + 1} lost thrust", (Column(ROTOR, k, "loss", "", 0.3),), k + 1)
+        for k in range(4)
+    )
+    body = (
+        Hypothesis("thrust_scale", "all rotors lost thrust, as of a failing battery", (
+            Column(THRUST, 0, "loss", "", 0.2),
+        )),
+        Hypothesis("payload", "the mass changed", (
+            Column(MASS, 0, "mass", "kg", 0.2 * vehicle.mass),
+        ), followed=True),
+        Hypothesis("payload_off_centre", "mass and its centre changed", (
+            Column(MASS, 0, "mass", "kg", 0.2 * vehicle.mass), *_axes(CENTRE, "x y", "m", 0.1 * arm),
+        ), followed=True),
+        Hypothesis("wind", "a force set in", _axes(FORCE, "force_x force_y force_z", "N", 0.05 * weight)),
+        Hypothesis("trim", "a torque set in", _axes(TORQUE, "torque_x torque_y torque_z", "N m", 0.05 * weight * arm)),
+        Hypothesis("impact", "the drone was hit", (
+            *_axes(KICK, "velocity_x velocity_y velocity_z", "m/s", 0.3),
+            *_axes(TURN, "rate_x rate_y rate_z", "rad/s", 3.0),
+        )),
+    )  # fmt: skip
+    sensors = (
+        Hypothesis("position_offset", "the position jumped", _axes(POSITION, "x y z", "m", 0.2)),
+        Hypothesis("velocity_offset", "the velocity jumped", _axes(VELOCITY, "x y z", "m/s", 0.3)),
+        Hypothesis("attitude_offset", "the attitude jumped", _axes(ATTITUDE, "roll pitch yaw", "rad", 0.1)),
+        Hypothesis("gyro_bias", "the body rates are biased", _axes(RATE, "x y z", "rad/s", 0.2)),
+        Hypothesis("velocity_scale", "velocities have another scale", (
+            Column(VELOCITY_SCALE, 0, "scale_error", "", 0.5),
+        )),
+        Hypothesis("gyro_scale", "body rates have another scale", (Column(RATE_SCALE, 0, "scale_error", "", 0.5),)),
+    )  # fmt: skip
+    geometry = vehicle.arm[0] > 0 and vehicle.arm[1] > 0 and vehicle.torque_per_thrust > 0
+    return (*(rotors if geometry else ()), *body, *sensors)

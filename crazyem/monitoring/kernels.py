@@ -1,0 +1,245 @@
+"""Compiled inner loops of the monitor: signatures along the filter, their scores and information, and what they say.
+
+A change at the onset t0 moves what the filter does not know by d: d <- Phi d + B, and after each scalar measurement
+d <- d - gain (d_i + m_i), where m is what a sensor adds. The innovation moves by g = d_i + m_i (Willsky and Jones
+1976). Innovations are taken in their standard deviations and whitened by an autoregression of first order, the
+signatures likewise.
+"""
+
+import numpy as np
+
+from crazyem.compiled import compiled
+from crazyem.estimation.kernels.algebra import apply
+
+
+@compiled
+def _step(d, scratch, blocks, dt, h, middle, acting, act, once, new):
+    """Carry d (12, C) over one step; `act` says whether anything acts, `new` whether it is the first step."""
+    apply(blocks, dt, h, d, scratch)
+    size = d.shape[1]
+    for i in range(12):
+        for a in range(size):
+            d[i, a] = scratch[i, a]
+    if not act:
+        return
+    for a in range(size):
+        t = dt
+        if once[a]:
+            if not new:
+                continue
+            t = 1.0
+        for i in range(3):
+            v = t * (middle[i, 0] * acting[a, 0] + middle[i, 1] * acting[a, 1] + middle[i, 2] * acting[a, 2])
+            d[3 + i, a] += v
+            d[i, a] += h * v
+            v = t * acting[a, 3 + i]
+            d[9 + i, a] += v
+            d[6 + i, a] += h * v
+
+
+@compiled
+def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, sensed, acting_n, sensed_n, drifting,
+           drift, once, block,
+           slots, rows, phi, weight, d, d_before, n, n_before, n_now, e_before, e_now, score, score_n, among, cross,
+           among_n):  # fmt: skip
+    """Take rows first..last-1 of the tape into every open window.
+
+    Args:
+        acting (k, C, 6), sensed (k, C, 12), acting_n (k, M, 6), sensed_n (k, M, 12): see `RowMaker`; once, block: see
+            `Columns`.
+        drifting (k, 1, 6): what the model's accelerations have changed by since its reference. drift: (12, 1) what the
+            filter does therefore, so that innovations are those of the reference.
+        slots: (w,) which windows are open. rows: (W,) rows that each has seen, counted on.
+        phi, weight: (W, 12) autoregression, and 1 over the standard deviation of what it leaves.
+        d, d_before: (W, 12, C) signatures, and their last normalised values; n, n_before, n_now: (12, M) the same.
+        e_before, e_now: (12,) last normalised innovations.
+        score (W, C), score_n (W, M), among (W, C, C) within hypotheses, cross (W, C, M), among_n (W, M, M): sums.
+    """
+    size, nuisances = d.shape[2], n.shape[1]
+    scratch = np.empty((12, size))
+    scratch_n = np.empty((12, nuisances))
+    now = np.empty(size)
+    whole = np.empty(size)
+    part = np.empty(nuisances)
+    never = np.zeros(nuisances, np.bool_)
+    scratch_1 = np.empty((12, 1))
+    for k in range(first, last):
+        dt = time[k] - time[k - 1]
+        h = lead * dt
+        _step(n, scratch_n, blocks[k], dt, h, middle[k], acting_n[k - first], usable[k], never, False)
+        _step(drift, scratch_1, blocks[k], dt, h, middle[k], drifting[k - first], usable[k], never, False)
+        for i in range(12):
+            e_now[i] = np.nan
+            if s[k, i] == 0.0:
+                continue
+            root = 1.0 / np.sqrt(s[k, i])
+            moved = drift[i, 0]
+            e_now[i] = (e[k, i] + moved) * root
+            for a in range(nuisances):
+                part[a] = n[i, a] + sensed_n[k - first, a, i]
+                n_now[i, a] = part[a] * root
+            for j in range(12):
+                g = gain[k, i, j]
+                drift[j, 0] -= g * moved
+                for a in range(nuisances):
+                    n[j, a] -= g * part[a]
+        for at in range(len(slots)):
+            w = slots[at]
+            dw = d[w]
+            _step(dw, scratch, blocks[k], dt, h, middle[k], acting[k - first], True, once, rows[w] == 0)
+            rows[w] += 1
+            for i in range(12):
+                if s[k, i] == 0.0:
+                    continue
+                root = 1.0 / np.sqrt(s[k, i])
+                f, q = phi[w, i], weight[w, i]
+                for a in range(size):
+                    now[a] = dw[i, a] + sensed[k - first, a, i]
+                for j in range(12):
+                    g = gain[k, i, j]
+                    dj = dw[j]
+                    for a in range(size):
+                        dj[a] -= g * now[a]
+                before = d_before[w, i]
+                for a in range(size):
+                    v = now[a] * root
+                    whole[a] = q * (v - f * before[a])
+                    before[a] = v
+                for a in range(nuisances):
+                    part[a] = q * (n_now[i, a] - f * n_before[i, a])
+                left = q * (e_now[i] - f * e_before[i])
+                for a in range(size):
+                    x = whole[a]
+                    if x == 0.0:
+                        continue
+                    score[w, a] += x * left
+                    for b in range(block[a], a + 1):
+                        among[w, a, b] += x * whole[b]
+                    row = cross[w, a]
+                    for b in range(nuisances):
+                        row[b] += x * part[b]
+                for a in range(nuisances):
+                    x = part[a]
+                    score_n[w, a] += x * left
+                    row = among_n[w, a]
+                    for b in range(a + 1):
+                        row[b] += x * part[b]
+        for i in range(12):
+            if s[k, i] != 0.0:
+                e_before[i] = e_now[i]
+                for a in range(nuisances):
+                    n_before[i, a] = n_now[i, a]
+
+
+@compiled
+def correlate(first, last, time, s, e, memory, most, before, square, product):
+    """Running mean square of the normalised innovations (12,), and of their products with the ones before (12,).
+
+    `memory` s is its time constant; a value beyond `most` standard deviations counts as that.
+    """
+    for k in range(first, last):
+        share = min((time[k] - time[k - 1]) / memory, 1.0)
+        for i in range(12):
+            if s[k, i] == 0.0:
+                continue
+            bound = most * np.sqrt(square[i])
+            v = min(max(e[k, i] / np.sqrt(s[k, i]), -bound), bound)
+            square[i] += share * (v * v - square[i])
+            product[i] += share * (v * before[i] - product[i])
+            before[i] = v
+
+
+@compiled
+def _factor(m, size):
+    """Cholesky factor of the lower triangle of m (size, size), in place; False where it is not positive definite."""
+    for j in range(size):
+        v = m[j, j]
+        for k in range(j):
+            v -= m[j, k] * m[j, k]
+        if not v > 0.0:
+            return False
+        m[j, j] = np.sqrt(v)
+        for i in range(j + 1, size):
+            v = m[i, j]
+            for k in range(j):
+                v -= m[i, k] * m[j, k]
+            m[i, j] = v / m[j, j]
+    return True
+
+
+@compiled
+def judge(slots, first, prior, prior_n, score, score_n, among, cross, among_n, statistic, determinant, size,
+          variance):  # fmt: skip
+    """What every open window says of every hypothesis, the nuisances integrated out.
+
+    Args:
+        first (H + 1,): columns of each hypothesis. prior (C,): precisions of the sizes. prior_n (M,): of the nuisances.
+        statistic (W, H): S' (J + prior)^-1 S, twice the logarithm of the likelihood ratio. determinant (W, H): log det
+        (1 + J / prior). size (W, C): most probable sizes, variance (W, C) theirs. Filled for the open windows.
+    """
+    nuisances = prior_n.shape[0]
+    columns = prior.shape[0]
+    m = np.empty((nuisances, nuisances))
+    x = np.empty((nuisances, columns + 1))
+    hyp = np.empty((8, 8))
+    y = np.empty(8)
+    for at in range(len(slots)):
+        w = slots[at]
+        for a in range(nuisances):
+            for b in range(a + 1):
+                m[a, b] = among_n[w, a, b]
+            m[a, a] += prior_n[a]
+        _factor(m, nuisances)
+        for a in range(nuisances):  # x = L^-1 (cross', score_n)
+            for c in range(columns):
+                x[a, c] = cross[w, c, a]
+            x[a, columns] = score_n[w, a]
+            for k in range(a):
+                f = m[a, k]
+                for c in range(columns + 1):
+                    x[a, c] -= f * x[k, c]
+            f = 1.0 / m[a, a]
+            for c in range(columns + 1):
+                x[a, c] *= f
+        for k in range(len(first) - 1):
+            lo, n = first[k], first[k + 1] - first[k]
+            log_prior = 0.0
+            for a in range(n):
+                v = score[w, lo + a]
+                for c in range(nuisances):
+                    v -= x[c, lo + a] * x[c, columns]
+                y[a] = v
+                for b in range(a + 1):
+                    u = among[w, lo + a, lo + b]
+                    for c in range(nuisances):
+                        u -= x[c, lo + a] * x[c, lo + b]
+                    hyp[a, b] = u
+                hyp[a, a] += prior[lo + a]
+                log_prior += np.log(prior[lo + a])
+            statistic[w, k] = 0.0
+            determinant[w, k] = 0.0
+            if not _factor(hyp, n):
+                for a in range(n):
+                    size[w, lo + a], variance[w, lo + a] = 0.0, 1.0 / prior[lo + a]
+                continue
+            for a in range(n):
+                for c in range(a):
+                    y[a] -= hyp[a, c] * y[c]
+                y[a] /= hyp[a, a]
+                statistic[w, k] += y[a] * y[a]
+                determinant[w, k] += 2.0 * np.log(hyp[a, a])
+            determinant[w, k] -= log_prior
+            for a in range(n - 1, -1, -1):
+                v = y[a]
+                for c in range(a + 1, n):
+                    v -= hyp[c, a] * size[w, lo + c]
+                size[w, lo + a] = v / hyp[a, a]
+            for a in range(n):  # variance: |L^-1 e_a|^2
+                total = 0.0
+                for c in range(a, n):
+                    v = 1.0 if c == a else 0.0
+                    for b in range(a, c):
+                        v -= hyp[c, b] * y[b]
+                    y[c] = v / hyp[c, c]
+                    total += y[c] * y[c]
+                variance[w, lo + a] = total

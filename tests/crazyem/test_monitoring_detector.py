@@ -1,0 +1,157 @@
+"""The detector on a synthetic flight: faults that come from the log itself, so that nothing simulates them for it.
+
+A rotor that lost a tenth of its thrust is one whose command says 1/0.9 of what acts; the flight itself goes on.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import synthetic
+
+from crazyem.estimation.online import OnlineEstimator
+from crazyem.live.flight_monitor import FlightMonitor
+from crazyem.live.policy import FaultRules
+from crazyem.monitoring.columns import Columns, RowMaker, mixing
+from crazyem.monitoring.detector import Detector
+from crazyem.monitoring.fault import Fault
+from crazyem.monitoring.hypotheses import hypotheses_for
+from crazyem.physics.rotors import wrench
+from crazyem.signals.sample import Sample
+from crazyem.vehicle import load_vehicle
+
+ONSET, SECONDS = 14.0, 16.5  # s
+VEHICLE = replace(load_vehicle("cf2"), thrust_curve=())  # thrust and torque are logged
+
+
+@pytest.fixture(scope="module")
+def flight() -> list[Sample]:
+    return synthetic.samples(synthetic.fly(seed=3, duration=SECONDS))
+
+
+def monitored(samples: Iterable[Sample]) -> tuple[list[Fault], FlightMonitor]:
+    reports: list[Fault] = []
+    monitor = FlightMonitor(VEHICLE, FaultRules(), on_fault=reports.append)
+    estimator = OnlineEstimator(VEHICLE, window=400)
+    assert monitor.watch(estimator)
+    for sample in samples:
+        monitor.take(sample, airborne=estimator.airborne)
+        estimator.feed(sample)
+    return reports, monitor
+
+
+def changed(
+    flight: list[Sample], signal: str, change: Callable[[tuple[float, ...]], tuple[float, ...]]
+) -> Iterable[Sample]:
+    for sample in flight:
+        hit = sample.signal == signal and sample.time >= ONSET
+        yield replace(sample, value=change(sample.value)) if hit else sample
+
+
+def command_of_more(rotor: int, loss: float) -> Callable[[tuple[float, ...]], tuple[float, ...]]:
+    """The command that asks for what this rotor gives, had it lost a share of its thrust."""
+    matrix = mixing(VEHICLE)
+
+    def change(command: tuple[float, ...]) -> tuple[float, ...]:
+        thrusts = np.linalg.solve(matrix, np.array(command))
+        thrusts[rotor - 1] /= 1.0 - loss
+        return tuple((matrix @ thrusts).tolist())
+
+    return change
+
+
+def test_a_flight_without_a_fault_gives_no_report(flight: list[Sample]) -> None:
+    reports, monitor = monitored(flight)
+    assert reports == []
+    assert monitor.stops(SECONDS) == ""
+
+
+def test_a_rotor_that_loses_a_tenth_is_named_with_its_size(flight: list[Sample]) -> None:
+    reports, monitor = monitored(changed(flight, "wrench_command", command_of_more(3, 0.1)))
+    first, settled = reports[:2]
+    assert (first.effect, first.rotor) == ("rotor_fault", 3)
+    assert first.detected - ONSET < 0.5
+    assert abs(first.onset - ONSET) < 0.2
+    assert first.probability > 0.9
+    assert (settled.effect, settled.rotor, settled.settled) == ("rotor_fault", 3, True)
+    assert settled.sizes["loss"].value == pytest.approx(0.1, abs=0.03)
+    assert monitor.stops(settled.detected).startswith("the model of the flight does not hold")
+    assert len(monitor.faults) == len(reports) - 1
+    assert settled.to_json()["rotor"] == 3
+
+
+def test_a_sensor_that_is_biased_is_named(flight: list[Sample]) -> None:
+    bias = changed(flight, "body_rate", lambda v: (v[0], v[1] + 0.1, v[2]))
+    reports, _ = monitored(bias)
+    assert reports[0].effect == "gyro_bias"
+    assert reports[0].sizes["y"].value == pytest.approx(0.1, abs=0.04)
+
+
+def test_a_signal_that_sticks_is_named_and_stops_pushing(flight: list[Sample]) -> None:
+    kept: list[tuple[float, ...]] = []
+
+    def stick(value: tuple[float, ...]) -> tuple[float, ...]:
+        kept.append(value)
+        return kept[0]
+
+    reports, monitor = monitored(changed(flight, "velocity", stick))
+    assert "stuck velocity" in [r.effect for r in reports]
+    assert monitor.stops(SECONDS)
+
+
+def test_the_columns_of_rotors_are_what_the_rotors_do() -> None:
+    vehicle = load_vehicle("cf2")
+    random = np.random.default_rng(1)
+    thrusts = random.uniform(0.05, 0.1, (20, 4))
+    np.testing.assert_allclose(
+        thrusts @ mixing(vehicle).T,
+        wrench(thrusts, arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust),
+        atol=1e-15,
+    )
+
+
+def test_every_column_of_the_body_is_the_derivative_of_the_model(flight: list[Sample]) -> None:
+    """By differences: the acceleration with the change, less that without, over the change."""
+    vehicle = VEHICLE
+    hypotheses = hypotheses_for(vehicle)
+    columns = Columns.of(hypotheses)
+    maker = RowMaker(columns, vehicle)
+    rows: list[Any] = []
+    estimator = OnlineEstimator(vehicle, window=100)
+    estimator.on_filtered = lambda em, p, first, last, sd: rows.append((em, first, last, p))
+    for sample in flight:
+        estimator.feed(sample)
+        if len(rows) > 30:
+            break
+    em, first, last, p = rows[-1]
+    acting, _ = maker.rows(em.tape, p, first, last)
+    mean = em.tape.mean[first:last]
+    named = {(h.effect, h.rotor, c.label): acting[:, i] for h, lo in zip(hypotheses, columns.first)
+             for i, c in enumerate(h.columns, lo)}  # fmt: skip
+    thrusts = np.linalg.solve(mixing(vehicle), mean.T).T
+    for rotor in range(1, 5):
+        less = thrusts.copy()
+        less[:, rotor - 1] *= 0.9
+        change = (less - thrusts) @ mixing(vehicle).T / 0.1
+        np.testing.assert_allclose(named["rotor_fault", rotor, "loss"][:, 2], change[:, 0] / p.theta[0], rtol=1e-9)
+        np.testing.assert_allclose(
+            named["rotor_fault", rotor, "loss"][:, 3:], change[:, 1:] @ p.inverse.T, rtol=1e-9, atol=1e-12
+        )
+    step = 1e-6
+    heavier = (mean[:, 0] / (p.theta[0] + step) - mean[:, 0] / p.theta[0]) / step
+    np.testing.assert_allclose(named["payload", None, "mass"][:, 2], heavier, rtol=1e-3)
+    change, _ = maker.nuisances(em.tape, p, em.setup.unit, first, last)
+    for column in range(4):  # mass and inertia, by their logarithms
+        theta = p.theta.copy()
+        theta[column] *= np.exp(1e-6)
+        moved = maker.drifting(em.tape, replace(p, theta=theta), p, first, last)[:, 0] / 1e-6
+        np.testing.assert_allclose(change[:, column], moved, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("per_hour", [0.01, 1.0])
+def test_thresholds_follow_the_rate_of_false_alarms(per_hour: float) -> None:
+    usual = Detector(load_vehicle("cf2"))
+    other = Detector(load_vehicle("cf2"), false_alarms_per_hour=per_hour)
+    assert ((other.threshold > usual.threshold) == (per_hour < 0.1)).all()
