@@ -143,7 +143,7 @@ def selected(data: Data, *candidates: Candidate, **values: dict[str, float]) -> 
     """A selection of these effects, fitted from these values, the first the weakest."""
     point = nominal(data, POINT)
     fitted = refine_base(data, point.with_effects(values), candidates, rounds=4, noise=False)
-    steps = tuple(Step((), Trial(c, 9.0 + k, 9.0, 1.0, 1e-9, 9.0 + k)) for k, c in enumerate(candidates))
+    steps = tuple(Step((), Trial(c, 9.0 + k, 900.0, 1.0, 1e-9, 9.0 + k)) for k, c in enumerate(candidates))
     steps = tuple(replace(s, taken=s.trials[0]) if s.trials else Step((), s.taken) for s in steps)
     return Selection(point, fitted.point, steps, candidates, fitted, 2)
 
@@ -221,7 +221,7 @@ def test_what_was_left_free_is_told_with_its_error(scaled: tuple[Recording, Diag
     assert {n for n, _ in free} >= {"input_delay", "inertia", "torque_scale", "center_of_mass", "motor_lag"}
     inertia = free["inertia", "xx"]
     assert inertia.expected == DRONE.inertia[0]
-    assert inertia.usual == pytest.approx(0.01 * DRONE.inertia[0])
-    assert 0.0 < inertia.sd <= 1.05 * inertia.usual
+    assert 0.01 * DRONE.inertia[0] < inertia.usual < 0.05 * DRONE.inertia[0]  # commands that were not logged
+    assert 0.0 < inertia.sd <= 2.0 * inertia.usual  # by the scatter of its blocks
     assert np.abs(inertia.value - inertia.expected) < 3 * inertia.usual
     assert inertia.unit == "kg m^2"

@@ -72,7 +72,7 @@ def schema(document: dict[str, Any], *, held_out: bool) -> None:
         assert set(effect["evidence"]) == {"held_out_nats", "p_value", "log_odds"}
         assert isinstance(effect["evidence"]["held_out_nats"], NUMBER)
         assert isinstance(effect["evidence"]["p_value"], NUMBER)
-        assert effect["evidence"]["log_odds"] is None  # by `--method stages`
+        assert isinstance(effect["evidence"]["log_odds"], NUMBER)
         known = {p.name: p.unit for p in CATALOGUE[effect["name"]].parameters}
         for name, parameter in effect["parameters"].items():
             assert name in known
@@ -241,7 +241,7 @@ def test_feedback_from_a_noisy_gyro_does_not_bend_a_gain() -> None:
     assert np.all(regressed(recording) > 0.88)
     value, sd = gain(recording, sway=0.0)
     assert abs(value - 0.8) < 2.5 * sd
-    assert sd < 0.07  # 0.058 with lag, inertias and filters on board known; the delay of either sign is most of that
+    assert sd < 0.1  # what a loop sends between logged commands is not known, and a noisy gyro makes that much
 
 
 def test_disturbances_that_the_controller_fights_do_not_shrink_a_gain() -> None:

@@ -36,11 +36,19 @@ from crazyem.diagnosis.flights.flight import _blocks, flight_of
 POINT = Point(DRONE, {}, first_guess())
 
 
+class Made(SimpleNamespace):
+    """Stands for a flight."""
+
+    __hash__ = object.__hash__
+
+
 def flown(*, speed: float, measured: bool = False) -> SimpleNamespace:
     """Flights that swing at these rms speeds [m/s] along x, y, z: 1, 2 and 4 times `speed`."""
     y = np.zeros((400, 13))
     y[:, 3:6] = np.sqrt(2) * speed * np.array([1, 2, 4]) * np.sin(np.arange(400) * np.pi / 20)[:, None]
-    flight = SimpleNamespace(name="flight", y=y, inputs=SimpleNamespace(measured=measured), coarse=False)
+    time = 0.01 * np.arange(400)
+    inputs = SimpleNamespace(measured=measured, time=time, thrust=np.full((400, 4), 0.07))
+    flight = Made(name="flight", y=y, time=time, inputs=inputs, coarse=False, levelled=False)
     signals = frozenset({"position", "velocity", "attitude", "body_rate"})
     return SimpleNamespace(flights=[flight], coarse=False, differ=False, signals=signals)
 
