@@ -13,7 +13,7 @@ from crazyem.physics import folding
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.planning.informative import PROCESS, noise_in
 from crazyem.planning.limits import Limits
-from crazyem.planning.plan import DEFAULT, Plan, could_split, plan_parameters, plan_split
+from crazyem.planning.plan import DEFAULT, Plan, can_discriminate, plan_discrimination, plan_parameters
 from crazyem.toml_file import read_text
 from crazyem.vehicle import Vehicle
 
@@ -62,7 +62,7 @@ def plan(
         raise UsageError(f"vehicle {given.name} has no rotors in its file, so nothing can be planned for it.")
     pair = look_alikes(diagnosis)[0] if diagnosis is not None else split
     if pair is not None:
-        return plan_split(*pair, given, limits, duration=duration, starts=starts, seed=seed, say=say)
+        return plan_discrimination(*pair, given, limits, duration=duration, starts=starts, seed=seed, say=say)
     nominal, _ = folding.fold(given)
     scales = None if noise is None else noise_of(noise, nominal)
     return plan_parameters(
@@ -100,7 +100,7 @@ def plan_commands(groups: Sequence[Sequence[str]], vehicle: Vehicle, name: str) 
     limits, found = Limits(), []
     for group in groups:
         for other in group[1:]:
-            if could_split(group[0], other, vehicle, limits):
+            if can_discriminate(group[0], other, vehicle, limits):
                 found.append(
                     f"fly a plan that tells {group[0]} from {other}: crazyem plan --split {group[0]},{other} "
                     f"--vehicle {name} -o plan.toml"

@@ -14,10 +14,10 @@ from crazyem.errors import UsageError
 from crazyem.estimation.model import NAMES, Noise
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.planning.closed_loop import Flown
+from crazyem.planning.discrimination import Odds, Pair
 from crazyem.planning.information import Expectation
 from crazyem.planning.limits import Limits
 from crazyem.planning.optimise import ITERATIONS, Family, Found, optimise, within
-from crazyem.planning.split import Odds, Pair
 from crazyem.vehicle import Vehicle
 
 INTERVAL = 1.96  # standard deviations on each side of a 95 % interval
@@ -190,7 +190,7 @@ def plan_parameters(
     return _plan(goal, vehicle, limits, found, widths, None, seed)
 
 
-def plan_split(
+def plan_discrimination(
     first: str,
     second: str,
     vehicle: Vehicle,
@@ -211,19 +211,19 @@ def plan_split(
     found = optimise(pair.merit, vehicle, limits, duration=duration, starts=starts, seed=seed, iterations=8, say=say)
     odds = pair.odds(found.flown)
     goal = f"tell {first} from {second}"
-    if not odds.splits:
+    if not odds.decides:
         return _none(goal, vehicle, limits, _alike(odds), seed, odds)
     return _plan(goal, vehicle, limits, found, {}, odds, seed)
 
 
-def could_split(first: str, second: str, vehicle: Vehicle, limits: Limits, *, duration: float = 10.0) -> bool:
+def can_discriminate(first: str, second: str, vehicle: Vehicle, limits: Limits, *, duration: float = 10.0) -> bool:
     """Whether a manoeuvre that nobody optimised tells two effects apart already, so that a plan certainly does."""
     try:
         pair = Pair(first, second, vehicle, limits)
         random = np.random.default_rng(0)
         family = Family.drawn(duration, random, vehicle, limits)
         even = family.manoeuvre(np.full(family.size, 1.0 / family.size))
-        return pair.odds(within(even, lambda flown: 0.0, vehicle, limits).flown, draws=300).splits
+        return pair.odds(within(even, lambda flown: 0.0, vehicle, limits).flown, draws=300).decides
     except UsageError:  # an effect without columns, a drone without reserve
         return False
 

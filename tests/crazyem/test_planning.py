@@ -21,7 +21,7 @@ from crazyem.estimation.inflation import steady_gain
 from crazyem.estimation.model import Noise
 from crazyem.physics.effects.effect import Situation
 from crazyem.physics.motion import motion
-from crazyem.planning import split
+from crazyem.planning import discrimination
 from crazyem.planning.closed_loop import PERIOD, Flown, fly, mixing
 from crazyem.planning.information import Expectation
 from crazyem.planning.limits import Limits
@@ -207,25 +207,25 @@ def test_divergence_and_evidence_are_those_of_normal_distributions() -> None:
     a, b = random.standard_normal((4, 2)), random.standard_normal((4, 1))
     one, other = (multivariate_normal(np.zeros(4), np.eye(4) + m @ m.T) for m in (a, b))
     z = one.rvs(200_000, random_state=5)
-    assert split._divergence(a, b) == pytest.approx(np.mean(one.logpdf(z) - other.logpdf(z)), rel=0.02)
+    assert discrimination._divergence(a, b) == pytest.approx(np.mean(one.logpdf(z) - other.logpdf(z)), rel=0.02)
     z = z[:50]
-    difference = split._log_evidence([a], z) - split._log_evidence([b], z)
+    difference = discrimination._log_evidence([a], z) - discrimination._log_evidence([b], z)
     assert difference == pytest.approx(one.logpdf(z) - other.logpdf(z))
 
 
 def test_parallel_columns_give_no_odds() -> None:
     column = np.array([[3.0], [1.0], [0.0]])
-    assert split._divergence(column, column) == pytest.approx(0.0, abs=1e-12)
-    assert split._correlation(column, -2.0 * column) == pytest.approx(1.0)
-    assert split._correlation(column, np.array([[1.0], [-3.0], [5.0]])) == pytest.approx(0.0, abs=1e-12)
+    assert discrimination._divergence(column, column) == pytest.approx(0.0, abs=1e-12)
+    assert discrimination._correlation(column, -2.0 * column) == pytest.approx(1.0)
+    assert discrimination._correlation(column, np.array([[1.0], [-3.0], [5.0]])) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_inertia_and_torque_scale_are_alike_on_every_flight_and_wind_and_tilt_are_not() -> None:
     flown = fly(within(SMALL.scaled(3.0), lambda f: 0.0, VEHICLE, Limits()).manoeuvre, VEHICLE)
-    alike = split.Pair("inertia", "torque_scale", VEHICLE, Limits()).odds(flown, draws=200)
+    alike = discrimination.Pair("inertia", "torque_scale", VEHICLE, Limits()).odds(flown, draws=200)
     assert alike.correlation == pytest.approx(1.0, abs=1e-3)
-    assert not alike.splits
-    apart = split.Pair("motor_lag", "thrust_scale", VEHICLE, Limits()).odds(flown, draws=200)
+    assert not alike.decides
+    apart = discrimination.Pair("motor_lag", "thrust_scale", VEHICLE, Limits()).odds(flown, draws=200)
     assert apart.correlation < 0.9
     assert apart.expected[0] > alike.expected[1]
 
@@ -233,7 +233,7 @@ def test_inertia_and_torque_scale_are_alike_on_every_flight_and_wind_and_tilt_ar
 def test_effects_that_cannot_be_planned_for_are_named() -> None:
     for pair, word in ((("nonsense", "wind"), "unknown"), (("gusts", "wind"), "random"), (("wind", "wind"), "two")):
         with pytest.raises(UsageError, match=word):
-            split.Pair(*pair, VEHICLE, Limits())
+            discrimination.Pair(*pair, VEHICLE, Limits())
 
 
 # files

@@ -55,7 +55,7 @@ class Odds:
     correlation: float
 
     @property
-    def splits(self) -> bool:
+    def decides(self) -> bool:
         """Whether the flight would decide, whichever is true."""
         return min(self.decided) >= LIKELY
 
