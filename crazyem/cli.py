@@ -261,9 +261,7 @@ def _plan(commands: Any) -> None:
     text = "the manoeuvre that most narrows intervals, or best tells two explanations apart; and what to expect of it"
     p = commands.add_parser("plan", help=text, description=text)
     goal = p.add_mutually_exclusive_group()
-    goal.add_argument(
-        "--for", dest="parameters", metavar="A,B,...", help="parameters to narrow (default: mass,Ixx,Iyy,Izz)"
-    )
+    goal.add_argument("--for", dest="parameters", metavar="A,...", help="to be narrowed (default: mass,Ixx,Iyy,Izz)")
     goal.add_argument("--split", metavar="EFFECT,EFFECT", help="effects to tell apart")
     goal.add_argument("--from", dest="diagnosis", metavar="DIAGNOSIS.json", help="tell its look-alikes apart")
     p.add_argument("--vehicle", default="cf2", metavar="NAME|FILE", help="preset or vehicle file (default: cf2)")
@@ -280,9 +278,7 @@ def _plan(commands: Any) -> None:
     p.add_argument("--noise", metavar="FLIGHT.json", help="expect the noise of this flight or replay of the drone")
     p.add_argument("--seed", type=_integer(0, 2**31 - 1), default=0, help="of the search (default: 0)")
     p.add_argument("--json", nargs="?", const="-", metavar="FILE", help="for programs; without FILE on standard output")
-    p.add_argument(
-        "-o", "--output", required=True, metavar="PLAN.toml", help="what crazyem fly --trajectory plan flies"
-    )
+    p.add_argument("-o", "--output", required=True, metavar="PLAN.toml", help="for crazyem fly --trajectory plan")
 
 
 def _predict(commands: Any) -> None:

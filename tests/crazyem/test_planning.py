@@ -220,6 +220,7 @@ def test_parallel_columns_give_no_odds() -> None:
     assert discrimination._correlation(column, np.array([[1.0], [-3.0], [5.0]])) == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_inertia_and_torque_scale_are_alike_on_every_flight_and_wind_and_tilt_are_not() -> None:
     flown = fly(within(SMALL.scaled(3.0), lambda f: 0.0, VEHICLE, Limits()).manoeuvre, VEHICLE)
     alike = discrimination.Pair("inertia", "torque_scale", VEHICLE, Limits()).odds(flown, draws=200)
