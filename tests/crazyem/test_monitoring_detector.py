@@ -62,6 +62,7 @@ def command_of_more(rotor: int, loss: float) -> Callable[[tuple[float, ...]], tu
     return change
 
 
+@pytest.mark.slow
 def test_a_flight_without_a_fault_gives_no_report(flight: list[Sample]) -> None:
     reports, monitor = monitored(flight)
     assert reports == []
@@ -82,6 +83,7 @@ def test_a_rotor_that_loses_a_tenth_is_named_with_its_size(flight: list[Sample])
     assert settled.to_json()["rotor"] == 3
 
 
+@pytest.mark.slow
 def test_a_sensor_that_is_biased_is_named(flight: list[Sample]) -> None:
     bias = changed(flight, "body_rate", lambda v: (v[0], v[1] + 0.1, v[2]))
     reports, _ = monitored(bias)
@@ -89,6 +91,7 @@ def test_a_sensor_that_is_biased_is_named(flight: list[Sample]) -> None:
     assert reports[0].sizes["y"].value == pytest.approx(0.1, abs=0.04)
 
 
+@pytest.mark.slow
 def test_a_signal_that_sticks_is_named_and_stops_pushing(flight: list[Sample]) -> None:
     kept: list[tuple[float, ...]] = []
 
