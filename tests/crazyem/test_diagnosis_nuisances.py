@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, fly
 
+from crazyem.diagnosis.fitting import nuisances as always
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
-from crazyem.diagnosis.fitting.fit import Data, starting_point
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, starting_point
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import (
@@ -205,3 +206,21 @@ def test_what_is_free_no_longer_does_not_stay_where_it_was_left():
     assert refine_base(data.twin(), replace(left, vehicle=filed), [lag], rounds=1).point.effects["torque_scale"] == {
         "scale": 1.1
     }
+
+
+def test_a_second_look_that_diverges_takes_nothing_away(monkeypatch):
+    looks = [SimpleNamespace(point=POINT, loglik=3.0), DivergedError("no number")]
+
+    def refined(*_: object, **__: object) -> SimpleNamespace:
+        look = looks.pop(0)
+        if isinstance(look, DivergedError):
+            raise look
+        return look
+
+    settled = []
+    monkeypatch.setattr(always, "refine_base", refined)
+    monkeypatch.setattr(always, "remembering_anew", lambda data, point: point)
+    found = refine_anew(SimpleNamespace(settle=settled.append), POINT, ())
+    assert found.loglik == 3.0
+    assert settled == [POINT]
+    assert looks == []

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, of_recordings
-from crazyem.diagnosis.fitting.fit import Data, Fitted, refine, remembering, remembering_anew
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, refine, remembering, remembering_anew
 from crazyem.diagnosis.fitting.gram import Solution, used
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.sampling import TRIM_SD, coarsely_sampled, interval, unlogged_share
@@ -385,7 +385,10 @@ def refine_anew(data: Data, point: Point, accepted: Sequence[Candidate], *, roun
     the nominal model gained 58 nats by a second look, which a torque scale got for itself before.
     """
     once = refine_base(data, point, accepted, rounds=rounds)
-    again = refine_base(data, remembering_anew(data, once.point), accepted, rounds=rounds)
+    try:
+        again = refine_base(data, remembering_anew(data, once.point), accepted, rounds=rounds)
+    except DivergedError:  # a second look that leads nowhere takes nothing away
+        again = once
     if again.loglik > once.loglik:
         return again
     data.settle(once.point)
