@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from crazyem.live.flight_result import FlightResult
     from crazyem.live.guard import Guard
     from crazyem.live.policy import Policy, load_policy
+    from crazyem.monitoring.fault import Fault
     from crazyem.planning.plan import Plan
     from crazyem.recordings.contents import ReadOptions
     from crazyem.recordings.recording import Recording

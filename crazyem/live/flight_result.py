@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 from crazyem.estimation.result import Estimate
 from crazyem.live.history import History
-from crazyem.live.pipeline import Pipeline
 from crazyem.live.summary import build_summary, text_summary
 from crazyem.notebook import finite, html_table, saved
 from crazyem.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from crazyem.live.pipeline import Pipeline
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,7 @@ class FlightResult:
 
 
 def result_of(
-    pipeline: Pipeline,
+    pipeline: "Pipeline",
     vehicle: Vehicle,
     *,
     title: str,

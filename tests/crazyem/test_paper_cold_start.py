@@ -40,7 +40,7 @@ inf, nan = math.inf, math.nan
 @pytest.fixture(scope="module")
 def study():
     """benchmarks/cold_start.py as a module."""
-    spec = importlib.util.spec_from_file_location("cold_start_study", ROOT / "benchmarks" / "cold_start.py")
+    spec = importlib.util.spec_from_file_location("cold_start_benchmark", ROOT / "benchmarks" / "cold_start.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
