@@ -206,7 +206,7 @@ def test_a_diagnosis_tells_of_a_rotor_that_does_not_follow_its_command(monkeypat
     speed = array_of("rotor_speed", command.time, np.sqrt(thrust / 2e-8), place=90)
     measured = replace(flown, signals={**flown.signals, "rotor_speed": speed})
     left = np.ones((4, 1000)) * np.array([[1.0], [1.0], [30.0 if sticks else 1.0], [1.0]]) * 1e-4
-    told = Answer(np.array([0.06 if sticks else 0.03, 0.0]), np.diag([1e-6, 1e-6]), left, (1.0, 9.0))
+    told = Answer(np.array([0.12 if sticks else 0.03, 0.0]), np.diag([1e-6, 1e-6]), left, (1.0, 9.0))
     monkeypatch.setattr(diagnosing, "answers", lambda recordings, vehicle: [told] * len(recordings))
     found = diagnosing.diagnose([measured], ROTORS, wanted=["linear_drag", "motor_lag"])
     regimes = [f.regime for f in found.unexplained.findings]

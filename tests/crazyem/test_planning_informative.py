@@ -168,9 +168,9 @@ def test_a_segment_is_aimed_at_what_is_still_wide() -> None:
         assert found is not None
         return expectation.of(fly(found, VEHICLE)).sd
 
-    roll, yaw = spread((1e-3, 0.3, 0.3, 1e-3)), spread((1e-3, 1e-3, 1e-3, 0.3))
-    assert roll[1] < yaw[1]
-    assert yaw[3] < roll[3]
+    tilt, yaw = spread((1e-3, 0.3, 0.3, 1e-3)), spread((1e-3, 1e-3, 1e-3, 0.3))
+    assert tilt[1] * tilt[2] < yaw[1] * yaw[2]  # D-optimal: the volume of the joint interval
+    assert yaw[3] < tilt[3]
 
 
 def test_the_command_refuses_what_has_no_room(capsys: pytest.CaptureFixture[str]) -> None:
