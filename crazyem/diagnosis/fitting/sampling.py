@@ -18,6 +18,7 @@ from crazyem.vehicle import Vehicle
 # for 2 ms only, and what acts was not logged. That is an error in the input, under which every fit makes the drone look
 # heavy and damped. Share of the power of roll and pitch torques above half of the Nyquist frequency (white: a half):
 COARSE = 0.2  # simulated flights have up to 0.12, whatever is wrong with the drone
+NEGLIGIBLE = 1e-3  # relative error of torques: a tenth of what is not known of inertias (`nuisances.INERTIA_SD`)
 LOOP = 2e-3  # s between commands of the loop (500 Hz, crazyflie-firmware stabilizer.c)
 EDGE, SLOW = 0.5, 1.0  # s left out at either end; Hz below which torques say nothing of sampling
 # m, torque per thrust: by how much the trim of a drone whose file has one differs from one day to the next. Healthy and
@@ -40,7 +41,7 @@ def shaken_commands(flights: Sequence[Flight], vehicle: Vehicle) -> bool:
 
 
 def unlogged_share(flights: Sequence[Flight], vehicle: Vehicle) -> float:
-    """0 to 1: by how much commands that were sent between the logged ones may falsify torques, relative.
+    """0 to 1: by how much commands that were sent between the logged ones may falsify torques, relative; 0 if slight.
 
     White commands have half of their power above half of the Nyquist frequency, so twice the fast share is the white
     part. All but one in period / `LOOP` of it was never logged. An error in the input biases a fit by its power times
@@ -51,7 +52,7 @@ def unlogged_share(flights: Sequence[Flight], vehicle: Vehicle) -> float:
         if not flight.inputs.measured:
             missed = max(0.0, 1.0 - LOOP / interval(flight))
             shares.append(min(1.0, 4.0 * missed * fast_share(flight, vehicle) ** 2))
-    return max(shares)
+    return max(shares) if max(shares) > NEGLIGIBLE else 0.0
 
 
 def interval(flight: Flight) -> float:

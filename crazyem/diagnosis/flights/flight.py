@@ -189,15 +189,16 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
 
 
 def thinned(time: NDArray, value: NDArray) -> tuple[NDArray, NDArray]:
-    """Every so many samples (n,), (n, k) of a stream that they are `SAMPLING` apart at most; all of a slower stream.
+    """The first of the samples (n,), (n, k) of a stream in each interval of about `SAMPLING`; all of a slower stream.
 
-    Counted by their stamps, so that a lost sample changes nothing of the others.
+    Intervals are whole periods of the stream and begin halfway between samples, so that the jitter of stamps moves none
+    into another. Where the first one was lost, the next stands for it.
     """
     period = float(np.median(np.diff(time))) if time.size > 1 else SAMPLING
     every = math.floor(SAMPLING / period + 0.1) if period > 0.0 else 1
     if every < 2:
         return time, value
-    keep = np.round(time / period).astype(np.int64) % every == 0
+    keep = np.diff(np.floor((time / period + 0.5) / every), prepend=-np.inf) > 0
     return time[keep], value[keep]
 
 
