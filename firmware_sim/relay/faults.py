@@ -149,8 +149,10 @@ class Engine:
         return 0.0 if self.began is None else now - self.began
 
     def dead(self, now: float) -> bool:
-        """Whether a fault wants the port closed now."""
-        t = self.elapsed(now)
+        """Whether a fault wants the port closed now. Never before the first packet: its time is what faults count from."""
+        if self.began is None:
+            return False
+        t = now - self.began
         return any(r.fault.what == "die" and r.fault.start <= t < r.fault.end for r in self._rules)
 
     def take(self, now: float, route: Hashable, direction: str, datagram: bytes) -> None:

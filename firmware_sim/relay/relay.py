@@ -45,6 +45,7 @@ class Relay:
         self._heard: dict[Address, float] = {}
         self._address: Address = (host, port)
         self._listener: socket.socket | None = None
+        self._place: socket.socket | None = None  # keeps the port while it refuses
         self._open()
 
     @property
@@ -64,7 +65,7 @@ class Relay:
                 now = time.monotonic()
                 dead = self.engine.dead(now)
                 if dead and self._listener is not None:
-                    self._close_listener()
+                    self._refuse()
                 elif not dead and self._listener is None:
                     self._open()
                 due = self.engine.next_time()
@@ -78,11 +79,13 @@ class Relay:
     def close(self) -> None:
         """Give back every socket; safe to call twice."""
         self._close_listener()
+        self._give_place()
         for host in list(self._drones):
             self._forget(host)
         self._selector.close()
 
     def _open(self) -> None:
+        self._give_place()
         sock = _socket()
         try:
             sock.bind(self._address)
@@ -100,6 +103,21 @@ class Relay:
             self._selector.unregister(self._listener)
             self._listener.close()
             self._listener = None
+
+    def _refuse(self) -> None:
+        """Hosts hear "connection refused", and no other program takes the port.
+
+        A UDP socket that is connected hears its peer alone. Connected to itself, the socket hears nobody.
+        """
+        self._close_listener()
+        self._place = _socket()
+        self._place.bind(self._address)
+        self._place.connect(self._address)
+
+    def _give_place(self) -> None:
+        if self._place is not None:
+            self._place.close()
+            self._place = None
 
     def _receive(self, sock: socket.socket, host: Address | None) -> None:
         """Everything that has arrived at one socket; `host` is None for the listener."""

@@ -124,6 +124,14 @@ def test_time_begins_with_the_first_packet():
     assert [engine.dead(t) for t in (501.9, 502.0, 502.9, 503.0)] == [False, True, True, False]
 
 
+def test_nobody_is_dead_before_the_first_packet():
+    """A dead relay takes no packet, so that its time would never begin."""
+    engine = Engine([Fault("die", end=2.0)])
+    assert not engine.dead(1e6)
+    engine.take(500.0, "host", UP, WRITE)
+    assert [engine.dead(t) for t in (500.0, 502.0)] == [True, False]
+
+
 def test_kinds_aim():
     out, engine = through([Fault("drop", kinds=frozenset({"log"}))], [LOG_DATA, WRITE, b"\x5d\x06", ECHO])
     assert [d for _, d in out] == [WRITE, ECHO]
@@ -276,6 +284,20 @@ def test_a_dead_peer_refuses_and_comes_back(drone):
                 pass
         assert refused
         assert alive == 5
+
+
+def test_the_port_of_a_dead_peer_stays_its_own(drone):
+    with relayed(drone, [Fault("die")]) as relay, host(relay) as sock:
+        began = time.monotonic()
+        with contextlib.suppress(ConnectionRefusedError):
+            while time.monotonic() - began < 60:
+                sock.send(b"\x2e1")
+                time.sleep(0.02)
+        with pytest.raises(ConnectionRefusedError):
+            sock.send(b"\x2e1")
+            sock.recv(64)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other, pytest.raises(OSError, match="in use"):
+            other.bind(relay.address)
 
 
 def test_many_scans_do_not_pile_up(drone):
