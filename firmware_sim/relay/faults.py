@@ -149,7 +149,7 @@ class Engine:
         return 0.0 if self.began is None else now - self.began
 
     def dead(self, now: float) -> bool:
-        """Whether a fault wants the port closed now. Never before the first packet: its time is what faults count from."""
+        """Whether a fault wants the port closed now; never before the first packet, from which faults count."""
         if self.began is None:
             return False
         t = now - self.began

@@ -85,6 +85,14 @@ class Simulator:
             self.process.stdout.close()
 
 
+@pytest.fixture(scope="module")
+def resting() -> Iterator[Simulator]:
+    """One simulator for all tests of a file, each of which leaves it as it was: on the floor, with nobody connected."""
+    drone = Simulator("--seed", "1")
+    yield drone
+    drone.stop()
+
+
 @pytest.fixture
 def simulator() -> Iterator[Callable[..., Simulator]]:
     """A factory: `simulator("--seed", "1")` starts one more simulator, all are stopped after the test."""

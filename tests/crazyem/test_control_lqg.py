@@ -3,7 +3,6 @@
 import subprocess
 import sys
 
-import control as ct
 import numpy as np
 import pytest
 from hypothesis import given
@@ -36,6 +35,8 @@ def test_gains_are_those_of_the_riccati_equation(dt, position, velocity):
 @pytest.mark.parametrize("dt", [0.005, 0.02])
 def test_the_position_loop_has_margins(dt):
     """Broken at the acceleration; an optimal loop has 60 degrees in continuous time, and little less at these steps."""
+    import control as ct
+
     a, b = double_integrator(dt)
     gains = position_gains(dt=dt, position_weight=16.0, velocity_weight=4.0)
     loop = ct.ss(a, b, gains[None], 0.0, dt)

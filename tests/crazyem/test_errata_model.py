@@ -1,6 +1,5 @@
 """Errata of the paper, sections II, VI and IX: state space, frames, dynamics, controller (docs: errata.md)."""
 
-import control as ct
 import numpy as np
 import pytest
 import sympy as sp
@@ -247,6 +246,8 @@ def test_18_the_yaw_error_must_be_wrapped():
 
 def test_82_without_weights_the_attitude_loop_is_undetermined():
     """LQR with unit weights, and K_theta = 40 in the reference of the rate: damping 0.10; with 20 and 20 it is 0.5."""
+    import control as ct
+
     k, _, _ = ct.lqr(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), np.eye(2), np.eye(1))
     stiffness, damping = k[0, 0] + 40.0 * k[0, 1], k[0, 1]  # the angle error acts twice, in 18 and in 82
     assert damping / (2 * np.sqrt(stiffness)) == pytest.approx(0.103, abs=0.002)
@@ -264,6 +265,8 @@ def _chain():
 
 
 def test_79_continuous_matrices_are_not_a_discrete_model():
+    import control as ct
+
     a, b = _chain()
     x, u = np.arange(12.0), np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     nilpotent = np.eye(12) + a * DT  # exp(A dt) = 1 + A dt, since A A = 0
@@ -279,6 +282,8 @@ def test_79_continuous_matrices_are_not_a_discrete_model():
 
 def test_appendix_a_the_row_of_roll_has_its_one_in_the_wrong_column():
     """Gains made from the printed matrix leave roll without a restoring torque: a pole at zero."""
+    import control as ct
+
     a, b = _chain()
     printed = a.copy()
     printed[6, 9], printed[6, 8] = 0.0, 1.0  # column 9 (psi) instead of 10 (omega_x)

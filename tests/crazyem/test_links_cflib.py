@@ -39,9 +39,8 @@ def logs(cf, count=25):
     return len(stamps) >= count
 
 
-def test_cflib_connects_logs_and_writes_through_the_relay(simulator):
-    drone = simulator()
-    with relayed(drone.uri) as relay:
+def test_cflib_connects_logs_and_writes_through_the_relay(resting):
+    with relayed(resting.uri) as relay:
         with SyncCrazyflie(relay.uri, cf=Crazyflie(ro_cache=None, rw_cache=None)) as scf:
             scf.wait_for_params()
             assert logs(scf.cf)
@@ -55,10 +54,9 @@ def test_cflib_connects_logs_and_writes_through_the_relay(simulator):
             assert fates["received"] == fates["forwarded"] > 500
 
 
-def test_a_bad_air_costs_cflib_log_packets_only(simulator):
+def test_a_bad_air_costs_cflib_log_packets_only(resting):
     """Requests and replies pass; a third of the log data does not, some of it comes twice, late or out of order."""
-    drone = simulator()
-    with relayed(drone.uri) as relay, SyncCrazyflie(relay.uri, cf=Crazyflie(ro_cache=None, rw_cache=None)) as scf:
+    with relayed(resting.uri) as relay, SyncCrazyflie(relay.uri, cf=Crazyflie(ro_cache=None, rw_cache=None)) as scf:
         scf.wait_for_params()
         data = {"kinds": ("log.data",)}
         now_on(relay, down("drop", rate=0.33, burst=3.0, **data), down("duplicate", rate=0.2, **data),

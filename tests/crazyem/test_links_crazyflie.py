@@ -184,6 +184,8 @@ def test_a_lost_drone_is_reported_once(fake_peer, monkeypatch, how):
             link.send_position(0.0, 0.0, 1.0, 0.0)
         with pytest.raises(LinkError):
             link.write_parameter("ctrlLee.mass", 0.03)
+        with pytest.raises(LinkError):
+            link.read_parameter("ctrlLee.mass")
 
 
 def test_closing_hands_back_only_if_it_commanded(fake_peer):

@@ -134,19 +134,17 @@ def test_two_replies_in_ten_are_lost(full_peer):
 
 
 @pytest.mark.slow
-def test_the_simulated_firmware_survives_single_losses_too(simulator):
-    drone = simulator()
+def test_the_simulated_firmware_survives_single_losses_too(resting):
     for k in (0, 1, 2, 3, 40, 200, 300, 420, 500, 600):
-        with relayed(drone.uri, down("drop", skip=k, count=1)) as relay, connected(relay.uri) as link:
+        with relayed(resting.uri, down("drop", skip=k, count=1)) as relay, connected(relay.uri) as link:
             assert "ctrlLee.mass" in link.parameters
             assert relay.engine.counts.fates["down"]["dropped"] == 1
 
 
 @pytest.mark.slow
-def test_a_loss_of_a_tenth_both_ways(simulator):
+def test_a_loss_of_a_tenth_both_ways(resting):
     """Seven hundred requests, one in five unanswered: cflib's own chance of connecting would be 1e-65."""
-    drone = simulator()
-    with relayed(drone.uri, down("drop", rate=0.1), up("drop", rate=0.1)) as relay, connected(relay.uri) as link:
+    with relayed(resting.uri, down("drop", rate=0.1), up("drop", rate=0.1)) as relay, connected(relay.uri) as link:
         blocks = link.subscribe(standard_variables(link.log_variables), 100.0)
         came = packets(link, 400)
         write = link.write_parameter("ctrlLee.mass", 0.031)
@@ -163,10 +161,9 @@ def test_a_loss_of_a_tenth_both_ways(simulator):
 # --- log blocks -----------------------------------------------------------------------------------------------------
 
 
-def test_blocks_of_two_packets_are_whole_whatever_is_lost(simulator):
+def test_blocks_of_two_packets_are_whole_whatever_is_lost(resting):
     """Ten variables take a create and an append; cflib ignores the second's reply."""
-    drone = simulator()
-    with relayed(drone.uri) as relay, connected(relay.uri) as link:
+    with relayed(resting.uri) as relay, connected(relay.uri) as link:
         for k in range(6):
             direction = up if k % 2 else down
             relay.engine.replace([direction("drop", kinds=["log.control"], skip=k // 2, count=1)])
@@ -180,9 +177,8 @@ def test_blocks_of_two_packets_are_whole_whatever_is_lost(simulator):
 
 
 @pytest.mark.parametrize(("rate", "period"), [(200.0, 5), pytest.param(500.0, 2, marks=pytest.mark.slow)])
-def test_faster_than_a_hundred_hertz(simulator, rate, period):
-    drone = simulator()
-    with connected(drone.uri) as link:
+def test_faster_than_a_hundred_hertz(resting, rate, period):
+    with connected(resting.uri) as link:
         blocks = link.subscribe(["gyro.x", "gyro.y", "gyro.z", "acc.x", "acc.y", "acc.z"], rate)
         packets(link, 50)
         stamps = [p.firmware_time_ms for p in packets(link, 1000 // period)]

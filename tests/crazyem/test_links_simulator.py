@@ -1,23 +1,16 @@
-"""The link against the simulated firmware: real tables, real blocks, a verified write, a flight, a death."""
+"""The link against the simulated firmware: real tables, real blocks, a verified write, a take-off."""
 
 import struct
 
 import pytest
-from received import packets, take, wait_for
+from received import packets
 
-from crazyem.errors import LinkError
-from crazyem.links.base import LinkLost
 from crazyem.links.crazyflie import CrazyflieLink
 from crazyem.signals.vocabulary import decoders, standard_variables
 
 
-@pytest.fixture
-def drone(simulator):
-    return simulator("--seed", "1")
-
-
-def test_standard_blocks_stream_at_100_hz(drone):
-    with CrazyflieLink(drone.uri) as link:
+def test_standard_blocks_stream_at_100_hz(resting):
+    with CrazyflieLink(resting.uri) as link:
         blocks = link.subscribe(standard_variables(link.log_variables), 100.0)
         came = packets(link, 300)
         statistics = link.statistics()
@@ -40,18 +33,18 @@ def test_standard_blocks_stream_at_100_hz(drone):
     assert mean == pytest.approx([0.0, 0.0, 9.81], abs=0.1)  # at rest on the ground
 
 
-def test_parameters_read_and_write(drone):
-    with CrazyflieLink(drone.uri) as link:
+def test_parameters_read_and_write(resting):
+    with CrazyflieLink(resting.uri) as link:
         assert link.parameters["ctrlLee.mass"] == "float"
         write = link.write_parameter("ctrlLee.mass", 0.0312)
         assert write.verified
         assert link.read_parameter("ctrlLee.mass") == struct.unpack("<f", struct.pack("<f", 0.0312))[0]
 
 
-def test_a_second_client_can_take_off_after_the_first_has_commanded(drone):
-    with CrazyflieLink(drone.uri) as first:
+def test_a_second_client_can_take_off_after_the_first_has_commanded(resting):
+    with CrazyflieLink(resting.uri) as first:
         first.send_hover(0.0, 0.0, 0.0, 0.0)
-    with CrazyflieLink(drone.uri) as second:
+    with CrazyflieLink(resting.uri) as second:
         blocks = second.subscribe(["stateEstimate.x", "stateEstimate.y", "stateEstimate.z"], 50.0)
         second.take_off(0.5, 1.0)
         table = decoders(blocks)
@@ -59,14 +52,3 @@ def test_a_second_client_can_take_off_after_the_first_has_commanded(drone):
             if any(s.value[2] > 0.2 for s in table[packet.block].decode(packet)):
                 return
     raise AssertionError("it did not take off")
-
-
-@pytest.mark.parametrize("how", ["kill", "pause"])
-def test_a_dead_simulator_is_reported_once(drone, how):
-    with CrazyflieLink(drone.uri) as link:
-        link.subscribe(standard_variables(link.log_variables), 100.0)
-        getattr(drone, how)()
-        wait_for(link, LinkLost)
-        assert take(link, 0.5) == []
-        with pytest.raises(LinkError):
-            link.read_parameter("ctrlLee.mass")

@@ -1,6 +1,5 @@
 """The LQG's gains against python-control and the algebraic solution; what it believes scales what it does."""
 
-import control
 import numpy as np
 import pytest
 
@@ -16,6 +15,8 @@ WEIGHTS = {name: DEFAULTS[f"ctrlLqg.{name}"] for name in parameters.LQG_WEIGHTS}
 
 
 def test_gains_are_those_of_python_control() -> None:
+    import control
+
     tau = WEIGHTS["tau"]
     A = np.array([[0, 1, 0], [0, 0, 1], [0, 0, -1 / tau]])
     system = control.c2d(control.ss(A, [[0], [0], [1 / tau]], np.eye(3), np.zeros((3, 1))), lqg.DT)
