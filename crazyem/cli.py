@@ -228,14 +228,9 @@ def _diagnose(commands: Any) -> None:
     p.add_argument("files", nargs="+", metavar="RECORDING", help="flights of one drone")
     p.add_argument("--vehicle", metavar="NAME|FILE", help="the nominal model (default: the one that was flown)")
     p.add_argument("--against", metavar="SIMULATED", help="a simulated recording of the same mission, to look at first")
-    p.add_argument(
-        "--held-out",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="RECORDING",
-        help="flights only to judge by, unless only they move (see --strict-held-out)",
-    )
+    several: dict[str, Any] = {"nargs": "+", "action": "extend", "default": [], "metavar": "RECORDING"}
+    p.add_argument("--held-out", **several, help="flights only to judge by, unless only they move (--strict-held-out)")
+    p.add_argument("--baseline", **several, help="flights of the healthy drone: its own trim, and how its days differ")
     p.add_argument(
         "--strict-held-out", action="store_true", help="fit nothing to these even where the others only hover"
     )

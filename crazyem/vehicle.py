@@ -16,6 +16,10 @@ File format (all SI; `presets/*.toml` are examples):
     inertia_sd = [0.5, 0.5, 0.7]      # optional: of Ixx, Iyy, Izz (one number for all three, or three)
     motor_time_constant_sd = 0.7      # optional
     [effects.NAME]                    # fitted effects, parameter = value
+    [days]                            # optional: how the drone differs from day to day, by healthy flights
+    flights = 5                       # that many
+    thrust_sd = 0.01                  # of the thrust, relative
+    trim_sd = [2e-4, 2e-4, 1e-4]      # of the trim (effects.trim), m
     [posterior]                       # optional, of a fitted file: how sure it is of these together
     parameters = ["inertia.xx", ...]  # effect.parameter
     mean = [...]
@@ -52,6 +56,21 @@ class Posterior:
 
 
 @dataclass(frozen=True)
+class Days:
+    """How a drone differs from one day to the next, standard deviations.
+
+    Attributes:
+        flights: number of healthy flights that say so.
+        thrust_sd: of the thrust, relative.
+        trim_sd: of torque over thrust about x, y, z [m].
+    """
+
+    flights: int
+    thrust_sd: float
+    trim_sd: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
 class Vehicle:
     """Nominal constants of one drone (SI). A vehicle without rotor data takes thrust and torque as its inputs.
 
@@ -71,6 +90,7 @@ class Vehicle:
         mass_sd, inertia_sd, motor_time_constant_sd: standard deviation of the value over the value, the estimator's
             prior; None where the file does not say (estimation/model.py has what stands then).
         posterior: of a fitted vehicle, how sure the fit is of its effects.
+        days: how the drone differs from day to day; None: not known.
     """
 
     name: str
@@ -89,6 +109,7 @@ class Vehicle:
     inertia_sd: tuple[float, float, float] | None = None
     motor_time_constant_sd: float | None = None
     posterior: Posterior | None = None
+    days: Days | None = None
 
     def to_toml(self) -> str:
         """The vehicle as the text of a vehicle file; reading it back gives an equal vehicle."""
@@ -110,6 +131,9 @@ class Vehicle:
         for name, parameters in self.effects.items():
             lines += ["", f"[effects.{_quote(name)}]"]
             lines += [f"{_quote(key)} = {_toml_value(value)}" for key, value in parameters.items()]
+        if self.days is not None:
+            lines += ["", "[days]", f"flights = {self.days.flights}", f"thrust_sd = {self.days.thrust_sd!r}"]
+            lines.append(f"trim_sd = {_toml_value(self.days.trim_sd)}")
         if self.posterior is not None:
             lines += ["", "[posterior]", f"parameters = {_toml_value(self.posterior.parameters)}"]
             lines += [f"mean = {_toml_value(self.posterior.mean)}", "covariance = ["]
@@ -146,7 +170,7 @@ def parse_vehicle(source: str, *, where: str = "vehicle") -> Vehicle:
     known = {
         "name", "mass", "inertia", "arm", "thrust_curve", "rotor_constant", "torque_per_thrust",
         "motor_time_constant", "thrust_max", "battery_compensated", "effects", "mass_sd", "inertia_sd",
-        "motor_time_constant_sd", "posterior",
+        "motor_time_constant_sd", "posterior", "days",
     }  # fmt: skip
     for key in data:
         if key not in known:
@@ -188,7 +212,19 @@ def parse_vehicle(source: str, *, where: str = "vehicle") -> Vehicle:
         inertia_sd=_spread(data, "inertia_sd", where, 3),
         motor_time_constant_sd=_spread(data, "motor_time_constant_sd", where, 1),
         posterior=_posterior(data["posterior"], where) if "posterior" in data else None,
+        days=_days(data["days"], where) if "days" in data else None,
     )
+
+
+def _days(data: Any, where: str) -> Days:
+    if not isinstance(data, dict) or set(data) != {"flights", "thrust_sd", "trim_sd"}:
+        raise FileFormatError(f"{where}: [days] needs the keys flights, thrust_sd and trim_sd")
+    if not isinstance(data["flights"], int) or isinstance(data["flights"], bool) or data["flights"] < 2:
+        raise FileFormatError(f"{where}: key 'days.flights' must be a whole number, 2 or more")
+    thrust, trim = _numbers(data, "thrust_sd", where, lengths=(1,)), _numbers(data, "trim_sd", where, lengths=(3,))
+    if min(*thrust, *trim) <= 0.0:
+        raise FileFormatError(f"{where}: keys 'days.thrust_sd' and 'days.trim_sd' must be larger than 0")
+    return Days(data["flights"], thrust[0], (trim[0], trim[1], trim[2]))
 
 
 def _posterior(data: Any, where: str) -> Posterior:

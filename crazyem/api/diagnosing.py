@@ -11,6 +11,7 @@ from crazyem.api.planning import plan_commands
 from crazyem.diagnosis import diagnose as by_recordings
 from crazyem.diagnosis.compare import compare
 from crazyem.diagnosis.document import document_of, saved_vehicle, text_of
+from crazyem.diagnosis.naming.baseline import with_baseline
 from crazyem.diagnosis.posterior.diagnose import diagnose as by_posterior
 from crazyem.diagnosis.prediction import predict as prediction
 from crazyem.diagnosis.prediction.predict import Prediction, recorded
@@ -131,6 +132,7 @@ def diagnose(
     vehicle: VehicleLike | None = None,
     *,
     held_out: RecordingLike | Sequence[RecordingLike] = (),
+    baseline: RecordingLike | Sequence[RecordingLike] = (),
     against: RecordingLike | None = None,
     candidates: Sequence[str] = (),
     withhold: Sequence[str] = (),
@@ -146,6 +148,7 @@ def diagnose(
         recordings: flights of one drone: recordings or paths.
         vehicle: the nominal model: a Vehicle, a preset's name or a file; None: the one that was flown.
         held_out: flights only to judge by, unless only these move.
+        baseline: flights of the healthy drone, two or more: its own trim and thrust, and how its days differ.
         against: a simulated recording of the same mission, to compare the first recording with.
         candidates: effects to look for; none: the whole catalogue.
         withhold: signals to leave unused, such as "pm.vbat".
@@ -165,6 +168,8 @@ def diagnose(
     if not flown:
         raise UsageError("a diagnosis needs at least one recording.")
     nominal = vehicle_of(vehicle, flown[0])
+    if healthy := [recording_of(r, options) for r in _several(baseline)]:
+        nominal = with_baseline(nominal, healthy, say)
     if method == "posterior":
         found = by_posterior(flown, nominal, held_out=kept, wanted=candidates, withhold=withhold, jobs=jobs, say=say)
     else:

@@ -29,6 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.files,
         arguments.vehicle,
         held_out=arguments.held_out,
+        baseline=arguments.baseline,
         against=arguments.against,
         candidates=[n.strip() for n in (arguments.candidates or "").split(",") if n.strip()],
         withhold=arguments.withhold,

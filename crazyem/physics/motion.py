@@ -205,7 +205,8 @@ def measured(situation: Situation, *, vehicle: Vehicle, effects: Effects) -> Off
     state, force = np.zeros((situation.size, 12)), np.zeros((situation.size, 3))
     for effect, values in active(effects, vehicle):
         if effect.measured is not None:
-            added = effect.measured(situation, **values)
+            turned = state[:, 6:9] if situation.tilt is None else situation.tilt + state[:, 6:9]
+            added = effect.measured(replace(situation, tilt=turned) if effect.by_force else situation, **values)
             state += added.state
             force += added.specific_force
     return Offset(state, force)

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting.nuisances import DAILY_LAG_SD, THRUST_SD
-from crazyem.diagnosis.fitting.sampling import TRIM_SD
+from crazyem.diagnosis.fitting.nuisances import DAILY_LAG_SD, day_sd
 from crazyem.errors import DataError, UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.rotors import THRUST_SCALE, TRIM
@@ -129,10 +128,11 @@ def _drawn(vehicle: Vehicle, parameters: Sequence[str], theta: Array) -> Vehicle
 def _another_day(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
     """The same drone on another day; sources of the spreads: `fitting/nuisances.py`, `fitting/sampling.py`."""
     effects = {n: dict(v) for n, v in vehicle.effects.items()}
+    thrust_sd, *trim_sd = day_sd(vehicle)
     scale = effects.setdefault(THRUST_SCALE.name, {"scale": 1.0})
-    scale["scale"] *= 1.0 + THRUST_SD * rng.standard_normal()
+    scale["scale"] *= 1.0 + thrust_sd * rng.standard_normal()
     trim = effects.setdefault(TRIM.name, dict.fromkeys("xyz", 0.0))
-    for axis, sd in zip("xyz", TRIM_SD, strict=True):
+    for axis, sd in zip("xyz", trim_sd, strict=True):
         trim[axis] = trim.get(axis, 0.0) + sd * rng.standard_normal()
     lag = effects.get(MOTOR_LAG.name, {}).get("time_constant", vehicle.motor_time_constant)
     if lag > 0.0:

@@ -44,7 +44,7 @@ def slow_to_turn():
 @pytest.mark.slow
 def test_an_inertia_that_no_body_has_leaves_open_what_turns_the_drone(slow_to_turn, monkeypatch):
     wanted = ("inertia", "linear_drag")
-    monkeypatch.setattr(determined, "improbable", lambda held_out_nats: "")  # one short flight says little for either
+    monkeypatch.setattr(determined, "improbable", lambda chance: "")  # one short flight says little for either
     found = diagnose([slow_to_turn], DRONE, wanted=wanted)
     assert {e.name for e in found.effects} == {"inertia", "linear_drag"}
     assert not found.left_out

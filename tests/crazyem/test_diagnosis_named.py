@@ -20,10 +20,11 @@ from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import LAG_OFF, by_a_wrong_lag, nuisances, refine_base, systematic_sd
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Finding
-from crazyem.diagnosis.naming import answer
+from crazyem.diagnosis.naming import answer, determined, trials
 from crazyem.diagnosis.naming.answer import _numbers, _rivals, _uncertainty, strongest_first
 from crazyem.diagnosis.naming.determined import improbable
-from crazyem.diagnosis.naming.named import CALIBRATED, DOUBTFUL, EVEN, SLOPE, Named, one_factor, presence, trust
+from crazyem.diagnosis.naming.named import DOUBTFUL, Named, one_factor, trust
+from crazyem.diagnosis.naming.presence import CALIBRATED, EVEN, SLOPE, presence
 from crazyem.diagnosis.naming.trials import Step, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained
 
@@ -49,7 +50,8 @@ def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_as
     flown = fly(Hidden(torque=0.7), seconds=20.0, seed=6)
     brought = []
     monkeypatch.setattr(answer, "trust", lambda remains, nats: brought.append(nats) or 1.0)
-    monkeypatch.setattr(answer, "presence", lambda nats: 0.123)
+    monkeypatch.setattr(trials, "presence", lambda nats: 0.123)
+    monkeypatch.setattr(determined, "improbable", lambda chance: "")
     monkeypatch.setattr(answer, "preferred", lambda taken, rivals: 1.0)
     found = diagnose([flown], DRONE, wanted=["inertia"])
     assert [(e.name, e.confidence) for e in found.effects] == [("inertia", 0.123)]
@@ -83,8 +85,8 @@ def test_a_name_is_as_sure_as_what_it_brings_on_flight_held_out() -> None:
         odds = math.exp(SLOPE * math.log(nats / EVEN))
         assert presence(nats) == pytest.approx(odds / (1.0 + odds))
     assert presence(1e5) == CALIBRATED
-    assert improbable(0.9 * EVEN).startswith("not determined")
-    assert not improbable(1.1 * EVEN)
+    assert improbable(presence(0.9 * EVEN)).startswith("not determined")
+    assert not improbable(presence(1.1 * EVEN))
 
 
 def left(nats: float, gained: float = 1e6) -> Unexplained:

@@ -49,7 +49,7 @@ def flown(*, speed: float, measured: bool = False) -> SimpleNamespace:
     y[:, 3:6] = np.sqrt(2) * speed * np.array([1, 2, 4]) * np.sin(np.arange(400) * np.pi / 20)[:, None]
     time = 0.01 * np.arange(400)
     inputs = SimpleNamespace(measured=measured, time=time, thrust=np.full((400, 4), 0.07))
-    flight = Made(name="flight", y=y, time=time, inputs=inputs, coarse=False, levelled=False)
+    flight = Made(name="flight", y=y, time=time, inputs=inputs, coarse=False, levelled=False, fused=False)
     signals = frozenset({"position", "velocity", "attitude", "body_rate"})
     return SimpleNamespace(flights=[flight], coarse=False, differ=False, signals=signals)
 

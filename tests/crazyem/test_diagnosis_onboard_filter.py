@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 from made_flight import array_of
+from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
-from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.model import Model, Point
+from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.physics.effects.effect import Situation
@@ -39,7 +41,7 @@ def test_the_offset_is_that_of_a_slow_low_pass():
         specific_force=turned.inv().apply(acceleration), angular_acceleration=np.gradient(rate, step, axis=0)[at],
         thrust=np.zeros((n, 4)), thrust_rate=np.zeros((n, 4)), voltage=np.zeros(n), rotor_constant=np.nan, air=none,
     )  # fmt: skip
-    offset = filtered(situation, rate_lag=lag, velocity_lag=lag, attitude_lag=0.0).state
+    offset = filtered(situation, rate_lag=lag, velocity_lag=lag, attitude_lag=0.0, lateral_memory=0.3).state
     wanted = (shown - np.hstack([velocity, rate]))[at]
     second_order = (pulse * lag) ** 2
     assert np.abs(offset[:, 9:] - wanted[:, 3:]).max() < 1.5 * second_order
@@ -48,9 +50,64 @@ def test_the_offset_is_that_of_a_slow_low_pass():
     assert not offset[:, [0, 1, 2, 6, 7, 8]].any()
     spin = np.array([0.5, -1.0, 2.0])  # rad/s, all the time: then the attitude of 2 ms ago is a turn back by 2 ms of it
     turning = replace(situation, body_rate=np.tile(spin, (n, 1)))
-    late = filtered(turning, rate_lag=0.0, velocity_lag=0.0, attitude_lag=lag).state[0, 6:9]
+    late = filtered(turning, rate_lag=0.0, velocity_lag=0.0, attitude_lag=lag, lateral_memory=0.0).state[0, 6:9]
     now, before = (turned * Rotation.from_rotvec(spin * t) for t in (1.0, 1.0 - lag))
     np.testing.assert_allclose(late, (now.inv() * before).as_rotvec(), atol=1e-12)
+
+
+@pytest.mark.parametrize("memory", [0.05, 0.2, 1.0])
+@pytest.mark.parametrize("tilt", [None, (0.02, -0.03, 0.01)])
+def test_a_filter_that_knows_no_drag_is_off_as_a_plain_integration_says(memory, tilt):
+    """A constant force along body x and y of a body that is turned, and an attitude that is shown tilted.
+
+    Thrust, along z, the filter knows. Where the pose is that of motion capture, nothing is off.
+    """
+    n, step = 300, 0.01
+    turned, none, force = Rotation.from_rotvec([0.3, -0.2, 0.5]), np.zeros((n, 3)), np.array([0.8, -0.5, 9.0])
+    situation = Situation(
+        time=step * np.arange(n), flown=none[:, 0], step=np.full(n, step), position=none, height=none[:, 0],
+        velocity=none, rotation=np.tile(rotation_matrix(turned.as_quat()), (n, 1, 1)), body_rate=none,
+        specific_force=none, modelled=np.tile(force, (n, 1)), angular_acceleration=none, thrust=np.zeros((n, 4)),
+        thrust_rate=np.zeros((n, 4)), voltage=np.zeros(n), rotor_constant=np.nan, air=none, fused=True,
+        tilt=None if tilt is None else np.tile(tilt, (n, 1)),
+    )  # fmt: skip
+    believed = np.array([0.0, 0.0, 9.0]) + np.cross(tilt or np.zeros(3), [0.0, 0.0, 9.0])  # to first order
+    drive = turned.apply([*(believed - force)[:2], 0.0])
+
+    def off(_, x):
+        return np.concatenate([x[3:] - 2.0 * x[:3] / memory, drive - 2.0 * x[:3] / memory**2])
+
+    plain = solve_ivp(off, (0.0, situation.time[-1]), np.zeros(6), t_eval=situation.time, rtol=1e-9, atol=1e-12).y.T
+    lags = {"rate_lag": 0.0, "velocity_lag": 0.0, "attitude_lag": 0.0, "lateral_memory": memory}
+    shown = filtered(situation, **lags).state
+    np.testing.assert_allclose(shown[:, :6], plain, rtol=1e-6, atol=1e-9)
+    if memory < 0.5:  # settled
+        assert shown[-1, 3:6] == pytest.approx(memory * drive, rel=1e-5)
+    assert not filtered(replace(situation, fused=False), **lags).state[:, :6].any()
+
+
+@pytest.mark.parametrize("effect", ["linear_drag", "wind"])
+def test_what_a_force_changes_in_the_velocity_that_is_shown_is_a_difference_of_likelihoods(effect):
+    """Score by a force's parameter, which acts and shows at once, against differences of whole passes."""
+    recording = fly(Hidden(), seconds=6.0, seed=3)
+    flight = replace(flight_of(recording, DRONE), fused=True)
+    effects = {"onboard_filter": {"lateral_memory": 0.2}, "linear_drag": {"x": 0.01, "y": 0.01}, "wind": {"x": 0.5}}
+    point = Point(DRONE, effects, first_guess())
+    model = Model(flight)
+    model.settle(point, passes=4)
+    column = Candidate(effect, (), ("x",)).columns(point)
+    score = model.twin().sweep(point, column).score.sum()
+
+    def loglik(change):
+        moved = point.with_effects({effect: {"x": effects[effect]["x"] + change}})
+        return model.twin().sweep(moved).loglik
+
+    width = 1e-4
+    assert score == pytest.approx((loglik(width) - loglik(-width)) / (2.0 * width), rel=0.02)
+    blind = replace(flight, fused=False)
+    alone = Model(blind)
+    alone.settle(point, passes=4)
+    assert alone.twin().sweep(point, column).score.sum() != pytest.approx(score, rel=0.02)
 
 
 def behind(recording: Recording, name: str, lag: float) -> Recording:

@@ -254,7 +254,7 @@ def test_a_scale_of_velocities_must_be_more_than_the_jitter_of_the_estimate():
     for speed, counts in ((0.007, False), (0.7, True)):
         moving = np.zeros((100, 13))
         moving[:, 3:6] = speed * np.sin(np.arange(100.0))[:, None]
-        data = SimpleNamespace(flights=[SimpleNamespace(y=moving)])
+        data = SimpleNamespace(flights=[SimpleNamespace(y=moving, fused=False)])
         assert matters(point, scale, data) == counts
 
 

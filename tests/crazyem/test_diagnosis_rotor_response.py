@@ -10,8 +10,9 @@ from made_flight import array_of
 
 from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis.flights.inputs import inputs_of
-from crazyem.diagnosis.naming.named import DOUBTFUL, presence
+from crazyem.diagnosis.naming.named import DOUBTFUL
 from crazyem.diagnosis.naming.other_likelihoods import late_rotors
+from crazyem.diagnosis.naming.presence import presence
 from crazyem.diagnosis.naming.rotor_response import (
     DELAY_SD,
     ENOUGH,

@@ -28,7 +28,7 @@ AGREED = {  # issue 5: names are an interface
     "suspended_load": "mass length", "rotor_sensor": "rotor scale",
     "trim": "x y z",  # not of the issue: what real drones need
     "sampled_commands": "tilt turn",  # nor this
-    "onboard_filter": "rate_lag velocity_lag attitude_lag",  # nor this: what every log needs
+    "onboard_filter": "rate_lag velocity_lag attitude_lag lateral_memory",  # nor this: what every log needs
     "force_by_place": "x y z xx xy xz yx yy yz zx zy zz",  # nor this: a rival of named ones, never named itself
 }  # fmt: skip
 
@@ -120,7 +120,8 @@ def everything(name: str, values: dict) -> np.ndarray:
     path = still(60, velocity=np.c_[np.sin(5 * t), np.cos(3 * t), np.sin(4 * t)], position=np.c_[t, 1 - t, 1 + t],
                  body_rate=np.c_[t, np.sin(9 * t), 1 - t],
                  specific_force=[1.0, 2.0, 9.0], thrust=[0.08, 0.07, 0.07, 0.07], thrust_rate=[0.1, 0, 0, 0],
-                 angular_acceleration=np.c_[np.cos(t), 9 * np.cos(9 * t), t], height=np.full(60, 0.1))  # fmt: skip
+                 angular_acceleration=np.c_[np.cos(t), 9 * np.cos(9 * t), t], height=np.full(60, 0.1),
+                 fused=True)  # fmt: skip
     effects: Effects = {name: values}
     moved, shown = (f(path, vehicle=ROTORS, effects=effects) for f in (motion, measured))
     found = [moved.specific_force, moved.angular_acceleration, shown.state, shown.specific_force]

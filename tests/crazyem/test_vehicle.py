@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy import stats
 
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.estimation.model import SPREAD, setup_for
-from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle, preset_names
+from crazyem.vehicle import Days, Vehicle, load_vehicle, parse_vehicle, preset_names
 
 GOOD = """
 name = "test"
@@ -125,6 +126,26 @@ def test_a_spread_that_is_none_is_refused_by_name(line):
 @given(vehicles())
 def test_a_vehicle_survives_the_round_trip(vehicle):
     assert parse_vehicle(vehicle.to_toml()) == vehicle
+
+
+@given(st.integers(2, 50), st.floats(1e-6, 1.0), st.tuples(*[st.floats(1e-9, 0.1)] * 3))
+def test_days_survive_the_round_trip(flights, thrust, trim):
+    vehicle = replace(load_vehicle("cf2"), days=Days(flights, thrust, trim))
+    assert parse_vehicle(vehicle.to_toml()) == vehicle
+
+
+@pytest.mark.parametrize(
+    ("lines", "key"),
+    [
+        ("flights = 1\nthrust_sd = 0.01\ntrim_sd = [1e-4, 1e-4, 1e-4]", "days.flights"),
+        ("flights = 4\nthrust_sd = 0.01", "trim_sd"),
+        ("flights = 4\nthrust_sd = 0.0\ntrim_sd = [1e-4, 1e-4, 1e-4]", "days.thrust_sd"),
+        ("flights = 4\nthrust_sd = 0.01\ntrim_sd = [1e-4, 1e-4]", "trim_sd"),
+    ],
+)
+def test_days_that_are_none_are_refused_by_name(lines, key):
+    with pytest.raises(FileFormatError, match=key):
+        parse_vehicle(load_vehicle("cf2").to_toml() + "\n[days]\n" + lines + "\n")
 
 
 @pytest.mark.parametrize("name", sorted({*FIRMWARE, "zhao"}))

@@ -34,6 +34,7 @@ class Candidate:
         both_ways: it may be less than nothing as well: a delay that is already counted may be counted too long.
         likeliest: it is fitted from `begin`, whatever derivatives say: that is the likeliest of many in full, or where
             an effect is something of which derivatives at nothing say nothing.
+        freedom: degrees of freedom of the prior of what is always free (`Prior.freedom`).
     """
 
     effect: str
@@ -42,6 +43,7 @@ class Candidate:
     begin: tuple[tuple[str, float], ...] = ()
     both_ways: bool = False
     likeliest: bool = False
+    freedom: float = math.inf
 
     @property
     def label(self) -> str:

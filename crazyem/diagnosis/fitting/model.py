@@ -27,6 +27,7 @@ from crazyem.physics.effects.effect import Effects, Situation
 from crazyem.physics.motion import measured, motion
 from crazyem.vehicle import Vehicle
 
+LATERAL = 0.05  # share of its accelerations from which a column's force along x and y counts in what a filter shows
 RECENT = 0.5  # s, over which what a model lacks is averaged: long enough that the noise of one sample is nothing
 # Prefix of what belongs to one recording and to no drone: "own:gyro_bias" -> {"FLIGHT/x": deviation}, added to what all
 # recordings share of that effect. Batteries and sensors are not the same on another day.
@@ -190,9 +191,13 @@ class Model:
             return offset
         situation = self._situation_shown(point, accelerations)
         for name in showing:
+            only = {name: effects[name]}
+            if CATALOGUE[name].by_force:  # it goes by what those before it show
+                turned = replace(situation, tilt=offset[:, 6:9])
+                offset = offset + measured(turned, vehicle=point.vehicle, effects=only).state
+                continue
             key = f"{name} {effects[name]!r}"
             if key not in self._offsets or self.moved is None:
-                only = {name: effects[name]}
                 self._offsets[key] = measured(situation, vehicle=point.vehicle, effects=only).state
             offset += self._offsets[key]
         return offset
@@ -202,11 +207,12 @@ class Model:
         if self._as_shown is not None and self.moved is not None:
             return self._as_shown
         path = initial_path(self.flight) if self.shown is None else self.shown
+        modelled = accelerations[:, :3]
         accelerations = accelerations if self.moved is None else self.moved
         situation = situation_of(self.flight, path, point.vehicle, self.thrusts(point.vehicle, {}))
         self._as_shown = replace(
             situation, specific_force=accelerations[:, :3], angular_acceleration=accelerations[:, 3:],
-            integrated=integrated_path(situation, accelerations),
+            integrated=integrated_path(situation, accelerations), modelled=modelled,
         )  # fmt: skip
         return self._as_shown
 
@@ -272,22 +278,21 @@ class Model:
     ) -> tuple[NDArray, NDArray, NDArray | None]:
         """Derivatives of accelerations (n, 6, c) and offsets (n, 12, d), and where each column went (None: no columns).
 
-        A column changes either accelerations or what is shown, or nothing here (-1): what belongs to another recording.
+        A column changes accelerations, what is shown, both, or nothing here: what belongs to another recording. Where
+        it went are two rows: places among all derivatives, -1 for none.
         """
         n = self.flight.time.size
         if not columns:
             return np.zeros((n, 6, 0)), np.zeros((n, 12, 0)), None
         acting: list[NDArray] = []
         showing: list[NDArray] = []
-        where: list[tuple[list[NDArray] | None, int]] = []
+        where: list[tuple[int, int]] = []
         for d_acting, d_showing in workers.map(lambda c: self._derivative(point, c, acceleration, offset), columns):
-            kind, change = (acting, d_acting) if d_showing is None else (showing, d_showing)
-            if change is None:
-                where.append((None, -1))
-            else:
-                where.append((kind, len(kind)))
-                kind.append(change)
-        order = np.array([len(acting) + at if kind is showing else at for kind, at in where])
+            where.append((-1 if d_acting is None else len(acting), -1 if d_showing is None else len(showing)))
+            acting += [] if d_acting is None else [d_acting]
+            showing += [] if d_showing is None else [d_showing]
+        order = np.array(where).T
+        order[1, order[1] >= 0] += len(acting)
         stack = (np.stack(acting, 2) if acting else np.zeros((n, 6, 0)),
                  np.stack(showing, 2) if showing else np.zeros((n, 12, 0)))  # fmt: skip
         return np.ascontiguousarray(stack[0]), np.ascontiguousarray(stack[1]), order
@@ -318,7 +323,23 @@ class Model:
             up = self.offsets(point, acceleration, plus)
             down = offset if column.minus is None else self.offsets(point, acceleration, column.minus)
             d_showing = (up - down) / column.width
+        elif d_acting is not None:
+            d_showing = self._shown_by(point, d_acting, acceleration)
         return d_acting, d_showing
+
+    def _shown_by(self, point: Point, change: NDArray, acceleration: NDArray) -> NDArray | None:
+        """(n, 12) what a change of accelerations (n, 6) changes in what is shown, where that goes by forces."""
+        if not self.flight.fused or np.linalg.norm(change[:, :2]) < LATERAL * np.linalg.norm(change):
+            return None
+        here = of_recording(point.effects, self.flight.name)
+        effects = {name: here[name] for name in here if CATALOGUE[name].by_force}
+        if not effects:
+            return None
+        situation = replace(self._situation_shown(point, acceleration), modelled=acceleration[:, :3])
+        changed = replace(situation, modelled=acceleration[:, :3] + change[:, :3])
+        up, down = (measured(s, vehicle=point.vehicle, effects=effects).state for s in (changed, situation))
+        shown: NDArray = up - down
+        return shown if shown.any() else None
 
 
 def relaxed(filtered: NDArray, before: NDArray | None, offset: NDArray) -> NDArray:
@@ -337,15 +358,20 @@ def relaxed(filtered: NDArray, before: NDArray | None, offset: NDArray) -> NDArr
 
 
 def _in_order(swept: Swept, order: NDArray) -> Swept:
-    """The pass with its columns put where they were asked for; -1: a column of zeros."""
-    known = order >= 0
-    if known.all():
-        return replace(swept, score=swept.score[:, order], information=swept.information[:, order][:, :, order])
-    score = np.zeros((len(swept.score), order.size))
-    information = np.zeros((len(swept.score), order.size, order.size))
-    score[:, known] = swept.score[:, order[known]]
-    information[np.ix_(np.arange(len(score)), known, known)] = swept.information[:, order[known]][:, :, order[known]]
-    return replace(swept, score=score, information=information)
+    """The pass with its columns put where they were asked for: the sums of two derivatives; -1: a column of zeros.
+
+    order: (2, columns) places among the derivatives.
+    """
+    score, information = (np.pad(v, [(0, 0)] + [(0, 1)] * (v.ndim - 1)) for v in (swept.score, swept.information))
+    first, more = np.where(order[0] >= 0, order[0], order[1]), np.flatnonzero((order >= 0).all(axis=0))
+    second = order[1, more]
+    ordered, products = score[:, first], information[:, first][:, :, first]
+    ordered[:, more] += score[:, second]
+    cross = information[:, second][:, :, first]
+    products[:, more] += cross
+    products[:, :, more] += np.swapaxes(cross, 1, 2)
+    products[np.ix_(np.arange(len(products)), more, more)] += information[:, second][:, :, second]
+    return replace(swept, score=ordered, information=products)
 
 
 def _before_rotors(name: str) -> bool:

@@ -14,6 +14,7 @@ from crazyem.diagnosis.fitting.gram import Solution, used
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.sampling import TRIM_SD, coarsely_sampled, interval, unlogged_share
 from crazyem.diagnosis.flights.flight import Flight
+from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.vehicle import GRAVITY, Vehicle
 
 # What is never exactly as a vehicle file says, and is therefore always free, within these standard deviations: the
@@ -37,10 +38,16 @@ CENTRE_SD = (2e-5, 2e-5, 7e-4)  # m; a height of -0.4 to -0.8 mm is what velocit
 # rad/s: what a gyro shows of itself in one recording. Mean rates by gyro and by motion capture differ by 0.16 deg/s
 # (rms about x and y of eight slow and medium flights of NanoBench, arXiv 2603.09908).
 GYRO_SD = 2.8e-3
-VELOCITY_SD, JITTER = 2e-3, 3e-3  # relative: no onboard filter is better; m/s, see `jittery`
+# Relative: no onboard filter is better; m/s, of motion capture and of a filter on board: see `jittery`.
+VELOCITY_SD, JITTER, ONBOARD_JITTER = 2e-3, 3e-3, 1e-2
 # s: rates behind the attitude, velocities behind the position, by the filters of the firmware; in 80 flights with
 # nothing hidden 0.0 to 2.4 and 0.0 to 1.6 ms, most in quick ones.
 FILTER, FILTER_SD = (("rate_lag", 1.2e-3), ("velocity_lag", 0.6e-3)), 0.7e-3
+# s: of velocities, where a filter on board makes them: 0.9 to 5.7 ms in ten flights of as many filters.
+ONBOARD_LAG_SD = 2e-3
+# s: fixes draw a velocity back that a filter on board makes without the drag: within 0.17 to 0.46 s in six simulated
+# flights, by the rate and the noise of the fixes. A filter that knows all forces has none of that error.
+LATERAL_MEMORY, LATERAL_MEMORY_SD = ("lateral_memory", 0.2), 0.2
 # Relative: in ten flights with nothing hidden, with the lag free, torques look 2 +- 2 % too strong (-0.5 to +4 %); a
 # longer lag with more torque is nearly the same to a loop whose commands are sampled.
 TORQUE_SD = 0.03
@@ -54,7 +61,7 @@ THRUST_SD = 0.02  # relative
 # s: of the lag of rotors in the calm flights of real drones, 24 to 105 ms in 26 flights for a file's 50, whether
 # anything was wrong with them or not, so a file to which one of them was fitted does not know it.
 DAILY_LAG_SD = 0.025
-FLAPPING_SD, DRAG_SD = 3e-4, 0.02  # N m s/m, N s/m: real rotors have both, bare rigid bodies of files neither
+FLAPPING_SD, DRAG_SD = 3e-5, 1e-3  # N m s/m, N s/m: a tenth of what real rotors have; another day's propellers
 LEANING_SD = (0.02, 0.02, 2e-3)  # rad: an attitude made from the acceleration is tilted as the accelerometer is
 # s: a filter on board that integrates a biased gyro and is drawn back by the fixes stays off by the bias times the time
 # that takes: 0.041, 0.043, 0.041 and 0.038 s in roll and pitch of two simulated flights.
@@ -142,18 +149,24 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
         found.append((Candidate("velocity_scale", (), ("x", "y", "z")), tuple((VELOCITY_SD + jittery(data)) ** -2.0)))
     shown = [f for f, stream in zip(FILTER, ("body_rate", "velocity"), strict=True) if stream in data.signals]
     if shown and ("attitude" in data.signals or "position" in data.signals):
-        found.append(
-            (Candidate("onboard_filter", tuple(shown), tuple(n for n, _ in shown)), (FILTER_SD**-2,) * len(shown))
-        )
+        onboard = {"velocity", "position"} <= data.signals and any(f.fused for f in data.flights)
+        lag = ONBOARD_LAG_SD if onboard else FILTER_SD
+        precision = tuple((lag if name == "velocity_lag" else FILTER_SD) ** -2 for name, _ in shown)
+        if onboard:
+            shown, precision = [*shown, LATERAL_MEMORY], (*precision, LATERAL_MEMORY_SD**-2)
+        found.append((Candidate("onboard_filter", tuple(shown), tuple(n for n, _ in shown)), precision))
     if "body_rate" in data.signals:
         offsets = of_recordings("gyro_bias", ("x", "y", "z"), data.flights)
         found.append((offsets, (GYRO_SD**-2,) * len(offsets.free)))
     if data.differ:
         own = of_recordings("thrust_scale", ("scale",), data.flights)
-        found.append((own, (THRUST_SD**-2,) * len(own.free)))
+        found.append((own, (day_sd(point.vehicle)[0] ** -2,) * len(own.free)))
     if daily:
-        found.append((Candidate(TRIM, (), ("x", "y", "z")), tuple(sd**-2 for sd in TRIM_SD)))
-        found.append((Candidate("thrust_scale", (), ("scale",)), (THRUST_SD**-2,)))
+        known = any(float(v) for v in point.vehicle.effects[TRIM].values())  # or nothing is known of the drone's own
+        tails = CATALOGUE[TRIM].prior.freedom if known else math.inf
+        thrust, *trim = day_sd(point.vehicle)
+        found.append((Candidate(TRIM, (), ("x", "y", "z"), freedom=tails), tuple(sd**-2 for sd in trim)))
+        found.append((Candidate("thrust_scale", (), ("scale",)), (thrust**-2,)))
         found.append((Candidate("velocity_moment", (), ("roll_per_vy", "pitch_per_vx")), (FLAPPING_SD**-2,) * 2))
         found.append((Candidate("linear_drag", (), ("x", "y", "z")), (DRAG_SD**-2,) * 3))
         if lags:
@@ -181,15 +194,24 @@ def differing(flights: Sequence[Flight], kept_apart: Sequence[Flight], vehicle: 
     return [[replace(f, differs=own) for f in part] for part in (flights, kept_apart)]
 
 
+def day_sd(vehicle: Vehicle) -> tuple[float, ...]:
+    """By how much thrust (relative) and trim about x, y, z [m] differ from day to day: as the file says, or as those of
+    any drone."""
+    if vehicle.days is not None:
+        return (vehicle.days.thrust_sd, *vehicle.days.trim_sd)
+    return (THRUST_SD, *TRIM_SD)
+
+
 def jittery(data: Data) -> NDArray:
     """(3,) by how much, relative, the jitter of an onboard estimate makes velocities look too large or too small.
 
     Its errors in position and velocity hang together, so a drone that hardly moves seems to move faster than it does:
     in simulated flights with right velocities by 1 to 3 mm/s, which is 20 % in hover, 1 to 5 % in small shakes, 0.3 %
-    in figures 8.
+    in figures 8; where gyro, pose and filter are as noisy as some are, by up to 10 mm/s.
     """
     moving = [np.nanmean(np.square(f.y[:, 3:6]), axis=0) for f in data.flights if np.isfinite(f.y[:, 3]).any()]
-    jitter: NDArray = JITTER / np.sqrt(np.maximum(np.mean(moving, axis=0) if moving else np.zeros(3), 1e-4))
+    size = ONBOARD_JITTER if any(f.fused for f in data.flights) else JITTER
+    jitter: NDArray = size / np.sqrt(np.maximum(np.mean(moving, axis=0) if moving else np.zeros(3), 1e-4))
     return jitter
 
 

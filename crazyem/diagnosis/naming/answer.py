@@ -13,11 +13,11 @@ from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import by_a_wrong_lag, solved, systematic_sd
-from crazyem.diagnosis.naming.balance import DAYS, Balance, how_weak, prefers
+from crazyem.diagnosis.naming.balance import Balance, how_weak, prefers
 from crazyem.diagnosis.naming.balance import steady as steadily
 from crazyem.diagnosis.naming.corroboration import TELLING
 from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, instead_of_a_load
-from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, one_factor, presence, trust
+from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, one_factor, trust
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, preferred, wald
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -81,7 +81,8 @@ def answer_of(
         away, covariance = _away(candidate, point), all_covariance[own, own]
         rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, selection, witnessed), balance)
         heard = _against(remains, candidate, data)
-        there = trust(heard, step.taken.held_out) * presence(step.taken.held_out)
+        there = step.taken.presence
+        there *= trust(heard, step.taken.held_out) if step.taken.log_odds is None else 1.0
         confidence = there * preferred(step.taken, rivals)
         confidence /= 1.0 + sum(float(np.exp(-nats)) for nats in steady.values())
         doubted = candidate.effect in selection.doubted
@@ -203,9 +204,9 @@ def _by_the_day(candidate: Candidate, point: Point, balance: Balance | None) -> 
         return None
     scale = float(candidate.values(point)["scale"])
     sd = how_weak(balance, int(dict(candidate.fixed)["rotor"]))[1]
-    reach = sd * float(stats.t.ppf(0.975, DAYS))
+    reach = sd * float(stats.t.ppf(0.975, balance.freedom))
     value = Value(scale, candidate.parameter("scale").unit, sd, (max(scale - reach, 0.0), scale + reach))
-    return {"scale": value}, 2.0 * float(stats.t.sf((1.0 - scale) / sd, DAYS))
+    return {"scale": value}, 2.0 * float(stats.t.sf((1.0 - scale) / sd, balance.freedom))
 
 
 def _steady_rivals(

@@ -19,8 +19,7 @@ from scipy.optimize import lsq_linear, minimize_scalar
 from crazyem.diagnosis.fitting.candidates import ON_BOARD, TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, refine
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import THRUST_SD, nuisances, solved, with_nuisances
-from crazyem.diagnosis.fitting.sampling import TRIM_SD
+from crazyem.diagnosis.fitting.nuisances import day_sd, nuisances, solved, with_nuisances
 from crazyem.diagnosis.naming.alternatives import exchanged
 from crazyem.diagnosis.naming.corroboration import TELLING
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
@@ -29,6 +28,9 @@ from crazyem.physics.rotors import wrench
 # Degrees of freedom of the day's covariance: known from some twelve days of two drones, four numbers each. Normal tails
 # would be sure of what a propeller that was taken off and put on again may do.
 DAYS = 8.0
+# Flights that the spread of other drones' days is worth beside a drone's own: days of two drones differ by a factor of
+# four (CrazyPAD, docs/results/diagnosis_real.md), so it is little.
+OTHERS = 2.0
 HEAVIEST = 1.0  # a load's weight over the drone's
 # How many of the four numbers each moves freely; a rotor's are in one ratio, a load's bounded by where it can be.
 FREE = {"rotor_fault": 1, "thrust_scale": 1, "battery_sag": 1, "suspended_load": 1, "wind": 3, "payload": 3}
@@ -43,11 +45,13 @@ class Balance:
         lack: (4,) thrust that is missing, relative; torque that acts besides, over thrust, about x, y, z [m], body.
         covariance: (4, 4) of it, from day to day and as it was fitted.
         rotors: (4, 4) rows: what each rotor does to it that has no thrust.
+        freedom: degrees of freedom of the t distribution from day to day.
     """
 
     lack: NDArray
     covariance: NDArray
     rotors: NDArray
+    freedom: float = DAYS
 
 
 def balance_of(data: Data, point: Point) -> Balance:
@@ -62,8 +66,10 @@ def balance_of(data: Data, point: Point) -> Balance:
     )
     as_lack = np.diag([-1.0 / filed[0], 1.0, 1.0, 1.0])  # stronger lacks less
     own = as_lack @ solved(fitted)[0].covariance[:4, :4] @ as_lack
-    days = np.diag(np.square([THRUST_SD, *TRIM_SD]))
-    return Balance(as_lack @ (found - filed), own + days, without_each(data, point))
+    days = point.vehicle.days
+    freedom = DAYS if days is None else OTHERS + days.flights - 1.0
+    covariance = own + np.diag(np.square(day_sd(point.vehicle)))
+    return Balance(as_lack @ (found - filed), covariance, without_each(data, point), freedom)
 
 
 def without_each(data: Data, point: Point) -> NDArray:
@@ -86,17 +92,17 @@ def balance_loglik(balance: Balance, effect: str, fixed: Mapping[str, Any]) -> f
     if effect == "rotor_fault":
         moved = root @ balance.rotors[int(fixed["rotor"]) - 1]
         rest = lack - moved * np.clip(moved @ lack / (moved @ moved), 0.0, 1.0)
-        return _likely(float(rest @ rest)) - FREE[effect]
+        return likely(float(rest @ rest), balance.freedom) - FREE[effect]
     if effect == "payload":
-        return _likely(_loaded(root, lack)) - FREE[effect]
+        return likely(_loaded(root, lack), balance.freedom) - FREE[effect]
     moves = root[:, [0]] if effect in BY_THRUST else root[:, 1:3]
     rest = lack - moves @ np.linalg.lstsq(moves, lack, rcond=None)[0]
-    return _likely(float(rest @ rest)) - FREE[effect]
+    return likely(float(rest @ rest), balance.freedom) - FREE[effect]
 
 
-def _likely(distance: float) -> float:
-    """Log-likelihood of four numbers at this squared distance, by a t distribution of `DAYS`, but for a constant."""
-    return -0.5 * (DAYS + 4.0) * float(np.log1p(distance / DAYS))
+def likely(distance: float, freedom: float) -> float:
+    """Log-likelihood of four numbers at this squared distance, by a t distribution, but for a constant."""
+    return -0.5 * (freedom + 4.0) * float(np.log1p(distance / freedom))
 
 
 def _loaded(root: NDArray, lack: NDArray) -> float:
@@ -144,7 +150,7 @@ def hidden_by_the_day(data: Data, selection: Selection, asked: Sequence[Candidat
     except (DivergedError, np.linalg.LinAlgError):
         return {}
     lacks = [how_weak(balance, rotor) for rotor in (1, 2, 3, 4)]
-    reach = float(stats.t.ppf(0.975, DAYS)) * max(sd for _, sd in lacks)
+    reach = float(stats.t.ppf(0.975, balance.freedom)) * max(sd for _, sd in lacks)
     each = ", ".join(str(round(100 * lack)) for lack, _ in lacks)
     text = (
         f"what changes from day to day hides a rotor that lacks up to {100 * reach:.0f} % of its thrust; by what is "

@@ -7,8 +7,7 @@ import numpy as np
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import HANGING_SD, THRUST_SD, jittery, usual_wind
-from crazyem.diagnosis.fitting.sampling import TRIM_SD
+from crazyem.diagnosis.fitting.nuisances import HANGING_SD, day_sd, jittery, usual_wind
 
 # Smaller than this, these are not told from what filters, sampling and the air of a room do: s, s, s, 1, rad, rad/s, 1,
 # 1, N m s/m. And no rotor is lighter, kg m^2: a rod of 0.1 g and 46 mm has 1.8e-8, and this is a sixth of it.
@@ -57,13 +56,13 @@ def _other_load(point: Point, here: Mapping[str, float], filed: Mapping[str, flo
     daily = TRIM in point.vehicle.effects
     heavier = abs(here["mass"] - filed["mass"])
     least = WEIGHED * HANGING_SD["mass"] if "length" in here else LEAST_LOAD
-    if heavier > (THRUST_SD if daily else least) * point.vehicle.mass:
+    if heavier > (day_sd(point.vehicle)[0] if daily else least) * point.vehicle.mass:
         return True
     if "x" not in here or not (daily or filed["mass"] > 0.0):
         return False
     along_x, along_y = (here["mass"] * here[n] - filed["mass"] * filed[n] for n in "xy")
     drawn = float(np.hypot(along_x, along_y)) / point.vehicle.mass
-    return drawn > (DRAWN * TRIM_SD[0] if daily else LEAST_CENTRE["x"])
+    return drawn > (DRAWN * day_sd(point.vehicle)[1] if daily else LEAST_CENTRE["x"])
 
 
 def _outweighs(point: Point, candidate: Candidate, data: Data) -> bool:

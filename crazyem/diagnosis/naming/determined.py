@@ -9,13 +9,16 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
+from scipy.special import expit
+
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.naming.answer import numbers_of
 from crazyem.diagnosis.naming.balance import Balance, by_balance
-from crazyem.diagnosis.naming.named import Named, Value, presence
+from crazyem.diagnosis.naming.named import Named, Value
+from crazyem.diagnosis.naming.presence import presence
 from crazyem.diagnosis.naming.prune import left_out
 from crazyem.diagnosis.naming.steady import with_exact_torques
 from crazyem.diagnosis.naming.trials import Selection
@@ -34,7 +37,7 @@ def determined(effects: Sequence[Named], point: Point) -> tuple[tuple[Named, ...
     kept, gone = [], {}
     for effect in effects:
         candidate = Candidate(effect.name, tuple(effect.chosen.items()), tuple(effect.parameters))
-        reason = not_determined(candidate, effect.parameters, point) or improbable(effect.held_out_nats)
+        reason = not_determined(candidate, effect.parameters, point) or improbable(_presence(effect))
         if reason:
             gone[effect.name] = reason
         else:
@@ -68,9 +71,13 @@ def not_determined(candidate: Candidate, parameters: Mapping[str, Value], point:
     return ""
 
 
-def improbable(held_out_nats: float) -> str:
-    """Why an effect that brings so many nats on flight held out is no finding; "" if it is one."""
-    chance = presence(held_out_nats)
+def _presence(effect: Named) -> float:
+    """Probability that the effect is there, whatever its look-alikes."""
+    return presence(effect.held_out_nats) if effect.log_odds is None else float(expit(effect.log_odds))
+
+
+def improbable(chance: float) -> str:
+    """Why an effect that is there with this probability is no finding; "" if it is one."""
     if chance >= TOLD:
         return ""
     return (
@@ -111,7 +118,7 @@ def without_undetermined(
             (trial.evidence, candidate, found, reason)
             for trial, candidate, found in zip(taken, selection.accepted, numbers, strict=True)
             if candidate.effect not in besides
-            and (reason := not_determined(candidate, found, selection.final) or improbable(trial.held_out))
+            and (reason := not_determined(candidate, found, selection.final) or improbable(trial.presence))
         ]
         if not doubted:
             return selection, balance, gone

@@ -7,7 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, bounds_of, held_near, moved
+from crazyem.diagnosis.fitting.fit import (
+    Data,
+    DivergedError,
+    Fitted,
+    bounds_of,
+    freedom_of,
+    held_near,
+    local_precision,
+    moved,
+)
 from crazyem.diagnosis.fitting.gram import bounded
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import nuisances
@@ -74,13 +83,16 @@ def gain_of_both(
         *(c.values(there.point)[n] - c.values(fitted.point)[n] for c in accepted for n in c.free),
         *(c.values(there.point)[n] - c.neutral(there.point)[n] for c, _ in free for n in c.free),
     ])  # fmt: skip
-    known = np.diag([*np.zeros(own), *(w for _, precision in free for w in precision)])
+    freedom = np.append(np.full(own, np.inf), freedom_of([c for c, _ in free]))
+    usual = np.array([*np.zeros(own), *(w for _, precision in free for w in precision)])
+    known = np.diag(local_precision(away, usual, freedom))
     differing = np.divide(1.0, paid, out=np.zeros(own), where=paid > 0.0)
     curvature = fitted.gram.total(range(fitted.gram.size))[1] + np.diag(fitted.precision)
     known[:own, :own] = _inverse(_inverse(curvature)[:own, :own] + np.diag(2.0 * differing))
     back = 0.5 * float(paid @ np.square(away[:own]) - away[:own] @ known[:own, :own] @ away[:own])
     rest = score - known @ away
-    low, high = held_near(*bounds_of(parts, there.point), away, np.diag(known) * (np.arange(len(away)) >= own))
+    near = np.diag(known) * (np.arange(len(away)) >= own)
+    low, high = held_near(*bounds_of(parts, there.point), away, near, freedom)
     step = bounded(information + known, rest, low, high)
     told = float(rest @ step - 0.5 * step @ (information + known) @ step)
     blocks, covariance = held_out.block_loglik(there.point), known_of(accepted, information + known)

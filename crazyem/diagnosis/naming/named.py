@@ -9,11 +9,6 @@ from scipy import stats
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
 
-# Probability that a name is right, by what it brings on flight held out [nats]: log-odds are SLOPE log(nats / EVEN), at
-# most CALIBRATED. Models are approximate: on healthy flights of random worlds wrong names gain tens of nats, and their
-# gains have a heavy tail. By 48 names in 67 random and foreign worlds (seeds 5050, 71001, 6060) EVEN is 42 and SLOPE
-# 1.15 (EVEN 30 to 90 within 0.5 of log-likelihood); the lower end is taken, by which fewest effects are lost.
-EVEN, SLOPE, CALIBRATED = 30.0, 1.1, 0.95
 # Confidence at most beside structure that a name does not outweigh, or where something that shakes explains as much.
 DOUBTFUL = 0.45
 # Times the nats of what is left, from which a name beside it is as likely right as not. Of 88 names beside structure in
@@ -84,13 +79,6 @@ def trust(remains: Unexplained, held_out_nats: float = 0.0) -> float:
         return explained
     times = max(held_out_nats, 0.0) / max(remains.nats, 1e-9)
     return min(explained, max(DOUBTFUL, times**2 / (times**2 + OUTWEIGHS**2)))
-
-
-def presence(held_out_nats: float) -> float:
-    """Probability that an effect is there, whatever its look-alikes, by what it brings on flight held out [nats]."""
-    if held_out_nats <= 0.0:
-        return 0.0
-    return min(CALIBRATED, 1.0 / (1.0 + (EVEN / held_out_nats) ** SLOPE))
 
 
 def one_factor(values: NDArray, neutral: NDArray, covariance: NDArray) -> bool:

@@ -11,7 +11,8 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import usual_gusts
 from crazyem.diagnosis.naming import accelerometer, rotor_response
 from crazyem.diagnosis.naming.gusts import find_gusts
-from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, around, presence, trust
+from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, around, trust
+from crazyem.diagnosis.naming.presence import presence
 from crazyem.diagnosis.naming.prune import ADMITTED
 from crazyem.diagnosis.naming.trials import SURE
 from crazyem.diagnosis.naming.unexplained import Unexplained

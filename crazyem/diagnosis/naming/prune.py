@@ -42,7 +42,7 @@ def drop(
     not heed its command, which needs no scale.
     """
     accepted, steps = list(accepted), list(steps)
-    kept: list[Candidate] = []
+    kept = [s.taken.candidate for s in steps if s.taken and s.taken.log_odds is not None]  # by other evidence
     usual = set() if held_out is None else {c.effect for c, _ in nuisances(held_out, fitted.point, ())}
     while accepted:
         here = data.loglik(fitted.point, passes=2)

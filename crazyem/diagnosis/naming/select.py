@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
-from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, held_near
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, freedom_of, held_near, local_precision
 from crazyem.diagnosis.fitting.gram import Solution
 from crazyem.diagnosis.fitting.model import Column, Noise, Point
 from crazyem.diagnosis.fitting.nuisances import (
@@ -32,6 +32,7 @@ from crazyem.diagnosis.naming.onset import date, onset_of
 from crazyem.diagnosis.naming.prune import ADMITTED, drop, shaken, survive
 from crazyem.diagnosis.naming.starting_points import best_begun
 from crazyem.diagnosis.naming.steady import as_steady, by_onsets, without_trim_rivals
+from crazyem.diagnosis.naming.steady_odds import by_days
 from crazyem.diagnosis.naming.trials import (
     SURE,
     Selection,
@@ -80,13 +81,15 @@ def linear_trials(
         columns += added
     gram = data.gram(point, columns)
     always = [i for group in index[: len(base)] for i in group]
-    weights = np.array([0.0 for c in accepted for _ in c.free] + [w for _, p in free for w in p])
     low = np.array([b for c in base for b in c.bounds(point)[0]])
     high = np.array([b for c in base for b in c.bounds(point)[1]])
     away = [c.neutral(point)[n] - c.values(point)[n] for c, _ in free for n in c.free]
     centre = np.array([0.0 for c in accepted for _ in c.free] + away)
+    freedom = np.append(np.full(len(centre) - len(away), np.inf), freedom_of([c for c, _ in free]))
+    weights = np.array([0.0 for c in accepted for _ in c.free] + [w for _, p in free for w in p])
+    weights = local_precision(centre, weights, freedom)
     wide_low, wide_high = low, high
-    low, high = held_near(low, high, -centre, weights)
+    low, high = held_near(low, high, -centre, weights, freedom)
     zero = gram.solve(always, precision=weights, prior=centre, low=low, high=high) if always else None
     gain0, held0 = (zero.gain, zero.held_out) if zero else (0.0, 0.0)
     found = []
@@ -281,6 +284,7 @@ def select(
     while True:
         rest = [c for c in candidates if may_join(c.effect, {a.effect for a in accepted})]
         rest = without_trim_rivals(rest, accepted)
+        rest = [c for c in rest if not by_days(point.vehicle, c)]
         say(f"looking for effect {len(accepted) + 1} among {len(rest)} candidates")
         linear = linear_trials(data, point, accepted, best_begun(data, point, accepted, rest))
         if len(accepted) > first:

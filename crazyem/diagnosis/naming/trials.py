@@ -13,6 +13,7 @@ from crazyem.diagnosis.fitting.fit import Fitted
 from crazyem.diagnosis.fitting.gram import MANY, Gram
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import solved
+from crazyem.diagnosis.naming.presence import CALIBRATED, presence
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 SURE = 1e-3  # p-value of the score test, before counting candidates,
@@ -42,6 +43,7 @@ class Trial:
             free parameters cost.
         recording: (b,) int, which recording each block is of.
         tuned: nats that it costs that its parameters might have been anything (`evidence.tuning`); None: one for each.
+        log_odds: log posterior odds that it is there, where they are known (`steady_odds.py`); None: by `held_out`.
     """
 
     candidate: Candidate
@@ -55,6 +57,12 @@ class Trial:
     value: float = 0.0
     recording: NDArray = field(default_factory=lambda: np.zeros(0, int))
     tuned: float | None = None
+    log_odds: float | None = None
+
+    @property
+    def presence(self) -> float:
+        """Probability that it is there, whatever its look-alikes."""
+        return presence(self.held_out) if self.log_odds is None else min(CALIBRATED, float(expit(self.log_odds)))
 
     @property
     def worth(self) -> float:

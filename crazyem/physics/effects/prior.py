@@ -9,6 +9,7 @@ Two standard deviations about neutral, of a normal distribution cut to the range
 They stand with the effects, each with its source. Diagnosis knows nothing else of an effect's size.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -60,6 +61,7 @@ class Prior:
         usual: from recording to recording; or as a function of what was logged.
         per: what the sizes of a parameter are shares of: "mass" or "inertia" (about x) of the vehicle, or
             "neutral", the parameter's own neutral value; SI where absent.
+        freedom: degrees of freedom of Student's t distribution, which `usual` is the scale of; infinite: a normal one.
         together: correlation of `own` between the parameters.
         unnamed: stands for what no effect of the catalogue is: it competes, and is told as unexplained.
     """
@@ -67,6 +69,7 @@ class Prior:
     own: Sizes = field(default_factory=dict)
     usual: Sizes | Callable[[Logged], Sizes] = field(default_factory=dict)
     per: Mapping[str, str] = field(default_factory=dict)
+    freedom: float = math.inf
     together: float = 0.0
     unnamed: bool = False
 

@@ -1,0 +1,59 @@
+"""What healthy flights of a drone say of its days: its own trim and thrust, and by how much these differ."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crazyem.diagnosis.fitting.candidates import TRIM
+from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.fitting.fit import nominal as nominal_of
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
+from crazyem.diagnosis.fitting.nuisances import day_sd, with_trim_noise
+from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.naming.balance import OTHERS, balance_of
+from crazyem.errors import UsageError
+from crazyem.recordings.recording import Recording
+from crazyem.vehicle import Days, Vehicle
+
+
+def with_baseline(
+    vehicle: Vehicle, recordings: Sequence[Recording], say: Callable[[str], None] = lambda text: None
+) -> Vehicle:
+    """The vehicle with trim and thrust as the mean of healthy flights, and with how these differ (`Days`).
+
+    Args:
+        recordings: flights of this drone with nothing wrong, of several days.
+
+    Raises:
+        UsageError: fewer than two flights. DataError: a recording cannot be used.
+    """
+    if len(recordings) < 2:
+        raise UsageError("--baseline needs two healthy flights or more: one does not say how days differ.")
+    trim = {"x": 0.0, "y": 0.0, "z": 0.0, **vehicle.effects.get(TRIM, {})}
+    known = replace(vehicle, effects={**vehicle.effects, TRIM: trim}, days=None)
+    lacks = []
+    for recording in recordings:
+        say(f"healthy flight {recording.path}")
+        data = Data([flight_of(recording, known)])
+        point = nominal_of(data, Point(known, {n: dict(v) for n, v in known.effects.items()}, first_guess()))
+        lacks.append(balance_of(data, with_trim_noise(data, point)).lack)
+    mean, sd = spread_of(np.array(lacks), np.array(day_sd(known)))
+    thrust = float(known.effects.get("thrust_scale", {}).get("scale", 1.0)) * (1.0 - float(mean[0]))
+    own = {axis: float(trim[axis] + m) for axis, m in zip("xyz", mean[1:], strict=True)}
+    effects = {**known.effects, TRIM: own, "thrust_scale": {"scale": thrust}}
+    days = Days(len(recordings), float(sd[0]), (float(sd[1]), float(sd[2]), float(sd[3])))
+    return replace(known, effects=effects, days=days)
+
+
+def spread_of(found: NDArray, usual: NDArray) -> tuple[NDArray, NDArray]:
+    """(k,) means of numbers of flights (n, k), and (k,) the scale of the t distribution of the next flight's.
+
+    usual: (k,) standard deviations of any drone, which count as `OTHERS` flights (conjugate prior of a variance, e.g.
+    Gelman et al., Bayesian Data Analysis, 3.3). Degrees of freedom: `OTHERS` + n - 1.
+    """
+    n, mean = len(found), found.mean(axis=0)
+    squares = OTHERS * np.square(usual) + np.square(found - mean).sum(axis=0)
+    return mean, np.sqrt(squares / (OTHERS + n - 1.0) * (1.0 + 1.0 / n))

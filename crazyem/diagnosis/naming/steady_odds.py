@@ -1,0 +1,134 @@
+"""Whether a rotor is weak or a load is on board: posterior odds by what is steady in every flight.
+
+A trim that changes from day to day looks like both. The filter's likelihood therefore leaves the trim free, with heavy
+tails (`Prior.freedom`), and says little of what is steady. The steady numbers of each flight (`balance.py`) are
+compared with what days differ by: a weak rotor or a load is the same in all flights, a day's trim is not.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import logit, logsumexp
+
+from crazyem.diagnosis.fitting.candidates import ON_BOARD, TRIM, Candidate
+from crazyem.diagnosis.fitting.fit import Data, DivergedError
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.nuisances import refine_base
+from crazyem.diagnosis.naming.balance import FREE, HEAVIEST, Balance, balance_of, likely, steady
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial
+from crazyem.vehicle import Vehicle
+
+MISSING = 0.05  # prior probability that one effect is missing from a vehicle file (posterior.md: 0.05 an effect)
+TOLD = 0.5  # posterior probability from which an effect is a finding
+LOOK_ALIKE = 0.05  # posterior probability from which another explanation is told as a look-alike
+Lack = Callable[[NDArray, Balance], NDArray]  # what an effect with these numbers moves of a balance
+
+
+def _rotor(index: int) -> tuple[Lack, list[tuple[float, float]]]:
+    return (lambda x, balance: x[0] * balance.rotors[index]), [(0.0, 1.0)]
+
+
+def _load(x: NDArray, balance: Balance) -> NDArray:
+    """Share of the whole weight, and where it is along x and y over the furthest place on board."""
+    return np.array([x[0], x[0] * ON_BOARD * x[1], x[0] * ON_BOARD * x[2], 0.0])
+
+
+def _thrust(x: NDArray, balance: Balance) -> NDArray:
+    return np.array([x[0], 0.0, 0.0, 0.0])
+
+
+def _air(x: NDArray, balance: Balance) -> NDArray:
+    return np.array([0.0, x[0], x[1], 0.0])
+
+
+def explanations(balances: Sequence[Balance]) -> dict[tuple[str, int], tuple[float, NDArray]]:
+    """(effect, rotor; 0 for others) -> log posterior weight [nats] and its numbers; ("", 0): nothing but the days.
+
+    The most that each explains of all balances together, less one nat a number (`FREE`).
+    """
+    asked: dict[tuple[str, int], tuple[Lack, list[tuple[float, float]]]] = {
+        **{("rotor_fault", r): _rotor(r - 1) for r in (1, 2, 3, 4)},
+        ("payload", 0): (_load, [(0.0, HEAVIEST / (1.0 + HEAVIEST)), (-1.0, 1.0), (-1.0, 1.0)]),
+        ("thrust_scale", 0): (_thrust, [(-1.0, 1.0)]),
+        ("wind", 0): (_air, [(-ON_BOARD, ON_BOARD)] * 2),
+    }
+    roots = [np.linalg.cholesky(np.linalg.inv(b.covariance)).T for b in balances]
+
+    def loglik(moves: Callable[[Balance], NDArray]) -> float:
+        rest = [root @ (b.lack - moves(b)) for root, b in zip(roots, balances, strict=True)]
+        return sum(likely(float(r @ r), b.freedom) for r, b in zip(rest, balances, strict=True))
+
+    found = {("", 0): (np.log1p(-MISSING) + loglik(lambda b: np.zeros(4)), np.zeros(0))}
+    for (effect, rotor), (lack, ends) in asked.items():
+        starts = [np.array([0.1 * high, *(0.0 for _ in ends[1:])]) for high in (ends[0][1], 3.0 * ends[0][1])]
+        best = min(
+            (
+                minimize(lambda x, f=lack: -loglik(lambda b: f(x, b)), start, bounds=ends, method="L-BFGS-B")
+                for start in starts
+            ),
+            key=lambda r: float(r.fun),
+        )
+        prior = np.log(MISSING / sum(e == effect for e, _ in asked))
+        found[effect, rotor] = (prior - float(best.fun) - FREE[effect], best.x)
+    return found
+
+
+def steady_first(
+    data: Data, apart: Data | None, nominal: Point, asked: Sequence[Candidate], say: Callable[[str], None]
+) -> Selection | None:
+    """A selection that begins with a weak rotor or a load, where all flights' balances make one more probable than not.
+
+    None where they do not, or where the vehicle file has no trim that is known.
+    """
+    mine = [c for c in asked if by_days(nominal.vehicle, c)]
+    if not mine:
+        return None
+    try:
+        flights = [*data.each(), *(apart.each() if apart is not None else ())]
+        found = explanations([balance_of(one, nominal) for one in flights])
+        total = float(logsumexp([weight for weight, _ in found.values()]))
+        chance = {name: float(np.exp(weight - total)) for name, (weight, _) in found.items()}
+        best = max(chance, key=lambda name: chance[name])
+        candidate = next((c for c in mine if _is(c, best)), None)
+        if candidate is None or chance[best] < TOLD:
+            return None
+        say(f"by what is steady in all flights: {candidate.label} with {chance[best]:.2f}")
+        before = refine_base(data.twin(), nominal, ())
+        start = nominal.with_effects({candidate.effect: _values(candidate, found[best][1], nominal)})
+        fitted = refine_base(data, start, [candidate])
+    except (DivergedError, np.linalg.LinAlgError):  # then the filter's likelihood is all there is
+        return None
+    odds = float(logit(min(chance[best], 1.0 - 1e-12)))
+    gain = fitted.loglik - before.loglik
+    trial = Trial(candidate, gain, max(odds, 0.0), 1.0, 1.0 - chance[best], odds, fitted, log_odds=odds)
+    alike = tuple(
+        replace(trial, candidate=other, fitted=None)
+        for other in asked
+        if other.effect != candidate.effect and any(_is(other, name) and p > LOOK_ALIKE for name, p in chance.items())
+    )
+    step = Step((trial, *alike), trial, alike)
+    return Selection(before.point, fitted.point, (step,), (candidate,), fitted, len(asked))
+
+
+def by_days(vehicle: Vehicle, candidate: Candidate) -> bool:
+    """Whether a candidate is told by the balance alone: a weak rotor or a load, where the vehicle's trim is known."""
+    known = any(float(v) for v in vehicle.effects.get(TRIM, {}).values())
+    return known and candidate.effect in ("rotor_fault", "payload") and steady(candidate)
+
+
+def _is(candidate: Candidate, name: tuple[str, int]) -> bool:
+    fixed = dict(candidate.fixed)
+    return candidate.effect == name[0] and fixed.get("rotor", 0) == name[1] and steady(candidate)
+
+
+def _values(candidate: Candidate, numbers: NDArray, point: Point) -> Mapping[str, float]:
+    """Numbers of a balance as parameters of the effect."""
+    values = candidate.neutral(point)
+    if candidate.effect == "rotor_fault":
+        return {**values, "scale": 1.0 - float(numbers[0])}
+    mass = point.vehicle.mass * float(numbers[0]) / (1.0 - float(numbers[0]))
+    # a load at (x, y) turns the drone by -y about x and by x about y, per weight
+    return {**values, "mass": mass, "x": ON_BOARD * float(numbers[2]), "y": -ON_BOARD * float(numbers[1])}
