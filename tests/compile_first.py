@@ -2,7 +2,8 @@
 
 python tests/compile_first.py
 
-`make test` runs it once. Whatever fails here fails in the tests, which say why.
+Kernels to machine code, and the modules of the tests to bytecode. `make test` runs it once. Whatever fails here fails
+in the tests, which say why.
 """
 
 import subprocess
@@ -17,6 +18,14 @@ from crazyem.vehicle import load_vehicle
 warm_up(load_vehicle("cf2"))
 """
 
+MADE_FLIGHTS = """
+import sys
+sys.path.insert(0, "tests/crazyem")
+import closed_loop, synthetic
+closed_loop.fly(seconds=1.0)
+synthetic.fly(duration=1.0)
+"""
+
 
 def python(*arguments: str) -> subprocess.Popen[str]:
     """A child process that says nothing but what it prints."""
@@ -25,9 +34,9 @@ def python(*arguments: str) -> subprocess.Popen[str]:
     )
 
 
-def simulated() -> None:
+def simulated(*arguments: str) -> None:
     """Once the simulator says where it listens, it is compiled."""
-    simulator = python("-m", "firmware_sim", "--port", "0")
+    simulator = python("-m", "firmware_sim", "--port", "0", *arguments)
     assert simulator.stdout is not None
     while (line := simulator.stdout.readline()) and "udp://" not in line:
         pass
@@ -42,12 +51,15 @@ def diagnosed(folder: str) -> None:
 
 
 def main() -> None:
-    """The estimator beside the simulator and the diagnosis, which take as long."""
-    estimator = python("-c", ESTIMATOR)
+    """The estimator, then the tests' flights, beside the simulator and the diagnosis, which take as long."""
+    collection = python("-m", "pytest", "-qq", "--collect-only", "-p", "no:cacheprovider")
+    estimator = python("-c", ESTIMATOR + MADE_FLIGHTS)
     with TemporaryDirectory() as folder:
         simulated()
+        simulated("--scenario", "firmware_sim/scenarios/payload_drop.toml")
         diagnosed(folder)
-    estimator.communicate()
+    for one in (estimator, collection):
+        one.communicate()
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ DEGREES = 180.0 / math.pi
 G = 9.81
 UP = np.array([0.0, 0.0, 1.0])
 EVERYTHING = ("onboard", "mocap", "accelerations", "angles")
-SIZES = settings(max_examples=5)
+SIZES = settings(max_examples=settings.default.max_examples // 5)  # each takes half a second
 REVIEWED = json.loads((Path(__file__).parent / "expectations" / "crazypad.json").read_text())["recordings"]
 
 
@@ -56,32 +57,31 @@ def repaired(recording: Recording, finding: Finding) -> Recording:
 # ---- silence ----
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_sound_flights_raise_no_finding(seed: int) -> None:
-    flight = made_flight(seed=seed, seconds=30.0, more=EVERYTHING, jitter=0.1, loss=0.02 * seed)
+    flight = made_flight(seed=seed, seconds=25.0, more=EVERYTHING, jitter=0.1, loss=0.04 * seed)
     assert found_in(flight) == []
 
 
-@pytest.mark.parametrize(
-    "flight",
-    [
-        made_flight(Motion(seconds=20.0, size=0.0, yaw=0.0)),
-        made_flight(Motion(seconds=20.0, size=0.15, yaw=0.0), noise=3.0),
-        made_flight(Motion(seconds=25.0, turn=1.0), rates={"state": 74.0, "imu": 1000.0}),
-        made_flight(seconds=25.0, rates={"state": 30.0, "imu": 100.0}, noise=2.0),
-        made_flight(seconds=25.0, gaps={"imu": [(8.0, 11.0)], "state": [(15.0, 15.3)]}),
-        made_flight(seconds=25.0, without=["state"]),
-        made_flight(seconds=25.0, without=["imu"]),
-        made_flight(seconds=1.0),
-    ],
-    ids=["hover", "slow and noisy", "74 Hz and 1 kHz", "30 Hz", "gaps", "no pose", "no IMU", "one second"],
-)
-def test_sound_flights_of_other_kinds_raise_no_finding(flight: Recording) -> None:
-    assert found_in(flight) == []
+KINDS: dict[str, dict[str, Any]] = {
+    "hover": {"motion": Motion(seconds=20.0, size=0.0, yaw=0.0)},
+    "slow and noisy": {"motion": Motion(seconds=20.0, size=0.15, yaw=0.0), "noise": 3.0},
+    "74 Hz and 1 kHz": {"motion": Motion(seconds=20.0, turn=1.0), "rates": {"state": 74.0, "imu": 1000.0}},
+    "30 Hz": {"seconds": 25.0, "rates": {"state": 30.0, "imu": 100.0}, "noise": 2.0},
+    "gaps": {"seconds": 25.0, "gaps": {"imu": [(8.0, 11.0)], "state": [(15.0, 15.3)]}},
+    "no pose": {"seconds": 20.0, "without": ["state"]},
+    "no IMU": {"seconds": 20.0, "without": ["imu"]},
+    "one second": {"seconds": 1.0},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_sound_flights_of_other_kinds_raise_no_finding(kind: str) -> None:
+    assert found_in(made_flight(**KINDS[kind])) == []
 
 
 @given(seed=st.integers(0, 100_000), noise=st.floats(0.2, 4.0), size=st.floats(0.0, 0.8), turn=st.floats(-1.0, 1.0))
-@settings(max_examples=4)
+@settings(max_examples=3)
 def test_sound_flights_of_any_size_raise_no_finding(seed: int, noise: float, size: float, turn: float) -> None:
     motion = Motion(seconds=25.0, seed=seed, size=size, turn=turn)
     assert found_in(made_flight(motion, seed=seed, noise=noise, more=EVERYTHING)) == []
@@ -120,8 +120,8 @@ def test_garbage_is_judged_without_a_word_of_numpy(seed: int) -> None:
 
 # ---- what is wrong is named ----
 
-FLIGHT = made_flight(seconds=20.0, seed=3, more=("mocap", "accelerations", "angles"))
-_TURN = Motion(seconds=20.0, seed=3)
+FLIGHT = made_flight(seconds=12.0, seed=3, more=("mocap", "accelerations", "angles"))
+_TURN = Motion(seconds=12.0, seed=3)
 
 
 def _value(name: str) -> np.ndarray:
@@ -232,7 +232,7 @@ scales = st.one_of(st.floats(0.8, 0.93), st.floats(1.07, 1.25))
 @given(factor=scales, seed=st.integers(0, 50))
 @SIZES
 def test_scale_faults_are_found_with_their_size(factor: float, seed: int) -> None:
-    flight = made_flight(Motion(seconds=30.0, seed=seed), seed=seed, more=("mocap", "accelerations"))
+    flight = made_flight(Motion(seconds=20.0, seed=seed), seed=seed, more=("mocap", "accelerations"))
     for check, name in (("rates", "body_rate"), ("velocities", "velocity"), ("forces", "specific_force")):
         broken = changed(flight, name, value=flight.signals[name].value * factor)
         findings = [f for f in found_in(broken, check) if f.signal == name]
@@ -247,7 +247,7 @@ def test_scale_faults_are_found_with_their_size(factor: float, seed: int) -> Non
 @given(factor=scales, axis=st.integers(0, 2), seed=st.integers(0, 50))
 @SIZES
 def test_a_scale_fault_of_one_axis_is_that_axis_alone(factor: float, axis: int, seed: int) -> None:
-    flight = made_flight(Motion(seconds=30.0, seed=seed), seed=seed, more=("mocap",))
+    flight = made_flight(Motion(seconds=20.0, seed=seed), seed=seed, more=("mocap",))
     gains = np.ones(3)
     gains[axis] = factor
     (finding,) = found_in(changed(flight, "body_rate", value=flight.signals["body_rate"].value * gains), "rates")
@@ -268,13 +268,13 @@ def test_positions_of_two_origins_are_compared(factor: float) -> None:
 @SIZES
 def test_a_tilted_frame_is_told_from_a_biased_accelerometer(degrees: float, heading: float, seed: int) -> None:
     axis = np.array([math.cos(heading), math.sin(heading), 0.0])
-    tilted = made_flight(Motion(seconds=30.0, seed=seed), seed=seed, tilt=math.radians(degrees) * axis)
+    tilted = made_flight(Motion(seconds=20.0, seed=seed), seed=seed, tilt=math.radians(degrees) * axis)
     (finding,) = found_in(tilted, "tilt")
     assert "tilted by" in finding.text
     assert finding.grade == (Grade.DEGRADES if finding.evidence["tilt_deg"] >= 1.5 else Grade.HARMLESS)
     assert abs(finding.evidence["tilt_deg"] - degrees) < 0.15
     assert finding.evidence["tilt_low_deg"] - 0.1 <= degrees <= finding.evidence["tilt_high_deg"] + 0.1
-    biased = made_flight(Motion(seconds=30.0, seed=seed), seed=seed, bias=G * math.radians(degrees + 2.0) * axis)
+    biased = made_flight(Motion(seconds=20.0, seed=seed), seed=seed, bias=G * math.radians(degrees + 2.0) * axis)
     (finding,) = found_in(biased, "tilt")
     assert finding.signal == "specific_force"
     assert abs(finding.evidence["body_deg"] - degrees - 2.0) < 0.15
@@ -294,7 +294,7 @@ def test_tilt_and_bias_are_not_told_apart_without_turning() -> None:
 )
 @SIZES
 def test_a_lag_is_found_with_its_size_and_taken_out(late: float, stream: str, seed: int) -> None:
-    motion = Motion(seconds=30.0, seed=seed)
+    motion = Motion(seconds=20.0, seed=seed)
     flight = made_flight(motion, seed=seed, more=("mocap",), lags={stream: late}, jitter=0.1)
     (finding,) = found_in(flight, "lag")
     evidence = finding.evidence
