@@ -19,6 +19,7 @@ from crazyem.signals.vocabulary import (
 )
 
 LEVEL = float(compress_quaternion((0.0, 0.0, 0.0, 1.0)))
+STEP = 20  # ms of the drone's clock between packets of a block: half of what a drone sends is enough
 WAITING = 10  # packets of a block that a session may be behind
 AHEAD = 0.1  # s of the drone's clock that a flight may be behind
 PATIENCE = 4000  # looks, a millisecond apart: a busy machine slows the looks as well as who is waited for
@@ -112,7 +113,7 @@ class FakeLink:
         return ParameterWrite(name, value, float32(value), True, time.time())
 
     def statistics(self):
-        return LinkStatistics(received=self.fm // 10, lost=0)
+        return LinkStatistics(received=self.fm // STEP, lost=0)
 
     def arm(self, armed):
         self.calls.append("arm")
@@ -170,20 +171,20 @@ class FakeLink:
     def _run(self):
         while not self._stop.is_set():
             self._wait()
-            self.fm += 10
+            self.fm += STEP
             if self.lost_at is not None and self.fm > self.lost_at:
                 self.packets.put(LinkLost("the link closed.", self.host_clock()))
                 self._silent_since = time.monotonic()
                 return
             sag = SAG * (0.036 - self.values["ctrlLee.mass"]) / 0.007
             goal = max(0.0, self.wanted[2] - sag) if self.motors else 0.0
-            self.height += 0.05 * (goal - self.height)
+            self.height += 0.0975 * (goal - self.height)
             if self._landing and self.height < 0.02:
                 self.motors = False
             for block in tuple(self.blocks):
                 values = tuple(self.value(v.name) for v in block.variables)
                 self.packets.put(Packet(block.identifier, self.fm, self.host_clock(), values))
-            time.sleep(0.01 / self.speed)
+            time.sleep(STEP / 1000.0 / self.speed)
 
     def value(self, name):
         if self.nan_at is not None and self.fm > self.nan_at and name == "acc.z":
