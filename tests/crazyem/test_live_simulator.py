@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from crazyem.cli import main
@@ -56,7 +57,7 @@ def wait_for(process, word, seconds=600.0):
 
 def test_a_flight_learns_its_mass_pushes_it_and_replays_bit_for_bit(tmp_path, payload, capsys, monkeypatch):
     out, log = tmp_path / "f.json", tmp_path / "f.mcap"
-    code = main(["fly", "--trajectory", "hover", "--duration", "11", "--scenario", payload,
+    code = main(["fly", "--trajectory", "hover", "--duration", "8", "--scenario", payload,
                  "--record", str(log), "--json", str(out)])  # fmt: skip
     assert code == 0  # as fast as time: beside other work the estimator is late at twice that, and nothing is pushed
     summary = json.loads(out.read_text())
@@ -127,9 +128,11 @@ def test_interrupt_lands_and_still_reports(tmp_path, simulator):
 
 
 def test_watch_estimates_what_somebody_else_flies(tmp_path, simulator):
-    """`watch` sees an idle drone: nothing identifiable, and it says why."""
-    drone = simulator()
-    assert main(["watch", drone.uri, "--duration", "2", "--json", str(tmp_path / "w.json")]) == 0
+    """`watch` sees an idle drone: nothing identifiable, and it says why. It logs as often as it is asked to."""
+    log, options = tmp_path / "w.mcap", ["--duration", "2", "--rate", "200", "--reconnect", "0"]
+    uri = simulator().uri
+    assert main(["watch", uri, *options, "--record", str(log), "--json", str(tmp_path / "w.json")]) == 0
+    assert np.median(np.diff(open_recording(log).signals["position"].time)) == pytest.approx(0.005)
     summary = json.loads((tmp_path / "w.json").read_text())
     assert not summary["estimates"]["mass"]["identifiable"]
     assert "ground" in summary["estimates"]["mass"]["reason"]
