@@ -149,7 +149,7 @@ def test_what_moves_no_balance_or_sets_in_later_is_not_weighed() -> None:
 
 
 def data_of(hidden: Hidden, seed: int) -> tuple[Data, Point]:
-    data = Data([flight_of(fly(hidden, seconds=12.0, seed=seed), TRIMMED)])
+    data = Data([flight_of(fly(hidden, seconds=9.0, seed=seed), TRIMMED)])
     effects = {n: dict(v) for n, v in TRIMMED.effects.items()}
     return data, nominal(data, Point(TRIMMED, effects, first_guess()))
 

@@ -30,12 +30,12 @@ def point_of(data: Data) -> Point:
 
 @pytest.fixture(scope="module")
 def recording() -> Recording:
-    return fly(seconds=15.0)
+    return fly(seconds=10.0)
 
 
 @pytest.fixture(scope="module")
 def sudden() -> Recording:
-    return fly(seconds=15.0, hop=0.6)
+    return fly(seconds=10.0, hop=0.6)
 
 
 def with_speeds(recording: Recording, factors: tuple[float, ...]) -> Recording:
@@ -147,7 +147,7 @@ def test_blocks_know_their_recording() -> None:
 
 def test_sampled_commands_are_torques_with_the_memory_of_the_lag() -> None:
     """A noisy gyro at 500 Hz makes commands of which the log at 100 Hz sees every fifth."""
-    data = Data([flight_of(fly(rate_noise=0.15, shake=0.02, seconds=12.0), DRONE)])
+    data = Data([flight_of(fly(rate_noise=0.15, shake=0.02, seconds=9.0), DRONE)])
     white = starting_point(Point(DRONE, {}, None))  # type: ignore[arg-type]
     data.settle(white)
     white = data.fit_noise(white)
@@ -158,8 +158,8 @@ def test_sampled_commands_are_torques_with_the_memory_of_the_lag() -> None:
 
 
 def test_a_force_that_depends_on_place_holds_on_the_next_flight() -> None:
-    pulled = [Data([flight_of(fly(Hidden(rope=0.02), seed=s, seconds=12.0), DRONE)]) for s in (1, 2)]
-    free = [Data([flight_of(fly(seed=s, seconds=12.0), DRONE)]) for s in (1, 2)]
+    pulled = [Data([flight_of(fly(Hidden(rope=0.02), seed=s, seconds=9.0), DRONE)]) for s in (1, 2)]
+    free = [Data([flight_of(fly(seed=s, seconds=9.0), DRONE)]) for s in (1, 2)]
     found = depends_on_place(pulled[0], pulled[1], settled(pulled))
     assert found is not None
     assert (found.finding.signal, found.finding.axis, found.finding.variable) == ("force", "x", "x")

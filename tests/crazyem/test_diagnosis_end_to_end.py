@@ -125,7 +125,7 @@ def finite(value: Any) -> None:
 
 @pytest.fixture(scope="module")
 def dragged() -> list[Recording]:
-    return [fly(Hidden(drag=(0.02, 0.015, 0.01)), seed=s, seconds=15.0) for s in (0, 1)]
+    return [fly(Hidden(drag=(0.02, 0.015, 0.01)), seed=s, seconds=12.0) for s in (0, 1)]
 
 
 def test_drag_is_named_measured_and_taken_away(dragged: list[Recording]) -> None:

@@ -15,7 +15,7 @@ FLOORS = (0.05, 0.056, 0.06)
 
 
 def flight(seed: int, ground: float, *, grounded: bool = True, above: float = 0.5) -> Flight:
-    made = flight_of(fly(Hidden(), seed=seed), DRONE)
+    made = flight_of(fly(Hidden(), seed=seed, seconds=12.0), DRONE)
     y = made.y.copy()
     y[:, 2] += ground + above - y[:, 2].min()
     return replace(made, y=y, ground=ground if grounded else 0.0, grounded=grounded)

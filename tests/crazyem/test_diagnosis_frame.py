@@ -24,7 +24,7 @@ def turned(recording: Recording, roll: float, pitch: float) -> Recording:
 
 
 def flight(seed: int, roll: float = 0.0, pitch: float = 0.0, hidden: Hidden = DRAG) -> Flight:
-    return flight_of(turned(fly(hidden, seed=seed), roll, pitch), DRONE)
+    return flight_of(turned(fly(hidden, seed=seed, seconds=12.0), roll, pitch), DRONE)
 
 
 def test_a_tilt_is_found_with_an_error_as_told() -> None:

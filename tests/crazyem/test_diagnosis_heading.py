@@ -33,7 +33,7 @@ def data_of(recording: Recording) -> Data:
 
 @pytest.fixture(scope="module")
 def flights() -> tuple[Recording, Recording]:
-    return fly(seconds=25.0, seed=3), fly(seconds=25.0, seed=4)
+    return fly(seconds=16.0, seed=3), fly(seconds=16.0, seed=4)
 
 
 def test_a_heading_that_goes_with_x_is_found_with_its_size(flights) -> None:

@@ -27,7 +27,7 @@ GYRO = Candidate("measurement_delay", (("streams", ("gyro",)),), ("delay",))
 def test_a_late_gyro_is_late_by_what_it_was_shifted(late: float) -> None:
     """With what is always free of onboard filters, which starts at 1.2 ms and is 0 here. By differences of the filtered
     rates, which hold the noise of the sample that they are to explain, it was 0 for all three."""
-    recording = fly(seconds=12.0, seed=3)
+    recording = fly(seconds=8.0, seed=3)
     rate = recording.signals["body_rate"]
     shown = array_of("body_rate", rate.time, CubicSpline(rate.time, rate.value)(rate.time - late), place=95)
     data = Data([flight_of(replace(recording, signals={**recording.signals, "body_rate": shown}), DRONE)])

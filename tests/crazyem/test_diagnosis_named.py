@@ -165,7 +165,7 @@ def test_what_no_scatter_shows_is_part_of_an_interval() -> None:
 
 def test_inertias_are_as_unsure_as_a_lag_that_is_a_little_wrong_makes_them() -> None:
     """Held to a lag 3 ms longer, they are elsewhere by as much."""
-    data = Data([flight_of(fly(seconds=12.0), DRONE)])
+    data = Data([flight_of(fly(seconds=8.0), DRONE)])
     inertia = Candidate("inertia", (), ("xx", "yy", "zz"))
     start = nominal(data, point_of()).with_effects({"inertia": dict(zip(inertia.free, DRONE.inertia, strict=True))})
     fitted = refine_base(data, start, [inertia], rounds=3, noise=False)

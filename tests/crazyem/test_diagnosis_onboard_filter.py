@@ -139,7 +139,7 @@ def test_lags_of_the_log_are_found(name, parameter, lags):
 def test_a_torque_that_the_model_lacks_is_no_bias_of_a_late_gyro():
     """Weak rotors on one side are 10 rad/s^2 that the nominal model does not have: 12 mrad/s in a gyro 1.2 ms behind,
     if it were the model's own acceleration by which a late gyro shows less."""
-    recording = behind(fly(Hidden(thrust=(0.95, 0.95, 1.0, 1.0)), seconds=15.0, rate_noise=2e-3), "body_rate", 1.2e-3)
+    recording = behind(fly(Hidden(thrust=(0.95, 0.95, 1.0, 1.0)), seconds=10.0, rate_noise=2e-3), "body_rate", 1.2e-3)
     data = Data([flight_of(recording, DRONE)])
     bias = Candidate("gyro_bias", (), ("x", "y", "z"))
     point = nominal(data, starting_point(Point(DRONE, {}, None)))  # type: ignore[arg-type]

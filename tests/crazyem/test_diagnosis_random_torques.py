@@ -174,7 +174,7 @@ def test_what_a_filter_remembers_is_an_innovation_again() -> None:
 
 def test_a_made_rotor_that_pushes_at_random_is_told() -> None:
     """By 4 mN with a memory of 0.05 s, for a roll of 4 mN times the arm: which rotor, and about how much."""
-    data = Data([flight_of(fly(sticking=4e-3), DRONE)])
+    data = Data([flight_of(fly(sticking=4e-3, seconds=14.0), DRONE)])
     quiet = memoryless(data, nominal(data, Point(DRONE, {}, first_guess())))
     data.settle(quiet)
     found = erratic_rotor(data.models, quiet)

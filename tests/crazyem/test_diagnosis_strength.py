@@ -19,7 +19,7 @@ STRONG = (0.97, 1.0, 1.03, 1.02)
 
 def flights() -> list[Flight]:
     made = [
-        replace(flight_of(fly(Hidden(thrust=(s,) * 4), seed=k, seconds=12.0), DRONE), name=f"{k}.csv")
+        replace(flight_of(fly(Hidden(thrust=(s,) * 4), seed=k, seconds=9.0), DRONE), name=f"{k}.csv")
         for k, s in enumerate(STRONG)
     ]
     return differing(made, [], DRONE)[0]

@@ -132,7 +132,6 @@ def test_the_firmware_on_a_pc_shakes_and_is_no_real_drone(shared_recordings) -> 
 SYMMETRIES = {
     "half a turn": (np.array([-1.0, -1.0, 1.0]), (3, 4, 1, 2)),
     "left and right": (np.array([1.0, -1.0, 1.0]), (4, 3, 2, 1)),
-    "front and rear": (np.array([-1.0, 1.0, 1.0]), (2, 1, 4, 3)),
 }
 ROTORS = ("motor_command", "motor_request")
 
