@@ -6,9 +6,9 @@ FLIES  := $(VENV)/.installed
 READY  := $(VENV)/.ready
 WARM   := $(VENV)/.compiled
 
-# Three processes for two cores, because some wait for sockets and clocks. One that is done takes over what others have
+# Four processes for two cores, because some wait for sockets and clocks. One that is done takes over what others have
 # not begun: a long test at the head of one's list does not keep the rest waiting.
-SHARED := -n 3 --dist worksteal
+SHARED := -n 4 --dist worksteal
 
 # Modules are compiled once: the tests start some hundred processes, each of which would compile all of them again.
 unexport PYTHONDONTWRITEBYTECODE
