@@ -33,6 +33,11 @@ class FakePeer:
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
+    def number(self) -> int:
+        """Of the packet that is sent next, of the only block that runs."""
+        ((_, _, number),) = self._periods.values()
+        return number
+
     def close(self) -> None:
         self._stop.set()
         self._thread.join(2)

@@ -170,13 +170,13 @@ def test_unknown_variable_names_itself(fake_peer):
 
 @pytest.mark.parametrize("how", ["silent", "gone"])
 def test_a_lost_drone_is_reported_once(fake_peer, monkeypatch, how):
-    monkeypatch.setattr("crazyem.links.crazyflie.SILENT_AFTER", 0.5)
     with connected(fake_peer) as link:
         link.subscribe(NAMES, 100.0)
         if how == "silent":
             fake_peer.silent = True
         else:
             fake_peer.close()
+        monkeypatch.setattr("crazyem.links.crazyflie.SILENT_AFTER", 0.5)
         items = collect(link, 10_000)
         assert isinstance(items[-1], LinkLost)
         assert link.packets.empty()

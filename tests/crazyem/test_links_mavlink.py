@@ -58,8 +58,7 @@ def streaming(kind=PX4, **options):
         finally:
             stop.set()
             thread.join()
-        time.sleep(0.1)
-        drain(link)
+        arrived(link)
         yield link, drone, blocks
 
 
@@ -69,6 +68,12 @@ def drain(link):
         while True:
             found.append(link.packets.get(timeout=0.05))
     return found
+
+
+def arrived(link):
+    """What was sent before this call: the answer to a question comes after it."""
+    link.read_parameter("MPC_THR_HOVER" if link.autopilot == PX4 else "MOT_THST_HOVER", timeout=60.0)
+    return drain(link)
 
 
 def samples(link, blocks, packets):
@@ -94,7 +99,7 @@ def test_a_px4_is_identified_and_its_streams_become_signals():
         assert drone.intervals[number_of("BATTERY_STATUS")] == 100_000
         before = drone.ms
         drone.stream(0.2)
-        found = samples(link, blocks, drain(link))
+        found = samples(link, blocks, arrived(link))
         position = of(found, "position")
         assert [s.time for s in position] == [(before + 10 * k) / 1000 for k in range(1, 21)]
         assert position[0].value[1:] == pytest.approx((-0.2, 1.0))
@@ -112,7 +117,7 @@ def test_an_ardupilot_without_intervals_is_asked_the_older_way():
         wait(lambda: set(drone.groups) == {1, 2, 3, 6, 10, 11})
         assert drone.groups[6] == 50
         drone.stream(0.1)
-        found = samples(link, blocks, drain(link))
+        found = samples(link, blocks, arrived(link))
         assert of(found, "attitude")[0].value == pytest.approx((0.0047, -0.0102, -0.0149, 0.9998), abs=1e-3)
         assert of(found, "motor_command")[0].value == pytest.approx((0.5, 0.53, 0.51, 0.52), abs=1e-6)
         assert of(found, "specific_force")[0].value == pytest.approx((0.0980665, -0.196133, 9.80665))
@@ -151,7 +156,7 @@ def test_losses_repetitions_and_damage_are_counted():
         drone.stream(0.4)  # 5 messages each 10 ms, and heartbeats
         drone.mangle = lambda data: [data]
         drone.stream(0.05)
-        packets = drain(link)
+        packets = arrived(link)
         after, told = link.statistics(), link.account()
         harmed = next(counter) // 10
         assert after.lost - before.lost == pytest.approx(2 * harmed, abs=3)  # lost, and damaged: both never came
@@ -173,7 +178,7 @@ def test_other_systems_components_and_senders_do_not_mix_in():
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:  # another sender who claims to be the drone
             other.sendto(forged, drone.socket.getpeername())
         drone.stream(0.05)
-        packets = drain(link)
+        packets = arrived(link)
         assert packets
         assert all(99.0 not in p.values for p in packets)
         assert "7:1" in link.account()["other_systems"]
@@ -288,9 +293,9 @@ def test_unknown_parameters_and_values_are_sentences():
 
 
 def test_silence_is_told_once_and_the_link_comes_back(monkeypatch):
-    monkeypatch.setattr("crazyem.links.mavlink.receiver.SILENT_AFTER", 0.3)
     with streaming() as (link, drone, blocks):
         drone.mute = True
+        monkeypatch.setattr("crazyem.links.mavlink.receiver.SILENT_AFTER", 0.3)
         received = []
         wait(lambda: received.extend(drain(link)) or any(isinstance(p, LinkLost) for p in received))
         (lost,) = (p for p in received + drain(link) if isinstance(p, LinkLost))
@@ -299,13 +304,14 @@ def test_silence_is_told_once_and_the_link_comes_back(monkeypatch):
             link.read_parameter("MPC_THR_HOVER")
         with pytest.raises(LinkError, match="did not come back"):
             link.reconnect(0.2)
+        monkeypatch.setattr("crazyem.links.mavlink.receiver.SILENT_AFTER", 60.0)
         drone.mute = False
         drone.intervals.clear()
         outage = link.reconnect(60.0)
         assert "nothing has come" in outage.reason
         assert number_of("LOCAL_POSITION_NED") in drone.intervals  # asked for again
         drone.stream(0.05)
-        assert of(samples(link, blocks, drain(link)), "position")
+        assert of(samples(link, blocks, arrived(link)), "position")
         assert link.statistics().outages == 1
 
 
