@@ -223,6 +223,7 @@ def predict_ensemble(
     seed: int = 0,
     days: bool = False,
     calibrate: RecordingLike | Sequence[RecordingLike] = (),
+    plain: bool = False,
     options: ReadOptions | None = None,
 ) -> Ensemble:
     """Predict a band by many drones of a fitted vehicle's posterior, from starts all along a flight.
@@ -234,6 +235,7 @@ def predict_ensemble(
         seed: of the draws.
         days: the trim, thrust and lag of another day: far wider, as recorded commands answer to the trim of theirs.
         calibrate: other flights, by which disturbances are learned; without, the band is of constants alone.
+        plain: the model alone, not corrected by the flight before each start.
 
     Raises:
         UsageError: no such file, or no posterior. DataError: no whole states, or no flight that is long enough.
@@ -243,7 +245,7 @@ def predict_ensemble(
     members = sample(fitted, count, seed=seed, days=days, mass_sd=0.0).vehicles
     period = recorded(flight, fitted).period if step is None else step
     others = [recording_of(r, options) for r in _several(calibrate)]
-    return ensemble(flight, fitted, members, horizon=horizon * period, calibrate=others, seed=seed)
+    return ensemble(flight, fitted, members, horizon=horizon * period, calibrate=others, seed=seed, plain=plain)
 
 
 def disagreements(first: SimulatorFile, second: SimulatorFile) -> list[str]:

@@ -60,6 +60,7 @@ def _ensemble(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         days=arguments.other_day,
         calibrate=arguments.calibrate,
+        plain=arguments.plain,
         options=read_options(arguments),
     )
     write(output, found.arrays())

@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from made_flight import made_flight
 
 from crazyem.cli import main
-from crazyem.diagnosis.prediction.ensemble import ensemble, offset
+from crazyem.diagnosis.prediction.bias_correction import MEMORY
+from crazyem.diagnosis.prediction.ensemble import PRIOR_TIME, ensemble, error_scale, offset
+from crazyem.diagnosis.prediction.horizon import SPACING
 from crazyem.errors import DataError, FileFormatError, UsageError
 from crazyem.physics.rotations import quaternion_from_rotation_vector
 from crazyem.simulators.constants import from_vehicle
@@ -132,10 +134,27 @@ def test_offsets_of_states() -> None:
 
 
 def test_a_band_holds_what_it_says_where_the_model_is_right() -> None:
-    """A made flight, whose errors are the noise of its own streams: learned from one seed, judged on another."""
+    """Made flights, whose errors are the noise of their own streams: learned from one, judged on a noisier one."""
     vehicle = replace(load_vehicle("cf2"), mass=0.036, rotor_constant=3e-8, effects={})
-    flights = [made_flight(seconds=12.0, seed=4), made_flight(seconds=12.0, seed=9)]
+    flights = [made_flight(seconds=12.0, seed=4), made_flight(seconds=12.0, seed=9, noise=3.0)]
     found = ensemble(flights[1], vehicle, [vehicle] * 16, calibrate=flights[:1], seed=1)
     held = found.held()
     assert all(0.75 < share <= 1.0 for share in held.values()), held
     assert found.arrays()["low"].shape == (len(found.rows), 12)
+
+
+def test_the_scale_of_errors_is_of_those_known_at_a_start() -> None:
+    rng = np.random.default_rng(3)
+    begin = np.cumsum(rng.uniform(0.05, 0.15, 40))
+    end, errors, prior = begin + 0.5, rng.standard_normal((40, 2)), np.array([4.0, 0.25])
+    errors[7] = np.nan
+    found = error_scale(begin, end, errors, prior)
+    for k in range(40):  # slow and plain
+        square, total = PRIOR_TIME * prior, PRIOR_TIME
+        for j in range(40):
+            if end[j] <= begin[k] and j != 7:
+                weight = min(SPACING, begin[j + 1] - begin[j]) * np.exp((end[j] - begin[k]) / MEMORY)
+                square, total = square + weight * errors[j] ** 2, total + weight
+        assert found[k] == pytest.approx(np.sqrt(square / total))
+    later = np.where(end[:, None] > begin[20], 100.0, errors)
+    assert np.array_equal(error_scale(begin, end, later, prior)[:21], found[:21])

@@ -1,8 +1,10 @@
 """Open-loop predictions by many drones that may be this one: a band instead of a line.
 
-The band has two parts: what is not known of the drone (its members), and what no constants tell: disturbances and the
-error of the state at the start. The second part is learned from other flights, as the joint error of position,
-velocity, attitude and rate of the vehicle itself, in the heading frame; without such flights it is left out.
+The centre is what `predict` says: the vehicle, corrected by the flight before each start. The band has two parts. The
+first is what is not known of the drone: its members. The second is what no constants tell: disturbances, and the error
+of the state at the start. Other flights tell the shape of this part. Their prediction errors, in the heading frame,
+are divided by a scale and drawn anew. The scale of each start is the root mean square of the errors that were known
+then: those of the other flights, and those of this flight so far. Without other flights the second part is left out.
 """
 
 from collections.abc import Sequence
@@ -11,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.prediction.horizon import UNITS, Windows, open_loop, windows
-from crazyem.diagnosis.prediction.predict import Recorded, recorded
+from crazyem.diagnosis.prediction.bias_correction import MEMORY, Weights, correction_weights
+from crazyem.diagnosis.prediction.horizon import SPACING, UNITS, Windows, open_loop, windows
+from crazyem.diagnosis.prediction.predict import Recorded, recorded, turned_by
 from crazyem.errors import DataError
 from crazyem.physics.rotations import quaternion_conjugate, quaternion_product
 from crazyem.recordings.recording import Recording
@@ -22,6 +25,7 @@ Array = NDArray[np.float64]
 BAND = 0.9  # share that the band should hold
 QUANTITIES = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 9), "body_rate": slice(9, 12)}
 FEWEST_STARTS = 30  # of errors to learn twelve spreads from
+PRIOR_TIME = 1.0  # s of flight that other flights count as, in the scale of errors: two horizons
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +34,7 @@ class Ensemble:
 
     Attributes:
         rows: (n,) starts, rows of the recording's states. time: (n,) s when each was predicted for.
-        centre: (n, 13) by the vehicle itself, as `predict.NAMES`.
+        centre: (n, 13) by the vehicle itself, corrected as in `predict`, as `predict.NAMES`.
         offsets: (m, n, 12) of each member from that: position m, velocity m/s (world), attitude as rotation vector
             rad (body), rate rad/s.
         truth: (n, 12) of what was recorded, from the same centre; NaN where nothing was.
@@ -86,6 +90,7 @@ def ensemble(
     horizon: float = 0.5,
     calibrate: Sequence[Recording] = (),
     seed: int = 0,
+    plain: bool = False,
 ) -> Ensemble:
     """Predict `horizon` [s] ahead by every member, from starts all along a flight.
 
@@ -93,27 +98,94 @@ def ensemble(
         vehicle: the most likely drone. members: drones as they may be.
         calibrate: other flights of the drone, by which disturbances are learned.
         seed: of the draws of disturbances.
+        plain: the model alone, not corrected by the flight before each start.
 
     Raises: DataError as `predict.recorded` and `horizon.windows`.
     """
-    shown = recorded(recording, vehicle)
-    at = windows(shown, horizons=(horizon,))
-    centre = open_loop(shown, at)[:, -1]
-    offsets = np.stack([offset(_flown(recording, shown, at, member), centre) for member in members])
-    root = _disturbances(calibrate, vehicle, horizon)
-    if root is not None:
-        rng = np.random.default_rng(seed)
-        noise = rng.standard_normal((*offsets.shape[:2], 12)) @ root.T
-        offsets = offsets + _to_world(noise, centre)
+    flight = _Flight.of(recording, vehicle, horizon, plain=plain)
+    at, centre = flight.at, flight.centre
+    offsets = np.stack([offset(flight.flown(member), centre) for member in members])
+    others = [f for f in (_Flight.maybe(r, vehicle, horizon, plain=plain) for r in calibrate) if f is not None]
+    if others:
+        errors = np.concatenate([f.errors[f.whole] for f in others])
+        if len(errors) < FEWEST_STARTS:
+            raise DataError(f"{len(errors)} starts are too few to learn disturbances from (at least {FEWEST_STARTS})")
+        prior = (errors**2).mean(axis=0)
+        shape = np.concatenate([(f.errors / f.scale(prior))[f.whole] for f in others])
+        drawn = np.random.default_rng(seed).integers(len(shape), size=offsets.shape[:2])
+        offsets = offsets + _turned(shape[drawn] * flight.scale(prior), _headings(centre))
     return Ensemble(at.rows, at.times[:, -1], centre, offsets, offset(at.truth[:, -1], centre), horizon)
 
 
-def _flown(recording: Recording, shown: Recorded, at: Windows, member: Vehicle) -> Array:
-    """(n, 13) by a member; the recording is read anew where its law of thrust is another one."""
-    law, own = ((v.rotor_constant, v.thrust_curve, v.thrust_max) for v in (member, shown.inputs.vehicle))
-    if law != own:
-        shown = recorded(recording, member)
-    found: Array = open_loop(shown, at, vehicle=member)[:, -1]
+@dataclass(frozen=True, eq=False)
+class _Flight:
+    """Predictions of one flight by the vehicle.
+
+    Attributes:
+        shown, at: the recording, and its n starts. weights: what was learned before each; None: the model alone.
+        centre: (n, 13). errors: (n, 12) of the recorded states from there, heading frame; NaN where nothing was
+            recorded.
+    """
+
+    recording: Recording
+    shown: Recorded
+    at: Windows
+    weights: Weights | None
+    centre: Array
+    errors: Array
+
+    @staticmethod
+    def of(recording: Recording, vehicle: Vehicle, horizon: float, *, plain: bool) -> "_Flight":
+        shown = recorded(recording, vehicle)
+        at = windows(shown, horizons=(horizon,))
+        weights = None if plain else correction_weights(turned_by(shown), at.times[:, 0], horizon=horizon)
+        centre = open_loop(shown, at, weights=weights)[:, -1]
+        errors = _turned(offset(at.truth[:, -1], centre), -_headings(centre))
+        return _Flight(recording, shown, at, weights, centre, errors)
+
+    @staticmethod
+    def maybe(recording: Recording, vehicle: Vehicle, horizon: float, *, plain: bool) -> "_Flight | None":
+        """None where a flight is too short or has no whole states."""
+        try:
+            return _Flight.of(recording, vehicle, horizon, plain=plain)
+        except DataError:
+            return None
+
+    @property
+    def whole(self) -> NDArray[np.bool_]:
+        """(n,) whether all of an error is known."""
+        return np.asarray(np.isfinite(self.errors).all(axis=1))
+
+    def flown(self, member: Vehicle) -> Array:
+        """(n, 13) by a member; the recording is read anew where its law of thrust is another one."""
+        shown = self.shown
+        law, own = ((v.rotor_constant, v.thrust_curve, v.thrust_max) for v in (member, shown.inputs.vehicle))
+        if law != own:
+            shown = recorded(self.recording, member)
+        found: Array = open_loop(shown, self.at, vehicle=member, weights=self.weights)[:, -1]
+        return found
+
+    def scale(self, prior: Array) -> Array:
+        """(n, 12), see `error_scale`."""
+        return error_scale(self.at.times[:, 0], self.at.times[:, -1], self.errors, prior)
+
+
+def error_scale(begin: Array, end: Array, errors: Array, prior: Array) -> Array:
+    """How large the errors were that are known at each start.
+
+    Args:
+        begin, end: (n,) s, starts in order, and when the error of each is known.
+        errors: (n, q); rows that are not finite are left out.
+        prior: (q,) mean square before the flight; counts as `PRIOR_TIME` of flight.
+
+    Returns: (n, q) root mean square, what is older than `MEMORY` counting less.
+    """
+    whole = np.asarray(np.isfinite(errors).all(axis=1))
+    span = np.diff(begin, append=begin[-1:] + SPACING).clip(0.0, SPACING)  # s of flight that a start stands for
+    ago = begin[:, None] - end
+    weight = np.where((ago >= 0.0) & whole, span * np.exp(-np.maximum(ago, 0.0) / MEMORY), 0.0)
+    square = weight @ np.where(whole[:, None], errors, 0.0) ** 2
+    found: Array = np.sqrt((PRIOR_TIME * prior + square) / (PRIOR_TIME + weight.sum(axis=1, keepdims=True)))
     return found
 
 
@@ -133,37 +205,11 @@ def _headings(centre: Array) -> Array:
     return np.asarray(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
-def _to_world(noise: Array, centre: Array) -> Array:
-    """Positions and velocities (..., n, 12) of the heading frame in the world."""
-    return _turned(noise, _headings(centre))
-
-
 def _turned(values: Array, angle: Array) -> Array:
+    """Positions and velocities of (..., n, 12) turned about the vertical by (n,) rad."""
     c, s = np.cos(angle), np.sin(angle)
     found = values.copy()
     for first in (0, 3):
         x, y = values[..., first], values[..., first + 1]
         found[..., first], found[..., first + 1] = c * x - s * y, s * x + c * y
     return found
-
-
-def _disturbances(recordings: Sequence[Recording], vehicle: Vehicle, horizon: float) -> Array | None:
-    """A root (12, 12) of the mean square of errors along flights, in the heading frame; None without flights."""
-    errors = []
-    for recording in recordings:
-        try:
-            shown = recorded(recording, vehicle)
-            at = windows(shown, horizons=(horizon,))
-        except DataError:
-            continue
-        centre = open_loop(shown, at)[:, -1]
-        found = _turned(offset(at.truth[:, -1], centre), -_headings(centre))
-        errors.append(found[np.isfinite(found).all(axis=1)])
-    if not errors:
-        return None
-    rows = np.concatenate(errors)
-    if len(rows) < FEWEST_STARTS:
-        raise DataError(f"{len(rows)} starts are too few to learn disturbances from (at least {FEWEST_STARTS})")
-    values, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
-    found_root: Array = vectors * np.sqrt(np.maximum(values, 0.0))
-    return found_root
