@@ -12,8 +12,7 @@ from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.naming import select
-from crazyem.diagnosis.naming.select import additions
-from crazyem.diagnosis.naming.trials import Step, Trial
+from crazyem.diagnosis.naming.trials import Step, Trial, additions
 from crazyem.diagnosis.workers import Workers
 
 POINT = Point(DRONE, {}, first_guess())

@@ -253,7 +253,7 @@ def test_a_rotor_is_told_with_the_day_as_its_uncertainty_and_rivals_by_the_balan
     assert numbers["scale"].ci95 == pytest.approx((0.75 - reach, 0.75 + reach))
     assert p_value < 1e-3
     assert _by_the_day(rotor(3), point, None) is None
-    assert _by_the_day(LOAD, point, shown) is None
+    assert _by_the_day(WIND, point, shown) is None
     assert _by_the_day(rotor(3, onset=2.0), point, shown) is None
     rivals = [Trial(c, 1.0, 1.0, 1.0, 1e-9, 1.0) for c in (LOAD, DRAG, WIND)]
     rest, nats = _steady_rivals(rotor(3), rivals, shown)

@@ -12,7 +12,10 @@ from test_diagnosis_balance import EACH, LOAD, SD, TRIMMED, balance, rotor
 
 from crazyem.diagnosis.fitting.candidates import TRIM
 from crazyem.diagnosis.fitting.fit import local_precision, log_prior
+from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import day_sd
+from crazyem.diagnosis.naming.answer import _by_the_day
 from crazyem.diagnosis.naming.baseline import spread_of, with_baseline
 from crazyem.diagnosis.naming.steady_odds import by_days, explanations
 from crazyem.errors import UsageError
@@ -58,6 +61,19 @@ def test_a_load_has_no_torque_about_z():
     chance, found = chances(heavier, heavier)
     assert max(chance, key=chance.get) == ("payload", 0)
     assert found["payload", 0][1][0] == pytest.approx(0.15, abs=0.02)
+
+
+def test_a_load_is_as_sure_as_the_day_s_thrust_and_at_the_edge_as_the_torque_that_needs_it():
+    """3.5 g are a tenth of this drone. Thrust differs by 2 %, and 0.5 mm of torque over thrust need 1.25 % at 40 mm."""
+    shown = balance([0.1, 0.0, 0.0, 0.0])
+    whole = TRIMMED.mass / 0.9
+    for place, sd in ((0.01, 0.02), (0.0396, (0.02**-2 + (0.04 / 5e-4) ** 2) ** -0.5)):
+        point = Point(TRIMMED, {"payload": {"mass": 0.1 * whole, "x": 0.0, "y": place, "z": 0.0}}, first_guess())
+        found, p_value = _by_the_day(LOAD, point, shown)  # type: ignore[misc]
+        assert found["mass"].sd == pytest.approx(sd * whole / 0.9)
+        assert found["y"].sd == pytest.approx(5e-4 / 0.1)
+        assert found["y"].ci95[1] <= 0.04
+        assert p_value < 0.01
 
 
 def test_the_balance_alone_speaks_of_weak_rotors_only_where_a_trim_is_known():

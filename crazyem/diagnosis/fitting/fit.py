@@ -64,12 +64,20 @@ class Data:
         self.models = [Model(f) for f in flights]
         self.workers = workers or Workers(1)
         self.informed = Informed()
+        self.held: frozenset[str] = frozenset()  # effects that are not free here, though they usually are
+
+    def holding(self, effect: str) -> "Data":
+        """A twin in which an effect is not free, though it usually is: as the vehicle file has it."""
+        twin = self.twin()
+        twin.held = self.held | {effect}
+        return twin
 
     def twin(self) -> "Data":
         """The same flights, with the paths of the last pass: what is done to the twin leaves this one as it is."""
         twin = Data((), self.workers)
         twin.models = [m.twin() for m in self.models]
         twin.informed = self.informed.copy()
+        twin.held = self.held
         return twin
 
     def together_with(self, other: "Data | None") -> "Data":
@@ -82,7 +90,7 @@ class Data:
         """Twins of the flights one by one."""
         parts = [Data((), self.workers) for _ in self.models]
         for part, model in zip(parts, self.models, strict=True):
-            part.models = [model.twin()]
+            part.models, part.held = [model.twin()], self.held
         return parts
 
     @property

@@ -248,3 +248,18 @@ def bounded(a: NDArray, b: NDArray, low: NDArray | None, high: NDArray | None) -
             break
         free[back] = True
     return np.clip(t / scale, *within)
+
+
+def none_of_it(
+    gram: Gram, order: Sequence[int], own: int, weights: NDArray, low: NDArray, high: NDArray, centre: NDArray
+) -> tuple[float, float]:
+    """Gain, on all blocks and on those held out, where the last `own` columns are at none of their effect.
+
+    weights, centre: of all columns; low, high: of the others.
+    """
+    away = centre[len(order) - own :]
+    wide = np.where(np.abs(away) > 0, np.abs(away), 1.0) * 1e-9
+    solution = gram.solve(
+        order, precision=weights, prior=centre, low=np.append(low, away - wide), high=np.append(high, away + wide)
+    )
+    return solution.gain, solution.held_out

@@ -61,7 +61,9 @@ THRUST_SD = 0.02  # relative
 # s: of the lag of rotors in the calm flights of real drones, 24 to 105 ms in 26 flights for a file's 50, whether
 # anything was wrong with them or not, so a file to which one of them was fitted does not know it.
 DAILY_LAG_SD = 0.025
-FLAPPING_SD, DRAG_SD = 3e-5, 1e-3  # N m s/m, N s/m: a tenth of what real rotors have; another day's propellers
+FLAPPING_SD, DRAG_SD = 3e-4, 0.02  # N m s/m, N s/m: real rotors have both, bare rigid bodies of files neither
+# So both are free beside any effect that is tried. A drag is named all the same where it explains more than none of it.
+OF_REAL_ROTORS = ("linear_drag",)
 LEANING_SD = (0.02, 0.02, 2e-3)  # rad: an attitude made from the acceleration is tilted as the accelerometer is
 # s: a filter on board that integrates a biased gyro and is drawn back by the fixes stays off by the bias times the time
 # that takes: 0.041, 0.043, 0.041 and 0.038 s in roll and pitch of two simulated flights.
@@ -178,7 +180,7 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
     if all(f.levelled for f in data.flights):
         found.append((Candidate("thrust_curve", (), ("slope_error",)), (SAG_SLOPE_SD**-2,)))
         found.append((Candidate("battery_sag", (), ("gain_per_second",)), (RUN_DOWN_SD**-2,)))
-    taken = {c.effect for c in accepted}
+    taken = {c.effect for c in accepted} | data.held
     if "motor_lag" in taken:  # both free, with a lag that has no prior, go along their ridge: a lag 8 ms too long
         taken.add("torque_scale")
     return [(c, p) for c, p in found if c.effect not in taken]
@@ -332,6 +334,7 @@ def systematic_sd(data: Data, point: Point) -> dict[tuple[str, str], float]:
         (c.effect, name): precision**-0.5
         for c, precisions in nuisances(data, point, ())
         for name, precision in zip(c.free, precisions, strict=True)
+        if c.effect not in OF_REAL_ROTORS
     }
     inertia = point.effects.get("rotor_inertia", {}).get("inertia", 0.0)
     hanging = {"mass": point.vehicle.mass, "length": point.effects.get("suspended_load", {}).get("length", 0.0)}

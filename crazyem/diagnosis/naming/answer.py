@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import logit
 
-from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.candidates import ON_BOARD, TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import by_a_wrong_lag, solved, systematic_sd
@@ -18,6 +18,7 @@ from crazyem.diagnosis.naming.balance import steady as steadily
 from crazyem.diagnosis.naming.corroboration import TELLING
 from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, instead_of_a_load
 from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, one_factor, trust
+from crazyem.diagnosis.naming.steady_odds import EDGE, by_days
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, preferred, wald
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -40,7 +41,7 @@ SAME = {"input_delay": (MEASURED_LATE,)}
 
 @dataclass(frozen=True)
 class Answer:
-    """The effects, strongest first; groups of names that these flights cannot tell apart, and what would."""
+    """The effects, most probable first; groups of names that these flights cannot tell apart, and what would."""
 
     effects: tuple[Named, ...] = ()
     groups: tuple[tuple[str, ...], ...] = ()
@@ -69,7 +70,7 @@ def answer_of(
     point, gram = selection.final, selection.fitted.gram
     _, _, all_covariance, used = _uncertainty(selection.fitted)
     numbers = numbers_of(data, selection, balance)
-    found: list[tuple[float, Named]] = []
+    found: list[tuple[tuple[float, float], Named]] = []
     groups: list[tuple[str, ...]] = []
     separate: list[str] = []
     at = 0
@@ -97,7 +98,7 @@ def answer_of(
         chosen: dict[str, object] = {"streams": ("state", "gyro")} if late else dict(candidate.fixed)
         odds = float(logit(there))
         named = Named(name, label, parameters, chosen, step.taken.held_out, p_value, confidence, candidate.effect, odds)
-        found.append((step.taken.evidence, named))
+        found.append(((-confidence, -step.taken.evidence), named))
 
         if doubted:
             separate.append(SHAKES)
@@ -116,7 +117,7 @@ def answer_of(
             separate.append(CATALOGUE[LOAD].separates)
         elif candidate.effect == "thrust_scale":
             separate.append(HEAVIER.format(1.0 / candidate.values(point)["scale"]))
-    found.sort(key=lambda entry: -entry[0])
+    found.sort(key=lambda entry: entry[0])
     return Answer(tuple(n for _, n in found), tuple(groups), tuple(dict.fromkeys(separate)))
 
 
@@ -198,8 +199,10 @@ def _numbers(
 
 
 def _by_the_day(candidate: Candidate, point: Point, balance: Balance | None) -> tuple[dict[str, Value], float] | None:
-    """How weak a rotor is by the balance, of which the day is most of what is uncertain, and the p-value that it is not
-    weak at all; None for other effects, and where there is no balance."""
+    """How weak a rotor is or how heavy a load by the balance, of which the day is most of what is uncertain, and the
+    p-value that there is none; None for other effects, and where there is no balance."""
+    if balance is not None and candidate.effect == LOAD and by_days(point.vehicle, candidate):
+        return _load_by_the_day(candidate, point, balance)
     if balance is None or candidate.effect != WEAK_ROTOR or not steadily(candidate):
         return None
     scale = float(candidate.values(point)["scale"])
@@ -207,6 +210,28 @@ def _by_the_day(candidate: Candidate, point: Point, balance: Balance | None) -> 
     reach = sd * float(stats.t.ppf(0.975, balance.freedom))
     value = Value(scale, candidate.parameter("scale").unit, sd, (max(scale - reach, 0.0), scale + reach))
     return {"scale": value}, 2.0 * float(stats.t.sf((1.0 - scale) / sd, balance.freedom))
+
+
+def _load_by_the_day(candidate: Candidate, point: Point, balance: Balance) -> tuple[dict[str, Value], float]:
+    """A load's mass and place, as sure as thrust and trim are from day to day; how high it sits may be anything."""
+    values, whole = candidate.values(point), point.vehicle.mass + float(candidate.values(point)["mass"])
+    share = float(values["mass"]) / whole
+    thrust, about_x, about_y = np.sqrt(np.diag(balance.covariance))[:3]
+    known = thrust**-2.0
+    for axis, torque in (("x", about_y), ("y", about_x)):  # at the edge, so much torque needs so much weight
+        known += (ON_BOARD / torque) ** 2.0 if abs(values[axis]) > 0.99 * EDGE * ON_BOARD else 0.0
+    far = max(share, 1e-9)
+    sds = {"mass": known**-0.5 * whole / (1.0 - share), "x": about_y / far, "y": about_x / far}
+    found = {}
+    for name in candidate.free:
+        low, high = candidate.range_of(name)
+        sd = float(sds.get(name, (high - low) / 12**0.5))
+        reach = sd * float(stats.t.ppf(0.975, balance.freedom))
+        value = float(values[name])
+        found[name] = Value(
+            value, candidate.parameter(name).unit, sd, (max(value - reach, low), min(value + reach, high))
+        )
+    return found, 2.0 * float(stats.t.sf(float(values["mass"]) / sds["mass"], balance.freedom))
 
 
 def _steady_rivals(

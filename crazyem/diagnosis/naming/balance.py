@@ -167,12 +167,16 @@ def by_balance(data: Data, selection: Selection) -> tuple[Selection, Balance | N
     steady force or torque.
     """
     names = {c.effect for c in selection.accepted}
-    mine = next((c for c in selection.accepted if c.effect in FREE), None)
-    single = len(names & set(FREE)) == 1 and TRIM not in names
+    decided = {s.taken.candidate: s.taken.size for s in selection.steps if s.taken and s.taken.log_odds is not None}
+    mine = next((c for c in selection.accepted if c in decided), None)
+    mine = mine or next((c for c in selection.accepted if c.effect in FREE), None)
+    single = mine in decided or (len(names & set(FREE)) == 1 and TRIM not in names)
     if TRIM not in selection.nominal.vehicle.effects or mine is None or not single or not steady(mine):
         return selection, None
     try:
         balance = balance_of(data, selection.nominal)
+        if mine in decided:
+            return _sized(data, selection, mine, {n: decided[mine][n] for n in mine.free}), balance
         selection, mine = _named(data, selection, mine, balance)
         if mine.effect == "rotor_fault":
             lack = how_weak(balance, int(dict(mine.fixed)["rotor"]))[0]

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, freedom_of, held_near, local_precision
-from crazyem.diagnosis.fitting.gram import Solution
+from crazyem.diagnosis.fitting.gram import Solution, none_of_it
 from crazyem.diagnosis.fitting.model import Column, Noise, Point
 from crazyem.diagnosis.fitting.nuisances import (
+    OF_REAL_ROTORS,
     by_gain,
     nuisances,
     on_held_out,
@@ -25,6 +26,7 @@ from crazyem.diagnosis.fitting.nuisances import (
     refine_base,
     unlike_a_body,
     with_nuisances,
+    without,
 )
 from crazyem.diagnosis.naming.detection_limits import at_the_end, matters
 from crazyem.diagnosis.naming.evidence import gain_of_both, known_by, tuning
@@ -38,6 +40,7 @@ from crazyem.diagnosis.naming.trials import (
     Selection,
     Step,
     Trial,
+    additions,
     both,
     by_evidence,
     distinguishable,
@@ -51,7 +54,6 @@ SHORTLIST = 6
 WORTH, ANYWAY = 0.15, 3  # share of the largest linear gain from which a candidate is fitted, and how many are anyway
 MOST = 9  # effects: real drones differ from a file in more than one thing
 NEARLY, MOST_COMPARED = 0.8, 3  # share of the best's gain from which, and how many, explanations get noise of their own
-BESIDE = 0.5  # share of its gain that an effect keeps beside another which it is no other name for
 # Angular acceleration is torque over inertia: where the one is fitted, so is the other, to be told apart or not; both
 # at once would be any size. A longer lag with more torque is nearly the same as neither.
 PARTNERS = (("torque_scale", "inertia"), ("inertia", "torque_scale"), ("torque_scale", "motor_lag"),
@@ -94,11 +96,14 @@ def linear_trials(
     gain0, held0 = (zero.gain, zero.held_out) if zero else (0.0, 0.0)
     found = []
 
-    def judge(c: Candidate, order: list[int], w: NDArray, lo: NDArray, hi: NDArray, mid: NDArray) -> None:
+    def judge(
+        c: Candidate, order: list[int], w: NDArray, lo: NDArray, hi: NDArray, mid: NDArray,
+        before: tuple[float, float] | None = None,
+    ) -> None:  # fmt: skip
         k = len(c.free)
         solution = gram.solve(order, precision=w, prior=mid, low=lo, high=hi, tested=range(len(order) - k, len(order)))
         dispersion = max(1.0, gram.solve(order[-k:]).dispersion)
-        gain, held = solution.gain - gain0, solution.held_out - held0
+        gain, held = (now - then for now, then in zip((solution.gain, solution.held_out), before or (gain0, held0)))
         p_value = by_gain(point, gain / dispersion, k, len(gram.score), solution.p_value)
         found.append((Trial(c, gain, held, dispersion, p_value, gain / dispersion - k), solution))
 
@@ -118,10 +123,11 @@ def linear_trials(
         w = weights[order].copy()
         w[len(order) - len(mine) :] = 0.0
         near = order[: len(order) - len(mine)]
+        none = none_of_it(gram, [always[i] for i in order], len(mine), w, low[near], high[near], centre[order])
         lo = np.append(low[near], wide_low[order[len(near) :]])
         hi = np.append(high[near], wide_high[order[len(near) :]])
         asked = next(a for a in candidates if a.effect == c.effect)
-        judge(asked, [always[i] for i in order], w, lo, hi, centre[order])
+        judge(asked, [always[i] for i in order], w, lo, hi, centre[order], none if c.effect in OF_REAL_ROTORS else None)
     return sorted(found, key=lambda t: -t[0].evidence)
 
 
@@ -154,6 +160,7 @@ class Basis:
 
 def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str], None]) -> Trial:
     """The trial of the linear approximation after a fit without it; changes nothing of the basis."""
+    basis = without_it(basis, trial.candidate)
     point = basis.point
     say(f"  fitting {trial.candidate.label}")
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
@@ -162,6 +169,16 @@ def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callabl
         return compared(basis, trial, data, fit)
     except DivergedError:  # the linear approximation went too far
         return replace(trial, p_value=1.0)
+
+
+def without_it(basis: Basis, candidate: Candidate) -> Basis:
+    """The basis with none of an effect that is free beside all others, and still is a finding where it is there."""
+    if candidate.effect not in OF_REAL_ROTORS or candidate.effect in basis.data.held:
+        return basis
+    data, apart = basis.data.holding(candidate.effect), basis.held_out and basis.held_out.holding(candidate.effect)
+    fit = refine_base(data, without(basis.point, candidate.effect), basis.accepted, rounds=3, noise=False)
+    held = on_held_out(apart.twin(), fit.point, basis.accepted).loglik if apart else 0.0
+    return replace(basis, data=data, held_out=apart, value=fit.loglik, held_value=held)
 
 
 @dataclass(frozen=True)
@@ -187,6 +204,7 @@ def held_out_noise(basis: Basis, trial: Trial) -> HeldOutNoise | None:
 def with_noise_refit(basis: Basis, own: HeldOutNoise | None, trial: Trial) -> Trial:
     """A trial with noise scales of its own: under those of the model before it, the right explanation gains little."""
     assert trial.fitted is not None
+    basis = without_it(basis, trial.candidate)
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
     try:
         fit = refine_anew(data, trial.fitted.point, mine, rounds=3)
@@ -365,16 +383,6 @@ def feigning(
     return [
         (replace(t, candidate=replace(t.candidate, begin=tuple(begin.items()), likeliest=True)), s) for t, s in asked
     ]
-
-
-def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
-    """Effects tried in a turn that gain nearly as much beside the one that was taken: no other name for it, but more.
-
-    Two explanations of one thing gain no more together than the better one alone.
-    """
-    left = {c: max(t.gain for t in later if t.candidate.effect == c) for c in {t.candidate.effect for t in later}}
-    fitted = [t for t in step.trials if t.fitted is not None and t.candidate.effect in left]
-    return frozenset(t.candidate.effect for t in fitted if 0 < BESIDE * t.gain < left[t.candidate.effect])
 
 
 def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], None]) -> tuple[list[Trial], list[Trial]]:

@@ -22,6 +22,7 @@ from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.vehicle import Vehicle
 
 MISSING = 0.05  # prior probability that one effect is missing from a vehicle file (posterior.md: 0.05 an effect)
+EDGE = 0.99  # of the way to the furthest place on board, within which a load is
 TOLD = 0.5  # posterior probability from which an effect is a finding
 LOOK_ALIKE = 0.05  # posterior probability from which another explanation is told as a look-alike
 Lack = Callable[[NDArray, Balance], NDArray]  # what an effect with these numbers moves of a balance
@@ -51,7 +52,7 @@ def explanations(balances: Sequence[Balance]) -> dict[tuple[str, int], tuple[flo
     """
     asked: dict[tuple[str, int], tuple[Lack, list[tuple[float, float]]]] = {
         **{("rotor_fault", r): _rotor(r - 1) for r in (1, 2, 3, 4)},
-        ("payload", 0): (_load, [(0.0, HEAVIEST / (1.0 + HEAVIEST)), (-1.0, 1.0), (-1.0, 1.0)]),
+        ("payload", 0): (_load, [(0.0, HEAVIEST / (1.0 + HEAVIEST)), (-EDGE, EDGE), (-EDGE, EDGE)]),
         ("thrust_scale", 0): (_thrust, [(-1.0, 1.0)]),
         ("wind", 0): (_air, [(-ON_BOARD, ON_BOARD)] * 2),
     }
@@ -97,13 +98,14 @@ def steady_first(
             return None
         say(f"by what is steady in all flights: {candidate.label} with {chance[best]:.2f}")
         before = refine_base(data.twin(), nominal, ())
-        start = nominal.with_effects({candidate.effect: _values(candidate, found[best][1], nominal)})
+        size = _values(candidate, found[best][1], nominal)
+        start = nominal.with_effects({candidate.effect: size})
         fitted = refine_base(data, start, [candidate])
     except (DivergedError, np.linalg.LinAlgError):  # then the filter's likelihood is all there is
         return None
     odds = float(logit(min(chance[best], 1.0 - 1e-12)))
     gain = fitted.loglik - before.loglik
-    trial = Trial(candidate, gain, max(odds, 0.0), 1.0, 1.0 - chance[best], odds, fitted, log_odds=odds)
+    trial = Trial(candidate, gain, max(odds, 0.0), 1.0, 1.0 - chance[best], odds, fitted, log_odds=odds, size=size)
     alike = tuple(
         replace(trial, candidate=other, fitted=None)
         for other in asked

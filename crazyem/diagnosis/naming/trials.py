@@ -1,6 +1,6 @@
 """Effects that were tried, and how two of them are compared: evidence, significance, what cannot be told apart."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,6 +23,7 @@ LIKELY = 5e-2  # which flights held out may lower where it is below this
 CLOSE = 4.0  # nats within which two explanations cannot be told apart,
 EVEN = 0.5  # what a name is worth, at least, beside a rival that is not significant itself
 TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks or recordings
+BESIDE = 0.5  # share of its gain that an effect keeps beside another which it is no other name for
 BEATEN = 0.1  # probability of being the better explanation below which a simpler one does not give the name
 
 
@@ -44,6 +45,7 @@ class Trial:
         recording: (b,) int, which recording each block is of.
         tuned: nats that it costs that its parameters might have been anything (`evidence.tuning`); None: one for each.
         log_odds: log posterior odds that it is there, where they are known (`steady_odds.py`); None: by `held_out`.
+        size: parameters by what those odds are of.
     """
 
     candidate: Candidate
@@ -58,6 +60,7 @@ class Trial:
     recording: NDArray = field(default_factory=lambda: np.zeros(0, int))
     tuned: float | None = None
     log_odds: float | None = None
+    size: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def presence(self) -> float:
@@ -179,6 +182,16 @@ def by_evidence(trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
         for t in trials
     ]
     return sorted(judged, key=lambda t: (t.p_value >= SURE, -t.evidence))
+
+
+def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
+    """Effects tried in a turn that gain nearly as much beside the one that was taken: no other name for it, but more.
+
+    Two explanations of one thing gain no more together than the better one alone.
+    """
+    left = {c: max(t.gain for t in later if t.candidate.effect == c) for c in {t.candidate.effect for t in later}}
+    fitted = [t for t in step.trials if t.fitted is not None and t.candidate.effect in left]
+    return frozenset(t.candidate.effect for t in fitted if 0 < BESIDE * t.gain < left[t.candidate.effect])
 
 
 def both(p_value: float, held: float) -> float:
