@@ -20,7 +20,7 @@ from crazyem.signals.vocabulary import (
 
 LEVEL = float(compress_quaternion((0.0, 0.0, 0.0, 1.0)))
 STEP = 20  # ms of the drone's clock between packets of a block: half of what a drone sends is enough
-WAITING = 10  # packets of a block that a session may be behind
+WAITING = 5  # packets of a block that a session may be behind: 0.1 s
 AHEAD = 0.1  # s of the drone's clock that a flight may be behind
 PATIENCE = 4000  # looks, a millisecond apart: a busy machine slows the looks as well as who is waited for
 SAG = 0.3  # m below the wanted height until the believed mass is right
@@ -67,7 +67,7 @@ class FakeLink:
         self._landing = False
         self._silent_since = None
         self._session = self._flight = None
-        self._free_until = 0  # ms of its clock: until then it waits for nobody
+        self._free_until = 0  # ms of its clock: until then it waits only for what receives
         self._stop = threading.Event()
         self._thread = None
 
@@ -81,9 +81,9 @@ class FakeLink:
         self._session, self._flight = session, flight
 
     def host_clock(self):
-        """Host time on which the drone's runs as fast as it should, however busy this machine is."""
+        """Host time [s] on which the drone's runs as fast as it should, however busy this machine is."""
         silent = time.monotonic() - self._silent_since if self._silent_since is not None else 0.0
-        return self.fm / 1000.0 + self.speed * silent
+        return self.fm / 1000.0 / self.speed + silent
 
     def connect(self, timeout=15.0):
         pass
@@ -147,21 +147,26 @@ class FakeLink:
     def stop(self):
         self.calls.append("stop")
         self.motors = False
+        self._flight = None  # it ends with this, and looks no more
 
     def _outruns(self):
         s = self._session
         if s is None or s.failure is not None or s.lost is not None:
             return False
+        most = WAITING * len(self.blocks)
+        if self.packets.qsize() > most:
+            return True
+        if self.fm < self._free_until:
+            return False
         waiting = self.packets.qsize() + (s._samples.qsize() if s._mailbox is None else len(s._mailbox._items))
-        return waiting > WAITING * len(self.blocks) or self._unseen() or (s.pusher is not None and s.pusher.busy)
+        return waiting > most or self._unseen() or (s.pusher is not None and s.pusher.busy)
 
     def _unseen(self):
-        seen = self._flight._moved[0] if self._flight is not None else -1.0
+        flight = self._flight
+        seen = flight._moved[0] if flight is not None else -1.0
         return seen >= 0.0 and self.fm / 1000.0 - seen > AHEAD  # not while it has seen nothing at all
 
     def _wait(self):
-        if self.fm < self._free_until:
-            return
         for _ in range(PATIENCE):
             if self._stop.is_set() or not self._outruns():
                 return
