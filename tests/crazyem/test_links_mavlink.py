@@ -238,7 +238,7 @@ def test_frames_are_handed_on_as_they_came():
         kept = []
         link.on_frame = lambda host, data: kept.append(data)
         drone.beating = False
-        time.sleep(0.15)
+        arrived(link)
         kept.clear()
         sent = []
         drone.mangle = lambda data: sent.append(data) or [data]
