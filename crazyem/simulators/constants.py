@@ -182,6 +182,12 @@ def from_vehicle(vehicle: Vehicle) -> tuple[Constants, list[str]]:
     return Constants(vehicle.name, **{n: None if v is None else float(v) for n, v in found.items()}), left
 
 
+def without_effects(vehicle: Vehicle) -> Vehicle:
+    """The vehicle without its effects; what scales the thrust stays, in the law from command to thrust."""
+    thrust = gain(active(vehicle.effects, vehicle), "thrust")
+    return replace(vehicle, effects={}, thrust_curve=tuple(c * thrust for c in vehicle.thrust_curve))
+
+
 def to_vehicle(c: Constants, base: Vehicle | None = None) -> Vehicle:
     """The vehicle of constants; what they do not say is that of `base` (its law from command to thrust, above all).
 

@@ -9,7 +9,7 @@ from crazyem.errors import FileFormatError, UsageError
 from crazyem.physics import folding
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording
-from crazyem.simulators.constants import Constants, from_vehicle, to_vehicle
+from crazyem.simulators.constants import Constants, from_vehicle, to_vehicle, without_effects
 from crazyem.simulators.cost import HORIZON, errors_after, flown, reference_flight, rms_distance, said, to_json
 from crazyem.simulators.fields import Contradiction, Format, SimulatorFile, read, write
 from crazyem.simulators.formats.rotorpy import ROTORPY, ROTORPY_JSON
@@ -178,7 +178,7 @@ def convert(
     """
     constants, left = from_vehicle(vehicle)
     if to == OWN:
-        plain = to_vehicle(constants, replace(vehicle, effects={}))
+        plain = to_vehicle(constants, without_effects(vehicle))
         kept = {n: v for n, v in vehicle.effects.items() if n in left}
         held = replace(plain, effects={**plain.effects, **kept}, name=name or vehicle.name)
         return Conversion(held.to_toml(), OWN, vehicle, held, ())
@@ -195,7 +195,7 @@ def convert(
     text = write(form, constants, template=template, where=where, name=name)
     said_there = _held(form, text, where=where, name=name)
     omissions = _omissions(vehicle, constants, left, said_there, flight) if costs else []
-    base = replace(vehicle, effects={}, motor_time_constant=0.0)  # who does not know of a lag has none
+    base = replace(without_effects(vehicle), motor_time_constant=0.0)  # who does not know of a lag has none
     return Conversion(text, to, vehicle, to_vehicle(said_there, base), tuple(omissions))
 
 
@@ -225,7 +225,7 @@ def _omissions(
     vehicle: Vehicle, full: Constants, left: list[str], held: Constants, flight: Recording | None
 ) -> list[Omission]:
     """What a file lacks of a vehicle, each with its cost: with all, against with all but this."""
-    base = replace(vehicle, effects={})
+    base = without_effects(vehicle)
     kept = {n: vehicle.effects[n] for n in left}
 
     def with_left(c: Constants, without: str = "") -> Vehicle:

@@ -21,6 +21,7 @@ from crazyem.diagnosis.prediction.bias_correction import (
     Turned,
     Weights,
     correction_weights,
+    moments,
     regressed,
     remembered,
 )
@@ -94,6 +95,28 @@ def test_the_running_sums_are_those_of_a_plain_loop() -> None:
         prior = np.diag(sd**-2.0)
         wanted = np.linalg.solve(a / noise + prior, b / noise + prior @ np.array([1.0, 0.0, 0.0]))
         assert row == pytest.approx(wanted, rel=1e-6)
+
+
+def test_earlier_flights_count_as_if_they_had_just_been_flown() -> None:
+    draw, rows = np.random.default_rng(8), 2000
+    x, sd = draw.standard_normal((rows, 2)), np.array([1.0, 0.5])
+    y = 0.4 * x[:, 0] - 0.2 * x[:, 1] + 0.1 * draw.standard_normal(rows)
+    i, j = np.triu_indices(2)
+    mean = np.column_stack([x[:, i] * x[:, j], x * y[:, None], y * y, np.ones(rows)]).mean(axis=0)
+    later_x, later_y = draw.standard_normal((50, 2)), draw.standard_normal(50)
+    found = regressed(later_x, later_y, sd, 1.0, STEP, np.array([-1, 49]), before=mean)
+    # the earlier rows again and again, until the memory is full of them
+    many = round(10 * MEMORY / STEP / rows) + 1
+    flown_x, flown_y = (np.concatenate([*[old] * many, new]) for old, new in ((x, later_x), (y, later_y)))
+    wanted = regressed(flown_x, flown_y, sd, 1.0, STEP, np.array([many * rows - 1, many * rows + 49]))
+    assert found == pytest.approx(wanted, abs=5e-3)
+
+
+def test_earlier_flights_tell_the_weights_of_the_first_start() -> None:
+    earlier, turned = (flight(seed, seconds=30.0, weight=0.4, offset=1.5, error=0.01) for seed in (2, 3))
+    found = correction_weights(turned, turned.time[:1], horizon=0.5, before=moments(earlier, horizon=0.5))
+    assert found.weight[0, 4:] == pytest.approx(0.4, abs=0.03)
+    assert found.added[0, 4:] == pytest.approx(1.5 * found.lags[4:, None] * np.ones(3), abs=0.05)
 
 
 def test_a_loop_that_takes_rates_back_is_learned() -> None:

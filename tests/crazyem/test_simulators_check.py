@@ -135,3 +135,11 @@ def test_a_vehicle_file_is_for_diagnose(tmp_path: Path, capsys: pytest.CaptureFi
     recording = str(Path(__file__).parents[2] / "logs" / "clean_figure8.mcap")
     assert main(["vehicle", "check", str(path), recording]) == 2
     assert "diagnose judges vehicle files" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("to", ["crazyem", "gym-pybullet-drones"])
+def test_what_a_file_holds_is_as_strong_at_a_command(to: str) -> None:
+    """A scale of thrust is no effect of a file; it belongs into the law from command to thrust."""
+    vehicle = replace(load_vehicle("cf2"), rotor_constant=3e-8, effects={"thrust_scale": {"scale": 0.8}})
+    held = convert(vehicle, to, costs=False).held
+    assert held.thrust_curve == pytest.approx([0.8 * c for c in vehicle.thrust_curve])

@@ -134,10 +134,10 @@ def test_offsets_of_states() -> None:
 
 
 def test_a_band_holds_what_it_says_where_the_model_is_right() -> None:
-    """Made flights, whose errors are the noise of their own streams: learned from one, judged on a noisier one."""
+    """Made flights, whose errors are the noise of their own streams: learned from two, judged on a noisier one."""
     vehicle = replace(load_vehicle("cf2"), mass=0.036, rotor_constant=3e-8, effects={})
-    flights = [made_flight(seconds=12.0, seed=4), made_flight(seconds=12.0, seed=9, noise=3.0)]
-    found = ensemble(flights[1], vehicle, [vehicle] * 16, calibrate=flights[:1], seed=1)
+    flights = [made_flight(seconds=12.0, seed=seed, noise=noise) for seed, noise in ((4, 1.0), (5, 1.0), (11, 3.0))]
+    found = ensemble(flights[2], vehicle, [vehicle] * 24, calibrate=flights[:2], seed=1)
     held = found.held()
     assert all(0.75 < share <= 1.0 for share in held.values()), held
     assert found.arrays()["low"].shape == (len(found.rows), 12)

@@ -13,9 +13,9 @@ wants,
     start = (angular acceleration that the model lacked in the last step, rate, and across the axis tilt, velocity,
              velocity times the flow along the rotors' axis, and how far the drone is from where it was on average),
 
-over the flight so far, never what comes after a start; what is older than `MEMORY` counts less. While little has been
-seen, everything is drawn towards the model itself: weight 1, the rest 0. The force, in body axes, is a battery or a
-day's thrust, which no file knows.
+over the flight so far, never what comes after a start; what is older than `MEMORY` counts less. Earlier flights of the
+drone, where given, count as if they had just been flown. While little has been seen, everything is drawn towards the
+model itself: weight 1, the rest 0. The force, in body axes, is a battery or a day's thrust, which no file knows.
 """
 
 from dataclasses import dataclass
@@ -106,34 +106,68 @@ class Turned:
         return self.time[last], model[last] - model[rows], self.rate[last] - self.rate[rows], rows
 
 
-def correction_weights(turned: Turned, starts: NDArray, *, horizon: float) -> Weights:
-    """The weights of starts (n,) s by the flight before them, for times ahead up to `horizon` s."""
+def correction_weights(turned: Turned, starts: NDArray, *, horizon: float, before: NDArray | None = None) -> Weights:
+    """The weights of starts (n,) s by the flight before them, for times ahead up to `horizon` s.
+
+    before: `moments` of earlier flights; None: there are none.
+    """
     lags = np.linspace(0.0, horizon, LAGS + 1)
     weight, added = np.ones((starts.size, lags.size, 3)), np.zeros((starts.size, lags.size, 3))
     here = turned.start[np.maximum(np.searchsorted(turned.time, starts + 1e-9, "right") - 1, 0)]
     for k, lag in enumerate(map(float, lags[1:]), 1):
-        ends, x, y, rows = turned.changes(lag)
+        ends, explaining, came = _explained(turned, lag)
         at = np.searchsorted(ends, starts, "right") - 1
-        known = (at + 1) * turned.period > LEAST_TIME
+        known = (at + 1) * turned.period > (LEAST_TIME if before is None else -1.0)
         if not known.any():
             continue
         sd = np.array([WEIGHT_SD, OFFSET_SD * lag, *(s * lag for s in FEEDBACK_SD)])
         for axis in range(3):
-            explaining = np.column_stack([x[:, axis], np.ones(rows.size), turned.start[rows, axis]])
-            found = regressed(explaining, y[:, axis], sd, max(1.0, lag / turned.period), turned.period, at[known])
+            found = regressed(
+                explaining[:, axis], came[:, axis], sd, max(1.0, lag / turned.period), turned.period, at[known],
+                before=None if before is None else before[k - 1, axis],
+            )  # fmt: skip
             weight[known, k, axis] = np.clip(found[:, 0], 0.0, MOST)
             added[known, k, axis] = found[:, 1] + np.einsum("nf,nf->n", found[:, 2:], here[known, axis])
     weight[:, 0] = weight[:, 1]
     return Weights(lags, weight, added, lacked(turned, starts))
 
 
-def regressed(x: NDArray, y: NDArray, sd: NDArray, alike: float, period: float, at: NDArray) -> NDArray:
+def moments(turned: Turned, *, horizon: float) -> NDArray:
+    """(l, 3, p) mean products of what is regressed in a flight, by time ahead and axis, for flights after it."""
+    found = []
+    for lag in np.linspace(0.0, horizon, LAGS + 1)[1:]:
+        _, explaining, came = _explained(turned, float(lag))
+        found.append([_products(explaining[:, axis], came[:, axis]).sum(0) / max(len(came), 1) for axis in range(3)])
+    return np.array(found)
+
+
+def _explained(turned: Turned, lag: float) -> tuple[NDArray, NDArray, NDArray]:
+    """End times (k,) s, what explains a change over `lag` s by axis (k, 3, c), and the change that came (k, 3)."""
+    ends, x, y, rows = turned.changes(lag)
+    return ends, np.concatenate([x[:, :, None], np.ones((rows.size, 3, 1)), turned.start[rows]], axis=2), y
+
+
+def _products(x: NDArray, y: NDArray) -> NDArray:
+    """(k, p) of x (k, c) and y (k,): the upper triangle of x x, then x y, y y and 1."""
+    i, j = np.triu_indices(x.shape[1])
+    return np.column_stack([x[:, i] * x[:, j], x * y[:, None], y * y, np.ones_like(y)])
+
+
+def regressed(
+    x: NDArray, y: NDArray, sd: NDArray, alike: float, period: float, at: NDArray, *, before: NDArray | None = None
+) -> NDArray:
     """(n, c) coefficients of y (k,) on the columns of x (k, c) up to each of the rows `at` (n,), drawn towards
-    1, 0, 0 ... by priors of these standard deviations (c,). Each `alike` rows, one every `period` s, say the same."""
+    1, 0, 0 ... by priors of these standard deviations (c,). Each `alike` rows, one every `period` s, say the same.
+
+    before: mean products (p,) of earlier flights (see `moments`), as if they had been flown until now; a row of -1
+        knows nothing else.
+    """
     forget, c = np.exp(-period / MEMORY), x.shape[1]
     i, j = np.triu_indices(c)
-    products = np.column_stack([x[:, i] * x[:, j], x * y[:, None], y * y, np.ones_like(y)])
-    sums = lfilter([1.0], [1.0, -forget], products, axis=0)[at]
+    products = _products(x, y)
+    earlier = np.zeros((1, products.shape[1])) if before is None else before[None] / (1.0 - forget)
+    later, _ = lfilter([1.0], [1.0, -forget], products, axis=0, zi=forget * earlier)
+    sums = np.concatenate([earlier, later])[at + 1]
     a = np.empty((at.size, c, c))
     a[:, i, j] = a[:, j, i] = sums[:, : i.size]
     b, yy, count = sums[:, i.size : i.size + c], sums[:, -2], sums[:, -1]

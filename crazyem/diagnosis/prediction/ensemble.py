@@ -1,10 +1,11 @@
 """Open-loop predictions by many drones that may be this one: a band instead of a line.
 
-The centre is what `predict` says: the vehicle, corrected by the flight before each start. The band has two parts. The
-first is what is not known of the drone: its members. The second is what no constants tell: disturbances, and the error
-of the state at the start. Other flights tell the shape of this part. Their prediction errors, in the heading frame,
-are divided by a scale and drawn anew. The scale of each start is the root mean square of the errors that were known
-then: those of the other flights, and those of this flight so far. Without other flights the second part is left out.
+The centre is the vehicle, corrected as in `predict` by the flight before each start, and by the other flights. The band
+has two parts. The first is what is not known of the drone: its members. The second is what no constants tell:
+disturbances, and the error of the state at the start. Other flights tell the shape of this part. Their prediction
+errors, in the heading frame, are divided by a scale and drawn anew. The scale of each start is the root mean square of
+the errors that were known then: those of the other flights, and those of this flight so far. Without other flights the
+second part is left out.
 """
 
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.prediction.bias_correction import MEMORY, Weights, correction_weights
+from crazyem.diagnosis.prediction.bias_correction import MEMORY, Weights, correction_weights, moments
 from crazyem.diagnosis.prediction.horizon import SPACING, UNITS, Windows, open_loop, windows
 from crazyem.diagnosis.prediction.predict import Recorded, recorded, turned_by
 from crazyem.errors import DataError
@@ -25,6 +26,7 @@ Array = NDArray[np.float64]
 BAND = 0.9  # share that the band should hold
 QUANTITIES = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 9), "body_rate": slice(9, 12)}
 FEWEST_STARTS = 30  # of errors to learn twelve spreads from
+STEP = 0.01  # s of the integration: for hundreds of drones
 PRIOR_TIME = 1.0  # s of flight that other flights count as, in the scale of errors: two horizons
 
 
@@ -102,10 +104,12 @@ def ensemble(
 
     Raises: DataError as `predict.recorded` and `horizon.windows`.
     """
-    flight = _Flight.of(recording, vehicle, horizon, plain=plain)
+    flown = [f for f in (_flown(r, vehicle) for r in calibrate) if f is not None]
+    learned = [] if plain else [moments(turned_by(shown), horizon=horizon) for shown in flown]
+    flight = _Flight.of(recorded(recording, vehicle), horizon, learned, plain=plain)
     at, centre = flight.at, flight.centre
-    offsets = np.stack([offset(flight.flown(member), centre) for member in members])
-    others = [f for f in (_Flight.maybe(r, vehicle, horizon, plain=plain) for r in calibrate) if f is not None]
+    offsets = np.stack([offset(flight.flown(member, recording), centre) for member in members])
+    others = [_Flight.of(shown, horizon, learned[:k] + learned[k + 1 :], plain=plain) for k, shown in enumerate(flown)]
     if others:
         errors = np.concatenate([f.errors[f.whole] for f in others])
         if len(errors) < FEWEST_STARTS:
@@ -127,7 +131,6 @@ class _Flight:
             recorded.
     """
 
-    recording: Recording
     shown: Recorded
     at: Windows
     weights: Weights | None
@@ -135,39 +138,44 @@ class _Flight:
     errors: Array
 
     @staticmethod
-    def of(recording: Recording, vehicle: Vehicle, horizon: float, *, plain: bool) -> "_Flight":
-        shown = recorded(recording, vehicle)
+    def of(shown: Recorded, horizon: float, before: Sequence[Array], *, plain: bool) -> "_Flight":
+        """With `moments` of other flights."""
         at = windows(shown, horizons=(horizon,))
-        weights = None if plain else correction_weights(turned_by(shown), at.times[:, 0], horizon=horizon)
-        centre = open_loop(shown, at, weights=weights)[:, -1]
+        learned = np.mean(before, axis=0) if before else None
+        weights = None
+        if not plain:
+            weights = correction_weights(turned_by(shown), at.times[:, 0], horizon=horizon, before=learned)
+        centre = open_loop(shown, at, weights=weights, substep=STEP)[:, -1]
         errors = _turned(offset(at.truth[:, -1], centre), -_headings(centre))
-        return _Flight(recording, shown, at, weights, centre, errors)
-
-    @staticmethod
-    def maybe(recording: Recording, vehicle: Vehicle, horizon: float, *, plain: bool) -> "_Flight | None":
-        """None where a flight is too short or has no whole states."""
-        try:
-            return _Flight.of(recording, vehicle, horizon, plain=plain)
-        except DataError:
-            return None
+        return _Flight(shown, at, weights, centre, errors)
 
     @property
     def whole(self) -> NDArray[np.bool_]:
         """(n,) whether all of an error is known."""
         return np.asarray(np.isfinite(self.errors).all(axis=1))
 
-    def flown(self, member: Vehicle) -> Array:
+    def flown(self, member: Vehicle, recording: Recording) -> Array:
         """(n, 13) by a member; the recording is read anew where its law of thrust is another one."""
         shown = self.shown
         law, own = ((v.rotor_constant, v.thrust_curve, v.thrust_max) for v in (member, shown.inputs.vehicle))
         if law != own:
-            shown = recorded(self.recording, member)
-        found: Array = open_loop(shown, self.at, vehicle=member, weights=self.weights)[:, -1]
+            shown = recorded(recording, member)
+        found: Array = open_loop(shown, self.at, vehicle=member, weights=self.weights, substep=STEP)[:, -1]
         return found
 
     def scale(self, prior: Array) -> Array:
         """(n, 12), see `error_scale`."""
         return error_scale(self.at.times[:, 0], self.at.times[:, -1], self.errors, prior)
+
+
+def _flown(recording: Recording, vehicle: Vehicle) -> Recorded | None:
+    """None where a flight has no whole states or is too short."""
+    try:
+        shown = recorded(recording, vehicle)
+        windows(shown)
+    except DataError:
+        return None
+    return shown
 
 
 def error_scale(begin: Array, end: Array, errors: Array, prior: Array) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.prediction.bias_correction import Weights
 from crazyem.diagnosis.prediction.predict import SAME, Recorded, start_rows
-from crazyem.diagnosis.prediction.simulate import Simulator
+from crazyem.diagnosis.prediction.simulate import SUBSTEP, Simulator
 from crazyem.errors import DataError
 from crazyem.physics.effects.effect import Effects
 from crazyem.physics.rotations import quaternion_conjugate, quaternion_product
@@ -134,6 +134,7 @@ def open_loop(
     effects: Effects | None = None,
     measured_attitude: bool = False,
     weights: Weights | None = None,
+    substep: float = SUBSTEP,
 ) -> NDArray:
     """(n, h, 13) predictions for windows.
 
@@ -144,6 +145,7 @@ def open_loop(
         effects: None takes those of the vehicle.
         measured_attitude: follow the recorded attitude and rate, so that forces are judged alone.
         weights: what was learned before each start (see `earned`); None: the model alone.
+        substep: largest step of the integration [s].
     """
     simulator = Simulator(shown.inputs, effects, vehicle=vehicle)
     swings = simulator.swings(shown.time, shown.state, shown.airborne)
@@ -153,6 +155,7 @@ def open_loop(
         swing=None if swings is None else swings[at.rows],
         given=at.times[:, -1] - shown.period,  # as in `predict`, where steps are the recording's
         attitude=(lambda time: recorded_attitude(shown, time)) if measured_attitude else None,
+        substep=substep,
         weights=weights,
     )
 
