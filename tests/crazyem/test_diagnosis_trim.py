@@ -210,7 +210,7 @@ def test_a_cut_propeller_of_a_relabelled_flight_is_named(shared_recordings, heal
 
 @pytest.mark.slow
 def test_how_much_a_cut_propeller_lacks_is_known(shared_recordings, healthy) -> None:
-    """3.5 mm less on each blade, on flights logged in different tables. A cut of 1.5 mm is no more than days differ by."""
+    """3.5 mm less on each blade, on flights logged in different tables. Cuts of 1.5 mm are within days."""
     values = []
     for table in ("motor", "controller"):
         name = f"{table}__cut_propeller_M3_3.5mm_3.5mm_40mm__E8_log00"
