@@ -5,6 +5,7 @@ No example fails for its wall-clock time, which a busy machine makes any.
 Ctrl-C reaches the programs that tests start even where a shell has started the tests in the background, deaf to it.
 """
 
+import gc
 import signal
 
 from hypothesis import HealthCheck, settings
@@ -23,3 +24,9 @@ settings.load_profile("steady")  # --hypothesis-profile loads the others
 def pytest_collection_modifyitems(items: list) -> None:
     """The longest test begins first: at the end of a list it would keep the others waiting for a minute."""
     items.sort(key=lambda item: "test_the_first_flight_after_installation" not in item.nodeid)
+
+
+def pytest_collection_finish() -> None:
+    """What was imported and collected stays: the garbage collector need not look through it again and again."""
+    gc.collect()
+    gc.freeze()

@@ -85,6 +85,12 @@ DEBTS: set[tuple[str, str]] = set()  # imports that break the rule and are to go
 
 
 @functools.cache
+def tree_of(path: Path) -> ast.Module:
+    """A module's syntax tree."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@functools.cache
 def imports(path: Path) -> tuple[str, ...]:
     """Every module a file imports, wherever in it: absolute dotted names; for `from x import y` both x and x.y."""
     return tuple(_imports(path))
@@ -92,7 +98,7 @@ def imports(path: Path) -> tuple[str, ...]:
 
 def _imports(path: Path) -> Iterator[str]:
     package = path.relative_to(ROOT).with_suffix("").parts
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -222,7 +228,7 @@ def test_only_links_know_cflib() -> None:
 def test_modules_say_first_what_they_are_for() -> None:
     guilty = []
     for path in MODULES:
-        tree = ast.parse(path.read_text(encoding="utf-8"))
+        tree = tree_of(path)
         documented = (ast.get_docstring(tree) or "").strip()
         marker = path.name == "__init__.py" and not tree.body
         if not marker and not (documented[:1].isalnum() or documented[:1] == "`"):

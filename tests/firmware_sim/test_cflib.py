@@ -165,6 +165,7 @@ def test_parameters_persist_and_echo(uri):
         assert answers.get(timeout=TIMEOUT) == pytest.approx(state.default_value)
 
 
+@pytest.mark.slow
 def test_a_parameter_stored_by_cflib_survives_a_restart(tmp_path):
     stored = ("--storage", str(tmp_path / "storage.json"))
     answers = queue.Queue()
