@@ -55,6 +55,6 @@ def test_offline_numbers_have_not_drifted() -> None:
 
 
 @pytest.mark.slow
-def test_no_number_has_drifted() -> None:
+def test_no_number_of_the_first_seed_has_drifted() -> None:
     """The estimator in the loop decides from update to update: its numbers are those of one numba and processor."""
-    check(ALL)
+    check([t for t in ALL if t.seed == 0 and t not in QUICK])
