@@ -24,7 +24,7 @@ from crazyem.physics.rotors import wrench
 from crazyem.recordings import open_recording
 from crazyem.simulators.convert import convert, load_source
 from crazyem.simulators.cost import HORIZON
-from crazyem.simulators.findings import rescaled
+from crazyem.simulators.findings import field_findings, rescaled
 from crazyem.simulators.sampling import sample
 from crazyem.vehicle import Posterior, Vehicle, load_vehicle
 
@@ -115,14 +115,19 @@ def pooled(cache: dict[str, dict], drone: str) -> str:
 
 
 def file_errors(shared: Path, results: Path, drone: str, path: str, name: str) -> str:
-    """Errors of a published file after half a second on the judged flights: as it is, with the numbers of the fit, and
-    of all that was fitted; position and velocity also along the recorded attitude, where forces alone are judged."""
+    """Fields of a published file that were fitted, and errors after half a second on the judged flights: as it is, with
+    the numbers of the fit, and of all that was fitted; position and velocity also along the recorded attitude, where
+    forces alone are judged. What was not fitted is as the drone's preset has it."""
     _, judged = flights(shared, drone)
     source = load_source(path, name=name or None, base=PUBLISHED[drone], strict=False)
+    assert source.imported is not None
     same_weight = rescaled(fitted(results, drone), source.vehicle.mass)
+    effects = json.loads(results.read_text())[drone]["effects"]
+    fields = field_findings(source.imported, source.vehicle, same_weight, effects, {})
     made = convert(same_weight, source.format, template=source.text, name=name, costs=False)
     models = {"before": source.vehicle, "corrected file": made.held, "all found": same_weight}
     lines = [f"{path} {name}: {', '.join(p.name.split('.')[0] for p in judged)}"]
+    lines += [f"{'off' if f.off else '   '} {f}" for f in fields if f.sd > 1e-6 * abs(f.fitted)]
     for which, model in models.items():
         shown = [recorded(open_recording(p), model) for p in judged]
         rms = []

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_flight import made_flight
 
+from benchmarks.ensemble_bands import RANDOM, randomised
 from crazyem.cli import main
 from crazyem.diagnosis.prediction.bias_correction import MEMORY
 from crazyem.diagnosis.prediction.ensemble import PRIOR_TIME, ensemble, error_scale, offset
@@ -158,3 +159,15 @@ def test_the_scale_of_errors_is_of_those_known_at_a_start() -> None:
         assert found[k] == pytest.approx(np.sqrt(square / total))
     later = np.where(end[:, None] > begin[20], 100.0, errors)
     assert np.array_equal(error_scale(begin, end, later, prior)[:21], found[:21])
+
+
+@pytest.mark.parametrize("each_rotor", [False, True])
+def test_the_randomisation_that_bands_are_compared_with(each_rotor: bool) -> None:
+    vehicle = replace(fitted(), effects={"thrust_scale": {"scale": 0.95}})
+    drawn = randomised(vehicle, 1, each_rotor=each_rotor)
+    ratios = np.array([d.mass / vehicle.mass for d in drawn])
+    assert np.abs(ratios - 1.0).max() <= RANDOM < 1.2 * np.abs(ratios - 1.0).max()
+    assert all(abs(d.effects["thrust_scale"]["scale"] / 0.95 - 1.0) <= RANDOM for d in drawn)
+    trims = np.array([list(d.effects["trim"].values()) for d in drawn])
+    assert (np.abs(trims).max() > 1e-3) == each_rotor  # m: torque over thrust
+    assert np.abs(trims[:, :2]).max() <= RANDOM / (1.0 - RANDOM) * max(vehicle.arm)
