@@ -23,6 +23,9 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
+from crazyem import load_vehicle, open_recording
+from crazyem.diagnosis.naming.baseline import with_baseline
+
 HORIZON = 50
 KINDS = ("square", "chirp", "random")
 MARKS = ("<!-- measured -->", "<!-- end of measured -->")
@@ -258,35 +261,27 @@ def _with(text: str, *, name: str, mass: float) -> str:
 # -- crazypad and sysid ------------------------------------------------------------------------------------------------
 
 
-HEALTHY = {  # the first of each drone judges all of its flights, the others the healthy and taped ones
-    "E8": (
-        "motor__normal_flight__E8_log00", "motor__normal_flight__E8_log03", "controller__normal_flight__E8_log00",
-        "motor__tape_on_propeller_M3__E8_log00",
-    ),
-    "E9": ("motor__normal_flight__E9_log00", "controller__normal_flight__E9_log00"),
-}  # fmt: skip
-
-
 def crazypad(shared: Path, work: Path) -> dict[str, Any]:
-    """As a user would: a preset and a healthy flight make the vehicle file, and other flights are judged by it.
+    """As a user would: a preset and the healthy flights of a drone make its file, and other flights are judged by it.
 
-    Every healthy flight judges every other of its drone, for the rate of false alarms.
+    Each healthy flight is judged by the others of its drone, for the rate of false alarms.
     """
     folder = shared / "recordings/crazypad"
     result: dict[str, Any] = {}
-    for drone, healthy in HEALTHY.items():
-        for name in healthy:
-            base = diagnose(work, name, [folder / name], [], "cf2-legacy")
-            result[f"{drone}, {name}"] = base
-            judged = sorted(folder.glob(f"*__{drone}_*")) if name == healthy[0] else [folder / n for n in healthy]
-            for path in judged:
-                if path.name == name:
-                    continue
-                title = f"{path.name} by {name}"
-                try:
-                    result[title] = diagnose(work, title, [path], [], base["fitted"])
-                except RuntimeError as error:
-                    result[title] = {"failed": str(error)}
+    for drone in ("E8", "E9"):
+        flights = sorted(folder.glob(f"*__{drone}_*"))
+        healthy = [p for p in flights if "normal_flight" in p.name]
+        for path in flights:
+            others = [p for p in healthy if p != path]
+            file = work / f"{drone}{healthy.index(path) if path in healthy else ''}.toml"
+            if not file.is_file():
+                learnt = with_baseline(load_vehicle("cf2-legacy"), [open_recording(p) for p in others])
+                file.write_text(learnt.to_toml())
+            try:
+                result[path.name] = diagnose(work, path.name, [path], [], file)
+            except RuntimeError as error:
+                result[path.name] = {"failed": str(error)}
+            print(path.name, [e["label"] for e in result[path.name].get("effects", [])], flush=True)
     return result
 
 

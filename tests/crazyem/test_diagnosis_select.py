@@ -18,7 +18,7 @@ from crazyem.diagnosis.locating.random_torques import peaks
 from crazyem.diagnosis.naming.evidence import gain_of_both
 from crazyem.diagnosis.naming.onset import ONSET, date
 from crazyem.diagnosis.naming.prune import shaken
-from crazyem.diagnosis.naming.select import Basis, compared, held_out_noise
+from crazyem.diagnosis.naming.select import Basis, compared, held_out_noise, linear_trials
 from crazyem.diagnosis.naming.trials import Trial
 
 ONSET_TIME = 4.37  # s
@@ -44,6 +44,17 @@ def test_a_failure_hides_its_moment_in_the_noise_until_it_is_fitted_again(failin
     assert fitted.point.effects["rotor_fault"]["scale"] == pytest.approx(0.9, abs=0.01)
     assert np.all(fitted.point.noise.disturbance[3:5] < 0.3 * point.noise.disturbance[3:5])  # what hid it is gone
     assert fitted.loglik > rough.loglik + 50.0
+
+
+def test_where_a_trim_is_known_only_what_sets_in_later_is_asked_of_rotors() -> None:
+    """What is steady the balance tells (`steady_odds.py`)."""
+    trimmed = replace(DRONE, effects={"trim": {"x": 1e-4, "y": -2e-4, "z": 3e-4}})
+    data = Data([flight_of(fly(Hidden(thrust=(1, 1, 0.9, 1), onset=ONSET_TIME), seconds=8.0), trimmed)])
+    point = nominal(data, Point(trimmed, {n: dict(v) for n, v in trimmed.effects.items()}, first_guess()))
+    candidates = [Candidate("rotor_fault", (("rotor", r), (ONSET, None)), ("scale",)) for r in (1, 2, 3, 4)]
+    asked = [t.candidate for t, _ in linear_trials(data, point, (), candidates)]
+    assert all(dict(c.fixed)[ONSET] is not None for c in asked)
+    assert dict(asked[0].fixed)["rotor"] == 3
 
 
 def test_an_effect_from_the_start_is_not_dated(failing: tuple[Data, Point]) -> None:

@@ -114,6 +114,8 @@ def linear_trials(
                 (replace(t, p_value=by_onsets(point, t.p_value, len(gram.score))), s)
                 for t, s in linear_trials(data, point, accepted, [later])
             ]
+        if by_days(point.vehicle, c):  # what is steady is told by the balance; what sets in later is not
+            continue
         lo, hi = (np.array(b) for b in c.bounds(point))
         judge(c, always + mine, np.append(weights, np.zeros(len(mine))), np.append(low, lo), np.append(high, hi),
               np.append(centre, np.zeros(len(mine))))  # fmt: skip
@@ -302,7 +304,6 @@ def select(
     while True:
         rest = [c for c in candidates if may_join(c.effect, {a.effect for a in accepted})]
         rest = without_trim_rivals(rest, accepted)
-        rest = [c for c in rest if not by_days(point.vehicle, c)]
         say(f"looking for effect {len(accepted) + 1} among {len(rest)} candidates")
         linear = linear_trials(data, point, accepted, best_begun(data, point, accepted, rest))
         if len(accepted) > first:
