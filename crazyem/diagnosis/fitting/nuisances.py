@@ -64,6 +64,7 @@ DAILY_LAG_SD = 0.025
 FLAPPING_SD, DRAG_SD = 3e-4, 0.02  # N m s/m, N s/m: real rotors have both, bare rigid bodies of files neither
 # So both are free beside any effect that is tried. A drag is named all the same where it explains more than none of it.
 OF_REAL_ROTORS = ("linear_drag",)
+ALWAYS_THERE = (*OF_REAL_ROTORS, "velocity_moment")  # so healthy flights of a drone give its file both
 LEANING_SD = (0.02, 0.02, 2e-3)  # rad: an attitude made from the acceleration is tilted as the accelerometer is
 # s: a filter on board that integrates a biased gyro and is drawn back by the fixes stays off by the bias times the time
 # that takes: 0.041, 0.043, 0.041 and 0.038 s in roll and pitch of two simulated flights.

@@ -11,7 +11,7 @@ from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.fit import nominal as nominal_of
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.fitting.nuisances import day_sd, with_trim_noise
+from crazyem.diagnosis.fitting.nuisances import ALWAYS_THERE, day_sd, refine_base, with_trim_noise
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming.balance import OTHERS, balance_of
 from crazyem.errors import UsageError
@@ -22,7 +22,8 @@ from crazyem.vehicle import Days, Vehicle
 def with_baseline(
     vehicle: Vehicle, recordings: Sequence[Recording], say: Callable[[str], None] = lambda text: None
 ) -> Vehicle:
-    """The vehicle with trim and thrust as the mean of healthy flights, and with how these differ (`Days`).
+    """The vehicle with trim and thrust as the mean of healthy flights, with how these differ (`Days`), and with what
+    rotors always have (`ALWAYS_THERE`) as all flights together say.
 
     Args:
         recordings: flights of this drone with nothing wrong, of several days.
@@ -34,18 +35,27 @@ def with_baseline(
         raise UsageError("--baseline needs two healthy flights or more: one does not say how days differ.")
     trim = {"x": 0.0, "y": 0.0, "z": 0.0, **vehicle.effects.get(TRIM, {})}
     known = replace(vehicle, effects={**vehicle.effects, TRIM: trim}, days=None)
-    lacks = []
+    lacks, flights = [], []
     for recording in recordings:
         say(f"healthy flight {recording.path}")
-        data = Data([flight_of(recording, known)])
-        point = nominal_of(data, Point(known, {n: dict(v) for n, v in known.effects.items()}, first_guess()))
-        lacks.append(balance_of(data, with_trim_noise(data, point)).lack)
+        flights.append(flight_of(recording, known))
+        data = Data(flights[-1:])
+        lacks.append(balance_of(data, _nominal(data, known)).lack)
+    data = Data(flights)
+    together = refine_base(data, _nominal(data, known), ()).point.effects
     mean, sd = spread_of(np.array(lacks), np.array(day_sd(known)))
     thrust = float(known.effects.get("thrust_scale", {}).get("scale", 1.0)) * (1.0 - float(mean[0]))
     own = {axis: float(trim[axis] + m) for axis, m in zip("xyz", mean[1:], strict=True)}
-    effects = {**known.effects, TRIM: own, "thrust_scale": {"scale": thrust}}
+    rotors = {name: dict(together[name]) for name in ALWAYS_THERE if name in together}
+    effects = {**known.effects, **rotors, TRIM: own, "thrust_scale": {"scale": thrust}}
     days = Days(len(recordings), float(sd[0]), (float(sd[1]), float(sd[2]), float(sd[3])))
     return replace(known, effects=effects, days=days)
+
+
+def _nominal(data: Data, vehicle: Vehicle) -> Point:
+    """The vehicle's model with the noise of these flights."""
+    bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, first_guess())
+    return with_trim_noise(data, nominal_of(data, bare))
 
 
 def spread_of(found: NDArray, usual: NDArray) -> tuple[NDArray, NDArray]:
