@@ -41,7 +41,8 @@ SAME = {"input_delay": (MEASURED_LATE,)}
 
 @dataclass(frozen=True)
 class Answer:
-    """The effects, most probable first; groups of names that these flights cannot tell apart, and what would."""
+    """The effects, first what is most surely there, whatever its look-alikes; groups of names that these flights cannot
+    tell apart, and what would."""
 
     effects: tuple[Named, ...] = ()
     groups: tuple[tuple[str, ...], ...] = ()
@@ -98,7 +99,7 @@ def answer_of(
         chosen: dict[str, object] = {"streams": ("state", "gyro")} if late else dict(candidate.fixed)
         odds = float(logit(there))
         named = Named(name, label, parameters, chosen, step.taken.held_out, p_value, confidence, candidate.effect, odds)
-        found.append(((-confidence, -step.taken.evidence), named))
+        found.append(((-there, -step.taken.evidence), named))
 
         if doubted:
             separate.append(SHAKES)

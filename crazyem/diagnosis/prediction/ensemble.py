@@ -111,11 +111,11 @@ def ensemble(
     offsets = np.stack([offset(flight.flown(member, recording), centre) for member in members])
     others = [_Flight.of(shown, horizon, learned[:k] + learned[k + 1 :], plain=plain) for k, shown in enumerate(flown)]
     if others:
-        errors = np.concatenate([f.errors[f.whole] for f in others])
+        errors = np.concatenate([f.errors[f.complete] for f in others])
         if len(errors) < FEWEST_STARTS:
             raise DataError(f"{len(errors)} starts are too few to learn disturbances from (at least {FEWEST_STARTS})")
         prior = (errors**2).mean(axis=0)
-        shape = np.concatenate([(f.errors / f.scale(prior))[f.whole] for f in others])
+        shape = np.concatenate([(f.errors / f.scale(prior))[f.complete] for f in others])
         drawn = np.random.default_rng(seed).integers(len(shape), size=offsets.shape[:2])
         offsets = offsets + _turned(shape[drawn] * flight.scale(prior), _headings(centre))
     return Ensemble(at.rows, at.times[:, -1], centre, offsets, offset(at.truth[:, -1], centre), horizon)
@@ -150,7 +150,7 @@ class _Flight:
         return _Flight(shown, at, weights, centre, errors)
 
     @property
-    def whole(self) -> NDArray[np.bool_]:
+    def complete(self) -> NDArray[np.bool_]:
         """(n,) whether all of an error is known."""
         return np.asarray(np.isfinite(self.errors).all(axis=1))
 
