@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
-from crazyem.diagnosis.fitting.fit import Data, nominal
+from crazyem.diagnosis.fitting.fit import ENOUGH, Data, nominal
 from crazyem.diagnosis.fitting.model import Noise, Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import (
@@ -23,8 +23,9 @@ from crazyem.diagnosis.fitting.nuisances import (
 )
 from crazyem.diagnosis.fitting.sampling import coarsely_sampled, fast_share, held, of_a_real_drone
 from crazyem.diagnosis.flights.flight import flight_of
+from crazyem.diagnosis.naming.balance import balance_of
 from crazyem.diagnosis.naming.baseline import with_baseline
-from crazyem.diagnosis.naming.select import linear_trials
+from crazyem.diagnosis.naming.steady_odds import explanations
 from crazyem.recordings import open_recording
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle, load_vehicle
@@ -166,23 +167,21 @@ def turned_file(vehicle: Vehicle, polar: NDArray) -> Vehicle:
     return replace(vehicle, effects={**vehicle.effects, TRIM: trim})
 
 
-def gains(recording: Recording, vehicle: Vehicle) -> NDArray:
-    """(4,) nats that a fault of each rotor gains in the linear approximation."""
+def odds(recording: Recording, vehicle: Vehicle) -> NDArray:
+    """(4,) nats by which the balance prefers a fault of each rotor to none."""
     data = Data([flight_of(recording, vehicle)])
-    point = nominal(data, replace(point_of(vehicle), noise=first_guess()))
-    candidates = [Candidate("rotor_fault", (("rotor", r),), ("scale",)) for r in (1, 2, 3, 4)]
-    found = {dict(t.candidate.fixed)["rotor"]: t.gain for t, _ in linear_trials(data, point, (), candidates)}
-    return np.array([found[r] for r in (1, 2, 3, 4)])
+    found = explanations([balance_of(data, nominal(data, replace(point_of(vehicle), noise=first_guess())))])
+    return np.array([found["rotor_fault", r][0] - found["", 0][0] for r in (1, 2, 3, 4)])
 
 
 @pytest.mark.parametrize("name", SYMMETRIES)
-def test_rotors_relabelled_by_symmetry_give_the_relabelled_gains(name: str) -> None:
+def test_rotors_relabelled_by_symmetry_give_the_relabelled_odds(name: str) -> None:
     polar, to = SYMMETRIES[name]
-    flown = fly(Hidden(thrust=(1.0, 1.0, 0.94, 1.0)), seconds=6.0, seed=3)
+    flown = fly(Hidden(thrust=(1.0, 1.0, 0.8, 1.0)), seconds=6.0, seed=3)
     vehicle = replace(DRONE, effects={TRIM: {"x": 1e-4, "y": -2e-4, "z": 3e-4}})
-    one, other = gains(flown, vehicle), gains(relabelled(flown, polar, to), turned_file(vehicle, polar))
+    one, other = odds(flown, vehicle), odds(relabelled(flown, polar, to), turned_file(vehicle, polar))
     assert np.argmax(one) == 2
-    np.testing.assert_allclose(other[np.array(to) - 1], one, rtol=1e-2)
+    np.testing.assert_allclose(other[np.array(to) - 1], one, atol=ENOUGH)  # a fit ends where so few nats are gained
 
 
 def trimmed_by(folder, name: str) -> Vehicle:
