@@ -181,7 +181,7 @@ def test_rotors_relabelled_by_symmetry_give_the_relabelled_odds(name: str) -> No
     vehicle = replace(DRONE, effects={TRIM: {"x": 1e-4, "y": -2e-4, "z": 3e-4}})
     one, other = odds(flown, vehicle), odds(relabelled(flown, polar, to), turned_file(vehicle, polar))
     assert np.argmax(one) == 2
-    np.testing.assert_allclose(other[np.array(to) - 1], one, atol=ENOUGH)  # a fit ends where so few nats are gained
+    np.testing.assert_allclose(other[np.array(to) - 1], one, atol=2.0 * ENOUGH)  # either fit may end so early
 
 
 def trimmed_by(folder, name: str) -> Vehicle:
