@@ -102,7 +102,10 @@ def pooled(cache: dict[str, dict], drone: str) -> str:
     """A table over the judged flights of a drone, each start counting the same."""
     rows = [entry for entry in cache.values() if entry["drone"] == drone]
     starts = np.array([r["ensemble"]["starts"][0] for r in rows], float)
-    mean = lambda which, what: np.array([r[which][what] for r in rows]).T @ starts / starts.sum()  # noqa: E731
+
+    def mean(which: str, what: str) -> np.ndarray:
+        return np.asarray(np.array([r[which][what] for r in rows]).T @ starts / starts.sum())
+
     width = mean("ensemble", "width")
     lines = [f"| {drone}, {len(rows)} flights, {starts.sum():.0f} starts | position | velocity | attitude | rate |",
              "|---|---|---|---|---|",

@@ -33,7 +33,7 @@ from crazyem.diagnosis.naming.prediction_check import with_found, without_what_m
 from crazyem.diagnosis.naming.rotor_response import answers, disobedient
 from crazyem.diagnosis.naming.select import select
 from crazyem.diagnosis.naming.steady import left_as_trim, with_exact_torques, with_its_thrust
-from crazyem.diagnosis.naming.steady_odds import steady_first
+from crazyem.diagnosis.naming.steady_odds import steady_selection
 from crazyem.diagnosis.naming.trials import Selection, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained, unexplained
 from crazyem.diagnosis.workers import Workers
@@ -245,7 +245,7 @@ def _selected(asked: _Request, workers: Workers, say: Say) -> _Chosen:
     )
     candidates, left_out = abstained(data, nominal, [*candidates, *asked.besides], left_out)
     nominal = with_trim_noise(data, nominal)
-    begun = steady_first(data, apart, nominal, candidates, say)
+    begun = steady_selection(data, apart, nominal, candidates, say)
     selection = select(data, nominal, candidates, held_out=apart, begun=begun, say=say)
     return _Chosen(asked, data, apart, selection, candidates, left_out)
 

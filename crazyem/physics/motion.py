@@ -206,7 +206,7 @@ def measured(situation: Situation, *, vehicle: Vehicle, effects: Effects) -> Off
     for effect, values in active(effects, vehicle):
         if effect.measured is not None:
             turned = state[:, 6:9] if situation.tilt is None else situation.tilt + state[:, 6:9]
-            added = effect.measured(replace(situation, tilt=turned) if effect.by_force else situation, **values)
+            added = effect.measured(replace(situation, tilt=turned) if effect.uses_force else situation, **values)
             state += added.state
             force += added.specific_force
     return Offset(state, force)

@@ -51,7 +51,7 @@ def flown(*, speed: float, measured: bool = False) -> SimpleNamespace:
     inputs = SimpleNamespace(measured=measured, time=time, thrust=np.full((400, 4), 0.07))
     flight = Made(name="flight", y=y, time=time, inputs=inputs, coarse=False, levelled=False, fused=False)
     signals = frozenset({"position", "velocity", "attitude", "body_rate"})
-    return SimpleNamespace(flights=[flight], coarse=False, differ=False, signals=signals, held=frozenset())
+    return SimpleNamespace(flights=[flight], coarse=False, differ=False, signals=signals, constrained=frozenset())
 
 
 def sd_of(data: SimpleNamespace, point: Point, effect: str) -> np.ndarray:

@@ -7,6 +7,7 @@ import pytest
 from closed_loop import DRONE, Hidden, fly
 from made_flight import array_of
 from scipy.integrate import solve_ivp
+from scipy.linalg import solve_continuous_are
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
@@ -41,7 +42,7 @@ def test_the_offset_is_that_of_a_slow_low_pass():
         specific_force=turned.inv().apply(acceleration), angular_acceleration=np.gradient(rate, step, axis=0)[at],
         thrust=np.zeros((n, 4)), thrust_rate=np.zeros((n, 4)), voltage=np.zeros(n), rotor_constant=np.nan, air=none,
     )  # fmt: skip
-    offset = filtered(situation, rate_lag=lag, velocity_lag=lag, attitude_lag=0.0, lateral_memory=0.3).state
+    offset = filtered(situation, rate_lag=lag, velocity_lag=lag, attitude_lag=0.0, lateral_time_constant=0.3).state
     wanted = (shown - np.hstack([velocity, rate]))[at]
     second_order = (pulse * lag) ** 2
     assert np.abs(offset[:, 9:] - wanted[:, 3:]).max() < 1.5 * second_order
@@ -50,7 +51,7 @@ def test_the_offset_is_that_of_a_slow_low_pass():
     assert not offset[:, [0, 1, 2, 6, 7, 8]].any()
     spin = np.array([0.5, -1.0, 2.0])  # rad/s, all the time: then the attitude of 2 ms ago is a turn back by 2 ms of it
     turning = replace(situation, body_rate=np.tile(spin, (n, 1)))
-    late = filtered(turning, rate_lag=0.0, velocity_lag=0.0, attitude_lag=lag, lateral_memory=0.0).state[0, 6:9]
+    late = filtered(turning, rate_lag=0.0, velocity_lag=0.0, attitude_lag=lag, lateral_time_constant=0.0).state[0, 6:9]
     now, before = (turned * Rotation.from_rotvec(spin * t) for t in (1.0, 1.0 - lag))
     np.testing.assert_allclose(late, (now.inv() * before).as_rotvec(), atol=1e-12)
 
@@ -67,7 +68,7 @@ def test_a_filter_that_knows_no_drag_is_off_as_a_plain_integration_says(memory, 
     situation = Situation(
         time=step * np.arange(n), flown=none[:, 0], step=np.full(n, step), position=none, height=none[:, 0],
         velocity=none, rotation=np.tile(rotation_matrix(turned.as_quat()), (n, 1, 1)), body_rate=none,
-        specific_force=none, modelled=np.tile(force, (n, 1)), angular_acceleration=none, thrust=np.zeros((n, 4)),
+        specific_force=none, model_force=np.tile(force, (n, 1)), angular_acceleration=none, thrust=np.zeros((n, 4)),
         thrust_rate=np.zeros((n, 4)), voltage=np.zeros(n), rotor_constant=np.nan, air=none, fused=True,
         tilt=None if tilt is None else np.tile(tilt, (n, 1)),
     )  # fmt: skip
@@ -78,7 +79,7 @@ def test_a_filter_that_knows_no_drag_is_off_as_a_plain_integration_says(memory, 
         return np.concatenate([x[3:] - 2.0 * x[:3] / memory, drive - 2.0 * x[:3] / memory**2])
 
     plain = solve_ivp(off, (0.0, situation.time[-1]), np.zeros(6), t_eval=situation.time, rtol=1e-9, atol=1e-12).y.T
-    lags = {"rate_lag": 0.0, "velocity_lag": 0.0, "attitude_lag": 0.0, "lateral_memory": memory}
+    lags = {"rate_lag": 0.0, "velocity_lag": 0.0, "attitude_lag": 0.0, "lateral_time_constant": memory}
     shown = filtered(situation, **lags).state
     np.testing.assert_allclose(shown[:, :6], plain, rtol=1e-6, atol=1e-9)
     if memory < 0.5:  # settled
@@ -86,12 +87,26 @@ def test_a_filter_that_knows_no_drag_is_off_as_a_plain_integration_says(memory, 
     assert not filtered(replace(situation, fused=False), **lags).state[:, :6].any()
 
 
+@pytest.mark.parametrize(("acceleration", "position"), [(0.1, 1e-4), (1.0, 1e-5), (3.0, 1e-6)])
+def test_the_gains_of_such_a_filter_are_those_of_its_riccati_equation(acceleration, position):
+    """p' = v, v' = white noise, p is measured in white noise: with T = 2 / first gain the second gain is 2 / T^2."""
+    covariance = solve_continuous_are(
+        np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[1.0], [0.0]]), np.diag([0.0, acceleration]), [[position]]
+    )
+    first, second = covariance[:, 0] / position
+    assert second == pytest.approx(2.0 / (2.0 / first) ** 2)
+
+
 @pytest.mark.parametrize("effect", ["linear_drag", "wind"])
 def test_what_a_force_changes_in_the_velocity_that_is_shown_is_a_difference_of_likelihoods(effect):
     """Score by a force's parameter, which acts and shows at once, against differences of whole passes."""
     recording = fly(Hidden(), seconds=6.0, seed=3)
     flight = replace(flight_of(recording, DRONE), fused=True)
-    effects = {"onboard_filter": {"lateral_memory": 0.2}, "linear_drag": {"x": 0.01, "y": 0.01}, "wind": {"x": 0.5}}
+    effects = {
+        "onboard_filter": {"lateral_time_constant": 0.2},
+        "linear_drag": {"x": 0.01, "y": 0.01},
+        "wind": {"x": 0.5},
+    }
     point = Point(DRONE, effects, first_guess())
     model = Model(flight)
     model.settle(point, passes=4)

@@ -83,7 +83,7 @@ def test_smooth_commands_and_measured_speeds_miss_nothing() -> None:
 
 def priors(flight: Any) -> dict[str, NDArray]:
     signals = frozenset({"position", "attitude", "body_rate"})
-    data: Any = SimpleNamespace(flights=[flight], coarse=False, differ=False, signals=signals, held=frozenset())
+    data: Any = SimpleNamespace(flights=[flight], coarse=False, differ=False, signals=signals, constrained=frozenset())
     found = nuisances(data, Point(DRONE, {}, first_guess()), ())
     return {c.effect: np.array(precision) ** -0.5 for c, precision in found}
 

@@ -11,13 +11,13 @@ from scipy import stats
 from test_diagnosis_balance import EACH, LOAD, SD, TRIMMED, balance, rotor
 
 from crazyem.diagnosis.fitting.candidates import TRIM
+from crazyem.diagnosis.fitting.days import day_freedom, day_sd
 from crazyem.diagnosis.fitting.fit import local_precision, log_prior
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.fitting.nuisances import day_sd
 from crazyem.diagnosis.naming.answer import _by_the_day
 from crazyem.diagnosis.naming.baseline import spread_of, with_baseline
-from crazyem.diagnosis.naming.steady_odds import by_days, explanations
+from crazyem.diagnosis.naming.steady_odds import decided_by_balance, explanations
 from crazyem.errors import UsageError
 from crazyem.vehicle import Days
 
@@ -77,11 +77,11 @@ def test_a_load_is_as_sure_as_the_day_s_thrust_and_at_the_edge_as_the_torque_tha
 
 
 def test_the_balance_alone_speaks_of_weak_rotors_only_where_a_trim_is_known():
-    assert by_days(TRIMMED, rotor(1))
-    assert by_days(TRIMMED, LOAD)
-    assert not by_days(TRIMMED, rotor(1, onset=3.0))
-    assert not by_days(DRONE, rotor(1))
-    assert not by_days(replace(DRONE, effects={TRIM: dict.fromkeys("xyz", 0.0)}), rotor(1))
+    assert decided_by_balance(TRIMMED, rotor(1))
+    assert decided_by_balance(TRIMMED, LOAD)
+    assert not decided_by_balance(TRIMMED, rotor(1, onset=3.0))
+    assert not decided_by_balance(DRONE, rotor(1))
+    assert not decided_by_balance(replace(DRONE, effects={TRIM: dict.fromkeys("xyz", 0.0)}), rotor(1))
 
 
 @given(st.floats(-1e2, 1e2), st.floats(1e-3, 1e3), st.floats(1.0, 50.0))
@@ -112,8 +112,9 @@ def test_the_spread_of_days_goes_from_that_of_other_drones_to_the_drone_s_own():
 
 
 def test_a_vehicle_says_how_its_days_differ():
-    assert day_sd(DRONE) == (0.02, 5e-4, 5e-4, 1.6e-4)
-    assert day_sd(replace(DRONE, days=Days(5, 0.01, (1e-4, 2e-4, 3e-4)))) == (0.01, 1e-4, 2e-4, 3e-4)
+    assert (day_sd(DRONE), day_freedom(DRONE)) == ((0.02, 5e-4, 5e-4, 1.6e-4), 8.0)
+    known = replace(DRONE, days=Days(5, 0.01, (1e-4, 2e-4, 3e-4)))
+    assert (day_sd(known), day_freedom(known)) == ((0.01, 1e-4, 2e-4, 3e-4), 6.0)
 
 
 def test_one_healthy_flight_says_nothing_of_days():

@@ -8,10 +8,11 @@ from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fitting.candidates import Candidate, OfRecordings, of_recordings
+from crazyem.diagnosis.fitting.days import THRUST_SD
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import OWN, Point, deviations, of_recording
 from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.fitting.nuisances import SEVERAL, THRUST_SD, differing, nuisances, refine_base
+from crazyem.diagnosis.fitting.nuisances import SEVERAL, differing, nuisances, refine_base
 from crazyem.diagnosis.flights.flight import Flight, flight_of
 
 STRONG = (0.97, 1.0, 1.03, 1.02)

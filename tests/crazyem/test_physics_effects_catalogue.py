@@ -28,7 +28,7 @@ AGREED = {  # issue 5: names are an interface
     "suspended_load": "mass length", "rotor_sensor": "rotor scale",
     "trim": "x y z",  # not of the issue: what real drones need
     "sampled_commands": "tilt turn",  # nor this
-    "onboard_filter": "rate_lag velocity_lag attitude_lag lateral_memory",  # nor this: what every log needs
+    "onboard_filter": "rate_lag velocity_lag attitude_lag lateral_time_constant",  # nor this: what every log needs
     "force_by_place": "x y z xx xy xz yx yy yz zx zy zz",  # nor this: a rival of named ones, never named itself
 }  # fmt: skip
 

@@ -64,12 +64,12 @@ class Data:
         self.models = [Model(f) for f in flights]
         self.workers = workers or Workers(1)
         self.informed = Informed()
-        self.held: frozenset[str] = frozenset()  # effects that are not free here, though they usually are
+        self.constrained: frozenset[str] = frozenset()  # effects that are not free here, though they usually are
 
-    def holding(self, effect: str) -> "Data":
-        """A twin in which an effect is not free, though it usually is: as the vehicle file has it."""
+    def constraining(self, effect: str) -> "Data":
+        """A twin in which an effect is as the vehicle file has it, though it is free usually."""
         twin = self.twin()
-        twin.held = self.held | {effect}
+        twin.constrained = self.constrained | {effect}
         return twin
 
     def twin(self) -> "Data":
@@ -77,7 +77,7 @@ class Data:
         twin = Data((), self.workers)
         twin.models = [m.twin() for m in self.models]
         twin.informed = self.informed.copy()
-        twin.held = self.held
+        twin.constrained = self.constrained
         return twin
 
     def together_with(self, other: "Data | None") -> "Data":
@@ -90,7 +90,7 @@ class Data:
         """Twins of the flights one by one."""
         parts = [Data((), self.workers) for _ in self.models]
         for part, model in zip(parts, self.models, strict=True):
-            part.models, part.held = [model.twin()], self.held
+            part.models, part.constrained = [model.twin()], self.constrained
         return parts
 
     @property
@@ -320,8 +320,7 @@ def refine(
 ) -> Fitted:
     """Maximum of the posterior near `start`, in which the candidates' effects already stand.
 
-    `nuisances` are free too, with priors of these precisions about neutral, or about their values in `about`: normal,
-    or with the tails that stand with the effect.
+    `nuisances` are free too, with priors of these precisions about neutral or `about`: normal, or with `freedom`.
 
     Raises: DivergedError if the filter leaves the range of numbers at `start`.
     """
@@ -367,5 +366,5 @@ def refine(
                 point, value, gram = better, found, slopes
         if gained < ENOUGH:
             break
-    local = local_precision(away(point), weight, freedom)
-    return Fitted(point, tuple(candidates), value, gram, local, tuple(c for c, _ in nuisances))
+    precision = local_precision(away(point), weight, freedom)
+    return Fitted(point, tuple(candidates), value, gram, precision, tuple(c for c, _ in nuisances))

@@ -250,7 +250,7 @@ def bounded(a: NDArray, b: NDArray, low: NDArray | None, high: NDArray | None) -
     return np.clip(t / scale, *within)
 
 
-def none_of_it(
+def neutral_gain(
     gram: Gram, order: Sequence[int], own: int, weights: NDArray, low: NDArray, high: NDArray, centre: NDArray
 ) -> tuple[float, float]:
     """Gain, on all blocks and on those held out, where the last `own` columns are at none of their effect.

@@ -192,7 +192,7 @@ class Model:
         situation = self._situation_shown(point, accelerations)
         for name in showing:
             only = {name: effects[name]}
-            if CATALOGUE[name].by_force:  # it goes by what those before it show
+            if CATALOGUE[name].uses_force:  # it goes by what those before it show
                 turned = replace(situation, tilt=offset[:, 6:9])
                 offset = offset + measured(turned, vehicle=point.vehicle, effects=only).state
                 continue
@@ -207,12 +207,12 @@ class Model:
         if self._as_shown is not None and self.moved is not None:
             return self._as_shown
         path = initial_path(self.flight) if self.shown is None else self.shown
-        modelled = accelerations[:, :3]
+        model_force = accelerations[:, :3]
         accelerations = accelerations if self.moved is None else self.moved
         situation = situation_of(self.flight, path, point.vehicle, self.thrusts(point.vehicle, {}))
         self._as_shown = replace(
             situation, specific_force=accelerations[:, :3], angular_acceleration=accelerations[:, 3:],
-            integrated=integrated_path(situation, accelerations), modelled=modelled,
+            integrated=integrated_path(situation, accelerations), model_force=model_force,
         )  # fmt: skip
         return self._as_shown
 
@@ -332,11 +332,11 @@ class Model:
         if not self.flight.fused or np.linalg.norm(change[:, :2]) < LATERAL * np.linalg.norm(change):
             return None
         here = of_recording(point.effects, self.flight.name)
-        effects = {name: here[name] for name in here if CATALOGUE[name].by_force}
+        effects = {name: here[name] for name in here if CATALOGUE[name].uses_force}
         if not effects:
             return None
-        situation = replace(self._situation_shown(point, acceleration), modelled=acceleration[:, :3])
-        changed = replace(situation, modelled=acceleration[:, :3] + change[:, :3])
+        situation = replace(self._situation_shown(point, acceleration), model_force=acceleration[:, :3])
+        changed = replace(situation, model_force=acceleration[:, :3] + change[:, :3])
         up, down = (measured(s, vehicle=point.vehicle, effects=effects).state for s in (changed, situation))
         shown: NDArray = up - down
         return shown if shown.any() else None

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, of_recordings
+from crazyem.diagnosis.fitting.days import day_freedom, day_sd, trim_known
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, refine, remembering, remembering_anew
 from crazyem.diagnosis.fitting.gram import Solution, used
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.sampling import TRIM_SD, coarsely_sampled, interval, unlogged_share
+from crazyem.diagnosis.fitting.sampling import coarsely_sampled, interval, unlogged_share
 from crazyem.diagnosis.flights.flight import Flight
-from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.vehicle import GRAVITY, Vehicle
 
 # What is never exactly as a vehicle file says, and is therefore always free, within these standard deviations: the
@@ -38,33 +38,30 @@ CENTRE_SD = (2e-5, 2e-5, 7e-4)  # m; a height of -0.4 to -0.8 mm is what velocit
 # rad/s: what a gyro shows of itself in one recording. Mean rates by gyro and by motion capture differ by 0.16 deg/s
 # (rms about x and y of eight slow and medium flights of NanoBench, arXiv 2603.09908).
 GYRO_SD = 2.8e-3
-# Relative: no onboard filter is better; m/s, of motion capture and of a filter on board: see `jittery`.
+# Relative: no onboard filter is better; m/s, of motion capture and of a filter on board, see `jittery`. Velocities of
+# 36 simulated filters in hover differ from the true ones by 0.9 to 10.6 mm/s (rms; median 2.7): the largest is taken.
 VELOCITY_SD, JITTER, ONBOARD_JITTER = 2e-3, 3e-3, 1e-2
 # s: rates behind the attitude, velocities behind the position, by the filters of the firmware; in 80 flights with
 # nothing hidden 0.0 to 2.4 and 0.0 to 1.6 ms, most in quick ones.
 FILTER, FILTER_SD = (("rate_lag", 1.2e-3), ("velocity_lag", 0.6e-3)), 0.7e-3
-# s: of velocities, where a filter on board makes them: 0.9 to 5.7 ms in ten flights of as many filters.
+# s: of velocities, where a filter on board makes them: 0.7 to 5.7 ms in ten simulated flights of five filters.
 ONBOARD_LAG_SD = 2e-3
-# s: fixes draw a velocity back that a filter on board makes without the drag: within 0.17 to 0.46 s in six simulated
+# s: fixes draw a velocity back that a filter on board makes without the drag: within 0.17 to 0.36 s in nine simulated
 # flights, by the rate and the noise of the fixes. A filter that knows all forces has none of that error.
-LATERAL_MEMORY, LATERAL_MEMORY_SD = ("lateral_memory", 0.2), 0.2
+LATERAL_TIME_CONSTANT, LATERAL_TIME_CONSTANT_SD = ("lateral_time_constant", 0.2), 0.2
 # Relative: in ten flights with nothing hidden, with the lag free, torques look 2 +- 2 % too strong (-0.5 to +4 %); a
 # longer lag with more torque is nearly the same to a loop whose commands are sampled.
 TORQUE_SD = 0.03
 # N m s: speeds logged at 100 Hz miss what the loop does in between, which looks like a damping of 1 to 11e-6 in quick
 # flights of 11 drones with nothing hidden (and of 8e-5 to 2.4e-4 in hovers, which hardly show it).
 DAMPING_SD = 6e-6
-# From one day to the next, of a drone whose file has a trim: batteries are put in again, propellers and feet bent.
-# Healthy and damaged flights of two drones on several days scatter like this (docs: diagnosis_real.md). The thrust is
-# free for each of several recordings of any drone (`SEVERAL`): one number for all would make it heed commands less.
-THRUST_SD = 0.02  # relative
 # s: of the lag of rotors in the calm flights of real drones, 24 to 105 ms in 26 flights for a file's 50, whether
 # anything was wrong with them or not, so a file to which one of them was fitted does not know it.
 DAILY_LAG_SD = 0.025
 FLAPPING_SD, DRAG_SD = 3e-4, 0.02  # N m s/m, N s/m: real rotors have both, bare rigid bodies of files neither
 # So both are free beside any effect that is tried. A drag is named all the same where it explains more than none of it.
-OF_REAL_ROTORS = ("linear_drag",)
-ALWAYS_THERE = (*OF_REAL_ROTORS, "velocity_moment")  # so healthy flights of a drone give its file both
+ROTOR_DRAG = ("linear_drag",)
+ROTOR_AERODYNAMICS = (*ROTOR_DRAG, "velocity_moment")  # so healthy flights of a drone give its file both
 LEANING_SD = (0.02, 0.02, 2e-3)  # rad: an attitude made from the acceleration is tilted as the accelerometer is
 # s: a filter on board that integrates a biased gyro and is drawn back by the fixes stays off by the bias times the time
 # that takes: 0.041, 0.043, 0.041 and 0.038 s in roll and pitch of two simulated flights.
@@ -150,14 +147,7 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
             found.append((Candidate("motor_lag", (), ("time_constant",)), (LAG_SD**-2,)))
     if "velocity" in data.signals and "position" in data.signals:
         found.append((Candidate("velocity_scale", (), ("x", "y", "z")), tuple((VELOCITY_SD + jittery(data)) ** -2.0)))
-    shown = [f for f, stream in zip(FILTER, ("body_rate", "velocity"), strict=True) if stream in data.signals]
-    if shown and ("attitude" in data.signals or "position" in data.signals):
-        onboard = {"velocity", "position"} <= data.signals and any(f.fused for f in data.flights)
-        lag = ONBOARD_LAG_SD if onboard else FILTER_SD
-        precision = tuple((lag if name == "velocity_lag" else FILTER_SD) ** -2 for name, _ in shown)
-        if onboard:
-            shown, precision = [*shown, LATERAL_MEMORY], (*precision, LATERAL_MEMORY_SD**-2)
-        found.append((Candidate("onboard_filter", tuple(shown), tuple(n for n, _ in shown)), precision))
+    found += _onboard_filter(data)
     if "body_rate" in data.signals:
         offsets = of_recordings("gyro_bias", ("x", "y", "z"), data.flights)
         found.append((offsets, (GYRO_SD**-2,) * len(offsets.free)))
@@ -165,13 +155,7 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
         own = of_recordings("thrust_scale", ("scale",), data.flights)
         found.append((own, (day_sd(point.vehicle)[0] ** -2,) * len(own.free)))
     if daily:
-        known = any(float(v) for v in point.vehicle.effects[TRIM].values())  # or nothing is known of the drone's own
-        tails = CATALOGUE[TRIM].prior.freedom if known else math.inf
-        thrust, *trim = day_sd(point.vehicle)
-        found.append((Candidate(TRIM, (), ("x", "y", "z"), freedom=tails), tuple(sd**-2 for sd in trim)))
-        found.append((Candidate("thrust_scale", (), ("scale",)), (thrust**-2,)))
-        found.append((Candidate("velocity_moment", (), ("roll_per_vy", "pitch_per_vx")), (FLAPPING_SD**-2,) * 2))
-        found.append((Candidate("linear_drag", (), ("x", "y", "z")), (DRAG_SD**-2,) * 3))
+        found += _another_day(point.vehicle)
         if lags:
             found.append((Candidate("motor_lag", (), ("time_constant",)), (DAILY_LAG_SD**-2,)))
     if "attitude" not in data.signals and any(np.isfinite(f.y[:, 6]).any() for f in data.flights):
@@ -181,10 +165,35 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
     if all(f.levelled for f in data.flights):
         found.append((Candidate("thrust_curve", (), ("slope_error",)), (SAG_SLOPE_SD**-2,)))
         found.append((Candidate("battery_sag", (), ("gain_per_second",)), (RUN_DOWN_SD**-2,)))
-    taken = {c.effect for c in accepted} | data.held
+    taken = {c.effect for c in accepted} | data.constrained
     if "motor_lag" in taken:  # both free, with a lag that has no prior, go along their ridge: a lag 8 ms too long
         taken.add("torque_scale")
     return [(c, p) for c, p in found if c.effect not in taken]
+
+
+def _onboard_filter(data: Data) -> Nuisances:
+    """Lags of filters on board, and the forces that they do not know."""
+    shown = [f for f, stream in zip(FILTER, ("body_rate", "velocity"), strict=True) if stream in data.signals]
+    if not shown or not {"attitude", "position"} & data.signals:
+        return []
+    onboard = {"velocity", "position"} <= data.signals and any(f.fused for f in data.flights)
+    lag = ONBOARD_LAG_SD if onboard else FILTER_SD
+    precision = tuple((lag if name == "velocity_lag" else FILTER_SD) ** -2 for name, _ in shown)
+    if onboard:
+        shown, precision = [*shown, LATERAL_TIME_CONSTANT], (*precision, LATERAL_TIME_CONSTANT_SD**-2)
+    return [(Candidate("onboard_filter", tuple(shown), tuple(n for n, _ in shown)), precision)]
+
+
+def _another_day(vehicle: Vehicle) -> Nuisances:
+    """What differs from day to day, of the file of a real drone, and what real rotors have."""
+    tails = day_freedom(vehicle) if trim_known(vehicle) else math.inf
+    thrust, *trim = day_sd(vehicle)
+    return [
+        (Candidate(TRIM, (), ("x", "y", "z"), freedom=tails), tuple(sd**-2 for sd in trim)),
+        (Candidate("thrust_scale", (), ("scale",)), (thrust**-2,)),
+        (Candidate("velocity_moment", (), ("roll_per_vy", "pitch_per_vx")), (FLAPPING_SD**-2,) * 2),
+        (Candidate("linear_drag", (), ("x", "y", "z")), (DRAG_SD**-2,) * 3),
+    ]
 
 
 def differing(flights: Sequence[Flight], kept_apart: Sequence[Flight], vehicle: Vehicle) -> list[list[Flight]]:
@@ -197,20 +206,12 @@ def differing(flights: Sequence[Flight], kept_apart: Sequence[Flight], vehicle: 
     return [[replace(f, differs=own) for f in part] for part in (flights, kept_apart)]
 
 
-def day_sd(vehicle: Vehicle) -> tuple[float, ...]:
-    """By how much thrust (relative) and trim about x, y, z [m] differ from day to day: as the file says, or as those of
-    any drone."""
-    if vehicle.days is not None:
-        return (vehicle.days.thrust_sd, *vehicle.days.trim_sd)
-    return (THRUST_SD, *TRIM_SD)
-
-
 def jittery(data: Data) -> NDArray:
     """(3,) by how much, relative, the jitter of an onboard estimate makes velocities look too large or too small.
 
     Its errors in position and velocity hang together, so a drone that hardly moves seems to move faster than it does:
     in simulated flights with right velocities by 1 to 3 mm/s, which is 20 % in hover, 1 to 5 % in small shakes, 0.3 %
-    in figures 8; where gyro, pose and filter are as noisy as some are, by up to 10 mm/s.
+    in figures 8; with other noise of gyro and pose by up to 10 mm/s.
     """
     moving = [np.nanmean(np.square(f.y[:, 3:6]), axis=0) for f in data.flights if np.isfinite(f.y[:, 3]).any()]
     size = ONBOARD_JITTER if any(f.fused for f in data.flights) else JITTER
@@ -335,7 +336,7 @@ def systematic_sd(data: Data, point: Point) -> dict[tuple[str, str], float]:
         (c.effect, name): precision**-0.5
         for c, precisions in nuisances(data, point, ())
         for name, precision in zip(c.free, precisions, strict=True)
-        if c.effect not in OF_REAL_ROTORS
+        if c.effect not in ROTOR_DRAG
     }
     inertia = point.effects.get("rotor_inertia", {}).get("inertia", 0.0)
     hanging = {"mass": point.vehicle.mass, "length": point.effects.get("suspended_load", {}).get("length", 0.0)}

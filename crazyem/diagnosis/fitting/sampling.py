@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import TRIM
+from crazyem.diagnosis.fitting.days import TRIM_SD
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.flights.flight import Flight
@@ -21,9 +22,6 @@ COARSE = 0.2  # simulated flights have up to 0.12, whatever is wrong with the dr
 NEGLIGIBLE = 1e-3  # relative error of torques: a tenth of what is not known of inertias (`nuisances.INERTIA_SD`)
 LOOP = 2e-3  # s between commands of the loop (500 Hz, crazyflie-firmware stabilizer.c)
 EDGE, SLOW = 0.5, 1.0  # s left out at either end; Hz below which torques say nothing of sampling
-# m, torque per thrust: by how much the trim of a drone whose file has one differs from one day to the next. Healthy and
-# damaged flights of two drones on several days scatter like this (docs/results/diagnosis_real.md).
-TRIM_SD = (5e-4, 5e-4, 1.6e-4)
 
 
 def coarsely_sampled(data: Data, point: Point) -> bool:

@@ -1,6 +1,7 @@
 """What was selected, as it is told: numbers with intervals, confidence, what is the same to every signal, and what
 would tell it apart."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -18,7 +19,7 @@ from crazyem.diagnosis.naming.balance import steady as steadily
 from crazyem.diagnosis.naming.corroboration import TELLING
 from crazyem.diagnosis.naming.load_or_rotors import LOAD, WEAKER, instead_of_a_load
 from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, one_factor, trust
-from crazyem.diagnosis.naming.steady_odds import EDGE, by_days
+from crazyem.diagnosis.naming.steady_odds import EDGE, decided_by_balance
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, preferred, wald
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -202,7 +203,7 @@ def _numbers(
 def _by_the_day(candidate: Candidate, point: Point, balance: Balance | None) -> tuple[dict[str, Value], float] | None:
     """How weak a rotor is or how heavy a load by the balance, of which the day is most of what is uncertain, and the
     p-value that there is none; None for other effects, and where there is no balance."""
-    if balance is not None and candidate.effect == LOAD and by_days(point.vehicle, candidate):
+    if balance is not None and candidate.effect == LOAD and decided_by_balance(point.vehicle, candidate):
         return _load_by_the_day(candidate, point, balance)
     if balance is None or candidate.effect != WEAK_ROTOR or not steadily(candidate):
         return None
@@ -220,7 +221,7 @@ def _load_by_the_day(candidate: Candidate, point: Point, balance: Balance) -> tu
     thrust, about_x, about_y = np.sqrt(np.diag(balance.covariance))[:3]
     known = thrust**-2.0
     for axis, torque in (("x", about_y), ("y", about_x)):  # at the edge, so much torque needs so much weight
-        known += (ON_BOARD / torque) ** 2.0 if abs(values[axis]) > 0.99 * EDGE * ON_BOARD else 0.0
+        known += (ON_BOARD / torque) ** 2.0 if math.isclose(abs(values[axis]), EDGE * ON_BOARD, rel_tol=1e-6) else 0.0
     far = max(share, 1e-9)
     sds = {"mass": known**-0.5 * whole / (1.0 - share), "x": about_y / far, "y": about_x / far}
     found = {}

@@ -17,20 +17,15 @@ from scipy import stats
 from scipy.optimize import lsq_linear, minimize_scalar
 
 from crazyem.diagnosis.fitting.candidates import ON_BOARD, TRIM, Candidate
+from crazyem.diagnosis.fitting.days import day_freedom, day_sd
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, refine
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import day_sd, nuisances, solved, with_nuisances
+from crazyem.diagnosis.fitting.nuisances import nuisances, solved, with_nuisances
 from crazyem.diagnosis.naming.alternatives import exchanged
 from crazyem.diagnosis.naming.corroboration import TELLING
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.physics.rotors import wrench
 
-# Degrees of freedom of the day's covariance: known from some twelve days of two drones, four numbers each. Normal tails
-# would be sure of what a propeller that was taken off and put on again may do.
-DAYS = 8.0
-# Flights that the spread of other drones' days is worth beside a drone's own: days of two drones differ by a factor of
-# four (CrazyPAD, docs/results/diagnosis_real.md), so it is little.
-OTHERS = 2.0
 HEAVIEST = 1.0  # a load's weight over the drone's
 # How many of the four numbers each moves freely; a rotor's are in one ratio, a load's bounded by where it can be.
 FREE = {"rotor_fault": 1, "thrust_scale": 1, "battery_sag": 1, "suspended_load": 1, "wind": 3, "payload": 3}
@@ -51,7 +46,7 @@ class Balance:
     lack: NDArray
     covariance: NDArray
     rotors: NDArray
-    freedom: float = DAYS
+    freedom: float
 
 
 def balance_of(data: Data, point: Point) -> Balance:
@@ -66,10 +61,8 @@ def balance_of(data: Data, point: Point) -> Balance:
     )
     as_lack = np.diag([-1.0 / filed[0], 1.0, 1.0, 1.0])  # stronger lacks less
     own = as_lack @ solved(fitted)[0].covariance[:4, :4] @ as_lack
-    days = point.vehicle.days
-    freedom = DAYS if days is None else OTHERS + days.flights - 1.0
     covariance = own + np.diag(np.square(day_sd(point.vehicle)))
-    return Balance(as_lack @ (found - filed), covariance, without_each(data, point), freedom)
+    return Balance(as_lack @ (found - filed), covariance, without_each(data, point), day_freedom(point.vehicle))
 
 
 def without_each(data: Data, point: Point) -> NDArray:
@@ -148,7 +141,8 @@ def hidden_by_the_day(data: Data, selection: Selection, asked: Sequence[Candidat
     try:
         balance = balance_of(data, selection.nominal)
     except (DivergedError, np.linalg.LinAlgError):
-        return {}
+        reason = "not asked: what is steady in this flight fits no model"
+        return {"rotor_fault": reason, "payload": reason}
     lacks = [how_weak(balance, rotor) for rotor in (1, 2, 3, 4)]
     reach = float(stats.t.ppf(0.975, balance.freedom)) * max(sd for _, sd in lacks)
     each = ", ".join(str(round(100 * lack)) for lack, _ in lacks)

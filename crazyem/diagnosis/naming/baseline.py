@@ -7,23 +7,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import TRIM
-from crazyem.diagnosis.fitting.fit import Data
+from crazyem.diagnosis.fitting.days import PRIOR_FLIGHTS, day_sd
+from crazyem.diagnosis.fitting.fit import REACH, Data
 from crazyem.diagnosis.fitting.fit import nominal as nominal_of
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.fitting.nuisances import ALWAYS_THERE, day_sd, refine_base, with_trim_noise
+from crazyem.diagnosis.fitting.nuisances import ROTOR_AERODYNAMICS, nuisances, refine_base, with_trim_noise
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.diagnosis.naming.balance import OTHERS, balance_of
+from crazyem.diagnosis.naming.balance import balance_of
 from crazyem.errors import UsageError
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Days, Vehicle
+
+INSIDE = 0.99  # of a prior's reach, within which a number is determined
 
 
 def with_baseline(
     vehicle: Vehicle, recordings: Sequence[Recording], say: Callable[[str], None] = lambda text: None
 ) -> Vehicle:
     """The vehicle with trim and thrust as the mean of healthy flights, with how these differ (`Days`), and with what
-    rotors always have (`ALWAYS_THERE`) as all flights together say.
+    rotors always have (`ROTOR_AERODYNAMICS`) as all flights together say.
 
     Args:
         recordings: flights of this drone with nothing wrong, of several days.
@@ -42,14 +45,26 @@ def with_baseline(
         data = Data(flights[-1:])
         lacks.append(balance_of(data, _nominal(data, known)).lack)
     data = Data(flights)
-    together = refine_base(data, _nominal(data, known), ()).point.effects
+    together = refine_base(data, _nominal(data, known), ()).point
     mean, sd = spread_of(np.array(lacks), np.array(day_sd(known)))
     thrust = float(known.effects.get("thrust_scale", {}).get("scale", 1.0)) * (1.0 - float(mean[0]))
     own = {axis: float(trim[axis] + m) for axis, m in zip("xyz", mean[1:], strict=True)}
-    rotors = {name: dict(together[name]) for name in ALWAYS_THERE if name in together}
-    effects = {**known.effects, **rotors, TRIM: own, "thrust_scale": {"scale": thrust}}
+    effects = {**known.effects, **rotor_aerodynamics(data, together), TRIM: own, "thrust_scale": {"scale": thrust}}
     days = Days(len(recordings), float(sd[0]), (float(sd[1]), float(sd[2]), float(sd[3])))
     return replace(known, effects=effects, days=days)
+
+
+def rotor_aerodynamics(data: Data, point: Point) -> dict[str, dict[str, float]]:
+    """Drag and flapping as fitted; as the vehicle file has them where a number is at the end of its prior's reach."""
+    found = {}
+    for candidate, precisions in nuisances(data, point, ()):
+        if candidate.effect in ROTOR_AERODYNAMICS:
+            filed, here = candidate.neutral(point), candidate.values(point)
+            found[candidate.effect] = {
+                name: float(here[name] if abs(here[name] - filed[name]) < INSIDE * REACH * w**-0.5 else filed[name])
+                for name, w in zip(candidate.free, precisions, strict=True)
+            }
+    return found
 
 
 def _nominal(data: Data, vehicle: Vehicle) -> Point:
@@ -61,9 +76,9 @@ def _nominal(data: Data, vehicle: Vehicle) -> Point:
 def spread_of(found: NDArray, usual: NDArray) -> tuple[NDArray, NDArray]:
     """(k,) means of numbers of flights (n, k), and (k,) the scale of the t distribution of the next flight's.
 
-    usual: (k,) standard deviations of any drone, which count as `OTHERS` flights (conjugate prior of a variance, e.g.
-    Gelman et al., Bayesian Data Analysis, 3.3). Degrees of freedom: `OTHERS` + n - 1.
+    usual: (k,) standard deviations of any drone, which count as `PRIOR_FLIGHTS` flights: the conjugate prior of a
+    variance (Gelman et al., Bayesian Data Analysis, 3.3). Degrees of freedom: `PRIOR_FLIGHTS` + n - 1.
     """
     n, mean = len(found), found.mean(axis=0)
-    squares = OTHERS * np.square(usual) + np.square(found - mean).sum(axis=0)
-    return mean, np.sqrt(squares / (OTHERS + n - 1.0) * (1.0 + 1.0 / n))
+    squares = PRIOR_FLIGHTS * np.square(usual) + np.square(found - mean).sum(axis=0)
+    return mean, np.sqrt(squares / (PRIOR_FLIGHTS + n - 1.0) * (1.0 + 1.0 / n))

@@ -5,16 +5,17 @@ from collections.abc import Mapping
 import numpy as np
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.days import day_sd
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import HANGING_SD, ONBOARD_LAG_SD, day_sd, jittery, usual_wind
+from crazyem.diagnosis.fitting.nuisances import HANGING_SD, ONBOARD_LAG_SD, jittery, usual_wind
 
 # Smaller than this, these are not told from what filters, sampling and the air of a room do: s, s, s, 1, rad, rad/s, 1,
 # 1, N m s/m. And no rotor is lighter, kg m^2: a rod of 0.1 g and 46 mm has 1.8e-8, and this is a sixth of it.
 LEAST = {"measurement_delay": 3e-3, "input_delay": 4e-3, "motor_lag": 7.5e-3, "velocity_scale": 0.035,
          "attitude_misalignment": 2e-3, "gyro_bias": 3e-3, "torque_scale": 0.08, "thrust_curve": 0.06,
          "velocity_moment": 3e-6, "rotor_inertia": 3e-9}  # fmt: skip
-LATER = 3.0  # standard deviations of an onboard filter's lag from which a state is later than such filters make it
+LEAST_ONBOARD_DELAY = 3.0 * ONBOARD_LAG_SD  # s: no filter on board makes states so late
 # N m s/m, of a moment that tips the drone further towards where it flies; air on rotors above the centre of mass tips
 # it back. Five that were told of simulated drones with none (seeds 2046 to 2048) were such about both axes, of 4e-6 to
 # 1.2e-5: more than that may be of a body below which the air finds more hold.
@@ -105,7 +106,7 @@ def matters(point: Point, candidate: Candidate, data: Data | None = None) -> boo
     if candidate.effect == "inertia":
         return any(abs(here[n] / neutral[n] - 1.0) > LEAST_INERTIA for n in candidate.free)
     if candidate.effect == "measurement_delay" and data is not None and any(f.fused for f in data.flights):
-        least = LATER * ONBOARD_LAG_SD
+        least = LEAST_ONBOARD_DELAY
     if candidate.effect == "velocity_scale" and data is not None:
         jitter = np.maximum(VELOCITY_LEAST * jittery(data), least or 0.0)
         return any(abs(here[n] - neutral[n]) > j for n, j in zip("xyz", jitter, strict=True) if n in candidate.free)

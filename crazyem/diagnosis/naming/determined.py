@@ -18,13 +18,12 @@ from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.naming.answer import numbers_of
 from crazyem.diagnosis.naming.balance import Balance, by_balance
 from crazyem.diagnosis.naming.named import Named, Value
-from crazyem.diagnosis.naming.presence import presence
+from crazyem.diagnosis.naming.presence import TOLD, presence
 from crazyem.diagnosis.naming.prune import left_out
 from crazyem.diagnosis.naming.steady import with_exact_torques
 from crazyem.diagnosis.naming.trials import Selection
 from crazyem.physics.effects.catalogue import CATALOGUE
 
-TOLD = 0.5  # probability below which an effect is no finding
 NEAR = 1e-9  # of a range, or of its larger end: a number that close to an end is at it
 
 

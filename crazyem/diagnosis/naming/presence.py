@@ -5,6 +5,7 @@
 # gains have a heavy tail. By 48 names in 67 random and foreign worlds (seeds 5050, 71001, 6060) EVEN is 42 and SLOPE
 # 1.15 (EVEN 30 to 90 within 0.5 of log-likelihood); the lower end is taken, by which fewest effects are lost.
 EVEN, SLOPE, CALIBRATED = 30.0, 1.1, 0.95
+TOLD = 0.5  # probability below which an effect is no finding
 
 
 def presence(held_out_nats: float) -> float:

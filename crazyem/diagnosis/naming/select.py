@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, freedom_of, held_near, local_precision
-from crazyem.diagnosis.fitting.gram import Solution, none_of_it
+from crazyem.diagnosis.fitting.gram import Solution, neutral_gain
 from crazyem.diagnosis.fitting.model import Column, Noise, Point
 from crazyem.diagnosis.fitting.nuisances import (
-    OF_REAL_ROTORS,
+    ROTOR_DRAG,
     by_gain,
     nuisances,
     on_held_out,
@@ -34,7 +34,7 @@ from crazyem.diagnosis.naming.onset import date, onset_of
 from crazyem.diagnosis.naming.prune import ADMITTED, drop, shaken, survive
 from crazyem.diagnosis.naming.starting_points import best_begun
 from crazyem.diagnosis.naming.steady import as_steady, by_onsets, without_trim_rivals
-from crazyem.diagnosis.naming.steady_odds import by_days
+from crazyem.diagnosis.naming.steady_odds import decided_by_balance
 from crazyem.diagnosis.naming.trials import (
     SURE,
     Selection,
@@ -114,7 +114,7 @@ def linear_trials(
                 (replace(t, p_value=by_onsets(point, t.p_value, len(gram.score))), s)
                 for t, s in linear_trials(data, point, accepted, [later])
             ]
-        if by_days(point.vehicle, c):  # what is steady is told by the balance; what sets in later is not
+        if decided_by_balance(point.vehicle, c):  # what is steady is told by the balance; what sets in later is not
             continue
         lo, hi = (np.array(b) for b in c.bounds(point))
         judge(c, always + mine, np.append(weights, np.zeros(len(mine))), np.append(low, lo), np.append(high, hi),
@@ -125,11 +125,11 @@ def linear_trials(
         w = weights[order].copy()
         w[len(order) - len(mine) :] = 0.0
         near = order[: len(order) - len(mine)]
-        none = none_of_it(gram, [always[i] for i in order], len(mine), w, low[near], high[near], centre[order])
+        none = neutral_gain(gram, [always[i] for i in order], len(mine), w, low[near], high[near], centre[order])
         lo = np.append(low[near], wide_low[order[len(near) :]])
         hi = np.append(high[near], wide_high[order[len(near) :]])
         asked = next(a for a in candidates if a.effect == c.effect)
-        judge(asked, [always[i] for i in order], w, lo, hi, centre[order], none if c.effect in OF_REAL_ROTORS else None)
+        judge(asked, [always[i] for i in order], w, lo, hi, centre[order], none if c.effect in ROTOR_DRAG else None)
     return sorted(found, key=lambda t: -t[0].evidence)
 
 
@@ -162,7 +162,7 @@ class Basis:
 
 def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str], None]) -> Trial:
     """The trial of the linear approximation after a fit without it; changes nothing of the basis."""
-    basis = without_it(basis, trial.candidate)
+    basis = constrained_basis(basis, trial.candidate)
     point = basis.point
     say(f"  fitting {trial.candidate.label}")
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
@@ -173,12 +173,13 @@ def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callabl
         return replace(trial, p_value=1.0)
 
 
-def without_it(basis: Basis, candidate: Candidate) -> Basis:
+def constrained_basis(basis: Basis, candidate: Candidate) -> Basis:
     """The basis with none of an effect that is free beside all others, and still is a finding where it is there."""
-    if candidate.effect not in OF_REAL_ROTORS or candidate.effect in basis.data.held:
+    name = candidate.effect
+    if name not in ROTOR_DRAG or name in basis.data.constrained:
         return basis
-    data, apart = basis.data.holding(candidate.effect), basis.held_out and basis.held_out.holding(candidate.effect)
-    fit = refine_base(data, without(basis.point, candidate.effect), basis.accepted, rounds=3, noise=False)
+    data, apart = basis.data.constraining(name), basis.held_out and basis.held_out.constraining(name)
+    fit = refine_base(data, without(basis.point, name), basis.accepted, rounds=3, noise=False)
     held = on_held_out(apart.twin(), fit.point, basis.accepted).loglik if apart else 0.0
     return replace(basis, data=data, held_out=apart, value=fit.loglik, held_value=held)
 
@@ -206,7 +207,7 @@ def held_out_noise(basis: Basis, trial: Trial) -> HeldOutNoise | None:
 def with_noise_refit(basis: Basis, own: HeldOutNoise | None, trial: Trial) -> Trial:
     """A trial with noise scales of its own: under those of the model before it, the right explanation gains little."""
     assert trial.fitted is not None
-    basis = without_it(basis, trial.candidate)
+    basis = constrained_basis(basis, trial.candidate)
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
     try:
         fit = refine_anew(data, trial.fitted.point, mine, rounds=3)

@@ -13,17 +13,18 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import logit, logsumexp
 
-from crazyem.diagnosis.fitting.candidates import ON_BOARD, TRIM, Candidate
+from crazyem.diagnosis.fitting.candidates import ON_BOARD, Candidate
+from crazyem.diagnosis.fitting.days import trim_known
 from crazyem.diagnosis.fitting.fit import Data, DivergedError
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.naming.balance import FREE, HEAVIEST, Balance, balance_of, likely, steady
+from crazyem.diagnosis.naming.presence import TOLD
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.vehicle import Vehicle
 
-MISSING = 0.05  # prior probability that one effect is missing from a vehicle file (posterior.md: 0.05 an effect)
+MISSING = 0.05  # prior probability that one effect is missing from a vehicle file: of 20 drones one
 EDGE = 0.99  # of the way to the furthest place on board, within which a load is
-TOLD = 0.5  # posterior probability from which an effect is a finding
 LOOK_ALIKE = 0.05  # posterior probability from which another explanation is told as a look-alike
 Lack = Callable[[NDArray, Balance], NDArray]  # what an effect with these numbers moves of a balance
 
@@ -77,14 +78,14 @@ def explanations(balances: Sequence[Balance]) -> dict[tuple[str, int], tuple[flo
     return found
 
 
-def steady_first(
+def steady_selection(
     data: Data, apart: Data | None, nominal: Point, asked: Sequence[Candidate], say: Callable[[str], None]
 ) -> Selection | None:
     """A selection that begins with a weak rotor or a load, where all flights' balances make one more probable than not.
 
     None where they do not, or where the vehicle file has no trim that is known.
     """
-    mine = [c for c in asked if by_days(nominal.vehicle, c)]
+    mine = [c for c in asked if decided_by_balance(nominal.vehicle, c)]
     if not mine:
         return None
     try:
@@ -101,7 +102,8 @@ def steady_first(
         size = _values(candidate, found[best][1], nominal)
         start = nominal.with_effects({candidate.effect: size})
         fitted = refine_base(data, start, [candidate])
-    except (DivergedError, np.linalg.LinAlgError):  # then the filter's likelihood is all there is
+    except (DivergedError, np.linalg.LinAlgError):  # `hidden_by_the_day` says so
+        say("what is steady in these flights fits no model: neither a weak rotor nor a load is asked for")
         return None
     odds = float(logit(min(chance[best], 1.0 - 1e-12)))
     gain = fitted.loglik - before.loglik
@@ -115,10 +117,9 @@ def steady_first(
     return Selection(before.point, fitted.point, (step,), (candidate,), fitted, len(asked))
 
 
-def by_days(vehicle: Vehicle, candidate: Candidate) -> bool:
+def decided_by_balance(vehicle: Vehicle, candidate: Candidate) -> bool:
     """Whether a candidate is told by the balance alone: a weak rotor or a load, where the vehicle's trim is known."""
-    known = any(float(v) for v in vehicle.effects.get(TRIM, {}).values())
-    return known and candidate.effect in ("rotor_fault", "payload") and steady(candidate)
+    return trim_known(vehicle) and candidate.effect in ("rotor_fault", "payload") and steady(candidate)
 
 
 def _is(candidate: Candidate, name: tuple[str, int]) -> bool:

@@ -125,8 +125,8 @@ class Situation:
             None: not known. An effect may go by rows before its own only.
         unrest: (3,) m/s^2 sqrt(s): how much of it comes and goes at random.
         fused: whether the attitude that is shown was made on board, from the gyro (`onboard_estimate.py`).
-        modelled: (n, 3) m/s^2, body: specific force by the model alone; None: as `specific_force`, which may hold what
-            measurements corrected.
+        model_force: (n, 3) m/s^2, body: specific force by the model alone; None: as `specific_force`, which may hold
+            what measurements corrected.
         tilt: (n, 3) rad, body: by how much the attitude that is shown is turned, by other effects; None: not at all.
     """
 
@@ -152,7 +152,7 @@ class Situation:
     seen: NDArray | None = None
     unrest: NDArray | None = None
     fused: bool = False
-    modelled: NDArray | None = None
+    model_force: NDArray | None = None
     tilt: NDArray | None = None
 
     @property
@@ -215,8 +215,8 @@ class Effect:
         tied: the same, for a force that itself answers to the drone's acceleration: here `situation.specific_force`
             is that at O under everything else.
         measured: (situation; **parameters) -> Offset, added up.
-        by_force: whether `measured` goes by `situation.modelled` and `situation.tilt`: then effects on forces and on
-            the attitude that is shown change what it shows, too.
+        uses_force: whether `measured` goes by `situation.model_force` and `situation.tilt`: then effects on forces and
+            on the attitude that is shown change what it shows, too.
         needs: at least one of these signals must be recorded, else nothing can be said: "voltage", "rotor_speed",
             "motor_command", "specific_force", "position", "attitude", "body_rate", "velocity".
         without: signals with which it cannot be (sag in time only matters where no voltage is known).
@@ -256,7 +256,7 @@ class Effect:
     external: Callable[..., Wrench] | None = None
     tied: Callable[..., Wrench] | None = None
     measured: Callable[..., Offset] | None = None
-    by_force: bool = False
+    uses_force: bool = False
     needs: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     separates: str = ""

@@ -66,7 +66,7 @@ def attitude_error(situation: Situation, rate_error: NDArray, *, delay: float) -
 
 
 @compiled
-def _fixed(gap, broken, drive, memory, position, velocity):
+def _path_errors(gap, broken, drive, time, position, velocity):
     """Errors (n, 3) at every row, by drives (n, 3) that are the means over the steps that end there; 0 where a stretch
     begins (`path_error`)."""
     for k in range(len(gap)):
@@ -74,50 +74,50 @@ def _fixed(gap, broken, drive, memory, position, velocity):
             position[k] = 0.0
             velocity[k] = 0.0
             continue
-        part = gap[k] / memory
+        part = gap[k] / time
         left, cosine, sine = np.exp(-part), np.cos(part), np.sin(part)
         for i in range(3):
-            last_p, last_v = 0.5 * memory * memory * drive[k, i], memory * drive[k, i]
+            last_p, last_v = 0.5 * time * time * drive[k, i], time * drive[k, i]
             p, v = position[k - 1, i] - last_p, velocity[k - 1, i] - last_v
-            position[k, i] = last_p + left * (cosine * p + sine * (memory * v - p))
-            velocity[k, i] = last_v + left * (cosine * v + sine * (v - 2.0 * p / memory))
+            position[k, i] = last_p + left * (cosine * p + sine * (time * v - p))
+            velocity[k, i] = last_v + left * (cosine * v + sine * (v - 2.0 * p / time))
 
 
-def path_error(situation: Situation, memory: float) -> tuple[NDArray, NDArray]:
+def path_error(situation: Situation, time_constant: float) -> tuple[NDArray, NDArray]:
     """(n, 3) m, (n, 3) m/s, world axes: errors p, v of a filter that does not know the specific force f along body x
     and y, nor that its attitude is turned by d [rad].
 
-    p' = v - 2 p / memory, v' = R (d x (0, 0, f_z) - (f_x, f_y, 0)) - 2 p / memory^2, and 0 where a stretch begins: the
-    steady Kalman filter of a position that is fixed and accelerations that are not known, whose damping is 1/sqrt(2)
-    (e.g. Gelb, Applied Optimal Estimation, 1974, example 4.3). A constant force makes v off by memory [s] times it.
+    p' = v - 2 p / T, v' = R (d x (0, 0, f_z) - (f_x, f_y, 0)) - 2 p / T^2, and 0 where a stretch begins. That is the
+    steady Kalman filter of a position that is fixed and of accelerations that are white noise: its Riccati equation
+    makes the second gain half of the first one squared. A constant force makes v off by T [s] times the force.
     """
     position, velocity = np.zeros((situation.size, 3)), np.zeros((situation.size, 3))
-    if memory and situation.size:
+    if time_constant and situation.size:
         gap, broken = stretches(situation)
-        force = situation.specific_force if situation.modelled is None else situation.modelled
+        force = situation.specific_force if situation.model_force is None else situation.model_force
         unknown = -force[:, :2]
         if situation.tilt is not None:
             unknown = unknown + force[:, 2:] * np.stack([situation.tilt[:, 1], -situation.tilt[:, 0]], axis=1)
         drive = np.einsum("nij,nj->ni", situation.rotation[:, :, :2], unknown)
-        _fixed(gap, broken, np.ascontiguousarray(drive), memory, position, velocity)
+        _path_errors(gap, broken, np.ascontiguousarray(drive), time_constant, position, velocity)
     return position, velocity
 
 
 def filtered(
-    situation: Situation, *, rate_lag: float, velocity_lag: float, attitude_lag: float, lateral_memory: float
+    situation: Situation, *, rate_lag: float, velocity_lag: float, attitude_lag: float, lateral_time_constant: float
 ) -> Offset:
     """The gyro shows w - rate_lag dw/dt, the estimate of velocity v - velocity_lag dv/dt, the attitude that of
     attitude_lag before; lags in s.
 
     The filter does not know the specific force along body x and y (drag, wind); fixes draw its velocity back within
-    lateral_memory [s] (`path_error`). Nothing where it is not made so.
+    lateral_time_constant [s] (`path_error`). Nothing where it is not made so.
     """
     offset = Offset(np.zeros((situation.size, 12)), np.zeros((situation.size, 3)))
     acceleration = np.einsum("nij,nj->ni", situation.rotation, situation.specific_force)
     acceleration[:, 2] -= GRAVITY
     offset.state[:, 3:6] = -velocity_lag * acceleration
     if situation.fused:
-        position, velocity = path_error(situation, lateral_memory)
+        position, velocity = path_error(situation, lateral_time_constant)
         offset.state[:, :3] = position
         offset.state[:, 3:6] += velocity
     offset.state[:, 9:12] = -rate_lag * situation.angular_acceleration
@@ -132,11 +132,11 @@ ONBOARD_FILTER = Effect(
         Parameter("rate_lag", "s", 0.0, -0.02, 0.02, 1e-3),
         Parameter("velocity_lag", "s", 0.0, -0.02, 0.02, 1e-3),
         Parameter("attitude_lag", "s", 0.0, -0.02, 0.02, 1e-3, needs=("attitude",)),
-        Parameter("lateral_memory", "s", 0.0, 0.0, 1.0, 0.01, needs=("attitude",)),
+        Parameter("lateral_time_constant", "s", 0.0, 0.0, 1.0, 0.01, needs=("attitude",)),
     ),
     order=85,
     measured=filtered,
-    by_force=True,
+    uses_force=True,
     # usual: 0.0 to 2.4 and 0.0 to 1.6 ms in 80 flights with nothing hidden (`fitting/nuisances.py`); attitudes 1.3 to
     # 4.2 ms late in three more
     prior=Prior(usual={"rate_lag": 1.3e-3, "velocity_lag": 7e-4, "attitude_lag": 2.5e-3}),

@@ -123,8 +123,8 @@ TRIM = Effect(
     tuple(Parameter(axis, "m", 0.0, -0.02, 0.02, 1e-4) for axis in "xyz"),
     order=41,
     external=trimmed,
-    # heavy tails: batteries are put in by hand. 4 degrees of freedom as in Lange, Little and Taylor (JASA 84, 1989).
-    prior=Prior(usual=_of_the_day, freedom=4.0),
+    # known from some twelve days of two drones; normal tails would be sure of what a new propeller may do
+    prior=Prior(usual=_of_the_day, freedom=8.0),
     separates="fly the drone while it is well and judge by the vehicle file written from that: its trim is in there",
 )
 

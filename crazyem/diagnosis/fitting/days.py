@@ -1,0 +1,35 @@
+"""By how much one drone differs from day to day: batteries are put in again, propellers and feet are bent.
+
+A vehicle file may say so (`Days`, from healthy flights). Else the spread of other drones counts, which stands with the
+effect `trim`.
+"""
+
+from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.prior import Logged
+from crazyem.vehicle import Vehicle
+
+_TRIM = CATALOGUE["trim"].prior
+TRIM_SD = tuple(_TRIM.usual_in(Logged(filed=frozenset({"trim"}))).values())  # m, torque over thrust about x, y, z
+# Relative: healthy and damaged flights of two drones on several days (docs/results/diagnosis_real.md). The thrust is
+# free for each of several recordings of any drone (`SEVERAL`): one number for all would make it heed commands less.
+THRUST_SD = 0.02
+# Flights that the spread of other drones is worth beside a drone's own: the two drones of CrazyPAD differ by a factor
+# of four in it, so other drones say little.
+PRIOR_FLIGHTS = 2.0
+
+
+def trim_known(vehicle: Vehicle) -> bool:
+    """Whether the file has the drone's own trim; one of 0 only says that it is a real drone."""
+    return any(float(v) for v in vehicle.effects.get("trim", {}).values())
+
+
+def day_sd(vehicle: Vehicle) -> tuple[float, ...]:
+    """By how much thrust (relative) and trim about x, y, z [m] differ from day to day."""
+    if vehicle.days is not None:
+        return (vehicle.days.thrust_sd, *vehicle.days.trim_sd)
+    return (THRUST_SD, *TRIM_SD)
+
+
+def day_freedom(vehicle: Vehicle) -> float:
+    """Degrees of freedom of Student's t distribution of a day."""
+    return _TRIM.freedom if vehicle.days is None else PRIOR_FLIGHTS + vehicle.days.flights - 1.0
