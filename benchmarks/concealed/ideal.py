@@ -7,7 +7,7 @@ Where it does not apply, a case counts as detectable.
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,7 @@ def ideal_nats(
     if _beyond(effects, seen):
         return None
     data = Data([flight_of(seen, vehicle)])
-    without = _best(data, nominal(data, Point(vehicle, known_effects(vehicle), first_guess())))
+    without = _best(data, nominal(data, Point(vehicle, known_effects(vehicle), first_guess())), ())
     return _under(data, without.point, effects) - without.loglik
 
 
@@ -59,7 +59,7 @@ def ideal_nats_of_each(
     if _beyond(effects, seen):
         return dict.fromkeys(effects)
     data = Data([flight_of(seen, vehicle)])
-    start = _best(data, nominal(data, Point(vehicle, known_effects(vehicle), first_guess()))).point
+    start = _best(data, nominal(data, Point(vehicle, known_effects(vehicle), first_guess())), ()).point
     whole = _under(data, start, effects)
     return {
         name: whole - _under(data, start, {other: table for other, table in effects.items() if other != name})
@@ -76,7 +76,7 @@ def _under(data: Data, start: Point, effects: Mapping[str, Mapping[str, Any]]) -
     """Log-likelihood under known effects."""
     point = replace(start, effects={**known_effects(start.vehicle), **{n: dict(table) for n, table in effects.items()}})
     data.settle(point)
-    return _best(data, point).loglik
+    return _best(data, point, effects).loglik
 
 
 def known_effects(vehicle: Vehicle) -> dict[str, dict[str, Any]]:
@@ -89,9 +89,10 @@ def options_of(mapping: Path | None) -> ReadOptions:
     return ReadOptions(None if mapping is None else str(mapping))
 
 
-def _best(data: Data, point: Point) -> Fitted:
-    """What suits a model best beside its effects: noise scales, memory of the torques or none, what is always free."""
-    known = [Candidate(name, (), ()) for name in point.effects]
+def _best(data: Data, point: Point, hidden: Iterable[str]) -> Fitted:
+    """What suits a model best beside its hidden effects: noise scales, memory of the torques or none, what is always
+    free, such as the trim of the day."""
+    known = [Candidate(name, (), ()) for name in hidden]
     once = refine_base(data, point, known)
     again = refine_base(data, remembering_anew(data, once.point), known)
     return max(once, again, key=lambda f: f.loglik)

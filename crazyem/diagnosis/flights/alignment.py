@@ -15,18 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.diagnosis.flights import band_delay as band
 from crazyem.physics.rotors import PITCH_SIGN, ROLL_SIGN
 from crazyem.recordings.airborne import Airtime
 from crazyem.recordings.ordering import inside, ordered
 from crazyem.recordings.recording import Recording
 
 REACH = 0.15  # s, on either side
-STEP = 2.5e-3  # s between delays tried
-GRID = 5e-3  # s between rows
-BLOCK = 1.0  # s
-BAND = (0.015, 0.1)  # s, widths of the Gaussians whose difference is the band: about 1.5 to 10 Hz
-SUPPORT = 0.3  # s, half the length of the band's filter
-LEAST = 4  # blocks
 SURE = 4e-3  # s: a larger standard error, and nothing is said
 AGREE = 6e-3  # s between roll and pitch
 EXPLAINED = 0.1  # share of the acceleration's variance that the rotors must explain
@@ -85,30 +80,29 @@ def align(recording: Recording, thrust_time: NDArray, thrust: NDArray, flight: A
     thrust_time, thrust = _fresh(thrust_time, thrust)
     if when.size < 100 or thrust_time.size < 100:
         return None
-    time = np.arange(max(when[0], thrust_time[0]), min(when[-1], thrust_time[-1]), GRID)
-    if time.size < LEAST * BLOCK / GRID:
+    time = np.arange(max(when[0], thrust_time[0]), min(when[-1], thrust_time[-1]), band.GRID)
+    if time.size < band.FEWEST_BLOCKS * band.BLOCK / band.GRID:
         return None
-    kernel = _band()
-    rates = _on(time, when, rate[:, :2])
-    torque = _on(time, thrust_time, np.stack([thrust @ ROLL_SIGN, thrust @ PITCH_SIGN], 1))
-    beside = [_filtered(rates, kernel)]
+    rates = band.on_grid(time, when, rate[:, :2])
+    torque = band.on_grid(time, thrust_time, np.stack([thrust @ ROLL_SIGN, thrust @ PITCH_SIGN], 1))
+    beside = [band.band_passed(rates)]
     if "velocity" in recording.signals:
         t, v = ordered(recording.signals["velocity"])
         if t.size > 2:
-            speed = _filtered(_on(time, t, v), kernel)
+            speed = band.band_passed(band.on_grid(time, t, v))
             beside += [speed[:, [0]].repeat(2, 1), speed[:, [1]].repeat(2, 1)]
-    acceleration = _filtered(np.gradient(rates, GRID, axis=0), kernel)
-    shaken = _filtered(torque, kernel)
-    margin = round((REACH + SUPPORT) / GRID)
+    acceleration = band.band_passed(np.gradient(rates, band.GRID, axis=0))
+    shaken = band.band_passed(torque)
+    margin = round((REACH + band.SUPPORT) / band.GRID)
     good = inside(time, flight.flown)
-    good &= (_age(time, when) < 0.04) & (_age(time, thrust_time) < 0.04)
+    good &= (band.spacing(time, when) < 0.04) & (band.spacing(time, thrust_time) < 0.04)
     good[:margin], good[len(good) - margin :] = False, False
     index = np.flatnonzero(good)
-    if index.size * GRID < LEAST * BLOCK:
+    if index.size * band.GRID < band.FEWEST_BLOCKS * band.BLOCK:
         return None
-    block = np.unique(((time[index] - time[0]) / BLOCK).astype(int), return_inverse=True)[1]
-    delays = np.arange(-REACH, REACH + STEP / 2, STEP)
-    sums = np.stack([_sums(index, block, acceleration, shaken, beside, d) for d in delays], 2)  # axis, block, delay
+    block = np.unique(((time[index] - time[0]) / band.BLOCK).astype(int), return_inverse=True)[1]
+    delays = band.delays_within(REACH)
+    sums = np.stack([band.products(index, block, acceleration, shaken, beside, d) for d in delays], 2)
     return _accepted(delays, sums, time[index], block)
 
 
@@ -118,79 +112,10 @@ def _fresh(time: NDArray, value: NDArray) -> tuple[NDArray, NDArray]:
     return time[new], value[new]
 
 
-def _on(time: NDArray, when: NDArray, value: NDArray) -> NDArray:
-    return np.stack([np.interp(time, when, column) for column in value.T], 1)
-
-
-def _age(time: NDArray, when: NDArray) -> NDArray:
-    after = np.clip(np.searchsorted(when, time), 1, when.size - 1)
-    return when[after] - when[after - 1]
-
-
-def _band() -> NDArray:
-    """A difference of Gaussians of zero sum, of finite length."""
-    t = np.arange(-round(SUPPORT / GRID), round(SUPPORT / GRID) + 1) * GRID
-    narrow, wide = (np.exp(-0.5 * np.square(t / width)) for width in BAND)
-    return narrow / narrow.sum() - wide / wide.sum()
-
-
-def _filtered(value: NDArray, kernel: NDArray) -> NDArray:
-    return np.stack([np.convolve(column, kernel, "same") for column in value.T], 1)
-
-
-def _sums(
-    index: NDArray, block: NDArray, wanted: NDArray, torque: NDArray, beside: list[NDArray], delay: float
-) -> NDArray:
-    """(2, blocks, k + 2, k + 2) sums of products of [torque(t - delay), beside, wanted], for roll and pitch."""
-    steps = delay / GRID
-    low = int(np.floor(steps))
-    part = steps - low
-    out = []
-    for axis in range(2):
-        moved = (1 - part) * torque[index - low, axis] + part * torque[index - low - 1, axis]
-        rows = np.stack([moved, *(b[index, axis] for b in beside), wanted[index, axis]], 1)
-        products = np.einsum("ni,nj->nij", rows, rows).reshape(len(rows), -1)
-        total = np.stack([np.bincount(block, weights=column) for column in products.T], 1)
-        out.append(total.reshape(-1, rows.shape[1], rows.shape[1]))
-    return np.stack(out)
-
-
-def _share(sums: NDArray) -> NDArray:
-    """Share (..., delays) of the wanted that torque explains beyond what is beside it, from (..., delays, k, k)."""
-    size = sums.shape[-1] - 1
-    whole = np.maximum(sums[..., size, size], 1e-300)
-    a = sums[..., :size, :size]
-    scale = np.sqrt(np.maximum(np.einsum("...ii->...i", a), 1e-300))
-    a = a / (scale[..., :, None] * scale[..., None, :]) + 1e-9 * np.eye(size)
-    b = sums[..., :size, size] / scale
-    got = np.linalg.solve(a, b[..., None])[..., 0]
-    gain = np.where(got[..., 0] > 0, 1.0, 0.0)  # torque turns the drone the way it points
-    rest = np.linalg.solve(a[..., 1:, 1:], b[..., 1:, None])[..., 0]
-    return gain * (np.sum(got * b, -1) - np.sum(rest * b[..., 1:], -1)) / whole
-
-
-def _peak(delays: NDArray, curve: NDArray) -> float:
-    """Delay of the maximum, between those tried by a parabola; NaN at the edge."""
-    top = int(np.argmax(curve))
-    if top in (0, curve.size - 1) or curve[top] <= 0:
-        return float("nan")
-    left, middle, right = curve[top - 1 : top + 2]
-    bend = left - 2 * middle + right
-    return float(delays[top] + STEP * (0.5 * (left - right) / bend if bend < 0 else 0.0))
-
-
-def _both(delays: NDArray, sums: NDArray) -> tuple[float, float]:
-    """Delay by roll and pitch together, from (2, delays, k, k), and the share explained."""
-    share = _share(sums)
-    whole = sums[:, 0, -1, -1]
-    curve = (share * whole[:, None]).sum(0) / max(float(whole.sum()), 1e-300)
-    return _peak(delays, curve), float(curve.max())
-
-
 def _unhit(delays: NDArray, sums: NDArray) -> NDArray:
     """(2, b, delays, k, k): the blocks in which nothing hit the drone."""
     total = sums.sum(1)
-    delay, _ = _both(delays, total)
+    delay, _ = band.delay_of(delays, total)
     at = int(np.argmin(np.abs(delays - delay))) if np.isfinite(delay) else delays.size // 2
     left = np.empty(sums.shape[:2])
     for axis in range(2):
@@ -206,37 +131,27 @@ def _unhit(delays: NDArray, sums: NDArray) -> NDArray:
 
 def _accepted(delays: NDArray, sums: NDArray, time: NDArray, block: NDArray) -> Alignment | None:
     count = sums.shape[1]
-    if count < LEAST:
+    if count < band.FEWEST_BLOCKS:
         return None
     unhit = _unhit(delays, sums)
     total = unhit.sum(1)
-    delay, explained = _both(delays, total)
-    roll, pitch = (_peak(delays, _share(total[i])) for i in range(2))
-    sd = _error(delays, unhit, total)
+    delay, explained = band.delay_of(delays, total)
+    roll, pitch = (band.peak(delays, band.explained_share(total[i])) for i in range(2))
+    sd = band.standard_error(delays, unhit, total)
     told = np.isfinite([delay, roll, pitch]).all() and explained > EXPLAINED and sd < SURE
     if not told or abs(roll - pitch) > AGREE + 3 * sd:
         return None
-    ends = np.array([time[block == b][-1] for b in range(count)]) + SUPPORT + REACH
+    ends = np.array([time[block == b][-1] for b in range(count)]) + band.SUPPORT + REACH
     running = np.zeros(count)
-    looked_at = set(np.unique(np.geomspace(LEAST, count, 16).astype(int) - 1).tolist())
-    for b in range(LEAST - 1, count):
+    looked_at = set(np.unique(np.geomspace(band.FEWEST_BLOCKS, count, 16).astype(int) - 1).tolist())
+    for b in range(band.FEWEST_BLOCKS - 1, count):
         if b not in looked_at:
             running[b] = running[b - 1]
             continue
         until = _unhit(delays, sums[:, : b + 1])
         before = until.sum(1)
-        found, _ = _both(delays, before)
-        error = _error(delays, until, before)
+        found, _ = band.delay_of(delays, before)
+        error = band.standard_error(delays, until, before)
         sound = np.isfinite(found) and np.isfinite(error)
         running[b] = found * PRIOR**2 / (PRIOR**2 + error**2) if sound else running[b - 1]
     return Alignment(delay, sd, roll, pitch, explained, ends, running)
-
-
-def _error(delays: NDArray, sums: NDArray, total: NDArray) -> float:
-    """Standard error of the delay, each of up to 12 groups of blocks left out (jackknife)."""
-    groups = np.array_split(np.arange(sums.shape[1]), min(12, sums.shape[1]))
-    found = np.array([_both(delays, total - sums[:, g].sum(1))[0] for g in groups])
-    if not np.isfinite(found).all():
-        return float("inf")
-    n = len(groups)
-    return float(np.sqrt((n - 1) / n * np.square(found - found.mean()).sum()))

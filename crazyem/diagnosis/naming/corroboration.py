@@ -1,8 +1,9 @@
 """Signals that the filter does not use, asked where it cannot tell two effects apart.
 
-Inputs that act late and measurements that are late are one to the filter; an accelerometer is punctual, so its lag
-behind the forces of the punctual model is the delay in the first case and nothing in the second. A rotor that is weak
-and one whose sensor counts wrong are one to the filter; commands tell what speed the other rotors would have shown.
+Inputs that act late and measurements that are late are one to the filter. An accelerometer is punctual but for its own
+low pass, so its lag behind the forces of the punctual model holds the delay in the first case, and not in the second. A
+rotor that is weak and one whose sensor counts wrong are one to the filter; commands tell what speed the other rotors
+would have shown.
 """
 
 from collections.abc import Sequence
@@ -11,20 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.fit import Data
-from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.naming.accelerometer import tilt
+from crazyem.diagnosis.fitting.model import Model, Point
+from crazyem.diagnosis.flights import band_delay as band
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording
 
 TELLING = 3.0  # nats by which a witness tells two effects apart
-PUNCTUAL, PUNCTUAL_SD = 1e-3, 1.5e-3  # s: lag of the accelerometer behind the forces of commands where nothing is late
-# Where thrust never sets in at once, what the model lacks of slow forces passes for lag: with 0.3 s of thrust over its
-# rate (standard deviations) by -18 to 28 ms in 17 simulated flights, most by 8 to 20, with 0.16 to 0.19 s by -3 to 8 in
-# 9; with 0.05 s, as sudden take-offs have, by no more than above.
-SUDDEN, SLOW = 0.06, 0.06  # s; s of lag for each second beyond it
+# s: how late an accelerometer shows a force that nothing delays. Its low pass of 30 Hz (second order; firmware of the
+# Crazyflie, default of PX4) takes 7.5 ms; 28 simulated flights with nothing late came out at 7.2 +- 3.4 ms.
+PUNCTUAL, PUNCTUAL_SD = 7.5e-3, 3.4e-3
+REACH = 0.1  # s, of delays that are tried on either side
 TWINS_SD = 0.01  # relative: speeds of two healthy rotors at one command
-LAG = 6  # which of the parameters of `accelerometer.tilt` is the lag [s]
 SECOND = 100  # samples to a block
 FEWEST = 8  # blocks
 
@@ -32,32 +31,37 @@ FEWEST = 8  # blocks
 def late_measurements(data: Data, nominal: Point, delay: float) -> float | None:
     """Nats for late measurements and against late inputs, of `delay` [s]; None without an accelerometer.
 
-    `nominal` has no delay. The flight that tells the lag best is heard, most often one where thrust sets in at once:
-    errors have one sign (in 11 simulated flights with nothing hidden that tell it to 2 to 4 ms it was one sd too long
-    on average, too short in none), so the mean of several would pass for better than it is. For measured rotor speeds
-    nothing is said: their own lag is not known.
+    `nominal` has no delay. For measured rotor speeds nothing is said: their own lag is not known.
     """
     if data.flights[0].inputs.measured:
         return None
-    told = [found for found in (_lag_of(one, nominal) for one in data.each()) if found is not None]
-    if not told:
+    lags = [found for found in (_lag_of(model, nominal) for model in data.models) if found is not None]
+    if not lags:
         return None
-    lag, variance = min(told, key=lambda one: one[1])
+    weight = sum(variance**-1 for _, variance in lags)
+    lag, variance = sum(lag / variance for lag, variance in lags) / weight, 1.0 / weight + PUNCTUAL_SD**2
     return ((lag - PUNCTUAL - delay) ** 2 - (lag - PUNCTUAL) ** 2) / (2.0 * variance)
 
 
-def _lag_of(data: Data, nominal: Point) -> tuple[float, float] | None:
-    """Lag [s] of the accelerometer behind the forces of one flight's commands, and its variance; None without one."""
-    found = tilt(data, nominal)
-    if found is None:
+def _lag_of(model: Model, point: Point) -> tuple[float, float] | None:
+    """Lag [s] of the accelerometer behind the thrust of one flight's commands, and its variance; None without one."""
+    flight = model.flight
+    thrust = model.accelerations(point)[0][:, 2]
+    known, shown = np.isfinite(thrust) & ~flight.starts, np.isfinite(flight.force[:, 2])
+    grid = np.arange(flight.time[0], flight.time[-1], band.GRID)
+    margin = round((REACH + band.SUPPORT) / band.GRID)
+    if min(known.sum(), shown.sum()) < 2 or grid.size < 2 * margin + band.FEWEST_BLOCKS * band.BLOCK / band.GRID:
         return None
-    flight = data.models[0].flight
-    force = data.models[0].accelerations(nominal)[0][:, 2]
-    inside = ~flight.starts & np.isfinite(force)
-    rate = np.gradient(force, flight.time)[inside]
-    slow = max(float(force[inside].std()) / max(float(rate.std()), 1e-9) - SUDDEN, 0.0)
-    variance = float(found[0].covariance[LAG, LAG]) + PUNCTUAL_SD**2 + (SLOW * slow) ** 2
-    return float(found[0].theta[LAG]), variance
+    middle = flight.time - 0.5 * np.diff(flight.time, prepend=flight.time[0])  # thrust is the mean of the step before
+    cause = band.band_passed(np.interp(grid, middle[known], thrust[known])[:, None])
+    wanted = band.band_passed(np.interp(grid, flight.time[shown], flight.force[shown, 2])[:, None])
+    index = np.arange(margin, grid.size - margin)
+    block = ((grid[index] - grid[margin]) / band.BLOCK).astype(int)
+    delays = band.delays_within(REACH)
+    sums = np.stack([band.products(index, block, wanted, cause, [], d) for d in delays], 2)
+    total = sums.sum(1)
+    lag, variance = band.delay_of(delays, total)[0], band.standard_error(delays, sums, total) ** 2
+    return (lag, variance) if np.isfinite([lag, variance]).all() and variance > 0.0 else None
 
 
 def false_speed(recordings: Sequence[Recording], rotor: int, scale: float, lag: float) -> float | None:
