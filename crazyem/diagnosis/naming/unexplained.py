@@ -94,7 +94,7 @@ def unexplained(data: Data, selection: Selection, after: Located, apart: Data | 
     everything, quiet = data.together_with(apart), memoryless(data.twin(), point)
     everything.settle(quiet)
     erratic = erratic_rotor(everything.models, quiet)
-    left += [erratic] if erratic else []
+    left += [erratic] if erratic and notable(erratic, point, differ=data.differ) else []
     left.sort(key=lambda f: -f.nats)
     gained = sum(s.taken.evidence for s in selection.steps if s.taken)
     return Unexplained(tuple(left[:12]), gained)

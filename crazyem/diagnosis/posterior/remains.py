@@ -47,7 +47,7 @@ def remains(study: Study, best: Fit, nothing: Fit, after: Located) -> Unexplaine
         quiet = memoryless(data.twin(), point)
         data.settle(quiet)
         erratic = erratic_rotor(data.models, quiet)
-        found += [erratic] if erratic else []
+        found += [erratic] if erratic and notable(erratic, point) else []
         data.settle(point)
     heading = heading_by_place(best.data[0], None)
     found += [heading] if heading else []
