@@ -11,6 +11,8 @@ def linear_force(situation: Situation, body: Body, *, x: float, y: float, z: flo
     return Wrench(-np.array([x, y, z]) * situation.airspeed, np.zeros((situation.size, 3)))
 
 
+LEAST = in_turn("x y z", 1e-3, 1e-3, 3e-3)  # N s/m, N s^2/m^2; along z thrust is a little wrong
+
 LINEAR_DRAG = Effect(
     "linear_drag",
     tuple(Parameter(axis, "N s/m", 0.0, 0.0, 0.5, 1e-3) for axis in "xyz"),
@@ -20,7 +22,8 @@ LINEAR_DRAG = Effect(
     external=linear_force,
     couples_air=True,
     # usual: an attitude 1 ms late is a force of 3e-4 N s/m; along z thrust is a little wrong (`fitting/nuisances.py`)
-    prior=Prior(alike("x y z", 0.012), in_turn("x y z", 5e-4, 5e-4, 1e-3)),
+    prior=Prior(alike("x y z", 0.012), in_turn("x y z", 5e-4, 5e-4, 1e-3), least=LEAST),
+    most_per_mass=5.0,
     needs=("velocity", "position"),
     separates="fly straight legs of different speeds in opposite directions",
 )
@@ -41,7 +44,9 @@ QUADRATIC_DRAG = Effect(
     about=("quadratic",),
     external=quadratic_force,
     couples_air=True,
-    prior=Prior(alike("x y z", 0.012), in_turn("x y z", 3e-4, 3e-4, 1e-3)),  # usual: as that of a linear drag
+    # usual: as that of a linear drag
+    prior=Prior(alike("x y z", 0.012), in_turn("x y z", 3e-4, 3e-4, 1e-3), least=LEAST),
+    most_per_mass=3.0,
     needs=("velocity", "position"),
     separates="fly straight legs at 0.5, 1 and 2 m/s: linear drag doubles with speed, this one goes up four times",
 )
@@ -66,6 +71,11 @@ def _sampled(logged: Logged) -> Sizes:
     return alike("x y z", 6e-6 * logged.coarse)
 
 
+# N m s/m: least of a moment that tips the drone back from where it flies, as air on rotors above the centre of mass
+# does, and further towards there. Five of simulated drones with none were such about both axes, of 4e-6 to 1.2e-5: more
+# than that may be of a body below which the air finds more hold.
+BACK, ONWARD = 3e-6, 1.5e-5
+
 VELOCITY_MOMENT = Effect(
     "velocity_moment",
     (
@@ -75,7 +85,11 @@ VELOCITY_MOMENT = Effect(
     order=62,
     external=flapping,
     # own: a Crazyflie tilts its flow by some 1e-5 N m s/m (docs/reference/effects.md)
-    prior=Prior(alike("roll_per_vy pitch_per_vx", 4e-5), alike("roll_per_vy pitch_per_vx", 1.5e-6)),
+    prior=Prior(
+        alike("roll_per_vy pitch_per_vx", 4e-5),
+        alike("roll_per_vy pitch_per_vx", 1.5e-6),
+        least={"roll_per_vy": (ONWARD, BACK), "pitch_per_vx": (BACK, ONWARD)},
+    ),
     needs=("velocity", "position"),
     separates="fly straight legs forward and back, then left and right, at 1 and 2 m/s, and hover between them",
 )

@@ -42,6 +42,7 @@ INERTIA = Effect(
         lambda logged: in_turn("xx yy zz", *(share * logged.coarse for share in (0.01, 0.01, 0.02))),
         dict.fromkeys(("xx", "yy", "zz"), "neutral"),
         0.9,
+        least=alike("xx yy zz", 0.08),
     ),
     alike=0.9,  # what is heavier about one axis is so about the others: they differ by a third of what they are more
 )
@@ -75,7 +76,8 @@ CENTER_OF_MASS = Effect(
     body=shifted,
     # own: a battery of a third of the weight, put in some millimetres off; usual height: what velocities of filters on
     # board look like (`fitting/nuisances.py`)
-    prior=Prior(alike("x y z", 1.5e-3), in_turn("x y z", 3e-5, 3e-5, 7e-4)),
+    # least: z shows in lateral accelerations of O alone
+    prior=Prior(alike("x y z", 1.5e-3), in_turn("x y z", 3e-5, 3e-5, 7e-4), least=in_turn("x y z", 1e-4, 1e-4, 1e-3)),
     separates=(
         "balance the drone on an edge, or log the accelerometer and yaw for 5 s at 2 Hz; for z fly hard sideways steps"
     ),

@@ -12,6 +12,7 @@ They stand with the effects, each with its source. Diagnosis knows nothing else 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,7 @@ class Logged:
 
 
 Sizes = Mapping[str, float]  # parameter -> standard deviation
+Least = Mapping[str, float | tuple[float, float]]  # parameter -> departure from neutral: either way, or below and above
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,8 @@ class Prior:
             "neutral", the parameter's own neutral value; SI where absent.
         freedom: degrees of freedom of Student's t distribution, which `usual` is the scale of; infinite: a normal one.
         together: correlation of `own` between the parameters.
+        least: departures that filters, the sampling of a log and the air of a room look like: less is no finding. Or
+            as a function of the choices (`Parameter.chosen`), and of whether a filter on board made the state.
         unnamed: stands for what no effect of the catalogue is: it competes, and is told as unexplained.
     """
 
@@ -71,11 +75,17 @@ class Prior:
     per: Mapping[str, str] = field(default_factory=dict)
     freedom: float = math.inf
     together: float = 0.0
+    least: Least | Callable[[Mapping[str, Any], bool], Least] = field(default_factory=dict)
     unnamed: bool = False
 
     def usual_in(self, logged: Logged) -> Sizes:
         """From recording to recording, for one as it was logged."""
         return self.usual(logged) if callable(self.usual) else self.usual
+
+    def least_in(self, chosen: Mapping[str, Any], *, onboard: bool) -> dict[str, tuple[float, float]]:
+        """Parameter -> smallest departures below and above neutral that are a finding, in the units of `own`."""
+        least = self.least(chosen, onboard) if callable(self.least) else self.least
+        return {n: size if isinstance(size, tuple) else (size, size) for n, size in least.items()}
 
     def share(self, name: str, *, mass: float, inertia: float, neutral: float) -> float:
         """What the sizes of a parameter are shares of, of a vehicle of that mass [kg] and inertia about x [kg m^2]; 1

@@ -79,7 +79,7 @@ TORQUE_SCALE = Effect(
     about=("torque_per_thrust", "arm", "inertia"),
     turning=turned,
     # usual: common to all axes of 76 flights of known torques (`fitting/nuisances.py`)
-    prior=Prior(own={"scale": 0.2}, usual=lambda logged: {"scale": 0.03 * logged.coarse}),
+    prior=Prior(own={"scale": 0.2}, usual=lambda logged: {"scale": 0.03 * logged.coarse}, least={"scale": 0.08}),
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum): torque over inertia is all that a flight shows",
 )
@@ -165,8 +165,9 @@ ROTOR_INERTIA = Effect(
     order=66,
     controllers=True,  # INDI: ctrlINDI.g2
     external=reaction,
-    # own: a bar of 0.3 g and 46 mm; a Crazyflie's propeller and rotor: a tenth of that, in no file
-    prior=Prior(own={"inertia": 4e-8}, usual={"inertia": 2e-9}),
+    # own: a bar of 0.3 g and 46 mm; a Crazyflie's propeller and rotor: a tenth of that, in no file. Least: a sixth of a
+    # rod of 0.1 g and 46 mm; no rotor is lighter.
+    prior=Prior(own={"inertia": 4e-8}, usual={"inertia": 2e-9}, least={"inertia": 3e-9}),
     needs=("body_rate", "attitude"),
     separates="yaw for 5 s at 2 Hz (spin-up), and roll while turning about yaw (gyroscope); weigh a propeller",
 )

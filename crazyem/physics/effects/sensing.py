@@ -58,7 +58,7 @@ ATTITUDE_MISALIGNMENT = Effect(
     _ANGLES,
     order=80,
     measured=tilted_pose,
-    prior=Prior(alike("roll pitch yaw", 0.04), _leaning),
+    prior=Prior(alike("roll pitch yaw", 0.04), _leaning, least=alike("roll pitch yaw", 2e-3)),
     needs=("attitude",),
     separates="hover for 5 s at each of four headings: a tilted frame turns with the drone, wind stays in the world",
 )
@@ -81,7 +81,7 @@ GYRO_BIAS = Effect(
     order=82,
     measured=biased_gyro,
     # usual: 0.16 deg/s between recordings of one drone (NanoBench, arXiv 2603.09908)
-    prior=Prior(alike("x y z", 0.025), alike("x y z", 2.8e-3)),
+    prior=Prior(alike("x y z", 0.025), alike("x y z", 2.8e-3), least=alike("x y z", 3e-3)),
     needs=("body_rate",),
     belongs_to="recording",  # it drifts with the temperature
     separates="record the gyro for 10 s with the drone at rest",
@@ -92,7 +92,7 @@ VELOCITY_SCALE = Effect(
     tuple(Parameter(axis, "", 1.0, 0.0, 3.0, 0.01) for axis in "xyz"),
     order=83,
     measured=scaled_velocity,
-    prior=Prior(alike("x y z", 0.12), _jittery),
+    prior=Prior(alike("x y z", 0.12), _jittery, least=alike("x y z", 0.035)),
     needs=("velocity",),
     words="velocity scale of the onboard estimate",
     belongs_to="recording",  # in a vehicle it cost 27 % of position error on other flights of the same drone
