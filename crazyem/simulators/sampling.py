@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.days import day_sd
-from crazyem.diagnosis.fitting.nuisances import DAILY_LAG_SD
 from crazyem.errors import DataError, UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.rotors import THRUST_SCALE, TRIM
-from crazyem.physics.effects.timing import MOTOR_LAG
+from crazyem.physics.effects.timing import DAILY_LAG_SD, MOTOR_LAG
 from crazyem.physics.motion import vehicle_values
 from crazyem.simulators.constants import NUMBERS, from_vehicle
 from crazyem.simulators.findings import rescaled
@@ -127,7 +126,7 @@ def _drawn(vehicle: Vehicle, parameters: Sequence[str], theta: Array) -> Vehicle
 
 
 def _another_day(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
-    """The same drone on another day; sources of the spreads: `fitting/nuisances.py`, `fitting/sampling.py`."""
+    """The same drone on another day; the spreads stand with the effects."""
     effects = {n: dict(v) for n, v in vehicle.effects.items()}
     thrust_sd, *trim_sd = day_sd(vehicle)
     scale = effects.setdefault(THRUST_SCALE.name, {"scale": 1.0})

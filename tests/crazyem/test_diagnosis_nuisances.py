@@ -13,18 +13,11 @@ from crazyem.diagnosis.fitting.fit import Data, DivergedError, starting_point
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import (
-    AT_ONCE_DAMPING_SD,
     AT_ONCE_SD,
     COARSE_REASON,
-    DAMPING_SD,
     FAST,
-    INERTIA_SD,
-    JITTER,
-    PULL,
-    VELOCITY_SD,
     _let_go,
     abstained,
-    jittery,
     nuisances,
     refine_anew,
     refine_base,
@@ -49,9 +42,12 @@ def flown(*, speed: float, measured: bool = False) -> SimpleNamespace:
     y[:, 3:6] = np.sqrt(2) * speed * np.array([1, 2, 4]) * np.sin(np.arange(400) * np.pi / 20)[:, None]
     time = 0.01 * np.arange(400)
     inputs = SimpleNamespace(measured=measured, time=time, thrust=np.full((400, 4), 0.07))
-    flight = Made(name="flight", y=y, time=time, inputs=inputs, coarse=False, levelled=False, fused=False)
     signals = frozenset({"position", "velocity", "attitude", "body_rate"})
-    return SimpleNamespace(flights=[flight], coarse=False, differ=False, signals=signals, constrained=frozenset())
+    flight = Made(
+        name="flight", y=y, time=time, inputs=inputs, signals=signals, coarse=False, levelled=False, fused=False,
+        differs=False,
+    )  # fmt: skip
+    return SimpleNamespace(flights=[flight], signals=signals, constrained=frozenset())
 
 
 def sd_of(data: SimpleNamespace, point: Point, effect: str) -> np.ndarray:
@@ -60,8 +56,7 @@ def sd_of(data: SimpleNamespace, point: Point, effect: str) -> np.ndarray:
 
 
 def test_velocities_are_as_wrong_as_an_onboard_estimate_jitters():
-    assert jittery(flown(speed=0.1)) == pytest.approx(JITTER / np.array([0.1, 0.2, 0.4]))  # type: ignore[arg-type]
-    assert sd_of(flown(speed=0.1), POINT, "velocity_scale")[0] == pytest.approx(VELOCITY_SD + JITTER / 0.1)
+    assert sd_of(flown(speed=0.1), POINT, "velocity_scale")[0] == pytest.approx(2e-3 + 3e-3 / 0.1)
     still = sd_of(flown(speed=0.0), POINT, "velocity_scale")
     assert np.all(np.isfinite(still))
     assert np.all(still > 0.2)
@@ -70,33 +65,31 @@ def test_velocities_are_as_wrong_as_an_onboard_estimate_jitters():
 def test_a_biased_gyro_tilts_the_attitude_that_a_filter_makes_of_it():
     assert sd_of(flown(speed=0.1), POINT, "attitude_misalignment").size == 0
     biased = POINT.with_effects({"gyro_bias": {"x": 0.03, "y": -0.04, "z": 0.0}})
-    assert sd_of(flown(speed=0.1), biased, "attitude_misalignment") == pytest.approx(np.full(3, PULL * 0.05))
+    assert sd_of(flown(speed=0.1), biased, "attitude_misalignment") == pytest.approx(np.full(3, 0.05 * 0.05))
     unbiased = POINT.with_effects({"gyro_bias": dict.fromkeys("xyz", 0.0)})
     assert sd_of(flown(speed=0.1), unbiased, "attitude_misalignment").size == 0
 
 
 def test_speeds_logged_too_seldom_look_like_a_damping_and_commands_have_their_own_way():
     """Without speeds, what commands miss is a torque with memory."""
-    assert sd_of(flown(speed=0.1, measured=True), POINT, "rate_damping") == pytest.approx(np.full(3, DAMPING_SD))
+    assert sd_of(flown(speed=0.1, measured=True), POINT, "rate_damping") == pytest.approx(np.full(3, 6e-6))
     assert sd_of(flown(speed=0.1), POINT, "rate_damping").size == 0
 
 
 def test_beside_heavy_rotors_the_yaw_inertia_is_hardly_known():
     heavy = POINT.with_effects({"rotor_inertia": {"inertia": 2e-8}})
     light, free = (sd_of(flown(speed=0.1), p, "inertia") / DRONE.inertia for p in (POINT, heavy))
-    assert light == pytest.approx(INERTIA_SD)
-    assert free == pytest.approx([*INERTIA_SD[:2], AT_ONCE_SD])
-    assert sd_of(flown(speed=0.1, measured=True), heavy, "inertia")[2] == pytest.approx(
-        INERTIA_SD[2] * DRONE.inertia[2]
-    )
+    assert light == pytest.approx([0.01, 0.01, 0.02])
+    assert free == pytest.approx([0.01, 0.01, AT_ONCE_SD])
+    assert sd_of(flown(speed=0.1, measured=True), heavy, "inertia")[2] == pytest.approx(0.02 * DRONE.inertia[2])
 
 
 def test_beside_heavy_rotors_a_damping_of_yaw_is_free_as_well_and_goes_with_them():
     """What sampled commands leave of their torque is a damping about z, of drones that have none."""
     heavy = POINT.with_effects({"rotor_inertia": {"inertia": 2e-8}})
-    wanted = [DAMPING_SD, DAMPING_SD, AT_ONCE_DAMPING_SD]
+    wanted = [6e-6, 6e-6, 1e-4]
     assert sd_of(flown(speed=0.1), heavy, "rate_damping") == pytest.approx(wanted)
-    assert sd_of(flown(speed=0.1, measured=True), heavy, "rate_damping") == pytest.approx(np.full(3, DAMPING_SD))
+    assert sd_of(flown(speed=0.1, measured=True), heavy, "rate_damping") == pytest.approx(np.full(3, 6e-6))
     left = POINT.with_effects({"rate_damping": {"x": 0.0, "y": 0.0, "z": 1e-4}})  # by a rotor inertia that is gone
     assert "rate_damping" not in _let_go(left, (), []).effects
     assert _let_go(left, [Candidate("rate_damping", (), ("x", "y", "z"))], []).effects == left.effects

@@ -12,15 +12,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.fitting.nuisances import (
-    COARSE_DAMPING_SD,
-    COARSE_INERTIA_SD,
-    DELAY_SD,
-    INERTIA_SD,
-    RUN_DOWN_SD,
-    SAG_SLOPE_SD,
-    nuisances,
-)
+from crazyem.diagnosis.fitting.nuisances import nuisances
 from crazyem.diagnosis.fitting.sampling import unlogged_share
 from crazyem.diagnosis.flights.flight import SAMPLING, thinned
 
@@ -61,8 +53,11 @@ class Commands(SimpleNamespace):
 def commanded(thrust: NDArray, period: float, *, measured: bool = False, levelled: bool = False) -> Any:
     time = period * np.arange(len(thrust))
     inputs = SimpleNamespace(time=time, thrust=thrust, measured=measured)
-    return Commands(name="flight", time=time, inputs=inputs, y=np.zeros((time.size, 13)), coarse=False,
-                    levelled=levelled)  # fmt: skip
+    signals = frozenset({"position", "attitude", "body_rate"})
+    return Commands(
+        name="flight", time=time, inputs=inputs, y=np.zeros((time.size, 13)), signals=signals, coarse=False,
+        levelled=levelled, fused=False, differs=False,
+    )  # fmt: skip
 
 
 WHITE = 0.07 + 0.001 * np.random.default_rng(1).standard_normal((6000, 4))
@@ -82,8 +77,7 @@ def test_smooth_commands_and_measured_speeds_miss_nothing() -> None:
 
 
 def priors(flight: Any) -> dict[str, NDArray]:
-    signals = frozenset({"position", "attitude", "body_rate"})
-    data: Any = SimpleNamespace(flights=[flight], coarse=False, differ=False, signals=signals, constrained=frozenset())
+    data: Any = SimpleNamespace(flights=[flight], constrained=frozenset())
     found = nuisances(data, Point(DRONE, {}, first_guess()), ())
     return {c.effect: np.array(precision) ** -0.5 for c, precision in found}
 
@@ -91,16 +85,16 @@ def priors(flight: Any) -> dict[str, NDArray]:
 def test_what_was_not_logged_widens_the_priors_of_what_turns_the_drone() -> None:
     flight = commanded(WHITE, 0.01)
     share, sd = unlogged_share([flight], DRONE), priors(flight)
-    assert sd["inertia"] / DRONE.inertia == pytest.approx(np.hypot(INERTIA_SD, COARSE_INERTIA_SD * share))
-    assert sd["rate_damping"] == pytest.approx(np.full(3, COARSE_DAMPING_SD * share))
-    assert sd["input_delay"] == pytest.approx(np.hypot(DELAY_SD[False], 0.01 * share))
+    assert sd["inertia"] / DRONE.inertia == pytest.approx(np.hypot([0.01, 0.01, 0.02], share))
+    assert sd["rate_damping"] == pytest.approx(np.full(3, 3e-4 * share))
+    assert sd["input_delay"] == pytest.approx(np.hypot(2e-3, 0.01 * share))
     whole = priors(commanded(WHITE, 0.002))
-    assert whole["inertia"] / DRONE.inertia == pytest.approx(INERTIA_SD)
+    assert whole["inertia"] / DRONE.inertia == pytest.approx([0.01, 0.01, 0.02])
     assert "rate_damping" not in whole
 
 
 def test_a_battery_without_a_voltage_may_sag_and_run_down() -> None:
     assert not {"thrust_curve", "battery_sag"} & priors(commanded(WHITE, 0.01)).keys()
     sd = priors(commanded(WHITE, 0.01, levelled=True))
-    assert sd["thrust_curve"] == SAG_SLOPE_SD
-    assert sd["battery_sag"] == pytest.approx(RUN_DOWN_SD)
+    assert sd["thrust_curve"] == pytest.approx(0.15)
+    assert sd["battery_sag"] == pytest.approx(1.5e-3)

@@ -100,8 +100,8 @@ def test_commands_that_are_faster_than_their_sampling_say_nothing_of_inertia(whi
     data, point = Data([replace(flight, inputs=rotor)]), point_of(TRIMMED)
     share = fast_share(data.flights[0], DRONE)
     assert share == pytest.approx(0.5, abs=0.1) if white else share < 0.15
-    assert coarsely_sampled(data, point) is coarse
-    assert not coarsely_sampled(data, point_of(DRONE))
+    assert coarsely_sampled(data.flights, TRIMMED) is coarse
+    assert not coarsely_sampled(data.flights, DRONE)
     assert of_a_real_drone(data.flights, DRONE) is DRONE  # whatever shakes: nothing steady is held against
     twisted = rotor.thrust * np.array([1.1, 0.9, 1.1, 0.9])
     held_against = [replace(flight, inputs=replace(rotor, thrust=twisted))]

@@ -37,8 +37,9 @@ def test_the_package_is_small() -> None:
 def test_every_effect_says_how_large_it_is(name: str) -> None:
     effect = CATALOGUE[name]
     known = {p.name: p for p in effect.parameters}
-    usual = effect.prior.usual_in(Logged(filed=frozenset({"trim"})))
-    assert effect.prior.own or usual
+    everything = frozenset({"position", "velocity", "attitude", "body_rate", "motor_command"})
+    usual = effect.prior.usual_in(Logged(signals=everything, arm=(0.03, 0.03)))
+    assert effect.prior.own or usual or effect.prior.usual_in(Logged(filed=frozenset({"trim"})))
     for sizes in (effect.prior.own, usual):
         assert set(sizes) <= set(known)
         assert all(size > 0.0 for size in sizes.values())

@@ -16,8 +16,8 @@ from crazyem.physics.motion import vehicle_values
 ON_BOARD = 0.04  # m from the middle of the rotors: no part of a Crazyflie is further away
 STRONGEST = 1.1  # a worn, cut or bent propeller pulls less than the others; a new one among worn ones a little more,
 NO_STRONGER = 1.0  # and none gets stronger in flight
-# judged by themselves: gusts.py, accelerometer.py, place_rivals.py; of every log: nuisances.py
-ASIDE = ("gusts", "accelerometer_misalignment", "onboard_filter", "sampled_commands", "force_by_place")
+# By gusts.py, accelerometer.py, place_rivals.py; `nuisances` has other inertias and delays for sampled commands.
+JUDGED_ALONE = ("gusts", "accelerometer_misalignment", "force_by_place", "sampled_commands")
 TRIM = "trim"
 ASKED = (TRIM,)  # looked for only if asked for: near every effect that brings a steady torque
 
@@ -182,7 +182,7 @@ def candidates_for(
         reason = impossible(effect, signals, measured_speeds)
         if reason:
             left_out[name] = reason
-        elif name not in ASIDE and (name in wanted or name not in ASKED):
+        elif (effect.prior.own and name not in JUDGED_ALONE) or (name in ASKED and name in wanted):
             found += variants(effect, point, signals)
     return found, left_out
 

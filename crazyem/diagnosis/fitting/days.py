@@ -8,11 +8,9 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.prior import Logged
 from crazyem.vehicle import Vehicle
 
-_TRIM = CATALOGUE["trim"].prior
-TRIM_SD = tuple(_TRIM.usual_in(Logged(filed=frozenset({"trim"}))).values())  # m, torque over thrust about x, y, z
-# Relative: healthy and damaged flights of two drones on several days (docs/results/diagnosis_real.md). The thrust is
-# free for each of several recordings of any drone (`SEVERAL`): one number for all would make it heed commands less.
-THRUST_SD = 0.02
+_TRIM, _REAL = CATALOGUE["trim"].prior, Logged(filed=frozenset({"trim"}))
+TRIM_SD = tuple(_TRIM.usual_in(_REAL).values())  # m, torque over thrust about x, y, z
+THRUST_SD = CATALOGUE["thrust_scale"].prior.usual_in(_REAL)["scale"]  # relative
 # Flights that the spread of other drones is worth beside a drone's own: the two drones of CrazyPAD differ by a factor
 # of four in it, so other drones say little.
 PRIOR_FLIGHTS = 2.0
@@ -32,4 +30,4 @@ def day_sd(vehicle: Vehicle) -> tuple[float, ...]:
 
 def day_freedom(vehicle: Vehicle) -> float:
     """Degrees of freedom of Student's t distribution of a day."""
-    return _TRIM.freedom if vehicle.days is None else PRIOR_FLIGHTS + vehicle.days.flights - 1.0
+    return _TRIM.freedom_in(_REAL) if vehicle.days is None else PRIOR_FLIGHTS + vehicle.days.flights - 1.0

@@ -5,70 +5,28 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, of_recordings
-from crazyem.diagnosis.fitting.days import day_freedom, day_sd, trim_known
+from crazyem.diagnosis.fitting.candidates import JUDGED_ALONE, TRIM, Candidate, of_recordings
+from crazyem.diagnosis.fitting.days import trim_known
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, refine, remembering, remembering_anew
 from crazyem.diagnosis.fitting.gram import Solution, used
+from crazyem.diagnosis.fitting.logged import logged
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.sampling import coarsely_sampled, interval, unlogged_share
+from crazyem.diagnosis.fitting.sampling import coarsely_sampled
 from crazyem.diagnosis.flights.flight import Flight
+from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.vehicle import GRAVITY, Vehicle
 
-# What is never exactly as a vehicle file says, and is therefore always free, within these standard deviations: the
-# delay between a stamp and its effect, what sampling the commands at 100 Hz does to inertia and lag, and what an
-# onboard filter does to velocities. An effect is more.
-DELAY_SD = {False: 2e-3, True: 5e-3}  # s, by whether rotor speeds are measured
-# Relative: in 76 flights of known torques over inertias, their differences scatter by 1.2 % between roll and pitch and
-# by 2.0 % to yaw beyond what fits say of themselves (figures 8 by 2.1 and 3.0 %, shakes by 0.5 and 1.3 %); what is
-# common to all three by 4.5 % (shakes 2.5 %), which is `TORQUE_SD`'s.
-INERTIA_SD = np.array([0.01, 0.01, 0.02])
-LAG_SD = 2e-3  # s: with nothing hidden and torques as free, 51 to 55 ms instead of 50 in ten flights
 # s: fits find the rotors' lag off all the same: in sixteen more flights with nothing hidden 47 to 55 ms, 3.1 ms (rms),
 # with inertias 3 % too small for each ms too long where the drone turns little.
 LAG_OFF = 3e-3
-# Relative, about z: rotors that are heavy answer with torque at once, without the lag that hides what sampled commands
-# miss, and then yaw looks too heavy by 20 to 40 %.
+# Relative, about z: with heavy rotors (`Logged.heavy_rotors`) their own inertia is as sure as that of yaw.
 AT_ONCE_SD = 0.25
-# N m s: and as if it were damped, by 1e-5 to 1.9e-4 in 11 flights that shake of drones with such rotors and no damping.
-AT_ONCE_DAMPING_SD = 1e-4
-CENTRE_SD = (2e-5, 2e-5, 7e-4)  # m; a height of -0.4 to -0.8 mm is what velocities of onboard filters look like
-# rad/s: what a gyro shows of itself in one recording. Mean rates by gyro and by motion capture differ by 0.16 deg/s
-# (rms about x and y of eight slow and medium flights of NanoBench, arXiv 2603.09908).
-GYRO_SD = 2.8e-3
-# Relative: no onboard filter is better; m/s, of motion capture and of a filter on board, see `jittery`. Velocities of
-# 36 simulated filters in hover differ from the true ones by 0.9 to 10.6 mm/s (rms; median 2.7): the largest is taken.
-VELOCITY_SD, JITTER, ONBOARD_JITTER = 2e-3, 3e-3, 1e-2
-# s: rates behind the attitude, velocities behind the position, by the filters of the firmware; in 80 flights with
-# nothing hidden 0.0 to 2.4 and 0.0 to 1.6 ms, most in quick ones.
-FILTER, FILTER_SD = (("rate_lag", 1.2e-3), ("velocity_lag", 0.6e-3)), 0.7e-3
-# s: of velocities, where a filter on board makes them: 0.7 to 5.7 ms in ten simulated flights of five filters.
-ONBOARD_LAG_SD = 2e-3
-# s: fixes draw a velocity back that a filter on board makes without the drag: within 0.17 to 0.36 s in nine simulated
-# flights, by the rate and the noise of the fixes. A filter that knows all forces has none of that error.
-LATERAL_TIME_CONSTANT, LATERAL_TIME_CONSTANT_SD = ("lateral_time_constant", 0.2), 0.2
-# Relative: in ten flights with nothing hidden, with the lag free, torques look 2 +- 2 % too strong (-0.5 to +4 %); a
-# longer lag with more torque is nearly the same to a loop whose commands are sampled.
-TORQUE_SD = 0.03
-# N m s: speeds logged at 100 Hz miss what the loop does in between, which looks like a damping of 1 to 11e-6 in quick
-# flights of 11 drones with nothing hidden (and of 8e-5 to 2.4e-4 in hovers, which hardly show it).
-DAMPING_SD = 6e-6
-# s: of the lag of rotors in the calm flights of real drones, 24 to 105 ms in 26 flights for a file's 50, whether
-# anything was wrong with them or not, so a file to which one of them was fitted does not know it.
-DAILY_LAG_SD = 0.025
-FLAPPING_SD, DRAG_SD = 3e-4, 0.02  # N m s/m, N s/m: real rotors have both, bare rigid bodies of files neither
-# So both are free beside any effect that is tried. A drag is named all the same where it explains more than none of it.
+# A drag is free beside any effect that is tried, of real drones. It is named all the same where it explains more than
+# none of it.
 ROTOR_DRAG = ("linear_drag",)
-ROTOR_AERODYNAMICS = (*ROTOR_DRAG, "velocity_moment")  # so healthy flights of a drone give its file both
-LEANING_SD = (0.02, 0.02, 2e-3)  # rad: an attitude made from the acceleration is tilted as the accelerometer is
-# s: a filter on board that integrates a biased gyro and is drawn back by the fixes stays off by the bias times the time
-# that takes: 0.041, 0.043, 0.041 and 0.038 s in roll and pitch of two simulated flights.
-PULL = 0.05
-# Of a battery whose voltage nobody recorded: it sags under the load, by 0.06 to 0.3 ohm of a cell and its wires, which
-# makes thrust rise less with the command (relative), and it runs down in flight (1/s, relative): 4.1 to 3.5 V in 300 s.
-SAG_SLOPE_SD, RUN_DOWN_SD = 0.15, 1.5e-3
+ROTOR_AERODYNAMICS = (*ROTOR_DRAG, "velocity_moment")  # healthy flights of a drone give its file both
 SEVERAL = 3  # recordings whose commands are known, from which on each has a thrust of its own
 # Standard deviations that no scatter shows. An attitude 1 ms late is a force that goes with the velocity, 3e-4 N s/m of
 # drag along the quicker axis of a figure 8 (mass * (3.1 rad/s)^2 * 1 ms); along z thrust is a little wrong; a gyro's
@@ -88,9 +46,6 @@ ANGLES = ("roll", "pitch", "yaw")
 TURNED_BY_TORQUE = ("inertia", "torque_scale")  # what is off with the lag: `by_a_wrong_lag`
 # What commands that are mostly faster than their sampling (`sampling.py`) say nothing of: relative; N m s.
 COARSE_INERTIA_SD, COARSE_DAMPING_SD = 1.0, 3e-4
-# Nor is a shifted centre of mass asked of them, but their commands trim the drone all the same: one rotor weaker by a
-# tenth is a torque per thrust of a twentieth of the arm. Taken for none, it was a wind (by the moment of its flow).
-COARSE_TRIM = 0.05
 # Streams that were put onto another clock by straight lines do not look white any more. Their torques explain so little
 # of the turning that the drone would have to be as heavy to turn as if all its mass were this many times as far out as
 # its rotors: no body of that size is, and what it stands for says nothing of the drone.
@@ -116,84 +71,28 @@ Nuisances = list[tuple[Candidate, tuple[float, ...]]]  # with the precision of e
 
 
 def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisances:
-    """What is always free, with the precisions of its priors about neutral."""
-    measured, daily = data.flights[0].inputs.measured, TRIM in point.vehicle.effects
-    lags = not measured and point.vehicle.motor_time_constant > 0
-    unlogged = unlogged_share(data.flights, point.vehicle)
-    late = math.hypot(DELAY_SD[measured], unlogged * max(interval(f) for f in data.flights))
-    found: Nuisances = [(Candidate("input_delay", (), ("delay",), both_ways=True), (late**-2,))]
-    if "body_rate" in data.signals or "attitude" in data.signals:
-        coarse = coarsely_sampled(data, point)
-        share = np.hypot(INERTIA_SD, COARSE_INERTIA_SD * (1.0 if coarse else unlogged))
-        heavy = not coarse and not measured and point.effects.get("rotor_inertia", {}).get("inertia", 0.0) > 0.0
-        if heavy:
-            share = np.array([*share[:2], AT_ONCE_SD])
-        moments = tuple((share * np.array(point.vehicle.inertia)) ** -2.0)
-        found.append((Candidate("inertia", (), ("xx", "yy", "zz")), moments))
-        if not coarse:
-            found.append((Candidate("torque_scale", (), ("scale",)), (TORQUE_SD**-2,)))
-        if coarse or measured or heavy or unlogged > 0.0:
-            usual = DAMPING_SD if measured or heavy else 0.0
-            tilting = COARSE_DAMPING_SD if coarse else math.hypot(usual, COARSE_DAMPING_SD * unlogged)
-            turning = AT_ONCE_DAMPING_SD if heavy else tilting
-            damped = Candidate("rate_damping", (), ("x", "y", "z"))
-            found.append((damped, (tilting**-2, tilting**-2, turning**-2)))
-        if "velocity" in data.signals:
-            trimmed = data.coarse and not daily
-            level = tuple(max(COARSE_TRIM * a, CENTRE_SD[0]) for a in point.vehicle.arm) if trimmed else CENTRE_SD[:2]
-            precision = tuple(sd**-2 for sd in (*level, CENTRE_SD[2]))
-            found.append((Candidate("center_of_mass", (), ("x", "y", "z")), precision))
-        if lags and not daily:
-            found.append((Candidate("motor_lag", (), ("time_constant",)), (LAG_SD**-2,)))
-    if "velocity" in data.signals and "position" in data.signals:
-        found.append((Candidate("velocity_scale", (), ("x", "y", "z")), tuple((VELOCITY_SD + jittery(data)) ** -2.0)))
-    found += _onboard_filter(data)
-    if "body_rate" in data.signals:
-        offsets = of_recordings("gyro_bias", ("x", "y", "z"), data.flights)
-        found.append((offsets, (GYRO_SD**-2,) * len(offsets.free)))
-    if data.differ:
-        own = of_recordings("thrust_scale", ("scale",), data.flights)
-        found.append((own, (day_sd(point.vehicle)[0] ** -2,) * len(own.free)))
-    if daily:
-        found += _another_day(point.vehicle)
-        if lags:
-            found.append((Candidate("motor_lag", (), ("time_constant",)), (DAILY_LAG_SD**-2,)))
-    if "attitude" not in data.signals and any(np.isfinite(f.y[:, 6]).any() for f in data.flights):
-        found.append((Candidate("attitude_misalignment", (), ANGLES), tuple(sd**-2 for sd in LEANING_SD)))
-    elif "attitude" in data.signals and _bias(point) > 0:
-        found.append((Candidate("attitude_misalignment", (), ANGLES), ((PULL * _bias(point)) ** -2,) * 3))
-    if all(f.levelled for f in data.flights):
-        found.append((Candidate("thrust_curve", (), ("slope_error",)), (SAG_SLOPE_SD**-2,)))
-        found.append((Candidate("battery_sag", (), ("gain_per_second",)), (RUN_DOWN_SD**-2,)))
+    """What is always free, with the precisions of its priors about neutral: the usual deviations of every effect."""
+    facts = logged(data.flights, point)
+    found: Nuisances = []
+    for effect in CATALOGUE.values():
+        prior, sizes = effect.prior, effect.prior.usual_in(facts)
+        if not sizes or effect.name in JUDGED_ALONE:
+            continue
+        if prior.each(facts):
+            candidate: Candidate = of_recordings(effect.name, tuple(sizes), data.flights)
+            precision = tuple(sd**-2 for sd in sizes.values()) * (len(candidate.free) // len(sizes))
+        else:
+            centre = tuple((n, c) for n, c in prior.centre.items() if n in sizes)
+            tails = prior.freedom_in(facts) if trim_known(point.vehicle) else math.inf
+            candidate = Candidate(effect.name, centre, tuple(sizes), both_ways=prior.signed, freedom=tails)
+            neutral = candidate.neutral(point)
+            body = {"mass": point.vehicle.mass, "inertia": point.vehicle.inertia[0]}
+            precision = tuple((sd * prior.share(n, **body, neutral=neutral[n])) ** -2.0 for n, sd in sizes.items())
+        found.append((candidate, precision))
     taken = {c.effect for c in accepted} | data.constrained
     if "motor_lag" in taken:  # both free, with a lag that has no prior, go along their ridge: a lag 8 ms too long
         taken.add("torque_scale")
     return [(c, p) for c, p in found if c.effect not in taken]
-
-
-def _onboard_filter(data: Data) -> Nuisances:
-    """Lags of filters on board, and the forces that they do not know."""
-    shown = [f for f, stream in zip(FILTER, ("body_rate", "velocity"), strict=True) if stream in data.signals]
-    if not shown or not {"attitude", "position"} & data.signals:
-        return []
-    onboard = {"velocity", "position"} <= data.signals and any(f.fused for f in data.flights)
-    lag = ONBOARD_LAG_SD if onboard else FILTER_SD
-    precision = tuple((lag if name == "velocity_lag" else FILTER_SD) ** -2 for name, _ in shown)
-    if onboard:
-        shown, precision = [*shown, LATERAL_TIME_CONSTANT], (*precision, LATERAL_TIME_CONSTANT_SD**-2)
-    return [(Candidate("onboard_filter", tuple(shown), tuple(n for n, _ in shown)), precision)]
-
-
-def _another_day(vehicle: Vehicle) -> Nuisances:
-    """What differs from day to day, of the file of a real drone, and what real rotors have."""
-    tails = day_freedom(vehicle) if trim_known(vehicle) else math.inf
-    thrust, *trim = day_sd(vehicle)
-    return [
-        (Candidate(TRIM, (), ("x", "y", "z"), freedom=tails), tuple(sd**-2 for sd in trim)),
-        (Candidate("thrust_scale", (), ("scale",)), (thrust**-2,)),
-        (Candidate("velocity_moment", (), ("roll_per_vy", "pitch_per_vx")), (FLAPPING_SD**-2,) * 2),
-        (Candidate("linear_drag", (), ("x", "y", "z")), (DRAG_SD**-2,) * 3),
-    ]
 
 
 def differing(flights: Sequence[Flight], kept_apart: Sequence[Flight], vehicle: Vehicle) -> list[list[Flight]]:
@@ -204,24 +103,6 @@ def differing(flights: Sequence[Flight], kept_apart: Sequence[Flight], vehicle: 
     commanded = not any(f.inputs.measured or f.levelled for f in (*flights, *kept_apart))
     own = len(flights) >= SEVERAL and commanded and TRIM not in vehicle.effects
     return [[replace(f, differs=own) for f in part] for part in (flights, kept_apart)]
-
-
-def jittery(data: Data) -> NDArray:
-    """(3,) by how much, relative, the jitter of an onboard estimate makes velocities look too large or too small.
-
-    Its errors in position and velocity hang together, so a drone that hardly moves seems to move faster than it does:
-    in simulated flights with right velocities by 1 to 3 mm/s, which is 20 % in hover, 1 to 5 % in small shakes, 0.3 %
-    in figures 8; with other noise of gyro and pose by up to 10 mm/s.
-    """
-    moving = [np.nanmean(np.square(f.y[:, 3:6]), axis=0) for f in data.flights if np.isfinite(f.y[:, 3]).any()]
-    size = ONBOARD_JITTER if any(f.fused for f in data.flights) else JITTER
-    jitter: NDArray = size / np.sqrt(np.maximum(np.mean(moving, axis=0) if moving else np.zeros(3), 1e-4))
-    return jitter
-
-
-def _bias(point: Point) -> float:
-    """The gyro's bias [rad/s], where the model has one."""
-    return float(np.linalg.norm([float(v) for v in point.effects.get("gyro_bias", {}).values()]))
 
 
 def unlike_a_body(point: Point, accepted: Sequence[Candidate]) -> bool:
@@ -247,7 +128,7 @@ def abstained(
         gone = {c.effect: TRIM_REASON for c in candidates if c.effect == "center_of_mass"}
     if all(f.levelled for f in data.flights):
         gone |= {c.effect: LEVEL_REASON for c in candidates if c.effect in HEAVY_OR_STRONG}
-    if coarsely_sampled(data, point):
+    if coarsely_sampled(data.flights, point.vehicle):
         # torques on another clock say nothing; how thrust goes with the command, and how late, shows in forces
         slow, aside = (SHOWN_BY_FORCES, OFF_THE_MIDDLE) if data.coarse else ((), ())
         fast = {*FAST, *aside} - {*slow}

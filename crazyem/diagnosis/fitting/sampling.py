@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import TRIM
 from crazyem.diagnosis.fitting.days import TRIM_SD
-from crazyem.diagnosis.fitting.fit import Data
-from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.rotors import wrench
 from crazyem.vehicle import Vehicle
@@ -24,12 +22,12 @@ LOOP = 2e-3  # s between commands of the loop (500 Hz, crazyflie-firmware stabil
 EDGE, SLOW = 0.5, 1.0  # s left out at either end; Hz below which torques say nothing of sampling
 
 
-def coarsely_sampled(data: Data, point: Point) -> bool:
+def coarsely_sampled(flights: Sequence[Flight], vehicle: Vehicle) -> bool:
     """Whether the commands of most flights are faster than their sampling, or on another clock.
 
     The first is asked of vehicles with a trim alone, as all are that fly so (`of_a_real_drone`).
     """
-    return data.coarse or (TRIM in point.vehicle.effects and shaken_commands(data.flights, point.vehicle))
+    return all(f.coarse for f in flights) or (TRIM in vehicle.effects and shaken_commands(flights, vehicle))
 
 
 def shaken_commands(flights: Sequence[Flight], vehicle: Vehicle) -> bool:

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import Candidate, impossible, variants
+from crazyem.diagnosis.fitting.logged import logged
 from crazyem.diagnosis.fitting.model import Column, Point
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.posterior.evidence import Gaussian
 from crazyem.diagnosis.posterior.settings import SETTINGS
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effect
-from crazyem.physics.effects.prior import Logged, Sizes
-from crazyem.vehicle import Vehicle
+from crazyem.physics.effects.prior import Sizes
 
 ACCELEROMETER_NEEDS = ("specific_force",)  # needs of an effect that the accelerometer alone shows (`accelerometer.py`)
 INDISTINCT = "in such recordings it differs by as much as it may be off"
@@ -87,21 +87,10 @@ class Pool:
     left_out: dict[str, str]
 
 
-def logged(flight: Flight, vehicle: Vehicle) -> Logged:
-    """What the usual spread of a flight depends on."""
-    seen = np.isfinite(flight.y[:, 3])
-    speed = np.sqrt(np.mean(np.square(flight.y[seen, 3:6]), axis=0)) if seen.any() else np.ones(3)
-    return Logged(
-        measured=flight.inputs.measured, onboard=flight.fused, voltage="voltage" in flight.signals,
-        filed=frozenset(vehicle.effects), speed=speed, period=float(np.median(np.diff(flight.inputs.time))),
-    )  # fmt: skip
-
-
 def pool_of(flights: Sequence[Flight], point: Point, wanted: Sequence[str] = ()) -> Pool:
     """What flights may ask for."""
-    vehicle = point.vehicle
     signals = frozenset.intersection(*(f.signals for f in flights))
-    facts = [logged(f, vehicle) for f in flights]
+    facts = [logged([f], point) for f in flights]
     measured = flights[0].inputs.measured
     members: list[Member] = []
     looks: list[Member] = []
@@ -120,17 +109,18 @@ def pool_of(flights: Sequence[Flight], point: Point, wanted: Sequence[str] = ())
             continue
         found = variants(effect, point, signals)
         spreads = [effect.prior.usual_in(fact) for fact in facts]
-        if any(spreads) and found:
-            names = tuple(dict.fromkeys(n for c in found for n in c.free if any(s.get(n, 0.0) > 0 for s in spreads)))
+        names = tuple(dict.fromkeys(n for s in spreads for n in s))
+        if names:
             table = np.array([[s.get(n, 0.0) * share(effect, n, point) for n in names] for s in spreads])
-            if names:
-                usual.append((replace(found[0], free=names, fixed=()), table))
+            centre = tuple((n, c) for n, c in effect.prior.centre.items() if n in names)
+            usual.append((Candidate(name, centre, names, both_ways=effect.prior.signed), table))
         if effect.prior.own and (not wanted or name in wanted or effect.prior.unnamed):
             told = _distinct(effect, spreads)
             found = [replace(c, free=tuple(n for n in c.free if n in told)) for c in found]
             found = [c for c in found if c.free]
             if not found:
                 left_out[name] = INDISTINCT
+                continue
             count = len({(c.fixed, c.free) for c in found})
             odds = prior_odds() - math.log(count)
             many = max((len(v) for v in effect.beginnings.values()), default=0) > SETTINGS.max_full_starts

@@ -1,5 +1,8 @@
 """linear_drag, quadratic_drag, velocity_moment, rate_damping: what the air does against motion."""
 
+import math
+from collections.abc import Callable
+
 import numpy as np
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
@@ -9,6 +12,11 @@ from crazyem.physics.effects.prior import Logged, Prior, Sizes, alike, in_turn
 def linear_force(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
     """-D v: x, y, z [N s/m] along body axes."""
     return Wrench(-np.array([x, y, z]) * situation.airspeed, np.zeros((situation.size, 3)))
+
+
+def _of_real_rotors(names: str, size: float) -> Callable[[Logged], Sizes]:
+    """Real rotors have drag and flapping, bare rigid bodies of files neither."""
+    return lambda logged: alike(names, size) if logged.dated else {}
 
 
 LEAST = in_turn("x y z", 1e-3, 1e-3, 3e-3)  # N s/m, N s^2/m^2; along z thrust is a little wrong
@@ -21,8 +29,7 @@ LINEAR_DRAG = Effect(
     about=("drag",),
     external=linear_force,
     couples_air=True,
-    # usual: an attitude 1 ms late is a force of 3e-4 N s/m; along z thrust is a little wrong (`fitting/nuisances.py`)
-    prior=Prior(alike("x y z", 0.012), in_turn("x y z", 5e-4, 5e-4, 1e-3), least=LEAST),
+    prior=Prior(alike("x y z", 0.012), _of_real_rotors("x y z", 0.02), least=LEAST),
     most_per_mass=5.0,
     needs=("velocity", "position"),
     separates="fly straight legs of different speeds in opposite directions",
@@ -44,8 +51,7 @@ QUADRATIC_DRAG = Effect(
     about=("quadratic",),
     external=quadratic_force,
     couples_air=True,
-    # usual: as that of a linear drag
-    prior=Prior(alike("x y z", 0.012), in_turn("x y z", 3e-4, 3e-4, 1e-3), least=LEAST),
+    prior=Prior(alike("x y z", 0.012), least=LEAST),
     most_per_mass=3.0,
     needs=("velocity", "position"),
     separates="fly straight legs at 0.5, 1 and 2 m/s: linear drag doubles with speed, this one goes up four times",
@@ -67,8 +73,13 @@ def damping(situation: Situation, body: Body, *, x: float, y: float, z: float) -
 
 
 def _sampled(logged: Logged) -> Sizes:
-    """Speeds that are logged more slowly than the loop runs look like a damping (`fitting/nuisances.py`)."""
-    return alike("x y z", 6e-6 * logged.coarse)
+    """N m s: what is sent between two logged commands looks like a damping. Speeds logged at 100 Hz: of 1 to 11e-6 in
+    quick flights of 11 drones with nothing hidden. With heavy rotors: about z of 1e-5 to 1.9e-4 in 11 flights."""
+    if not logged.turning or not (logged.unheard or logged.measured or logged.heavy_rotors or logged.unlogged > 0.0):
+        return {}
+    usual = 6e-6 if logged.measured or logged.heavy_rotors else 0.0
+    tilting = 3e-4 if logged.unheard else math.hypot(usual, 3e-4 * logged.unlogged)
+    return in_turn("x y z", tilting, tilting, 1e-4 if logged.heavy_rotors else tilting)
 
 
 # N m s/m: least of a moment that tips the drone back from where it flies, as air on rotors above the centre of mass
@@ -87,7 +98,7 @@ VELOCITY_MOMENT = Effect(
     # own: a Crazyflie tilts its flow by some 1e-5 N m s/m (docs/reference/effects.md)
     prior=Prior(
         alike("roll_per_vy pitch_per_vx", 4e-5),
-        alike("roll_per_vy pitch_per_vx", 1.5e-6),
+        _of_real_rotors("roll_per_vy pitch_per_vx", 3e-4),
         least={"roll_per_vy": (ONWARD, BACK), "pitch_per_vx": (BACK, ONWARD)},
     ),
     needs=("velocity", "position"),

@@ -38,8 +38,7 @@ WIND = Effect(
     order=64,
     air=blowing,
     external=pushing,
-    # usual: what filters and sampling look like in still air
-    prior=Prior(in_turn("x y z", 2.0, 2.0, 0.7), in_turn("x y z", 0.05, 0.05, 0.1)),
+    prior=Prior(in_turn("x y z", 2.0, 2.0, 0.7)),
     needs=("velocity", "position"),  # a force that goes on moves the drone; an accelerometer alone is only tilted by it
     separates="hover for 5 s at each of four headings: wind stays in the world, a tilted frame turns with the drone",
 )

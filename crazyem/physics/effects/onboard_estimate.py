@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from crazyem.compiled import compiled
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
-from crazyem.physics.effects.prior import Prior
+from crazyem.physics.effects.prior import Logged, Prior, Sizes
 from crazyem.physics.effects.stretches import stretches
 from crazyem.vehicle import GRAVITY
 
@@ -126,6 +126,22 @@ def filtered(
     return offset
 
 
+def _lags(logged: Logged) -> Sizes:
+    """s: rates behind the attitude, velocities behind the position, by the filters of the firmware.
+
+    In 80 flights with nothing hidden 0.0 to 2.4 and 0.0 to 1.6 ms, most in quick ones; of velocities that a filter on
+    board makes 0.7 to 5.7 ms in ten simulated flights of five filters. Fixes draw a velocity back that is made without
+    the drag: within 0.17 to 0.36 s in nine simulated flights, by the rate and the noise of the fixes. A filter that
+    knows all forces has none of that error.
+    """
+    if not {"attitude", "position"} & logged.signals:
+        return {}
+    made = logged.onboard and {"velocity", "position"} <= logged.signals
+    found = {"rate_lag": 0.7e-3} if "body_rate" in logged.signals else {}
+    found |= {"velocity_lag": 2e-3 if made else 0.7e-3} if "velocity" in logged.signals else {}
+    return found | ({"lateral_time_constant": 0.2} if made and found else {})
+
+
 ONBOARD_FILTER = Effect(
     "onboard_filter",
     (
@@ -137,9 +153,7 @@ ONBOARD_FILTER = Effect(
     order=85,
     measured=filtered,
     uses_force=True,
-    # usual: 0.0 to 2.4 and 0.0 to 1.6 ms in 80 flights with nothing hidden (`fitting/nuisances.py`); attitudes 1.3 to
-    # 4.2 ms late in three more
-    prior=Prior(usual={"rate_lag": 1.3e-3, "velocity_lag": 7e-4, "attitude_lag": 2.5e-3}),
+    prior=Prior(usual=_lags, centre={"rate_lag": 1.2e-3, "velocity_lag": 0.6e-3, "lateral_time_constant": 0.2}),
     needs=("velocity", "body_rate"),
     words="filters on board",
     belongs_to="recording",

@@ -23,31 +23,56 @@ class Logged:
     """What the usual spread of a recording depends on.
 
     Attributes:
+        signals: that were recorded.
         measured: rotor speeds were measured; else commands are all that is known of the rotors.
         onboard: pose and velocity come from a filter on board.
-        voltage: the battery's voltage was recorded.
+        turned: an attitude shows that was made from other signals.
+        levelled: no voltage was recorded, and that of the flight's own beginning is taken for all of it.
+        differs: one of several recordings, each with a battery of its own.
         filed: names of the effects that the vehicle file has.
+        arm: (2,) m of the rotors. lag: s of the rotors.
+        days: by how much thrust (relative) and torque over thrust about x, y, z [m] differ from day to day, and degrees
+            of freedom of their distribution; None: as other drones do.
         speed: (3,) m/s, root mean square of the velocity, world axes.
-        period: s between commands (or speeds) of the rotors.
+        period: s between commands (or speeds) of the rotors, as a model uses them.
+        unlogged: 0 to 1, by how much commands that were sent between the logged ones may falsify torques, relative.
+        unheard: what turned the drone is not in the commands as recorded: faster than their sampling, or another clock.
+        apart: the commands are on another clock.
+        rotor_inertia: kg m^2, gyro_bias: rad/s; of the model.
     """
 
+    signals: frozenset[str] = frozenset()
     measured: bool = False
     onboard: bool = True
-    voltage: bool = True
+    turned: bool = False
+    levelled: bool = False
+    differs: bool = False
     filed: frozenset[str] = frozenset()
+    arm: tuple[float, float] = (0.0, 0.0)
+    lag: float = 0.05
+    days: tuple[float, float, float, float, float] | None = None
     speed: NDArray = field(default_factory=lambda: np.ones(3))
     period: float = 0.01
-
-    @property
-    def coarse(self) -> float:
-        """Period of the commands over 10 ms, 0.5 to 2: what a loop does between two of them looks like other inertias,
-        torques, lags and dampings, the more the longer it is. Sizes at 100 Hz are those of `fitting/nuisances.py`."""
-        return min(max(self.period / 0.01, 0.5), 2.0)
+    unlogged: float = 0.0
+    unheard: bool = False
+    apart: bool = False
+    rotor_inertia: float = 0.0
+    gyro_bias: float = 0.0
 
     @property
     def dated(self) -> bool:
         """Whether the vehicle file holds the trim of another day: it is the file of one drone, not of its kind."""
         return "trim" in self.filed
+
+    @property
+    def turning(self) -> bool:
+        """Whether the turning of the drone shows."""
+        return bool({"body_rate", "attitude"} & self.signals)
+
+    @property
+    def heavy_rotors(self) -> bool:
+        """Rotors that are heavy answer with torque at once, without the lag that hides what sampled commands miss."""
+        return not self.unheard and not self.measured and self.rotor_inertia > 0.0
 
 
 Sizes = Mapping[str, float]  # parameter -> standard deviation
@@ -63,7 +88,10 @@ class Prior:
         usual: from recording to recording; or as a function of what was logged.
         per: what the sizes of a parameter are shares of: "mass" or "inertia" (about x) of the vehicle, or
             "neutral", the parameter's own neutral value; SI where absent.
+        centre: what recordings have on average anyway, where that is not neutral.
         freedom: degrees of freedom of Student's t distribution, which `usual` is the scale of; infinite: a normal one.
+        signed: `usual` goes below the physical range, too: a delay that is counted may be counted too long.
+        each: whether several recordings that are fitted together have a deviation each.
         together: correlation of `own` between the parameters.
         least: departures that filters, the sampling of a log and the air of a room look like: less is no finding. Or
             as a function of the choices (`Parameter.chosen`), and of whether a filter on board made the state.
@@ -73,7 +101,10 @@ class Prior:
     own: Sizes = field(default_factory=dict)
     usual: Sizes | Callable[[Logged], Sizes] = field(default_factory=dict)
     per: Mapping[str, str] = field(default_factory=dict)
-    freedom: float = math.inf
+    centre: Sizes = field(default_factory=dict)
+    freedom: float | Callable[[Logged], float] = math.inf
+    signed: bool = False
+    each: Callable[[Logged], bool] = lambda logged: False
     together: float = 0.0
     least: Least | Callable[[Mapping[str, Any], bool], Least] = field(default_factory=dict)
     unnamed: bool = False
@@ -81,6 +112,10 @@ class Prior:
     def usual_in(self, logged: Logged) -> Sizes:
         """From recording to recording, for one as it was logged."""
         return self.usual(logged) if callable(self.usual) else self.usual
+
+    def freedom_in(self, logged: Logged) -> float:
+        """Degrees of freedom, for a recording as it was logged."""
+        return self.freedom(logged) if callable(self.freedom) else self.freedom
 
     def least_in(self, chosen: Mapping[str, Any], *, onboard: bool) -> dict[str, tuple[float, float]]:
         """Parameter -> smallest departures below and above neutral that are a finding, in the units of `own`."""

@@ -2,7 +2,7 @@
 
 trim is the steady torque that every real drone needs. No four rotors are equal or upright, and no battery sits in the
 middle. The trim goes with the thrust, so nothing acts on a drone with its rotors at rest. For a vehicle file that has
-a trim, the day's differs a little from the file's; how much is in `crazyem/diagnosis/fitting/nuisances.py`.
+a trim, the day's differs a little from the file's; by how much, its prior says.
 rotor_inertia is the rotors' angular momentum, which turns with the body (gyroscope) and reacts on spinning up.
 """
 
@@ -40,8 +40,11 @@ def turned(torque: NDArray, *, scale: float) -> NDArray:
 
 
 def _strength(logged: Logged) -> Sizes:
-    """From day to day: batteries are put in again, propellers bend (docs/results/diagnosis_real.md)."""
-    return {"scale": 0.02 if logged.dated else 0.009}
+    """From day to day: batteries are put in again, propellers bend (docs/results/diagnosis_real.md).
+
+    Of several recordings of any drone each has its own: one number for all would make it heed commands less.
+    """
+    return {"scale": logged.days[0] if logged.days else 0.02} if logged.differs or logged.dated else {}
 
 
 THRUST_SCALE = Effect(
@@ -51,7 +54,7 @@ THRUST_SCALE = Effect(
     gain="thrust",
     about=("thrust_per_speed2", "thrust_max", "mass"),
     rotors=scaled,
-    prior=Prior(own={"scale": 0.08}, usual=_strength),
+    prior=Prior(own={"scale": 0.08}, usual=_strength, each=lambda logged: logged.differs),
     separates="weigh the drone; without its weight thrust and mass are one number",
 )
 
@@ -71,6 +74,13 @@ ROTOR_FAULT = Effect(
     ),
 )
 
+
+def _torques(logged: Logged) -> Sizes:
+    """Relative: in ten flights with nothing hidden, with the lag free, torques look 2 +- 2 % too strong (-0.5 to +4 %);
+    a longer lag with more torque is nearly the same to a loop whose commands are sampled."""
+    return {"scale": 0.03} if logged.turning and not logged.unheard else {}
+
+
 TORQUE_SCALE = Effect(
     "torque_scale",
     (Parameter("scale", "", 1.0, 0.0, 5.0, 0.02),),
@@ -78,8 +88,7 @@ TORQUE_SCALE = Effect(
     gain="torque",
     about=("torque_per_thrust", "arm", "inertia"),
     turning=turned,
-    # usual: common to all axes of 76 flights of known torques (`fitting/nuisances.py`)
-    prior=Prior(own={"scale": 0.2}, usual=lambda logged: {"scale": 0.03 * logged.coarse}, least={"scale": 0.08}),
+    prior=Prior(own={"scale": 0.2}, usual=_torques, least={"scale": 0.08}),
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum): torque over inertia is all that a flight shows",
 )
@@ -115,7 +124,12 @@ def trimmed(situation: Situation, body: Body, *, x: float, y: float, z: float) -
 
 def _of_the_day(logged: Logged) -> Sizes:
     """As healthy and damaged flights of two drones on several days scatter (docs/results/diagnosis_real.md)."""
-    return in_turn("x y z", 5e-4, 5e-4, 1.6e-4) if logged.dated else {}
+    return in_turn("x y z", *(logged.days[1:4] if logged.days else (5e-4, 5e-4, 1.6e-4))) if logged.dated else {}
+
+
+def _tails(logged: Logged) -> float:
+    """Known from some twelve days of two drones; normal tails would be sure of what a new propeller may do."""
+    return 8.0 if logged.days is None else logged.days[4]
 
 
 TRIM = Effect(
@@ -123,8 +137,7 @@ TRIM = Effect(
     tuple(Parameter(axis, "m", 0.0, -0.02, 0.02, 1e-4) for axis in "xyz"),
     order=41,
     external=trimmed,
-    # known from some twelve days of two drones; normal tails would be sure of what a new propeller may do
-    prior=Prior(usual=_of_the_day, freedom=8.0),
+    prior=Prior(usual=_of_the_day, freedom=_tails),
     separates="fly the drone while it is well and judge by the vehicle file written from that: its trim is in there",
 )
 
@@ -167,7 +180,7 @@ ROTOR_INERTIA = Effect(
     external=reaction,
     # own: a bar of 0.3 g and 46 mm; a Crazyflie's propeller and rotor: a tenth of that, in no file. Least: a sixth of a
     # rod of 0.1 g and 46 mm; no rotor is lighter.
-    prior=Prior(own={"inertia": 4e-8}, usual={"inertia": 2e-9}, least={"inertia": 3e-9}),
+    prior=Prior(own={"inertia": 4e-8}, least={"inertia": 3e-9}),
     needs=("body_rate", "attitude"),
     separates="yaw for 5 s at 2 Hz (spin-up), and roll while turning about yaw (gyroscope); weigh a propeller",
 )
