@@ -17,18 +17,16 @@ from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.fitting.nuisances import COARSE_REASON, FAST, refine_base
+from crazyem.diagnosis.fitting.nuisances import COARSE_REASON, refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.locating.random_torques import AT_RANDOM
 from crazyem.diagnosis.naming import answer, determined
 from crazyem.diagnosis.naming import select as selecting
-from crazyem.diagnosis.naming.answer import BY_FORCE
 from crazyem.diagnosis.naming.named import DOUBTFUL, trust
 from crazyem.diagnosis.naming.select import select
 from crazyem.diagnosis.naming.trials import Selection
 from crazyem.diagnosis.naming.unexplained import Unexplained, notable
-from crazyem.physics.effects.catalogue import CATALOGUE
 
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
 THRUST = Candidate("thrust_scale", (), ("scale",))
@@ -142,8 +140,6 @@ def test_a_rotor_that_pushes_at_random_says_nothing_against_forces_that_last():
     assert trust(remains.without_random_rotor(4)) == 1.0  # nor against its being weak
     assert trust(remains.without_random_rotor(1)) == DOUBTFUL
     assert trust(remains.with_finding(shaken).without_random_rotor()) == DOUBTFUL  # a loop that swings feigns a drag
-    assert set(BY_FORCE) <= set(CATALOGUE)
-    assert not set(BY_FORCE) & set(FAST) - {"thrust_curve"}
     data = SimpleNamespace(coarse=False)
     for name, rotor, against in (
         ("linear_drag", 0, False), ("inertia_products", 0, True), ("rotor_fault", 4, False), ("rotor_fault", 1, True),

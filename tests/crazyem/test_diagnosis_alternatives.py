@@ -46,7 +46,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, *, load: float, weaker: float, was: f
 
     monkeypatch.setattr(alternatives, "refitted", judged)
     monkeypatch.setattr(alternatives, "refine_anew", lambda data, point, accepted: SimpleNamespace(point=point))
-    return alternatives.named_again(SimpleNamespace(workers=Workers(1)), None, selection)  # type: ignore[arg-type]
+    return alternatives.named_again(SimpleNamespace(flights=[], workers=Workers(1)), None, selection)  # type: ignore[arg-type]
 
 
 def names(selection: Selection) -> list[str]:
@@ -94,7 +94,7 @@ def test_one_effect_alone_is_not_asked_again(monkeypatch):
     monkeypatch.setattr(alternatives, "refitted", lambda *a: pytest.fail("nothing is new"))
     taken = trial(LOAD, 100.0, POINT)
     alone = Selection(BARE, POINT, (Step((taken, trial(WEAKER, 99.0, THERE)), taken),), (LOAD,), SimpleNamespace(), 34)  # type: ignore[arg-type]
-    assert alternatives.named_again(SimpleNamespace(workers=Workers(1)), None, alone) is alone  # type: ignore[arg-type]
+    assert alternatives.named_again(SimpleNamespace(flights=[], workers=Workers(1)), None, alone) is alone  # type: ignore[arg-type]
     assert replace(alone) == alone
 
 
@@ -111,6 +111,6 @@ def test_what_ended_where_its_range_ends_gives_way_to_whatever_is_next(monkeypat
         monkeypatch.setattr(alternatives, "refitted", lambda data, held_out, start, candidates: (
             (1000.0 if candidates[0] is slope else 100.0), BLOCKS, unknown(candidates)))  # fmt: skip
         monkeypatch.setattr(alternatives, "refine_anew", lambda data, point, accepted: SimpleNamespace(point=point))
-        found = alternatives.named_again(SimpleNamespace(workers=Workers(1)), None, selection)  # type: ignore[arg-type]
+        found = alternatives.named_again(SimpleNamespace(flights=[], workers=Workers(1)), None, selection)  # type: ignore[arg-type]
         assert names(found) == [name, "velocity_moment"]
         assert (slope in [t.candidate for t in found.steps[0].trials]) == (name == "thrust_curve")

@@ -15,7 +15,6 @@ from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import (
     AT_ONCE_SD,
     COARSE_REASON,
-    FAST,
     _let_go,
     abstained,
     nuisances,
@@ -26,6 +25,7 @@ from crazyem.diagnosis.fitting.nuisances import (
     usual_wind,
 )
 from crazyem.diagnosis.flights.flight import _blocks, flight_of
+from crazyem.physics.effects.catalogue import CATALOGUE
 
 POINT = Point(DRONE, {}, first_guess())
 
@@ -140,11 +140,12 @@ def data_of(flights):
 def test_of_flights_whose_commands_do_not_turn_the_drone_nothing_fast_is_asked():
     flights = [SimpleNamespace(coarse=c, levelled=False) for c in (True, True)]
     sideways = ("payload", "center_of_mass", "rotor_fault")  # told from a thrust scale by their torque alone
-    candidates = [Candidate(n, (), ()) for n in (*FAST, *sideways, "linear_drag", "wind", "thrust_scale")]
+    fast = [n for n, effect in CATALOGUE.items() if effect.fast]
+    candidates = [Candidate(n, (), ()) for n in (*fast, *sideways, "linear_drag", "wind", "thrust_scale")]
     kept, reasons = abstained(data_of(flights), POINT, candidates, {})
-    slow = ["motor_lag", "input_delay", "thrust_curve"]  # shown by forces
+    slow = ["thrust_curve", "motor_lag", "input_delay"]  # shown by forces
     assert [c.effect for c in kept] == [*slow, "linear_drag", "wind", "thrust_scale"]
-    assert reasons == dict.fromkeys((*(n for n in FAST if n not in slow), *sideways), COARSE_REASON)
+    assert reasons == dict.fromkeys((*(n for n in fast if n not in slow), *sideways), COARSE_REASON)
     flights[1].coarse = False
     assert abstained(data_of(flights), POINT, candidates, {})[0] == candidates
 

@@ -14,7 +14,6 @@ from crazyem.diagnosis.fitting.fit import ENOUGH, Data, nominal
 from crazyem.diagnosis.fitting.model import Noise, Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import (
-    FAST,
     abstained,
     nuisances,
     refine_base,
@@ -26,6 +25,7 @@ from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming.balance import balance_of
 from crazyem.diagnosis.naming.baseline import with_baseline
 from crazyem.diagnosis.naming.steady_odds import explanations
+from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings import open_recording
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle, load_vehicle
@@ -111,7 +111,7 @@ def test_commands_that_are_faster_than_their_sampling_say_nothing_of_inertia(whi
     assert of_a_real_drone(data.flights, TRIMMED) is TRIMMED
     candidates, _ = candidates_for(point, flight.signals, measured_speeds=False)
     left, reasons = abstained(data, point, candidates, {"gusts": "why not"})
-    assert ({c.effect for c in left} & set(FAST) == set()) is coarse
+    assert ({c.effect for c in left} & {n for n, e in CATALOGUE.items() if e.fast} == set()) is coarse
     assert ("inertia" in reasons) is coarse
     load = next(c for c in left if c.effect == "payload")
     assert load.free == (("mass", "x", "y") if coarse else ("mass", "x", "y", "z"))  # no torque tells its height

@@ -28,7 +28,7 @@ def logged(flights: Sequence[Flight], point: Point) -> Logged:
         arm=vehicle.arm,
         lag=vehicle.motor_time_constant,
         days=(days[0], days[1], days[2], days[3], day_freedom(vehicle)),
-        speed=_speed(flights),
+        speed=rms_speed(flights),
         period=max(interval(f) for f in flights),
         unlogged=unlogged_share(flights, vehicle),
         unheard=coarsely_sampled(flights, vehicle),
@@ -38,7 +38,7 @@ def logged(flights: Sequence[Flight], point: Point) -> Logged:
     )
 
 
-def _speed(flights: Sequence[Flight]) -> np.ndarray:
+def rms_speed(flights: Sequence[Flight]) -> np.ndarray:
     """(3,) m/s, root mean square along world axes; of flights without a velocity the least."""
     moving = [np.nanmean(np.square(f.y[:, 3:6]), axis=0) for f in flights if np.isfinite(f.y[:, 3]).any()]
     found: np.ndarray = np.sqrt(np.maximum(np.mean(moving, axis=0) if moving else np.zeros(3), LEAST_SPEED**2))

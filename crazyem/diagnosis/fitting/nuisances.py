@@ -16,6 +16,7 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.sampling import coarsely_sampled
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.effect import Effect
 from crazyem.vehicle import GRAVITY, Vehicle
 
 # s: fits find the rotors' lag off all the same: in sixteen more flights with nothing hidden 47 to 55 ms, 3.1 ms (rms),
@@ -28,24 +29,11 @@ AT_ONCE_SD = 0.25
 ROTOR_DRAG = ("linear_drag",)
 ROTOR_AERODYNAMICS = (*ROTOR_DRAG, "velocity_moment")  # healthy flights of a drone give its file both
 SEVERAL = 3  # recordings whose commands are known, from which on each has a thrust of its own
-# Standard deviations that no scatter shows. An attitude 1 ms late is a force that goes with the velocity, 3e-4 N s/m of
-# drag along the quicker axis of a figure 8 (mass * (3.1 rad/s)^2 * 1 ms); along z thrust is a little wrong; a gyro's
-# bias walks; a slope of thrust came out 0.02 too large; how fast fixes draw an attitude back that is made of a late
-# gyro (physics/effects/onboard_estimate.py) is roughly known. Found at these sizes in drones with known ones.
-SYSTEMATIC = {
-    ("thrust_curve", "slope_error"): 0.02,
-    ("measurement_delay", "delay"): 1.5e-3,
-    **{(name, axis): sd for name in ("linear_drag", "quadratic_drag") for axis, sd in zip("xyz", (3e-4, 3e-4, 1e-3))},
-    **{("gyro_bias", axis): 4e-4 for axis in "xyz"},
-}
 # Of a load on a string: its weight is thrust that is a little wrong, as a share of the drone's; its length, relative.
 HANGING_SD = {"mass": 3e-3, "length": 5e-3}
 # Of lengths where a flight drives loads astray: 2.1 % too long (rms of seven loads of seeds 2038 to 2041).
 ASTRAY_LENGTH_SD = 0.02
-ANGLES = ("roll", "pitch", "yaw")
 TURNED_BY_TORQUE = ("inertia", "torque_scale")  # what is off with the lag: `by_a_wrong_lag`
-# What commands that are mostly faster than their sampling (`sampling.py`) say nothing of: relative; N m s.
-COARSE_INERTIA_SD, COARSE_DAMPING_SD = 1.0, 3e-4
 # Streams that were put onto another clock by straight lines do not look white any more. Their torques explain so little
 # of the turning that the drone would have to be as heavy to turn as if all its mass were this many times as far out as
 # its rotors: no body of that size is, and what it stands for says nothing of the drone.
@@ -57,9 +45,6 @@ COARSE_REASON = "the recorded commands are mostly faster than their sampling: wh
 TRIM_REASON = "a shifted centre of mass is a trim, and that changes from day to day"
 LEVEL_REASON = "no battery voltage is recorded, so how heavy or strong the drone is cannot be told"
 HEAVY_OR_STRONG = ("payload", "thrust_scale")
-FAST = ("inertia", "inertia_products", "torque_scale", "rate_damping", "rotor_inertia", "motor_lag", "input_delay",
-        "measurement_delay", "gyro_bias", "thrust_curve")  # fmt: skip
-SHOWN_BY_FORCES = ("thrust_curve", "motor_lag", "input_delay")
 OFF_THE_MIDDLE = ("payload", "center_of_mass", "rotor_fault")  # told from a thrust scale by their torque alone
 HIGH_OR_LOW = ("payload", "center_of_mass")
 # m/s, where trims differ from day to day, and on any drone; times what the file has. Hovering in a real room looks like
@@ -130,11 +115,15 @@ def abstained(
         gone |= {c.effect: LEVEL_REASON for c in candidates if c.effect in HEAVY_OR_STRONG}
     if coarsely_sampled(data.flights, point.vehicle):
         # torques on another clock say nothing; how thrust goes with the command, and how late, shows in forces
-        slow, aside = (SHOWN_BY_FORCES, OFF_THE_MIDDLE) if data.coarse else ((), ())
-        fast = {*FAST, *aside} - {*slow}
-        gone |= {c.effect: COARSE_REASON for c in candidates if c.effect in fast}
+        gone |= {c.effect: COARSE_REASON for c in candidates if _unheard(CATALOGUE[c.effect], apart=data.coarse)}
         candidates = [replace(c, free=_without_height(c)) for c in candidates]
     return [c for c in candidates if c.effect not in gone], {**left_out, **gone}
+
+
+def _unheard(effect: Effect, *, apart: bool) -> bool:
+    """Whether commands that are faster than their sampling, or on another clock (`apart`), say nothing of an effect."""
+    before_rotors = effect.commanded is not None or effect.timing is not None
+    return (effect.fast and not (apart and before_rotors)) or (apart and effect.name in OFF_THE_MIDDLE)
 
 
 def _without_height(candidate: Candidate) -> tuple[str, ...]:
@@ -211,7 +200,7 @@ def without(point: Point, effect: str) -> Point:
 def systematic_sd(data: Data, point: Point) -> dict[tuple[str, str], float]:
     """(effect, parameter) -> standard deviation within which it is never known, whatever a fit says.
 
-    That of what is always free, and of what the same log shows in another way: see `SYSTEMATIC`.
+    That of what is always free, and of what the same log shows in another way.
     """
     free = {
         (c.effect, name): precision**-0.5
@@ -225,7 +214,8 @@ def systematic_sd(data: Data, point: Point) -> dict[tuple[str, str], float]:
     if hanging["length"] and any(model.diverges("suspended_load", point.vehicle) for model in data.models):
         relative = {**HANGING_SD, "length": ASTRAY_LENGTH_SD}
     of_a_load = {("suspended_load", name): sd * hanging[name] for name, sd in relative.items()}
-    return {**SYSTEMATIC, **of_a_load, ("rotor_inertia", "inertia"): AT_ONCE_SD * inertia, **free}
+    known = {(e.name, n): sd for e in CATALOGUE.values() for n, sd in e.prior.systematic.items()}
+    return {**known, **of_a_load, ("rotor_inertia", "inertia"): AT_ONCE_SD * inertia, **free}
 
 
 def by_a_wrong_lag(data: Data, fitted: Fitted) -> dict[tuple[str, str], float]:

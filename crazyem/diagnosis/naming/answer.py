@@ -30,9 +30,6 @@ SHAKES = "hold the drone with its rotors turning: what shakes then is not the lo
 HEAVIER = "weigh the drone: with {:.3g} times its mass and its inertias it would fly the same"
 MEASURED_LATE = "measurement_delay"
 BY_TORQUE = ("velocity_moment",)  # of what is asked of flights whose torques say little, what they alone can tell
-# Told by forces that last, which no rotor feigns that pushes at random.
-BY_FORCE = ("thrust_scale", "thrust_curve", "battery_sag", "linear_drag", "quadratic_drag", "wind", "ground_effect",
-            "attitude_misalignment", "velocity_scale")  # fmt: skip
 # Two weak rotors beside each other lack thrust and tilt the drone as a weight on their side does, with no torque about
 # z; only what turns tells, which a drone whose trim changes from day to day does not show.
 WEAK_ROTOR = "rotor_fault"
@@ -153,7 +150,7 @@ def _against(remains: Unexplained, candidate: Candidate, data: Data) -> Unexplai
     """What speaks against a name of all that remains."""
     if data.coarse and candidate.effect not in BY_TORQUE:
         remains = remains.of_forces()  # where torques say nothing, what they leave says nothing against forces
-    if candidate.effect in BY_FORCE:
+    if CATALOGUE[candidate.effect].lasting:
         return remains.without_random_rotor()
     if candidate.effect == WEAK_ROTOR:  # a propeller that is cut is out of balance as well
         return remains.without_random_rotor(int(dict(candidate.fixed)["rotor"]))

@@ -7,7 +7,7 @@ import numpy as np
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.days import day_sd
 from crazyem.diagnosis.fitting.fit import Data
-from crazyem.diagnosis.fitting.logged import logged
+from crazyem.diagnosis.fitting.logged import rms_speed
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import HANGING_SD, usual_wind
 from crazyem.physics.effects.catalogue import CATALOGUE
@@ -88,7 +88,7 @@ def matters(point: Point, candidate: Candidate, data: Data | None = None) -> boo
     onboard = data is not None and any(f.fused for f in data.flights)
     least = prior.least_in(dict(candidate.fixed), onboard=onboard)
     if candidate.effect == "velocity_scale" and data is not None:
-        jittery = VELOCITY_LEAST * jitter(logged(data.flights, point))
+        jittery = VELOCITY_LEAST * jitter(rms_speed(data.flights), onboard=onboard)
         least = {n: (max(j, least[n][0]),) * 2 for n, j in zip("xyz", jittery, strict=True)}
     if not least:
         return True

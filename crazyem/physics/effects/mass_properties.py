@@ -56,6 +56,7 @@ INERTIA = Effect(
         least=alike("xx yy zz", 0.08),
     ),
     alike=0.9,  # what is heavier about one axis is so about the others: they differ by a third of what they are more
+    fast=True,
 )
 
 INERTIA_PRODUCTS = Effect(
@@ -68,6 +69,7 @@ INERTIA_PRODUCTS = Effect(
     needs=("body_rate", "attitude"),
     separates="excite one axis at a time: roll, pitch and yaw for 5 s each at 2 Hz",
     prior=Prior(alike("xy xz yz", 0.15), per=dict.fromkeys(("xy", "xz", "yz"), "inertia")),
+    fast=True,
 )
 
 

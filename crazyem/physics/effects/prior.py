@@ -93,6 +93,7 @@ class Prior:
         signed: `usual` goes below the physical range, too: a delay that is counted may be counted too long.
         each: whether several recordings that are fitted together have a deviation each.
         together: correlation of `own` between the parameters.
+        systematic: within which a parameter is never known, whatever a fit says: what no scatter shows; SI.
         least: departures that filters, the sampling of a log and the air of a room look like: less is no finding. Or
             as a function of the choices (`Parameter.chosen`), and of whether a filter on board made the state.
         unnamed: stands for what no effect of the catalogue is: it competes, and is told as unexplained.
@@ -106,6 +107,7 @@ class Prior:
     signed: bool = False
     each: Callable[[Logged], bool] = lambda logged: False
     together: float = 0.0
+    systematic: Sizes = field(default_factory=dict)
     least: Least | Callable[[Mapping[str, Any], bool], Least] = field(default_factory=dict)
     unnamed: bool = False
 

@@ -56,6 +56,7 @@ THRUST_SCALE = Effect(
     rotors=scaled,
     prior=Prior(own={"scale": 0.08}, usual=_strength, each=lambda logged: logged.differs),
     separates="weigh the drone; without its weight thrust and mass are one number",
+    lasting=True,
 )
 
 ROTOR_FAULT = Effect(
@@ -91,6 +92,7 @@ TORQUE_SCALE = Effect(
     prior=Prior(own={"scale": 0.2}, usual=_torques, least={"scale": 0.08}),
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum): torque over inertia is all that a flight shows",
+    fast=True,
 )
 
 
@@ -113,6 +115,7 @@ GROUND_EFFECT = Effect(
     nudge={"strength": 0.02},
     amplitude="strength",
     beginnings={"height": (0.03, 0.1, 0.3)},
+    lasting=True,
 )
 
 
@@ -183,4 +186,5 @@ ROTOR_INERTIA = Effect(
     prior=Prior(own={"inertia": 4e-8}, least={"inertia": 3e-9}),
     needs=("body_rate", "attitude"),
     separates="yaw for 5 s at 2 Hz (spin-up), and roll while turning about yaw (gyroscope); weigh a propeller",
+    fast=True,
 )

@@ -51,20 +51,24 @@ def _leaning(logged: Logged) -> Sizes:
     return alike("roll pitch yaw", 0.05 * logged.gyro_bias) if logged.gyro_bias > 0.0 else {}
 
 
-def jitter(logged: Logged) -> NDArray:
-    """(3,) by how much, relative, the jitter of an onboard estimate makes velocities look too large or too small.
+def jitter(speed: NDArray, *, onboard: bool) -> NDArray:
+    """(3,) by how much, relative, the jitter of an estimate makes velocities of (3,) m/s (rms) look wrong.
 
     Its errors in position and velocity hang together, so a drone that hardly moves seems to move faster than it does.
     By motion capture: 3 mm/s. Velocities of 36 simulated filters in hover differ from the true ones by 0.9 to 10.6 mm/s
     (rms; median 2.7): the largest is taken.
     """
-    found: NDArray = (1e-2 if logged.onboard else 3e-3) / np.maximum(logged.speed, 0.01)
+    found: NDArray = (1e-2 if onboard else 3e-3) / np.maximum(speed, 0.01)
     return found
 
 
 def _jittery(logged: Logged) -> Sizes:
     """Relative; no filter on board is better than 0.2 %."""
-    return in_turn("x y z", *(2e-3 + jitter(logged))) if {"velocity", "position"} <= logged.signals else {}
+    return (
+        in_turn("x y z", *(2e-3 + jitter(logged.speed, onboard=logged.onboard)))
+        if {"velocity", "position"} <= logged.signals
+        else {}
+    )
 
 
 _ANGLES = tuple(Parameter(name, "rad", 0.0, -np.pi, np.pi, 5e-3) for name in ("roll", "pitch", "yaw"))
@@ -77,6 +81,7 @@ ATTITUDE_MISALIGNMENT = Effect(
     prior=Prior(alike("roll pitch yaw", 0.04), _leaning, least=alike("roll pitch yaw", 2e-3)),
     needs=("attitude",),
     separates="hover for 5 s at each of four headings: a tilted frame turns with the drone, wind stays in the world",
+    lasting=True,
 )
 
 ACCELEROMETER_MISALIGNMENT = Effect(
@@ -102,11 +107,13 @@ GYRO_BIAS = Effect(
         alike("x y z", 0.025),
         lambda logged: alike("x y z", 2.8e-3) if "body_rate" in logged.signals else {},
         each=lambda logged: True,
+        systematic=alike("x y z", 4e-4),  # it walks
         least=alike("x y z", 3e-3),
     ),
     needs=("body_rate",),
     belongs_to="recording",  # it drifts with the temperature
     separates="record the gyro for 10 s with the drone at rest",
+    fast=True,
 )
 
 VELOCITY_SCALE = Effect(
@@ -119,6 +126,7 @@ VELOCITY_SCALE = Effect(
     words="velocity scale of the onboard estimate",
     belongs_to="recording",  # in a vehicle it cost 27 % of position error on other flights of the same drone
     separates="log position from motion capture or beacons, and fly straight legs of known length",
+    lasting=True,
 )
 
 

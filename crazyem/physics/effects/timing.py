@@ -99,6 +99,7 @@ MOTOR_LAG = Effect(
     needs=("motor_command",),
     separates="log rotor speeds; or log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
     spared={"rotor_speed": "log rotor speeds; or "},
+    fast=True,
 )
 
 INPUT_DELAY = Effect(
@@ -109,6 +110,7 @@ INPUT_DELAY = Effect(
     prior=Prior(own={"delay": 8e-3}, usual=_clock, signed=True, least={"delay": 4e-3}),
     needs=("motor_command", "rotor_speed"),
     separates="log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
+    fast=True,
 )
 
 
@@ -201,8 +203,11 @@ MEASUREMENT_DELAY = Effect(
     ),
     order=84,
     measured=shown_late,
-    prior=Prior(own={"delay": 0.012}, least=_least_delay),  # usual: see `onboard_filter`
+    # systematic: how fast fixes draw an attitude back that is made of a late gyro is roughly known
+    # (`onboard_estimate.py`); usual: see `onboard_filter`
+    prior=Prior(own={"delay": 0.012}, systematic={"delay": 1.5e-3}, least=_least_delay),
     needs=("position", "velocity", "attitude", "body_rate", "specific_force"),
     belongs_to="recording",
     separates="log the gyro and the pose at 100 Hz or more, and turn and stop sharply several times",
+    fast=True,
 )
