@@ -19,6 +19,8 @@ from crazyem.diagnosis.naming.detection_limits import at_the_end, matters
 from crazyem.diagnosis.naming.select import shortlist, with_started
 from crazyem.diagnosis.naming.trials import LIKELY, SURE, Step, Trial, significance
 from crazyem.diagnosis.workers import Workers
+from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.prior import Logged
 
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
 TAKEN = Step((), Trial(DRAG, gain=30.0, held_out=20.0, dispersion=2.0, p_value=1e-6, evidence=12.0))
@@ -249,13 +251,20 @@ def test_a_ground_effect_that_does_not_fade_is_thrust_that_is_a_little_wrong():
 
 def test_a_scale_of_velocities_must_be_more_than_the_jitter_of_the_estimate():
     """20 % of the 7 mm/s of a hover are 1 mm/s, and any onboard estimate is as wrong; 20 % of 0.7 m/s are more."""
-    scale = Candidate("velocity_scale", (), ("x", "y", "z"))
-    point = POINT.with_effects({"velocity_scale": {"x": 1.2, "y": 1.0, "z": 1.0}})
-    for speed, counts in ((0.007, False), (0.7, True)):
-        moving = np.zeros((100, 13))
-        moving[:, 3:6] = speed * np.sin(np.arange(100.0))[:, None]
-        data = SimpleNamespace(flights=[SimpleNamespace(y=moving, fused=False)])
-        assert matters(point, scale, data) == counts
+    for speed, counts in ((0.005, False), (0.5, True)):
+        facts = Logged(speed=np.full(3, speed), onboard=False)
+        least = CATALOGUE["velocity_scale"].prior.least_in({}, facts)
+        assert (least["x"][1] < 1.2 - 1.0) == counts
+
+
+def test_a_thrust_within_what_days_differ_by_is_no_finding_of_a_drone_with_a_file_of_its_own():
+    """Two standard deviations of a day: of other drones 2 % each, or as the file says."""
+    trimmed = replace(POINT, vehicle=replace(DRONE, effects={"trim": {"x": 1e-4, "y": 0.0, "z": 0.0}}))
+    thrust = Candidate("thrust_scale", (), ("scale",))
+    for scale, new, filed in ((1.03, True, False), (0.95, True, True), (1.05, True, True)):
+        there = {"thrust_scale": {"scale": scale}}
+        assert matters(POINT.with_effects(there), thrust) == new
+        assert matters(trimmed.with_effects(there), thrust) == filed
 
 
 def test_a_load_counts_from_a_share_of_the_drone_s_mass_on_whatever_its_length():

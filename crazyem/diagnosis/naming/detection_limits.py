@@ -7,13 +7,12 @@ import numpy as np
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.days import day_sd
 from crazyem.diagnosis.fitting.fit import Data
-from crazyem.diagnosis.fitting.logged import rms_speed
+from crazyem.diagnosis.fitting.logged import logged
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import HANGING_SD, usual_wind
 from crazyem.physics.effects.catalogue import CATALOGUE
-from crazyem.physics.effects.sensing import jitter
+from crazyem.physics.effects.prior import Logged
 
-VELOCITY_LEAST = 2.0  # times what the jitter of an onboard estimate looks like
 STEEP = 3.0  # vertical over horizontal wind
 HIGHEST = 1.0  # m: a floor is felt by some rotor radii, Crazyflies have 23 to 28 mm
 LEAST_LOAD = 0.005  # of the drone's mass: what filters and sampling look like
@@ -68,11 +67,17 @@ def _outweighs(point: Point, candidate: Candidate, data: Data) -> bool:
     return lifted > WEIGHED * HANGING_SD["mass"]
 
 
+def _facts(point: Point, data: Data | None) -> Logged:
+    """What is known of the flights to which an effect was fitted."""
+    if data is None or not data.flights:
+        return Logged(filed=frozenset(point.vehicle.effects), onboard=False, speed=np.full(3, np.inf))
+    return logged(data.flights, point)
+
+
 def matters(point: Point, candidate: Candidate, data: Data | None = None) -> bool:
     """Whether the effect is larger than what onboard filters or the sampling of a log look like, and within its range.
 
-    One number that ends where nothing more is admitted would be more: it stands for something else. With the flights it
-    was fitted to, a scale of velocities must be more than the jitter of the estimate in them, too.
+    One number that ends where nothing more is admitted would be more: it stands for something else.
     """
     here, neutral = candidate.values(point), candidate.neutral(point)
     if at_the_end(point, candidate) or (data is not None and not _outweighs(point, candidate, data)):
@@ -85,11 +90,7 @@ def matters(point: Point, candidate: Candidate, data: Data | None = None) -> boo
     if candidate.effect in ("payload", "suspended_load"):
         return _other_load(point, here, neutral)
     prior = CATALOGUE[candidate.effect].prior
-    onboard = data is not None and any(f.fused for f in data.flights)
-    least = prior.least_in(dict(candidate.fixed), onboard=onboard)
-    if candidate.effect == "velocity_scale" and data is not None:
-        jittery = VELOCITY_LEAST * jitter(rms_speed(data.flights), onboard=onboard)
-        least = {n: (max(j, least[n][0]),) * 2 for n, j in zip("xyz", jittery, strict=True)}
+    least = prior.least_in(dict(candidate.fixed), _facts(point, data))
     if not least:
         return True
     for name in candidate.free:

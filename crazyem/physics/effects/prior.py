@@ -95,7 +95,7 @@ class Prior:
         together: correlation of `own` between the parameters.
         systematic: within which a parameter is never known, whatever a fit says: what no scatter shows; SI.
         least: departures that filters, the sampling of a log and the air of a room look like: less is no finding. Or
-            as a function of the choices (`Parameter.chosen`), and of whether a filter on board made the state.
+            as a function of the choices (`Parameter.chosen`) and of what was logged.
         unnamed: stands for what no effect of the catalogue is: it competes, and is told as unexplained.
     """
 
@@ -108,7 +108,7 @@ class Prior:
     each: Callable[[Logged], bool] = lambda logged: False
     together: float = 0.0
     systematic: Sizes = field(default_factory=dict)
-    least: Least | Callable[[Mapping[str, Any], bool], Least] = field(default_factory=dict)
+    least: Least | Callable[[Mapping[str, Any], Logged], Least] = field(default_factory=dict)
     unnamed: bool = False
 
     def usual_in(self, logged: Logged) -> Sizes:
@@ -119,9 +119,9 @@ class Prior:
         """Degrees of freedom, for a recording as it was logged."""
         return self.freedom(logged) if callable(self.freedom) else self.freedom
 
-    def least_in(self, chosen: Mapping[str, Any], *, onboard: bool) -> dict[str, tuple[float, float]]:
+    def least_in(self, chosen: Mapping[str, Any], logged: Logged) -> dict[str, tuple[float, float]]:
         """Parameter -> smallest departures below and above neutral that are a finding, in the units of `own`."""
-        least = self.least(chosen, onboard) if callable(self.least) else self.least
+        least = self.least(chosen, logged) if callable(self.least) else self.least
         return {n: size if isinstance(size, tuple) else (size, size) for n, size in least.items()}
 
     def share(self, name: str, *, mass: float, inertia: float, neutral: float) -> float:

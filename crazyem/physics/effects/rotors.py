@@ -54,7 +54,13 @@ THRUST_SCALE = Effect(
     gain="thrust",
     about=("thrust_per_speed2", "thrust_max", "mass"),
     rotors=scaled,
-    prior=Prior(own={"scale": 0.08}, usual=_strength, each=lambda logged: logged.differs),
+    # least: two standard deviations of a day
+    prior=Prior(
+        own={"scale": 0.08},
+        usual=_strength,
+        each=lambda logged: logged.differs,
+        least=lambda chosen, logged: {n: 2.0 * sd for n, sd in _strength(logged).items()},
+    ),
     separates="weigh the drone; without its weight thrust and mass are one number",
     lasting=True,
 )

@@ -1,10 +1,13 @@
 """attitude_misalignment, accelerometer_misalignment, gyro_bias, velocity_scale, rotor_sensor: what sensors show."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
-from crazyem.physics.effects.prior import Logged, Prior, Sizes, alike, in_turn
+from crazyem.physics.effects.prior import Least, Logged, Prior, Sizes, alike, in_turn
 from crazyem.physics.rotations import axes, quaternion_from_euler, rotation_vector_from_quaternion
 
 
@@ -71,6 +74,11 @@ def _jittery(logged: Logged) -> Sizes:
     )
 
 
+def _least_scale(chosen: Mapping[str, Any], logged: Logged) -> Least:
+    """Relative: more than jitter looks like, twice."""
+    return in_turn("x y z", *np.maximum(2.0 * jitter(logged.speed, onboard=logged.onboard), 0.035))
+
+
 _ANGLES = tuple(Parameter(name, "rad", 0.0, -np.pi, np.pi, 5e-3) for name in ("roll", "pitch", "yaw"))
 
 ATTITUDE_MISALIGNMENT = Effect(
@@ -121,7 +129,7 @@ VELOCITY_SCALE = Effect(
     tuple(Parameter(axis, "", 1.0, 0.0, 3.0, 0.01) for axis in "xyz"),
     order=83,
     measured=scaled_velocity,
-    prior=Prior(alike("x y z", 0.12), _jittery, least=alike("x y z", 0.035)),
+    prior=Prior(alike("x y z", 0.12), _jittery, least=_least_scale),
     needs=("velocity",),
     words="velocity scale of the onboard estimate",
     belongs_to="recording",  # in a vehicle it cost 27 % of position error on other flights of the same drone

@@ -178,10 +178,10 @@ def _past_attitude(rotation: NDArray, row: NDArray, part: NDArray) -> NDArray:
     return rotation_between(rotation, shown)
 
 
-def _least_delay(chosen: Mapping[str, Any], onboard: bool) -> Least:
+def _least_delay(chosen: Mapping[str, Any], logged: Logged) -> Least:
     """s. Where no gyro was late, rates were 1.2 ms later than usual at most in 51 simulated flights. Velocities of a
     filter on board are 0.7 to 5.7 ms late anyway, in ten flights of five filters."""
-    return {"delay": 2e-3 if chosen.get("streams") == ("gyro",) else 6e-3 if onboard else 3e-3}
+    return {"delay": 2e-3 if chosen.get("streams") == ("gyro",) else 6e-3 if logged.onboard else 3e-3}
 
 
 MEASUREMENT_DELAY = Effect(
