@@ -24,7 +24,7 @@ from crazyem.diagnosis.naming import answer, determined, trials
 from crazyem.diagnosis.naming.answer import _numbers, _rivals, _uncertainty, strongest_first
 from crazyem.diagnosis.naming.determined import improbable
 from crazyem.diagnosis.naming.named import DOUBTFUL, Named, one_factor, trust
-from crazyem.diagnosis.naming.presence import CALIBRATED, EVEN, SLOPE, presence
+from crazyem.diagnosis.naming.presence import CALIBRATED, CONSTANT, FITTED, HELD_OUT, TOLD, presence
 from crazyem.diagnosis.naming.trials import Step, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained
 
@@ -50,7 +50,7 @@ def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_as
     flown = fly(Hidden(torque=0.7), seconds=20.0, seed=6)
     brought = []
     monkeypatch.setattr(answer, "trust", lambda remains, nats: brought.append(nats) or 1.0)
-    monkeypatch.setattr(trials, "presence", lambda nats: 0.123)
+    monkeypatch.setattr(trials, "presence", lambda held_out, fitted: 0.123)
     monkeypatch.setattr(determined, "improbable", lambda chance: "")
     monkeypatch.setattr(answer, "preferred", lambda taken, rivals: 1.0)
     found = diagnose([flown], DRONE, wanted=["inertia"])
@@ -71,22 +71,22 @@ def test_what_is_found_beside_the_selection_stands_where_its_evidence_puts_it():
     assert strongest_first((), [named("gusts", 3.0)])[0].name == "gusts"
 
 
-@given(st.floats(-100.0, 1e4), st.floats(-100.0, 1e4))
-def test_more_evidence_never_makes_a_name_less_sure(held, more) -> None:
+@given(st.floats(-100.0, 1e4), st.floats(-100.0, 1e4), st.floats(-100.0, 1e4))
+def test_more_evidence_never_makes_a_name_less_sure(held, more, beside) -> None:
     least, most = sorted((held, more))
-    assert 0.0 <= presence(least) <= presence(most) <= CALIBRATED
+    assert 0.0 <= presence(least, beside) <= presence(most, beside) <= CALIBRATED
+    assert 0.0 <= presence(beside, least) <= presence(beside, most) <= CALIBRATED
 
 
-def test_a_name_is_as_sure_as_what_it_brings_on_flight_held_out() -> None:
-    """Log-odds that are linear in the logarithm of the nats, by a formula of its own."""
-    assert presence(-5.0) == presence(0.0) == 0.0
-    assert presence(EVEN) == pytest.approx(0.5)
-    for nats in (5.0, 30.0, 200.0):
-        odds = math.exp(SLOPE * math.log(nats / EVEN))
-        assert presence(nats) == pytest.approx(odds / (1.0 + odds))
-    assert presence(1e5) == CALIBRATED
-    assert improbable(presence(0.9 * EVEN)).startswith("not determined")
-    assert not improbable(presence(1.1 * EVEN))
+def test_a_name_is_as_sure_as_what_it_brings_on_flight_held_out_and_fitted() -> None:
+    """Odds that are a product of powers of the nats, by a formula of its own."""
+    assert presence(-5.0, 1e3) == presence(1e3, 0.0) == 0.0
+    for held, fitted in ((5.0, 30.0), (30.0, 5.0), (200.0, 80.0)):
+        odds = math.exp(CONSTANT) * held**HELD_OUT * (1.0 + fitted) ** FITTED
+        assert presence(held, fitted) == pytest.approx(odds / (1.0 + odds))
+    assert presence(1e9, 1e9) == CALIBRATED
+    assert improbable(0.9 * TOLD).startswith("not determined")
+    assert not improbable(1.1 * TOLD)
 
 
 def left(nats: float, gained: float = 1e6) -> Unexplained:

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, fly
 from made_flight import array_of
+from scipy.special import expit
 
 from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis.flights.inputs import inputs_of
 from crazyem.diagnosis.naming.named import DOUBTFUL
 from crazyem.diagnosis.naming.other_likelihoods import late_rotors
-from crazyem.diagnosis.naming.presence import presence
+from crazyem.diagnosis.naming.presence import CALIBRATED
 from crazyem.diagnosis.naming.rotor_response import (
     DELAY_SD,
     ENOUGH,
@@ -193,7 +194,10 @@ def test_a_late_rotor_is_as_sure_as_what_speaks_for_it(lag, held_out, deaf):
     found, groups = late_rotors([slow], [slow] if held_out else [], ROTORS, (), {}, deaf=deaf)
     assert groups == ()
     assert [e.name for e in found] == ["motor_lag"]
-    most = presence(found[0].held_out_nats)
+    odds = found[0].log_odds
+    assert odds is not None
+    most = float(expit(odds))
+    assert most <= CALIBRATED
     assert found[0].confidence == pytest.approx(min(most, DOUBTFUL) if deaf else most)
 
 

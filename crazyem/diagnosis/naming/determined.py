@@ -18,7 +18,7 @@ from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.naming.answer import numbers_of
 from crazyem.diagnosis.naming.balance import Balance, by_balance
 from crazyem.diagnosis.naming.named import Named, Value
-from crazyem.diagnosis.naming.presence import TOLD, presence
+from crazyem.diagnosis.naming.presence import TOLD
 from crazyem.diagnosis.naming.prune import left_out
 from crazyem.diagnosis.naming.steady import with_exact_torques
 from crazyem.diagnosis.naming.trials import Selection
@@ -36,7 +36,8 @@ def determined(effects: Sequence[Named], point: Point) -> tuple[tuple[Named, ...
     kept, gone = [], {}
     for effect in effects:
         candidate = Candidate(effect.name, tuple(effect.chosen.items()), tuple(effect.parameters))
-        reason = not_determined(candidate, effect.parameters, point) or improbable(_presence(effect))
+        there = effect.confidence if effect.log_odds is None else float(expit(effect.log_odds))
+        reason = not_determined(candidate, effect.parameters, point) or improbable(there)
         if reason:
             gone[effect.name] = reason
         else:
@@ -68,11 +69,6 @@ def not_determined(candidate: Candidate, parameters: Mapping[str, Value], point:
         )
         return f"not determined: what is found is no surer than that there is none of it (95 %: {which})"
     return ""
-
-
-def _presence(effect: Named) -> float:
-    """Probability that the effect is there, whatever its look-alikes."""
-    return presence(effect.held_out_nats) if effect.log_odds is None else float(expit(effect.log_odds))
 
 
 def improbable(chance: float) -> str:

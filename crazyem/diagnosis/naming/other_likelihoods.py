@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy import stats
+from scipy.special import logit
 
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
@@ -57,8 +58,9 @@ def other_likelihoods(
             if held > 0:
                 # what the regression explains, nothing where gusts are all there is, says nothing of them
                 left = replace(remains.without_force(), gained=gusts.gain)
-                sure = trust(left, held) * presence(min(gusts.gain, held))
-                found.append(Named("gusts", "gusts", values, {}, held, float(np.exp(-min(held, 700.0))), sure))
+                sure = trust(left, held) * presence(held, gusts.gain)
+                chance = float(np.exp(-min(held, 700.0)))
+                found.append(Named("gusts", "gusts", values, {}, held, chance, sure, log_odds=float(logit(sure))))
     if not wanted or accelerometer.EFFECT in wanted:
         tilted = accelerometer.tilt(data, point)
         if tilted is not None:
@@ -67,12 +69,13 @@ def other_likelihoods(
             angles = solution.theta[:3]
             wald = float(stats.f.sf(np.sum((angles / sd)[:2] ** 2) / 2, 2, max(len(gram.score) - 7, 3)))
             held = accelerometer.held_out_gain(apart or data, point, angles, yaw_sd=float(sd[2]))
-            sure = max(solution.p_value, wald) < SURE and held > ADMITTED
-            if sure and np.abs(angles[:2]).max() > accelerometer.LEAST:
+            enough = max(solution.p_value, wald) < SURE and held > ADMITTED
+            if enough and np.abs(angles[:2]).max() > accelerometer.LEAST:
                 values = {n: Value(float(a), "rad", float(e), around(float(a), float(e)))
                           for n, a, e in zip(accelerometer.ANGLES, angles, sd, strict=True)}  # fmt: skip
-                found.append(Named(accelerometer.EFFECT, accelerometer.EFFECT, values, {}, held, wald,
-                                   presence(min(solution.gain / max(1.0, solution.dispersion), held))))  # fmt: skip
+                sure = presence(held, solution.gain / max(1.0, solution.dispersion))
+                name = accelerometer.EFFECT
+                found.append(Named(name, name, values, {}, held, wald, sure, log_odds=float(logit(sure))))
     return found
 
 
@@ -101,7 +104,8 @@ def late_rotors(
         p = CATALOGUE[name].parameters[0]
         values = {p.name: Value(value, p.unit, sd, around(value, sd))}
         p_value = float(np.exp(-min(late.nats, 700.0)))
-        sure = presence(min(late.nats, late.held_out)) * (0.5 if late.alike else 1.0)
+        there = presence(late.held_out, late.nats)
+        sure = there * (0.5 if late.alike else 1.0)
         sure = min(sure, DOUBTFUL) if deaf else sure
-        named.append(Named(name, name, values, {}, late.held_out, p_value, sure))
+        named.append(Named(name, name, values, {}, late.held_out, p_value, sure, log_odds=float(logit(there))))
     return named, (("motor_lag", "input_delay"),) if late.alike else ()

@@ -65,7 +65,9 @@ class Trial:
     @property
     def presence(self) -> float:
         """Probability that it is there, whatever its look-alikes."""
-        return presence(self.held_out) if self.log_odds is None else min(CALIBRATED, float(expit(self.log_odds)))
+        if self.log_odds is not None:
+            return min(CALIBRATED, float(expit(self.log_odds)))
+        return presence(self.held_out, self.gain / self.dispersion)
 
     @property
     def worth(self) -> float:
