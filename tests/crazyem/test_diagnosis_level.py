@@ -42,6 +42,18 @@ def test_the_voltage_is_the_one_that_the_battery_had(seed):
     assert "cannot be told" in found.notices[0]
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_heights_tell_it_where_no_velocity_is_recorded(seed):
+    shown = without(unmeasured(replace(MOTION, seed=seed)), "velocity")
+    height = shown.signals["position"]
+    noise = 1e-3 * np.random.default_rng(seed).standard_normal(height.value.shape)
+    for recording in (shown, changed(shown, "position", value=height.value + noise)):
+        found = inputs(recording)
+        assert found.level is not None
+        middle = found.level.known - 1.5
+        assert found.level.voltage == pytest.approx(float(MOTION.voltage(np.array([middle]))[0]), rel=0.005)
+
+
 @settings(max_examples=10)
 @given(st.floats(0.7, 1.4))
 def test_commands_carry_the_vehicle_whatever_its_mass(factor):
@@ -59,7 +71,7 @@ def test_where_a_flight_does_not_show_it_a_nominal_one_stays():
     flown = unmeasured()
     lying = replace(flown, signals={n: a for n, a in flown.signals.items() if n not in ("position", "flying")})
     for recording, vehicle in (
-        (without(flown, "velocity"), DRONE),
+        (without(flown, "velocity", "position"), DRONE),
         (flown, replace(DRONE, mass=10 * DRONE.mass)),  # no battery carries that
         (changed(lying, "motor_command", value=0.0 * lying.signals["motor_command"].value), DRONE),
     ):

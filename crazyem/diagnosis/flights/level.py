@@ -24,6 +24,7 @@ CLEAR = 0.3  # m above the floor, where its effect is over; within
 SOON = 5.0  # s of leaving it, else at once
 LONG, SHORT = 3.0, 1.0  # s of flight that are looked at, and least;
 LOOKS = (0.2, 0.5, 1.0, 2.0)  # s after leaving the floor when a prediction looks already
+SLOPE, FEWEST_HEIGHTS = 0.2, 4  # s of a slope of the height that is a velocity, and heights in it
 ADMITTED = (0.4, 1.4)  # times the nominal voltage
 
 
@@ -58,20 +59,22 @@ def level_of(
         until: s, what comes later is not looked at; then less than `SHORT` will do, from the moment it left the floor.
 
     Returns:
-        None where the recording has no velocity, no flight that is long enough, or no voltage does it.
+        None where the recording has neither velocity nor position, no flight that is long enough, or no voltage does
+        it.
     """
-    if flight is None or not flight.flown or "velocity" not in recording.signals or not vehicle.thrust_curve:
+    moving = {"velocity", "position"} & set(recording.signals)
+    if flight is None or not flight.flown or not moving or not vehicle.thrust_curve:
         return None
     begin, short = _clear(recording, flight), SHORT
     if begin + SHORT > until:
         begin, short = flight.flown[0][0], 0.5 * LOOKS[0]
     end = min(begin + LONG, max(e for b, e in flight.flown if b <= begin), until)
-    when, velocity = ordered(recording.signals["velocity"])
-    seen = (when >= begin) & (when <= end) & np.isfinite(velocity[:, 2])
+    at, upwards = _climbing(recording, begin, end)
+    if "velocity" not in recording.signals and at.size:
+        begin, end = float(at[0]), float(at[-1])
     inside = (time >= begin) & (time <= end)
-    if seen.sum() < 2 or inside.sum() < 2 or end - begin < short:
+    if at.size < 2 or inside.sum() < 2 or end - begin < short:
         return None
-    at, upwards = when[seen], velocity[seen, 2]
     grid = time[inside]
     wanted = vehicle.mass * (
         GRAVITY * (grid[-1] - grid[0]) + np.interp(grid[-1], at, upwards) - np.interp(grid[0], at, upwards)
@@ -87,6 +90,20 @@ def level_of(
     if not lacking(low) < 0.0 < lacking(high):
         return None
     return Level(float(brentq(lacking, low, high, xtol=1e-4)), float(max(at[-1], grid[-1])))
+
+
+def _climbing(recording: Recording, begin: float, end: float) -> tuple[NDArray, NDArray]:
+    """Stamps (n,) s within a time, and the upward velocity there (n,) m/s; without a recorded one by the height."""
+    when, value = ordered(recording.signals["velocity" if "velocity" in recording.signals else "position"])
+    seen = (when >= begin) & (when <= end) & np.isfinite(value[:, 2])
+    at, upwards = when[seen], value[seen, 2]
+    if "velocity" in recording.signals or at.size < FEWEST_HEIGHTS:
+        return (at, upwards) if "velocity" in recording.signals else (at[:0], upwards[:0])
+    ends = at[0] + 0.5 * SLOPE, at[-1] - 0.5 * SLOPE
+    near = [np.abs(at - e) <= 0.5 * SLOPE for e in ends]
+    if ends[0] >= ends[1] or min(n.sum() for n in near) < FEWEST_HEIGHTS:
+        return at[:0], upwards[:0]
+    return np.array(ends), np.array([np.polyfit(at[n] - e, upwards[n], 1)[0] for n, e in zip(near, ends, strict=True)])
 
 
 def _clear(recording: Recording, flight: Airtime) -> float:
