@@ -314,6 +314,11 @@ def _corroborated(
                 witnessed |= {candidate.effect, other.effect}
                 if nats > 0:
                     selection = exchanged(data, selection, candidate, other, [start])
+            weak = candidate.effect == WEAK_OR_MISREAD[0]
+            misread = nats is not None and (nats > TELLING if weak else nats < 0)
+            if nats is not None and misread:
+                # a healthy rotor turns as a weak one does: what commands say against that they say for the sensor
+                selection = selection.with_evidence(other if weak else candidate, abs(nats))
     return selection, frozenset(witnessed)
 
 
@@ -323,7 +328,7 @@ def _misread_or_weak(
     """For a weak rotor the sensor that would be wrong, for a wrong sensor the rotor that would be weak: the nats that
     commands speak for it, its candidate, and where it begins."""
     rotor, scale = dict(candidate.fixed)["rotor"], candidate.values(selection.final)["scale"]
-    weak = candidate.effect == "rotor_fault"
+    weak = candidate.effect == WEAK_OR_MISREAD[0]
     reading = scale**-0.5 if weak else scale
     nats = false_speed(recordings, rotor, reading, selection.nominal.vehicle.motor_time_constant)
     fixed: tuple[tuple[str, Any], ...] = (("rotor", rotor),)

@@ -101,7 +101,9 @@ def exchanged(data: Data, selection: Selection, old: Candidate, new: Candidate, 
     accepted = tuple(new if c is old else c for c in selection.accepted)
     fitted = refine_base(data, point, accepted, rounds=3, noise=False)
     steps = tuple(
-        replace(s, taken=replace(s.taken, candidate=new)) if s.taken and s.taken.candidate.effect == old.effect else s
+        replace(s, taken=replace(s.taken, candidate=new, log_odds=None, size={}))
+        if s.taken and s.taken.candidate.effect == old.effect
+        else s
         for s in selection.steps
     )
     return replace(selection, final=fitted.point, fitted=fitted, accepted=accepted, steps=steps)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.special import expit
+from scipy.special import expit, logit
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Fitted
@@ -46,6 +46,7 @@ class Trial:
         tuned: nats that it costs that its parameters might have been anything (`evidence.tuning`); None: one for each.
         log_odds: log posterior odds that it is there, where they are known (`steady_odds.py`); None: by `held_out`.
         size: parameters by what those odds are of.
+        other_nats: by which a signal speaks for it that the filter does not use.
     """
 
     candidate: Candidate
@@ -61,13 +62,15 @@ class Trial:
     tuned: float | None = None
     log_odds: float | None = None
     size: Mapping[str, float] = field(default_factory=dict)
+    other_nats: float = 0.0
 
     @property
     def presence(self) -> float:
         """Probability that it is there, whatever its look-alikes."""
         if self.log_odds is not None:
             return min(CALIBRATED, float(expit(self.log_odds)))
-        return presence(self.held_out, self.gain / self.dispersion)
+        there = presence(self.held_out, self.gain / self.dispersion)
+        return min(CALIBRATED, float(expit(logit(there) + self.other_nats)))
 
     @property
     def worth(self) -> float:
@@ -109,6 +112,14 @@ class Selection:
     fitted: Fitted
     tried: int
     doubted: frozenset[str] = frozenset()
+
+    def with_evidence(self, candidate: Candidate, nats: float) -> "Selection":
+        """With so many nats of another likelihood for an effect that was selected, and against its look-alikes."""
+        steps = list(self.steps)
+        for k, step in enumerate(steps):
+            if step.taken is not None and step.taken.candidate.effect == candidate.effect:
+                steps[k] = replace(step, taken=replace(step.taken, other_nats=nats), alike=())
+        return replace(self, steps=tuple(steps))
 
 
 def margin(best: Trial, other: Trial, *, recordings: bool = True) -> tuple[float, float]:
