@@ -54,7 +54,7 @@ def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_as
     monkeypatch.setattr(determined, "improbable", lambda chance: "")
     monkeypatch.setattr(answer, "preferred", lambda taken, rivals: 1.0)
     found = diagnose([flown], DRONE, wanted=["inertia"])
-    assert [(e.name, e.confidence) for e in found.effects] == [("inertia", 0.123)]
+    assert [(e.name, e.confidence) for e in found.effects] == [("inertia", pytest.approx(0.123))]
     assert brought == [found.effects[0].held_out_nats] != [0.0]  # what is weighed against what is left
     assert found.indistinguishable == (("inertia", "torque_scale"),)
 
