@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 from made_flight import array_of
+from scipy.special import expit, logit
 
 from crazyem.diagnosis.diagnose import _corroborated
 from crazyem.diagnosis.fitting.candidates import Candidate
@@ -19,6 +20,7 @@ from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.place import depends_on_place
 from crazyem.diagnosis.naming.answer import answer_of
 from crazyem.diagnosis.naming.corroboration import TELLING, _lag_of, false_speed, late_measurements
+from crazyem.diagnosis.naming.presence import CALIBRATED, presence
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial, between, both, distinguishable, margin, scatter
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.recordings.recording import Recording
@@ -57,6 +59,35 @@ def test_commands_tell_a_sensor_that_counts_wrong_from_a_weak_rotor(recording: R
     assert unsaid < -10.0
     assert abs(said + unsaid) < 4.0  # the two hypotheses are each other's mirror
     assert false_speed([recording], 2, 1.06, lag) is None  # no speeds
+
+
+@pytest.mark.parametrize("named", ["rotor_fault", "rotor_sensor"])
+def test_what_commands_say_counts_for_a_sensor_that_counts_wrong(recording: Recording, named: str) -> None:
+    """Also where a steady balance had taken it for a weak rotor: then that balance decides nothing any more."""
+    data, scale = Data([flight_of(recording, DRONE)]), 1.06
+    start = point_of(data)
+    candidate = Candidate(named, (("rotor", 2),), ("scale",))
+    values = {"rotor": 2, "scale": scale if named == "rotor_sensor" else scale**-2}
+    final = start.with_effects({named: values})
+    fitted = Fitted(final, (candidate,), 0.0, data.gram(final, candidate.columns(final)), np.zeros(1))
+    odds = None if named == "rotor_sensor" else 1.0
+    taken = Trial(candidate, 20.0, 20.0, 1.0, 1e-9, 40.0, fitted, data.block_loglik(final), 40.0, log_odds=odds)
+    load = replace(taken, candidate=Candidate("payload", (), ("mass",)), log_odds=None)
+    selection = Selection(start, final, (Step((taken, load), taken, (load,)),), (candidate,), fitted, 1)
+    shown = with_speeds(recording, (1.0, scale, 1.0, 1.0))
+    found, witnessed = _corroborated(data, None, selection, [shown])
+    one = found.steps[0].taken
+    assert one is not None
+    assert (one.candidate.effect, one.log_odds) == ("rotor_sensor", None)
+    expected = false_speed([shown], 2, scale, DRONE.motor_time_constant)
+    assert expected is not None
+    assert one.other_nats == pytest.approx(expected)
+    assert one.presence == pytest.approx(expit(logit(presence(20.0, 20.0)) + expected)) or one.presence == CALIBRATED
+    assert found.steps[0].alike == ()
+    assert witnessed == {"rotor_fault", "rotor_sensor"}
+    healthy, _ = _corroborated(data, None, selection, [with_speeds(recording, (1.0, 1.0, 1.0, 1.0))])
+    assert healthy.steps[0].taken is not None
+    assert healthy.steps[0].taken.other_nats == 0.0
 
 
 def felt(recording: Recording, late: float, shaken: float = 1.0) -> Recording:
