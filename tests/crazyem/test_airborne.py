@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from made_flight import array_of, made_flight
 
@@ -23,7 +23,6 @@ def placed(z: np.ndarray, *, noise: float, seed: int = 0, wander: float = 0.05) 
     return Recording("made", "made", {"position": array_of("position", TIME, value)})
 
 
-@settings(max_examples=20, deadline=None)
 @given(
     table=st.floats(-2.0, 2.0), climb=st.floats(0.2, 2.0), noise=st.sampled_from([1e-4, 1e-3, 5e-3]),
     start=st.floats(4.0, 8.0), lasting=st.floats(6.0, 12.0), carried=st.floats(0.2, 1.0), seed=st.integers(0, 99),

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import butter, tf2ss
 
@@ -170,7 +170,6 @@ def test_the_loop_is_stable_within_the_caps_and_not_far_beyond() -> None:
 ratios, lags = st.floats(0.5, 2.0), st.floats(0.03, 0.1)
 
 
-@settings(max_examples=30, deadline=None)
 @given(ratios, ratios, lags, lags)
 def test_no_state_on_the_way_is_much_less_damped_than_both_ends(g1_from, g1_to, lag_from, lag_to) -> None:
     """Roll axis: believed g1 and lag to others, in the order of `writes_for`, with rotors of the final lag.

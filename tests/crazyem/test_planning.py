@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
@@ -40,7 +40,6 @@ SMALL = Harmonics(6.0, 1.0, (*SIDEWAYS, Axis(), Axis((2.0,), (0.05,), (0.0,))))
 @given(
     st.floats(2.0, 20.0), st.floats(0.2, 0.9), st.floats(0.1, 5.0), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3),
 )  # fmt: skip
-@settings(max_examples=25, deadline=None)
 def test_derivatives_are_those_of_the_path_and_vanish_at_the_ends(
     duration: float, ramp: float, frequency: float, cosine: float, sine: float
 ) -> None:

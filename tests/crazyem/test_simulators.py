@@ -109,7 +109,6 @@ NEARLY_SYMMETRIC = Constants(
 
 
 @pytest.mark.parametrize("name", FORMATS)
-@settings(max_examples=40, deadline=None)
 @given(drone=drones())
 @example(drone=NEARLY_SYMMETRIC)
 def test_what_was_written_is_read_again(name: str, drone: Constants) -> None:
@@ -120,7 +119,6 @@ def test_what_was_written_is_read_again(name: str, drone: Constants) -> None:
     assert {n for n in NUMBERS if getattr(found, n) is not None} - HOLDS[name] <= {"lag", *DRAG, *CENTRE, *DAMPING}
 
 
-@settings(max_examples=60, deadline=None)
 @given(drone=drones())
 def test_constants_become_a_vehicle_and_back(drone: Constants) -> None:
     found, left = from_vehicle(to_vehicle(drone))
@@ -173,7 +171,7 @@ def words(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", [n for n in PUBLISHED if n not in ("rotorpy", "crazyswarm2", "gazebo")])
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=settings.default.max_examples // 3)
 @given(drone=drones())
 def test_a_template_changes_in_its_numbers_alone(name: str, drone: Constants) -> None:
     drone = replace(shaped(drone, name), arm_y=drone.arm_x)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from made_flight import made_flight
 
@@ -71,7 +71,6 @@ def test_other_days_differ_more() -> None:
     assert "trim.x" in other
 
 
-@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**31 - 1), wide=st.floats(1.0, 6.0))
 def test_every_drone_can_be(seed: int, wide: float) -> None:
     """Inertias obey the triangle inequality however wide the posterior is."""
