@@ -7,6 +7,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -77,22 +78,25 @@ class Motion:
 
     def _path(self, t: Array) -> tuple[Array, Array, Array]:
         """Position, velocity, acceleration, each (n, 3)."""
+        p, v, a = self._path_at(np.ascontiguousarray(t).tobytes())
+        return p.copy(), v.copy(), a.copy()
+
+    @lru_cache(maxsize=4)  # noqa: B019  # the signals of a stream share their stamps
+    def _path_at(self, stamps: bytes) -> tuple[Array, Array, Array]:
+        t = np.frombuffer(stamps)
         rng = np.random.default_rng(self.seed)
         shape = np.zeros((3, t.size, 3))
         for axis, scale in enumerate((1.0, 1.0, 0.35)):
             for factor in (0.7, 1.0, 1.7):
                 w = 2.0 * np.pi * self.frequency * factor * rng.uniform(0.85, 1.15)
                 amplitude, phase = scale * self.size / factor**2 * rng.uniform(0.6, 1.0), rng.uniform(0, 2 * np.pi)
-                shape[0, :, axis] += amplitude * np.sin(w * t + phase)
+                sine = np.sin(w * t + phase)
+                shape[0, :, axis] += amplitude * sine
                 shape[1, :, axis] += amplitude * w * np.cos(w * t + phase)
-                shape[2, :, axis] -= amplitude * w**2 * np.sin(w * t + phase)
+                shape[2, :, axis] -= amplitude * w**2 * sine
         shape[0, :, 2] += self.height + 0.5 * self.size
         e, de, dde = self._airborne(t)
-        return (
-            shape[0] * e,
-            shape[1] * e + shape[0] * de,
-            shape[2] * e + 2.0 * shape[1] * de + shape[0] * dde,
-        )
+        return shape[0] * e, shape[1] * e + shape[0] * de, shape[2] * e + 2.0 * shape[1] * de + shape[0] * dde
 
     def _airborne(self, t: Array) -> tuple[Array, Array, Array]:
         """0 on the ground, 1 in flight, smooth to the fourth derivative; with its two derivatives, each (n, 1)."""
@@ -247,18 +251,10 @@ def array_of(quantity: str, time: ArrayLike, value: ArrayLike, *, stream: str = 
     value = value.reshape(time.size, SIGNALS[quantity][0])
     _, unit, frame = SIGNALS[quantity]
     return SignalArray(
-        time,
-        value,
-        np.arange(time.size, dtype=np.int64) * 64 + place,
-        np.full(time.size, np.nan),
-        ~np.isfinite(value).all(axis=1),
-        quantity=quantity,
-        unit=unit,
-        frame=frame,
-        clock="firmware",
-        stream=stream,
+        time, value, np.arange(time.size, dtype=np.int64) * 64 + place, np.full(time.size, np.nan),
+        ~np.isfinite(value).all(axis=1), quantity=quantity, unit=unit, frame=frame, clock="firmware", stream=stream,
         source=(quantity,),
-    )
+    )  # fmt: skip
 
 
 def changed(

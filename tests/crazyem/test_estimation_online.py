@@ -30,6 +30,13 @@ def feed(estimator, samples):
     return [e for e in map(estimator.feed, samples) if e is not None]
 
 
+def ended(samples, vehicle=LAGGED):
+    """The estimator after these samples and its last estimate; few updates, since nobody reads those on the way."""
+    estimator = OnlineEstimator(vehicle, every=25)
+    feed(estimator, samples)
+    return estimator, estimator.finish()
+
+
 def same(a, b):
     """Bit for bit, NaN included."""
     return str(a.to_json()) == str(b.to_json()) and a.samples == b.samples and dict(a.noise) == dict(b.noise)
@@ -150,9 +157,7 @@ def test_one_packet_in_five_lost(flight):
         if rng.uniform() > 0.2:
             t = flight.fine_time[row + 7]
             events.append(Sample("wrench_command", t, tuple(flight.fine_wrench[row + 7])))
-    estimator = OnlineEstimator(LAGGED)
-    feed(estimator, events)
-    final = estimator.finish()
+    _, final = ended(events)
     for name, true in TRUE.items():
         within(final, name, true)
     assert final["mass"].identifiable
@@ -164,29 +169,23 @@ def test_commands_stamped_between_the_measurements(flight):
         t, y = flight.fine_time[row], flight.fine_y[row]
         events += [Sample(n, t, tuple(y[c])) for n, c in synthetic.COLUMNS.items()]
         events.append(Sample("wrench_command", flight.fine_time[row + 5], tuple(flight.fine_wrench[row + 5])))
-    estimator = OnlineEstimator(LAGGED)
-    feed(estimator, events)
-    final = estimator.finish()
+    _, final = ended(events)
     for name, true in TRUE.items():
         within(final, name, true)
 
 
 def test_a_gap_is_a_break_and_not_a_step(flight):
     samples = [s for s in synthetic.samples(flight) if not 2.0 < s.time < 2.5]
-    estimator = OnlineEstimator(LAGGED)
-    feed(estimator, samples)
+    estimator, final = ended(samples)
     assert estimator.counters.breaks == 2
-    final = estimator.finish()
     for name, true in TRUE.items():
         within(final, name, true)
 
 
 def test_commands_that_stop_for_a_while_are_not_held_over(flight):
     samples = [s for s in synthetic.samples(flight) if s.signal != "wrench_command" or not 2.0 < s.time < 2.5]
-    estimator = OnlineEstimator(LAGGED)
-    feed(estimator, samples)
+    estimator, final = ended(samples)
     assert estimator.counters.breaks > 1
-    final = estimator.finish()
     for name, true in TRUE.items():
         within(final, name, true)
 
@@ -226,9 +225,7 @@ def test_ground_before_and_after_a_flight_leaves_the_estimate_alone(flight, plai
     end = float(flight.time[-1])
     samples = [*on_ground(-0.6, -0.3, 0.0), *on_ground(-0.3, -0.005, TRUTH.mass * 9.81), *synthetic.samples(flight),
                *on_ground(end + 0.01, end + 0.4, 0.3), *on_ground(end + 0.4, end + 0.6, 0.0)]  # fmt: skip
-    estimator = OnlineEstimator(LAGGED)
-    feed(estimator, samples)
-    final, reference = estimator.finish(), plain[-1]
+    (_, final), reference = ended(samples), plain[-1]
     assert final.samples == reference.samples
     for name in NAMES:
         assert abs(final[name].value - reference[name].value) < 0.5 * reference[name].sd
@@ -306,9 +303,7 @@ def test_motor_commands_with_battery_voltage(flight, plain):
     for k, t in enumerate(flight.time):
         samples += [Sample("voltage", t, (3.9,)), Sample("motor_command", t, tuple(duty[k]))]
         samples += [Sample(n, t, tuple(flight.y[k, c])) for n, c in synthetic.COLUMNS.items()]
-    estimator = OnlineEstimator(vehicle)
-    feed(estimator, samples)
-    ours, reference = estimator.finish(), plain[-1]
+    (_, ours), reference = ended(samples, vehicle), plain[-1]
     for name in NAMES:
         assert abs(ours[name].value - reference[name].value) < 0.3 * reference[name].sd
 
@@ -321,9 +316,7 @@ def test_rotor_speeds_include_the_lag(flight):
     for k, t in enumerate(flight.time):
         samples.append(Sample("rotor_speed", t, tuple(speed[k])))
         samples += [Sample(n, t, tuple(flight.y[k, c])) for n, c in synthetic.COLUMNS.items()]
-    estimator = OnlineEstimator(vehicle)
-    feed(estimator, samples)
-    final = estimator.finish()
+    _, final = ended(samples, vehicle)
     for name in NAMES:
         within(final, name, TRUE[name])
     assert not final["motor_time_constant"].identifiable
@@ -338,8 +331,8 @@ ZHAO = synthetic.Truth(mass=0.18, inertia=(2.5e-4, 3.1e-4, 2.0e-4), lag=0.0, for
 def test_cold_start_on_the_drone_of_the_paper():
     """What a warm start gives, too."""
     flight = synthetic.fly(ZHAO, seed=4, duration=4.0, rate=100, sub=10, control_every=10)
-    cold = OnlineEstimator(load_vehicle("zhao"), mass=0.001, inertia=(1e-4, 2e-4, 1e-4))
-    warm = OnlineEstimator(load_vehicle("zhao"))
+    cold = OnlineEstimator(load_vehicle("zhao"), mass=0.001, inertia=(1e-4, 2e-4, 1e-4), every=25)
+    warm = OnlineEstimator(load_vehicle("zhao"), every=25)
     for estimator in (cold, warm):
         feed(estimator, synthetic.samples(flight))
     final, other = cold.finish(), warm.finish()
@@ -356,9 +349,7 @@ def test_products_of_inertia_of_the_vehicle_file_are_used():
     """With the true products fixed the moments come out right; without them they are off by their coupling at most."""
     truth = replace(TRUTH, inertia=(2.0e-5, 2.1e-5, 3.6e-5, 2e-6, -1e-6, 1e-6))
     flight = synthetic.fly(truth, seed=6, duration=5.0)
-    estimator = OnlineEstimator(replace(LAGGED, inertia_products=truth.inertia[3:]))
-    feed(estimator, synthetic.samples(flight))
-    final = estimator.finish()
+    _, final = ended(synthetic.samples(flight), replace(LAGGED, inertia_products=truth.inertia[3:]))
     for name, true in zip(NAMES, (truth.mass, *truth.inertia[:3])):
         within(final, name, true)
 
