@@ -18,7 +18,7 @@ from crazyem.deprecated import moved
 from crazyem.errors import CrazyemError, DataError, FileFormatError, UsageError
 
 LOG = str(Path(__file__).parents[2] / "logs" / "clean_figure8.mcap")
-PART = crazyem.ReadOptions(end=5.0)
+PART = crazyem.ReadOptions(end=3.5)
 NAMES = sorted(set(crazyem.__all__) - {"__version__"})
 RESULTS = ("Diagnosis", "Estimate", "FlightResult", "Prediction", "Recording")
 
@@ -80,7 +80,7 @@ def test_the_import_loads_nothing_heavy():
 
 def test_a_replay_gives_the_numbers_of_the_command_and_prints_nothing(tmp_path, capfd):
     out = tmp_path / "replay.json"
-    assert main(["replay", LOG, "--to", "5", "--json", str(out), "--plot", str(tmp_path / "a.png")]) == 0
+    assert main(["replay", LOG, "--to", "3.5", "--json", str(out), "--plot", str(tmp_path / "a.png")]) == 0
     capfd.readouterr()
     result = crazyem.replay(LOG, options=PART)
     assert capfd.readouterr() == ("", "")
@@ -102,7 +102,7 @@ def test_a_replay_gives_the_numbers_of_the_command_and_prints_nothing(tmp_path, 
 
 def test_a_prediction_gives_the_arrays_of_the_command_and_prints_nothing(tmp_path, capfd):
     out = tmp_path / "p.npz"
-    assert main(["predict", LOG, "--to", "5", "--horizon", "10", "--every", "20", "-o", str(out)]) == 0
+    assert main(["predict", LOG, "--to", "3.5", "--horizon", "10", "--every", "20", "-o", str(out)]) == 0
     capfd.readouterr()
     recording = crazyem.open_recording(LOG, PART)
     found = crazyem.predict(recording, horizon=10, every=20)

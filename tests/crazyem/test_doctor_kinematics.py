@@ -82,7 +82,7 @@ def test_sound_flights_of_other_kinds_raise_no_finding(kind: str) -> None:
 def test_sound_flights_of_any_size_raise_no_finding(
     seed: int, noise: float, size: float, turn: float, loss: float
 ) -> None:
-    motion = Motion(seconds=25.0, seed=seed, size=size, turn=turn)
+    motion = Motion(seconds=15.0, seed=seed, size=size, turn=turn)
     assert found_in(made_flight(motion, seed=seed, noise=noise, more=EVERYTHING, jitter=0.1, loss=loss)) == []
 
 

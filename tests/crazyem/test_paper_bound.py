@@ -116,7 +116,7 @@ def plain_information(flight, sensor, first, last, names):
 
 @pytest.mark.parametrize("sensor", "ABC")
 def test_bound_is_that_of_a_plain_filter(flight, sensor):
-    first, last = 180, 194  # the middle of a turn, away from level
+    first, last = 184, 194  # the middle of a turn, away from level
     found = bound(flight, sensor, first, last)
     information, score = plain_information(flight, sensor, first, last, found.names)
     scale = np.sqrt(np.outer(np.diag(information), np.diag(information)))

@@ -131,7 +131,7 @@ def opened(path, **options):
 
 
 def test_real_files_are_exact(shared_recordings, monkeypatch):
-    files = [*sorted((shared_recordings / "crazypad").iterdir()), shared_recordings / "sysid" / "log10"]
+    files = [*sorted((shared_recordings / "crazypad").iterdir())[::3], shared_recordings / "sysid" / "log10"]
     seen = tables_of(monkeypatch)
     for file in files:
         data = file.read_bytes()
