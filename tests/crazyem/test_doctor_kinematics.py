@@ -16,7 +16,6 @@ from made_flight import Motion, array_of, changed, made_flight
 from scipy.spatial.transform import Rotation
 
 from crazyem.doctor.weight import apparent_mass
-from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording
@@ -343,56 +342,6 @@ def test_a_drone_far_heavier_than_its_vehicle_is_asked_for() -> None:
 
 
 # ---- real flights ----
-
-
-@pytest.mark.slow
-def test_every_wrong_claim_of_the_nanobench_publisher_is_found_and_only_if_it_is_believed(shared_recordings) -> None:
-    lagging = 0
-    for path in sorted((shared_recordings / "nanobench").glob("*.csv.gz")):
-        believed = found_in(open_recording(path, ReadOptions(as_published=True)))
-        told = {(f.check, f.signal): f for f in believed if f.grade == Grade.UNUSABLE}
-        assert "once too often" in told.pop(("angles", "euler")).text
-        assert "sign of pitch" in told.pop(("angles", "euler@onboard")).text
-        assert "in the body frame already" in told.pop(("rates", "body_rate@vicon")).text
-        assert "in g, not m/s^2" in told.pop(("forces", "acceleration@onboard")).text
-        assert told == {}
-        corrected = found_in(open_recording(path))
-        assert [f.text for f in corrected if f.grade == Grade.UNUSABLE] == []
-        (weight,) = [f for f in corrected if f.check == "weight"]
-        assert 1.45 < weight.evidence["ratio"] < 1.70
-        assert 0.0400 < weight.evidence["mass_cf2_kg"] < 0.0455
-        lagging += any(f.check == "lag" for f in corrected)
-        assert {f.check for f in corrected} <= {"lag", "weight", "velocities", "forces", "tilt"}
-    assert lagging >= 9  # the others have too few whole stretches to tell
-
-
-@pytest.mark.slow
-def test_the_onboard_velocity_of_nanodrone_is_a_tenth_too_large_by_two_positions(shared_recordings) -> None:
-    """8 to 11 % in x and y, as a low-pass and a gradient of the mocap position say; z is right."""
-    for name in ("chirp_run2", "random_run1", "random_run4"):
-        flight = open_recording(shared_recordings / "nanodrone" / "raw" / f"{name}.csv.gz")
-        (finding,) = found_in(flight, "velocities")
-        assert finding.signal == "velocity"
-        assert finding.fix is not None
-        assert all(1.07 < finding.evidence[f"slope_{axis}"] < 1.12 for axis in "xy")
-        assert finding.fix.factor[2] == 1.0
-        assert not found_in(flight, "angles", "rates", "forces")
-        (tilt,) = found_in(flight, "tilt")
-        assert 1.1 < tilt.evidence["together_deg"] < 1.8
-        assert "apart" in tilt.text
-
-
-@pytest.mark.slow
-def test_good_real_flights_raise_no_finding(shared_recordings) -> None:
-    paths = [
-        *sorted((shared_recordings / "real_firmware").glob("lee*39g.csv.gz")),
-        shared_recordings / "real_firmware" / "lee_34g_mass_pushed_midflight.csv.gz",
-        *(shared_recordings / "crazypad" / name for name in REVIEWED),
-        *sorted((shared_recordings / "sysid").iterdir()),
-        Path(__file__).resolve().parents[2] / "logs" / "payload_excite.mcap",
-    ]
-    for path in paths:
-        assert [f.text for f in found_in(open_recording(path))] == [], path
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from crazyem import extras
 from crazyem.commands.batch import each
 from crazyem.commands.common import plot_path
 from crazyem.commands.view import wants_view
-from crazyem.diagnosis.report import Series, write_report
+from crazyem.diagnosis.report import Series, html, write_report
 from crazyem.live.foxglove import sdk
 from crazyem.paper.figures import draw_all
 from crazyem.recordings.autopilots import ulog_file
@@ -46,6 +46,7 @@ NEEDS: list[tuple[str, Callable[[Path], object]]] = [
 def test_a_missing_library_is_one_sentence(monkeypatch, tmp_path, library, use):
     for name in {library, *(n for n in sys.modules if n.startswith(f"{library}."))}:
         monkeypatch.setitem(sys.modules, name, None)
+    html._template.cache_clear()  # another test may have made a report before
     with pytest.raises(extras.MissingExtraError) as raised:
         use(tmp_path)
     extra = next(name for name, modules in extras.EXTRAS.items() if library in modules)

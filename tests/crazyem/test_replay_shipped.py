@@ -14,7 +14,8 @@ TRUTH = {"mass": 0.036, "Ixx": 2.0e-5, "Iyy": 2.1e-5, "Izz": 3.6e-5, "motor_time
 
 def test_replay_finds_the_payload(tmp_path):
     out = tmp_path / "replay.json"
-    assert main(["replay", str(FLIGHT), "--json", str(out), "--plot", str(tmp_path / "replay.png"), "--every", "40"]) == 0
+    plot = ["--plot", str(tmp_path / "replay.png"), "--every", "40"]
+    assert main(["replay", str(FLIGHT), "--json", str(out), *plot]) == 0
     estimates = json.loads(out.read_text())["estimates"]
     for name, truth in TRUTH.items():
         estimate = estimates[name]
