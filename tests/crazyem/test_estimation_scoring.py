@@ -194,11 +194,8 @@ def test_settles_from_thirty_per_cent_off(seed):
     settled, errors = settled_from_afar(seed)
     assert settled.converged
     assert settled.maps <= 3
+    assert settled.steps <= 10
     assert np.all(np.abs(errors) < 5)
-
-
-def test_settles_within_ten_steps_from_thirty_per_cent_off():
-    assert max(settled_from_afar(seed)[0].steps for seed in (1, 2, 3, 4)) <= 10
 
 
 def test_the_end_is_a_maximum():

@@ -80,20 +80,6 @@ def crazypad(shared_recordings):
     return sorted(f"crazypad/{path.name}" for path in (shared_recordings / "crazypad").glob("motor__*"))
 
 
-def test_crazypad_logged_requests(shared_recordings):
-    files = crazypad(shared_recordings)
-    assert files
-    for file in files:
-        recording = read(shared_recordings / file, ReadOptions())
-        assert recording.metadata["motor"]["meaning"] == "request"
-        assert {"motor_command", "motor_request"} <= recording.signals.keys()
-        assert recording.signals["motor_command"].source == tuple(SENT)
-        (finding,) = [f for f in recording.findings if f.check == "motor_meaning"]
-        assert finding.grade is Grade.HARMLESS
-        assert finding.evidence["compensation_error_counts"] < 15
-        assert finding.evidence["mixer_share"] > 0.99
-
-
 def test_crazypad_without_its_pwm_is_told_by_the_mixers_grid(shared_recordings):
     for file in crazypad(shared_recordings):
         original = columns_of(shared_recordings, file)
@@ -104,15 +90,6 @@ def test_crazypad_without_its_pwm_is_told_by_the_mixers_grid(shared_recordings):
         told = decide([table(columns)])
         assert told.meaning == "duty"
         assert 0.03 < told.evidence["mixer_share"] < 0.1  # 1/16 by chance
-
-
-def test_sysid_logged_pwm(shared_recordings):
-    for name in ("log10", "log15"):
-        recording = read(shared_recordings / "sysid" / name, ReadOptions())
-        assert recording.metadata["motor"]["meaning"] == "duty"
-        assert "motor_command" in recording.signals
-        (finding,) = [f for f in recording.findings if f.check == "motor_meaning"]
-        assert 0.05 < finding.evidence["mixer_share"] < 0.08
 
 
 def test_real_firmware_logged_pwm(shared_recordings):
