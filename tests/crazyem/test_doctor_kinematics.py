@@ -2,10 +2,8 @@
 the parts they stand on against scipy and closed forms."""
 
 import importlib
-import json
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,7 +26,6 @@ G = 9.81
 UP = np.array([0.0, 0.0, 1.0])
 EVERYTHING = ("onboard", "mocap", "accelerations", "angles")
 SIZES = settings(max_examples=settings.default.max_examples // 5)  # each takes half a second
-REVIEWED = json.loads((Path(__file__).parent / "expectations" / "crazypad.json").read_text())["recordings"]
 
 
 def found_in(recording: Recording, *checks: str) -> list[Finding]:
