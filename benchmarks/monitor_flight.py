@@ -13,18 +13,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from crazyem.signals.packet import Block, Packet, Variable
-from firmware_sim.controllers.tick_with_effects import tick_step_with_effects
 
 from benchmarks.concealed import conditions
 from benchmarks.concealed.courses import course, size_of
 from benchmarks.concealed.draw import waypoints
 from benchmarks.concealed.random_world import random_case, scenario_of
 from benchmarks.concealed.simulate import BOOT, SETPOINT, astray, full_state
-from crazyem.signals.sample import Sample
+from crazyem.signals.sample import Block, Packet, Sample, Variable
 from crazyem.signals.vocabulary import block_plan, decoders
 from crazyem.vehicle import Vehicle, parse_vehicle
 from firmware_sim.commander.setpoint import CRTP
+from firmware_sim.controllers.tick import tick_step_with_effects
 from firmware_sim.firmware import Firmware
 from firmware_sim.flight import Flight
 from firmware_sim.plant import layout as at

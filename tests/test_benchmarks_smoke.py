@@ -1,6 +1,7 @@
 """The benchmarks still run, on tiny sizes and without their peers; nothing here looks at a clock's verdict."""
 
 import importlib
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -65,3 +66,12 @@ def test_peers_when_installed(speed: ModuleType, peer: str, module: str) -> None
     pytest.importorskip(peer, reason=f"{peer} is an optional peer (pip install -e '.[bench]')")
     em = speed.settled(seed=1, window=60, seconds=1.2)
     assert importlib.import_module(module).make(speed.window_of(em, em.tape.size - 60, em.tape.size))() is not None
+
+
+def test_every_benchmark_that_pages_run_as_a_module_imports() -> None:
+    root = FOLDER.parent
+    pages = (*root.glob("docs/**/*.md"), *FOLDER.glob("*.py"), root / "Makefile")
+    named = {n for page in pages for n in re.findall(r"python\S* -m (benchmarks\.\w+)", page.read_text("utf-8"))}
+    assert "benchmarks.monitor" in named
+    for name in sorted(named):
+        importlib.import_module(name)
