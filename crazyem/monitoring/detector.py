@@ -32,8 +32,8 @@ AUTOREGRESSION_MEMORY = 20.0  # s, of mean squares and products of innovations
 SCALE_MEMORY = 60.0  # s, of the running means of the statistics
 CLIPPED = 4.0  # standard deviations as which a larger innovation counts there, and so the root of a statistic
 LEARNING, REFERENCE = 8.0, 2.0  # s in the air in which the estimator still learns; s that its parameters stay
-SCALE_BEFORE, SCALE_FREEDOM = 2.0, 8.0  # the scale before the flight: that of manoeuvres; its degrees of freedom
-REGIME = 0.25  # s of flight that add one, at least
+SCALE_BEFORE, SCALE_WEIGHT = 2.0, 10.0  # the scale before the flight: that of manoeuvres; s of flight it counts as
+SCALE_FREEDOM, REGIME = 8.0, 0.25  # degrees of freedom of the scale before the flight; s of flight that add another
 LEAST_WINDOWS = 6.0  # that must have been seen, end to end, of a length that is tested
 CALM = 3.0  # s in the air before anything is tested
 SETTLED = 1.0  # s after the onset when the size is reported again
@@ -89,7 +89,10 @@ class Detector:
         self.square, self.product = np.ones(12), np.zeros(12)
         self.statistic, self.determinant = np.zeros((WINDOWS, count)), np.zeros((WINDOWS, count))
         self.size, self.variance = np.zeros((WINDOWS, size)), np.ones((WINDOWS, size))
-        self.moments = np.zeros((3, LEVELS, count))  # running means of the first three powers of the statistics
+        d = self.freedom.astype(float)
+        before = SCALE_BEFORE * np.ones((LEVELS, 1))
+        # running means of the first three powers of the statistics
+        self.moments = np.stack([d * before, d * (d + 2) * before**2, d * (d + 2) * (d + 4) * before**3])
         self.scale = np.full((LEVELS, count), SCALE_BEFORE)
         self.known = np.zeros(LEVELS)  # s over which it was taken
         self.scale_of = np.full((WINDOWS, LEVELS, count), SCALE_BEFORE)  # as it was when a window opened
@@ -218,13 +221,9 @@ class Detector:
 
     @staticmethod
     def _freedom(levels: NDArray[np.int64], known: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Degrees of freedom of the running means of each window (n, H).
-
-        Statistics of sliding windows of a length l are correlated: squares of a normal value whose correlation falls
-        linearly over l count once in 2/3 l. Windows of a group are 3/4 of its longest on average.
-        """
-        longest = SPACING * 4.0 * 2.0**levels
-        out: NDArray[np.float64] = (np.minimum(known, SCALE_MEMORY) / np.maximum(0.5 * longest, REGIME))[:, None]
+        """Degrees of freedom of the running means of each window (n, H)."""
+        lengths = np.maximum(SPACING * 4.0 * 2.0**levels, REGIME)
+        out: NDArray[np.float64] = (np.minimum(known, SCALE_MEMORY) / lengths)[:, None]
         return out
 
     def _learn(self, levels: NDArray[np.int64], statistic: NDArray[np.float64], passed: float) -> None:
@@ -232,8 +231,6 @@ class Detector:
 
         For chi-square times a scale, the first moment over the freedom is the scale, and so is the third over the
         second and the freedom + 4. Where tails are heavier the latter is larger, and it is the tails that alarm.
-        The scale is the mean of its conjugate posterior (scaled inverse chi-square): the prior and the flight, each by
-        its degrees of freedom.
         """
         d = self.freedom
         for level in range(LEVELS):
@@ -242,14 +239,11 @@ class Detector:
                 continue
             mine = np.minimum(mine, CLIPPED**2 * self.scale[level] * d)
             powers = np.stack([mine.mean(0), (mine**2).mean(0), (mine**3).mean(0)])
-            self.known[level] += passed
-            memory = min(self.known[level], SCALE_MEMORY)
+            memory = min(SCALE_WEIGHT + self.known[level], SCALE_MEMORY)
             self.moments[:, level] += passed / memory * (powers - self.moments[:, level])
             first, second, third = self.moments[:, level]
-            tail = third / np.maximum(second * (d + 4.0), 1e-12)
-            seen = np.maximum(np.maximum(first / d, tail), 1.0)
-            freedom = self._freedom(np.array([level]), self.known[[level]])[0]
-            self.scale[level] = (SCALE_FREEDOM * SCALE_BEFORE + freedom * seen) / (SCALE_FREEDOM + freedom)
+            self.scale[level] = np.maximum(np.maximum(first / d, third / (second * (d + 4.0))), 1.0)
+            self.known[level] += passed
 
     def _settle(
         self, now: float, slots: NDArray[np.int64], statistic: NDArray[np.float64], scale: NDArray[np.float64]
