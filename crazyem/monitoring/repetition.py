@@ -1,16 +1,34 @@
 """A signal that sticks: the same values again and again, more often than this signal repeats itself.
 
-Logs come in steps, so a signal at rest repeats itself now and then, and a slow one often. A run of repetitions is
-improbable by the share p of repetitions so far: a run of n has the probability p^n.
+Logs come in steps, so a signal at rest repeats itself now and then, and a slow one often. Repetitions come in runs,
+because a drone rests for a while: a Markov chain of first order. With the share p of samples that begin a run and the
+share q of repetitions that go on, a run of n has the probability p q^(n - 1). Both are known from the runs so far
+alone, so the expectation over their beta distributions is taken.
 """
 
 import math
 
 from crazyem.monitoring.threshold import HOUR
 
-MEMORY = 2000  # samples over which the share of repetitions is taken
-REPEATED_BEFORE, SEEN_BEFORE = 5.0, 20.0  # repetitions and samples that the share begins with
+MEMORY = 2000  # samples over which a share is taken
+REPEATED_BEFORE, SEEN_BEFORE = 5.0, 20.0  # repetitions and samples that a share begins with
 LONGEST_GAP = 0.5  # s without a sample after which a run begins anew
+
+
+class _Share:
+    """How often something happened of the times that it could, over the last `MEMORY` times."""
+
+    def __init__(self) -> None:
+        self._happened, self._could = REPEATED_BEFORE, SEEN_BEFORE
+
+    def add(self, happened: int, could: int) -> None:
+        kept = 1.0 - 1.0 / MEMORY if self._could > MEMORY else 1.0
+        self._happened, self._could = kept * self._happened + happened, kept * self._could + could
+
+    def log_probability(self, times: int) -> float:
+        """Of happening so many times in a row: E[q^n] of a beta distribution."""
+        a, whole = self._happened, self._could
+        return math.lgamma(a + times) - math.lgamma(a) - math.lgamma(whole + times) + math.lgamma(whole)
 
 
 class RunTest:
@@ -22,7 +40,7 @@ class RunTest:
 
     def __init__(self, false_alarms_per_hour: float) -> None:
         self._per_second = false_alarms_per_hour / HOUR
-        self._repeated, self._seen = REPEATED_BEFORE, SEEN_BEFORE
+        self._begun, self._continued = _Share(), _Share()
         self._value: tuple[float, ...] = ()
         self._time = self.since = -math.inf
         self._run = 0
@@ -33,15 +51,15 @@ class RunTest:
         step = time - self._time
         same = value == self._value and 0.0 < step < LONGEST_GAP
         if not same:
-            share = max(1.0 - 1.0 / MEMORY, 0.0) if self._seen > MEMORY else 1.0
-            self._seen = share * self._seen + 1.0 + (0 if self.alarmed else self._run)
-            self._repeated = share * self._repeated + (0 if self.alarmed else self._run)
+            # a run that ended was a rest, alarm or not
+            self._begun.add(int(self._run > 0), 1)
+            self._continued.add(max(self._run - 1, 0), self._run)
             self._run, self.since, self.alarmed = 0, time, False
         else:
             self._run += 1
         self._value, self._time = value, time
         if not same or self.alarmed:
             return False
-        log_probability = self._run * math.log(self._repeated / self._seen)
+        log_probability = self._begun.log_probability(1) + self._continued.log_probability(self._run - 1)
         self.alarmed = log_probability < math.log(self._per_second * step)
         return self.alarmed

@@ -56,6 +56,22 @@ def test_a_signal_that_sticks_is_told_from_one_that_rests() -> None:
     assert not test.alarmed
 
 
+def test_a_drone_that_rests_now_and_then_is_not_stuck() -> None:
+    """A Markov chain: one sample in fifty begins a run, and nineteen of twenty repetitions go on."""
+    random = np.random.default_rng(2)
+    test, alarms, value, resting = RunTest(0.01), [], 0.0, False
+    for k in range(100_000):
+        resting = random.random() < (0.95 if resting else 0.02)
+        value += 0.0 if resting else 1.0
+        alarms += [k] if test.add(0.01 * k, (value,)) else []
+    assert len(alarms) <= 1
+    assert all(k < 5_000 for k in alarms)  # before a rest was known
+    found = [k for k in range(1000) if test.add(1000.0 + 0.01 * k, (value + 1.0,))]
+    assert len(found) == 1
+    # by the closed form of a run with so small a probability: 0.02 0.95^(n - 1) < 0.01 / 3600 s * 0.01 s
+    assert found[0] == pytest.approx(np.log(0.01 / 3600.0 * 0.01 / 0.02) / np.log(0.95), rel=0.25)
+
+
 def test_a_gap_is_no_repetition() -> None:
     test = RunTest(0.01)
     assert not any(test.add(float(k), (1.0, 2.0)) for k in range(200))
