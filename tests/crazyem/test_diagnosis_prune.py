@@ -253,7 +253,7 @@ def test_a_scale_of_velocities_must_be_more_than_the_jitter_of_the_estimate():
     """20 % of the 7 mm/s of a hover are 1 mm/s, and any onboard estimate is as wrong; 20 % of 0.7 m/s are more."""
     for speed, counts in ((0.005, False), (0.5, True)):
         facts = Logged(speed=np.full(3, speed), onboard=False)
-        least = CATALOGUE["velocity_scale"].prior.least_in({}, facts)
+        least = CATALOGUE["velocity_scale"].prior.detection_limit_in({}, facts)
         assert (least["x"][1] < 1.2 - 1.0) == counts
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
-from crazyem.diagnosis.fitting import nuisances as always
+from crazyem.diagnosis.fitting import logged as facts
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, remembering, remembering_anew
 from crazyem.diagnosis.fitting.model import Point
@@ -87,7 +87,7 @@ def with_free(data: Data, candidate: Candidate) -> tuple[Point, Fitted]:
 
 @pytest.mark.slow
 def test_an_inertia_that_a_vibration_speaks_for_is_another_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(always, "unlogged_share", lambda flights, vehicle: 0.0)  # else the inertia is doubted before
+    monkeypatch.setattr(facts, "unlogged_share", lambda flights, vehicle: 0.0)  # else the inertia is doubted before
     data = Data([flight_of(fly(vibration=4.0, seconds=20.0), DRONE)])
     point, fitted = with_free(data, INERTIA)
     assert peaks(data.models[0], point)

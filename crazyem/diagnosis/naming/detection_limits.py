@@ -90,12 +90,12 @@ def matters(point: Point, candidate: Candidate, data: Data | None = None) -> boo
     if candidate.effect in ("payload", "suspended_load"):
         return _other_load(point, here, neutral)
     prior = CATALOGUE[candidate.effect].prior
-    least = prior.least_in(dict(candidate.fixed), _facts(point, data))
-    if not least:
+    limit = prior.detection_limit_in(dict(candidate.fixed), _facts(point, data))
+    if not limit:
         return True
     for name in candidate.free:
         share = prior.share(name, mass=point.vehicle.mass, inertia=point.vehicle.inertia[0], neutral=neutral[name])
         away = (here[name] - neutral[name]) / share
-        if name in least and not -least[name][0] <= away <= least[name][1]:
+        if name in limit and not -limit[name][0] <= away <= limit[name][1]:
             return True
     return False

@@ -13,7 +13,7 @@ from crazyem.diagnosis.fitting.nuisances import usual_gusts
 from crazyem.diagnosis.naming import accelerometer, rotor_response
 from crazyem.diagnosis.naming.gusts import find_gusts
 from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, around, trust
-from crazyem.diagnosis.naming.presence import presence
+from crazyem.diagnosis.naming.presence import presence, presence_by_odds
 from crazyem.diagnosis.naming.prune import ADMITTED
 from crazyem.diagnosis.naming.trials import SURE
 from crazyem.diagnosis.naming.unexplained import Unexplained
@@ -104,7 +104,7 @@ def late_rotors(
         p = CATALOGUE[name].parameters[0]
         values = {p.name: Value(value, p.unit, sd, around(value, sd))}
         p_value = float(np.exp(-min(late.nats, 700.0)))
-        there = presence(late.held_out, late.nats)
+        there = presence_by_odds(min(late.held_out, late.nats))
         sure = there * (0.5 if late.alike else 1.0)
         sure = min(sure, DOUBTFUL) if deaf else sure
         named.append(Named(name, name, values, {}, late.held_out, p_value, sure, log_odds=float(logit(there))))

@@ -2,7 +2,7 @@
 
 import math
 
-from scipy.special import expit
+from scipy.special import expit, logit
 
 # Log-odds that a name is right: CONSTANT + HELD_OUT log(nats on flight held out) + FITTED log(1 + nats on the flight it
 # was fitted to, over how much more scores scatter than the model says), at most `CALIBRATED`. Models are approximate:
@@ -10,6 +10,7 @@ from scipy.special import expit
 # By maximum likelihood from 98 names in 80 random and foreign worlds (seeds 8101, 9301, 9402).
 CONSTANT, HELD_OUT, FITTED, CALIBRATED = -3.0, 0.26, 0.52, 0.95
 LEAST_NATS = 0.5  # on flight held out: less is chance
+MISSING = 0.05  # prior probability that one effect is missing from a vehicle file: of 20 drones one
 TOLD = 0.5  # probability below which an effect is no finding
 
 
@@ -24,3 +25,9 @@ def presence(held_out: float, fitted: float) -> float:
         return 0.0
     odds = CONSTANT + HELD_OUT * math.log(max(held_out, LEAST_NATS)) + FITTED * math.log1p(fitted)
     return min(CALIBRATED, float(expit(odds)))
+
+
+def presence_by_odds(nats: float) -> float:
+    """Probability that an effect is there by a likelihood that holds what is systematically wrong with its model: then
+    nats are odds."""
+    return min(CALIBRATED, float(expit(nats + logit(MISSING))))

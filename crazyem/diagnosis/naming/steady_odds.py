@@ -19,11 +19,10 @@ from crazyem.diagnosis.fitting.fit import Data, DivergedError
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.naming.balance import FREE, HEAVIEST, Balance, balance_of, likely, steady
-from crazyem.diagnosis.naming.presence import TOLD
+from crazyem.diagnosis.naming.presence import MISSING, TOLD
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.vehicle import Vehicle
 
-MISSING = 0.05  # prior probability that one effect is missing from a vehicle file: of 20 drones one
 EDGE = 0.99  # of the way to the furthest place on board, within which a load is
 LOOK_ALIKE = 0.05  # posterior probability from which another explanation is told as a look-alike
 Lack = Callable[[NDArray, Balance], NDArray]  # what an effect with these numbers moves of a balance

@@ -108,7 +108,8 @@ def pool_of(flights: Sequence[Flight], point: Point, wanted: Sequence[str] = ())
         if effect.needs == ACCELEROMETER_NEEDS:
             continue
         found = variants(effect, point, signals)
-        spreads = [effect.prior.usual_in(fact) for fact in facts]
+        never = {} if any(p.chosen for p in effect.parameters) else effect.prior.systematic
+        spreads = [{**never, **effect.prior.usual_in(fact)} for fact in facts]
         names = tuple(dict.fromkeys(n for s in spreads for n in s))
         if names:
             table = np.array([[s.get(n, 0.0) * share(effect, n, point) for n in names] for s in spreads])

@@ -22,7 +22,7 @@ def _of_real_rotors(names: str, size: float) -> Callable[[Logged], Sizes]:
 # N s/m, N s^2/m^2, within which no drag is known: an attitude 1 ms late is a force of 3e-4 N s/m along the quicker axis
 # of a figure 8 (mass * (3.1 rad/s)^2 * 1 ms); along z thrust is a little wrong.
 SYSTEMATIC = in_turn("x y z", 3e-4, 3e-4, 1e-3)
-LEAST = in_turn("x y z", 1e-3, 1e-3, 3e-3)  # N s/m, N s^2/m^2; along z thrust is a little wrong
+DETECTABLE = in_turn("x y z", 1e-3, 1e-3, 3e-3)  # N s/m, N s^2/m^2; along z thrust is a little wrong
 
 LINEAR_DRAG = Effect(
     "linear_drag",
@@ -32,7 +32,9 @@ LINEAR_DRAG = Effect(
     about=("drag",),
     external=linear_force,
     couples_air=True,
-    prior=Prior(alike("x y z", 0.012), _of_real_rotors("x y z", 0.02), systematic=SYSTEMATIC, least=LEAST),
+    prior=Prior(
+        alike("x y z", 0.012), _of_real_rotors("x y z", 0.02), systematic=SYSTEMATIC, detection_limit=DETECTABLE
+    ),
     most_per_mass=5.0,
     needs=("velocity", "position"),
     separates="fly straight legs of different speeds in opposite directions",
@@ -55,7 +57,7 @@ QUADRATIC_DRAG = Effect(
     about=("quadratic",),
     external=quadratic_force,
     couples_air=True,
-    prior=Prior(alike("x y z", 0.012), systematic=SYSTEMATIC, least=LEAST),
+    prior=Prior(alike("x y z", 0.012), systematic=SYSTEMATIC, detection_limit=DETECTABLE),
     most_per_mass=3.0,
     needs=("velocity", "position"),
     separates="fly straight legs at 0.5, 1 and 2 m/s: linear drag doubles with speed, this one goes up four times",
@@ -87,7 +89,7 @@ def _sampled(logged: Logged) -> Sizes:
     return in_turn("x y z", tilting, tilting, 1e-4 if logged.heavy_rotors else tilting)
 
 
-# N m s/m: least of a moment that tips the drone back from where it flies, as air on rotors above the centre of mass
+# N m s/m: smallest moment that tips the drone back from where it flies, as air on rotors above the centre of mass
 # does, and further towards there. Five of simulated drones with none were such about both axes, of 4e-6 to 1.2e-5: more
 # than that may be of a body below which the air finds more hold.
 BACK, ONWARD = 3e-6, 1.5e-5
@@ -104,7 +106,7 @@ VELOCITY_MOMENT = Effect(
     prior=Prior(
         alike("roll_per_vy pitch_per_vx", 4e-5),
         _of_real_rotors("roll_per_vy pitch_per_vx", 3e-4),
-        least={"roll_per_vy": (ONWARD, BACK), "pitch_per_vx": (BACK, ONWARD)},
+        detection_limit={"roll_per_vy": (ONWARD, BACK), "pitch_per_vx": (BACK, ONWARD)},
     ),
     needs=("velocity", "position"),
     separates="fly straight legs forward and back, then left and right, at 1 and 2 m/s, and hover between them",

@@ -53,7 +53,7 @@ INERTIA = Effect(
         _moments,
         dict.fromkeys(("xx", "yy", "zz"), "neutral"),
         together=0.9,  # what is heavy in one axis is so in the others
-        least=alike("xx yy zz", 0.08),
+        detection_limit=alike("xx yy zz", 0.08),
     ),
     alike=0.9,  # what is heavier about one axis is so about the others: they differ by a third of what they are more
     fast=True,
@@ -100,8 +100,8 @@ CENTER_OF_MASS = Effect(
     words="shift of the centre of mass",
     body=shifted,
     # own: a battery of a third of the weight, put in some millimetres off
-    # least: z shows in lateral accelerations of O alone
-    prior=Prior(alike("x y z", 1.5e-3), _placed, least=in_turn("x y z", 1e-4, 1e-4, 1e-3)),
+    # detection limit: z shows in lateral accelerations of O alone
+    prior=Prior(alike("x y z", 1.5e-3), _placed, detection_limit=in_turn("x y z", 1e-4, 1e-4, 1e-3)),
     separates=(
         "balance the drone on an edge, or log the accelerometer and yaw for 5 s at 2 Hz; for z fly hard sideways steps"
     ),

@@ -76,7 +76,9 @@ class Logged:
 
 
 Sizes = Mapping[str, float]  # parameter -> standard deviation
-Least = Mapping[str, float | tuple[float, float]]  # parameter -> departure from neutral: either way, or below and above
+Limits = Mapping[
+    str, float | tuple[float, float]
+]  # parameter -> departure from neutral: either way, or below and above
 
 
 @dataclass(frozen=True)
@@ -94,8 +96,8 @@ class Prior:
         each: whether several recordings that are fitted together have a deviation each.
         together: correlation of `own` between the parameters.
         systematic: within which a parameter is never known, whatever a fit says: what no scatter shows; SI.
-        least: departures that filters, the sampling of a log and the air of a room look like: less is no finding. Or
-            as a function of the choices (`Parameter.chosen`) and of what was logged.
+        detection_limit: departures that filters, the sampling of a log and the air of a room look like; less is no
+            finding. Or as a function of the choices (`Parameter.chosen`) and of what was logged.
         unnamed: stands for what no effect of the catalogue is: it competes, and is told as unexplained.
     """
 
@@ -108,7 +110,7 @@ class Prior:
     each: Callable[[Logged], bool] = lambda logged: False
     together: float = 0.0
     systematic: Sizes = field(default_factory=dict)
-    least: Least | Callable[[Mapping[str, Any], Logged], Least] = field(default_factory=dict)
+    detection_limit: Limits | Callable[[Mapping[str, Any], Logged], Limits] = field(default_factory=dict)
     unnamed: bool = False
 
     def usual_in(self, logged: Logged) -> Sizes:
@@ -119,10 +121,10 @@ class Prior:
         """Degrees of freedom, for a recording as it was logged."""
         return self.freedom(logged) if callable(self.freedom) else self.freedom
 
-    def least_in(self, chosen: Mapping[str, Any], logged: Logged) -> dict[str, tuple[float, float]]:
+    def detection_limit_in(self, chosen: Mapping[str, Any], logged: Logged) -> dict[str, tuple[float, float]]:
         """Parameter -> smallest departures below and above neutral that are a finding, in the units of `own`."""
-        least = self.least(chosen, logged) if callable(self.least) else self.least
-        return {n: size if isinstance(size, tuple) else (size, size) for n, size in least.items()}
+        limit = self.detection_limit(chosen, logged) if callable(self.detection_limit) else self.detection_limit
+        return {n: size if isinstance(size, tuple) else (size, size) for n, size in limit.items()}
 
     def share(self, name: str, *, mass: float, inertia: float, neutral: float) -> float:
         """What the sizes of a parameter are shares of, of a vehicle of that mass [kg] and inertia about x [kg m^2]; 1

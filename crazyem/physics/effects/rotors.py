@@ -54,12 +54,12 @@ THRUST_SCALE = Effect(
     gain="thrust",
     about=("thrust_per_speed2", "thrust_max", "mass"),
     rotors=scaled,
-    # least: two standard deviations of a day
+    # detection limit: two standard deviations of a day
     prior=Prior(
         own={"scale": 0.08},
         usual=_strength,
         each=lambda logged: logged.differs,
-        least=lambda chosen, logged: {n: 2.0 * sd for n, sd in _strength(logged).items()},
+        detection_limit=lambda chosen, logged: {n: 2.0 * sd for n, sd in _strength(logged).items()},
     ),
     separates="weigh the drone; without its weight thrust and mass are one number",
     lasting=True,
@@ -95,7 +95,7 @@ TORQUE_SCALE = Effect(
     gain="torque",
     about=("torque_per_thrust", "arm", "inertia"),
     turning=turned,
-    prior=Prior(own={"scale": 0.2}, usual=_torques, least={"scale": 0.08}),
+    prior=Prior(own={"scale": 0.2}, usual=_torques, detection_limit={"scale": 0.08}),
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum): torque over inertia is all that a flight shows",
     fast=True,
@@ -187,9 +187,9 @@ ROTOR_INERTIA = Effect(
     order=66,
     controllers=True,  # INDI: ctrlINDI.g2
     external=reaction,
-    # own: a bar of 0.3 g and 46 mm; a Crazyflie's propeller and rotor: a tenth of that, in no file. Least: a sixth of a
-    # rod of 0.1 g and 46 mm; no rotor is lighter.
-    prior=Prior(own={"inertia": 4e-8}, least={"inertia": 3e-9}),
+    # own: a bar of 0.3 g and 46 mm; a Crazyflie's propeller and rotor: a tenth of that, in no file. Detection limit: a
+    # sixth of a rod of 0.1 g and 46 mm; no rotor is lighter.
+    prior=Prior(own={"inertia": 4e-8}, detection_limit={"inertia": 3e-9}),
     needs=("body_rate", "attitude"),
     separates="yaw for 5 s at 2 Hz (spin-up), and roll while turning about yaw (gyroscope); weigh a propeller",
     fast=True,

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
-from crazyem.physics.effects.prior import Least, Logged, Prior, Sizes, alike, in_turn
+from crazyem.physics.effects.prior import Limits, Logged, Prior, Sizes, alike, in_turn
 from crazyem.physics.rotations import axes, quaternion_from_euler, rotation_vector_from_quaternion
 
 
@@ -74,7 +74,7 @@ def _jittery(logged: Logged) -> Sizes:
     )
 
 
-def _least_scale(chosen: Mapping[str, Any], logged: Logged) -> Least:
+def _scale_limit(chosen: Mapping[str, Any], logged: Logged) -> Limits:
     """Relative: more than jitter looks like, twice."""
     return in_turn("x y z", *np.maximum(2.0 * jitter(logged.speed, onboard=logged.onboard), 0.035))
 
@@ -86,7 +86,7 @@ ATTITUDE_MISALIGNMENT = Effect(
     _ANGLES,
     order=80,
     measured=tilted_pose,
-    prior=Prior(alike("roll pitch yaw", 0.04), _leaning, least=alike("roll pitch yaw", 2e-3)),
+    prior=Prior(alike("roll pitch yaw", 0.04), _leaning, detection_limit=alike("roll pitch yaw", 2e-3)),
     needs=("attitude",),
     separates="hover for 5 s at each of four headings: a tilted frame turns with the drone, wind stays in the world",
     lasting=True,
@@ -116,7 +116,7 @@ GYRO_BIAS = Effect(
         lambda logged: alike("x y z", 2.8e-3) if "body_rate" in logged.signals else {},
         each=lambda logged: True,
         systematic=alike("x y z", 4e-4),  # it walks
-        least=alike("x y z", 3e-3),
+        detection_limit=alike("x y z", 3e-3),
     ),
     needs=("body_rate",),
     belongs_to="recording",  # it drifts with the temperature
@@ -129,7 +129,7 @@ VELOCITY_SCALE = Effect(
     tuple(Parameter(axis, "", 1.0, 0.0, 3.0, 0.01) for axis in "xyz"),
     order=83,
     measured=scaled_velocity,
-    prior=Prior(alike("x y z", 0.12), _jittery, least=_least_scale),
+    prior=Prior(alike("x y z", 0.12), _jittery, detection_limit=_scale_limit),
     needs=("velocity",),
     words="velocity scale of the onboard estimate",
     belongs_to="recording",  # in a vehicle it cost 27 % of position error on other flights of the same drone

@@ -44,7 +44,7 @@ THRUST_CURVE = Effect(
         own={"slope_error": 0.25},
         usual=lambda logged: {"slope_error": 0.15} if logged.levelled else {},
         systematic={"slope_error": 0.02},  # slopes of drones with known ones came out so much too large
-        least={"slope_error": 0.06},
+        detection_limit={"slope_error": 0.06},
     ),
     separates="climb and sink hard with the same battery, or measure thrust over command on a stand",
     fast=True,

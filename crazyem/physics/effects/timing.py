@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
 from crazyem.physics.effects.onboard_estimate import attitude_error
-from crazyem.physics.effects.prior import Least, Logged, Prior, Sizes
+from crazyem.physics.effects.prior import Limits, Logged, Prior, Sizes
 from crazyem.physics.effects.stretches import stretches
 from crazyem.physics.lag import PREDICTION_ORDER, fit_predictor
 from crazyem.physics.rotations import rotation_between
@@ -95,7 +95,7 @@ MOTOR_LAG = Effect(
     constants={"time_constant": "lag"},
     about=("lag",),
     timing=slow,
-    prior=Prior(own={"time_constant": 0.015}, usual=_lag, least={"time_constant": 7.5e-3}),
+    prior=Prior(own={"time_constant": 0.015}, usual=_lag, detection_limit={"time_constant": 7.5e-3}),
     needs=("motor_command",),
     separates="log rotor speeds; or log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
     spared={"rotor_speed": "log rotor speeds; or "},
@@ -107,7 +107,7 @@ INPUT_DELAY = Effect(
     (Parameter("delay", "s", 0.0, 0.0, 0.1, 1e-3),),
     order=23,
     timing=late,
-    prior=Prior(own={"delay": 8e-3}, usual=_clock, signed=True, least={"delay": 4e-3}),
+    prior=Prior(own={"delay": 8e-3}, usual=_clock, signed=True, detection_limit={"delay": 4e-3}),
     needs=("motor_command", "rotor_speed"),
     separates="log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
     fast=True,
@@ -178,7 +178,7 @@ def _past_attitude(rotation: NDArray, row: NDArray, part: NDArray) -> NDArray:
     return rotation_between(rotation, shown)
 
 
-def _least_delay(chosen: Mapping[str, Any], logged: Logged) -> Least:
+def _delay_limit(chosen: Mapping[str, Any], logged: Logged) -> Limits:
     """s. Where no gyro was late, rates were 1.2 ms later than usual at most in 51 simulated flights. Velocities of a
     filter on board are 0.7 to 5.7 ms late anyway, in ten flights of five filters."""
     return {"delay": 2e-3 if chosen.get("streams") == ("gyro",) else 6e-3 if logged.onboard else 3e-3}
@@ -205,7 +205,7 @@ MEASUREMENT_DELAY = Effect(
     measured=shown_late,
     # systematic: how fast fixes draw an attitude back that is made of a late gyro is roughly known
     # (`onboard_estimate.py`); usual: see `onboard_filter`
-    prior=Prior(own={"delay": 0.012}, systematic={"delay": 1.5e-3}, least=_least_delay),
+    prior=Prior(own={"delay": 0.012}, systematic={"delay": 1.5e-3}, detection_limit=_delay_limit),
     needs=("position", "velocity", "attitude", "body_rate", "specific_force"),
     belongs_to="recording",
     separates="log the gyro and the pose at 100 Hz or more, and turn and stop sharply several times",
