@@ -216,3 +216,16 @@ def test_statistics_sum_to_the_counts():
     kernels.total(1, n, em.tape.stats, sums)
     assert sums[kernels.COUNT] == n - 1
     np.testing.assert_array_equal(sums[kernels.MEASURED : kernels.MEASURED + 4], 3 * (n - 1))
+
+
+def test_incremental_passes_come_close_to_the_converged_one():
+    """The last estimate on the way against finish(): same window, within a fraction of the standard deviation."""
+    flight = synthetic.fly(TRUTH, seed=7, duration=4.5)
+    estimator = OnlineEstimator(LAGGED, window=400)
+    last = None
+    for sample in synthetic.samples(flight):
+        last = estimator.feed(sample) or last
+    final = estimator.finish()
+    assert last is not None
+    for name in NAMES[:5]:
+        assert abs(last[name].value - final[name].value) < 0.3 * final[name].sd, name

@@ -220,6 +220,17 @@ def test_ground_before_and_after_a_flight_leaves_the_estimate_alone(flight, plai
         assert abs(final[name].value - reference[name].value) < 0.5 * reference[name].sd
 
 
+def test_commands_stamped_between_the_measurements(flight):
+    events = []
+    for row in range(0, len(flight.fine_time) - 10, 10):
+        t, y = flight.fine_time[row], flight.fine_y[row]
+        events += [Sample(n, t, tuple(y[c])) for n, c in synthetic.COLUMNS.items()]
+        events.append(Sample("wrench_command", flight.fine_time[row + 5], tuple(flight.fine_wrench[row + 5])))
+    _, final = ended(events)
+    for name, true in TRUE.items():
+        within(final, name, true)
+
+
 @pytest.mark.parametrize(("window", "every"), [(100, 7), (200, 10)])
 def test_window_and_every_are_settable(flight, window, every):
     estimator = OnlineEstimator(LAGGED, window=window, every=every)
