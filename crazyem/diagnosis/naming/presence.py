@@ -7,7 +7,7 @@ from scipy.special import expit, logit
 # Log-odds that a name is right: CONSTANT + HELD_OUT log(nats on flight held out) + FITTED log(1 + nats on the flight it
 # was fitted to, over how much more scores scatter than the model says), at most `CALIBRATED`. Models are approximate:
 # wrong names gain tens of nats, with a heavy tail, so odds grow with a power of what is gained and not with the nats.
-# By maximum likelihood from 98 names in 80 random and foreign worlds (seeds 8101, 9301, 9402).
+# By maximum likelihood from 98 names in 87 random and foreign worlds (seeds 8101, 9301, 9402).
 CONSTANT, HELD_OUT, FITTED, CALIBRATED = -3.0, 0.26, 0.52, 0.95
 LEAST_NATS = 0.5  # on flight held out: less is chance
 MISSING = 0.05  # prior probability that one effect is missing from a vehicle file: of 20 drones one
