@@ -233,14 +233,14 @@ def nanobench(shared: Path, work: Path) -> dict[str, Any]:
     train = [folder / f"{n}.csv.gz" for n in TRAIN]
     apart = [folder / f"{LEFT_OUT[0]}.csv.gz"]
     with_voltage = diagnose(work, "nanobench", train, apart, vehicle)
-    constrained_basis = diagnose(work, "nanobench_withheld", train, apart, vehicle, "--withhold", "pm.vbat")
+    withheld = diagnose(work, "nanobench_withheld", train, apart, vehicle, "--withhold", "pm.vbat")
     return {
         **with_voltage,
-        "withheld": constrained_basis,
+        "withheld": withheld,
         "before": judged(folder, str(vehicle)),
         "after": judged(folder, with_voltage["fitted"]),
         "withheld_before": judged(folder, str(vehicle), ["pm.vbat"]),
-        "withheld_after": judged(folder, constrained_basis["fitted"], ["pm.vbat"]),
+        "withheld_after": judged(folder, withheld["fitted"], ["pm.vbat"]),
     }
 
 

@@ -315,10 +315,10 @@ def _corroborated(
                 if nats > 0:
                     selection = exchanged(data, selection, candidate, other, [start])
             weak = candidate.effect == WEAK_OR_MISREAD[0]
-            misread = nats is not None and (nats > TELLING if weak else nats < 0)
-            if nats is not None and misread:
+            for_sensor = (nats or 0.0) if weak else -(nats or 0.0)
+            if for_sensor > (TELLING if weak else 0.0):
                 # a healthy rotor turns as a weak one does: what commands say against that they say for the sensor
-                selection = selection.with_evidence(other if weak else candidate, abs(nats))
+                selection = selection.with_evidence(other if weak else candidate, for_sensor)
     return selection, frozenset(witnessed)
 
 

@@ -81,13 +81,14 @@ def test_what_commands_say_counts_for_a_sensor_that_counts_wrong(recording: Reco
     assert (one.candidate.effect, one.log_odds) == ("rotor_sensor", None)
     expected = false_speed([shown], 2, scale, DRONE.motor_time_constant)
     assert expected is not None
-    assert one.other_nats == pytest.approx(expected)
-    assert one.presence == pytest.approx(expit(logit(presence(20.0, 20.0)) + expected)) or one.presence == CALIBRATED
+    assert one.other_evidence == pytest.approx(expected)
+    assert one.presence == pytest.approx(min(CALIBRATED, expit(logit(presence(20.0, 20.0)) + expected)))
+    assert replace(one, other_evidence=0.5).presence == pytest.approx(expit(logit(presence(20.0, 20.0)) + 0.5))
     assert found.steps[0].alike == ()
     assert witnessed == {"rotor_fault", "rotor_sensor"}
     healthy, _ = _corroborated(data, None, selection, [with_speeds(recording, (1.0, 1.0, 1.0, 1.0))])
     assert healthy.steps[0].taken is not None
-    assert healthy.steps[0].taken.other_nats == 0.0
+    assert healthy.steps[0].taken.other_evidence == 0.0
 
 
 def felt(recording: Recording, late: float, shaken: float = 1.0) -> Recording:

@@ -20,7 +20,7 @@ from crazyem.diagnosis.naming.select import shortlist, with_started
 from crazyem.diagnosis.naming.trials import LIKELY, SURE, Step, Trial, significance
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
-from crazyem.physics.effects.prior import Logged
+from crazyem.physics.effects.prior import Conditions
 
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
 TAKEN = Step((), Trial(DRAG, gain=30.0, held_out=20.0, dispersion=2.0, p_value=1e-6, evidence=12.0))
@@ -252,7 +252,7 @@ def test_a_ground_effect_that_does_not_fade_is_thrust_that_is_a_little_wrong():
 def test_a_scale_of_velocities_must_be_more_than_the_jitter_of_the_estimate():
     """20 % of the 7 mm/s of a hover are 1 mm/s, and any onboard estimate is as wrong; 20 % of 0.7 m/s are more."""
     for speed, counts in ((0.005, False), (0.5, True)):
-        facts = Logged(speed=np.full(3, speed), onboard=False)
+        facts = Conditions(speed=np.full(3, speed), onboard=False)
         least = CATALOGUE["velocity_scale"].prior.detection_limit_in({}, facts)
         assert (least["x"][1] < 1.2 - 1.0) == counts
 

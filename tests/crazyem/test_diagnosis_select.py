@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from closed_loop import DRONE, Hidden, fly
 
-from crazyem.diagnosis.fitting import logged as facts
+from crazyem.diagnosis.fitting import conditions as facts
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, remembering, remembering_anew
 from crazyem.diagnosis.fitting.model import Point

@@ -111,7 +111,7 @@ def test_commands_that_are_faster_than_their_sampling_say_nothing_of_inertia(whi
     assert of_a_real_drone(data.flights, TRIMMED) is TRIMMED
     candidates, _ = candidates_for(point, flight.signals, measured_speeds=False)
     left, reasons = abstained(data, point, candidates, {"gusts": "why not"})
-    assert ({c.effect for c in left} & {n for n, e in CATALOGUE.items() if e.fast} == set()) is coarse
+    assert ({c.effect for c in left} & {n for n, e in CATALOGUE.items() if e.needs_fast_commands} == set()) is coarse
     assert ("inertia" in reasons) is coarse
     load = next(c for c in left if c.effect == "payload")
     assert load.free == (("mass", "x", "y") if coarse else ("mass", "x", "y", "z"))  # no torque tells its height

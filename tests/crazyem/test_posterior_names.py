@@ -7,7 +7,7 @@ import pytest
 
 import crazyem.diagnosis.posterior as package
 from crazyem.physics.effects.catalogue import CATALOGUE
-from crazyem.physics.effects.prior import Logged
+from crazyem.physics.effects.prior import Conditions
 
 FILES = sorted(Path(package.__file__).parent.glob("*.py"))
 LONGEST = 1620  # lines of the package
@@ -38,8 +38,8 @@ def test_every_effect_says_how_large_it_is(name: str) -> None:
     effect = CATALOGUE[name]
     known = {p.name: p for p in effect.parameters}
     everything = frozenset({"position", "velocity", "attitude", "body_rate", "motor_command"})
-    usual = effect.prior.usual_in(Logged(signals=everything, arm=(0.03, 0.03)))
-    assert effect.prior.own or usual or effect.prior.usual_in(Logged(filed=frozenset({"trim"})))
+    usual = effect.prior.usual_in(Conditions(signals=everything, arm=(0.03, 0.03)))
+    assert effect.prior.own or usual or effect.prior.usual_in(Conditions(file_effects=frozenset({"trim"})))
     for sizes in (effect.prior.own, usual):
         assert set(sizes) <= set(known)
         assert all(size > 0.0 for size in sizes.values())

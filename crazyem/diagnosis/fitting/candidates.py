@@ -17,7 +17,7 @@ ON_BOARD = 0.04  # m from the middle of the rotors: no part of a Crazyflie is fu
 STRONGEST = 1.1  # a worn, cut or bent propeller pulls less than the others; a new one among worn ones a little more,
 NO_STRONGER = 1.0  # and none gets stronger in flight
 # By gusts.py, accelerometer.py, place_rivals.py; `nuisances` has other inertias and delays for sampled commands.
-JUDGED_ALONE = ("gusts", "accelerometer_misalignment", "force_by_place", "sampled_commands")
+OTHER_LIKELIHOOD = ("gusts", "accelerometer_misalignment", "force_by_place", "sampled_commands")
 TRIM = "trim"
 ASKED = (TRIM,)  # looked for only if asked for: near every effect that brings a steady torque
 
@@ -182,7 +182,7 @@ def candidates_for(
         reason = impossible(effect, signals, measured_speeds)
         if reason:
             left_out[name] = reason
-        elif (effect.prior.own and name not in JUDGED_ALONE) or (name in ASKED and name in wanted):
+        elif (effect.prior.own and name not in OTHER_LIKELIHOOD) or (name in ASKED and name in wanted):
             found += variants(effect, point, signals)
     return found, left_out
 

@@ -5,10 +5,10 @@ effect `trim`.
 """
 
 from crazyem.physics.effects.catalogue import CATALOGUE
-from crazyem.physics.effects.prior import Logged
+from crazyem.physics.effects.prior import Conditions
 from crazyem.vehicle import Vehicle
 
-_TRIM, _REAL = CATALOGUE["trim"].prior, Logged(filed=frozenset({"trim"}))
+_TRIM, _REAL = CATALOGUE["trim"].prior, Conditions(file_effects=frozenset({"trim"}))
 TRIM_SD = tuple(_TRIM.usual_in(_REAL).values())  # m, torque over thrust about x, y, z
 THRUST_SD = CATALOGUE["thrust_scale"].prior.usual_in(_REAL)["scale"]  # relative
 # Flights that the spread of other drones is worth beside a drone's own: the two drones of CrazyPAD differ by a factor

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from crazyem.diagnosis.fitting.candidates import JUDGED_ALONE, TRIM, Candidate, of_recordings
+from crazyem.diagnosis.fitting.candidates import OTHER_LIKELIHOOD, TRIM, Candidate, of_recordings
+from crazyem.diagnosis.fitting.conditions import conditions_of
 from crazyem.diagnosis.fitting.days import trim_known
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, refine, remembering, remembering_anew
 from crazyem.diagnosis.fitting.gram import Solution, used
-from crazyem.diagnosis.fitting.logged import logged
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.sampling import coarsely_sampled
 from crazyem.diagnosis.flights.flight import Flight
@@ -22,7 +22,7 @@ from crazyem.vehicle import GRAVITY, Vehicle
 # s: fits find the rotors' lag off all the same: in sixteen more flights with nothing hidden 47 to 55 ms, 3.1 ms (rms),
 # with inertias 3 % too small for each ms too long where the drone turns little.
 LAG_OFF = 3e-3
-# Relative, about z: with heavy rotors (`Logged.heavy_rotors`) their own inertia is as sure as that of yaw.
+# Relative, about z: with heavy rotors (`Conditions.heavy_rotors`) their own inertia is as sure as that of yaw.
 AT_ONCE_SD = 0.25
 # A drag is free beside any effect that is tried, of real drones. It is named all the same where it explains more than
 # none of it.
@@ -57,11 +57,11 @@ Nuisances = list[tuple[Candidate, tuple[float, ...]]]  # with the precision of e
 
 def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisances:
     """What is always free, with the precisions of its priors about neutral: the usual deviations of every effect."""
-    facts = logged(data.flights, point)
+    facts = conditions_of(data.flights, point)
     found: Nuisances = []
     for effect in CATALOGUE.values():
         prior, sizes = effect.prior, effect.prior.usual_in(facts)
-        if not sizes or effect.name in JUDGED_ALONE:
+        if not sizes or effect.name in OTHER_LIKELIHOOD:
             continue
         if prior.each(facts):
             candidate: Candidate = of_recordings(effect.name, tuple(sizes), data.flights)
@@ -115,15 +115,21 @@ def abstained(
         gone |= {c.effect: LEVEL_REASON for c in candidates if c.effect in HEAVY_OR_STRONG}
     if coarsely_sampled(data.flights, point.vehicle):
         # torques on another clock say nothing; how thrust goes with the command, and how late, shows in forces
-        gone |= {c.effect: COARSE_REASON for c in candidates if _unheard(CATALOGUE[c.effect], apart=data.coarse)}
+        gone |= {
+            c.effect: COARSE_REASON
+            for c in candidates
+            if _beyond_sampling(CATALOGUE[c.effect], other_clock=data.coarse)
+        }
         candidates = [replace(c, free=_without_height(c)) for c in candidates]
     return [c for c in candidates if c.effect not in gone], {**left_out, **gone}
 
 
-def _unheard(effect: Effect, *, apart: bool) -> bool:
-    """Whether commands that are faster than their sampling, or on another clock (`apart`), say nothing of an effect."""
+def _beyond_sampling(effect: Effect, *, other_clock: bool) -> bool:
+    """Whether coarsely sampled commands, or commands of another clock, say nothing of an effect."""
     before_rotors = effect.commanded is not None or effect.timing is not None
-    return (effect.fast and not (apart and before_rotors)) or (apart and effect.name in OFF_THE_MIDDLE)
+    if not other_clock:
+        return effect.needs_fast_commands
+    return effect.name in OFF_THE_MIDDLE or (effect.needs_fast_commands and not before_rotors)
 
 
 def _without_height(candidate: Candidate) -> tuple[str, ...]:

@@ -93,17 +93,19 @@ def level_of(
 
 
 def _climbing(recording: Recording, begin: float, end: float) -> tuple[NDArray, NDArray]:
-    """Stamps (n,) s within a time, and the upward velocity there (n,) m/s; without a recorded one by the height."""
-    when, value = ordered(recording.signals["velocity" if "velocity" in recording.signals else "position"])
+    """Stamps (n,) s within a time, and the upward velocity there (n,) m/s; without a recorded one the slope of the
+    height at either end."""
+    shown = "velocity" if "velocity" in recording.signals else "position"
+    when, value = ordered(recording.signals[shown])
     seen = (when >= begin) & (when <= end) & np.isfinite(value[:, 2])
     at, upwards = when[seen], value[seen, 2]
-    if "velocity" in recording.signals or at.size < FEWEST_HEIGHTS:
-        return (at, upwards) if "velocity" in recording.signals else (at[:0], upwards[:0])
-    ends = at[0] + 0.5 * SLOPE, at[-1] - 0.5 * SLOPE
+    if shown == "velocity" or not at.size:
+        return at, upwards
+    ends = np.array([at[0] + 0.5 * SLOPE, at[-1] - 0.5 * SLOPE])
     near = [np.abs(at - e) <= 0.5 * SLOPE for e in ends]
     if ends[0] >= ends[1] or min(n.sum() for n in near) < FEWEST_HEIGHTS:
         return at[:0], upwards[:0]
-    return np.array(ends), np.array([np.polyfit(at[n] - e, upwards[n], 1)[0] for n, e in zip(near, ends, strict=True)])
+    return ends, np.array([np.polyfit(at[n] - e, upwards[n], 1)[0] for n, e in zip(near, ends, strict=True)])
 
 
 def _clear(recording: Recording, flight: Airtime) -> float:

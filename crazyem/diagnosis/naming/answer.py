@@ -150,7 +150,7 @@ def _against(remains: Unexplained, candidate: Candidate, data: Data) -> Unexplai
     """What speaks against a name of all that remains."""
     if data.coarse and candidate.effect not in BY_TORQUE:
         remains = remains.of_forces()  # where torques say nothing, what they leave says nothing against forces
-    if CATALOGUE[candidate.effect].lasting:
+    if CATALOGUE[candidate.effect].steady_force:
         return remains.without_random_rotor()
     if candidate.effect == WEAK_ROTOR:  # a propeller that is cut is out of balance as well
         return remains.without_random_rotor(int(dict(candidate.fixed)["rotor"]))

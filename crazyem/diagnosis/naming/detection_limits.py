@@ -5,13 +5,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.conditions import conditions_of
 from crazyem.diagnosis.fitting.days import day_sd
 from crazyem.diagnosis.fitting.fit import Data
-from crazyem.diagnosis.fitting.logged import logged
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import HANGING_SD, usual_wind
 from crazyem.physics.effects.catalogue import CATALOGUE
-from crazyem.physics.effects.prior import Logged
+from crazyem.physics.effects.prior import Conditions
 
 STEEP = 3.0  # vertical over horizontal wind
 HIGHEST = 1.0  # m: a floor is felt by some rotor radii, Crazyflies have 23 to 28 mm
@@ -19,8 +19,7 @@ LEAST_LOAD = 0.005  # of the drone's mass: what filters and sampling look like
 LEAST_SHIFT = 1e-4  # m, of the centre of mass
 DRAWN = 2.0  # standard deviations of the day's trim
 LIFTING = ("battery_sag", "payload", "thrust_curve", "thrust_scale")
-# Standard deviations to which a swing weighs a load: less is none, nor is, beside one, less thrust than that. Beside
-# payloads far off the middle 0.19 and 0.25 g on 0.14 m were told (2042/0084, 0317).
+# Standard deviations to which a swing weighs a load: less is none, nor is, beside one, less thrust than that.
 WEIGHED = 3.0
 
 
@@ -67,11 +66,11 @@ def _outweighs(point: Point, candidate: Candidate, data: Data) -> bool:
     return lifted > WEIGHED * HANGING_SD["mass"]
 
 
-def _facts(point: Point, data: Data | None) -> Logged:
+def _facts(point: Point, data: Data | None) -> Conditions:
     """What is known of the flights to which an effect was fitted."""
     if data is None or not data.flights:
-        return Logged(filed=frozenset(point.vehicle.effects), onboard=False, speed=np.full(3, np.inf))
-    return logged(data.flights, point)
+        return Conditions(file_effects=frozenset(point.vehicle.effects), onboard=False, speed=np.full(3, np.inf))
+    return conditions_of(data.flights, point)
 
 
 def matters(point: Point, candidate: Candidate, data: Data | None = None) -> bool:

@@ -46,7 +46,7 @@ class Trial:
         tuned: nats that it costs that its parameters might have been anything (`evidence.tuning`); None: one for each.
         log_odds: log posterior odds that it is there, where they are known (`steady_odds.py`); None: by `held_out`.
         size: parameters by what those odds are of.
-        other_nats: by which a signal speaks for it that the filter does not use.
+        other_evidence: by which a signal speaks for it that the filter does not use.
     """
 
     candidate: Candidate
@@ -62,7 +62,7 @@ class Trial:
     tuned: float | None = None
     log_odds: float | None = None
     size: Mapping[str, float] = field(default_factory=dict)
-    other_nats: float = 0.0
+    other_evidence: float = 0.0
 
     @property
     def presence(self) -> float:
@@ -70,7 +70,7 @@ class Trial:
         if self.log_odds is not None:
             return min(CALIBRATED, float(expit(self.log_odds)))
         there = presence(self.held_out, self.gain / self.dispersion)
-        return min(CALIBRATED, float(expit(logit(there) + self.other_nats)))
+        return min(CALIBRATED, float(expit(logit(there) + self.other_evidence)))
 
     @property
     def worth(self) -> float:
@@ -118,7 +118,7 @@ class Selection:
         steps = list(self.steps)
         for k, step in enumerate(steps):
             if step.taken is not None and step.taken.candidate.effect == candidate.effect:
-                steps[k] = replace(step, taken=replace(step.taken, other_nats=nats), alike=())
+                steps[k] = replace(step, taken=replace(step.taken, other_evidence=nats), alike=())
         return replace(self, steps=tuple(steps))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.logged import logged
+from crazyem.diagnosis.fitting.conditions import conditions_of
 from crazyem.diagnosis.fitting.model import Model, Point
 from crazyem.diagnosis.posterior.evidence import Gaussian, Pass, Posterior, Shared
 from crazyem.diagnosis.posterior.members import ACCELEROMETER_NEEDS, prior_odds
@@ -54,7 +54,7 @@ def _accelerometer_effect(effect: Effect, study: Study, fit: Fit) -> Acceleromet
         return None
     usual = []
     for data in fit.data:
-        sizes = effect.prior.usual_in(logged(data.flights, fit.points[0]))
+        sizes = effect.prior.usual_in(conditions_of(data.flights, fit.points[0]))
         usual.append([*(sizes.get(n, 0.0) for n in names), BIAS_SD, BIAS_SD, BIAS_SD, LAG_SD])
     known = [p for p in passes if p is not None]
     shared = Shared(known, np.array(usual))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.candidates import Candidate, impossible, variants
-from crazyem.diagnosis.fitting.logged import logged
+from crazyem.diagnosis.fitting.conditions import conditions_of
 from crazyem.diagnosis.fitting.model import Column, Point
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.posterior.evidence import Gaussian
@@ -90,7 +90,7 @@ class Pool:
 def pool_of(flights: Sequence[Flight], point: Point, wanted: Sequence[str] = ()) -> Pool:
     """What flights may ask for."""
     signals = frozenset.intersection(*(f.signals for f in flights))
-    facts = [logged([f], point) for f in flights]
+    facts = [conditions_of([f], point) for f in flights]
     measured = flights[0].inputs.measured
     members: list[Member] = []
     looks: list[Member] = []

@@ -24,7 +24,7 @@ from crazyem.diagnosis.posterior.settings import SETTINGS
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effect
-from crazyem.physics.effects.prior import Logged
+from crazyem.physics.effects.prior import Conditions
 from crazyem.vehicle import Vehicle
 
 FORCES = (0, 1, 2)  # of the disturbances
@@ -108,7 +108,7 @@ class Study:
         """m/s^2: the spread of a force with memory that is usual."""
         assert effect.random is not None
         one = effect.random(np.ones(6), SETTINGS.correlation_time, mass=point.vehicle.mass, drag=float("nan"))
-        return effect.prior.usual_in(Logged())[effect.amplitude] / one[effect.amplitude]
+        return effect.prior.usual_in(Conditions())[effect.amplitude] / one[effect.amplitude]
 
     def _moving(self, point: Point) -> Point:
         """With a force that has a memory as part of the noise, as every flight has."""

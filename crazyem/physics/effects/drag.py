@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
-from crazyem.physics.effects.prior import Logged, Prior, Sizes, alike, in_turn
+from crazyem.physics.effects.prior import Conditions, Prior, Sizes, alike, in_turn
 
 
 def linear_force(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
@@ -14,9 +14,9 @@ def linear_force(situation: Situation, body: Body, *, x: float, y: float, z: flo
     return Wrench(-np.array([x, y, z]) * situation.airspeed, np.zeros((situation.size, 3)))
 
 
-def _of_real_rotors(names: str, size: float) -> Callable[[Logged], Sizes]:
+def _of_real_rotors(names: str, size: float) -> Callable[[Conditions], Sizes]:
     """Real rotors have drag and flapping, bare rigid bodies of files neither."""
-    return lambda logged: alike(names, size) if logged.dated else {}
+    return lambda conditions: alike(names, size) if conditions.own_file else {}
 
 
 # N s/m, N s^2/m^2, within which no drag is known: an attitude 1 ms late is a force of 3e-4 N s/m along the quicker axis
@@ -38,7 +38,7 @@ LINEAR_DRAG = Effect(
     most_per_mass=5.0,
     needs=("velocity", "position"),
     separates="fly straight legs of different speeds in opposite directions",
-    lasting=True,
+    steady_force=True,
 )
 
 
@@ -61,7 +61,7 @@ QUADRATIC_DRAG = Effect(
     most_per_mass=3.0,
     needs=("velocity", "position"),
     separates="fly straight legs at 0.5, 1 and 2 m/s: linear drag doubles with speed, this one goes up four times",
-    lasting=True,
+    steady_force=True,
 )
 
 
@@ -79,14 +79,14 @@ def damping(situation: Situation, body: Body, *, x: float, y: float, z: float) -
     return Wrench(np.zeros((situation.size, 3)), -np.array([x, y, z]) * situation.body_rate)
 
 
-def _sampled(logged: Logged) -> Sizes:
+def _sampled(conditions: Conditions) -> Sizes:
     """N m s: what is sent between two logged commands looks like a damping. Speeds logged at 100 Hz: of 1 to 11e-6 in
     quick flights of 11 drones with nothing hidden. With heavy rotors: about z of 1e-5 to 1.9e-4 in 11 flights."""
-    if not logged.turning or not (logged.unheard or logged.measured or logged.heavy_rotors or logged.unlogged > 0.0):
+    usual = 6e-6 if conditions.measured_speeds or conditions.heavy_rotors else 0.0
+    tilting = 3e-4 if conditions.coarse_commands else math.hypot(usual, 3e-4 * conditions.unlogged_share)
+    if not conditions.shows_rotation or tilting == 0.0:
         return {}
-    usual = 6e-6 if logged.measured or logged.heavy_rotors else 0.0
-    tilting = 3e-4 if logged.unheard else math.hypot(usual, 3e-4 * logged.unlogged)
-    return in_turn("x y z", tilting, tilting, 1e-4 if logged.heavy_rotors else tilting)
+    return in_turn("x y z", tilting, tilting, 1e-4 if conditions.heavy_rotors else tilting)
 
 
 # N m s/m: smallest moment that tips the drone back from where it flies, as air on rotors above the centre of mass
@@ -125,5 +125,5 @@ RATE_DAMPING = Effect(
         "turn at several steady yaw rates; and step roll and pitch with the gyro logged at 500 Hz or more (a lag shows"
         " in the first 50 ms, damping throughout)"
     ),
-    fast=True,
+    needs_fast_commands=True,
 )

@@ -233,8 +233,8 @@ class Effect:
         belongs_to: "vehicle", or "recording" where each recording has its own: what a sensor or a filter on board shows
             on that day, which no vehicle file is to have.
         prior: how large its parameters are.
-        fast: told by torques from sample to sample, of which commands that are faster than their sampling say nothing.
-        lasting: told by forces that last, which no torque at random looks like.
+        needs_fast_commands: told by torques from sample to sample, of which coarsely sampled commands say nothing.
+        steady_force: told by forces that last, which no torque at random looks like.
         most_per_mass: of a parameter over the drone's mass, in its unit over kg: more is something else.
         random: (spread (6,) m/s^2 and rad/s^2, body axes, and memory s of a disturbance; mass kg; drag N s/m, NaN where
             unknown) -> parameters: of an effect that is a random process and adds nothing to the mean motion.
@@ -273,8 +273,8 @@ class Effect:
     words: str = ""
     belongs_to: str = "vehicle"
     prior: Prior = field(default_factory=Prior)
-    fast: bool = False
-    lasting: bool = False
+    needs_fast_commands: bool = False
+    steady_force: bool = False
     most_per_mass: float = math.inf
     random: Callable[..., dict[str, float]] | None = None
     gain: str = ""

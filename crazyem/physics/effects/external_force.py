@@ -41,7 +41,7 @@ WIND = Effect(
     prior=Prior(in_turn("x y z", 2.0, 2.0, 0.7)),
     needs=("velocity", "position"),  # a force that goes on moves the drone; an accelerometer alone is only tilted by it
     separates="hover for 5 s at each of four headings: wind stays in the world, a tilted frame turns with the drone",
-    lasting=True,
+    steady_force=True,
 )
 
 GUSTS = Effect(

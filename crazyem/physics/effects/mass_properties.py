@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter
-from crazyem.physics.effects.prior import Logged, Prior, Sizes, alike, in_turn
+from crazyem.physics.effects.prior import Conditions, Prior, Sizes, alike, in_turn
 
 
 def diagonal(body: Body, *, xx: float, yy: float, zz: float) -> Body:
@@ -25,17 +25,17 @@ def products(body: Body, *, xy: float, xz: float, yz: float) -> Body:
     return replace(body, inertia=inertia)
 
 
-def _moments(logged: Logged) -> Sizes:
+def _moments(conditions: Conditions) -> Sizes:
     """Relative. In 76 flights of known torques over inertias their differences scatter by 1.2 % between roll and pitch
     and by 2.0 % to yaw beyond what fits say of themselves (figures 8 by 2.1 and 3.0 %, shakes by 0.5 and 1.3 %).
 
     Commands that are faster than their sampling say nothing of it. With heavy rotors yaw looks too heavy by 20 to 40 %.
     """
-    if not logged.turning:
+    if not conditions.shows_rotation:
         return {}
-    sampled = 1.0 if logged.unheard else logged.unlogged
+    sampled = 1.0 if conditions.coarse_commands else conditions.unlogged_share
     x, y, z = (math.hypot(share, sampled) for share in (0.01, 0.01, 0.02))
-    return in_turn("xx yy zz", x, y, 0.25 if logged.heavy_rotors else z)
+    return in_turn("xx yy zz", x, y, 0.25 if conditions.heavy_rotors else z)
 
 
 INERTIA = Effect(
@@ -56,7 +56,7 @@ INERTIA = Effect(
         detection_limit=alike("xx yy zz", 0.08),
     ),
     alike=0.9,  # what is heavier about one axis is so about the others: they differ by a third of what they are more
-    fast=True,
+    needs_fast_commands=True,
 )
 
 INERTIA_PRODUCTS = Effect(
@@ -69,7 +69,7 @@ INERTIA_PRODUCTS = Effect(
     needs=("body_rate", "attitude"),
     separates="excite one axis at a time: roll, pitch and yaw for 5 s each at 2 Hz",
     prior=Prior(alike("xy xz yz", 0.15), per=dict.fromkeys(("xy", "xz", "yz"), "inertia")),
-    fast=True,
+    needs_fast_commands=True,
 )
 
 
@@ -78,16 +78,16 @@ def shifted(body: Body, *, x: float, y: float, z: float) -> Body:
     return replace(body, centre=np.array([x, y, z]))
 
 
-def _placed(logged: Logged) -> Sizes:
+def _placed(conditions: Conditions) -> Sizes:
     """m; a height of -0.4 to -0.8 mm is what velocities of onboard filters look like.
 
     Of commands on another clock no shift is asked, but they trim the drone all the same: one rotor weaker by a tenth is
     a torque per thrust of a twentieth of the arm. Taken for none, it was a wind (by the moment of its flow).
     """
-    if not logged.turning or "velocity" not in logged.signals:
+    if not conditions.shows_rotation or "velocity" not in conditions.signals:
         return {}
-    trimmed = logged.apart and not logged.dated
-    level = [max(0.05 * arm, 2e-5) if trimmed else 2e-5 for arm in logged.arm]
+    trimmed = conditions.other_clock and not conditions.own_file
+    level = [max(0.05 * arm, 2e-5) if trimmed else 2e-5 for arm in conditions.arm]
     return in_turn("x y z", *level, 7e-4)
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from crazyem.compiled import compiled
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
-from crazyem.physics.effects.prior import Logged, Prior, Sizes
+from crazyem.physics.effects.prior import Conditions, Prior, Sizes
 from crazyem.physics.effects.stretches import stretches
 from crazyem.vehicle import GRAVITY
 
@@ -126,7 +126,7 @@ def filtered(
     return offset
 
 
-def _lags(logged: Logged) -> Sizes:
+def _lags(conditions: Conditions) -> Sizes:
     """s: rates behind the attitude, velocities behind the position, by the filters of the firmware.
 
     In 80 flights with nothing hidden 0.0 to 2.4 and 0.0 to 1.6 ms, most in quick ones; of velocities that a filter on
@@ -134,11 +134,11 @@ def _lags(logged: Logged) -> Sizes:
     the drag: within 0.17 to 0.36 s in nine simulated flights, by the rate and the noise of the fixes. A filter that
     knows all forces has none of that error.
     """
-    if not {"attitude", "position"} & logged.signals:
+    if not {"attitude", "position"} & conditions.signals:
         return {}
-    made = logged.onboard and {"velocity", "position"} <= logged.signals
-    found = {"rate_lag": 0.7e-3} if "body_rate" in logged.signals else {}
-    found |= {"velocity_lag": 2e-3 if made else 0.7e-3} if "velocity" in logged.signals else {}
+    made = conditions.onboard and {"velocity", "position"} <= conditions.signals
+    found = {"rate_lag": 0.7e-3} if "body_rate" in conditions.signals else {}
+    found |= {"velocity_lag": 2e-3 if made else 0.7e-3} if "velocity" in conditions.signals else {}
     return found | ({"lateral_time_constant": 0.2} if made and found else {})
 
 

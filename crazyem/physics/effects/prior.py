@@ -19,66 +19,65 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
-class Logged:
+class Conditions:
     """What the usual spread of a recording depends on.
 
     Attributes:
         signals: that were recorded.
-        measured: rotor speeds were measured; else commands are all that is known of the rotors.
+        measured_speeds: rotor speeds were measured; else commands are all that is known of the rotors.
         onboard: pose and velocity come from a filter on board.
-        turned: an attitude shows that was made from other signals.
-        levelled: no voltage was recorded, and that of the flight's own beginning is taken for all of it.
-        differs: one of several recordings, each with a battery of its own.
-        filed: names of the effects that the vehicle file has.
+        inferred_attitude: an attitude shows that was made from other signals.
+        no_voltage: no voltage was recorded, and that of the flight's own beginning is taken for all of it.
+        own_battery: one of several recordings, each with a battery of its own.
+        file_effects: names of the effects that the vehicle file has.
         arm: (2,) m of the rotors. lag: s of the rotors.
         days: by how much thrust (relative) and torque over thrust about x, y, z [m] differ from day to day, and degrees
             of freedom of their distribution; None: as other drones do.
         speed: (3,) m/s, root mean square of the velocity, world axes.
         period: s between commands (or speeds) of the rotors, as a model uses them.
-        unlogged: 0 to 1, by how much commands that were sent between the logged ones may falsify torques, relative.
-        unheard: what turned the drone is not in the commands as recorded: faster than their sampling, or another clock.
-        apart: the commands are on another clock.
+        unlogged_share: 0 to 1, by how much commands between the logged ones may falsify torques, relative.
+        coarse_commands: what turned the drone is not in the commands: faster than their sampling, or `other_clock`.
+        other_clock: the commands are on another clock.
         rotor_inertia: kg m^2, gyro_bias: rad/s; of the model.
     """
 
     signals: frozenset[str] = frozenset()
-    measured: bool = False
+    measured_speeds: bool = False
     onboard: bool = True
-    turned: bool = False
-    levelled: bool = False
-    differs: bool = False
-    filed: frozenset[str] = frozenset()
+    inferred_attitude: bool = False
+    no_voltage: bool = False
+    own_battery: bool = False
+    file_effects: frozenset[str] = frozenset()
     arm: tuple[float, float] = (0.0, 0.0)
     lag: float = 0.05
     days: tuple[float, float, float, float, float] | None = None
     speed: NDArray = field(default_factory=lambda: np.ones(3))
     period: float = 0.01
-    unlogged: float = 0.0
-    unheard: bool = False
-    apart: bool = False
+    unlogged_share: float = 0.0
+    coarse_commands: bool = False
+    other_clock: bool = False
     rotor_inertia: float = 0.0
     gyro_bias: float = 0.0
 
     @property
-    def dated(self) -> bool:
+    def own_file(self) -> bool:
         """Whether the vehicle file holds the trim of another day: it is the file of one drone, not of its kind."""
-        return "trim" in self.filed
+        return "trim" in self.file_effects
 
     @property
-    def turning(self) -> bool:
+    def shows_rotation(self) -> bool:
         """Whether the turning of the drone shows."""
         return bool({"body_rate", "attitude"} & self.signals)
 
     @property
     def heavy_rotors(self) -> bool:
         """Rotors that are heavy answer with torque at once, without the lag that hides what sampled commands miss."""
-        return not self.unheard and not self.measured and self.rotor_inertia > 0.0
+        return not self.coarse_commands and not self.measured_speeds and self.rotor_inertia > 0.0
 
 
 Sizes = Mapping[str, float]  # parameter -> standard deviation
-Limits = Mapping[
-    str, float | tuple[float, float]
-]  # parameter -> departure from neutral: either way, or below and above
+# parameter -> departure from neutral: either way, or below and above
+Limits = Mapping[str, float | tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ class Prior:
 
     Attributes:
         own: where the effect is missing; empty: nobody asks for it.
-        usual: from recording to recording; or as a function of what was logged.
+        usual: from recording to recording; or as a function of what was conditions.
         per: what the sizes of a parameter are shares of: "mass" or "inertia" (about x) of the vehicle, or
             "neutral", the parameter's own neutral value; SI where absent.
         centre: what recordings have on average anyway, where that is not neutral.
@@ -97,33 +96,33 @@ class Prior:
         together: correlation of `own` between the parameters.
         systematic: within which a parameter is never known, whatever a fit says: what no scatter shows; SI.
         detection_limit: departures that filters, the sampling of a log and the air of a room look like; less is no
-            finding. Or as a function of the choices (`Parameter.chosen`) and of what was logged.
+            finding. Or as a function of the choices (`Parameter.chosen`) and of what was conditions.
         unnamed: stands for what no effect of the catalogue is: it competes, and is told as unexplained.
     """
 
     own: Sizes = field(default_factory=dict)
-    usual: Sizes | Callable[[Logged], Sizes] = field(default_factory=dict)
+    usual: Sizes | Callable[[Conditions], Sizes] = field(default_factory=dict)
     per: Mapping[str, str] = field(default_factory=dict)
     centre: Sizes = field(default_factory=dict)
-    freedom: float | Callable[[Logged], float] = math.inf
+    freedom: float | Callable[[Conditions], float] = math.inf
     signed: bool = False
-    each: Callable[[Logged], bool] = lambda logged: False
+    each: Callable[[Conditions], bool] = lambda conditions: False
     together: float = 0.0
     systematic: Sizes = field(default_factory=dict)
-    detection_limit: Limits | Callable[[Mapping[str, Any], Logged], Limits] = field(default_factory=dict)
+    detection_limit: Limits | Callable[[Mapping[str, Any], Conditions], Limits] = field(default_factory=dict)
     unnamed: bool = False
 
-    def usual_in(self, logged: Logged) -> Sizes:
-        """From recording to recording, for one as it was logged."""
-        return self.usual(logged) if callable(self.usual) else self.usual
+    def usual_in(self, conditions: Conditions) -> Sizes:
+        """From recording to recording, for one as it was conditions."""
+        return self.usual(conditions) if callable(self.usual) else self.usual
 
-    def freedom_in(self, logged: Logged) -> float:
-        """Degrees of freedom, for a recording as it was logged."""
-        return self.freedom(logged) if callable(self.freedom) else self.freedom
+    def freedom_in(self, conditions: Conditions) -> float:
+        """Degrees of freedom, for a recording as it was conditions."""
+        return self.freedom(conditions) if callable(self.freedom) else self.freedom
 
-    def detection_limit_in(self, chosen: Mapping[str, Any], logged: Logged) -> dict[str, tuple[float, float]]:
+    def detection_limit_in(self, chosen: Mapping[str, Any], conditions: Conditions) -> dict[str, tuple[float, float]]:
         """Parameter -> smallest departures below and above neutral that are a finding, in the units of `own`."""
-        limit = self.detection_limit(chosen, logged) if callable(self.detection_limit) else self.detection_limit
+        limit = self.detection_limit(chosen, conditions) if callable(self.detection_limit) else self.detection_limit
         return {n: size if isinstance(size, tuple) else (size, size) for n, size in limit.items()}
 
     def share(self, name: str, *, mass: float, inertia: float, neutral: float) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
-from crazyem.physics.effects.prior import Logged, Prior, Sizes, in_turn
+from crazyem.physics.effects.prior import Conditions, Prior, Sizes, in_turn
 
 
 def scaled(situation: Situation, *, scale: float) -> NDArray:
@@ -39,12 +39,14 @@ def turned(torque: NDArray, *, scale: float) -> NDArray:
     return torque * scale
 
 
-def _strength(logged: Logged) -> Sizes:
+def _strength(conditions: Conditions) -> Sizes:
     """From day to day: batteries are put in again, propellers bend (docs/results/diagnosis_real.md).
 
     Of several recordings of any drone each has its own: one number for all would make it heed commands less.
     """
-    return {"scale": logged.days[0] if logged.days else 0.02} if logged.differs or logged.dated else {}
+    if not (conditions.own_battery or conditions.own_file):
+        return {}
+    return {"scale": conditions.days[0] if conditions.days else 0.02}
 
 
 THRUST_SCALE = Effect(
@@ -58,11 +60,11 @@ THRUST_SCALE = Effect(
     prior=Prior(
         own={"scale": 0.08},
         usual=_strength,
-        each=lambda logged: logged.differs,
-        detection_limit=lambda chosen, logged: {n: 2.0 * sd for n, sd in _strength(logged).items()},
+        each=lambda conditions: conditions.own_battery,
+        detection_limit=lambda chosen, conditions: {n: 2.0 * sd for n, sd in _strength(conditions).items()},
     ),
     separates="weigh the drone; without its weight thrust and mass are one number",
-    lasting=True,
+    steady_force=True,
 )
 
 ROTOR_FAULT = Effect(
@@ -82,10 +84,10 @@ ROTOR_FAULT = Effect(
 )
 
 
-def _torques(logged: Logged) -> Sizes:
+def _torques(conditions: Conditions) -> Sizes:
     """Relative: in ten flights with nothing hidden, with the lag free, torques look 2 +- 2 % too strong (-0.5 to +4 %);
     a longer lag with more torque is nearly the same to a loop whose commands are sampled."""
-    return {"scale": 0.03} if logged.turning and not logged.unheard else {}
+    return {"scale": 0.03} if conditions.shows_rotation and not conditions.coarse_commands else {}
 
 
 TORQUE_SCALE = Effect(
@@ -98,7 +100,7 @@ TORQUE_SCALE = Effect(
     prior=Prior(own={"scale": 0.2}, usual=_torques, detection_limit={"scale": 0.08}),
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum): torque over inertia is all that a flight shows",
-    fast=True,
+    needs_fast_commands=True,
 )
 
 
@@ -121,7 +123,7 @@ GROUND_EFFECT = Effect(
     nudge={"strength": 0.02},
     amplitude="strength",
     beginnings={"height": (0.03, 0.1, 0.3)},
-    lasting=True,
+    steady_force=True,
 )
 
 
@@ -131,14 +133,16 @@ def trimmed(situation: Situation, body: Body, *, x: float, y: float, z: float) -
     return Wrench(np.zeros((situation.size, 3)), np.array([x, y, z]) * total)
 
 
-def _of_the_day(logged: Logged) -> Sizes:
+def _of_the_day(conditions: Conditions) -> Sizes:
     """As healthy and damaged flights of two drones on several days scatter (docs/results/diagnosis_real.md)."""
-    return in_turn("x y z", *(logged.days[1:4] if logged.days else (5e-4, 5e-4, 1.6e-4))) if logged.dated else {}
+    if not conditions.own_file:
+        return {}
+    return in_turn("x y z", *(conditions.days[1:4] if conditions.days else (5e-4, 5e-4, 1.6e-4)))
 
 
-def _tails(logged: Logged) -> float:
+def _tails(conditions: Conditions) -> float:
     """Known from some twelve days of two drones; normal tails would be sure of what a new propeller may do."""
-    return 8.0 if logged.days is None else logged.days[4]
+    return 8.0 if conditions.days is None else conditions.days[4]
 
 
 TRIM = Effect(
@@ -192,5 +196,5 @@ ROTOR_INERTIA = Effect(
     prior=Prior(own={"inertia": 4e-8}, detection_limit={"inertia": 3e-9}),
     needs=("body_rate", "attitude"),
     separates="yaw for 5 s at 2 Hz (spin-up), and roll while turning about yaw (gyroscope); weigh a propeller",
-    fast=True,
+    needs_fast_commands=True,
 )

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
-from crazyem.physics.effects.prior import Limits, Logged, Prior, Sizes, alike, in_turn
+from crazyem.physics.effects.prior import Conditions, Limits, Prior, Sizes, alike, in_turn
 from crazyem.physics.rotations import axes, quaternion_from_euler, rotation_vector_from_quaternion
 
 
@@ -43,15 +43,15 @@ def _nothing(situation: Situation) -> Offset:
     return Offset(np.zeros((situation.size, 12)), np.zeros((situation.size, 3)))
 
 
-def _leaning(logged: Logged) -> Sizes:
+def _leaning(conditions: Conditions) -> Sizes:
     """rad. An attitude made from the acceleration is tilted as the accelerometer is.
 
     One that a filter on board makes of a biased gyro stays off by the bias times the time in which fixes draw it back:
     38 to 43 ms in roll and pitch of two simulated flights.
     """
-    if "attitude" not in logged.signals:
-        return in_turn("roll pitch yaw", 0.02, 0.02, 2e-3) if logged.turned else {}
-    return alike("roll pitch yaw", 0.05 * logged.gyro_bias) if logged.gyro_bias > 0.0 else {}
+    if "attitude" not in conditions.signals:
+        return in_turn("roll pitch yaw", 0.02, 0.02, 2e-3) if conditions.inferred_attitude else {}
+    return alike("roll pitch yaw", 0.05 * conditions.gyro_bias) if conditions.gyro_bias > 0.0 else {}
 
 
 def jitter(speed: NDArray, *, onboard: bool) -> NDArray:
@@ -65,18 +65,18 @@ def jitter(speed: NDArray, *, onboard: bool) -> NDArray:
     return found
 
 
-def _jittery(logged: Logged) -> Sizes:
+def _jittery(conditions: Conditions) -> Sizes:
     """Relative; no filter on board is better than 0.2 %."""
     return (
-        in_turn("x y z", *(2e-3 + jitter(logged.speed, onboard=logged.onboard)))
-        if {"velocity", "position"} <= logged.signals
+        in_turn("x y z", *(2e-3 + jitter(conditions.speed, onboard=conditions.onboard)))
+        if {"velocity", "position"} <= conditions.signals
         else {}
     )
 
 
-def _scale_limit(chosen: Mapping[str, Any], logged: Logged) -> Limits:
+def _scale_limit(chosen: Mapping[str, Any], conditions: Conditions) -> Limits:
     """Relative: more than jitter looks like, twice."""
-    return in_turn("x y z", *np.maximum(2.0 * jitter(logged.speed, onboard=logged.onboard), 0.035))
+    return in_turn("x y z", *np.maximum(2.0 * jitter(conditions.speed, onboard=conditions.onboard), 0.035))
 
 
 _ANGLES = tuple(Parameter(name, "rad", 0.0, -np.pi, np.pi, 5e-3) for name in ("roll", "pitch", "yaw"))
@@ -89,7 +89,7 @@ ATTITUDE_MISALIGNMENT = Effect(
     prior=Prior(alike("roll pitch yaw", 0.04), _leaning, detection_limit=alike("roll pitch yaw", 2e-3)),
     needs=("attitude",),
     separates="hover for 5 s at each of four headings: a tilted frame turns with the drone, wind stays in the world",
-    lasting=True,
+    steady_force=True,
 )
 
 ACCELEROMETER_MISALIGNMENT = Effect(
@@ -113,15 +113,15 @@ GYRO_BIAS = Effect(
     # flights of NanoBench, arXiv 2603.09908)
     prior=Prior(
         alike("x y z", 0.025),
-        lambda logged: alike("x y z", 2.8e-3) if "body_rate" in logged.signals else {},
-        each=lambda logged: True,
+        lambda conditions: alike("x y z", 2.8e-3) if "body_rate" in conditions.signals else {},
+        each=lambda conditions: True,
         systematic=alike("x y z", 4e-4),  # it walks
         detection_limit=alike("x y z", 3e-3),
     ),
     needs=("body_rate",),
     belongs_to="recording",  # it drifts with the temperature
     separates="record the gyro for 10 s with the drone at rest",
-    fast=True,
+    needs_fast_commands=True,
 )
 
 VELOCITY_SCALE = Effect(
@@ -134,7 +134,7 @@ VELOCITY_SCALE = Effect(
     words="velocity scale of the onboard estimate",
     belongs_to="recording",  # in a vehicle it cost 27 % of position error on other flights of the same drone
     separates="log position from motion capture or beacons, and fly straight legs of known length",
-    lasting=True,
+    steady_force=True,
 )
 
 

@@ -42,13 +42,13 @@ THRUST_CURVE = Effect(
     # thrust rises less with the command
     prior=Prior(
         own={"slope_error": 0.25},
-        usual=lambda logged: {"slope_error": 0.15} if logged.levelled else {},
+        usual=lambda conditions: {"slope_error": 0.15} if conditions.no_voltage else {},
         systematic={"slope_error": 0.02},  # slopes of drones with known ones came out so much too large
         detection_limit={"slope_error": 0.06},
     ),
     separates="climb and sink hard with the same battery, or measure thrust over command on a stand",
-    fast=True,
-    lasting=True,
+    needs_fast_commands=True,
+    steady_force=True,
 )
 
 BATTERY_SAG = Effect(
@@ -74,9 +74,9 @@ BATTERY_SAG = Effect(
     # own: a cell of 0.1 to 0.3 ohm at some amperes; usual, where nobody recorded the voltage: 4.1 to 3.5 V in 300 s
     prior=Prior(
         in_turn("gain_per_volt gain_per_second", 0.4, 3e-3),
-        lambda logged: {"gain_per_second": 1.5e-3} if logged.levelled else {},
+        lambda conditions: {"gain_per_second": 1.5e-3} if conditions.no_voltage else {},
     ),
     separates="log pm.vbat, and fly the same battery from full to empty",
     spared={"voltage": "log pm.vbat, and "},
-    lasting=True,
+    steady_force=True,
 )

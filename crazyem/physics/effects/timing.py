@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
 from crazyem.physics.effects.onboard_estimate import attitude_error
-from crazyem.physics.effects.prior import Limits, Logged, Prior, Sizes
+from crazyem.physics.effects.prior import Conditions, Limits, Prior, Sizes
 from crazyem.physics.effects.stretches import stretches
 from crazyem.physics.lag import PREDICTION_ORDER, fit_predictor
 from crazyem.physics.rotations import rotation_between
@@ -68,9 +68,10 @@ def late(lag: float, before: float, *, delay: float) -> tuple[float, float]:
     return lag, before + delay
 
 
-def _clock(logged: Logged) -> Sizes:
+def _clock(conditions: Conditions) -> Sizes:
     """s between a stamp and its effect; stamps of measured speeds come by another way."""
-    return {"delay": math.hypot(5e-3 if logged.measured else 2e-3, logged.unlogged * logged.period)}
+    stamps = 5e-3 if conditions.measured_speeds else 2e-3
+    return {"delay": math.hypot(stamps, conditions.unlogged_share * conditions.period)}
 
 
 # s: the lag of rotors in the calm flights of real drones, 24 to 105 ms in 26 flights for a file's 50, whether anything
@@ -78,13 +79,13 @@ def _clock(logged: Logged) -> Sizes:
 DAILY_LAG_SD = 0.025
 
 
-def _lag(logged: Logged) -> Sizes:
+def _lag(conditions: Conditions) -> Sizes:
     """s: with nothing hidden and torques as free, 51 to 55 ms instead of 50 in ten flights; or as from day to day."""
-    if logged.measured or logged.lag <= 0.0:
+    if conditions.measured_speeds or conditions.lag <= 0.0:
         return {}
-    if logged.dated:
+    if conditions.own_file:
         return {"time_constant": DAILY_LAG_SD}
-    return {"time_constant": 2e-3} if logged.turning else {}
+    return {"time_constant": 2e-3} if conditions.shows_rotation else {}
 
 
 MOTOR_LAG = Effect(
@@ -99,7 +100,7 @@ MOTOR_LAG = Effect(
     needs=("motor_command",),
     separates="log rotor speeds; or log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
     spared={"rotor_speed": "log rotor speeds; or "},
-    fast=True,
+    needs_fast_commands=True,
 )
 
 INPUT_DELAY = Effect(
@@ -110,7 +111,7 @@ INPUT_DELAY = Effect(
     prior=Prior(own={"delay": 8e-3}, usual=_clock, signed=True, detection_limit={"delay": 4e-3}),
     needs=("motor_command", "rotor_speed"),
     separates="log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
-    fast=True,
+    needs_fast_commands=True,
 )
 
 
@@ -178,10 +179,10 @@ def _past_attitude(rotation: NDArray, row: NDArray, part: NDArray) -> NDArray:
     return rotation_between(rotation, shown)
 
 
-def _delay_limit(chosen: Mapping[str, Any], logged: Logged) -> Limits:
+def _delay_limit(chosen: Mapping[str, Any], conditions: Conditions) -> Limits:
     """s. Where no gyro was late, rates were 1.2 ms later than usual at most in 51 simulated flights. Velocities of a
     filter on board are 0.7 to 5.7 ms late anyway, in ten flights of five filters."""
-    return {"delay": 2e-3 if chosen.get("streams") == ("gyro",) else 6e-3 if logged.onboard else 3e-3}
+    return {"delay": 2e-3 if chosen.get("streams") == ("gyro",) else 6e-3 if conditions.onboard else 3e-3}
 
 
 MEASUREMENT_DELAY = Effect(
@@ -209,5 +210,5 @@ MEASUREMENT_DELAY = Effect(
     needs=("position", "velocity", "attitude", "body_rate", "specific_force"),
     belongs_to="recording",
     separates="log the gyro and the pose at 100 Hz or more, and turn and stop sharply several times",
-    fast=True,
+    needs_fast_commands=True,
 )
