@@ -237,11 +237,7 @@ def _diagnose(commands: Any) -> None:
     p.add_argument(
         "--withhold", action="append", default=[], metavar="SIGNAL", help="a signal to leave unused, e.g. pm.vbat"
     )
-    p.add_argument(
-        "--method", choices=("stages", "posterior"), default="stages",
-        help="how effects are named: step by step, or by one posterior over sets of effects, which is being tried "
-        "(default %(default)s)",
-    )  # fmt: skip
+    p.add_argument("--method", choices=("stages", "posterior"), help=argparse.SUPPRESS)
     p.add_argument("--candidates", metavar="A,B,...", help="effects to look for (default: the whole catalogue)")
     p.add_argument("--jobs", type=_integer(1, 64), metavar="N", help="threads (default: one a core)")
     p.add_argument("--report", metavar="OUT.html", help="one self-contained page")

@@ -4,15 +4,15 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from crazyem.api.inputs import RecordingLike, VehicleLike, recording_of, vehicle_of
 from crazyem.api.planning import plan_commands
+from crazyem.deprecated import warn
 from crazyem.diagnosis import diagnose as by_recordings
 from crazyem.diagnosis.compare import compare
 from crazyem.diagnosis.document import document_of, saved_vehicle, text_of
 from crazyem.diagnosis.naming.baseline import with_baseline
-from crazyem.diagnosis.posterior.diagnose import diagnose as by_posterior
 from crazyem.diagnosis.prediction import predict as prediction
 from crazyem.diagnosis.prediction.predict import Prediction, recorded
 from crazyem.diagnosis.report.pictures import Series, draw
@@ -137,7 +137,7 @@ def diagnose(
     candidates: Sequence[str] = (),
     withhold: Sequence[str] = (),
     strict_held_out: bool = False,
-    method: Literal["stages", "posterior"] = "stages",
+    method: str = "",
     jobs: int | None = None,
     options: ReadOptions | None = None,
     progress: Callable[[str], None] | None = None,
@@ -153,7 +153,7 @@ def diagnose(
         candidates: effects to look for; none: the whole catalogue.
         withhold: signals to leave unused, such as "pm.vbat".
         strict_held_out: fit nothing to `held_out`, even where the others only hover.
-        method: how effects are named: in stages, or by one posterior over sets of effects.
+        method: deprecated, changes nothing.
         jobs: threads; None: one a core. The result is the same for any number.
         options: how paths are read.
         progress: told in a few words what is being done; by several threads.
@@ -170,13 +170,11 @@ def diagnose(
     nominal = vehicle_of(vehicle, flown[0])
     if healthy := [recording_of(r, options) for r in _several(baseline)]:
         nominal = with_baseline(nominal, healthy, say)
-    if method == "posterior":
-        found = by_posterior(flown, nominal, held_out=kept, wanted=candidates, withhold=withhold, jobs=jobs, say=say)
-    else:
-        found = by_recordings.diagnose(
-            flown, nominal, held_out=kept, wanted=candidates, withhold=withhold, strict=strict_held_out, jobs=jobs,
-            say=say,
-        )  # fmt: skip
+    if method:
+        warn("diagnose(method=...)", "diagnose, which has one method")
+    found = by_recordings.diagnose(
+        flown, nominal, held_out=kept, wanted=candidates, withhold=withhold, strict=strict_held_out, jobs=jobs, say=say
+    )
     say("open-loop errors before and after")
     document, pictures = document_of(found, flown, kept, withhold=withhold)
     document["notices"] = [*(n for r in flown for n in r.notices), *document["notices"]]

@@ -18,6 +18,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     for path in (arguments.json, arguments.report, arguments.write_vehicle):
         check_writable(path)
+    if arguments.method:
+        sys.stderr.write("diagnose: --method is deprecated and changes nothing: there is one method.\n")
     begin = time.monotonic()
 
     def say(text: str) -> None:
@@ -34,7 +36,6 @@ def run(arguments: argparse.Namespace) -> int:
         candidates=[n.strip() for n in (arguments.candidates or "").split(",") if n.strip()],
         withhold=arguments.withhold,
         strict_held_out=arguments.strict_held_out,
-        method=arguments.method,
         jobs=arguments.jobs,
         options=read_options(arguments),
         progress=say,

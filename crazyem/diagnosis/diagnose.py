@@ -54,8 +54,6 @@ class Diagnosis:
             as well.
         free: what was free beside the effects.
         swapped: `recordings` are those that were held out (see `flights/held_out.py`).
-        by_others: of several recordings with none held out, for each the vehicle fitted to the others.
-        selection: by stages; None: by one posterior, whose `ranking` of single effects is as the document has it.
     """
 
     vehicle: Vehicle
@@ -70,14 +68,12 @@ class Diagnosis:
     indistinguishable: tuple[tuple[str, ...], ...]
     would_separate: tuple[str, ...]
     unexplained: Unexplained
-    selection: Selection | None
+    selection: Selection
     left_out: dict[str, str]
     explained: float
     free: tuple[Free, ...]
     own: tuple[RecordingNuisances, ...]
     swapped: bool = False
-    ranking: tuple[dict[str, Any], ...] = ()
-    by_others: tuple[Vehicle, ...] = ()
 
 
 def diagnose(

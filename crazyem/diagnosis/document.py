@@ -59,8 +59,6 @@ def document_of(
     models = [vehicle, as_flown] + ([] if drone == as_flown else [drone])
     train = _compared([without(r, withhold) for r in recordings], models)
     apart = _compared([without(r, withhold) for r in held_out], [vehicle, drone])
-    for recording, other in zip(recordings, diagnosis.by_others, strict=False):
-        apart += _compared([without(recording, withhold)], [vehicle, other])
     fitted, confirmed = _before_after(train), _before_after(apart)
     left = diagnosis.unexplained
     where = strongest(diagnosis.before.findings)
@@ -169,10 +167,8 @@ def _finding(f: Finding) -> dict[str, Any]:
 
 def _ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """All that was tried in the first turn, best first."""
-    if diagnosis.selection is None or not diagnosis.selection.steps:
-        return list(diagnosis.ranking)
     found, seen = [], set()
-    for trial in diagnosis.selection.steps[0].trials:
+    for trial in diagnosis.selection.steps[0].trials if diagnosis.selection.steps else ():
         if trial.candidate.label in seen:
             continue
         seen.add(trial.candidate.label)

@@ -26,18 +26,17 @@ def posterior_of(diagnosis: Diagnosis) -> Posterior | None:
             if math.isfinite(value.value) and math.isfinite(value.sd) and value.sd > 0.0:
                 mean[f"{effect.name}.{name}"], sd[f"{effect.name}.{name}"] = float(value.value), float(value.sd)
     correlation: dict[tuple[str, str], float] = {}
-    if diagnosis.selection is not None:
-        fitted = diagnosis.selection.fitted
-        covariance = solved(fitted)[0].covariance
-        spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        columns = list(_columns(diagnosis))
-        for i, (key, number) in enumerate(columns):
-            if key and key not in mean and spread[i] > 0.0:
-                mean[key], sd[key] = number, float(spread[i])
-        for i, (first, _) in enumerate(columns):
-            for j, (second, _) in enumerate(columns):
-                if first in mean and second in mean and spread[i] * spread[j] > 0.0:
-                    correlation[first, second] = float(covariance[i, j] / (spread[i] * spread[j]))
+    fitted = diagnosis.selection.fitted
+    covariance = solved(fitted)[0].covariance
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    columns = list(_columns(diagnosis))
+    for i, (key, number) in enumerate(columns):
+        if key and key not in mean and spread[i] > 0.0:
+            mean[key], sd[key] = number, float(spread[i])
+    for i, (first, _) in enumerate(columns):
+        for j, (second, _) in enumerate(columns):
+            if first in mean and second in mean and spread[i] * spread[j] > 0.0:
+                correlation[first, second] = float(covariance[i, j] / (spread[i] * spread[j]))
     if not mean:
         return None
     names = tuple(mean)
@@ -52,7 +51,6 @@ def posterior_of(diagnosis: Diagnosis) -> Posterior | None:
 
 def _columns(diagnosis: Diagnosis) -> Iterator[tuple[str, float]]:
     """The columns of the fit: "effect.parameter" of what belongs to the drone, else "", and the value."""
-    assert diagnosis.selection is not None
     fitted = diagnosis.selection.fitted
     seen = set()
     for candidate in (*fitted.candidates, *fitted.nuisances):

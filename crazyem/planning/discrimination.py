@@ -9,7 +9,7 @@ full rank, and no flight gives odds: that is seen here, before any is flown.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.model import Model, Point
 from crazyem.diagnosis.fitting.noise import TYPICAL
 from crazyem.diagnosis.flights.flight import Flight
-from crazyem.diagnosis.posterior.members import Member, pool_of
 from crazyem.errors import UsageError
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.motion import RotorInput
 from crazyem.planning.closed_loop import Flown
 from crazyem.planning.limits import Limits
+from crazyem.planning.priors import nuisances_of, variants_of
 from crazyem.vehicle import Vehicle
 
 HEIGHT = 1.0  # m of the hover above the floor (control/named_trajectories.py, DEFAULT_HEIGHT)
@@ -88,14 +88,13 @@ class Pair:
         for name in (first, second):
             if name not in CATALOGUE:
                 raise UsageError(f"unknown effect '{name}' (known: {', '.join(CATALOGUE)}).")
-            if CATALOGUE[name].random is not None:
+            if CATALOGUE[name].random:
                 raise UsageError(f"{name} is random motion of the air: it has no columns, and a plan cannot aim at it.")
         if first == second:
             raise UsageError("--split needs two different effects.")
         self.effects = (first, second)
         self.vehicle, self.limits = vehicle, limits
         self.point = Point(vehicle, dict(vehicle.effects), TYPICAL)
-        self._members: dict[str, list[Member]] | None = None
 
     def odds(self, flown: Flown, *, draws: int = DRAWS, seed: int = 0) -> Odds:
         """What a flight would say; the shares by `draws` drones and noises, 0 of them gives none."""
@@ -123,19 +122,12 @@ class Pair:
         """Of each variant of each effect (r, k): columns in the space where noise and nuisances are white, each times
         the standard deviation of its parameter."""
         flight = flight_of(flown, self.vehicle, self.limits)
-        pool = pool_of([flight], self.point, self.effects)
-        members = [[m for m in pool.looks if m.effect == name] for name in self.effects]
-        for name, found in zip(self.effects, members):
-            if not found:
-                raise UsageError(
-                    f"a flight cannot speak of {name}: {pool.left_out.get(name, 'nobody says how large it may be')}."
-                )
-        usual = [(replace(c, free=(n,)), float(table[0, k])) for c, table in pool.usual for k, n in enumerate(c.free)]
-        usual = [(c, sd) for c, sd in usual if sd > 0 and c.effect not in self.effects]
+        variants = [variants_of(name, flight, self.point) for name in self.effects]
+        usual = nuisances_of(flight, self.point, self.effects)
         columns = [column for c, _ in usual for column in c.columns(self.point)]
         ends = [len(columns)]
-        for m in (*members[0], *members[1]):
-            columns += m.candidate.columns(self.point)
+        for v in (*variants[0], *variants[1]):
+            columns += v.candidate.columns(self.point)
             ends.append(len(columns))
         swept = Model(flight).sweep(self.point, columns)
         information = swept.information.sum(0)
@@ -145,11 +137,11 @@ class Pair:
         across = sd[:, None] * information[:u, u:]
         rest = information[u:, u:] - across.T @ np.linalg.solve(inner, across)
         root = _root(rest)
-        variants = []
-        for m, begin, end in zip((*members[0], *members[1]), ends[:-1], ends[1:]):
-            covariance = m.prior(self.point, nudged=bool(m.candidate.begin)).covariance
-            variants.append(root[:, begin - u : end - u] @ np.linalg.cholesky(covariance))
-        return variants[: len(members[0])], variants[len(members[0]) :]
+        white = [
+            root[:, begin - u : end - u] @ np.linalg.cholesky(v.covariance(self.point))
+            for v, begin, end in zip((*variants[0], *variants[1]), ends[:-1], ends[1:])
+        ]
+        return white[: len(variants[0])], white[len(variants[0]) :]
 
 
 def _root(information: NDArray[np.float64]) -> NDArray[np.float64]:

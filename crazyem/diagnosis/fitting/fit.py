@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import OWN, Column, Model, Point, Swept
-from crazyem.diagnosis.fitting.noise import ROWS, Informed, coloured, first_guess, fit_noise, without_slight
+from crazyem.diagnosis.fitting.noise import Informed, coloured, fit_noise, without_slight
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.workers import Workers
 from crazyem.errors import DataError
@@ -140,16 +140,13 @@ class Data:
                 break
             before = now
 
-    def fit_noise(self, point: Point, *, near: bool = False, rows: int = ROWS, held: tuple[int, ...] = ()) -> Point:
-        """The same model with noise scales that fit, by that many rows of each flight; `near`: they begin near; `held`:
-        the disturbances (0 to 5) of which they stay."""
+    def fit_noise(self, point: Point, *, near: bool = False) -> Point:
+        """The same model with noise scales that fit; `near`: they begin near."""
         parts = []
         for model in self.models:
             acceleration, _ = model.accelerations(point)
             parts.append((model.flight, acceleration, model.offsets(point, acceleration)))
-        found = fit_noise(
-            parts, point.noise, near=near, workers=self.workers, informed=self.informed, rows=rows, held=held
-        )
+        found = fit_noise(parts, point.noise, near=near, workers=self.workers, informed=self.informed)
         return replace(point, noise=found)
 
     def leave_out_wild(self, point: Point) -> int:
@@ -244,11 +241,6 @@ def remembering_anew(data: Data, point: Point) -> Point:
     chosen = remembering(data, white)
     data.settle(chosen)
     return chosen
-
-
-def starting_point(point: Point) -> Point:
-    """The point with a first guess of the noise."""
-    return replace(point, noise=first_guess())
 
 
 def bounds_of(candidates: Sequence[Candidate], point: Point) -> tuple[NDArray, NDArray]:

@@ -119,31 +119,26 @@ def fit_noise(
     tolerance: float = 0.2,
     workers: Workers | None = None,
     informed: Informed | None = None,
-    rows: int = ROWS,
-    held: tuple[int, ...] = (),
 ) -> Noise:
     """Noise scales of highest posterior density, the accelerations (n, 6) and offsets (n, 12) of each flight given.
 
-    Scales of quantities that nothing measures stay. Disturbances are fitted where they start above 0, but for those
-    `held`. Unless the start is near, most of the way is gone on few rows.
+    Scales of quantities that nothing measures stay. Disturbances are fitted where they start above 0. Unless the
+    start is near, most of the way is gone on few rows.
     """
     workers, informed = workers or Workers(1), informed or Informed()
     if not near and any(f.time.size > FEW for f, _, _ in parts):
         few = [(f.rows(k), a[k], o[k]) for f, a, o in parts for k in (sample_rows(f, rows=FEW, stretch=SHORT),)]
-        start = _scored(few, start, 5 * tolerance, workers, Informed(), held)
-    chosen = [(f.rows(keep), a[keep], o[keep]) for f, a, o in parts for keep in (sample_rows(f, rows=rows),)]
-    return _scored(chosen, start, tolerance, workers, informed, held)
+        start = _scored(few, start, 5 * tolerance, workers, Informed())
+    chosen = [(f.rows(keep), a[keep], o[keep]) for f, a, o in parts for keep in (sample_rows(f, rows=ROWS),)]
+    return _scored(chosen, start, tolerance, workers, informed)
 
 
-def _scored(
-    chosen: list[Part], start: Noise, tolerance: float, workers: Workers, informed: Informed, held: tuple[int, ...]
-) -> Noise:
+def _scored(chosen: list[Part], start: Noise, tolerance: float, workers: Workers, informed: Informed) -> Noise:
     measured = np.zeros(4, bool)
     for flight, _, _ in chosen:
         measured |= np.array([np.isfinite(flight.y[:, c]).any() for c in FIRST])
     lasting = measured & (start.coloured > 0)
     free = np.concatenate([np.ones(6, bool), measured, start.disturbance > 0, lasting, lasting])
-    free[10 + np.array(held, int)] = False
     logs, memory, floor = logs_of(start), start.memory, logs_of(LEAST)
     if any("attitude" not in f.signals and np.isfinite(f.y[:, 6]).any() for f, _, _ in chosen):
         floor[8] = np.log(LEANING_FLOOR)

@@ -236,8 +236,7 @@ class Effect:
         needs_fast_commands: told by torques from sample to sample, of which coarsely sampled commands say nothing.
         steady_force: told by forces that last, which no torque at random looks like.
         most_per_mass: of a parameter over the drone's mass, in its unit over kg: more is something else.
-        random: (spread (6,) m/s^2 and rad/s^2, body axes, and memory s of a disturbance; mass kg; drag N s/m, NaN where
-            unknown) -> parameters: of an effect that is a random process and adds nothing to the mean motion.
+        random: a random process, which adds nothing to the mean motion.
         gain: "thrust" or "torque" where its one parameter multiplies that of all rotors.
         own: vehicle -> values of the parameters whose neutral value is the vehicle's.
         constants: parameter -> the constant of a simulator's file that is the same (`simulators/constants.py`).
@@ -276,7 +275,7 @@ class Effect:
     needs_fast_commands: bool = False
     steady_force: bool = False
     most_per_mass: float = math.inf
-    random: Callable[..., dict[str, float]] | None = None
+    random: bool = False
     gain: str = ""
     own: Callable[[Vehicle], dict[str, float]] | None = None
     constants: Mapping[str, str] = field(default_factory=dict)

@@ -26,12 +26,6 @@ def pushing(situation: Situation, body: Body, *, x: float, y: float, z: float) -
     return Wrench(none if situation.shaken else situation.to_body(ALONE * np.array([x, y, z])), none)
 
 
-def moving(spread: NDArray, memory: float, *, mass: float, drag: float) -> dict[str, float]:
-    """Air that moves at random, by the specific force (m/s^2, body axes) with a memory [s] that it is."""
-    push = drag if drag > 0.0 else ALONE
-    return {"standard_deviation": float(np.median(spread[:3])) * mass / push, "correlation_time": memory}
-
-
 WIND = Effect(
     "wind",
     tuple(Parameter(axis, "m/s", 0.0, -30.0, 30.0, 0.2) for axis in "xyz"),
@@ -51,7 +45,7 @@ GUSTS = Effect(
         Parameter("correlation_time", "s", 1.0, 0.01, 100.0, 0.1),
     ),
     order=65,
-    random=moving,
+    random=True,
     prior=Prior(own={"standard_deviation": 1.5}, usual={"standard_deviation": 0.3}),  # usual: a room with people in it
     separates="fly the same manoeuvre in still air",
     amplitude="standard_deviation",
@@ -82,7 +76,6 @@ FORCE_BY_PLACE = Effect(
     prior=Prior(
         dict.fromkeys((p.name for p in CONSTANT + SLOPES), 0.01),
         {**in_turn("x y z", 4e-4, 4e-4, 1e-3), **dict.fromkeys((p.name for p in SLOPES), 5e-4)},
-        unnamed=True,
     ),
     needs=("position",),
     separates="fly the same path elsewhere in the room",

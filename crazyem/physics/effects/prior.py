@@ -86,7 +86,7 @@ class Prior:
 
     Attributes:
         own: where the effect is missing; empty: nobody asks for it.
-        usual: from recording to recording; or as a function of what was conditions.
+        usual: from recording to recording; or as a function of the conditions.
         per: what the sizes of a parameter are shares of: "mass" or "inertia" (about x) of the vehicle, or
             "neutral", the parameter's own neutral value; SI where absent.
         centre: what recordings have on average anyway, where that is not neutral.
@@ -96,8 +96,7 @@ class Prior:
         together: correlation of `own` between the parameters.
         systematic: within which a parameter is never known, whatever a fit says: what no scatter shows; SI.
         detection_limit: departures that filters, the sampling of a log and the air of a room look like; less is no
-            finding. Or as a function of the choices (`Parameter.chosen`) and of what was conditions.
-        unnamed: stands for what no effect of the catalogue is: it competes, and is told as unexplained.
+            finding. Or as a function of the choices (`Parameter.chosen`) and of the conditions.
     """
 
     own: Sizes = field(default_factory=dict)
@@ -110,14 +109,13 @@ class Prior:
     together: float = 0.0
     systematic: Sizes = field(default_factory=dict)
     detection_limit: Limits | Callable[[Mapping[str, Any], Conditions], Limits] = field(default_factory=dict)
-    unnamed: bool = False
 
     def usual_in(self, conditions: Conditions) -> Sizes:
-        """From recording to recording, for one as it was conditions."""
+        """From recording to recording, under some conditions."""
         return self.usual(conditions) if callable(self.usual) else self.usual
 
     def freedom_in(self, conditions: Conditions) -> float:
-        """Degrees of freedom, for a recording as it was conditions."""
+        """Degrees of freedom, under some conditions."""
         return self.freedom(conditions) if callable(self.freedom) else self.freedom
 
     def detection_limit_in(self, chosen: Mapping[str, Any], conditions: Conditions) -> dict[str, tuple[float, float]]:

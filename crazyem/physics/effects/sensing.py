@@ -97,8 +97,8 @@ ACCELEROMETER_MISALIGNMENT = Effect(
     _ANGLES,
     order=81,
     measured=tilted_accelerometer,
-    # usual: what the force of a model that is a little wrong looks like, beside the sensor's bias
-    # (`posterior/accelerometer.py`); thrust along body z hardly shows a yaw
+    # usual: what the force of a model that is a little wrong looks like, beside the sensor's bias; thrust along body z
+    # hardly shows a yaw
     prior=Prior(alike("roll pitch yaw", 0.04), in_turn("roll pitch yaw", 1.5e-3, 1.5e-3, 0.03)),
     needs=("specific_force",),
     separates="record the accelerometer for 10 s with the drone standing on a level floor, then turned by 180 degrees",

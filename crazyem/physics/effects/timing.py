@@ -9,7 +9,7 @@ expected one and a share of what is new, as in a Kalman filter of constant gain
 
 with one share for roll and pitch (tilt) and one for yaw (turn). The thrust of all rotors together is smooth.
 With all of it, torques look too weak (errors in the variables; Fuller, Measurement Error Models, 1987, ch. 1).
-It belongs to the log and not to the drone: `diagnose --method posterior` leaves it free for each recording.
+It belongs to the log and not to the drone.
 """
 
 import math
