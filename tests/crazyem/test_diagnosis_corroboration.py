@@ -13,8 +13,9 @@ from scipy.special import expit, logit
 
 from crazyem.diagnosis.diagnose import _corroborated
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, remembering, starting_point
+from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal, remembering
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.locating.place import depends_on_place
@@ -27,7 +28,7 @@ from crazyem.recordings.recording import Recording
 
 
 def point_of(data: Data) -> Point:
-    return nominal(data, starting_point(Point(DRONE, {}, None)))  # type: ignore[arg-type]
+    return nominal(data, Point(DRONE, {}, first_guess()))
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +190,7 @@ def test_blocks_know_their_recording() -> None:
 def test_sampled_commands_are_torques_with_the_memory_of_the_lag() -> None:
     """A noisy gyro at 500 Hz makes commands of which the log at 100 Hz sees every fifth."""
     data = Data([flight_of(fly(rate_noise=0.15, shake=0.02, seconds=9.0), DRONE)])
-    white = starting_point(Point(DRONE, {}, None))  # type: ignore[arg-type]
+    white = Point(DRONE, {}, first_guess())
     data.settle(white)
     white = data.fit_noise(white)
     remembered = remembering(data, white)

@@ -9,7 +9,7 @@ from closed_loop import DRONE, fly
 
 from crazyem.diagnosis.fitting import nuisances as always
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
-from crazyem.diagnosis.fitting.fit import Data, DivergedError, starting_point
+from crazyem.diagnosis.fitting.fit import Data, DivergedError
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import (
@@ -173,7 +173,7 @@ def test_without_position_and_velocity_neither_wind_nor_what_swings_can_be_seen(
 def test_a_second_look_at_the_memory_of_torques_never_makes_a_fit_worse():
     """Begun with white torques where they sway for half a second, and once more where that is known."""
     data = Data([flight_of(fly(seconds=8.0, sway=3.0, seed=2), DRONE)])
-    begun = data.fit_noise(starting_point(Point(DRONE, {}, first_guess())))
+    begun = data.fit_noise(Point(DRONE, {}, first_guess()))
     once, anew = (refine(data.twin(), begun, ()) for refine in (refine_base, refine_anew))
     assert not once.point.noise.disturbance.any()
     assert anew.point.noise.disturbance[3:].any()
@@ -187,7 +187,7 @@ def test_what_is_free_no_longer_does_not_stay_where_it_was_left():
     held where it stood before, it would make all that is balanced by torques wrong by as much, and nobody be told."""
     data = Data([flight_of(fly(seconds=8.0, seed=3), DRONE)])
     lag = Candidate("motor_lag", (), ("time_constant",))
-    neutral = starting_point(Point(DRONE, {}, first_guess())).with_effects({"motor_lag": lag.neutral(POINT)})
+    neutral = Point(DRONE, {}, first_guess()).with_effects({"motor_lag": lag.neutral(POINT)})
     data.settle(neutral)
     begun = data.fit_noise(neutral)
     left = begun.with_effects({"torque_scale": {"scale": 0.925}})

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
+from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Model, Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import refine_base
@@ -145,7 +145,7 @@ def test_lags_of_the_log_are_found(name, parameter, lags):
     for lag in lags:
         recording = behind(fly(seconds=20.0, seed=5, rate_noise=2e-3, shake=0.05), name, lag)
         data = Data([flight_of(recording, DRONE)])
-        point = nominal(data, starting_point(Point(DRONE, {}, None)))  # type: ignore[arg-type]
+        point = nominal(data, Point(DRONE, {}, first_guess()))
         begun = point.with_effects({"onboard_filter": {"rate_lag": 0.0, "velocity_lag": 0.0}})
         found.append(refine_base(data, begun, [free]).point.effects["onboard_filter"][parameter])
     assert found[1] - found[0] == pytest.approx(lags[1], abs=0.3e-3)
@@ -157,7 +157,7 @@ def test_a_torque_that_the_model_lacks_is_no_bias_of_a_late_gyro():
     recording = behind(fly(Hidden(thrust=(0.95, 0.95, 1.0, 1.0)), seconds=10.0, rate_noise=2e-3), "body_rate", 1.2e-3)
     data = Data([flight_of(recording, DRONE)])
     bias = Candidate("gyro_bias", (), ("x", "y", "z"))
-    point = nominal(data, starting_point(Point(DRONE, {}, None)))  # type: ignore[arg-type]
+    point = nominal(data, Point(DRONE, {}, first_guess()))
     begun = refine_base(data, point, ()).point.with_effects({"gyro_bias": dict.fromkeys("xyz", 0.0)})
     found = refine_base(data, begun, [bias]).point
     assert found.noise.disturbance[3:5].max() > 1.0  # the filter carries the torque along as a disturbance

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from crazyem.diagnosis.compare import compare
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.document import text_of
-from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
+from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
+from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import flight_of, without
 from crazyem.diagnosis.locating.locate import Finding
 from crazyem.diagnosis.locating.place import Place
@@ -42,7 +43,7 @@ def with_values(recording, name, change):
 def fitted(recording):
     vehicle = load_vehicle("cf2")
     data = Data([flight_of(recording, vehicle)])
-    return data, nominal(data, starting_point(Point(vehicle, {}, None)))
+    return data, nominal(data, Point(vehicle, {}, first_guess()))
 
 
 @pytest.mark.slow
@@ -112,7 +113,7 @@ def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(m
     found = Gusts(5000.0, np.ones(3), 0.25, 3e4, True, 1.6, 0.05)
     monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.find_gusts", lambda data, point: found)
     vehicle, remains = load_vehicle("cf2"), Unexplained((), 0.0)
-    data, point = Data(()), starting_point(Point(vehicle, {}, None))
+    data, point = Data(()), Point(vehicle, {}, first_guess())
     (named,) = other_likelihoods(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
     assert named.parameters["correlation_time"].ci95 == (0.01, 100.0)
     assert named.parameters["standard_deviation"].ci95 == pytest.approx((1.502, 1.698))
@@ -127,7 +128,7 @@ def test_gusts_are_as_sure_as_what_they_leave_allows(monkeypatch, nats, confiden
     monkeypatch.setattr("crazyem.diagnosis.naming.other_likelihoods.find_gusts", lambda data, point: air)
     where = Finding("attitude", "y", "changes at 7 s", "time", (7.0, 28.0), 0.04, 0.005, "rad", nats, 1e-7)
     remains = Unexplained((where,) if nats else (), 0.0)
-    data, point = Data(()), starting_point(Point(load_vehicle("cf2"), {}, None))
+    data, point = Data(()), Point(load_vehicle("cf2"), {}, first_guess())
     (named,) = other_likelihoods(data, None, point, remains, ["gusts"], {}, False, lambda text: None)
     assert named.confidence == pytest.approx(confidence, abs=1e-3)
 

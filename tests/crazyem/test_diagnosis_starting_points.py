@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from crazyem.diagnosis.fitting.candidates import Candidate, variants
 from crazyem.diagnosis.fitting.divergence import diverges
-from crazyem.diagnosis.fitting.fit import Data, nominal, starting_point
+from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Model, Point
+from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming import starting_points
@@ -26,7 +27,7 @@ from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 LOAD = CATALOGUE["suspended_load"]
-POINT = starting_point(Point(DRONE, {}, None))  # type: ignore[arg-type]
+POINT = Point(DRONE, {}, first_guess())
 
 
 @given(st.lists(st.floats(0, 1e6), min_size=1, max_size=30))

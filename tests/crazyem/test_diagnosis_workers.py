@@ -1,6 +1,7 @@
 """Threads that share a diagnosis: the same result for any number of them, in order, and nobody waits for himself."""
 
 import threading
+from dataclasses import replace
 from itertools import chain
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fitting.fit import Data, starting_point
+from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.flights.flight import flight_of
@@ -94,7 +95,7 @@ def test_what_is_done_to_a_twin_leaves_the_data_as_it_is():
     data.settle(point)
     path = data.models[0].path
     kept = path.copy()
-    other = starting_point(point).with_effects({"payload": {"mass": 0.01, "x": 0.0, "y": 0.0, "z": 0.0}})
+    other = replace(point, noise=first_guess()).with_effects({"payload": {"mass": 0.01, "x": 0.0, "y": 0.0, "z": 0.0}})
     twin = data.twin()
     twin.settle(other)
     assert data.models[0].path is path

@@ -16,7 +16,7 @@ def linear_force(situation: Situation, body: Body, *, x: float, y: float, z: flo
 
 def _of_real_rotors(names: str, size: float) -> Callable[[Conditions], Sizes]:
     """Real rotors have drag and flapping, bare rigid bodies of files neither."""
-    return lambda conditions: alike(names, size) if conditions.own_file else {}
+    return lambda conditions: alike(names, size) if conditions.individual_file else {}
 
 
 # N s/m, N s^2/m^2, within which no drag is known: an attitude 1 ms late is a force of 3e-4 N s/m along the quicker axis

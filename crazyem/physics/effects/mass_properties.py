@@ -86,7 +86,7 @@ def _placed(conditions: Conditions) -> Sizes:
     """
     if not conditions.shows_rotation or "velocity" not in conditions.signals:
         return {}
-    trimmed = conditions.other_clock and not conditions.own_file
+    trimmed = conditions.other_clock and not conditions.individual_file
     level = [max(0.05 * arm, 2e-5) if trimmed else 2e-5 for arm in conditions.arm]
     return in_turn("x y z", *level, 7e-4)
 

@@ -60,7 +60,7 @@ class Conditions:
     gyro_bias: float = 0.0
 
     @property
-    def own_file(self) -> bool:
+    def individual_file(self) -> bool:
         """Whether the vehicle file holds the trim of another day: it is the file of one drone, not of its kind."""
         return "trim" in self.file_effects
 

@@ -44,7 +44,7 @@ def _strength(conditions: Conditions) -> Sizes:
 
     Of several recordings of any drone each has its own: one number for all would make it heed commands less.
     """
-    if not (conditions.own_battery or conditions.own_file):
+    if not (conditions.own_battery or conditions.individual_file):
         return {}
     return {"scale": conditions.days[0] if conditions.days else 0.02}
 
@@ -135,7 +135,7 @@ def trimmed(situation: Situation, body: Body, *, x: float, y: float, z: float) -
 
 def _of_the_day(conditions: Conditions) -> Sizes:
     """As healthy and damaged flights of two drones on several days scatter (docs/results/diagnosis_real.md)."""
-    if not conditions.own_file:
+    if not conditions.individual_file:
         return {}
     return in_turn("x y z", *(conditions.days[1:4] if conditions.days else (5e-4, 5e-4, 1.6e-4)))
 

@@ -83,7 +83,7 @@ def _lag(conditions: Conditions) -> Sizes:
     """s: with nothing hidden and torques as free, 51 to 55 ms instead of 50 in ten flights; or as from day to day."""
     if conditions.measured_speeds or conditions.lag <= 0.0:
         return {}
-    if conditions.own_file:
+    if conditions.individual_file:
         return {"time_constant": DAILY_LAG_SD}
     return {"time_constant": 2e-3} if conditions.shows_rotation else {}
 
