@@ -325,3 +325,21 @@ def test_heavy_rotors_are_fitted_beside_a_damping_from_where_they_are_heavy():
     assert [t.candidate.effect for t, _ in shortlist([drag, rotors])] == ["linear_drag"]
     found = [entry("rotor_inertia", 300.0), damping]  # by its derivative: once is enough
     assert sum(t.candidate.effect == "rotor_inertia" for t, _ in shortlist(found)) == 1
+
+
+@pytest.mark.parametrize(("left", "doubted"), [(False, frozenset()), (True, frozenset({"linear_drag"}))])
+def test_an_effect_that_leaves_no_hump_is_not_doubted(monkeypatch, left: bool, doubted: frozenset[str]) -> None:
+    """Beside the hump the effect is of another size; that counts only where a hump stays once the effect is there."""
+    hump = [SimpleNamespace(axis=0, frequency=4.0)]
+    drone = POINT.with_effects({"linear_drag": {"x": 0.02, "y": 0.02, "z": 0.02}})
+    monkeypatch.setattr(prune, "peaks", lambda model, point: hump if left or point is POINT else [])
+    monkeypatch.setattr(prune, "nuisances", lambda data, point, accepted: ())
+
+    def gram(move: float) -> Gram:
+        scores = np.random.default_rng(1).normal(100.0 * move, 10.0, (30, 3))
+        return Gram(scores, np.broadcast_to(1e4 * np.eye(3), (30, 3, 3)), np.zeros(30, int))
+
+    monkeypatch.setattr(prune, "off_peak_gram", lambda data, point, columns, found: gram(-1.0))
+    data = SimpleNamespace(models=[None], gram=lambda point, columns: gram(0.0))
+    fitted = SimpleNamespace(point=drone, precision=np.zeros(3))
+    assert prune.shaken(data, POINT, fitted, [DRAG], lambda text: None) == doubted  # type: ignore[arg-type]

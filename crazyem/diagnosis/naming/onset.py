@@ -1,12 +1,15 @@
 """Effects that begin in mid-flight: whether one does, and since when."""
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted
 from crazyem.diagnosis.fitting.gram import Gram
+from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.physics.effects.catalogue import CATALOGUE
 
@@ -15,8 +18,12 @@ DATED = 6.0  # nats that an onset must gain
 SCANS = ((1.5, 0.1), (0.5, 0.1), (0.1, 0.02))  # s to either side, and the step between onsets tried
 
 
-def onset_of(data: Data, candidate: Candidate, gram: Gram, index: list[int]) -> Candidate | None:
-    """The same effect from a block on that explains more than from the start; None if there is none."""
+def onset_of(data: Data, point: Point, candidate: Candidate, gram: Gram, index: list[int]) -> Candidate | None:
+    """The same effect from a moment on that explains more than from the start; None if there is none.
+
+    Sums over blocks find the block, and the likelihood the tenth of a second: noise with a memory makes a step tell
+    most where the step is, and some samples off it speaks against the effect.
+    """
     known = dict(candidate.fixed)
     if known.get(ONSET) is not None or all(p.name != ONSET for p in CATALOGUE[candidate.effect].parameters):
         return None
@@ -32,7 +39,20 @@ def onset_of(data: Data, candidate: Candidate, gram: Gram, index: list[int]) -> 
     if k < 2 or gains[k] - gains[0] < DATED * scatter:
         return None
     begins = float(flight.time[np.flatnonzero(flight.block == k)[0]])
+    name, values = candidate.free[0], candidate.values(point)
+    size = float(np.clip(values[name] + theta, *candidate.range_of(name)))
+    begins = likeliest(data, point, candidate, {**values, name: size}, begins, *SCANS[0])
     return replace(candidate, fixed=(*candidate.fixed, (ONSET, begins)))
+
+
+def likeliest(
+    data: Data, point: Point, candidate: Candidate, values: Mapping[str, Any], begins: float, reach: float, step: float
+) -> float:
+    """The likeliest of the onsets every `step` from `reach` before to `reach` after one [s]; changes nothing."""
+    count = round(reach / step)
+    tried = [begins + k * step for k in range(-count, count + 1)]
+    points = [point.with_effects({candidate.effect: {**values, ONSET: at}}) for at in tried]
+    return tried[int(np.argmax(data.workers.map(lambda there: data.twin().loglik(there), points)))]
 
 
 def date(data: Data, fitted: Fitted, candidate: Candidate) -> tuple[Fitted, Candidate]:
@@ -45,11 +65,7 @@ def date(data: Data, fitted: Fitted, candidate: Candidate) -> tuple[Fitted, Cand
     if begins is None:
         return fitted, candidate
     for reach, step in SCANS:
-        count = round(reach / step)
-        tried = [begins + k * step for k in range(-count, count + 1)]
-        points = [fitted.point.with_effects({candidate.effect: {ONSET: at}}) for at in tried]
-        values = data.workers.map(lambda point: data.twin().loglik(point), points)
-        begins = tried[int(np.argmax(values))]
+        begins = likeliest(data, fitted.point, candidate, candidate.values(fitted.point), begins, reach, step)
         moved = replace(candidate, fixed=tuple((n, begins if n == ONSET else v) for n, v in candidate.fixed))
         others = tuple(moved if c is candidate else c for c in fitted.candidates)
         candidate = moved

@@ -169,10 +169,10 @@ def shaken(
     """Effects that are another size beside the humps of the spectrum than with them: something shakes there.
 
     The loop answers a vibration, so gains, delays and inertias seem wrong at its frequency. A delay whose loop swings
-    leaves a hump as well, but is the same delay beside it.
+    makes a hump as well, but leaves none once it is part of the model, or is the same delay beside the hump.
     """
     found = [peaks(m, nominal) for m in data.models]  # before what is always free gave way to them
-    if not accepted or not any(found):
+    if not accepted or not any(found) or not any(peaks(m, fitted.point) for m in data.models):
         return frozenset()
     free = [*accepted, *(c for c, _ in nuisances(data, fitted.point, accepted))]
     columns = [x for c in free for x in c.columns(fitted.point)]

@@ -108,7 +108,7 @@ def linear_trials(
         found.append((Trial(c, gain, held, dispersion, p_value, gain / dispersion - k), solution))
 
     for c, mine in zip(tested, index[len(base) :], strict=True):
-        later = onset_of(data, c, gram, mine)
+        later = onset_of(data, point, c, gram, mine)
         if later is not None:
             found += [
                 (replace(t, p_value=by_onsets(point, t.p_value, len(gram.score))), s)
