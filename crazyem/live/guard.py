@@ -35,8 +35,8 @@ class Limits:
         ..._half_width: largest 95 % half width, relative to the value.
         ..._agreement: largest spread (max - min over value) within `agreement_time`.
         ..._deadband: relative changes smaller than this are not worth a write.
-        effectiveness_slew, effectiveness_unjudged, effectiveness_bounds: what stands for an incremental controller's
-            inertia and lag instead of `slew`, `unjudged` and `inertia_bounds`.
+        effectiveness_...: what stands for an incremental controller's inertia and lag instead of `slew`, `unjudged`,
+            `inertia_bounds` and `inertia_deadband`.
         drag_slew: largest change of drag over mass in one write, 1/s.
         agreement_time: s over which estimates have to agree, all of them acceptable.
         slew: largest relative change in one write; a step of mass adds itself, up to `LARGEST_STEP`.
@@ -78,6 +78,7 @@ class Limits:
     effectiveness_bounds: tuple[float, float] = (0.5, 2.0)
     effectiveness_slew: float = 0.50
     effectiveness_unjudged: float = 0.50
+    effectiveness_deadband: float = 0.01
 
     def of(self, name: str, kind: str) -> Any:
         """A limit for an estimate: bounds, absolute, half_width, agreement or deadband."""
@@ -94,7 +95,7 @@ class Limits:
 
     def for_incremental(self) -> "Limits":
         """The limits for a controller that believes control effectiveness."""
-        return replace(self, inertia_bounds=self.effectiveness_bounds)
+        return replace(self, inertia_bounds=self.effectiveness_bounds, inertia_deadband=self.effectiveness_deadband)
 
 
 @dataclass(frozen=True)

@@ -231,6 +231,7 @@ _POLICY_KEYS: tuple[tuple[str, str, str, str, _Kind], ...] = (
     ("effectiveness", "bounds_relative", "limits", "effectiveness_bounds", _range(0.05, 20.0)),
     ("effectiveness", "slew", "limits", "effectiveness_slew", _number(0.001, 0.5)),
     ("effectiveness", "unjudged_change", "limits", "effectiveness_unjudged", _SHARE),
+    ("effectiveness", "deadband", "limits", "effectiveness_deadband", _SHARE),
     ("effectiveness", "oscillation_rad_s", "watch", "incremental_oscillation", _number(0.0, 100.0)),
     ("mass_thrust", "bounds_per_N", "limits", "mass_thrust_absolute", _range(1e3, 1e7)),
     ("mass_thrust", "deadband", "limits", "mass_thrust_deadband", _SHARE),
