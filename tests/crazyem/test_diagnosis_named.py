@@ -160,7 +160,7 @@ def test_what_no_scatter_shows_is_part_of_an_interval() -> None:
     shaken = systematic_sd(data, point_of(suspended_load={"mass": 0.002, "length": 0.4}))
     assert shaken["suspended_load", "length"] == pytest.approx(0.008)
     assert shaken["suspended_load", "mass"] == never["suspended_load", "mass"]
-    assert systematic_sd(data, point_of())["suspended_load", "length"] == 0.0
+    assert ("suspended_load", "length") not in systematic_sd(data, point_of())
 
 
 def test_inertias_are_as_unsure_as_a_lag_that_is_a_little_wrong_makes_them() -> None:

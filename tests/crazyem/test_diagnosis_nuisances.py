@@ -13,7 +13,6 @@ from crazyem.diagnosis.fitting.fit import Data, DivergedError
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import (
-    AT_ONCE_SD,
     COARSE_REASON,
     _let_go,
     abstained,
@@ -22,10 +21,11 @@ from crazyem.diagnosis.fitting.nuisances import (
     refine_base,
     systematic_sd,
     unlike_a_body,
-    usual_wind,
 )
 from crazyem.diagnosis.flights.flight import _blocks, flight_of
+from crazyem.diagnosis.naming.detection_limits import matters
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.prior import AT_ONCE_SD
 
 POINT = Point(DRONE, {}, first_guess())
 
@@ -151,7 +151,12 @@ def test_of_flights_whose_commands_do_not_turn_the_drone_nothing_fast_is_asked()
 
 
 def test_a_draft_of_a_room_is_a_finding_only_of_a_drone_whose_trim_does_not_change():
-    assert usual_wind(DRONE) < 0.5 < usual_wind(replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}}))
+    of_one_drone = replace(DRONE, effects={TRIM: {"x": 0.0, "y": 0.0, "z": 0.0}})
+    half = {"wind": {"x": 0.5, "y": 0.0, "z": 0.0}}
+    found = [
+        matters(Point(v, half, first_guess()), Candidate("wind", (), ("x", "y", "z"))) for v in (DRONE, of_one_drone)
+    ]
+    assert found == [True, False]
 
 
 def test_short_flights_have_shorter_blocks_so_that_there_are_forty():

@@ -17,13 +17,13 @@ from crazyem.diagnosis.fitting.nuisances import (
     abstained,
     nuisances,
     refine_base,
-    usual_gusts,
     without,
 )
 from crazyem.diagnosis.fitting.sampling import coarsely_sampled, fast_share, held, of_a_real_drone
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming.balance import balance_of
 from crazyem.diagnosis.naming.baseline import with_baseline
+from crazyem.diagnosis.naming.detection_limits import usual_gusts
 from crazyem.diagnosis.naming.steady_odds import explanations
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings import open_recording
@@ -58,9 +58,11 @@ def test_a_day_is_free_only_where_the_file_has_a_trim() -> None:
     for vehicle, there in ((DRONE, False), (TRIMMED, True)):
         free = {c.effect for c, _ in nuisances(data, point_of(vehicle), ())}
         assert ({TRIM, "thrust_scale", "velocity_moment"} <= free) is there
-        assert usual_gusts(vehicle) == (1.0 if there else 0.4)  # m/s: weather of a drone that flew, air of a room
+        assert usual_gusts(Point(vehicle, {}, first_guess())) == (
+            1.0 if there else 0.4
+        )  # m/s: weather of a drone that flew, air of a room
     stormy = replace(TRIMMED, effects={**TRIMMED.effects, "gusts": {"standard_deviation": 2.0}})
-    assert usual_gusts(stormy) == pytest.approx(4.0)
+    assert usual_gusts(Point(stormy, {}, first_guess())) == pytest.approx(4.0)
 
 
 @pytest.mark.slow

@@ -13,13 +13,7 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effect, Parameter
 from crazyem.physics.motion import vehicle_values
 
-ON_BOARD = 0.04  # m from the middle of the rotors: no part of a Crazyflie is further away
-STRONGEST = 1.1  # a worn, cut or bent propeller pulls less than the others; a new one among worn ones a little more,
-NO_STRONGER = 1.0  # and none gets stronger in flight
-# By gusts.py, accelerometer.py, place_rivals.py; `nuisances` has other inertias and delays for sampled commands.
-OTHER_LIKELIHOOD = ("gusts", "accelerometer_misalignment", "force_by_place", "sampled_commands")
 TRIM = "trim"
-ASKED = (TRIM,)  # looked for only if asked for: near every effect that brings a steady torque
 
 
 @dataclass(frozen=True)
@@ -59,12 +53,10 @@ class Candidate:
 
     def range_of(self, name: str) -> tuple[float, float]:
         """What is admitted of a parameter while it is fitted: a payload is on the drone, a faulty rotor no stronger."""
-        p, far = self.parameter(name), math.inf
-        if self.effect in ("payload", "center_of_mass") and name in "xyz":
-            far = ON_BOARD
-        elif self.effect == "rotor_fault" and name == "scale":
-            far = STRONGEST if dict(self.fixed).get("onset_time") is None else NO_STRONGER
-        return max(-p.high if self.both_ways else p.low, -far), min(p.high, far)
+        p, effect = self.parameter(name), CATALOGUE.get(self.effect)
+        admitted = effect.admitted(dict(self.fixed)) if effect else {}  # none of a deviation of one recording
+        low, high = admitted.get(name, (-math.inf, math.inf))
+        return max(-p.high if self.both_ways else p.low, low), min(p.high, high)
 
     def neutral(self, point: Point) -> dict[str, Any]:
         """All its parameters as the vehicle file has them, else at neutral; the choices made."""
@@ -182,7 +174,7 @@ def candidates_for(
         reason = impossible(effect, signals, measured_speeds)
         if reason:
             left_out[name] = reason
-        elif (effect.prior.own and name not in OTHER_LIKELIHOOD) or (name in ASKED and name in wanted):
+        elif (effect.prior.own and not effect.own_likelihood) or (effect.on_request and name in wanted):
             found += variants(effect, point, signals)
     return found, left_out
 
@@ -192,7 +184,8 @@ def impossible(effect: Effect, signals: frozenset[str], measured_speeds: bool) -
         return f"needs {' or '.join(effect.needs).replace('_', ' ')}, which the recording does not have"
     if effect.speed is not None and not measured_speeds:
         return "needs measured rotor speeds"
-    if measured_speeds and (effect.commanded is not None or effect.name == "motor_lag"):
+    before_rotors = effect.timing is not None and "rotor_speed" not in effect.needs
+    if measured_speeds and (effect.commanded is not None or before_rotors):
         return "acts before the rotors, whose speeds were measured"
     return ""
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from crazyem.diagnosis.fitting.candidates import OTHER_LIKELIHOOD, TRIM, Candidate, of_recordings
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, of_recordings
 from crazyem.diagnosis.fitting.conditions import conditions_of
 from crazyem.diagnosis.fitting.days import trim_known
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, refine, remembering, remembering_anew
@@ -17,23 +17,13 @@ from crazyem.diagnosis.fitting.sampling import coarsely_sampled
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effect
+from crazyem.physics.effects.prior import Prior
 from crazyem.vehicle import GRAVITY, Vehicle
 
 # s: fits find the rotors' lag off all the same: in sixteen more flights with nothing hidden 47 to 55 ms, 3.1 ms (rms),
 # with inertias 3 % too small for each ms too long where the drone turns little.
 LAG_OFF = 3e-3
-# Relative, about z: with heavy rotors (`Conditions.heavy_rotors`) their own inertia is as sure as that of yaw.
-AT_ONCE_SD = 0.25
-# A drag is free beside any effect that is tried, of real drones. It is named all the same where it explains more than
-# none of it.
-ROTOR_DRAG = ("linear_drag",)
-ROTOR_AERODYNAMICS = (*ROTOR_DRAG, "velocity_moment")  # healthy flights of a drone give its file both
 SEVERAL = 3  # recordings whose commands are known, from which on each has a thrust of its own
-# Of a load on a string: its weight is thrust that is a little wrong, as a share of the drone's; its length, relative.
-HANGING_SD = {"mass": 3e-3, "length": 5e-3}
-# Of lengths where a flight drives loads astray: 2.1 % too long (rms of seven loads of seeds 2038 to 2041).
-ASTRAY_LENGTH_SD = 0.02
-TURNED_BY_TORQUE = ("inertia", "torque_scale")  # what is off with the lag: `by_a_wrong_lag`
 # Streams that were put onto another clock by straight lines do not look white any more. Their torques explain so little
 # of the turning that the drone would have to be as heavy to turn as if all its mass were this many times as far out as
 # its rotors: no body of that size is, and what it stands for says nothing of the drone.
@@ -44,13 +34,6 @@ INDUCED = 2.0
 COARSE_REASON = "the recorded commands are mostly faster than their sampling: what acted in between is not known"
 TRIM_REASON = "a shifted centre of mass is a trim, and that changes from day to day"
 LEVEL_REASON = "no battery voltage is recorded, so how heavy or strong the drone is cannot be told"
-HEAVY_OR_STRONG = ("payload", "thrust_scale")
-OFF_THE_MIDDLE = ("payload", "center_of_mass", "rotor_fault")  # told from a thrust scale by their torque alone
-HIGH_OR_LOW = ("payload", "center_of_mass")
-# m/s, where trims differ from day to day, and on any drone; times what the file has. Hovering in a real room looks like
-# 0 to 0.6 m/s, and a drone with nothing hidden once like 0.3.
-CALM, ROOM, GUSTIER = 1.0, 0.4, 2.0
-STILL = 0.1  # m/s of steady wind
 SOMETIMES_FREE = ("torque_scale", "rate_damping")  # by what was found: until a lag is, and beside a rotor inertia
 Nuisances = list[tuple[Candidate, tuple[float, ...]]]  # with the precision of each free parameter
 
@@ -61,7 +44,7 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
     found: Nuisances = []
     for effect in CATALOGUE.values():
         prior, sizes = effect.prior, effect.prior.usual_in(facts)
-        if not sizes or effect.name in OTHER_LIKELIHOOD:
+        if not sizes or effect.own_likelihood:
             continue
         if prior.each(facts):
             candidate: Candidate = of_recordings(effect.name, tuple(sizes), data.flights)
@@ -112,7 +95,7 @@ def abstained(
     if TRIM in point.vehicle.effects:
         gone = {c.effect: TRIM_REASON for c in candidates if c.effect == "center_of_mass"}
     if all(f.levelled for f in data.flights):
-        gone |= {c.effect: LEVEL_REASON for c in candidates if c.effect in HEAVY_OR_STRONG}
+        gone |= {c.effect: LEVEL_REASON for c in candidates if CATALOGUE[c.effect].needs_voltage}
     if coarsely_sampled(data.flights, point.vehicle):
         # torques on another clock say nothing; how thrust goes with the command, and how late, shows in forces
         gone |= {
@@ -129,13 +112,13 @@ def _beyond_sampling(effect: Effect, *, other_clock: bool) -> bool:
     before_rotors = effect.commanded is not None or effect.timing is not None
     if not other_clock:
         return effect.needs_fast_commands
-    return effect.name in OFF_THE_MIDDLE or (effect.needs_fast_commands and not before_rotors)
+    return effect.steady_torque or (effect.needs_fast_commands and not before_rotors)
 
 
 def _without_height(candidate: Candidate) -> tuple[str, ...]:
     """What is fitted of a candidate whose height shows in torques that go with lateral acceleration, not in its
     weight."""
-    return tuple(n for n in candidate.free if candidate.effect not in HIGH_OR_LOW or n != "z")
+    return tuple(n for n in candidate.free if not CATALOGUE[candidate.effect].shifts_centre or n != "z")
 
 
 def with_trim_noise(data: Data, point: Point) -> Point:
@@ -183,16 +166,9 @@ def by_gain(point: Point, gain: float, count: int, blocks: int, p_value: float) 
     return float(stats.f.sf(2.0 * max(gain, 0.0) / count, count, max(blocks - 1, 1)))
 
 
-def usual_gusts(vehicle: Vehicle) -> float:
-    """Standard deviation of the air's speed [m/s] below which it is the weather, and no finding."""
-    filed = float(vehicle.effects.get("gusts", {}).get("standard_deviation", 0.0))
-    return max(GUSTIER * filed, CALM if TRIM in vehicle.effects else ROOM)
-
-
-def usual_wind(vehicle: Vehicle) -> float:
-    """Horizontal speed of the air [m/s] up to which wind is no finding: a room's draft, where trims differ from day to
-    day and a drone's answer to air is not known; on others what filters and sampling look like."""
-    return CALM if TRIM in vehicle.effects else STILL
+def usual_named(candidate: Candidate) -> bool:
+    """Whether an effect that is free beside all others is a finding all the same, where it explains more than none."""
+    return candidate.effect in CATALOGUE and CATALOGUE[candidate.effect].prior.usual_named
 
 
 def without(point: Point, effect: str) -> Point:
@@ -212,16 +188,15 @@ def systematic_sd(data: Data, point: Point) -> dict[tuple[str, str], float]:
         (c.effect, name): precision**-0.5
         for c, precisions in nuisances(data, point, ())
         for name, precision in zip(c.free, precisions, strict=True)
-        if c.effect not in ROTOR_DRAG
+        if not usual_named(c)
     }
-    inertia = point.effects.get("rotor_inertia", {}).get("inertia", 0.0)
-    hanging = {"mass": point.vehicle.mass, "length": point.effects.get("suspended_load", {}).get("length", 0.0)}
-    relative = HANGING_SD
-    if hanging["length"] and any(model.diverges("suspended_load", point.vehicle) for model in data.models):
-        relative = {**HANGING_SD, "length": ASTRAY_LENGTH_SD}
-    of_a_load = {("suspended_load", name): sd * hanging[name] for name, sd in relative.items()}
     known = {(e.name, n): sd for e in CATALOGUE.values() for n, sd in e.prior.systematic.items()}
-    return {**known, **of_a_load, ("rotor_inertia", "inertia"): AT_ONCE_SD * inertia, **free}
+    for name, here in point.effects.items():
+        prior = CATALOGUE[name].prior if name in CATALOGUE else Prior()
+        astray = prior.relative_error_astray and any(m.diverges(name, point.vehicle) for m in data.models)
+        for n, share in {**prior.relative_error, **(prior.relative_error_astray if astray else {})}.items():
+            known[name, n] = share * (point.vehicle.mass if prior.per.get(n) == "mass" else abs(float(here[n])))
+    return {**known, **free}
 
 
 def by_a_wrong_lag(data: Data, fitted: Fitted) -> dict[tuple[str, str], float]:
@@ -238,7 +213,7 @@ def by_a_wrong_lag(data: Data, fitted: Fitted) -> dict[tuple[str, str], float]:
     scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
     along = np.linalg.lstsq((a / np.outer(scale, scale))[np.ix_(others, others)], a[others, at] / scale[others])[0]
     moved = dict(zip((names[i] for i in others), np.abs(along / scale[others]) * LAG_OFF, strict=True))
-    return {name: float(moved[name]) for name in own if name[0] in TURNED_BY_TORQUE}
+    return {name: float(moved[name]) for name in own if CATALOGUE[name[0]].twins}
 
 
 def with_nuisances(point: Point, free: Nuisances) -> Point:

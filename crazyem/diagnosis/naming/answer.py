@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import logit
 
-from crazyem.diagnosis.fitting.candidates import ON_BOARD, TRIM, Candidate
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, Fitted
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import by_a_wrong_lag, solved, systematic_sd
@@ -23,6 +23,7 @@ from crazyem.diagnosis.naming.steady_odds import EDGE, decided_by_balance
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguishable, preferred, wald
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.mass_properties import ON_BOARD
 
 WITHIN = 0.05  # p-value from which an effect's own uncertainty holds that there is none of it
 SHAKES = "hold the drone with its rotors turning: what shakes then is not the loop that swings with a wrong model"
@@ -33,8 +34,6 @@ BY_TORQUE = ("velocity_moment",)  # of what is asked of flights whose torques sa
 # Two weak rotors beside each other lack thrust and tilt the drone as a weight on their side does, with no torque about
 # z; only what turns tells, which a drone whose trim changes from day to day does not show.
 WEAK_ROTOR = "rotor_fault"
-# Exactly the same to every signal: inputs that act late, and measurements that are all late together.
-SAME = {"input_delay": (MEASURED_LATE,)}
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def answer_of(
         equal = [
             *(t.candidate.effect for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}),
             *(name for name, nats in steady.items() if nats < TELLING),
-            *(() if candidate.effect in witnessed else SAME.get(candidate.effect, ())),
+            *(() if candidate.effect in witnessed else CATALOGUE[candidate.effect].same_as),
             *_in_place(candidate, in_place, selection),
             *_as_a_factor(candidate, step, point, covariance),
             *_by_turning_alone(candidate, data, selection),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import lsq_linear, minimize_scalar
 
-from crazyem.diagnosis.fitting.candidates import ON_BOARD, TRIM, Candidate
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.days import day_freedom, day_sd
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, refine
 from crazyem.diagnosis.fitting.model import Point
@@ -24,6 +24,7 @@ from crazyem.diagnosis.fitting.nuisances import nuisances, solved, with_nuisance
 from crazyem.diagnosis.naming.alternatives import exchanged
 from crazyem.diagnosis.naming.corroboration import TELLING
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
+from crazyem.physics.effects.mass_properties import ON_BOARD
 from crazyem.physics.rotors import wrench
 
 HEAVIEST = 1.0  # a load's weight over the drone's

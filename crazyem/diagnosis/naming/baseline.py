@@ -12,10 +12,11 @@ from crazyem.diagnosis.fitting.fit import REACH, Data
 from crazyem.diagnosis.fitting.fit import nominal as nominal_of
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
-from crazyem.diagnosis.fitting.nuisances import ROTOR_AERODYNAMICS, nuisances, refine_base, with_trim_noise
+from crazyem.diagnosis.fitting.nuisances import nuisances, refine_base, with_trim_noise
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming.balance import balance_of
 from crazyem.errors import UsageError
+from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Days, Vehicle
 
@@ -26,7 +27,7 @@ def with_baseline(
     vehicle: Vehicle, recordings: Sequence[Recording], say: Callable[[str], None] = lambda text: None
 ) -> Vehicle:
     """The vehicle with trim and thrust as the mean of healthy flights, with how these differ (`Days`), and with what
-    rotors always have (`ROTOR_AERODYNAMICS`) as all flights together say.
+    rotors always have (`Effect.of_healthy_rotors`) as all flights together say.
 
     Args:
         recordings: flights of this drone with nothing wrong, of several days.
@@ -58,7 +59,7 @@ def rotor_aerodynamics(data: Data, point: Point) -> dict[str, dict[str, float]]:
     """Drag and flapping as fitted; as the vehicle file has them where a number is at the end of its prior's reach."""
     found = {}
     for candidate, precisions in nuisances(data, point, ()):
-        if candidate.effect in ROTOR_AERODYNAMICS:
+        if candidate.effect in CATALOGUE and CATALOGUE[candidate.effect].of_healthy_rotors:
             filed, here = candidate.neutral(point), candidate.values(point)
             found[candidate.effect] = {
                 name: float(here[name] if abs(here[name] - filed[name]) < INSIDE * REACH * w**-0.5 else filed[name])

@@ -9,16 +9,13 @@ from crazyem.diagnosis.fitting.conditions import conditions_of
 from crazyem.diagnosis.fitting.days import day_sd
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import HANGING_SD, usual_wind
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.prior import Conditions
 
-STEEP = 3.0  # vertical over horizontal wind
-HIGHEST = 1.0  # m: a floor is felt by some rotor radii, Crazyflies have 23 to 28 mm
 LEAST_LOAD = 0.005  # of the drone's mass: what filters and sampling look like
 LEAST_SHIFT = 1e-4  # m, of the centre of mass
+GUSTIER = 2.0  # times the gusts of the file
 DRAWN = 2.0  # standard deviations of the day's trim
-LIFTING = ("battery_sag", "payload", "thrust_curve", "thrust_scale")
 # Standard deviations to which a swing weighs a load: less is none, nor is, beside one, less thrust than that.
 WEIGHED = 3.0
 
@@ -35,14 +32,19 @@ def at_the_end(point: Point, candidate: Candidate) -> bool:
     return here[name] in candidate.range_of(name) and here[name] != candidate.neutral(point)[name]
 
 
-def _other_load(point: Point, here: Mapping[str, float], filed: Mapping[str, float]) -> bool:
+def _weight_error(name: str) -> float:
+    """Share of the drone's mass within which the weight of a load is known; 0 where nothing says so."""
+    return CATALOGUE[name].prior.relative_error.get("mass", 0.0) if name in CATALOGUE else 0.0
+
+
+def _other_load(point: Point, candidate: Candidate, here: Mapping[str, float], filed: Mapping[str, float]) -> bool:
     """Whether a load is another than the file's by more than is told: in weight, or in where it draws the centre.
 
     With a trim in the file by more than differs from day to day; that of no load is told by its weight alone.
     """
     daily = TRIM in point.vehicle.effects
     heavier = abs(here["mass"] - filed["mass"])
-    least = WEIGHED * HANGING_SD["mass"] if "length" in here else LEAST_LOAD
+    least = WEIGHED * _weight_error(candidate.effect) or LEAST_LOAD
     if heavier > (day_sd(point.vehicle)[0] if daily else least) * point.vehicle.mass:
         return True
     if "x" not in here or not (daily or filed["mass"] > 0.0):
@@ -58,19 +60,27 @@ def _outweighs(point: Point, candidate: Candidate, data: Data) -> bool:
     Lateral forces of flights that shake come out 1 % too small: attitudes of onboard filters lag. A load of 1 g was
     told as one of 0.9 g, and what was left of its weight as a sag.
     """
-    if candidate.effect not in LIFTING or "suspended_load" not in point.effects:
+    open_weight = max((_weight_error(name) for name in point.effects), default=0.0)
+    if not CATALOGUE[candidate.effect].lifts or not open_weight:
         return True
     without = point.with_effects({candidate.effect: candidate.neutral(point)})
     up, before = (np.concatenate([model.accelerations(p)[0][:, 2] for model in data.models]) for p in (point, without))
     lifted = float(np.sqrt(np.mean((up - before) ** 2) / np.mean(before**2)))
-    return lifted > WEIGHED * HANGING_SD["mass"]
+    return lifted > WEIGHED * open_weight
 
 
-def _facts(point: Point, data: Data | None) -> Conditions:
+def _conditions(point: Point, data: Data | None) -> Conditions:
     """What is known of the flights to which an effect was fitted."""
     if data is None or not data.flights:
         return Conditions(file_effects=frozenset(point.vehicle.effects), onboard=False, speed=np.full(3, np.inf))
     return conditions_of(data.flights, point)
+
+
+def usual_gusts(point: Point, data: Data | None = None) -> float:
+    """Standard deviation of the air's speed [m/s] below which it is the weather, and no finding."""
+    filed = float(point.vehicle.effects.get("gusts", {}).get("standard_deviation", 0.0))
+    limit = CATALOGUE["gusts"].prior.detection_limit_in({}, _conditions(point, data))["standard_deviation"][0]
+    return max(GUSTIER * filed, limit)
 
 
 def matters(point: Point, candidate: Candidate, data: Data | None = None) -> bool:
@@ -81,15 +91,13 @@ def matters(point: Point, candidate: Candidate, data: Data | None = None) -> boo
     here, neutral = candidate.values(point), candidate.neutral(point)
     if at_the_end(point, candidate) or (data is not None and not _outweighs(point, candidate, data)):
         return False
-    if candidate.effect == "wind":  # what rises or sinks is thrust that is a little wrong
-        along = float(np.hypot(here["x"], here["y"]))
-        return along > usual_wind(point.vehicle) and abs(here["z"]) < STEEP * along
-    if candidate.effect == "ground_effect":  # what does not fade with height is thrust that is a little wrong
-        return here["height"] < HIGHEST
-    if candidate.effect in ("payload", "suspended_load"):
-        return _other_load(point, here, neutral)
-    prior = CATALOGUE[candidate.effect].prior
-    limit = prior.detection_limit_in(dict(candidate.fixed), _facts(point, data))
+    effect, conditions = CATALOGUE[candidate.effect], _conditions(point, data)
+    prior = effect.prior
+    if effect.amplitude == "mass":
+        return _other_load(point, candidate, here, neutral)
+    if prior.finding is not None:
+        return prior.finding(here, neutral, conditions)
+    limit = prior.detection_limit_in(dict(candidate.fixed), conditions)
     if not limit:
         return True
     for name in candidate.free:

@@ -9,8 +9,8 @@ from scipy.special import logit
 
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import usual_gusts
 from crazyem.diagnosis.naming import accelerometer, rotor_response
+from crazyem.diagnosis.naming.detection_limits import usual_gusts
 from crazyem.diagnosis.naming.gusts import find_gusts
 from crazyem.diagnosis.naming.named import DOUBTFUL, Named, Value, around, trust
 from crazyem.diagnosis.naming.presence import presence, presence_by_odds
@@ -39,7 +39,7 @@ def other_likelihoods(
     if (not wanted or "gusts" in wanted) and "gusts" not in left_out and not pulled:
         say("gusts")
         gusts = find_gusts(data, point)
-        known = gusts is not None and gusts.speed < usual_gusts(point.vehicle)
+        known = gusts is not None and gusts.speed < usual_gusts(point, data)
         if gusts is not None and not known and gusts.moving_air and remains.force_nats < FIXED * gusts.gain:
             memory_sd = gusts.memory * gusts.memory_sd
             # a memory that the flight says nothing of has an interval without end

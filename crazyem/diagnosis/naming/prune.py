@@ -10,7 +10,7 @@ from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.fit import TORQUES, Data, Fitted
 from crazyem.diagnosis.fitting.gram import used
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import ROTOR_DRAG, nuisances, on_held_out, refine_base, without
+from crazyem.diagnosis.fitting.nuisances import nuisances, on_held_out, refine_base, usual_named, without
 from crazyem.diagnosis.locating.random_torques import off_peak_gram, peaks
 from crazyem.diagnosis.naming.detection_limits import at_the_end
 from crazyem.diagnosis.naming.trials import LIKELY, SURE, Step, both, significance, wald
@@ -114,7 +114,7 @@ def bare_fit(
     """The fit without one of the effects, and its log-likelihood on flights held out; changes nothing of the data."""
     rest = [a for a in accepted if a is not candidate]
     here, there = data.twin(), held_out.twin() if held_out else None
-    if candidate.effect in ROTOR_DRAG:
+    if usual_named(candidate):
         here, there = here.constraining(candidate.effect), there and there.constraining(candidate.effect)
     less = refine_base(here, without(fitted.point, candidate.effect), rest, rounds=2, noise=False)
     return less, on_held_out(there, less.point, rest).loglik if there else 0.0

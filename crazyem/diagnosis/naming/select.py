@@ -18,13 +18,13 @@ from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, freedom_o
 from crazyem.diagnosis.fitting.gram import Solution, neutral_gain
 from crazyem.diagnosis.fitting.model import Column, Noise, Point
 from crazyem.diagnosis.fitting.nuisances import (
-    ROTOR_DRAG,
     by_gain,
     nuisances,
     on_held_out,
     refine_anew,
     refine_base,
     unlike_a_body,
+    usual_named,
     with_nuisances,
     without,
 )
@@ -49,21 +49,12 @@ from crazyem.diagnosis.naming.trials import (
     significance,
     sure_enough,
 )
+from crazyem.physics.effects.catalogue import CATALOGUE
 
 SHORTLIST = 6
 WORTH, ANYWAY = 0.15, 3  # share of the largest linear gain from which a candidate is fitted, and how many are anyway
 MOST = 9  # effects: real drones differ from a file in more than one thing
 NEARLY, MOST_COMPARED = 0.8, 3  # share of the best's gain from which, and how many, explanations get noise of their own
-# Angular acceleration is torque over inertia: where the one is fitted, so is the other, to be told apart or not; both
-# at once would be any size. A longer lag with more torque is nearly the same as neither.
-PARTNERS = (("torque_scale", "inertia"), ("inertia", "torque_scale"), ("torque_scale", "motor_lag"),
-            ("motor_lag", "torque_scale"))  # fmt: skip
-TURNING = {name for pair in PARTNERS for name in pair}
-# Rotors that are heavy look like a damping about z to commands that are sampled, and their derivative at none may have
-# the wrong sign: where that damping is fitted, so are they, begun as a bar of 0.3 g and 46 mm would be.
-FEIGNED = {"rate_damping": ("rotor_inertia", {"inertia": 5e-8})}
-# A heavier drone with as much more thrust has more torque and nothing else: beside a lag that is the same again.
-TORQUE_AND_LAG = {"payload", "thrust_scale", "motor_lag"}
 
 
 def linear_trials(
@@ -129,7 +120,7 @@ def linear_trials(
         lo = np.append(low[near], wide_low[order[len(near) :]])
         hi = np.append(high[near], wide_high[order[len(near) :]])
         asked = next(a for a in candidates if a.effect == c.effect)
-        judge(asked, [always[i] for i in order], w, lo, hi, centre[order], none if c.effect in ROTOR_DRAG else None)
+        judge(asked, [always[i] for i in order], w, lo, hi, centre[order], none if usual_named(c) else None)
     return sorted(found, key=lambda t: -t[0].evidence)
 
 
@@ -176,7 +167,7 @@ def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callabl
 def constrained_basis(basis: Basis, candidate: Candidate) -> Basis:
     """The basis with none of an effect that is free beside all others, and still is a finding where it is there."""
     name = candidate.effect
-    if name not in ROTOR_DRAG or name in basis.data.constrained:
+    if not usual_named(candidate) or name in basis.data.constrained:
         return basis
     data, apart = basis.data.constraining(name), basis.held_out and basis.held_out.constraining(name)
     fit = refine_base(data, without(basis.point, name), basis.accepted, rounds=3, noise=False)
@@ -255,11 +246,9 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted, *, own: HeldOu
 
 def may_join(effect: str, found: set[str]) -> bool:
     """Whether an effect can be known beside those found: not twice, and not where it is what they are, differently."""
-    return (
-        effect not in found
-        and all((effect, f) not in PARTNERS for f in found)
-        and not (effect in TORQUE_AND_LAG and {effect, *found} >= TORQUE_AND_LAG)
-    )
+    together = {effect, *found}
+    same_again = any(group <= together for name in together for group in CATALOGUE[name].never_beside)
+    return effect not in found and not found & set(CATALOGUE[effect].twins) and not same_again
 
 
 def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Callable[[str], None]) -> Step:
@@ -364,27 +353,30 @@ def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Sol
             chosen.append(entry)
         if len(chosen) == SHORTLIST:
             break
-    for one, other in PARTNERS:
-        names = {t.candidate.effect for t, _ in chosen}
-        if one in names and other not in names:
-            chosen += [e for e in linear if e[0].candidate.effect == other][:1]
-    chosen += [e for t, _ in chosen for e in feigning(t, chosen, linear)]
+    for name in [n for n, effect in CATALOGUE.items() if effect.twins]:
+        for twin in CATALOGUE[name].twins:
+            names = {t.candidate.effect for t, _ in chosen}
+            if name in names and twin not in names:
+                chosen += [e for e in linear if e[0].candidate.effect == twin][:1]
+    chosen += [e for t, _ in chosen for e in imitating(t, chosen, linear)]
     asked = [e for e in linear if e[0].candidate.likeliest]
     asked += [e for e in linear if e[0].candidate.effect == TRIM][:1]
     return chosen + [e for e in asked if all(e is not c for c in chosen)]
 
 
-def feigning(
+def imitating(
     trial: Trial, chosen: Sequence[tuple[Trial, Solution]], linear: Sequence[tuple[Trial, Solution]]
 ) -> list[tuple[Trial, Solution]]:
     """What may look like a trial and says nothing of it where it is none, begun where it is something."""
-    name, begin = FEIGNED.get(trial.candidate.effect, ("", {}))
-    if any(t.candidate.effect == name for t, _ in chosen):
-        return []
-    asked = [e for e in linear if e[0].candidate.effect == name][:1]
-    return [
-        (replace(t, candidate=replace(t.candidate, begin=tuple(begin.items()), likeliest=True)), s) for t, s in asked
-    ]
+    found = []
+    for name, begin in CATALOGUE[trial.candidate.effect].imitators.items():
+        asked = [e for e in linear if e[0].candidate.effect == name][:1]
+        if all(t.candidate.effect != name for t, _ in chosen):
+            found += [
+                (replace(t, candidate=replace(t.candidate, begin=tuple(begin.items()), likeliest=True)), s)
+                for t, s in asked
+            ]
+    return found
 
 
 def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], None]) -> tuple[list[Trial], list[Trial]]:
@@ -395,12 +387,12 @@ def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], No
     """
     counted = basis.held_out is not None
     equals = alike_with(trials[0], trials, counted=counted)
-    turns = trials[0].candidate.effect in TURNING
+    turns = bool(CATALOGUE[trials[0].candidate.effect].twins)
     nearly = [
         t
         for t in trials
         if rivals(t, counted=counted)
-        and (t.value > NEARLY * trials[0].value or (turns and t.candidate.effect in TURNING))
+        and (t.value > NEARLY * trials[0].value or (turns and CATALOGUE[t.candidate.effect].twins))
     ]
     equals += [t for t in nearly[:MOST_COMPARED] if all(t is not e for e in equals)]
     if len(equals) == 1:

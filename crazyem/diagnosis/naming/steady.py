@@ -18,14 +18,14 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import nuisances, refine_base, with_nuisances, with_trim_noise, without
 from crazyem.diagnosis.flights.flight import Flight
+from crazyem.diagnosis.naming.onset import ONSET
 from crazyem.diagnosis.naming.trials import Selection, Trial, distinguishable
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.diagnosis.workers import Workers
+from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.vehicle import Vehicle
 
 THRUST = Candidate("thrust_scale", (), ("scale",))
-CENTRED = ("payload", "center_of_mass")
-STEADY = ("rotor_fault", "payload")  # what brings a steady torque as a trim does
 
 
 def left_as_trim(flights: Sequence[Flight], vehicle: Vehicle, remains: Unexplained, workers: Workers) -> Vehicle:
@@ -64,7 +64,8 @@ def with_exact_torques(data: Data, selection: Selection) -> Selection:
     freedom, -3 to +5 %, moved the centre by as much, 37 um (rms) of 220 to 3300; without it, it is wrong by 6.
     """
     names = {c.effect for c in selection.accepted}
-    if not names & set(CENTRED) or "torque_scale" in names or TRIM in selection.final.vehicle.effects:
+    centred = any(CATALOGUE[n].shifts_centre for n in names)
+    if not centred or "torque_scale" in names or TRIM in selection.final.vehicle.effects:
         return selection
     point = without(selection.final, "torque_scale")
     free = [(c, p) for c, p in nuisances(data, point, selection.accepted) if c.effect != "torque_scale"]
@@ -82,17 +83,23 @@ def as_steady(trim: Trial, rivals: Sequence[Trial]) -> tuple[Trial, ...]:
     So a trim is taken first where it is asked for: every real drone has one, and a weak rotor or a load beside the
     middle is told by a file that knows it, which a flight of the healthy drone gives.
     """
-    others = (t for t in rivals if t.candidate.effect in STEADY)
+    others = (t for t in rivals if CATALOGUE[t.candidate.effect].steady_torque)
     return tuple(t for t in others if not distinguishable(trim, t))
 
 
 def without_trim_rivals(candidates: Sequence[Candidate], accepted: Sequence[Candidate]) -> list[Candidate]:
-    """The candidates without what a fitted trim is, too: a rotor that is weak all the time, and where a load is."""
+    """The candidates without what a fitted trim is, too: a torque from the start on, of which only an amplitude that
+    shows otherwise is left (how heavy a load is)."""
     if all(c.effect != TRIM for c in accepted):
         return list(candidates)
-    weak = [c for c in candidates if c.effect == "rotor_fault" and dict(c.fixed).get("onset_time") is None]
-    rest = [c for c in candidates if all(c is not w for w in weak)]
-    return [replace(c, free=("mass",)) if c.effect == "payload" else c for c in rest]
+    kept = []
+    for c in candidates:
+        effect = CATALOGUE[c.effect]
+        if not effect.steady_torque or dict(c.fixed).get(ONSET) is not None:
+            kept.append(c)
+        elif effect.amplitude:
+            kept.append(replace(c, free=(effect.amplitude,)))
+    return kept
 
 
 def by_onsets(point: Point, p_value: float, blocks: int) -> float:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import logit, logsumexp
 
-from crazyem.diagnosis.fitting.candidates import ON_BOARD, Candidate
+from crazyem.diagnosis.fitting.candidates import Candidate
 from crazyem.diagnosis.fitting.days import trim_known
 from crazyem.diagnosis.fitting.fit import Data, DivergedError
 from crazyem.diagnosis.fitting.model import Point
@@ -21,6 +21,7 @@ from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.naming.balance import FREE, HEAVIEST, Balance, balance_of, likely, steady
 from crazyem.diagnosis.naming.presence import MISSING, TOLD
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
+from crazyem.physics.effects.mass_properties import ON_BOARD
 from crazyem.vehicle import Vehicle
 
 EDGE = 0.99  # of the way to the furthest place on board, within which a load is

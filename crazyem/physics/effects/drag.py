@@ -33,8 +33,13 @@ LINEAR_DRAG = Effect(
     external=linear_force,
     couples_air=True,
     prior=Prior(
-        alike("x y z", 0.012), _of_real_rotors("x y z", 0.02), systematic=SYSTEMATIC, detection_limit=DETECTABLE
+        alike("x y z", 0.012),
+        _of_real_rotors("x y z", 0.02),
+        systematic=SYSTEMATIC,
+        detection_limit=DETECTABLE,
+        usual_named=True,
     ),
+    of_healthy_rotors=True,
     most_per_mass=5.0,
     needs=("velocity", "position"),
     separates="fly straight legs of different speeds in opposite directions",
@@ -102,6 +107,7 @@ VELOCITY_MOMENT = Effect(
     ),
     order=62,
     external=flapping,
+    of_healthy_rotors=True,
     # own: a Crazyflie tilts its flow by some 1e-5 N m s/m (docs/reference/effects.md)
     prior=Prior(
         alike("roll_per_vy pitch_per_vx", 4e-5),
@@ -120,6 +126,9 @@ RATE_DAMPING = Effect(
     about=("damping",),
     external=damping,
     prior=Prior(alike("x y z", 2e-5), _sampled),
+    # rotors that are heavy look like a damping about z to commands that are sampled, and their derivative at none may
+    # have the wrong sign: begun as a bar of 0.3 g and 46 mm would be
+    imitators={"rotor_inertia": {"inertia": 5e-8}},
     needs=("body_rate", "attitude"),
     separates=(
         "turn at several steady yaw rates; and step roll and pitch with the gyro logged at 500 Hz or more (a lag shows"

@@ -235,6 +235,19 @@ class Effect:
         prior: how large its parameters are.
         needs_fast_commands: told by torques from sample to sample, of which coarsely sampled commands say nothing.
         steady_force: told by forces that last, which no torque at random looks like.
+        steady_torque: whether it makes a torque that lasts, as a trim does.
+        shifts_centre: whether it moves the centre of mass.
+        lifts: whether it acts up and down as a weight does.
+        needs_voltage: whether nothing can be said of its size without the voltage of the battery.
+        twins: effects that are nearly the same to every signal: fitted where it is fitted, and never beside it.
+        never_beside: sets of effects that together are the same as it.
+        same_as: effects that are exactly the same to every signal.
+        imitators: effects that may look like it although derivatives at nothing say nothing of them -> where such a fit
+            begins.
+        own_likelihood: whether another likelihood than that of the filter speaks of it, or none.
+        on_request: whether it is looked for only if asked for.
+        of_healthy_rotors: whether flights of the healthy drone give the vehicle file its values.
+        admitted: choices -> (low, high) of parameters while they are fitted, less than a file may have.
         most_per_mass: of a parameter over the drone's mass, in its unit over kg: more is something else.
         random: a random process, which adds nothing to the mean motion.
         gain: "thrust" or "torque" where its one parameter multiplies that of all rotors.
@@ -274,6 +287,18 @@ class Effect:
     prior: Prior = field(default_factory=Prior)
     needs_fast_commands: bool = False
     steady_force: bool = False
+    steady_torque: bool = False
+    shifts_centre: bool = False
+    lifts: bool = False
+    needs_voltage: bool = False
+    twins: tuple[str, ...] = ()
+    never_beside: tuple[frozenset[str], ...] = ()
+    same_as: tuple[str, ...] = ()
+    imitators: Mapping[str, Values] = field(default_factory=dict)
+    own_likelihood: bool = False
+    on_request: bool = False
+    of_healthy_rotors: bool = False
+    admitted: Callable[[Values], Mapping[str, tuple[float, float]]] = lambda chosen: {}
     most_per_mass: float = math.inf
     random: bool = False
     gain: str = ""

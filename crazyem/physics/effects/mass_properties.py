@@ -6,7 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter
-from crazyem.physics.effects.prior import Conditions, Prior, Sizes, alike, in_turn
+from crazyem.physics.effects.prior import AT_ONCE_SD, Conditions, Prior, Sizes, alike, in_turn
+
+ON_BOARD = 0.04  # m from the middle of the rotors: no part of a Crazyflie is further away
+WITHIN = dict.fromkeys("xyz", (-ON_BOARD, ON_BOARD))
 
 
 def diagonal(body: Body, *, xx: float, yy: float, zz: float) -> Body:
@@ -35,7 +38,7 @@ def _moments(conditions: Conditions) -> Sizes:
         return {}
     sampled = 1.0 if conditions.coarse_commands else conditions.unlogged_share
     x, y, z = (math.hypot(share, sampled) for share in (0.01, 0.01, 0.02))
-    return in_turn("xx yy zz", x, y, 0.25 if conditions.heavy_rotors else z)
+    return in_turn("xx yy zz", x, y, AT_ONCE_SD if conditions.heavy_rotors else z)
 
 
 INERTIA = Effect(
@@ -57,6 +60,7 @@ INERTIA = Effect(
     ),
     alike=0.9,  # what is heavier about one axis is so about the others: they differ by a third of what they are more
     needs_fast_commands=True,
+    twins=("torque_scale",),
 )
 
 INERTIA_PRODUCTS = Effect(
@@ -99,6 +103,9 @@ CENTER_OF_MASS = Effect(
     about=("centre",),
     words="shift of the centre of mass",
     body=shifted,
+    steady_torque=True,
+    shifts_centre=True,
+    admitted=lambda chosen: WITHIN,
     # own: a battery of a third of the weight, put in some millimetres off
     # detection limit: z shows in lateral accelerations of O alone
     prior=Prior(alike("x y z", 1.5e-3), _placed, detection_limit=in_turn("x y z", 1e-4, 1e-4, 1e-3)),
@@ -136,4 +143,9 @@ PAYLOAD = Effect(
     separates="weigh the drone",
     nudge={"mass": 5e-4},
     amplitude="mass",
+    steady_torque=True,
+    shifts_centre=True,
+    lifts=True,
+    needs_voltage=True,
+    admitted=lambda chosen: WITHIN,
 )

@@ -17,6 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+# Relative, about z: with heavy rotors (`Conditions.heavy_rotors`) their own inertia is as sure as that of yaw.
+AT_ONCE_SD = 0.25
+
 
 @dataclass(frozen=True)
 class Conditions:
@@ -95,6 +98,10 @@ class Prior:
         each: whether several recordings that are fitted together have a deviation each.
         together: correlation of `own` between the parameters.
         systematic: within which a parameter is never known, whatever a fit says: what no scatter shows; SI.
+        relative_error: the same as a share of the parameter, or of what `per` says.
+        relative_error_astray: the same in flights that drive the effect where no fit follows (`divergence.py`).
+        usual_named: whether what is usual is named all the same, where it explains more than none of it.
+        finding: (values, neutral values, conditions) -> whether that is a finding, where no single limit says so.
         detection_limit: departures that filters, the sampling of a log and the air of a room look like; less is no
             finding. Or as a function of the choices (`Parameter.chosen`) and of the conditions.
     """
@@ -108,6 +115,10 @@ class Prior:
     each: Callable[[Conditions], bool] = lambda conditions: False
     together: float = 0.0
     systematic: Sizes = field(default_factory=dict)
+    relative_error: Sizes = field(default_factory=dict)
+    relative_error_astray: Sizes = field(default_factory=dict)
+    usual_named: bool = False
+    finding: Callable[[Mapping[str, Any], Mapping[str, Any], Conditions], bool] | None = None
     detection_limit: Limits | Callable[[Mapping[str, Any], Conditions], Limits] = field(default_factory=dict)
 
     def usual_in(self, conditions: Conditions) -> Sizes:

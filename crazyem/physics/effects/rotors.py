@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
-from crazyem.physics.effects.prior import Conditions, Prior, Sizes, in_turn
+from crazyem.physics.effects.prior import AT_ONCE_SD, Conditions, Prior, Sizes, in_turn
 
 
 def scaled(situation: Situation, *, scale: float) -> NDArray:
@@ -65,6 +65,8 @@ THRUST_SCALE = Effect(
     ),
     separates="weigh the drone; without its weight thrust and mass are one number",
     steady_force=True,
+    lifts=True,
+    needs_voltage=True,
 )
 
 ROTOR_FAULT = Effect(
@@ -77,6 +79,10 @@ ROTOR_FAULT = Effect(
     order=31,
     rotors=faulty,
     prior=Prior(own={"scale": 0.1}),
+    steady_torque=True,
+    # a worn, cut or bent propeller pulls less than the others, a new one among worn ones a little more; none gets
+    # stronger in flight
+    admitted=lambda chosen: {"scale": (0.0, 1.1 if chosen.get("onset_time") is None else 1.0)},
     separates=(
         "yaw for 5 s at 2 Hz (a weak rotor also lacks drag torque, a heavy corner does not), or hover with the drone's"
         " battery turned round"
@@ -98,6 +104,7 @@ TORQUE_SCALE = Effect(
     about=("torque_per_thrust", "arm", "inertia"),
     turning=turned,
     prior=Prior(own={"scale": 0.2}, usual=_torques, detection_limit={"scale": 0.08}),
+    twins=("inertia", "motor_lag"),  # angular acceleration is torque over inertia: both at once would be any size
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum): torque over inertia is all that a flight shows",
     needs_fast_commands=True,
@@ -117,7 +124,8 @@ GROUND_EFFECT = Effect(
     ),
     order=32,
     rotors=lifted,
-    prior=Prior(own={"strength": 0.3, "height": 0.1}),
+    # finding: a floor is felt by some rotor radii; what does not fade with height is thrust that is a little wrong
+    prior=Prior(own={"strength": 0.3, "height": 0.1}, finding=lambda here, neutral, conditions: here["height"] < 1.0),
     needs=("position",),
     separates="hover for 5 s at each of several heights, from 3 cm to 1 m",
     nudge={"strength": 0.02},
@@ -151,6 +159,7 @@ TRIM = Effect(
     order=41,
     external=trimmed,
     prior=Prior(usual=_of_the_day, freedom=_tails),
+    on_request=True,  # near every effect that brings a steady torque
     separates="fly the drone while it is well and judge by the vehicle file written from that: its trim is in there",
 )
 
@@ -192,8 +201,8 @@ ROTOR_INERTIA = Effect(
     controllers=True,  # INDI: ctrlINDI.g2
     external=reaction,
     # own: a bar of 0.3 g and 46 mm; a Crazyflie's propeller and rotor: a tenth of that, in no file. Detection limit: a
-    # sixth of a rod of 0.1 g and 46 mm; no rotor is lighter.
-    prior=Prior(own={"inertia": 4e-8}, detection_limit={"inertia": 3e-9}),
+    # sixth of a rod of 0.1 g and 46 mm; no rotor is lighter. It is as sure as the inertia of yaw.
+    prior=Prior(own={"inertia": 4e-8}, relative_error={"inertia": AT_ONCE_SD}, detection_limit={"inertia": 3e-9}),
     needs=("body_rate", "attitude"),
     separates="yaw for 5 s at 2 Hz (spin-up), and roll while turning about yaw (gyroscope); weigh a propeller",
     needs_fast_commands=True,

@@ -101,6 +101,7 @@ ACCELEROMETER_MISALIGNMENT = Effect(
     # hardly shows a yaw
     prior=Prior(alike("roll pitch yaw", 0.04), in_turn("roll pitch yaw", 1.5e-3, 1.5e-3, 0.03)),
     needs=("specific_force",),
+    own_likelihood=True,
     separates="record the accelerometer for 10 s with the drone standing on a level floor, then turned by 180 degrees",
 )
 

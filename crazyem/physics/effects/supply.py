@@ -49,6 +49,7 @@ THRUST_CURVE = Effect(
     separates="climb and sink hard with the same battery, or measure thrust over command on a stand",
     needs_fast_commands=True,
     steady_force=True,
+    lifts=True,
 )
 
 BATTERY_SAG = Effect(
@@ -79,4 +80,5 @@ BATTERY_SAG = Effect(
     separates="log pm.vbat, and fly the same battery from full to empty",
     spared={"voltage": "log pm.vbat, and "},
     steady_force=True,
+    lifts=True,
 )

@@ -64,7 +64,14 @@ SUSPENDED_LOAD = Effect(
     (Parameter("mass", "kg", 0.0, 0.0, 0.5, 5e-4), Parameter("length", "m", 0.3, 0.02, 10.0, 2e-4, usual=0.3)),
     order=70,
     tied=pulled,
-    prior=Prior(own={"mass": 0.08, "length": 0.3}, per={"mass": "mass"}),
+    # error: its weight is thrust that is a little wrong. Lengths were 2.1 % too long (rms of seven loads of seeds 2038
+    # to 2041) where a flight drives loads astray
+    prior=Prior(
+        own={"mass": 0.08, "length": 0.3},
+        per={"mass": "mass"},
+        relative_error={"mass": 3e-3, "length": 5e-3},
+        relative_error_astray={"length": 0.02},
+    ),
     needs=("position", "velocity"),  # it swings by the drone's path, which no accelerometer alone shows
     separates="stop sharply from a straight leg and hover for 10 s, so that what hangs can be seen swinging",
     nudge={"mass": 5e-4},

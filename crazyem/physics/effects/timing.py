@@ -54,6 +54,7 @@ SAMPLED_COMMANDS = Effect(
     needs=("motor_command",),
     words="commands between samples",
     belongs_to="recording",
+    own_likelihood=True,  # `nuisances` has other inertias and delays instead
     separates="log motor commands at 500 Hz",
 )
 
@@ -101,6 +102,9 @@ MOTOR_LAG = Effect(
     separates="log rotor speeds; or log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
     spared={"rotor_speed": "log rotor speeds; or "},
     needs_fast_commands=True,
+    twins=("torque_scale",),  # a longer lag with more torque is nearly the same as neither
+    # a heavier drone with as much more thrust has more torque and nothing else: beside a lag that is the same again
+    never_beside=(frozenset({"payload", "thrust_scale"}),),
 )
 
 INPUT_DELAY = Effect(
@@ -109,6 +113,7 @@ INPUT_DELAY = Effect(
     order=23,
     timing=late,
     prior=Prior(own={"delay": 8e-3}, usual=_clock, signed=True, detection_limit={"delay": 4e-3}),
+    same_as=("measurement_delay",),  # of all that is measured
     needs=("motor_command", "rotor_speed"),
     separates="log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
     needs_fast_commands=True,
