@@ -24,8 +24,8 @@ from crazyem.diagnosis.naming import answer, determined, trials
 from crazyem.diagnosis.naming.answer import _numbers, _rivals, _uncertainty, strongest_first
 from crazyem.diagnosis.naming.determined import improbable
 from crazyem.diagnosis.naming.named import DOUBTFUL, Named, one_factor, trust
-from crazyem.diagnosis.naming.presence import CALIBRATED, CONSTANT, FITTED, HELD_OUT, TOLD, presence
-from crazyem.diagnosis.naming.trials import Step, Trial
+from crazyem.diagnosis.naming.presence import CALIBRATED, CONSTANT, FITTED, HELD_OUT, ORDER, TOLD, presence
+from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained
 
 OWN = np.array([1.66e-5, 1.67e-5, 2.93e-5])
@@ -50,7 +50,7 @@ def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_as
     flown = fly(Hidden(torque=0.7), seconds=20.0, seed=6)
     brought = []
     monkeypatch.setattr(answer, "trust", lambda remains, nats: brought.append(nats) or 1.0)
-    monkeypatch.setattr(trials, "presence", lambda held_out, fitted: 0.123)
+    monkeypatch.setattr(trials, "presence", lambda held_out, fitted, order: 0.123)
     monkeypatch.setattr(determined, "improbable", lambda chance: "")
     monkeypatch.setattr(answer, "preferred", lambda taken, rivals: 1.0)
     found = diagnose([flown], DRONE, wanted=["inertia"])
@@ -81,9 +81,9 @@ def test_more_evidence_never_makes_a_name_less_sure(held, more, beside) -> None:
 def test_a_name_is_as_sure_as_what_it_brings_on_flight_held_out_and_fitted() -> None:
     """Odds that are a product of powers of the nats, by a formula of its own."""
     assert presence(-5.0, 1e3) == presence(1e3, 0.0) == 0.0
-    for held, fitted in ((5.0, 30.0), (30.0, 5.0), (200.0, 80.0)):
-        odds = math.exp(CONSTANT) * held**HELD_OUT * (1.0 + fitted) ** FITTED
-        assert presence(held, fitted) == pytest.approx(odds / (1.0 + odds))
+    for held, fitted, order in ((5.0, 30.0, 1), (30.0, 5.0, 2), (200.0, 80.0, 3)):
+        odds = math.exp(CONSTANT) * held**HELD_OUT * (1.0 + fitted) ** FITTED / order**ORDER
+        assert presence(held, fitted, order) == pytest.approx(odds / (1.0 + odds))
     assert presence(1e9, 1e9) == CALIBRATED
     assert improbable(0.9 * TOLD).startswith("not determined")
     assert not improbable(1.1 * TOLD)
@@ -208,3 +208,10 @@ def test_what_is_needed_beside_a_name_is_no_other_name_for_it(accepted: list[str
     turned = Step((inertia, *others), inertia, alike=(others[1],))
     found = SimpleNamespace(accepted=(inertia.candidate,))
     assert "torque_scale" in {t.candidate.effect for t in _rivals(inertia.candidate, turned, found, frozenset())}
+
+
+def test_later_effects_are_told_by_how_many_were_found_before_them_but_a_trim() -> None:
+    names, point = ("wind", "trim", "payload", "motor_lag"), Point(DRONE, {}, first_guess())
+    steps = tuple(Step((), Trial(Candidate(n, (), ()), 1.0, 1.0, 1.0, 0.0, 1.0)) for n in names)
+    selection = Selection(point, point, (*steps, Step((), None)), (), SimpleNamespace(), 4)  # type: ignore[arg-type]
+    assert selection.orders() == [1, 2, 2, 3]

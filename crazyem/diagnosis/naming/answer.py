@@ -73,14 +73,15 @@ def answer_of(
     separate: list[str] = []
     at = 0
     taken = [s for s in selection.steps if s.taken]
-    for candidate, step, parameters in zip(selection.accepted, taken, numbers, strict=True):
+    orders = selection.orders()
+    for candidate, step, parameters, order in zip(selection.accepted, taken, numbers, orders, strict=True):
         assert step.taken is not None
         own = slice(at, at + len(candidate.free))
         at = own.stop
         away, covariance = _away(candidate, point), all_covariance[own, own]
         rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, selection, witnessed), balance)
         heard = _against(remains, candidate, data)
-        there = step.taken.presence
+        there = step.taken.presence(order)
         there *= trust(heard, step.taken.held_out) if step.taken.log_odds is None else 1.0
         confidence = there * preferred(step.taken, rivals)
         confidence /= 1.0 + sum(float(np.exp(-nats)) for nats in steady.values())

@@ -111,9 +111,11 @@ def without_undetermined(
         taken = [s.taken for s in selection.steps if s.taken]
         doubted = [
             (trial.evidence, candidate, found, reason)
-            for trial, candidate, found in zip(taken, selection.accepted, numbers, strict=True)
+            for trial, candidate, found, order in zip(
+                taken, selection.accepted, numbers, selection.orders(), strict=True
+            )
             if candidate.effect not in besides
-            and (reason := not_determined(candidate, found, selection.final) or improbable(trial.presence))
+            and (reason := not_determined(candidate, found, selection.final) or improbable(trial.presence(order)))
         ]
         if not doubted:
             return selection, balance, gone

@@ -64,12 +64,11 @@ class Trial:
     size: Mapping[str, float] = field(default_factory=dict)
     other_evidence: float = 0.0
 
-    @property
-    def presence(self) -> float:
-        """Probability that it is there, whatever its look-alikes."""
+    def presence(self, order: int) -> float:
+        """Probability that it is there as the `order`-th effect that was found (from 1), whatever its look-alikes."""
         if self.log_odds is not None:
             return min(CALIBRATED, float(expit(self.log_odds)))
-        there = presence(self.held_out, self.gain / self.dispersion)
+        there = presence(self.held_out, self.gain / self.dispersion, order)
         return min(CALIBRATED, float(expit(logit(there) + self.other_evidence)))
 
     @property
@@ -112,6 +111,11 @@ class Selection:
     fitted: Fitted
     tried: int
     doubted: frozenset[str] = frozenset()
+
+    def orders(self) -> list[int]:
+        """Of the effects that were selected, which each is among those found (from 1); a trim is not counted."""
+        names = [s.taken.candidate.effect for s in self.steps if s.taken]
+        return [1 + sum(n != TRIM for n in names[:k]) for k in range(len(names))]
 
     def with_evidence(self, candidate: Candidate, nats: float) -> "Selection":
         """With so many nats of another likelihood for an effect that was selected, and against its look-alikes."""
