@@ -8,7 +8,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from crazyem.doctor.kinematics import GRAVITY, GRID_STEP, Grid, Track, grid_of, measurements, track
@@ -19,8 +18,6 @@ from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.thrust import carried, vehicle_for, weight_objection
 from crazyem.vehicle import Vehicle, load_vehicle, preset_names
-
-Array = NDArray[np.float64]
 
 REPORTED_MASS_DEVIATION = 0.15  # claimed mass against the nearest law: reported from here on
 LIFTING_THRUST_RATIO = 0.6  # of the median thrust while rotors turn: less is a take-off, a landing or the ground

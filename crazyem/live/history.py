@@ -11,7 +11,6 @@ from crazyem.estimation.result import Estimate, Step
 from crazyem.monitoring.fault import Fault
 from crazyem.signals.sample import Sample
 
-PARAMETER_NAMES = ("mass", "Ixx", "Iyy", "Izz", "motor_time_constant")
 MOST_ESTIMATES = 6000  # estimates; four minutes at 25 a second. The recording has them all
 TRACK_ROWS = 60_000  # of a track; ten minutes at 100 Hz
 SETTLE_SECONDS = 4.0  # s after the first push before a tracking error counts as "after": the height loop takes 2 to 3 s

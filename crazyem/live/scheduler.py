@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from crazyem.estimation.result import Estimate
-from crazyem.live.pipeline import Estimator, residual_of
+from crazyem.live.pipeline import residual_of
 from crazyem.signals.sample import Sample
 
 POLL_PAUSE = 0.002  # s between two rounds of receiving: a twentieth of an update's budget
@@ -241,8 +241,3 @@ class UpdateThrottle:
         self.inner.every = self._every
         estimate: Estimate = self.inner.finish()
         return estimate
-
-
-def throttle(inner: Estimator, *, number: int, of: int) -> UpdateThrottle:
-    """The estimator of drone `number` among `of`."""
-    return UpdateThrottle(inner, number=number, of=of)

@@ -17,24 +17,16 @@ class Grade(StrEnum):
     UNUSABLE = "unusable"  # the signal, or the recording, must not be used as it is
 
 
-# Fixes that lose nothing: each can be undone, or removes only what was never measured.
-FIXES = {
-    "scale": "multiply the components of the signals by `factor` (unit, sign or scale)",
-    "world_to_body": "rotate a world vector into the body frame by the attitude of the recording",
-    "shift": "add `factor[0]` seconds to the time stamps of the signals",
-    "unwrap": "add `factor[i]` seconds to the stamps from sample `rows[i]` on",
-    "mark": "the samples in `rows` become missing (they were never measured)",
-    "sort": "samples into the order of their stamps",
-    "stamps": "the reader has left out, placed or shifted what had stamps that cannot be; nothing is left to change",
-}
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Fix:
-    """A lossless repair.
+    """A repair that loses nothing: it can be undone, or removes only what was never measured.
 
     Attributes:
-        kind: a key of `FIXES`.
+        kind: "scale" multiplies the components of the signals by `factor` (unit, sign or scale); "world_to_body"
+            rotates a world vector into the body frame by the attitude of the recording; "shift" adds `factor[0]`
+            seconds to the stamps; "unwrap" adds `factor[i]` seconds to the stamps from sample `rows[i]` on; "mark"
+            makes the samples in `rows` missing (they were never measured); "sort" brings samples into the order of
+            their stamps; "stamps" changes nothing: the reader has dealt with what had stamps that cannot be.
         signals: names of the signals it changes.
         factor: numbers, meaning by kind; one a component for "scale".
         rows: sample numbers it applies to, None for all.

@@ -200,38 +200,6 @@ class Recording:
                 raise DataError(f"{self.path}: {name} has samples without a time.")
 
 
-def collect(samples: Iterable[tuple[Sample, bool]]) -> dict[str, SignalArray]:
-    """Arrays from samples in processing order, each with its `marked` flag."""
-    times: dict[str, list[float]] = {}
-    values: dict[str, list[tuple[float, ...]]] = {}
-    orders: dict[str, list[int]] = {}
-    hosts: dict[str, list[float]] = {}
-    marks: dict[str, list[bool]] = {}
-    for order, (sample, marked) in enumerate(samples):
-        name = sample.signal
-        if name not in times:
-            times[name], values[name], orders[name], hosts[name], marks[name] = [], [], [], [], []
-        times[name].append(sample.time)
-        values[name].append(sample.value)
-        orders[name].append(order)
-        hosts[name].append(sample.host_time)
-        marks[name].append(marked)
-    return {
-        name: SignalArray(
-            np.array(times[name], float),
-            np.array(values[name], float).reshape(len(times[name]), SIGNALS[name][0]),
-            np.array(orders[name], np.int64),
-            np.array(hosts[name], float),
-            np.array(marks[name], bool),
-            quantity=name,
-            unit=SIGNALS[name][1],
-            frame=SIGNALS[name][2],
-        )
-        for name in SIGNALS
-        if name in times
-    }
-
-
 # What names of attitudes that a filter on board made begin with, beside those of MAVLink: the Crazyflie's, ULog's.
 CRAZYFLIE_PREFIXES = ("stateEstimate", "kalman.")
 ONBOARD_PREFIXES = (*CRAZYFLIE_PREFIXES, "vehicle_attitude.")

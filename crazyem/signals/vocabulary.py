@@ -292,7 +292,6 @@ STATE_BLOCK = _names("stateEstimateZ.*", "x y z vx vy vz quat")
 IMU_BLOCK = (*_names("gyro.*", "x y z"), *_names("acc.*", "x y z"))
 MOTOR_BLOCK = (*_names("motor.*", "m1 m2 m3 m4"), "pm.vbatMV", "supervisor.info")
 ROTOR_SPEED_BLOCK = _names("motor.*_rpm", "m1 m2 m3 m4")
-SETPOINT_BLOCK = _names("ctrltarget.*", "x y z vx vy vz")
 STANDARD_BLOCKS: tuple[tuple[str, ...], ...] = (STATE_BLOCK, IMU_BLOCK, MOTOR_BLOCK)
 # And what a session logs.
 STATE_VARIABLES = STATE_BLOCK + tuple(f"stateEstimateZ.rate{a}" for a in ("Roll", "Pitch", "Yaw"))

@@ -66,14 +66,6 @@ class Constants:
 
 
 NUMBERS = tuple(f.name for f in fields(Constants) if f.name != "name")
-UNITS = {
-    **dict.fromkeys(("arm_x", "arm_y", "centre_x", "centre_y", "centre_z", "torque_per_thrust"), "m"),
-    **{f"inertia_{a}": "kg m^2" for a in ("xx", "yy", "zz", "xy", "xz", "yz")},
-    **{f"drag_{a}": "N s/m" for a in "xyz"},
-    **{f"quadratic_drag_{a}": "N s^2/m^2" for a in "xyz"},
-    **{f"damping_{a}": "N m s" for a in "xyz"},
-    "mass": "kg", "thrust_per_speed2": "N/(rad/s)^2", "thrust_max": "N", "lag": "s",
-}  # fmt: skip
 
 
 def hover_speed(c: Constants) -> float:

@@ -6,16 +6,6 @@ from firmware_sim.kernel import kernel
 
 
 @kernel
-def rotate(q, o, v, out):
-    """out = R(q[o:o+4]) v: a body vector in the world."""
-    w, x, y, z = q[o], q[o + 1], q[o + 2], q[o + 3]
-    tx, ty, tz = 2 * (y * v[2] - z * v[1]), 2 * (z * v[0] - x * v[2]), 2 * (x * v[1] - y * v[0])
-    out[0] = v[0] + w * tx + y * tz - z * ty
-    out[1] = v[1] + w * ty + z * tx - x * tz
-    out[2] = v[2] + w * tz + x * ty - y * tx
-
-
-@kernel
 def matrix(q, o, R):
     """R (3x3, filled in) of q[o:o+4], body to world."""
     w, x, y, z = q[o], q[o + 1], q[o + 2], q[o + 3]

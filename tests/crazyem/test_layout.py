@@ -7,16 +7,12 @@ import re
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_mcap_signals import flight
 
 from crazyem.commands import layout as command
 from crazyem.errors import UsageError
 from crazyem.recordings.mcap import schemas
-from crazyem.recordings.mcap.layout import foxglove_layout, swarm_layout, topics_of
+from crazyem.recordings.mcap.layout import foxglove_layout, swarm_layout
 from crazyem.recordings.mcap.messages import EVENT_TOPICS
-from crazyem.recordings.mcap.signals import write_recording
-from crazyem.recordings.mcap.survey import from_summary
-from crazyem.signals.sample import Block, Variable
 from crazyem.signals.vocabulary import MOTOR_BLOCK, ROTOR_SPEED_BLOCK, block_plan
 
 PATH = re.compile(r"(?P<topic>(?:/\w+)+)\.(?P<fields>.+)")
@@ -92,30 +88,6 @@ def test_panels_are_placed_once_and_it_is_json():
     for name in ("mass", "Ixx", "Iyy", "Izz", "motor_time_constant"):
         for field in ("value", "ci95_low", "ci95_high"):
             assert f'/estimate.parameters[:]{{name=="{name}"}}.{field}' in paths(layout)
-
-
-def test_a_layout_for_an_imported_recording(tmp_path):
-    path = tmp_path / "f.mcap"
-    write_recording(flight(), path)
-    topics = topics_of(from_summary(path)[0])
-    assert "voltage" in topics["/signals/power"]
-    found = paths(foxglove_layout(topics))
-    assert "/signals/power.voltage" in found
-    assert not [p for p in found if "motor_m" in p]  # it has no motor commands
-
-
-def test_topics_of_log_blocks():
-    from mcap.records import Channel, Schema
-
-    codec = schemas.BlockCodec(Block(3, (Variable("pm.vbatMV", "uint16_t"),), 10))
-    announced = [
-        Schema(id=1, data=codec.schema_data(), encoding="protobuf", name=codec.schema_name),
-        Channel(id=1, topic="/log/3", message_encoding="protobuf", metadata={}, schema_id=1),
-        Schema(id=2, data=b"\xff\xff", encoding="protobuf", name="x"),
-        Channel(id=2, topic="/x", message_encoding="protobuf", metadata={}, schema_id=2),
-    ]
-    assert topics_of(announced) == {"/log/3": ["firmware_time_ms", "host_time", "pm_vbatMV"]}
-    assert "/log/3.pm_vbatMV" in paths(foxglove_layout(topics_of(announced)))
 
 
 NAMES = st.lists(st.from_regex(r"[A-Za-z0-9_-]{1,12}", fullmatch=True), min_size=1, max_size=6, unique=True)

@@ -28,8 +28,6 @@ ONBOARD_HOVER_ESTIMATORS = {
     motors.ARDUPILOT: ("MOT_HOVER_LEARN", 2.0, "ArduPilot learns and saves hover thrust itself"),
 }
 
-_Waiter = Callable[[], bool]
-
 
 class MavlinkLink:
     """One autopilot. Blocks are messages (`streams`); every call has a time limit, none waits for ever.

@@ -84,8 +84,3 @@ class DroneClock:
         newest = int(self.newest_ms) * per_ms
         half = modulus // 2
         return (newest + (stamp - newest + half) % modulus - half) // per_ms
-
-    def restart(self) -> None:
-        """Forget what was: the next stamp is believed."""
-        self.newest_ms = self._newest_host = math.nan
-        self._utc_ms, self._refused_in_row = None, 0

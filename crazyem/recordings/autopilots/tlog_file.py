@@ -43,8 +43,6 @@ _INSTANCE = {
 _MOST_INSTANCES = 64
 _NO_SIGNALS = {"PARAM_VALUE", "STATUSTEXT", "FILE_TRANSFER_PROTOCOL", "LOG_DATA", "SERIAL_CONTROL"}
 
-Stamps = NDArray[np.int64]
-
 
 def recognises(head: bytes) -> bool:
     """True if frames with sound checksums follow each other near the start."""
