@@ -3,15 +3,15 @@
 Extended Kalman filter with dense matrices and joint measurement updates; Rauch-Tung-Striebel smoother with the
 covariance of the state at both ends of a step (lag-one); expectations taken from those. With an
 accelerometer the state is augmented by the impulse of the step, of which the measurement is a component. Nothing here
-is shared with the kernels but the model itself (crazyem.physics.rigid_body).
+is shared with the kernels but the model (rigid_body.py).
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from rigid_body import State, angular_acceleration, bridge_covariance, step, step_jacobians
 
-from crazyem.physics.rigid_body import State, angular_acceleration, bridge_covariance, step, step_jacobians
 from crazyem.physics.rotations import quaternion_conjugate, quaternion_product, rotation_vector_from_quaternion
 
 
@@ -54,7 +54,7 @@ def extended_kalman_filter(
     """Filter over all samples; y (n, 13) with NaN where missing; thrust (n,), torque (n, 3) means of the steps.
 
     q (6,) impulse variances per second in units of acceleration, r (12,) measurement variances; `lead` as in
-    crazyem.physics.rigid_body.
+    rigid_body.py.
     """
     n = len(time)
     predicted: list[State] = []

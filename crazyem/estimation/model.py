@@ -24,7 +24,7 @@ NAMES = (
 GROUPS = ("position", "velocity", "attitude", "body_rate", "specific_force")
 
 
-# How velocities of a step become positions (physics/rigid_body.py). A flying body follows the midpoint rule; simulators
+# How velocities of a step become positions (estimation/kernels). A flying body follows the midpoint rule; simulators
 # that step explicitly (as eq. 56 does) or semi-implicitly are followed exactly by theirs.
 INTEGRATION = {"midpoint": 0.5, "euler": 0.0, "semi-implicit": 1.0}
 TINY_IMPULSE = 1e-7  # m/s^2 sqrt(s), rad/s^2 sqrt(s): stands for no process noise at all
@@ -180,7 +180,7 @@ class Setup:
         prior: on parameters and noise scales.
         free: (9,) bool, which parameters are estimated.
         unit: (9,) of the linear parameters; 1 for those taken by their logarithms.
-        lead: rule of integration (physics/rigid_body.py): 0.5 midpoint, 0 explicit Euler, 1 semi-implicit Euler.
+        lead: rule of integration (estimation/kernels): 0.5 midpoint, 0 explicit Euler, 1 semi-implicit Euler.
         known: noise that is not estimated.
     """
 

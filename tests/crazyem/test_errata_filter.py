@@ -27,10 +27,10 @@ from errata_tools import (
     zero,
 )  # fmt: skip
 from reference import extended_kalman_filter, rauch_tung_striebel
+from rigid_body import State
 from scipy.optimize import approx_fprime
 
 from crazyem.paper import plant
-from crazyem.physics.rigid_body import State
 from crazyem.vehicle import GRAVITY
 
 SEEN_A = [0, 1, 2, 9, 10, 11]  # rows of eq. 72

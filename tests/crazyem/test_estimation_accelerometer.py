@@ -6,10 +6,10 @@ import reference
 import test_estimation_kernels as plain
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rigid_body import State, step
 from test_estimation_kernels import INERTIA, MASS, R_FORCE, THETA, Q, R, filled_tape, scaled
 
 from crazyem.estimation import kernels
-from crazyem.physics.rigid_body import State, step
 from crazyem.vehicle import GRAVITY
 
 ACCELEROMETER = 4  # group of its noise

@@ -6,10 +6,10 @@ import reference
 import test_estimation_kernels as midpoint
 from hypothesis import given
 from hypothesis import strategies as st
+from rigid_body import State, angular_acceleration, bridge_covariance, step, step_jacobians
 from scipy.spatial.transform import Rotation
 from test_estimation_kernels import INERTIA, MASS, Q, R, filled_tape, scaled
 
-from crazyem.physics.rigid_body import State, angular_acceleration, bridge_covariance, step, step_jacobians
 from crazyem.vehicle import GRAVITY
 
 LEADS = [0.0, 0.3, 0.5, 1.0]

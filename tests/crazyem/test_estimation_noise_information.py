@@ -6,11 +6,11 @@ import reference
 import test_estimation_kernels as plain
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rigid_body import State, step, step_jacobians
 from test_estimation_accelerometer import measured_tape
 from test_estimation_kernels import INERTIA, MASS, P0, R_FORCE, THETA, Q, R, filled_tape
 
 from crazyem.estimation import kernels
-from crazyem.physics.rigid_body import State, step, step_jacobians
 from crazyem.vehicle import GRAVITY
 
 SCALES = 11

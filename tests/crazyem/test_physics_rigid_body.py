@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rigid_body import State, angular_acceleration, bridge_covariance, step, step_jacobians
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from crazyem.physics.rigid_body import State, angular_acceleration, bridge_covariance, step, step_jacobians
 from crazyem.vehicle import GRAVITY
 
 MASS = 0.036

@@ -7,6 +7,28 @@ recursion: it gives the smoothed moments of Rauch-Tung-Striebel (benchmarks/refe
 tests compare them), and yields the smoothed process noise, all that the M-step needs, without inverting the
 prediction covariance.
 
+The model is the rigid body: position p [m, world], velocity v [m/s, world], attitude q (x, y, z, w; body to world),
+body rate w [rad/s, FLU]. Errors are 12-vectors (dp, dv, dtheta, dw) with q_true = q * exp(dtheta): the attitude error
+is in the body frame. One step of length dt with mean thrust F and mean torque M over the step, and random impulses u of
+specific force and angular acceleration (body frame), with h = lead dt:
+
+    a  = R(q exp(h w)) (e3 F/m + u_v/dt) - g e3             v' = v + dt a
+    al = I^-1 (M - w x I w) + u_w/dt                        w' = w + dt al
+    p' = p + dt v + h dt a                                  q' = q exp(dt w + h dt al)
+
+`lead` says by which fraction of a step the velocities that move position and attitude, and the attitude that turns the
+force, are ahead of the step's start. Flights in continuous time take 1/2, the midpoint rule, second order in dt. The
+others are for data of simulators that step so: 0 is explicit Euler (Zhao eq. 56), 1 is semi-implicit Euler. For those
+the discrete motion is the truth, and there is nothing within a step. For the midpoint rule the integral of a Brownian
+motion given both its ends adds dt^3/12 times its intensity to the covariance of position and attitude.
+
+Explicit Euler adds to roll, pitch and yaw dt times their derivatives (Zhao eq. 47), as the simulators do that step so:
+q' is not q exp(dt w) but differs from it by dt^2, which precise noise levels notice. Where pitch is within 3 degrees of
+a right angle, and those derivatives have no bounds, it is q exp(dt w) after all.
+
+Noise enters through force and torque only (Zhao eq. 55), so its covariance has rank 6, not 12; in units of
+acceleration it does not depend on mass and inertia.
+
 State arrays hold 13 numbers: position (3) m world, velocity (3) m/s world, quaternion x y z w (4) body to
 world, body rate (3) rad/s FLU. Noise intensities `q` (6,) are in units of acceleration: variance per second of
 specific-impulse x y z [(m/s)^2/s] and angular-velocity impulse x y z [(rad/s)^2/s], body frame. `r` (12,) are

@@ -3,7 +3,8 @@
 import numpy as np
 
 from crazyem.compiled import compiled
-from crazyem.physics.rigid_body import UPRIGHT
+
+UPRIGHT = 0.05  # cosine of pitch below which Euler angles are not stepped
 
 
 @compiled
@@ -88,7 +89,7 @@ def rate_jacobian(w, inertia, inverse, dt, out):
 
 @compiled
 def right_jacobian(phi, out):
-    """d log(exp(phi)^-1 exp(phi + d)) / dd to second order in phi, as in physics/rigid_body.py."""
+    """d log(exp(phi)^-1 exp(phi + d)) / dd to second order in phi, as in benchmarks/rigid_body.py."""
     x0, x1, x2 = phi[0], phi[1], phi[2]
     n2 = x0 * x0 + x1 * x1 + x2 * x2
     for i in range(3):

@@ -26,7 +26,7 @@ def forward(first, last, restart, time, kind, y, force, thrust, torque, mass, in
     A sample k is predicted from k - 1 with thrust[k], torque[k] (means over the step that ends at k), except where
     kind[k] == 1 (a break: the state starts anew at the measurement with variances p0) and at k == first with restart
     (the prior xp[first], pp[first] stands as it is). Missing measurements are NaN in y and force. `lead` is the
-    rule of integration (physics/rigid_body.py).
+    rule of integration (estimation/kernels).
     """
     cov = np.empty((12, 12))
     tmp = np.empty((12, 12))

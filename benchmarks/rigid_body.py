@@ -1,26 +1,7 @@
-"""The rigid body: one step of its motion under thrust along body z and torque, and the step's analytic Jacobian.
+"""The rigid body in plain numpy: a step of the model of crazyem.estimation.kernels, and the step's analytic Jacobian.
 
-State: position p [m, world], velocity v [m/s, world], attitude q (x, y, z, w; body to world), body rate w [rad/s, FLU].
-Errors are 12-vectors (dp, dv, dtheta, dw) with q_true = q * exp(dtheta): the attitude error is in the body frame.
-
-One step of length dt with mean thrust F and mean torque M over the step, and random impulses u of specific force and
-angular acceleration (body frame), with h = lead dt:
-
-    a  = R(q exp(h w)) (e3 F/m + u_v/dt) - g e3             v' = v + dt a
-    al = I^-1 (M - w x I w) + u_w/dt                        w' = w + dt al
-    p' = p + dt v + h dt a                                  q' = q exp(dt w + h dt al)
-
-`lead` says by which fraction of a step the velocities that move position and attitude, and the attitude that turns the
-force, are ahead of the step's start. Flights in continuous time take 1/2, the midpoint rule, second order in dt. The
-others are for data of simulators that step so: 0 is explicit Euler (Zhao eq. 56), 1 is semi-implicit Euler. For those
-the discrete motion is the truth, and there is nothing within a step (`bridge_covariance`).
-
-Explicit Euler adds to roll, pitch and yaw dt times their derivatives (Zhao eq. 47), as the simulators do that step so:
-q' is not q exp(dt w) but differs from it by dt^2, which precise noise levels notice. Where pitch is within 3 degrees of
-a right angle, and those derivatives have no bounds, it is q exp(dt w) after all.
-
-Noise enters through force and torque only (Zhao eq. 55), so its covariance has rank 6, not 12; in units of
-acceleration it does not depend on mass and inertia.
+Notation as there. The plain twin of the kernels (reference.py) and tests stand on this; crazyem itself runs the
+compiled pieces of crazyem.estimation.kernels.algebra.
 """
 
 from typing import NamedTuple
@@ -28,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.estimation.kernels.algebra import UPRIGHT
 from crazyem.physics.rotations import (
     quaternion_from_euler,
     quaternion_from_rotation_vector,
@@ -36,8 +18,6 @@ from crazyem.physics.rotations import (
     skew,
 )
 from crazyem.vehicle import GRAVITY
-
-UPRIGHT = 0.05  # cosine of pitch below which Euler angles are not stepped
 
 
 class State(NamedTuple):
