@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from crazyem.atomic_file import write_file
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.paper.experiments import Task
 from crazyem.paper.pages import notes, settings_grid
 from crazyem.paper.published_values import ONLINE_ITERATIONS
-from crazyem.paper.runner import SCHEMA, write_atomically
+from crazyem.paper.runner import SCHEMA
 from crazyem.paper.table_text import (
     Grid,
     convergence_grid,
@@ -281,14 +282,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         kept = root / "docs" / STORED_RESULTS
         if arguments.results:
             results = read_results(Path(arguments.results))
-            write_atomically(kept, json.dumps(summarised(results), indent=1, allow_nan=False) + "\n")
+            write_file(kept, json.dumps(summarised(results), indent=1, allow_nan=False) + "\n")
             if arguments.small:
-                write_atomically(Path(arguments.small), json.dumps(small(results), indent=1, allow_nan=False) + "\n")
+                write_file(Path(arguments.small), json.dumps(small(results), indent=1, allow_nan=False) + "\n")
         results = read_results(kept)
         for name in PAGES:
             page = root / name
             if page.is_file():
-                write_atomically(page, filled(page.read_text(encoding="utf-8"), results))
+                write_file(page, filled(page.read_text(encoding="utf-8"), results))
     except CrazyemError as error:
         parser.exit(error.exit_code, f"{parser.prog}: {error}\n")
     return 0

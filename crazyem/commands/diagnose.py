@@ -6,8 +6,9 @@ import sys
 import time
 from pathlib import Path
 
+from crazyem.atomic_file import write_file
 from crazyem.commands.files import read_options
-from crazyem.commands.output import put, replace_text
+from crazyem.commands.output import put
 from crazyem.live.summary import check_writable
 
 
@@ -42,13 +43,13 @@ def run(arguments: argparse.Namespace) -> int:
     )
     document = {**found.document, "seconds": time.monotonic() - begin}
     if arguments.write_vehicle:
-        replace_text(arguments.write_vehicle, found.named_vehicle(Path(arguments.write_vehicle).stem).to_toml())
+        write_file(arguments.write_vehicle, found.named_vehicle(Path(arguments.write_vehicle).stem).to_toml())
     if arguments.report:
         found.report(arguments.report)
     if arguments.json == "-":
         put(json.dumps(document, indent=1))
         return 0
     if arguments.json:
-        replace_text(arguments.json, json.dumps(document, indent=1) + "\n")
+        write_file(arguments.json, json.dumps(document, indent=1) + "\n")
     put(text_of(document))
     return 0

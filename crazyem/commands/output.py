@@ -1,7 +1,6 @@
 """What the commands on recordings say and where: text without control characters, JSON, progress on standard error."""
 
 import argparse
-import os
 import sys
 import time
 from collections.abc import Iterable, Mapping
@@ -33,17 +32,6 @@ def complain(text: str) -> None:
     """An error that does not end the command, to standard error."""
     sentence = plain(text).strip()
     print(f"crazyem: {sentence}{'' if sentence.endswith('.') else '.'}", file=sys.stderr, flush=True)
-
-
-def replace_text(path: str, text: str) -> None:
-    """A whole file or none. Raises UsageError if it cannot be written."""
-    beside = Path(f"{path}.part")
-    try:
-        beside.write_text(text, encoding="utf-8", newline="")
-        os.replace(beside, path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise UsageError(f"cannot write {path}: {error.strerror or error}.") from None
 
 
 def remarks(findings: Iterable[Finding]) -> list[str]:

@@ -127,12 +127,12 @@ def draw_group(records: list[Any], settings: Settings, folder: str, name: str) -
 
 def write_results(folder: Path, results: dict[str, Any]) -> None:
     """results.json, tables.md and index.html."""
+    from crazyem.atomic_file import write_file
     from crazyem.paper.pages import index_html, tables_markdown
-    from crazyem.paper.runner import write_atomically
 
-    write_atomically(folder / "results.json", json.dumps(results, allow_nan=False, indent=None) + "\n")
-    write_atomically(folder / "tables.md", tables_markdown(results))
-    write_atomically(folder / "index.html", index_html(results, results["figures"]))
+    write_file(folder / "results.json", json.dumps(results, allow_nan=False, indent=None) + "\n")
+    write_file(folder / "tables.md", tables_markdown(results))
+    write_file(folder / "index.html", index_html(results, results["figures"]))
 
 
 def _summary(results: dict[str, Any], folder: Path) -> None:

@@ -2,8 +2,9 @@
 
 import argparse
 
+from crazyem.atomic_file import write_file
 from crazyem.commands.common import say
-from crazyem.commands.output import put, replace_text
+from crazyem.commands.output import put
 from crazyem.errors import CrazyemError, UsageError
 from crazyem.live.summary import check_writable, write_json
 
@@ -46,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise NoManoeuvreError(str(found))
     if arguments.json != "-":
         put(str(found))
-    replace_text(arguments.output, found.to_toml())
+    write_file(arguments.output, found.to_toml())
     say(f"plan: {arguments.output}   fly it: crazyem fly --trajectory plan {arguments.output}")
     return 0
 

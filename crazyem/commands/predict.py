@@ -1,16 +1,15 @@
 """`crazyem predict RECORDING --vehicle FILE --horizon N -o OUT.npz`: causal open-loop predictions from every start."""
 
 import argparse
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.atomic_file import new_file
 from crazyem.commands.files import Found, read_options, targets
 from crazyem.commands.output import Progress, put
-from crazyem.errors import UsageError
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -69,13 +68,6 @@ def _ensemble(arguments: argparse.Namespace) -> int:
 
 
 def write(output: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    """All or nothing: into a file part it first. Raises UsageError if it cannot be written."""
-    part = output.with_name(output.name + ".part")
-    try:
-        with part.open("wb") as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]
-        os.replace(part, output)
-    except OSError as error:
-        raise UsageError(f"cannot write {output}: {error.strerror or error}.") from None
-    finally:
-        part.unlink(missing_ok=True)
+    """All or nothing. Raises UsageError if it cannot be written."""
+    with new_file(output, force=True) as temporary, temporary.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]

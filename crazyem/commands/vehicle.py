@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from crazyem.atomic_file import write_file
 from crazyem.commands.common import say
 from crazyem.commands.files import read_options
-from crazyem.commands.output import put, replace_text
+from crazyem.commands.output import put
 from crazyem.errors import DataError, UsageError
 from crazyem.live.summary import check_writable
 
@@ -40,7 +41,7 @@ def _check(arguments: argparse.Namespace) -> int:
         progress=lambda text: say(f"check: {text}"),
     )
     if arguments.write:
-        replace_text(arguments.write, found.corrected.text)
+        write_file(arguments.write, found.corrected.text)
     _report(arguments, {**found.to_dict(), "written": arguments.write}, [str(found)])
     return DataError.exit_code if arguments.strict and not found.fits else 0
 
@@ -64,7 +65,7 @@ def _convert(arguments: argparse.Namespace) -> int:
         source.vehicle, to, template=template, where=arguments.template or "", name=arguments.name or "",
         suffix=output.suffix.lower(), flight=flight,
     )  # fmt: skip
-    replace_text(str(output), made.text)
+    write_file(str(output), made.text)
     remarks = [] if source.imported is None else list(source.imported.remarks)
     document = {"source": arguments.source, "source_format": source.format, "output": str(output), **made.to_json()}
     document["remarks"] = remarks
@@ -103,7 +104,7 @@ def _sample(arguments: argparse.Namespace) -> int:
             _check_target(target, arguments)
             made = convert(drawn, to, template=template, where=arguments.template or "", name=arguments.name or "",
                            costs=False)  # fmt: skip
-            replace_text(str(target), made.text)
+            write_file(str(target), made.text)
     rows = {n: [float(np.mean(v)), float(np.std(v))] for n, v in arrays.items()}
     document = {
         "file": arguments.file, "output": str(output), "to": to, "count": arguments.count, "seed": arguments.seed,
@@ -158,6 +159,6 @@ def _report(arguments: argparse.Namespace, document: dict[str, Any], lines: list
         put(text)
         return 0
     if arguments.json:
-        replace_text(arguments.json, text + "\n")
+        write_file(arguments.json, text + "\n")
     put("\n".join(lines))
     return 0

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.atomic_file import write_file
 from crazyem.extras import require
 from crazyem.paper.flight import Flight, fly
 from crazyem.paper.published_values import FIGURES, PARAMETERS, PUBLISHED_RANGES, UNITS, PaperFigure
-from crazyem.paper.runner import write_atomically
 from crazyem.paper.settings import Settings
 
 Record = Mapping[str, Any]
@@ -79,7 +79,7 @@ def _save(figure: Any, path: Path) -> None:
     for suffix, options in kinds:
         buffer = io.BytesIO()
         figure.savefig(buffer, format=suffix[1:], dpi=_DPI, **options)
-        write_atomically(path.with_suffix(suffix), buffer.getvalue())
+        write_file(path.with_suffix(suffix), buffer.getvalue())
 
 
 # states and paths ---------------------------------------------------------------------------------------------

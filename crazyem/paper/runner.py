@@ -3,7 +3,6 @@
 import ast
 import hashlib
 import json
-import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -12,6 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from crazyem.atomic_file import write_file
 from crazyem.errors import UsageError
 from crazyem.paper.experiments import Task, run_task
 from crazyem.paper.settings import Settings, described
@@ -81,24 +81,7 @@ def run_and_store(task: Task, settings: Settings, folder: str, stamp: str) -> No
         UsageError: it cannot be written.
     """
     record = run_task(task, settings)
-    write_atomically(
-        task_file(Path(folder), task), json.dumps({"fingerprint": stamp, "record": record}, allow_nan=False)
-    )
-
-
-def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file so that nobody ever sees half of it.
-
-    Raises:
-        UsageError: it cannot be written.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise UsageError(f"cannot write {path}: {error.strerror or error}.") from None
+    write_file(task_file(Path(folder), task), json.dumps({"fingerprint": stamp, "record": record}, allow_nan=False))
 
 
 def prepare(folder: Path) -> None:

@@ -4,13 +4,10 @@ A row is an instant: samples with the same stamp that follow one another. A fiel
 sample in that row, and NaN where it has one that is not a number.
 """
 
-import contextlib
 import csv
 import io
 import json
 import math
-import os
-import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +15,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from crazyem.atomic_file import new_file
 from crazyem.errors import UsageError
 from crazyem.recordings.columns import Column, Description, Rows, describe, rows_of
 from crazyem.recordings.description import to_json
@@ -61,34 +59,6 @@ def export_parts(parts: Any, path: str | Path, *, force: bool = False) -> Descri
                 text = json.dumps(csvw(description, path.name), indent=1, allow_nan=False, ensure_ascii=True)
                 other.write_text(text + "\n", encoding="utf-8")
     return description
-
-
-@contextlib.contextmanager
-def new_file(path: Path, *, force: bool = False) -> Iterator[Path]:
-    """A temporary file that becomes `path` when the block ends well, and vanishes when it does not.
-
-    Raises: UsageError if `path` exists and not `force`, or it cannot be written.
-    """
-    try:
-        if path.is_dir():
-            raise UsageError(f"{path} is a directory.")
-        if not force and path.exists():
-            raise UsageError(f"{path} exists already (--force replaces it).")
-        handle, name = tempfile.mkstemp(prefix=".crazyem-", suffix=path.suffix, dir=path.parent)
-        os.close(handle)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}.") from None
-    temporary = Path(name)
-    try:
-        yield temporary
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
-        temporary.replace(path)
-    except OSError as error:
-        raise UsageError(f"cannot write {path}: {error.strerror or error}.") from None
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _blocks(description: Description, parts: Iterable[Recording], schema: Any) -> Iterator[Any]:

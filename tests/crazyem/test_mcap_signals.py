@@ -271,7 +271,7 @@ def test_nothing_half_written_stays(tmp_path, monkeypatch):
     with pytest.raises(UsageError, match="No space left"):
         write_recording(flight(), tmp_path / "f.mcap")
     assert os.listdir(tmp_path) == []
-    with pytest.raises(UsageError, match="cannot be written"):
+    with pytest.raises(UsageError, match="cannot write"):
         write_recording(flight(), tmp_path / "no" / "f.mcap")
 
 

@@ -17,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_paper import offline
 
+from crazyem.atomic_file import write_file
 from crazyem.cli import main
 from crazyem.errors import UsageError
 from crazyem.paper import experiments, figures, runner
@@ -145,7 +146,7 @@ def test_results_are_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Monk
     target.write_text("before")
     monkeypatch.setattr(os, "replace", interrupted)
     with pytest.raises(UsageError, match="No space left"):
-        runner.write_atomically(target, "after")
+        write_file(target, "after")
     assert target.read_text() == "before"
     assert [p.name for p in tmp_path.iterdir()] == ["results.json"]
 

@@ -3,16 +3,15 @@
 Nothing in it is fetched from elsewhere, nothing in it runs, and every text of a recording or a file is escaped.
 """
 
-import os
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crazyem.atomic_file import write_file
 from crazyem.diagnosis.report.content import facts, sections
 from crazyem.diagnosis.report.pictures import Series, data_uri
 from crazyem.diagnosis.report.verdict import Document, changes, claim
-from crazyem.errors import UsageError
 from crazyem.extras import require
 
 if TYPE_CHECKING:
@@ -29,15 +28,7 @@ def write_report(path: str | Path, document: Document, pictures: Mapping[str, Se
 
     Raises: UsageError if the file cannot be written. MissingExtraError: no Jinja2, or no matplotlib.
     """
-    text = report(document, pictures or {})
-    target = Path(path)
-    beside = target.with_name(target.name + ".part")
-    try:
-        beside.write_text(text, encoding="utf-8")
-        os.replace(beside, target)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise UsageError(f"cannot write {target}: {error.strerror or error}.") from None
+    write_file(path, report(document, pictures or {}))
 
 
 def report(document: Document, pictures: Mapping[str, Series]) -> str:

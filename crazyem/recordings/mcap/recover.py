@@ -1,7 +1,5 @@
 """A broken MCAP file into a new, valid one: every complete chunk, whatever program wrote it."""
 
-import os
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.atomic_file import new_file
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.recordings.mcap import scan as mcap_scan
 from crazyem.recordings.mcap.messages import PROFILE
@@ -81,30 +80,18 @@ def recover(source: str | Path, target: str | Path, *, replace: bool = False) ->
     source, target = Path(source), Path(target)
     if not source.is_file():
         raise UsageError(f"{source}: no such file.")
-    if target.exists() and (not replace or target.samefile(source)):
-        what = "is the damaged file itself" if target.samefile(source) else "exists already"
-        raise UsageError(f"{target} {what}; it was left as it is.")
-    temporary = ""
-    try:
+    if target.exists() and target.samefile(source):
+        raise UsageError(f"{target} is the damaged file itself; it was left as it is.")
+    with new_file(target, force=replace) as temporary:
         with source.open("rb") as stream:
             head = stream.read(4096)
         if not head.startswith(MCAP_MAGIC):
             raise FileFormatError(f"{source} is not an MCAP file.")
-        handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
-        with os.fdopen(handle, "wb") as stream:
+        with temporary.open("wb") as stream:
             report = _copy(source, head, Output(stream))
-            stream.flush()
-            os.fsync(stream.fileno())
         if not report.messages:
             where = f" (byte {report.problems[0].offset}: {report.problems[0].why})" if report.problems else ""
             raise FileFormatError(f"{source}: not one message can be recovered{where}.")
-        os.chmod(temporary, source.stat().st_mode & 0o777 | 0o200)
-        os.replace(temporary, target)
-    except OSError as error:
-        raise UsageError(f"{target} cannot be written: {error.strerror or error}.") from error
-    finally:
-        if temporary and os.path.exists(temporary):
-            os.unlink(temporary)
     return report
 
 

@@ -6,8 +6,6 @@ clocks and sources, events, findings and metadata. docs/reference/formats/mcap.m
 
 import json
 import math
-import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -16,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.errors import UsageError
+from crazyem.atomic_file import new_file
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.mcap import schemas
 from crazyem.recordings.mcap.findings import IMPORT_METADATA, findings_to_json
@@ -56,35 +54,8 @@ def write_recording(
 
     Raises: UsageError if the file exists or cannot be written.
     """
-    path = Path(path)
-    if path.exists() and not replace:
-        raise UsageError(f"{path} exists already; it was left as it is.")
-    temporary = ""
-    try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-        with os.fdopen(handle, "wb") as stream:
-            _write(recording, Output(stream), {**recording.metadata, **(metadata or {})})
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
-        if replace:
-            os.replace(temporary, path)
-        else:
-            os.link(temporary, path)  # fails if somebody was faster
-            os.unlink(temporary)
-    except FileExistsError as error:
-        raise UsageError(f"{path} exists already; it was left as it is.") from error
-    except OSError as error:
-        raise UsageError(f"{path} cannot be written: {error.strerror or error}.") from error
-    finally:
-        if temporary and os.path.exists(temporary):
-            os.unlink(temporary)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    with new_file(Path(path), force=replace) as temporary, temporary.open("wb") as stream:
+        _write(recording, Output(stream), {**recording.metadata, **(metadata or {})})
 
 
 def _write(recording: Recording, output: Output, metadata: Mapping[str, Mapping[str, str]]) -> None:
