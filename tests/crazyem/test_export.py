@@ -339,17 +339,17 @@ def test_packed_it_is_read_as_well(exported: Path, tmp_path: Path) -> None:
     found = read(path, ReadOptions())
     assert 0 < len(sequence(found)) < len(whole)
     assert sequence(found) == whole[: len(sequence(found))]
-    assert "damaged" in found.findings[0].text
+    assert "ends early" in found.findings[0].text
 
 
 def test_a_bomb_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("crazyem.recordings.csv.exported._UNPACKED_LIMITS", (1 << 20, 50))
+    monkeypatch.setattr("crazyem.recordings.csv.text._SMALL_TEXT", 1 << 20)
     path = tmp_path / "f.csv.gz"
     with gzip.open(path, "wb", compresslevel=9) as file:
         file.write(b"time [s],host_time [s],voltage [V]\n")
         for _ in range(3):
             file.write(b"0,,1\n" * 100_000)
-    with pytest.raises(FileFormatError, match="unpacks to far more"):
+    with pytest.raises(FileFormatError, match="unpacks to more than 200 times"):
         read(path, ReadOptions())
 
 

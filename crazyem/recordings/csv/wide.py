@@ -14,6 +14,7 @@ from crazyem.recordings.csv.mapping import CsvMapping, SignalColumns
 from crazyem.recordings.csv.signals import Layout, Rows, signals_of
 from crazyem.recordings.csv.text import Columns, Damage, Header, read_columns
 from crazyem.recordings.finding import Finding, Grade, note
+from crazyem.recordings.growing import GrowingArray
 from crazyem.recordings.recording import Recording
 from crazyem.signals.sample import SIGNALS
 
@@ -37,28 +38,22 @@ class _Plan:
 
 
 class _Held:
-    """Rows read and not yet handed out, column by column, in arrays that grow (one copy of the data, not two)."""
+    """Rows read and not yet handed out, column by column (one copy of the data, not two)."""
 
     def __init__(self) -> None:
-        self.arrays: Columns = {}
+        self.arrays: dict[int, GrowingArray] = {}
         self.rows = 0
 
     def add(self, block: Columns) -> None:
         """Append rows."""
         more = next(iter(block.values())).size
         for c, values in block.items():
-            array = self.arrays.get(c)
-            if array is None or array.size < self.rows + more:
-                grown = np.empty(max(2 * self.rows, self.rows + more))
-                if array is not None:
-                    grown[: self.rows] = array[: self.rows]
-                self.arrays[c] = array = grown
-            array[self.rows : self.rows + more] = values
+            self.arrays.setdefault(c, GrowingArray(float)).more(more)[:] = values
         self.rows += more
 
     def joined(self) -> Columns:
         """One array a column."""
-        return {c: array[: self.rows] for c, array in self.arrays.items()}
+        return {c: array.rows for c, array in self.arrays.items()}
 
 
 def read_wide(path: Path, header: Header, mapping: CsvMapping, *, as_published: bool) -> Recording:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from crazyem.recordings.growing import GrowingArray
 from crazyem.recordings.mcap import scan as mcap_scan
 from crazyem.recordings.mcap import schemas
 from crazyem.recordings.mcap.messages import EVENT_TOPICS, OTHER_EVENT_TOPIC, fields_of
@@ -43,44 +44,26 @@ class _Rows:
         none, _ = codec.decode(np.empty(0, np.uint8), np.empty(0, np.int64))
         kinds = [none.dtype[first] if last > first else np.dtype(float) for first, last in self._groups]
         self._arrays = [
-            np.empty((expected, last - first), kind) for (first, last), kind in zip(self._groups, kinds, strict=True)
+            GrowingArray(kind, last - first, expected=expected)
+            for (first, last), kind in zip(self._groups, kinds, strict=True)
         ]
-        self._places = np.empty((expected, 1), np.int64)
-        self._size = 0
+        self._places = GrowingArray(np.int64, expected=expected)
 
     def add(self, data: NDArray[np.uint8], messages: NDArray[np.int64], places: NDArray[np.int64]) -> int:
         """Take messages (rows of `Scan.messages`) at `places` in the file; returns how many are not sound."""
         right = messages[:, 1] == self.codec.size
         rows, sound = self.codec.decode(data, messages[right, 0])
         rows = rows[sound]
-        start, self._size = self._size, self._size + rows.size
-        for number, (first, last) in enumerate(self._groups):
-            self._arrays[number] = _grown(self._arrays[number], self._size)
+        for array, (first, last) in zip(self._arrays, self._groups, strict=True):
+            room = array.more(rows.size)
             for i in range(first, last):
-                self._arrays[number][start : self._size, i - first] = rows[str(i)]
-        self._places = _grown(self._places, self._size)
-        self._places[start : self._size, 0] = places[right][sound]
+                room[:, i - first] = rows[str(i)]
+        self._places.more(rows.size)[:] = places[right][sound]
         return len(messages) - int(sound.sum())
 
     def take(self) -> tuple[list[NDArray[Any]], NDArray[np.int64]]:
         """(n, fields) values of each group and (n,) places in the file; handed over, not kept."""
-        arrays = [_trimmed(array, self._size) for array in self._arrays]
-        places = _trimmed(self._places, self._size)[:, 0]
-        self._arrays = [np.empty((0, array.shape[1]), array.dtype) for array in arrays]
-        self._places, self._size = np.empty((0, 1), np.int64), 0
-        return arrays, places
-
-
-def _grown(array: NDArray[Any], size: int) -> NDArray[Any]:
-    if size <= len(array):
-        return array
-    larger = np.empty((max(size, len(array) * 3 // 2), array.shape[1]), array.dtype)
-    larger[: len(array)] = array
-    return larger
-
-
-def _trimmed(array: NDArray[Any], size: int) -> NDArray[Any]:
-    return array[:size] if len(array) - size < len(array) // 16 else array[:size].copy()
+        return [array.take() for array in self._arrays], self._places.take()
 
 
 @dataclass
