@@ -7,6 +7,7 @@ quantity gives it, further ones must agree, all of them are written.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import resources
 from typing import Any, Protocol
 
 from crazyem.errors import FileFormatError, UsageError
@@ -131,6 +132,21 @@ _GIVERS = {
     **{f"drag_{a}": ("drag", "rotor_drag_xy") for a in "xy"}, "drag_z": ("drag", "rotor_drag_z"),
     **{f"damping_{a}": ("damping",) for a in "xyz"},
 }  # fmt: skip
+
+
+def template(file: str, *, named: Callable[[str], str] = str) -> Callable[[str], str]:
+    """A format's `skeleton` out of the folder templates: the file, with the drone's name for each @NAME@.
+
+    Args:
+        file: its name.
+        named: how the format writes a name.
+    """
+
+    def skeleton(name: str) -> str:
+        text = (resources.files("crazyem.simulators") / "templates" / file).read_text(encoding="utf-8")
+        return text.replace("@NAME@", named(name))
+
+    return skeleton
 
 
 @dataclass(frozen=True)

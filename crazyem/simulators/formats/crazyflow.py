@@ -10,7 +10,7 @@ from typing import Any
 
 from crazyem.simulators.constants import Constants, hover_speed
 from crazyem.simulators.documents.tables import TomlDocument
-from crazyem.simulators.fields import Field, Format
+from crazyem.simulators.fields import Field, Format, template
 from crazyem.simulators.plausible import RPM
 from crazyem.vehicle import GRAVITY
 
@@ -111,35 +111,6 @@ def _names(document: TomlDocument) -> list[str]:
     return [k for k in document.keys(()) if "rpm2thrust" in document.keys((k,))]
 
 
-def _skeleton(name: str) -> str:
-    return f"""\
-[{_key(name)}]
-mass = 0.0  # kg
-J = [  # kg m^2
-    [0.0, 0.0, 0.0],
-    [0.0, 0.0, 0.0],
-    [0.0, 0.0, 0.0],
-]
-thrust_min = 0.0  # N per motor
-thrust_max = 0.0  # N per motor
-L = 0.0  # m, offset of a rotor along an axis
-prop_inertia = 0.0  # kg m^2
-rpm2thrust = [0.0, 0.0, 0.0]  # N, polynomial in RPM
-rpm2torque = [0.0, 0.0, 0.0]  # N m, polynomial in RPM
-rotor_dyn_coef = [20.0, 0.0, 20.0, 0.0]  # 1/s: rise, its square; fall, its square
-mixing_matrix = [
-    [-1.0, -1.0, 1.0, 1.0],
-    [-1.0, 1.0, 1.0, -1.0],
-    [-1.0, 1.0, -1.0, 1.0],
-]
-drag_matrix = [  # N/(m/s)
-    [0.0, 0.0, 0.0],
-    [0.0, 0.0, 0.0],
-    [0.0, 0.0, 0.0],
-]
-"""
-
-
 def _key(name: str) -> str:
     return name if name.replace("_", "").replace("-", "").isalnum() else '"' + name.replace('"', "") + '"'
 
@@ -153,7 +124,7 @@ CRAZYFLOW = Format(
     recognises=lambda text: "rpm2thrust" in text and "rotor_dyn_coef" in text and "=" in text and "<" not in text[:1],
     names=_names,
     fields=_fields,
-    skeleton=_skeleton,
+    skeleton=template("crazyflow.toml", named=_key),
     read_more=_read_more,
     write_more=_write_more,
     source="comments of crazyflow 0.4, dynamics/first_principles/params.toml",

@@ -4,7 +4,7 @@ Its own simulator takes no constants from here.
 """
 
 from crazyem.simulators.documents.tables import YamlDocument
-from crazyem.simulators.fields import Field, Format
+from crazyem.simulators.fields import Field, Format, template
 
 
 def _fields(document: YamlDocument, name: str) -> list[Field]:
@@ -14,25 +14,6 @@ def _fields(document: YamlDocument, name: str) -> list[Field]:
         *(Field((*lee, f"J_{a}"), f"inertia_{a}{a}", "kg m^2") for a in "xyz"),
         Field((*mellinger, "mass"), "mass", "kg"),
     ]
-
-
-def _skeleton(name: str) -> str:
-    return f"""\
-robots:
-  {name}:
-    enabled: true
-    uri: radio://0/80/2M/E7E7E7E7E7
-    initial_position: [0, 0, 0]
-    type: default
-    firmware_params:
-      ctrlLee:
-        mass: 0.0
-        J_x: 0.0
-        J_y: 0.0
-        J_z: 0.0
-      ctrlMel:
-        mass: 0.0
-"""
 
 
 def _recognises(text: str) -> bool:
@@ -49,6 +30,6 @@ CRAZYSWARM2 = Format(
     recognises=_recognises,
     names=lambda document: document.keys(("robots",)),
     fields=_fields,
-    skeleton=_skeleton,
+    skeleton=template("crazyswarm2.yaml"),
     source="crazyswarm2, config/crazyflies.yaml; parameter groups ctrlLee and ctrlMel of the firmware",
 )

@@ -13,7 +13,7 @@ from crazyem.errors import FileFormatError
 from crazyem.physics.effects.mass_properties import steiner
 from crazyem.simulators.constants import Constants, inertia_of
 from crazyem.simulators.documents.xml import Element, XmlDocument
-from crazyem.simulators.fields import Field, Format
+from crazyem.simulators.fields import Field, Format, template
 from crazyem.simulators.layout import NOTHING
 
 Array = NDArray[np.float64]
@@ -229,59 +229,6 @@ def _write_lags(document: XmlDocument, c: Constants) -> None:
             document.put((*path, f"plugin[{k}]", key, "#"), value * factor)
 
 
-def _skeleton(name: str) -> str:
-    corners = ((1, -1, "ccw"), (-1, -1, "cw"), (-1, 1, "ccw"), (1, 1, "cw"))
-    zero = "".join(f"<{key}>0</{key}>" for key, _, _ in _ELEMENTS)
-    small = "<ixx>1e-11</ixx><iyy>1e-11</iyy><izz>1e-11</izz>"
-    links, joints, motors, rotors = "", "", "", ""
-    for k, (x, y, turns) in enumerate(corners, start=1):
-        links += f"""\
-    <link name="m{k}_prop">
-      <pose>{x} {y} 0 0 0 0</pose>
-      <inertial><mass>1e-6</mass><inertia>{small}</inertia></inertial>
-    </link>
-"""
-        joints += f"""\
-    <joint name="m{k}_joint" type="revolute">
-      <parent>body</parent>
-      <child>m{k}_prop</child>
-      <axis><xyz>0 0 1</xyz></axis>
-    </joint>
-"""
-        motors += f"""\
-    <plugin filename="gz-sim-multicopter-motor-model-system" name="gz::sim::systems::MulticopterMotorModel">
-      <jointName>m{k}_joint</jointName>
-      <linkName>m{k}_prop</linkName>
-      <turningDirection>{turns}</turningDirection>
-      <timeConstantUp>0.05</timeConstantUp>
-      <timeConstantDown>0.05</timeConstantDown>
-      <maxRotVelocity>3000</maxRotVelocity>
-      <motorConstant>0</motorConstant>
-      <momentConstant>0</momentConstant>
-      <rotorDragCoefficient>0</rotorDragCoefficient>
-      <rollingMomentCoefficient>0</rollingMomentCoefficient>
-      <rotorVelocitySlowdownSim>20</rotorVelocitySlowdownSim>
-      <actuator_number>{k - 1}</actuator_number>
-      <motorType>velocity</motorType>
-    </plugin>
-"""
-    return f"""\
-<?xml version="1.0" ?>
-<sdf version="1.8">
-  <model name="crazyflie">
-    <link name="body">
-      <inertial>
-        <pose>0 0 0 0 0 0</pose>
-        <mass>0</mass>
-        <inertia>{zero}</inertia>
-      </inertial>
-      <collision name="body_collision"><geometry><box><size>0.1 0.1 0.03</size></box></geometry></collision>
-    </link>
-{links}{joints}{motors}{rotors}  </model>
-</sdf>
-"""
-
-
 GAZEBO = Format(
     name="gazebo",
     order=40,
@@ -290,7 +237,7 @@ GAZEBO = Format(
     open=XmlDocument,
     recognises=lambda text: "<sdf" in text and "motorConstant" in text,
     fields=_fields,
-    skeleton=_skeleton,
+    skeleton=template("gazebo.sdf"),
     read_more=_read_more,
     write_more=_write_more,
     source="gz-sim, MulticopterMotorModel; crazyflie-simulation, gazebo/crazyflie/model.sdf",

@@ -7,7 +7,7 @@ of inertia are not written: Bullet turns the base frame to the principal axes, a
 from typing import Any
 
 from crazyem.simulators.documents.xml import XmlDocument
-from crazyem.simulators.fields import Field, Format
+from crazyem.simulators.fields import Field, Format, template
 from crazyem.simulators.formats.crazyflow import PER_RPM2
 from crazyem.simulators.layout import PLUS
 
@@ -48,52 +48,6 @@ def _read_more(document: XmlDocument, name: str, found: dict[str, float]) -> lis
     return [*([PLUS] if _is_plus(document) else []), *([turned] if any(products) else [])]
 
 
-def _link(name: str, x: int = 0, y: int = 0) -> str:
-    return f"""
-  <link name="{name}_link">
-    <inertial>
-      <origin rpy="0 0 0" xyz="{x} {y} 0"/>
-      <mass value="0"/>
-      <inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>
-    </inertial>
-  </link>
-  <joint name="{name}_joint" type="fixed">
-    <parent link="base_link"/>
-    <child link="{name}_link"/>
-  </joint>
-"""
-
-
-def _skeleton(name: str) -> str:
-    corners = ((1, -1), (-1, -1), (-1, 1), (1, 1))  # front right and then clockwise, as rotors of a Crazyflie
-    props = "".join(_link(f"prop{k}", x, y) for k, (x, y) in enumerate(corners))
-    return f"""\
-<?xml version="1.0" ?>
-
-<robot name="cf2">
-
-  <properties arm="0" kf="0" km="0" thrust2weight="2" max_speed_kmh="30" gnd_eff_coeff="11.36859"
-    prop_radius="2.31348e-2" drag_coeff_xy="0" drag_coeff_z="0"
-    dw_coeff_1="2267.18" dw_coeff_2=".16" dw_coeff_3="-.11"/>
-
-  <link name="base_link">
-    <inertial>
-      <origin rpy="0 0 0" xyz="0 0 0"/>
-      <mass value="0"/>
-      <inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>
-    </inertial>
-    <collision>
-      <origin rpy="0 0 0" xyz="0 0 0"/>
-      <geometry>
-        <cylinder radius=".06" length=".025"/>
-      </geometry>
-    </collision>
-  </link>
-{props}{_link("center_of_mass")}
-</robot>
-"""
-
-
 GYM_PYBULLET_DRONES = Format(
     name="gym-pybullet-drones",
     order=20,
@@ -102,7 +56,7 @@ GYM_PYBULLET_DRONES = Format(
     open=XmlDocument,
     recognises=lambda text: "<robot" in text and "<properties" in text and "kf=" in text,
     fields=_fields,
-    skeleton=_skeleton,
+    skeleton=template("gym_pybullet_drones.urdf"),
     read_more=_read_more,
     source="gym-pybullet-drones, BaseAviary.py (_parseURDFParameters, _physics, _drag)",
 )

@@ -12,7 +12,7 @@ import numpy as np
 from crazyem.errors import FileFormatError
 from crazyem.simulators.constants import Constants, inertia_of
 from crazyem.simulators.documents.literal import LiteralDocument
-from crazyem.simulators.fields import AGREE, Field, Format
+from crazyem.simulators.fields import AGREE, Field, Format, template
 from crazyem.simulators.layout import placed, read_positions
 from crazyem.vehicle import GRAVITY
 
@@ -130,33 +130,6 @@ def _write_more(document: LiteralDocument, name: str, c: Constants) -> None:
             )
 
 
-def _skeleton(name: str) -> str:
-    def rows(values: list[list[float]]) -> str:
-        return "[" + ", ".join(str(v) for v in values) + "]"
-
-    zeros = [[0.0] * 3] * 3
-    positions = [[1.0, -1.0, 0.0], [-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [1.0, 1.0, 0.0]]
-    return f"""\
-{{
-  "dynamics": {{
-    "rotor_positions": {rows(positions)},
-    "rotor_thrust_directions": {rows([[0.0, 0.0, 1.0]] * 4)},
-    "rotor_torque_directions": {rows([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])},
-    "rotor_thrust_coefficients": {rows([[0.0, 0.0, 1.0]] * 4)},
-    "rotor_torque_constants": [0.0, 0.0, 0.0, 0.0],
-    "rotor_time_constants_rising": [0.05, 0.05, 0.05, 0.05],
-    "rotor_time_constants_falling": [0.05, 0.05, 0.05, 0.05],
-    "mass": 0.0,
-    "gravity": [0.0, 0.0, -9.81],
-    "J": {rows(zeros)},
-    "J_inv": {rows(zeros)},
-    "hovering_throttle_relative": 0.5,
-    "action_limit": {{"min": 0.0, "max": 1.0}}
-  }}
-}}
-"""
-
-
 L2F = Format(
     name="l2f",
     order=90,
@@ -165,7 +138,7 @@ L2F = Format(
     open=LiteralDocument,
     recognises=lambda text: "rotor_thrust_coefficients" in text and "rotor_torque_constants" in text,
     fields=_fields,
-    skeleton=_skeleton,
+    skeleton=template("l2f.json"),
     read_more=_read_more,
     write_more=_write_more,
     source="rl_tools, rl/environments/l2f (json of Dynamics, multirotor_dynamics)",

@@ -8,7 +8,7 @@ from typing import Any
 
 from crazyem.errors import FileFormatError
 from crazyem.simulators.documents.xml import Element, XmlDocument
-from crazyem.simulators.fields import Field, Format
+from crazyem.simulators.fields import Field, Format, template
 
 _FULL = ("xx", "yy", "zz", "xy", "xz", "yz")
 
@@ -93,32 +93,6 @@ def _write_more(document: XmlDocument, name: str, constants: Any) -> None:
             )
 
 
-def _skeleton(name: str) -> str:
-    return """\
-<mujoco model="crazyem">
-  <compiler inertiafromgeom="false" autolimits="true"/>
-  <option integrator="RK4" timestep="0.002"/>
-  <worldbody>
-    <body name="drone" pos="0 0 0.1">
-      <freejoint/>
-      <inertial pos="0 0 0" mass="0" fullinertia="0 0 0 0 0 0"/>
-      <geom type="cylinder" size="0.06 0.0125" contype="0" conaffinity="0"/>
-      <site name="actuation" pos="0 0 0"/>
-    </body>
-  </worldbody>
-  <actuator>
-    <motor name="body_thrust" site="actuation" gear="0 0 1 0 0 0" ctrlrange="0 1"/>
-    <motor name="x_moment" site="actuation" gear="0 0 0 1 0 0" ctrlrange="-1 1"/>
-    <motor name="y_moment" site="actuation" gear="0 0 0 0 1 0" ctrlrange="-1 1"/>
-    <motor name="z_moment" site="actuation" gear="0 0 0 0 0 1" ctrlrange="-1 1"/>
-  </actuator>
-  <keyframe>
-    <key name="hover" qpos="0 0 0.3 1 0 0 0" ctrl="0 0 0 0"/>
-  </keyframe>
-</mujoco>
-"""
-
-
 def tiny_limits(document: XmlDocument) -> list[str]:
     """A remark where torque motors can hardly turn the drone."""
     actuator = document.find(("actuator",))
@@ -148,7 +122,7 @@ MUJOCO = Format(
     open=XmlDocument,
     recognises=lambda text: "<mujoco" in text,
     fields=_fields,
-    skeleton=_skeleton,
+    skeleton=template("mujoco.xml"),
     read_more=_read_more,
     write_more=_write_more,
     source="MuJoCo XML reference (inertial, actuator/motor, keyframe); mujoco_menagerie, bitcraze_crazyflie_2",

@@ -8,7 +8,7 @@ import math
 from crazyem.errors import FileFormatError
 from crazyem.simulators.constants import Constants
 from crazyem.simulators.documents.tables import YamlDocument
-from crazyem.simulators.fields import Field, Format
+from crazyem.simulators.fields import Field, Format, template
 from crazyem.simulators.layout import PLUS
 
 _ROTORS = ("rotor_configuration",)
@@ -68,22 +68,6 @@ def _write_more(document: YamlDocument, name: str, c: Constants) -> None:
             document.put((*_ROTORS, "rotor_angles", k), wanted)
 
 
-def _skeleton(name: str) -> str:
-    def listed(key: str, values: list[float]) -> str:
-        return f"  {key}:\n" + "".join(f"  - {v}\n" for v in values)
-
-    quarter = math.pi / 4.0
-    return (
-        f"name: {name}\nmass: 0.0\ninertia:\n"
-        + "".join(f"  {a}: 0.0\n" for a in ("xx", "xy", "xz", "yy", "yz", "zz"))
-        + "drag_coef: 0.0\nrotor_configuration:\n  num_rotors: 4\n"
-        + listed("arm_lengths", [1.0] * 4)
-        + listed("rotor_angles", [-quarter, -3 * quarter, 3 * quarter, quarter])
-        + listed("directions", [-1.0, 1.0, -1.0, 1.0])
-        + "".join(listed(key, [1.0] * 4) for key, _, _ in _LISTS)
-    )
-
-
 OMNIDRONES = Format(
     name="omnidrones",
     order=80,
@@ -92,7 +76,7 @@ OMNIDRONES = Format(
     open=YamlDocument,
     recognises=lambda text: "rotor_configuration" in text and "force_constants" in text and "<" not in text[:1],
     fields=_fields,
-    skeleton=_skeleton,
+    skeleton=template("omnidrones.yaml"),
     read_more=_read_more,
     write_more=_write_more,
     source="OmniDrones, robots/drone/multirotor.py and actuators/rotor_group.py",

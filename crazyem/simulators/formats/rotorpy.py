@@ -11,7 +11,7 @@ import numpy as np
 from crazyem.errors import FileFormatError
 from crazyem.simulators.constants import Constants, solved
 from crazyem.simulators.documents.literal import LiteralDocument
-from crazyem.simulators.fields import Field, Format
+from crazyem.simulators.fields import Field, Format, template
 from crazyem.simulators.layout import NOTHING, placed, read_positions
 
 _ROTORS = ("r1", "r2", "r3", "r4")
@@ -83,59 +83,6 @@ def _write_more(document: LiteralDocument, name: str, c: Constants) -> None:
                 document.put((*root, "rotor_pos", rotor, k), float(wanted[row, k]))
 
 
-_ENTRIES = """\
-    "mass": 0.0,{kg}
-    "Ixx": 0.0,{kg m^2}
-    "Iyy": 0.0,
-    "Izz": 0.0,
-    "Ixy": 0.0,
-    "Ixz": 0.0,
-    "Iyz": 0.0,
-    "num_rotors": 4,
-    "rotor_pos": {{
-        "r1": [1.0, 1.0, 0.0],{m, from the centre of mass}
-        "r2": [1.0, -1.0, 0.0],
-        "r3": [-1.0, -1.0, 0.0],
-        "r4": [-1.0, 1.0, 0.0]
-    }},
-    "rotor_directions": [1, -1, 1, -1],
-    "rI": [0, 0, 0],
-    "c_Dx": 0.0,{N/(m/s)^2}
-    "c_Dy": 0.0,
-    "c_Dz": 0.0,
-    "k_eta": 0.0,{N/(rad/s)^2}
-    "k_m": 0.0,{N m/(rad/s)^2}
-    "k_d": 0.0,{N/(m/s)/(rad/s)}
-    "k_z": 0.0,{N/(m/s)/(rad/s)}
-    "k_h": 0.0,
-    "k_flap": 0.0,
-    "tau_m": 0.05,{s}
-    "rotor_speed_min": 0,
-    "rotor_speed_max": 3000.0,{rad/s}
-    "motor_noise_std": 0.0
-"""
-
-
-def _entries(*, comments: bool, array: bool) -> str:
-    lines = []
-    for line in _ENTRIES.splitlines():
-        head, brace, unit = line.replace("{{", "\0").replace("}}", "\1").partition("{")
-        text = head + (f"  # {unit[:-1]}" if brace and comments else "")
-        text = text.replace("\0", "{").replace("\1", "}")
-        if array and "[" in text:
-            text = text.replace("[", "np.array([").replace("]", "])")
-        lines.append(text)
-    return "\n".join(lines)
-
-
-def _module(name: str) -> str:
-    return f"import numpy as np\n\nquad_params = {{\n{_entries(comments=True, array=True)}\n}}\n"
-
-
-def _json(name: str) -> str:
-    return f"{{\n{_entries(comments=False, array=False)}\n}}\n"
-
-
 ROTORPY = Format(
     name="rotorpy",
     order=50,
@@ -144,7 +91,7 @@ ROTORPY = Format(
     open=LiteralDocument,
     recognises=lambda text: "k_eta" in text and "rotor_pos" in text,
     fields=_fields,
-    skeleton=_module,
+    skeleton=template("rotorpy.py.txt"),
     read_more=_read_more,
     write_more=_write_more,
     source="rotorpy 3.0, vehicles/multirotor.py (Multirotor)",
@@ -152,6 +99,6 @@ ROTORPY = Format(
 ROTORPY_JSON = Format(
     name="rotorpy-json", order=100, suffix=".json", words="the parameters of a rotorpy vehicle (JSON)",
     open=LiteralDocument,
-    recognises=lambda text: False, fields=_fields, skeleton=_json, read_more=_read_more, write_more=_write_more,
-    source=ROTORPY.source,
+    recognises=lambda text: False, fields=_fields, skeleton=template("rotorpy.json"),
+    read_more=_read_more, write_more=_write_more, source=ROTORPY.source,
 )  # fmt: skip
