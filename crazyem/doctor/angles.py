@@ -16,12 +16,11 @@ from crazyem.doctor.kinematics import (
     measurements,
     origin_of,
     rate_of_attitude,
-    rotate,
     track,
     width_for,
 )
 from crazyem.doctor.regression import Choice, Slope, blocks, choose, slope
-from crazyem.physics.rotations import euler_from_quaternion
+from crazyem.physics.rotations import euler_from_quaternion, rotate
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 

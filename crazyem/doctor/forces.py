@@ -19,10 +19,10 @@ from crazyem.doctor.kinematics import (
     grid_of,
     measurements,
     poses,
-    rotate,
     track,
     width_for,
 )
+from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 

@@ -15,7 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
-from crazyem.physics.rotations import quaternion_from_euler
+from crazyem.physics.rotations import (
+    quaternion_conjugate,
+    quaternion_from_euler,
+    quaternion_product,
+    rotation_vector_from_quaternion,
+)
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.signals.sample import SIGNALS
 
@@ -221,8 +226,8 @@ def rate_of_attitude(attitude: Track) -> Track:
     q = attitude.value
     rate = np.zeros((len(q), 3))
     if len(q) >= 5:
-        near = _relative(q[1:-3], q[3:-1]) / (2.0 * GRID_STEP)
-        far = _relative(q[:-4], q[4:]) / (4.0 * GRID_STEP)
+        near = _turn(q[1:-3], q[3:-1]) / (2.0 * GRID_STEP)
+        far = _turn(q[:-4], q[4:]) / (4.0 * GRID_STEP)
         rate[2:-2] = (4.0 * near - far) / 3.0
     return Track(rate, _inner(attitude.valid))
 
@@ -244,26 +249,9 @@ def _inner(valid: Mask) -> Mask:
     return out
 
 
-def rotate(attitude: Array, vector: Array, *, inverse: bool = False) -> Array:
-    """R v, body to world (or R^T v with `inverse`): (m, 4) unit quaternions x y z w, (m, 3) vectors."""
-    u = -attitude[:, :3] if inverse else attitude[:, :3]
-    cross = 2.0 * np.cross(u, vector)
-    return np.asarray(vector + attitude[:, 3:] * cross + np.cross(u, cross), float)
-
-
-def _relative(first: Array, second: Array) -> Array:
+def _turn(first: Array, second: Array) -> Array:
     """Rotation vectors of conj(first) * second, (m, 3)."""
-    ax, ay, az, aw = first.T
-    bx, by, bz, bw = second.T
-    x = aw * bx - ax * bw - ay * bz + az * by
-    y = aw * by + ax * bz - ay * bw - az * bx
-    z = aw * bz - ax * by + ay * bx - az * bw
-    w = aw * bw + ax * bx + ay * by + az * bz
-    sign = np.where(w < 0.0, -1.0, 1.0)
-    vector = np.column_stack([x, y, z]) * sign[:, None]
-    sine = np.sqrt(np.einsum("ij,ij->i", vector, vector))
-    angle = 2.0 * np.arctan2(sine, np.abs(w))
-    return vector * np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0)[:, None]
+    return rotation_vector_from_quaternion(quaternion_product(quaternion_conjugate(first), second))
 
 
 def _continuous(q: Array) -> Array:

@@ -6,7 +6,8 @@ import numpy as np
 
 from crazyem.doctor import axes
 from crazyem.doctor.hypotheses import Comparison, compare_hypotheses, misread, wrong_scale
-from crazyem.doctor.kinematics import Pose, Track, grid_of, measurements, poses, rate_of_attitude, rotate, width_for
+from crazyem.doctor.kinematics import Pose, Track, grid_of, measurements, poses, rate_of_attitude, width_for
+from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 

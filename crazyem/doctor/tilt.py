@@ -25,11 +25,11 @@ from crazyem.doctor.kinematics import (
     origin_of,
     poses,
     rate_of_attitude,
-    rotate,
     track,
     width_for,
 )
 from crazyem.doctor.regression import FEWEST_BLOCKS, SLOPE_CONFIDENCE, blocks
+from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 

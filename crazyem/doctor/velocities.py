@@ -2,7 +2,8 @@
 
 from crazyem.doctor import axes
 from crazyem.doctor.hypotheses import Comparison, agreed_scale, compare_hypotheses, wrong_scale
-from crazyem.doctor.kinematics import Pose, Track, difference, grid_of, measurements, poses, rotate, track, width_for
+from crazyem.doctor.kinematics import Pose, Track, difference, grid_of, measurements, poses, track, width_for
+from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 

@@ -53,6 +53,13 @@ def rotation_vector_from_quaternion(q: ArrayLike) -> NDArray:
     return q[..., :3] * np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0)
 
 
+def rotate(q: NDArray, vector: NDArray, *, inverse: bool = False) -> NDArray:
+    """R v, body to world, or R^T v with `inverse`. q: (n, 4) unit quaternions, vector: (n, 3) -> (n, 3)."""
+    axis = -q[:, :3] if inverse else q[:, :3]
+    cross = 2.0 * np.cross(axis, vector)
+    return vector + q[:, 3:] * cross + np.cross(axis, cross)
+
+
 def rotation_matrix(q: ArrayLike) -> NDArray:
     """Body to world. q: (..., 4) -> (..., 3, 3)."""
     q = np.asarray(q, float)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.physics.rotations import quaternion_from_euler
+from crazyem.physics.rotations import quaternion_from_euler, quaternion_product, rotate
 from crazyem.recordings.csv.interpolation import corners, interpolated_rows
 from crazyem.recordings.csv.mapping import SignalColumns
 from crazyem.recordings.finding import Finding, Grade, intervals_of
@@ -227,9 +227,9 @@ class _Kept:
             if source.inverted:
                 value = value * [-1.0, -1.0, -1.0, 1.0]
             if source.axes[1] == "NED":
-                value = _product(np.array([_NED_TO_ENU]), value)
+                value = quaternion_product(_NED_TO_ENU, value)
             if source.axes[0] == "FRD":
-                value = _product(value, np.array([_FLU_TO_FRD]))
+                value = quaternion_product(value, _FLU_TO_FRD)
             self._turned[name] = value, marked
         return self._turned[name]
 
@@ -278,29 +278,11 @@ class _Kept:
         return (stamp - since <= source.hold).astype(float)[:, None]
 
 
-def _product(a: Array, b: Array) -> Array:
-    """(n, 4) quaternion product a b, x y z w."""
-    ax, ay, az, aw = a.T
-    bx, by, bz, bw = b.T
-    return np.stack(
-        [
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-            aw * bw - ax * bx - ay * by - az * bz,
-        ],
-        axis=1,
-    )
-
-
 def _rotated(quaternion: Array, vector: Array, *, inverse: bool) -> Array:
     """(n, 3) vectors turned by (n, 4) quaternions of any length but 0 (NaN for that), x y z w, or turned back."""
-    sign = -1.0 if inverse else 1.0
     turned = np.empty_like(vector)
     for start in range(0, len(vector), _CHUNK_ROWS):
         part = slice(start, start + _CHUNK_ROWS)
         unit = quaternion[part] / np.linalg.norm(quaternion[part], axis=1, keepdims=True)
-        axis, scalar = sign * unit[:, :3], unit[:, 3:]
-        side = 2.0 * np.cross(axis, vector[part])
-        turned[part] = vector[part] + scalar * side + np.cross(axis, side)
+        turned[part] = rotate(unit, vector[part], inverse=inverse)
     return turned

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
 from crazyem.links.clock import STAMP_MODULUS, StampUnwrapper
+from crazyem.physics.rotations import rotate
 from crazyem.recordings.autopilots.frd_ned import euler_from_quaternions, stacked
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.motor_meaning import decide
@@ -381,7 +382,7 @@ def _odometry(d: _Decoded, topic: Topic, mapping: BagMapping, notes: list[Findin
     for m in _columns(topic, "velocity", "twist.twist.linear.", _XYZ):
         if frame == "body" and attitude is None:
             continue
-        value = m.value if frame == "world" or attitude is None else rotated(attitude, m.value)
+        value = m.value if frame == "world" or attitude is None else rotate(attitude, m.value)
         why = f'its child frame is "{text_of(child)}"' if child else "it has no child frame"
         why = "as told" if mapping.twist else why
         text = f"The twist of {text_of(d.topic.name)} is read as in the {frame} frame: {why}."
@@ -391,10 +392,3 @@ def _odometry(d: _Decoded, topic: Topic, mapping: BagMapping, notes: list[Findin
     for m in _columns(topic, "body_rate", "twist.twist.angular.", _XYZ):
         if m.value.any():
             yield m
-
-
-def rotated(quaternion: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 3) vectors turned by (n, 4) unit quaternions x y z w."""
-    axis, scalar = quaternion[:, :3], quaternion[:, 3:]
-    half = 2.0 * np.cross(axis, vector)
-    return vector + scalar * half + np.cross(axis, half)
