@@ -1,6 +1,7 @@
 """A battery that nobody measured: its level from the first seconds in the air, and what is then not told."""
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -106,6 +107,11 @@ def test_a_prediction_knows_it_only_as_far_as_it_was_seen():
         assert level.voltage == pytest.approx(float(MOTION.voltage(np.array([level.known]))[0]), rel=0.03)
 
 
+@cache
+def as_it_was():
+    return predict(recorded(unmeasured(), DRONE), horizon=10)
+
+
 @pytest.mark.parametrize("after", [0.1, 0.3, 0.8, 1.5, 2.5, 5.0])
 def test_nothing_later_than_a_start_tells_of_the_battery(after):
     recording = unmeasured()
@@ -120,7 +126,7 @@ def test_nothing_later_than_a_start_tells_of_the_battery(after):
         value = array.value.copy()
         value[array.time > end] += by
         broken = changed(broken, name, value=value)
-    one, other = (predict(recorded(r, DRONE), horizon=10) for r in (recording, broken))
+    one, other = as_it_was(), predict(recorded(broken, DRONE), horizon=10)
     start = np.flatnonzero(one.start_time <= at)[-1]
     assert np.array_equal(one.prediction[start], other.prediction[other.start_index == one.start_index[start]][0])
 
