@@ -2,8 +2,10 @@
 
 import gzip
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, cast
 
 from crazyem.errors import FileFormatError, UsageError
 
@@ -30,35 +32,37 @@ class ReadOptions:
 
 LARGEST_FILE = 4 << 30  # bytes of a plain file: hours of a uSD log at 1 kHz
 LARGEST_UNPACKED = 1 << 30  # bytes of a gzip file, unpacked: a bomb has no end
-_PIECE_BYTES = 1 << 20
 
 
-def contents(path: Path, *, limit: int = LARGEST_UNPACKED, plain: int = LARGEST_FILE) -> bytes:
-    """All bytes of a file, unpacked.
+def pieces(path: Path, size: int) -> Iterator[bytes]:
+    """The bytes of a file, plain or gzip (told by content), unpacked, up to `size` of them at a time.
 
-    Args:
-        path: plain or gzip, told by content.
-        limit: most bytes to unpack a gzip file to.
-        plain: most bytes of one that is not packed.
-
-    Raises: UsageError if it cannot be read, FileFormatError if it cannot be unpacked or is too large.
+    Raises: UsageError if it cannot be read, FileFormatError if it is a gzip file that cannot be unpacked, or that
+        unpacks to more than `LARGEST_UNPACKED`.
     """
+    taken = 0
     try:
         with path.open("rb") as file:
             packed = file.read(2) == b"\x1f\x8b"
-        if not packed:
-            if path.stat().st_size > plain:
-                raise FileFormatError(f"{path} is larger than {plain >> 20} MiB, more than can be read at once.")
-            return path.read_bytes()
-        data = bytearray()
-        with gzip.open(path, "rb") as file:
-            # in pieces: asking for `limit` bytes at once would set them aside at once
-            while len(data) <= limit and (piece := file.read(_PIECE_BYTES)):
-                data += piece
+        with cast(IO[bytes], gzip.open(path, "rb")) if packed else path.open("rb") as file:
+            while piece := file.read(size):
+                taken += len(piece)
+                if packed and taken > LARGEST_UNPACKED:
+                    most = f"{LARGEST_UNPACKED >> 20} MiB"
+                    raise FileFormatError(f"{path} unpacks to more than {most}; unpack it yourself if it is sound.")
+                yield piece
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise FileFormatError(f"{path} is not a readable gzip file ({error}).") from error
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
-    if len(data) > limit:
-        raise FileFormatError(f"{path} unpacks to more than {limit >> 20} MiB; unpack it yourself if it is sound.")
-    return bytes(data)
+
+
+def contents(path: Path) -> bytes:
+    """All bytes of a file, unpacked. Raises as `pieces`; FileFormatError if it is larger than `LARGEST_FILE`."""
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
+    if size > LARGEST_FILE:
+        raise FileFormatError(f"{path} is larger than {LARGEST_FILE >> 20} MiB, more than can be read at once.")
+    return b"".join(pieces(path, max(size, 1)))  # a plain file in one piece, which is not copied

@@ -10,10 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crazyem.errors import FileFormatError
-from crazyem.recordings import motor_meaning
 from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Grade
-from crazyem.recordings.tables import Table
+from crazyem.recordings.tables import Table, signals_from_tables
 from crazyem.recordings.usd.file import read, recognises
 
 FIXED = 0xFFFF
@@ -84,13 +83,12 @@ def slow_decode(data, *, whole=True):
 def tables_of(monkeypatch):
     """What the reader hands on, before it becomes signals."""
     seen = []
-    genuine = motor_meaning.decide
 
     def spy(tables, **options):
         seen.append(list(tables))
-        return genuine(tables, **options)
+        return signals_from_tables(tables, **options)
 
-    monkeypatch.setattr("crazyem.recordings.usd.file.motor_meaning.decide", spy)
+    monkeypatch.setattr("crazyem.recordings.usd.file.signals_from_tables", spy)
     return seen
 
 
@@ -350,7 +348,7 @@ def test_gzip_and_a_bomb(put, monkeypatch):
     _, _, data = small_log()
     packed = put(gzip.compress(data), "log.gz")
     assert len(opened(packed)) == len(opened(put(data)))
-    monkeypatch.setattr("crazyem.recordings.contents.contents.__kwdefaults__", {"limit": 100, "plain": 1 << 30})
+    monkeypatch.setattr("crazyem.recordings.contents.LARGEST_UNPACKED", 100)
     with pytest.raises(FileFormatError, match="more than"):
         opened(packed)
     with pytest.raises(FileFormatError, match="gzip"):

@@ -155,7 +155,7 @@ def test_a_part_is_no_longer_than_told_nor_larger_than_it_may_be(tmp_path, monke
     parts = list(read_parts(path, ReadOptions(), seconds=1.0))
     assert [part.duration for part in parts[:-1]] == pytest.approx([1.0] * 9, abs=0.011)  # a record more where 0.99..9
     path.write_bytes(log(2, events, [(0, 7, [i]) for i in range(1000)]))  # a clock that stands
-    monkeypatch.setattr("crazyem.recordings.usd.stretches._STRETCH_BYTES", 1400)
+    monkeypatch.setattr("crazyem.recordings.usd.file.STRETCH_BYTES", 1400)
     parts = list(read_parts(path, ReadOptions(), seconds=1.0))
     assert len(parts) >= 10
     assert_joined(parts, read(path, ReadOptions()))
@@ -170,7 +170,7 @@ def test_packed_it_is_read_in_parts_as_well(tmp_path, monkeypatch):
     with pytest.raises(FileFormatError, match="gzip"):
         list(read_parts(path, ReadOptions()))
     path.write_bytes(gzip.compress(data))
-    monkeypatch.setattr("crazyem.recordings.usd.stretches.LARGEST_UNPACKED", 100)
+    monkeypatch.setattr("crazyem.recordings.contents.LARGEST_UNPACKED", 100)
     with pytest.raises(FileFormatError, match="unpacks to more"):
         list(read_parts(path, ReadOptions()))
 

@@ -1,6 +1,5 @@
 """What the records of a uSD card log become: times, tables, events, metadata, and what its checksum says."""
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,13 +25,6 @@ class Checksum:
     @property
     def right(self) -> bool:
         return self.stored is not None and self.stored == self.computed
-
-
-def checksum_of(data: bytes, header: Header) -> Checksum:
-    """The checksum of a whole file."""
-    if len(data) < header.size + CRC_BYTES:
-        return Checksum(None, None)
-    return Checksum(int.from_bytes(data[-CRC_BYTES:], "little"), zlib.crc32(memoryview(data)[:-CRC_BYTES]))
 
 
 class Clock:
@@ -99,7 +91,7 @@ def integrity(
         stop, unknown: where its last whole record ends and what follows there, as in `Records`.
         checksum: of the file.
         last: time of the last record [s].
-        blank: from which byte on nothing was written (`records.blank_from`).
+        blank: from which byte on nothing was written.
     """
     left = size - stop - (CRC_BYTES if checksum.right else 0)
     evidence = {"offset_bytes": float(stop), "left_bytes": float(left), "last_s": last}

@@ -1,18 +1,17 @@
 """Logs of the Crazyflie's uSD card deck, versions 1 and 2: a table for each event, read to the last whole record."""
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from crazyem.errors import FileFormatError
 from crazyem.recordings import motor_meaning
-from crazyem.recordings.contents import ReadOptions, contents
+from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.tables import signals_from_tables
 from crazyem.recordings.usd import content
-from crazyem.recordings.usd.format import Header, blank_from, gather, locate, parse_header, plausible, written
-from crazyem.recordings.usd.stretches import Survey, stretches
+from crazyem.recordings.usd.format import plausible
+from crazyem.recordings.usd.stretches import STRETCH_BYTES, Survey, stretches
 
 
 def recognises(head: bytes) -> bool:
@@ -28,41 +27,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
     Raises: FileFormatError if the header makes no sense or not a single whole record follows it.
     """
-    data = contents(path)
-    header = parse_header(data, path)
-    checksum = content.checksum_of(data, header)
-    records = locate(data, header.events, header.size, len(data) - (content.CRC_BYTES if checksum.right else 0))
-    blank = len(data) if checksum.right else blank_from(data)
-    records = written(records, blank)
-    if not records.start.size:
-        raise _empty(path, header)
-    order = [np.flatnonzero(records.kind == kind) for kind in range(len(header.events))]
-    packed = [gather(data, e, records.start[rows]) for e, rows in zip(header.events, order, strict=True)]
-    time = content.Clock(header).seconds(order, [p["stamp"] for p in packed])
-    tables = tuple(
-        content.table(event, values, time[rows], rows)
-        for event, values, rows in zip(header.events, packed, order, strict=True)
-        if rows.size and event.variables
-    )
-    del packed
-    verdict, findings = content.integrity(
-        size=len(data),
-        stop=records.stop,
-        unknown=records.unknown,
-        checksum=checksum,
-        last=float(time[-1]),
-        blank=blank,
-    )
-    metadata = {"usd": content.metadata(header, [rows.size for rows in order], verdict)}
-    meaning = motor_meaning.decide(tables, given=options.motor, metadata=metadata)
-    return Recording(
-        str(path),
-        f"usd:{header.version}",
-        signals_from_tables(tables, motor=meaning.meaning),
-        metadata | meaning.metadata,
-        (*findings, *meaning.findings),
-        content.events(header, order, time),
-    )
+    return next(_recordings(path, options, seconds=math.inf, largest=math.inf))
 
 
 def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Iterator[Recording]:
@@ -74,15 +39,20 @@ def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Itera
 
     Raises: as `read`, with the first part.
     """
+    return _recordings(path, options, seconds=seconds, largest=STRETCH_BYTES)
+
+
+def _recordings(path: Path, options: ReadOptions, *, seconds: float, largest: float) -> Iterator[Recording]:
+    """A recording for each stretch of at least `seconds`, or of `largest` bytes of records."""
     survey = Survey(path)
     header = survey.header
     if not sum(survey.counts):
-        raise _empty(path, header)
+        raise FileFormatError(f"{path} has a header of {header.size} bytes and not a single whole record after it.")
     verdict = survey.integrity(last=0.0)[0]
     metadata = {"usd": content.metadata(header, survey.counts, verdict)}
     meaning = motor_meaning.decide(survey.tables(), given=options.motor, metadata=metadata)
     findings = meaning.findings
-    for part in stretches(survey, seconds):
+    for part in stretches(survey, seconds, largest):
         tables = [
             content.table(event, values, part.time[rows], part.first + rows)
             for event, values, rows, count in zip(header.events, part.packed, part.order, survey.counts, strict=True)
@@ -99,7 +69,3 @@ def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Itera
             content.events(header, part.order, part.time),
         )
         findings = ()
-
-
-def _empty(path: Path, header: Header) -> FileFormatError:
-    return FileFormatError(f"{path} has a header of {header.size} bytes and not a single whole record after it.")

@@ -212,12 +212,6 @@ def locate(data: bytes, events: tuple[EventType, ...], begin: int, end: int) -> 
     return Records(starts, _kinds(data, events, starts), at, unknown)
 
 
-def blank_from(data: bytes) -> int:
-    """Where a run of one and the same byte that nobody wrote (0xFF of erased flash, 0) begins that ends the data."""
-    last = data[-1:]
-    return len(data.rstrip(last)) if last in BLANK_BYTES else len(data)
-
-
 def written(records: Records, blank: int) -> Records:
     """The records that begin before `blank`, a byte: in erased flash even the number of an event is 0xFFFF."""
     count = int(np.searchsorted(records.start, blank))

@@ -1,17 +1,15 @@
 """A uSD card log a stretch at a time: a first look at all of the file, then its records; memory does not grow."""
 
-import gzip
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.errors import FileFormatError, UsageError
-from crazyem.recordings.contents import LARGEST_UNPACKED
+from crazyem.errors import FileFormatError
+from crazyem.recordings.contents import pieces
 from crazyem.recordings.finding import Finding
 from crazyem.recordings.motor_meaning import MOTOR_VARIABLES
 from crazyem.recordings.tables import Table
@@ -20,7 +18,7 @@ from crazyem.recordings.usd.format import BLANK_BYTES, EventType, Header, Record
 
 _READ_BYTES = 1 << 22  # bytes read at a time
 _LONGEST_HEADER = 1 << 27  # bytes; what the limits of usd/format.py add up to is less
-_STRETCH_BYTES = 1 << 26  # of records in a stretch, however slowly its clock runs
+STRETCH_BYTES = 1 << 26  # of records in a stretch, however slowly its clock runs
 _SAMPLED_ROWS = 1 << 19  # rows from which is decided what motor.m1..4 is
 
 Packed = list[NDArray[np.void]]  # records of each kind
@@ -33,7 +31,7 @@ class Survey:
         header: of the file.
         size: of the file, unpacked [bytes].
         checksum: of the file.
-        blank: byte from which on nothing was written, as `records.blank_from`.
+        blank: byte from which on nothing was written: where a run of one of `BLANK_BYTES` begins that ends the file.
         stop, unknown: where its last whole record ends and what follows there, as in `Records`.
         counts: records of each kind.
 
@@ -50,7 +48,7 @@ class Survey:
         tail = b""
         self.size, computed = 0, 0
         blanks = dict.fromkeys(BLANK_BYTES, 0)  # where the last other byte ends
-        for piece in _pieces(path):
+        for piece in pieces(path, _READ_BYTES):
             blanks = {b: self.size + len(r) if (r := piece.rstrip(b)) else at for b, at in blanks.items()}
             self.size += len(piece)
             tail += piece
@@ -122,8 +120,8 @@ class Stretch:
     ends: bool
 
 
-def stretches(survey: Survey, seconds: float) -> Iterator[Stretch]:
-    """The records of a file in stretches of at least `seconds`, or of 64 MiB if they come sooner."""
+def stretches(survey: Survey, seconds: float, largest: float = STRETCH_BYTES) -> Iterator[Stretch]:
+    """The records of a file in stretches of at least `seconds`, or of `largest` bytes if they come sooner."""
     header = survey.header
     total, first, begin, held_bytes = sum(survey.counts), 0, 0.0, 0
     clock = Clock(header)
@@ -143,7 +141,7 @@ def stretches(survey: Survey, seconds: float) -> Iterator[Stretch]:
             held_bytes += sum(p.nbytes for p in held[-1][2])
             at = end
             ends = first + rows == total
-            if late.size or held_bytes >= _STRETCH_BYTES or ends:
+            if late.size or held_bytes >= largest or ends:
                 yield _joined(header, held, first, ends)
                 first, rows, held, held_bytes = first + rows, 0, [], 0
     if held:  # the file has become shorter meanwhile
@@ -182,7 +180,7 @@ def _walk(survey: Survey) -> Iterator[tuple[int, bytes, Records]]:
     end = survey.size - (CRC_BYTES if survey.checksum.right else 0)
     data, begin = b"", 0  # a piece of the file, and where it begins
     skip = header.size
-    for piece in _pieces(survey.path):
+    for piece in pieces(survey.path, _READ_BYTES):
         data += piece
         if len(data) <= skip:
             continue
@@ -195,7 +193,7 @@ def _walk(survey: Survey) -> Iterator[tuple[int, bytes, Records]]:
 
 def _header(path: Path) -> Header:
     data = b""
-    for piece in _pieces(path):
+    for piece in pieces(path, _READ_BYTES):
         data += piece
         try:
             return parse_header(data, path)
@@ -203,22 +201,3 @@ def _header(path: Path) -> Header:
             if len(data) > _LONGEST_HEADER:
                 raise
     return parse_header(data, path)
-
-
-def _pieces(path: Path) -> Iterator[bytes]:
-    """The bytes of a file, unpacked. Raises as `contents`."""
-    size = 0
-    try:
-        with path.open("rb") as plain:
-            packed = plain.read(2) == b"\x1f\x8b"
-        with cast(IO[bytes], gzip.open(path, "rb")) if packed else path.open("rb") as file:
-            while piece := file.read(_READ_BYTES):
-                size += len(piece)
-                if packed and size > LARGEST_UNPACKED:
-                    most = LARGEST_UNPACKED >> 20
-                    raise FileFormatError(f"{path} unpacks to more than {most} MiB; unpack it yourself if it is sound.")
-                yield piece
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise FileFormatError(f"{path} is not a readable gzip file ({error}).") from error
-    except OSError as error:
-        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
