@@ -36,17 +36,21 @@ class Part:
     announced: list[Any] = field(default_factory=list)
 
 
-def parts(path: Path, problems: list[Problem], *, limit: int = mcap_scan.LARGEST_CHUNK) -> Iterator[Part]:
+def parts(
+    path: Path, problems: list[Problem], *, limit: int = mcap_scan.LARGEST_CHUNK, most: int | None = None
+) -> Iterator[Part]:
     """All that can be read of a file, in its order; what cannot goes to `problems`.
 
     Args:
         limit: bytes of the largest chunk that is unpacked.
+        most: bytes of all chunks unpacked; None: a chunk, and so many times the size of the file.
 
     Raises: UsageError if it cannot be opened, FileFormatError for a decompression bomb.
     """
     try:
         with path.open("rb") as stream:
-            most = mcap_scan.LARGEST_CHUNK + LARGEST_UNPACKED_RATIO * path.stat().st_size
+            if most is None:
+                most = mcap_scan.LARGEST_CHUNK + LARGEST_UNPACKED_RATIO * path.stat().st_size
             yield from _parts(path, stream, problems, limit, most)
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error

@@ -7,19 +7,19 @@ IMRCLab/crazyswarm2 (crazyflie_interfaces/msg, crazyflie/src/crazyflie_server.cp
 """
 
 import re
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mcap.records import Schema
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader
 
 from crazyem.errors import CrazyemError, FileFormatError, UsageError
 from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.mcap import scan as mcap_scan
-from crazyem.recordings.mcap.scan import HEAD, MESSAGE_HEAD, Loss, Problem
+from crazyem.recordings.mcap.scan import Loss, Problem
+from crazyem.recordings.mcap.survey import parts
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.ros.ros2_messages import LARGEST_MESSAGE, MessageType, message_type, standard_definition
 from crazyem.recordings.ros.rosbag2_signals import ROBOT_TYPES, WORLD_TOPICS, BagMapping, BagTopic, recording_of
@@ -27,7 +27,7 @@ from crazyem.recordings.topics import text_of
 from crazyem.toml_file import read_toml
 
 _SQLITE = b"SQLite format 3\0"
-_LARGEST_RATIO = 200  # unpacked bytes a packed byte, beyond the first gibibyte
+_LARGEST_UNPACKED, _LARGEST_RATIO = 1 << 30, 200  # bytes of a file unpacked, and beyond them a packed byte
 _LARGEST_TOTAL = 2 << 30  # bytes of messages that are kept for decoding
 _MOST_FILES = 10_000
 _MAPPING_KEYS = {"robot": str, "twist": str, "topics": dict}
@@ -83,8 +83,6 @@ class _Bag:
     large: dict[str, int] = field(default_factory=dict)  # topic -> messages that were too large
     damage: list[Finding] = field(default_factory=list)
     kept: int = 0
-    unpacked: int = 0
-    packed: int = 0
     count: int = 0
     _types: dict[tuple[str, str], MessageType | str] = field(default_factory=dict)
 
@@ -92,50 +90,19 @@ class _Bag:
         """Read one file to its end, or as far as it is sound."""
         problems: list[Problem] = []
         channels: dict[int, BagTopic | None] = {}
-        schemas: dict[int, Any] = {}
-        try:
-            self.packed += path.stat().st_size
-            with path.open("rb") as stream:
-                for opcode, data in self._records(path, stream, problems):
-                    if opcode == mcap_scan.MESSAGE:
-                        self._message(path, data, channels)
-                    elif opcode == mcap_scan.SCHEMA:
-                        schema = _parsed(opcode, data)
-                        if schema is not None:
-                            schemas[schema.id] = schema
-                    elif opcode == mcap_scan.CHANNEL:
-                        channel = _parsed(opcode, data)
-                        if channel is not None and channel.id not in channels:
-                            channels[channel.id] = self._topic(channel, schemas.get(channel.schema_id))
-        except OSError as error:
-            raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
+        schemas: dict[int, Schema] = {}
+        for part in parts(path, problems, most=_LARGEST_UNPACKED + _LARGEST_RATIO * path.stat().st_size):
+            for entry in part.announced:
+                if isinstance(entry, Schema):
+                    schemas[entry.id] = entry
+                elif entry.id not in channels:
+                    channels[entry.id] = self._topic(entry, schemas.get(entry.schema_id))
+            if part.scan is not None:
+                for offset, length, channel, log, *_ in part.scan.messages.tolist():
+                    topic = channels.get(channel)
+                    if topic is not None:
+                        self._take(path, topic, log % 2**64, part.scan.data[offset : offset + length].tobytes())
         self.problems += [(path, problem) for problem in problems]
-
-    def _records(self, path: Path, stream: Any, problems: list[Problem]) -> Iterator[tuple[int, bytes]]:
-        """Schemas, channels and messages in the order of the file, with their content."""
-        for record in mcap_scan.records(stream, problems):
-            if record.opcode != mcap_scan.CHUNK:
-                yield record.opcode, record.data
-                continue
-            try:
-                chunk = mcap_scan.parse_chunk(record.data)
-                self.unpacked += chunk.size
-                if self.unpacked > (1 << 30) + _LARGEST_RATIO * self.packed:
-                    raise FileFormatError(f"{path} unpacks to more than {_LARGEST_RATIO} times its size.")
-                data = mcap_scan.unpack(chunk)
-                inner = list(_inner(data))
-            except ValueError as error:
-                problems.append(Problem(Loss.DAMAGED, record.offset, record.end, str(error)))
-                continue
-            yield from inner
-
-    def _message(self, path: Path, data: bytes, channels: Mapping[int, BagTopic | None]) -> None:
-        if len(data) < MESSAGE_HEAD.size - HEAD.size:
-            return
-        topic = channels.get(int.from_bytes(data[:2], "little"))
-        if topic is not None:
-            log = int.from_bytes(data[6:14], "little")
-            self._take(path, topic, log, data[MESSAGE_HEAD.size - HEAD.size :])
 
     def add_sqlite(self, path: Path) -> None:
         """Read an SQLite file, or the folder of a bag with several, to its end or as far as it is sound."""
@@ -233,26 +200,6 @@ class _Bag:
         for name, number in self.large.items():
             found.append(note("mapping", f"{number} messages of {text_of(name)} are too large to hold signals."))
         return found
-
-
-def _inner(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Opcode and content of each record in a chunk. Raises ValueError where they make no sense."""
-    at, size = 0, len(data)
-    while at < size:
-        if at + HEAD.size > size:
-            raise ValueError("the records in a chunk make no sense")
-        opcode, length = HEAD.unpack_from(data, at)
-        at += HEAD.size
-        if at + length > size:
-            raise ValueError("the records in a chunk make no sense")
-        yield opcode, data[at : at + length]
-        at += length
-
-
-def _parsed(opcode: int, data: bytes) -> Any:
-    from crazyem.recordings.mcap.survey import parse
-
-    return parse(opcode, data)
 
 
 def _owner(topic: str) -> str:
