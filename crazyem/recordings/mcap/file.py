@@ -171,7 +171,7 @@ def _imported(own: Mapping[str, str] | None) -> tuple[float, str, tuple[Finding,
     try:
         origin = float(own.get("origin", "0"))
         findings = findings_from_json(own.get("findings", "[]"))
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (ValueError, RecursionError):
         text = "What the first reader of this recording noticed cannot be read any more."
         return 0.0, own.get("source", "mcap"), (note("integrity", text, Grade.DEGRADES),)
     return origin if math.isfinite(origin) else 0.0, own.get("source", "mcap"), findings

@@ -4,10 +4,11 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.mcap.scan import Loss, Problem
 
 IMPORT_METADATA = "crazyem.signals"  # metadata record of an imported recording that is ours, not the source's
@@ -26,32 +27,19 @@ def findings_to_json(findings: Iterable[Finding]) -> str:
 
 
 def findings_from_json(text: str) -> tuple[Finding, ...]:
-    """Inverse of `findings_to_json`. Raises ValueError, KeyError, TypeError or AttributeError on anything else."""
-    return tuple(
-        Finding(
-            check=str(entry["check"]),
-            grade=Grade(entry["grade"]),
-            text=str(entry["text"]),
-            signal=str(entry["signal"]),
-            intervals=tuple((float(a), float(b)) for a, b in entry["intervals"]),
-            evidence={str(k): float(v) for k, v in entry["evidence"].items()},
-            advice=str(entry["advice"]),
-            fix=_fix(entry["fix"]),
-        )
-        for entry in json.loads(text)
-    )
+    """Inverse of `findings_to_json`. Raises ValueError or RecursionError on anything else."""
+    try:
+        return msgspec.convert(json.loads(text), tuple[Finding, ...], dec_hook=_rows_of_runs)
+    except msgspec.ValidationError as error:
+        raise ValueError(str(error)) from None
 
 
-def _fix(entry: Any) -> Fix | None:
-    if entry is None:
-        return None
-    rows = None
-    if entry["rows"] is not None:
-        runs = [(int(a), int(b)) for a, b in entry["rows"]]
-        if any(a < 0 or b < a for a, b in runs) or sum(b - a for a, b in runs) > _MOST_ROWS:
-            raise ValueError("not rows")
-        rows = np.concatenate([np.empty(0, np.int64), *(np.arange(a, b) for a, b in runs)]).astype(np.int64)
-    return Fix(str(entry["kind"]), tuple(map(str, entry["signals"])), tuple(map(float, entry["factor"])), rows)
+def _rows_of_runs(kind: type, value: Any) -> NDArray[np.int64]:
+    """Rows of a fix: the only numpy array in a finding."""
+    runs = msgspec.convert(value, list[tuple[int, int]])
+    if any(a < 0 or b < a for a, b in runs) or sum(b - a for a, b in runs) > _MOST_ROWS:
+        raise ValueError("not rows")
+    return np.concatenate([np.empty(0, np.int64), *(np.arange(a, b) for a, b in runs)]).astype(np.int64)
 
 
 def _runs(rows: NDArray[np.int64]) -> list[list[int]]:
