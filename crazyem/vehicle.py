@@ -28,13 +28,13 @@ File format (all SI; `presets/*.toml` are examples):
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.toml_file import parse_toml, read_text
+from crazyem.toml_file import is_number, parse_toml, read_text, toml_text
 
 GRAVITY = 9.81  # m/s^2, as the firmware has it
 LARGEST_SPREAD = 3.0  # standard deviation of a logarithm beyond which a prior says nothing
@@ -113,32 +113,14 @@ class Vehicle:
 
     def to_toml(self) -> str:
         """The vehicle as the text of a vehicle file; reading it back gives an equal vehicle."""
-        inertia = self.inertia + (self.inertia_products if any(self.inertia_products) else ())
-        lines = [f"name = {_quote(self.name)}", f"mass = {self.mass!r}", f"inertia = {list(inertia)!r}"]
-        lines.append(f"arm = {list(self.arm)!r}")
-        if self.thrust_curve:
-            lines.append(f"thrust_curve = {list(self.thrust_curve)!r}")
-        if self.rotor_constant is not None:
-            lines.append(f"rotor_constant = {self.rotor_constant!r}")
-        lines.append(f"torque_per_thrust = {self.torque_per_thrust!r}")
-        lines.append(f"motor_time_constant = {self.motor_time_constant!r}")
-        lines.append(f"thrust_max = {self.thrust_max!r}")  # TOML knows inf
-        lines.append(f"battery_compensated = {str(self.battery_compensated).lower()}")
-        for key in ("mass_sd", "inertia_sd", "motor_time_constant_sd"):
-            value = getattr(self, key)
-            if value is not None:
-                lines.append(f"{key} = {_toml_value(value)}")
-        for name, parameters in self.effects.items():
-            lines += ["", f"[effects.{_quote(name)}]"]
-            lines += [f"{_quote(key)} = {_toml_value(value)}" for key, value in parameters.items()]
-        if self.days is not None:
-            lines += ["", "[days]", f"flights = {self.days.flights}", f"thrust_sd = {self.days.thrust_sd!r}"]
-            lines.append(f"trim_sd = {_toml_value(self.days.trim_sd)}")
-        if self.posterior is not None:
-            lines += ["", "[posterior]", f"parameters = {_toml_value(self.posterior.parameters)}"]
-            lines += [f"mean = {_toml_value(self.posterior.mean)}", "covariance = ["]
-            lines += [f"  {_toml_value(row)}," for row in self.posterior.covariance] + ["]"]
-        return "\n".join(lines) + "\n"
+        table = {field.name: getattr(self, field.name) for field in fields(self)}
+        table["inertia"] = self.inertia + (self.inertia_products if any(self.inertia_products) else ())
+        table["thrust_curve"], table["effects"] = self.thrust_curve or None, self.effects or None
+        for part in ("days", "posterior"):
+            value = getattr(self, part)
+            table[part] = None if value is None else asdict(value)
+        del table["inertia_products"]
+        return toml_text(table)
 
 
 def preset_names() -> list[str]:
@@ -270,22 +252,18 @@ def _check_inertia(moments: tuple[float, ...], products: tuple[float, ...], wher
         raise FileFormatError(f"{where}: key 'inertia' is not a positive definite matrix")
 
 
-def _is_number(value: Any) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
-
-
 def _number(
     data: Mapping[str, Any], key: str, where: str, default: float | None = None, *, low: float, high: float = math.inf
 ) -> float:
     value = data.get(key, default)
-    if not _is_number(value) or not low <= value <= high:
+    if not is_number(value) or not low <= value <= high:
         raise FileFormatError(f"{where}: key '{key}' must be a number in [{low:g}, {high:g}], got {value!r}")
     return float(value)
 
 
 def _positive(data: Mapping[str, Any], key: str, where: str) -> float:
     value = data.get(key)
-    if not _is_number(value) or not 0 < value < math.inf:
+    if not is_number(value) or not 0 < value < math.inf:
         raise FileFormatError(f"{where}: key '{key}' must be a positive number, got {value!r}")
     return float(value)
 
@@ -293,22 +271,7 @@ def _positive(data: Mapping[str, Any], key: str, where: str) -> float:
 def _numbers(data: Mapping[str, Any], key: str, where: str, *, lengths: Any) -> tuple[float, ...]:
     value = data[key]
     values = value if isinstance(value, list) else [value]
-    if len(values) not in lengths or not all(_is_number(v) and math.isfinite(v) for v in values):
+    if len(values) not in lengths or not all(is_number(v) and math.isfinite(v) for v in values):
         wanted = " or ".join(str(n) for n in lengths)
         raise FileFormatError(f"{where}: key '{key}' must hold {wanted} finite numbers, got {value!r}")
     return tuple(float(v) for v in values)
-
-
-def _quote(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return '"' + "".join(c if ord(c) >= 32 and ord(c) != 127 else f"\\u{ord(c):04x}" for c in escaped) + '"'
-
-
-def _toml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return _quote(value)
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
-    return repr(value)

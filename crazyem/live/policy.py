@@ -12,7 +12,7 @@ from typing import Any
 
 from crazyem.errors import FileFormatError
 from crazyem.live.guard import WRITABLE_ESTIMATES, Limits
-from crazyem.toml_file import parse_toml, read_text
+from crazyem.toml_file import is_number, parse_toml, read_text, toml_value
 
 LARGEST_POLICY_FILE = 65536  # bytes
 FAULT_ACTIONS = ("report", "stop", "land")  # tell; push nothing meanwhile; land as well, where crazyem flies
@@ -127,14 +127,14 @@ class Policy:
 
     def to_toml(self, *, against: "Policy | None" = None) -> str:
         """The text of a policy file; reading it back gives an equal policy. Differences to `against` are remarked."""
-        lines = [f"name = {_text(self.name)}"]
+        lines = [f"name = {toml_value(self.name)}"]
         others = against.entries() if against else {}
         for section, values in self.entries().items():
             lines += ["", f"[{section}]"]
             for key, value in values.items():
                 other = others.get(section, {}).get(key, value)
-                remark = f" # {against.name}: {_text(other)}" if against and other != value else ""
-                lines.append(f"{key} = {_text(value)}{remark}")
+                remark = f" # {against.name}: {toml_value(other)}" if against and other != value else ""
+                lines.append(f"{key} = {toml_value(value)}{remark}")
         return "\n".join(lines) + "\n"
 
 
@@ -146,13 +146,9 @@ class _Kind:
     shown: Callable[[Any], Any] = lambda value: value
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
 def _number(low: float, high: float, *, scale: float = 1.0) -> _Kind:
     def read(value: Any) -> float:
-        if not _is_number(value) or not low <= value <= high:
+        if not is_number(value) or not low <= value <= high:
             raise ValueError(f"a number in [{low:g}, {high:g}]")
         return float(value) * scale
 
@@ -161,7 +157,7 @@ def _number(low: float, high: float, *, scale: float = 1.0) -> _Kind:
 
 def _range(low: float, high: float) -> _Kind:
     def read(value: Any) -> tuple[float, float]:
-        if not isinstance(value, list) or len(value) != 2 or not all(map(_is_number, value)):
+        if not isinstance(value, list) or len(value) != 2 or not all(map(is_number, value)):
             raise ValueError("two numbers, lower and upper")
         if not low <= value[0] < value[1] <= high:
             raise ValueError(f"rising and within [{low:g}, {high:g}]")
@@ -320,14 +316,3 @@ def _check_names(data: Mapping[str, Any], where: str) -> None:
                 raise FileFormatError(
                     f"{where}: unknown key '{section}.{key[:60]}' (known: {', '.join(known[section])})"
                 )
-
-
-def _text(value: Any) -> str:
-    """A value as TOML."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_text, value)) + "]"
-    return repr(value)
