@@ -1,6 +1,7 @@
 """Fixtures of the crazyem tests: the simulator as its own process, and a bare-socket Crazyflie that loses replies."""
 
 import contextlib
+import fcntl
 import os
 import re
 import select
@@ -17,6 +18,23 @@ from fake_peer import FakePeer
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SHARED = REPOSITORY.parent / "shared"
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Callable[[str, Callable[[], str]], str]:
+    """`made_once(name, make)`: a text that takes long to make, made by the first of all processes that asks for it."""
+    own = tmp_path_factory.getbasetemp()
+    folder = own if worker_id == "master" else own.parent
+
+    def text(name: str, make: Callable[[], str]) -> str:
+        with (folder / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # until it is closed
+            path = folder / name
+            if not path.exists():
+                path.write_text(make(), encoding="utf-8")
+            return path.read_text(encoding="utf-8")
+
+    return text
 
 
 @pytest.fixture(scope="session")

@@ -28,7 +28,7 @@ from crazyem.diagnosis.naming.steady_odds import explanations
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings import open_recording
 from crazyem.recordings.recording import Recording
-from crazyem.vehicle import Vehicle, load_vehicle
+from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
 
 TRIMMED = replace(DRONE, effects={TRIM: {"x": 1e-4, "y": -2e-4, "z": 3e-4}, "linear_drag": {"x": 0.01}})
 NOISE = Noise(np.full(6, 0.3), np.full(4, 1e-2))
@@ -186,41 +186,41 @@ def test_rotors_relabelled_by_symmetry_give_the_relabelled_odds(name: str) -> No
     np.testing.assert_allclose(other[np.array(to) - 1], one, atol=2.0 * ENOUGH)  # either fit may end so early
 
 
-def trimmed_by(folder, name: str) -> Vehicle:
-    """The file of drone E8 by a flight with whole propellers, as a user would make it: a preset and nothing named."""
-    return diagnose([open_recording(folder / name)], load_vehicle("cf2-legacy")).fitted_vehicle
-
-
 @pytest.fixture(scope="module")
-def healthy(shared_recordings) -> Vehicle:
-    return trimmed_by(shared_recordings / "crazypad", "motor__normal_flight__E8_log00")
+def healthy(shared_recordings, made_once) -> Vehicle:
+    """The file of drone E8 by a flight with whole propellers, as a user would make it: a preset and nothing named."""
+    flight = shared_recordings / "crazypad" / "motor__normal_flight__E8_log00"
 
+    def text() -> str:
+        return diagnose([open_recording(flight)], load_vehicle("cf2-legacy")).fitted_vehicle.to_toml()
 
-CUT = "motor__cut_propeller_M3_3.5mm_3.5mm_40mm__E8_log00"
+    return parse_vehicle(made_once("E8.toml", text))
 
 
 @pytest.mark.slow
-def test_a_cut_propeller_of_a_relabelled_flight_is_named(shared_recordings, healthy) -> None:
-    """Rotor 3 of a real drone has 3.5 mm less on each blade; the file is of a flight with whole propellers."""
-    cut = open_recording(shared_recordings / "crazypad" / CUT)
+def test_a_cut_propeller_is_named_with_what_it_lacks_also_where_rotors_are_relabelled(
+    shared_recordings, healthy
+) -> None:
+    """Rotor 3 of a real drone has 3.5 mm less on each blade; the file is of a flight with whole propellers.
+
+    Flights logged in different tables, one of them relabelled. Cuts of 1.5 mm are within days.
+    """
     polar, to = SYMMETRIES["left and right"]
-    effect = diagnose([relabelled(cut, polar, to)], turned_file(healthy, polar)).effects[0]
-    assert (effect.name, effect.chosen["rotor"]) == ("rotor_fault", to[2])
-    assert 0.7 < effect.parameters["scale"].value < 0.9
-
-
-@pytest.mark.slow
-def test_how_much_a_cut_propeller_lacks_is_known(shared_recordings, healthy) -> None:
-    """3.5 mm less on each blade, on flights logged in different tables. Cuts of 1.5 mm are within days."""
+    motor, controller = (
+        open_recording(shared_recordings / "crazypad" / f"{table}__cut_propeller_M3_3.5mm_3.5mm_40mm__E8_log00")
+        for table in ("motor", "controller")
+    )
     values = []
-    for table in ("motor", "controller"):
-        name = f"{table}__cut_propeller_M3_3.5mm_3.5mm_40mm__E8_log00"
-        effect = diagnose([open_recording(shared_recordings / "crazypad" / name)], healthy).effects[0]
-        assert (effect.name, effect.chosen["rotor"]) == ("rotor_fault", 3)
+    for flown, vehicle, rotor in (
+        (relabelled(motor, polar, to), turned_file(healthy, polar), to[2]),
+        (controller, healthy, 3),
+    ):
+        effect = diagnose([flown], vehicle).effects[0]
+        assert (effect.name, effect.chosen["rotor"]) == ("rotor_fault", rotor)
         assert effect.confidence > 0.8
         values.append(effect.parameters["scale"])
     assert values[0].value == pytest.approx(values[1].value, abs=0.06)  # the day, or the log
-    assert all(v.ci95[1] < 0.85 for v in values)
+    assert all(0.7 < v.value < 0.9 and v.ci95[1] < 0.85 for v in values)
 
 
 @pytest.mark.slow
