@@ -13,7 +13,8 @@ SHARED := -n 4 --dist worksteal
 # Modules are compiled once: the tests start some hundred processes, each of which would compile all of them again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: fly test slow slow-fixed lint bench docs concealed paper paper-docs cfclient-test simulators clean setup oldest
+.PHONY: fly test slow slow-fixed test-all lint bench docs concealed paper paper-docs cfclient-test simulators clean \
+	setup compiled oldest
 
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable
 
@@ -32,6 +33,8 @@ $(WARM): $(READY)  # once: what is compiled stays on the disk
 
 setup: $(READY)
 
+compiled: $(WARM)
+
 oldest:  ## an environment of the lower bounds of pyproject.toml, as continuous integration tests it
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
@@ -48,8 +51,11 @@ test: $(WARM)  ## everything that is not marked slow
 slow: $(WARM)  ## the long ones: many seeds, many flights, and made-up examples that are many and new
 	$(BIN)/python -m pytest -q $(SHARED) -m "slow or hypothesis" --hypothesis-profile new
 
-slow-fixed: $(WARM)  ## the long ones alone, with made-up examples that are many and always the same
-	$(BIN)/python -m pytest -q $(SHARED) -m slow --hypothesis-profile many
+slow-fixed: $(WARM)  ## the long ones alone
+	$(BIN)/python -m pytest -q $(SHARED) -m slow
+
+test-all: $(WARM)  ## `test` and `slow-fixed` in one go: what waits for a clock or a socket waits beside what computes
+	$(BIN)/python -m pytest -q $(SHARED) -m ""
 
 lint: $(READY)
 	$(BIN)/ruff check .

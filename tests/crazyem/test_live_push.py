@@ -213,7 +213,6 @@ def test_no_step_of_a_set_or_of_its_way_back_is_less_damped_than_both_ends(first
         believed, values = {**believed, **changed}, end
 
 
-@pytest.mark.slow
 @given(st.tuples(factor, factor, factor), st.integers(0, 9), st.booleans())
 def test_undoing_half_a_set_is_as_damped_whether_the_lost_write_arrived_or_not(factors, at, arrived):
     changed = {n: NOMINAL[n] * f for n, f in zip(("Ixx", "Iyy", "Izz"), factors)} | {"mass": 0.033}
