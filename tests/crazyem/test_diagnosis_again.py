@@ -59,7 +59,7 @@ def test_an_inertia_that_no_body_has_leaves_open_what_turns_the_drone(slow_to_tu
 @pytest.mark.slow
 def test_what_went_on_to_its_end_is_taken_back_and_the_selection_goes_on(monkeypatch):
     """As a slope of the thrust curve did, in the fit with all that is free: a thrust that does not heed its command."""
-    data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02), thrust=(0.9,) * 4), seconds=20.0), DRONE)])
+    data = Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02), thrust=(0.9,) * 4), seconds=10.0), DRONE)])
     point = nominal(data, Point(DRONE, {}, first_guess()))
     real, said = selecting.refine_anew, []
     end = THRUST.range_of("scale")[0]

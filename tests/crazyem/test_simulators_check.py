@@ -101,7 +101,7 @@ def test_two_files_of_a_drone_that_disagree() -> None:
 @pytest.mark.slow
 def test_a_wrong_file_is_corrected_by_a_flight(tmp_path: Path) -> None:
     """A flight in closed form: 36 g, 3e-8 N/(rad/s)^2, drag of 0.2 1/s. The file says a tenth more thrust, no drag."""
-    flight = made_flight(seconds=20.0, seed=3, more=("rpm",), without=("motor_command",))
+    flight = made_flight(seconds=12.0, seed=3, more=("rpm",), without=("motor_command",))
     path = tmp_path / "mine.urdf"
     wrong = replace(load_vehicle("cf2"), mass=0.036, rotor_constant=1.1 * ROTOR_CONSTANT)
     path.write_text(convert(wrong, "gym-pybullet-drones").text)
