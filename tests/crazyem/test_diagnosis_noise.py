@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from closed_loop import turned
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -33,29 +34,32 @@ def drawn(seed: int, noise: Noise, *, rows: int = 900, dt: float = 0.01) -> tupl
     time = dt * np.arange(rows)
     acceleration[:, 2] = G
     acceleration[:, 3:] = 3 * np.cos(4 * time[:, None] + np.arange(3))
-    p, v, turn, w = np.zeros(3), np.zeros(3), Rotation.identity(), np.zeros(3)
+    p, v, turn, w = np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3)
     disturbance = rng.normal(size=6) * noise.disturbance
-    y = np.zeros((rows, 13))
+    y, turns, errors = np.zeros((rows, 13)), np.zeros((rows, 3, 3)), np.zeros((rows, 12))
     sd, lasting, kept = (np.repeat(v, 3) for v in (noise.measurement, noise.coloured, np.exp(-dt / noise.recall)))
     other = np.random.default_rng([seed, 1])
     last = other.normal(size=12) * lasting
     h = dt / 10
+    down = np.array([0, 0, G * h])
     for k in range(rows):
         if k:
             for _ in range(10):
                 impulse = rng.normal(size=6) * noise.impulse * np.sqrt(h) + disturbance * h
-                dv = turn.apply(acceleration[k, :3] * h + impulse[:3]) - [0, 0, G * h]
+                dv = turn @ (acceleration[k, :3] * h + impulse[:3]) - down
                 dw = acceleration[k, 3:] * h + impulse[3:]
                 p = p + h * (v + dv / 2)
                 v = v + dv
-                turn = turn * Rotation.from_rotvec(h * (w + dw / 2))
+                turn = turned(turn, h * (w + dw / 2))
                 w = w + dw
             decay = np.exp(-dt / noise.memory)
             disturbance = decay * disturbance + np.sqrt(1 - decay**2) * noise.disturbance * rng.normal(size=6)
             last = kept * last + np.sqrt(1 - kept**2) * lasting * other.normal(size=12)
-        error = rng.normal(size=12) * sd + last
-        y[k, :3], y[k, 3:6], y[k, 10:] = p + error[:3], v + error[3:6], w + error[9:]
-        y[k, 6:10] = (turn * Rotation.from_rotvec(error[6:9])).as_quat()
+        errors[k] = rng.normal(size=12) * sd + last
+        y[k, :3], y[k, 3:6], y[k, 10:], turns[k] = p, v, w, turn
+    y[:, :6] += errors[:, :6]
+    y[:, 10:] += errors[:, 9:]
+    y[:, 6:10] = (Rotation.from_matrix(turns) * Rotation.from_rotvec(errors[:, 6:9])).as_quat()
     starts = np.zeros(rows, bool)
     starts[0] = True
     nothing = np.full(rows, np.nan)
