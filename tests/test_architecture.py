@@ -17,7 +17,7 @@ READABLE = 450  # lines
 LONG: set[str] = set()  # files that may be longer, each with its reason: none now
 
 # What every part may import: errors, optional dependencies, how results show themselves, old names.
-BASE = ("errors", "extras", "notebook", "deprecated", "toml_file")
+BASE = ("errors", "extras", "notebook", "deprecated", "toml_file", "atomic_file")
 
 # What the parts of crazyem may import of crazyem, besides themselves and `BASE`. Nothing here is circular.
 ALLOWED: dict[str, set[str]] = {

@@ -104,7 +104,7 @@ def diagnose(
     chosen = _chosen(asked, workers, say)
     data, apart = chosen.data, chosen.apart
     selection, pull = by_place(data, apart, chosen.selection, say)
-    selection, witnessed = _corroborated(data, apart, selection, asked.recordings)
+    selection, corroborated = _corroborated(data, apart, selection, asked.recordings)
     selection, balance = by_balance(data, with_exact_torques(data, selection))
     judges = asked.held_out or asked.recordings
     selection = without_what_misleads(data, selection, asked.vehicle, judges, withhold=withhold, say=say)
@@ -120,13 +120,13 @@ def diagnose(
     beside = other_likelihoods(data, apart, selection.final, remains, wanted, left_out, pulled, say)
     if any(e.name == "gusts" for e in beside):
         remains = remains.without_force()
-    told = answer_of(
-        data, selection, remains, witnessed=witnessed, in_place=_in_place(data, apart, selection), balance=balance
+    answer = answer_of(
+        data, selection, remains, corroborated=corroborated, in_place=_in_place(data, apart, selection), balance=balance
     )
     if asked.flights[0].inputs.measured:
-        told, late, remains = _late_rotors(asked, vehicle, told, remains, left_out)
+        answer, late, remains = _late_rotors(asked, vehicle, answer, remains, left_out)
         beside += late
-    effects, impossible = determined(strongest_first(told.effects, beside), selection.final)
+    effects, impossible = determined(strongest_first(answer.effects, beside), selection.final)
     as_flown = _with_effects(asked.vehicle, selection, [e for e in effects if any(e.name == b.name for b in beside)])
     as_flown = with_its_thrust(as_flown, data, selection.final, selection.accepted)
     as_flown = _restored(
@@ -145,8 +145,8 @@ def diagnose(
         before=before,
         after=after,
         effects=effects,
-        indistinguishable=tuple(g for g in told.groups if any(e.name in g for e in effects)),
-        would_separate=_advice(told.separate, [*asked.recordings, *asked.held_out]),
+        indistinguishable=tuple(g for g in answer.groups if any(e.name in g for e in effects)),
+        would_separate=_advice(answer.separate, [*asked.recordings, *asked.held_out]),
         unexplained=remains,
         selection=selection,
         left_out={n: reason for n, reason in left_out.items() if all(n != e.name for e in effects)},
@@ -275,39 +275,39 @@ def _in_place(data: Data, apart: Data | None, selection: Selection) -> dict[str,
 
 
 def _late_rotors(
-    asked: _Request, vehicle: Vehicle, told: Answer, remains: Unexplained, left_out: dict[str, str]
+    asked: _Request, vehicle: Vehicle, answer: Answer, remains: Unexplained, left_out: dict[str, str]
 ) -> tuple[Answer, list[Named], Unexplained]:
-    """What is told, what is found beside it, and what remains, with what measured rotor speeds say of the commands."""
+    """What is answered, what is found beside it, and what remains, with what measured speeds say of commands."""
     here, there = answers(asked.recordings, vehicle), answers(asked.held_out, vehicle)
     # the body answers to the speeds that were measured, so this says nothing against what was told of it
     deaf = disobedient([*here, *there])
     remains = remains.with_finding(deaf) if deaf else remains
-    if any(e.name == "input_delay" for e in told.effects):
-        return told, [], remains
+    if any(e.name == "input_delay" for e in answer.effects):
+        return answer, [], remains
     late, alike = late_rotors(here, there, vehicle, asked.wanted, left_out, deaf=deaf is not None)
-    separate = (*told.separate, *(CATALOGUE[n].separates for g in alike for n in g))
-    told = replace(told, groups=(*told.groups, *alike), separate=tuple(dict.fromkeys(separate)))
-    return told, late, remains
+    separate = (*answer.separate, *(CATALOGUE[n].separates for g in alike for n in g))
+    answer = replace(answer, groups=(*answer.groups, *alike), separate=tuple(dict.fromkeys(separate)))
+    return answer, late, remains
 
 
 def _corroborated(
     data: Data, apart: Data | None, selection: Selection, recordings: Sequence[Recording]
 ) -> tuple[Selection, frozenset[str]]:
-    """The selection after the witnesses were heard, and the names of effects that they told from their look-alikes.
+    """The selection after other signals were asked, and the names of effects that they told from their look-alikes.
 
     An accelerometer says most where thrust sets in, which not every flight shows: it is heard on those kept apart, too.
     """
-    witnessed: set[str] = set()
+    corroborated: set[str] = set()
     punctual = replace(selection.nominal, effects={n: dict(v) for n, v in selection.nominal.vehicle.effects.items()})
     for candidate in selection.accepted:
         if candidate.effect == "input_delay":
             nats = late_measurements(data.together_with(apart), punctual, candidate.values(selection.final)["delay"])
             if nats is not None and abs(nats) > TELLING:
-                witnessed |= {MEASURED_LATE if nats > 0 else "input_delay", "input_delay"}
+                corroborated |= {MEASURED_LATE if nats > 0 else "input_delay", "input_delay"}
         elif candidate.effect in WEAK_OR_MISREAD and dict(candidate.fixed).get("onset_time") is None:
             nats, other, start = _misread_or_weak(candidate, selection, recordings)
             if nats is not None and abs(nats) > TELLING:
-                witnessed |= {candidate.effect, other.effect}
+                corroborated |= {candidate.effect, other.effect}
                 if nats > 0:
                     selection = exchanged(data, selection, candidate, other, [start])
             weak = candidate.effect == WEAK_OR_MISREAD[0]
@@ -315,7 +315,7 @@ def _corroborated(
             if for_sensor > (TELLING if weak else 0.0):
                 # a healthy rotor turns as a weak one does: what commands say against that they say for the sensor
                 selection = selection.with_evidence(other if weak else candidate, for_sensor)
-    return selection, frozenset(witnessed)
+    return selection, frozenset(corroborated)
 
 
 def _misread_or_weak(

@@ -104,9 +104,9 @@ def _left_free(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     found = [free.to_json() for free in diagnosis.free]
     for own in diagnosis.own:
         found += own.free()
-    told = {e.fitted_as or e.name for e in diagnosis.effects}
+    named = {e.fitted_as or e.name for e in diagnosis.effects}
     for name, values in diagnosis.fitted_vehicle.effects.items():
-        if name not in told and values != diagnosis.vehicle.effects.get(name):
+        if name not in named and values != diagnosis.vehicle.effects.get(name):
             effect = CATALOGUE[name]
             found += [
                 {"name": name, "words": f"{effect.said({})}, written into the vehicle", "parameter": p.said,

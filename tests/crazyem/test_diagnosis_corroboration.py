@@ -175,7 +175,7 @@ def test_a_group_holds_the_name_that_is_told(recording: Recording) -> None:
         ({"input_delay"}, "input_delay", ("input_delay", "motor_lag")),
         (set(), "input_delay", ("input_delay", "motor_lag", "measurement_delay")),
     ):
-        told = answer_of(data, selection, Unexplained((), 50.0), witnessed=frozenset(witnessed), in_place={})
+        told = answer_of(data, selection, Unexplained((), 50.0), corroborated=frozenset(witnessed), in_place={})
         assert [e.name for e in told.effects] == [name]
         assert told.groups == (group,)
 

@@ -99,7 +99,7 @@ def test_weighing_is_asked_for_whether_a_load_is_told_apart_or_not() -> None:
     selection = Selection(point, fitted.point, (Step((trial,), trial),), (LOAD,), fitted, 1)
     for value, group in ((30.0, ()), (49.0, (("payload", "thrust_scale", "center_of_mass"),))):
         pair = (trial, replace(weaker, value=value))
-        told = answer_of(data, selection, Unexplained((), 50.0), witnessed=frozenset(), in_place={"payload": pair})
+        told = answer_of(data, selection, Unexplained((), 50.0), corroborated=frozenset(), in_place={"payload": pair})
         assert told.groups == group
         assert CATALOGUE["payload"].separates in told.separate
 

@@ -24,7 +24,7 @@ from crazyem.diagnosis.naming import answer, determined, trials
 from crazyem.diagnosis.naming.answer import _numbers, _rivals, _uncertainty, strongest_first
 from crazyem.diagnosis.naming.determined import improbable
 from crazyem.diagnosis.naming.named import DOUBTFUL, Named, one_factor, trust
-from crazyem.diagnosis.naming.presence import CALIBRATED, CONSTANT, FITTED, HELD_OUT, ORDER, TOLD, presence
+from crazyem.diagnosis.naming.presence import CALIBRATED, CONSTANT, FITTED, HELD_OUT, LEAST_PROBABILITY, ORDER, presence
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained
 
@@ -85,8 +85,8 @@ def test_a_name_is_as_sure_as_what_it_brings_on_flight_held_out_and_fitted() -> 
         odds = math.exp(CONSTANT) * held**HELD_OUT * (1.0 + fitted) ** FITTED / order**ORDER
         assert presence(held, fitted, order) == pytest.approx(odds / (1.0 + odds))
     assert presence(1e9, 1e9) == CALIBRATED
-    assert improbable(0.9 * TOLD).startswith("not determined")
-    assert not improbable(1.1 * TOLD)
+    assert improbable(0.9 * LEAST_PROBABILITY).startswith("not determined")
+    assert not improbable(1.1 * LEAST_PROBABILITY)
 
 
 def left(nats: float, gained: float = 1e6) -> Unexplained:

@@ -193,8 +193,8 @@ def systematic_sd(data: Data, point: Point) -> dict[tuple[str, str], float]:
     known = {(e.name, n): sd for e in CATALOGUE.values() for n, sd in e.prior.systematic.items()}
     for name, here in point.effects.items():
         prior = CATALOGUE[name].prior if name in CATALOGUE else Prior()
-        astray = prior.relative_error_astray and any(m.diverges(name, point.vehicle) for m in data.models)
-        for n, share in {**prior.relative_error, **(prior.relative_error_astray if astray else {})}.items():
+        chaotic = prior.relative_error_chaotic and any(m.diverges(name, point.vehicle) for m in data.models)
+        for n, share in {**prior.relative_error, **(prior.relative_error_chaotic if chaotic else {})}.items():
             known[name, n] = share * (point.vehicle.mass if prior.per.get(n) == "mass" else abs(float(here[n])))
     return {**known, **free}
 

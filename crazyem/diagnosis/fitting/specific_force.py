@@ -45,9 +45,9 @@ def evidence(
         noise: (3,) m/s^2.
         bias: (3,) m/s^2 of the sensor.
     """
-    felt = np.full_like(flight.force, np.nan)  # mean over the step, as the model has it
-    felt[1:] = 0.5 * (flight.force[1:] + flight.force[:-1])
-    standard = (felt - model - bias) / noise
+    measured = np.full_like(flight.force, np.nan)  # mean over the step, as the model has it
+    measured[1:] = 0.5 * (flight.force[1:] + flight.force[:-1])
+    standard = (measured - model - bias) / noise
     usable = np.isfinite(standard).all(axis=1) & ~flight.starts
     z = np.where(usable[:, None], np.clip(standard, -WILD, WILD), 0.0)
     loglik = -0.5 * float(np.sum(z**2)) - float(usable.sum() * np.log(2 * np.pi * noise**2).sum() / 2)

@@ -138,8 +138,8 @@ def _accepted(delays: NDArray, sums: NDArray, time: NDArray, block: NDArray) -> 
     delay, explained = band.delay_of(delays, total)
     roll, pitch = (band.peak(delays, band.explained_share(total[i])) for i in range(2))
     sd = band.standard_error(delays, unhit, total)
-    told = np.isfinite([delay, roll, pitch]).all() and explained > EXPLAINED and sd < SURE
-    if not told or abs(roll - pitch) > AGREE + 3 * sd:
+    determined = np.isfinite([delay, roll, pitch]).all() and explained > EXPLAINED and sd < SURE
+    if not determined or abs(roll - pitch) > AGREE + 3 * sd:
         return None
     ends = np.array([time[block == b][-1] for b in range(count)]) + band.SUPPORT + REACH
     running = np.zeros(count)

@@ -34,14 +34,14 @@ def alike(flights: Sequence[Flight], kept_apart: Sequence[Flight]) -> tuple[list
     where there is none, and where attitudes come from a filter on board, nothing is done.
     """
     everyone = [*flights, *kept_apart]
-    told = {i: tilt for i, f in enumerate(everyone) if (tilt := tilt_of(f)) is not None}
-    fitted = sum(i < len(flights) for i in told)
-    if not fitted or len(told) < 2:
+    known = {i: tilt for i, f in enumerate(everyone) if (tilt := tilt_of(f)) is not None}
+    fitted = sum(i < len(flights) for i in known)
+    if not fitted or len(known) < 2:
         return list(flights), list(kept_apart)
-    tilts, sds = (np.array([found[k] for found in told.values()]) for k in (0, 1))
+    tilts, sds = (np.array([found[k] for found in known.values()]) for k in (0, 1))
     deviation = np.stack([_deviation(tilts[:, a], sds[:, a], fitted) for a in range(2)], 1)
     turned = list(everyone)
-    for i, away, error in zip(told, deviation, sds, strict=True):
+    for i, away, error in zip(known, deviation, sds, strict=True):
         if away.any():
             turned[i] = _turned_back(everyone[i], away, error)
     return turned[: len(flights)], turned[len(flights) :]

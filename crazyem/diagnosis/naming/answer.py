@@ -51,7 +51,7 @@ def answer_of(
     selection: Selection,
     remains: Unexplained,
     *,
-    witnessed: frozenset[str],
+    corroborated: frozenset[str],
     in_place: Mapping[str, tuple[Trial, Trial] | None],
     balance: Balance | None = None,
 ) -> Answer:
@@ -59,7 +59,7 @@ def answer_of(
 
     Args:
         remains: the structure that they leave, beside which no name is sure.
-        witnessed: names that a witness told from their look-alikes.
+        corroborated: names that another signal separates from their look-alikes.
         in_place: for an effect the two trials, of it and of what else could stand in its place.
         balance: what is steady, by which names are told apart where a file has a trim.
     """
@@ -79,10 +79,10 @@ def answer_of(
         own = slice(at, at + len(candidate.free))
         at = own.stop
         away, covariance = _away(candidate, point), all_covariance[own, own]
-        rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, selection, witnessed), balance)
-        heard = _against(remains, candidate, data)
+        rivals, steady = _steady_rivals(candidate, _rivals(candidate, step, selection, corroborated), balance)
+        against = _against(remains, candidate, data)
         there = step.taken.presence(order)
-        there *= trust(heard, step.taken.held_out) if step.taken.log_odds is None else 1.0
+        there *= trust(against, step.taken.held_out) if step.taken.log_odds is None else 1.0
         confidence = there * preferred(step.taken, rivals)
         confidence /= 1.0 + sum(float(np.exp(-nats)) for nats in steady.values())
         doubted = candidate.effect in selection.doubted
@@ -92,7 +92,7 @@ def answer_of(
             confidence = min(confidence, DOUBTFUL)
         p_value = min(1.0, step.taken.p_value * max(1, selection.tried))
         # late inputs and late measurements are one model, so it is fitted as the first, whatever it is called
-        late = candidate.effect == "input_delay" and MEASURED_LATE in witnessed
+        late = candidate.effect == "input_delay" and MEASURED_LATE in corroborated
         name, label = (MEASURED_LATE, MEASURED_LATE) if late else (candidate.effect, candidate.label)
         chosen: dict[str, object] = {"streams": ("state", "gyro")} if late else dict(candidate.fixed)
         odds = float(logit(there))
@@ -104,7 +104,7 @@ def answer_of(
         equal = [
             *(t.candidate.effect for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}),
             *(name for name, nats in steady.items() if nats < TELLING),
-            *(() if candidate.effect in witnessed else CATALOGUE[candidate.effect].same_as),
+            *(() if candidate.effect in corroborated else CATALOGUE[candidate.effect].same_as),
             *_in_place(candidate, in_place, selection),
             *_as_a_factor(candidate, step, point, covariance),
             *_by_turning_alone(candidate, data, selection),
@@ -139,11 +139,11 @@ def numbers_of(data: Data, selection: Selection, balance: Balance | None) -> lis
 def strongest_first(effects: Sequence[Named], beside: Sequence[Named]) -> tuple[Named, ...]:
     """The effects in their order, and among them, before the first that brings less on flight held out, those that the
     selection cannot ask for (gusts, an accelerometer, what acts before measured rotors)."""
-    told = list(effects)
+    ordered = list(effects)
     for one in beside:
-        at = next((i for i, e in enumerate(told) if e.held_out_nats < one.held_out_nats), len(told))
-        told.insert(at, one)
-    return tuple(told)
+        at = next((i for i, e in enumerate(ordered) if e.held_out_nats < one.held_out_nats), len(ordered))
+        ordered.insert(at, one)
+    return tuple(ordered)
 
 
 def _against(remains: Unexplained, candidate: Candidate, data: Data) -> Unexplained:
@@ -247,15 +247,17 @@ def _steady_rivals(
     return [t for t, margin in said if margin is None], nats
 
 
-def _rivals(candidate: Candidate, step: Step, selection: Selection, witnessed: frozenset[str]) -> list[Trial]:
-    """What else explains what the effect explains; not what a witness told from it, nor what was found beside it.
+def _rivals(candidate: Candidate, step: Step, selection: Selection, corroborated: frozenset[str]) -> list[Trial]:
+    """What else explains what the effect explains; not what another signal separates from it, nor what is beside it.
 
     Of two effects that the final model needs beside each other neither is another name for the other. Nor is a factor
     on the torques one for what is needed beside inertias, which can be such a factor themselves.
     """
     found = {c.effect for c in selection.accepted}
     found |= {"torque_scale"} if "inertia" in found and candidate.effect != "inertia" else set()
-    others = {candidate.effect, *step.beside, *found} | (witnessed if candidate.effect in witnessed else frozenset())
+    others = {candidate.effect, *step.beside, *found} | (
+        corroborated if candidate.effect in corroborated else frozenset()
+    )
     return [t for t in step.explanations() if t.candidate.effect not in others]
 
 

@@ -91,15 +91,15 @@ def _beyond(recording: Recording, rotor: int, lag: float) -> NDArray | None:
         flying |= (time > begin + 0.5) & (time < end - 0.5)
     if time.size < 2 or when.size < 2:
         return None
-    told = command.astype(float).copy()
+    expected = command.astype(float).copy()
     for k in range(1, time.size):
         decay = np.exp(-max(time[k] - time[k - 1], 0.0) / max(lag, 1e-3))
-        told[k] = command[k - 1] + (told[k - 1] - command[k - 1]) * decay
+        expected[k] = command[k - 1] + (expected[k - 1] - command[k - 1]) * decay
     seen = np.stack([np.interp(time, when, speed[:, i]) for i in range(4)], 1)
-    flying &= np.all((told > 0.01) & (seen > 1.0), axis=1)
+    flying &= np.all((expected > 0.01) & (seen > 1.0), axis=1)
     if flying.sum() < FEWEST * SECOND:
         return None
-    x, y = np.log(told[flying]), np.log(seen[flying])
+    x, y = np.log(expected[flying]), np.log(seen[flying])
     others = [i for i in range(4) if i != rotor]
     centre = float(x.mean())
     slope = np.polynomial.Polynomial.fit(x[:, others].ravel() - centre, y[:, others].ravel(), 2)

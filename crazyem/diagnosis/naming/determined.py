@@ -18,7 +18,7 @@ from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.naming.answer import numbers_of
 from crazyem.diagnosis.naming.balance import Balance, by_balance
 from crazyem.diagnosis.naming.named import Named, Value
-from crazyem.diagnosis.naming.presence import TOLD
+from crazyem.diagnosis.naming.presence import LEAST_PROBABILITY
 from crazyem.diagnosis.naming.prune import left_out
 from crazyem.diagnosis.naming.steady import with_exact_torques
 from crazyem.diagnosis.naming.trials import Selection
@@ -73,7 +73,7 @@ def not_determined(candidate: Candidate, parameters: Mapping[str, Value], point:
 
 def improbable(chance: float) -> str:
     """Why an effect that is there with this probability is no finding; "" if it is one."""
-    if chance >= TOLD:
+    if chance >= LEAST_PROBABILITY:
         return ""
     return (
         f"not determined: what it explains of flight held out, other causes explain as often (probability {chance:.2g})"

@@ -94,10 +94,10 @@ def gain_of_both(
     near = np.diag(known) * (np.arange(len(away)) >= own)
     low, high = held_near(*bounds_of(parts, there.point), away, near, freedom)
     step = bounded(information + known, rest, low, high)
-    told = float(rest @ step - 0.5 * step @ (information + known) @ step)
+    gain = float(rest @ step - 0.5 * step @ (information + known) @ step)
     blocks, covariance = held_out.block_loglik(there.point), known_of(accepted, information + known)
-    if told < FAR:
-        return back + told, blocks, covariance
+    if gain < FAR:
+        return back + gain, blocks, covariance
     # So much is told by slopes where an effect is far from what these flights want; what the step brings is to be seen
     looked = held_out.twin()
     begin, best = looked.loglik(there.point) - 0.5 * float(away @ known @ away), 0.0
@@ -111,7 +111,7 @@ def gain_of_both(
             # by which explanations scatter: a drag that is right and was fitted to a hover ruins what it was not fitted
             # to, so badly that none could be told from it
             best, blocks = brought, looked.block_loglik(point)
-    return back + min(best, told), blocks, covariance
+    return back + min(best, gain), blocks, covariance
 
 
 def known_by(fitted: Fitted, accepted: Sequence[Candidate]) -> NDArray:
@@ -133,7 +133,7 @@ def _inverse(matrix: NDArray) -> NDArray:
     """
     if not np.isfinite(matrix).all():
         raise DivergedError("the curvature of a fit is not finite")
-    told = np.diag(matrix) > 0.0
-    scale = np.sqrt(np.where(told, np.diag(matrix), 1.0))
+    informed = np.diag(matrix) > 0.0
+    scale = np.sqrt(np.where(informed, np.diag(matrix), 1.0))
     inverse: NDArray = np.linalg.pinv(matrix / np.outer(scale, scale), rcond=1e-9) / np.outer(scale, scale)
     return inverse

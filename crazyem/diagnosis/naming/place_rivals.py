@@ -16,7 +16,7 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import refine_base, solved, without
 from crazyem.diagnosis.locating.locate import AXES, Finding
 from crazyem.diagnosis.locating.place import NATS, left_by_place, slope_finding
-from crazyem.diagnosis.naming.trials import TOLD, Selection, scatter
+from crazyem.diagnosis.naming.trials import SEPARATION, Selection, scatter
 from crazyem.physics.effects.external_force import FORCE_BY_PLACE
 
 IMITATE = ("wind", "ground_effect")
@@ -56,7 +56,7 @@ def by_place(
         (named, flights), (instead, again) = data.workers.map(lambda run: both(*run), runs)
         theirs, ours = flights.block_loglik(named.point), again.block_loglik(instead.point)
         better = instead.loglik - named.loglik - len(FORCE.free) + sum(len(c.free) for c in names)
-        if better < NATS or better < TOLD * scatter(ours - theirs):
+        if better < NATS or better < SEPARATION * scatter(ours - theirs):
             return selection, None
         finding = _finding(again, instead, better)
         if finding is None:

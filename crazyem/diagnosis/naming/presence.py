@@ -12,7 +12,7 @@ from scipy.special import expit, logit
 CONSTANT, HELD_OUT, FITTED, ORDER, CALIBRATED = -2.65, 0.27, 0.54, 1.2, 0.95
 LEAST_NATS = 0.5  # on flight held out: less is chance
 MISSING = 0.05  # prior probability that one effect is missing from a vehicle file: of 20 drones one
-TOLD = 0.5  # probability below which an effect is no finding
+LEAST_PROBABILITY = 0.5  # probability below which an effect is no finding
 
 
 def presence(held_out: float, fitted: float, order: int = 1) -> float:

@@ -22,7 +22,7 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 
 FEW = 5  # beginnings that are all tried in full; of more,
 KEPT = 2  # the best peaks are
-SEEN = 50.0  # nats, from which an effect that has sizes is tried with them, where it is driven astray
+SEEN = 50.0  # nats, from which an effect that has sizes is tried with them, where it is driven chaotic
 
 
 def best_begun(
@@ -48,8 +48,8 @@ def best_begun(
         gains = [_gain(gram, weights, at + i) for i in range(len(family))]
         at += len(family)
         best = peaks(gains)
-        astray = max(gains) > SEEN and any(model.diverges(family[0].effect, point.vehicle) for model in data.models)
-        found = larger(data, point, family) if astray else None
+        chaotic = max(gains) > SEEN and any(model.diverges(family[0].effect, point.vehicle) for model in data.models)
+        found = larger(data, point, family) if chaotic else None
         dropped |= set(family) - ({family[i] for i in best} if found is None else set())
         added += [found] if found is not None else []
     return [*(c for c in candidates if c not in dropped), *added]

@@ -19,7 +19,7 @@ from crazyem.diagnosis.fitting.fit import Data, DivergedError
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.naming.balance import FREE, HEAVIEST, Balance, balance_of, likely, steady
-from crazyem.diagnosis.naming.presence import MISSING, TOLD
+from crazyem.diagnosis.naming.presence import LEAST_PROBABILITY, MISSING
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.physics.effects.mass_properties import ON_BOARD
 from crazyem.vehicle import Vehicle
@@ -95,7 +95,7 @@ def steady_selection(
         chance = {name: float(np.exp(weight - total)) for name, (weight, _) in found.items()}
         best = max(chance, key=lambda name: chance[name])
         candidate = next((c for c in mine if _is(c, best)), None)
-        if candidate is None or chance[best] < TOLD:
+        if candidate is None or chance[best] < LEAST_PROBABILITY:
             return None
         say(f"by what is steady in all flights: {candidate.label} with {chance[best]:.2f}")
         before = refine_base(data.twin(), nominal, ())

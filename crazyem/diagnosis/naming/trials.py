@@ -22,7 +22,7 @@ SURE_DAILY = 1e-4
 LIKELY = 5e-2  # which flights held out may lower where it is below this
 CLOSE = 4.0  # nats within which two explanations cannot be told apart,
 EVEN = 0.5  # what a name is worth, at least, beside a rival that is not significant itself
-TOLD = 1.64  # or standard deviations of the difference of their likelihoods, over blocks or recordings
+SEPARATION = 1.64  # or standard deviations of the difference of their likelihoods, over blocks or recordings
 BESIDE = 0.5  # share of its gain that an effect keeps beside another which it is no other name for
 BEATEN = 0.1  # probability of being the better explanation below which a simpler one does not give the name
 
@@ -186,7 +186,7 @@ def between(differences: NDArray, recording: NDArray) -> float:
 def distinguishable(best: Trial, other: Trial, *, recordings: bool = True) -> bool:
     """Whether the flights prefer the one by more than chance."""
     nats, sd = margin(best, other, recordings=recordings)
-    return nats > CLOSE and nats > TOLD * sd
+    return nats > CLOSE and nats > SEPARATION * sd
 
 
 def by_evidence(trials: Sequence[Trial], *, counted: bool) -> list[Trial]:

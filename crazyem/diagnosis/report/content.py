@@ -245,13 +245,13 @@ def _free(document: Document) -> list[Text | Table]:
 def _ranking(document: Document) -> list[Text | Table]:
     entries = tables(document.get("ranking"))
     best = max((number(e.get("held_out_nats")) or 0.0 for e in entries), default=0.0)
-    told = {str(e.get("name")) for e in tables(document.get("effects"))}
+    named = {str(e.get("name")) for e in tables(document.get("effects"))}
     rows = []
     for entry in entries[:MOST_RANKED]:
         held = number(entry.get("held_out_nats"))
         share = 100 * max(held or 0.0, 0.0) / best if best > 0 else 0.0
         words = spaced(entry["words"]) if entry.get("words") else said_of(entry.get("name", ""))
-        note = str(entry.get("note", "")) or ("told" if str(entry.get("name")) in told else "")
+        note = str(entry.get("note", "")) or ("told" if str(entry.get("name")) in named else "")
         rows.append((words, short(entry.get("gain_nats"), ".1f"), short(held, ".1f"), Meter(round(share, 1)), note))
     heads = ("candidate", "gain", "held out", "", "")
     return [Table(heads, tuple(rows), (1, 2)), Text(LIKELIHOOD)] if rows else []

@@ -99,7 +99,7 @@ class Prior:
         together: correlation of `own` between the parameters.
         systematic: within which a parameter is never known, whatever a fit says: what no scatter shows; SI.
         relative_error: the same as a share of the parameter, or of what `per` says.
-        relative_error_astray: the same in flights that drive the effect where no fit follows (`divergence.py`).
+        relative_error_chaotic: the same in flights that drive the effect into chaos (`divergence.py`).
         usual_named: whether what is usual is named all the same, where it explains more than none of it.
         finding: (values, neutral values, conditions) -> whether that is a finding, where no single limit says so.
         detection_limit: departures that filters, the sampling of a log and the air of a room look like; less is no
@@ -116,7 +116,7 @@ class Prior:
     together: float = 0.0
     systematic: Sizes = field(default_factory=dict)
     relative_error: Sizes = field(default_factory=dict)
-    relative_error_astray: Sizes = field(default_factory=dict)
+    relative_error_chaotic: Sizes = field(default_factory=dict)
     usual_named: bool = False
     finding: Callable[[Mapping[str, Any], Mapping[str, Any], Conditions], bool] | None = None
     detection_limit: Limits | Callable[[Mapping[str, Any], Conditions], Limits] = field(default_factory=dict)

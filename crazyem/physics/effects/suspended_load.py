@@ -70,7 +70,7 @@ SUSPENDED_LOAD = Effect(
         own={"mass": 0.08, "length": 0.3},
         per={"mass": "mass"},
         relative_error={"mass": 3e-3, "length": 5e-3},
-        relative_error_astray={"length": 0.02},
+        relative_error_chaotic={"length": 0.02},
     ),
     needs=("position", "velocity"),  # it swings by the drone's path, which no accelerometer alone shows
     separates="stop sharply from a straight leg and hover for 10 s, so that what hangs can be seen swinging",
