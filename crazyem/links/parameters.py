@@ -5,15 +5,17 @@ here travel beside it: sent through `Crazyflie.send_packet`, sent again while un
 matched to their echo by a port callback. A lost echo so costs one unverified write, never the parameter path.
 """
 
+import functools
 import queue
 import struct
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import ParameterWrite
+from crazyem.links.retry import replies, send
 
 _READ_CHANNEL = 1
 _WRITE_CHANNEL = 2
@@ -53,8 +55,7 @@ class ParameterClient:
         element = self._element(name)
         identifier = struct.pack("<H", element.ident)
         with self._lock:
-            deadline = time.monotonic() + timeout
-            for reply in self._replies_until(_READ_CHANNEL, identifier, identifier, deadline):
+            for reply in self._replies_to(_READ_CHANNEL, identifier, identifier, timeout):
                 value = _decode(element.pytype, reply[3:])
                 if reply[2] == 0 and value is not None:
                     self.fault = ""
@@ -75,8 +76,7 @@ class ParameterClient:
         payload = identifier + _encode(name, element, value)
         echoed: float | None = None
         with self._lock:
-            deadline = time.monotonic() + timeout
-            for reply in self._replies_until(_WRITE_CHANNEL, identifier, payload, deadline):
+            for reply in self._replies_to(_WRITE_CHANNEL, identifier, payload, timeout):
                 echoed = _decode(element.pytype, reply[2:])
                 # An echo with another value belongs to an earlier write: keep waiting for ours.
                 if reply == payload:
@@ -90,28 +90,14 @@ class ParameterClient:
         )
         return ParameterWrite(name, value, echoed, False, time.time())
 
-    def _replies_until(self, channel: int, identifier: bytes, payload: bytes, deadline: float) -> Any:
-        """Send until the deadline, yielding each reply on the channel that carries the identifier."""
-        from cflib.crtp.crtpstack import CRTPPacket
-
+    def _replies_to(self, channel: int, identifier: bytes, payload: bytes, timeout: float) -> Iterator[bytes]:
+        """Send until `timeout`, yielding each reply on the channel that carries the identifier."""
         if self._cf.is_called_by_incoming_handler_thread():
             raise UsageError("Parameters cannot be accessed from inside a cflib callback.")
-        while not self._replies.empty():  # leftovers of an exchange that was given up
-            self._replies.get_nowait()
         self._waiting = (channel, identifier)
         try:
-            resend_at = 0.0
-            while (now := time.monotonic()) < deadline and self._cf.link is not None:
-                if now >= resend_at:
-                    packet = CRTPPacket()
-                    packet.set_header(self._port, channel)
-                    packet.data = payload
-                    self._cf.send_packet(packet)
-                    resend_at = now + _RESEND_AFTER
-                try:
-                    yield self._replies.get(timeout=max(0.0, min(deadline, resend_at) - now))
-                except queue.Empty:
-                    continue
+            ask = functools.partial(send, self._cf, self._port, channel, payload)
+            yield from replies(ask, self._replies, timeout=timeout, repeat_after=_RESEND_AFTER)
         finally:
             self._waiting = None
 

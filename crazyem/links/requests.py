@@ -8,6 +8,7 @@ High-level commands are among them: cflib sends a command to port 8 once and loo
 each with its first byte, two more, and an error (crtp_commander_high_level.c).
 """
 
+import functools
 import queue
 import struct
 import threading
@@ -15,6 +16,7 @@ import time
 from typing import Any
 
 from crazyem.errors import UsageError
+from crazyem.links.retry import replies, send
 
 _FIRST_TIMEOUT = 0.15  # s until the first repetition, while nothing is known about the round trip
 _SHORTEST_TIMEOUT, _LONGEST_TIMEOUT = 0.03, 0.5  # s
@@ -146,32 +148,15 @@ class RequestClient:
             timeout: s.
             repeat_after: s without a reply after which to ask again; None for what must not be done twice.
         """
-        from cflib.crtp.crtpstack import CRTPPacket
-
         if self._cf.is_called_by_incoming_handler_thread():
             raise UsageError("The drone cannot be asked from inside a cflib callback.")
         with self._lock:
-            while not self._replies.empty():
-                self._replies.get_nowait()
             self._waiting = key_of(port, channel, data)
-            deadline, send_at = time.monotonic() + timeout, 0.0
             try:
-                while (now := time.monotonic()) < deadline:
-                    if now >= send_at:
-                        if self._cf.link is None:
-                            return None
-                        packet = CRTPPacket()
-                        packet.set_header(port, channel)
-                        packet.data = data
-                        self._cf.send_packet(packet)
-                        send_at = deadline if repeat_after is None else now + repeat_after
-                    try:
-                        return self._replies.get(timeout=max(0.0, min(deadline, send_at) - now))
-                    except queue.Empty:
-                        continue
+                ask = functools.partial(send, self._cf, port, channel, data)
+                return next(replies(ask, self._replies, timeout=timeout, repeat_after=repeat_after), None)
             finally:
                 self._waiting = None
-        return None
 
     def _on_packet(self, packet: Any) -> None:
         waiting = self._waiting
@@ -195,28 +180,16 @@ def send_until_confirmed(crazyflie: Any, command: bytes, *, timeout: float, repe
 
     For commands that may be carried out twice. Not to be called from a cflib callback.
     """
-    from cflib.crtp.crtpstack import CRTPPacket
-
-    replies: queue.SimpleQueue[int] = queue.SimpleQueue()
+    errors: queue.SimpleQueue[int] = queue.SimpleQueue()
 
     def take(packet: Any) -> None:
         data = bytes(packet.data)
         if (packet.port, packet.channel) == (HIGH_LEVEL_PORT, 0) and len(data) >= 4 and data[0] == command[0]:
-            replies.put(data[3])
+            errors.put(data[3])
 
     crazyflie.packet_received.add_callback(take)
     try:
-        deadline = time.monotonic() + timeout
-        while (now := time.monotonic()) < deadline and crazyflie.link is not None:
-            packet = CRTPPacket()
-            packet.set_header(HIGH_LEVEL_PORT, 0)
-            packet.data = command
-            crazyflie.send_packet(packet)
-            try:
-                if replies.get(timeout=min(repeat_after, deadline - now)) == 0:
-                    return True
-            except queue.Empty:
-                continue
-        return False
+        ask = functools.partial(send, crazyflie, HIGH_LEVEL_PORT, 0, command)
+        return 0 in replies(ask, errors, timeout=timeout, repeat_after=repeat_after)
     finally:
         crazyflie.packet_received.remove_callback(take)

@@ -8,11 +8,12 @@ import queue
 import struct
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import ParameterWrite
+from crazyem.links.retry import replies
 
 RESEND_AFTER = 0.3  # s
 # MAV_PARAM_TYPE -> name, struct format
@@ -92,7 +93,7 @@ class ParameterClient:
     def read(self, name: str, timeout: float) -> float:
         """The value in the drone now. Raises LinkError: no answer (some autopilots do not answer for unknown names)."""
         with self._lock:
-            for value, kind in self._replies_until(name, lambda: self._ask_read(name), timeout):
+            for value, kind in self._replies_to(name, lambda: self._ask_read(name), timeout):
                 self.fault = ""
                 return decode(value, kind, bitwise=self._bitwise())
         self.fault = f"The drone at {self._uri} did not answer a read of {name} within {timeout:g} s."
@@ -113,7 +114,7 @@ class ParameterClient:
         wire = encode(value, kind, bitwise=bitwise)
         echoed: float | None = None
         with self._lock:
-            for echo, echo_kind in self._replies_until(name, lambda: self._ask_write(name, wire, kind), timeout):
+            for echo, echo_kind in self._replies_to(name, lambda: self._ask_write(name, wire, kind), timeout):
                 echoed = decode(echo, echo_kind, bitwise=bitwise)
                 # An echo with another value belongs to an earlier write: keep waiting for ours.
                 if echo_kind == kind and struct.pack("<f", echo) == struct.pack("<f", wire):
@@ -123,23 +124,12 @@ class ParameterClient:
         self.fault = f"The drone at {self._uri} {said} within {timeout:g} s."
         return ParameterWrite(name, value, echoed, False, time.time())
 
-    def _replies_until(self, name: str, request: Callable[[], None], timeout: float) -> Any:
+    def _replies_to(self, name: str, request: Callable[[], object], timeout: float) -> Iterator[tuple[float, int]]:
         """Ask until the deadline, yielding each answer for the name."""
         if not name or len(name) > 16 or not name.isascii():
             raise UsageError(f'"{name[:40]}" is no name of a MAVLink parameter.')
-        while not self._replies.empty():
-            self._replies.get_nowait()
         self._waiting = name
-        deadline = time.monotonic() + timeout
-        again = 0.0
         try:
-            while (now := time.monotonic()) < deadline:
-                if now >= again:
-                    request()
-                    again = now + RESEND_AFTER
-                try:
-                    yield self._replies.get(timeout=max(0.001, min(deadline, again) - now))
-                except queue.Empty:
-                    continue
+            yield from replies(request, self._replies, timeout=timeout, repeat_after=RESEND_AFTER)
         finally:
             self._waiting = ""
