@@ -24,32 +24,8 @@ CLOCK_WRAPS: dict[str, float] = {
 RATE_DEVIATION = 0.002  # relative deviation of the rate worth a word
 WRONG_RATE_DEVIATION = 0.1  # from which a claimed rate is wrong
 _USUAL_RATES = (
-    1,
-    2,
-    4,
-    5,
-    8,
-    10,
-    12.5,
-    20,
-    25,
-    30,
-    40,
-    50,
-    60,
-    100,
-    120,
-    125,
-    200,
-    240,
-    250,
-    300,
-    400,
-    500,
-    800,
-    1000,
-    2000,
-)
+    1, 2, 4, 5, 8, 10, 12.5, 20, 25, 30, 40, 50, 60, 100, 120, 125, 200, 240, 250, 300, 400, 500, 800, 1000, 2000,
+)  # Hz  # fmt: skip
 CLOCK_JUMP = 0.3  # s by which two clocks may part from one packet to the next: a radio link stalls for less
 
 
