@@ -182,6 +182,13 @@ def diagnose(
         document["against"] = compare(flown[0], recording_of(against, options))
     name = nominal.name if vehicle is None or isinstance(vehicle, Vehicle) else str(vehicle)
     plans = plan_commands(found.indistinguishable, nominal, name)
+    return _with_plans(found, plans, document, pictures)
+
+
+def _with_plans(
+    found: by_recordings.Diagnosis, plans: list[str], document: dict[str, Any], pictures: dict[str, Series]
+) -> Diagnosis:
+    """A diagnosis with its document, and in both the commands that plan a flight to tell look-alikes apart."""
     document["would_separate"] = [*document["would_separate"], *plans]
     values = {f.name: getattr(found, f.name) for f in fields(found)}
     values["would_separate"] = (*found.would_separate, *plans)

@@ -64,12 +64,7 @@ def replay(
     watching = monitor_for(nominal, FaultRules(), enabled=monitor, false_alarms_per_hour=false_alarms_per_hour)
     pipeline = Pipeline(estimator, history=history, monitor=watching)
     pipeline.estimate_until = history.marks.get("estimate_end", pipeline.estimate_until)
-    first: float | None = None
-    for sample in recording.samples():
-        first = sample.time if first is None else first
-        pipeline.sample(sample)
-        if progress is not None:
-            progress(sample.time - first, history)
+    _feed(pipeline, recording, progress)
     check_flown(recording, nominal, air, max((e.samples for e in history.estimates), default=0))
     received, lost = packet_counts(recording)
     return result_of(
@@ -87,6 +82,16 @@ def replay(
         },
         notices=_notices(recording, findings, folding.notice(left_out), weight_objection(recording, nominal, air)),
     )
+
+
+def _feed(pipeline: Pipeline, recording: Recording, progress: Progress | None) -> None:
+    """Every sample, in the order in which the live loop had it."""
+    first: float | None = None
+    for sample in recording.samples():
+        first = sample.time if first is None else first
+        pipeline.sample(sample)
+        if progress is not None:
+            progress(sample.time - first, pipeline.history)
 
 
 def _notices(recording: Recording, findings: list[Finding], left_out: str, weight: str) -> list[str]:

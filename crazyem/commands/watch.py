@@ -21,15 +21,17 @@ from crazyem.commands.flights import confirm_in_terminal, follow, interrupts
 from crazyem.commands.view import Streams, Viewed, live_view, wants_view
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
+from crazyem.links.base import Link
 from crazyem.live.flight_monitor import monitor_for
 from crazyem.live.hover_thrust import hover_afterwards
-from crazyem.live.policy import load_policy
+from crazyem.live.policy import Policy, load_policy
 from crazyem.live.runner import connect, finished, open_session
 from crazyem.live.session import Session
 from crazyem.live.summary import check_writable
 from crazyem.live.telemetry import FLYING
 from crazyem.live.write_supervisor import WriteRules
 from crazyem.physics import folding
+from crazyem.vehicle import Vehicle
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -55,20 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         streams = stack.enter_context(Streams(arguments.foxglove))
         link = connect(stack, arguments.uri)
         say(f"watching {arguments.uri} (Ctrl-C ends)")
-        configuration = {
-            "command": "watch", "uri": arguments.uri, "window": arguments.window, "every": arguments.every,
-            "rate": arguments.rate,
-        }  # fmt: skip
-        session = open_session(
-            stack, link, vehicle=vehicle, left_out=left_out, configuration=configuration,
-            estimator=new_estimator(vehicle, arguments, crazyflie=not arguments.uri.startswith("mavlink:")),
-            record=arguments.record, append=arguments.append,
-            rate=arguments.rate, reconnect=arguments.reconnect, wrap=streams.with_stream,
-            monitor=monitor_for(
-                vehicle, policy.monitor, enabled=arguments.monitor,
-                false_alarms_per_hour=arguments.false_alarms_per_hour,
-            ),
-        )  # fmt: skip
+        session = _open_session(arguments, stack, link, streams, vehicle, left_out, policy)
         try:
             session.start()
             if rules is not None:
@@ -96,6 +85,31 @@ def run(arguments: argparse.Namespace) -> int:
             error = error or e
     raise_after(error)
     return 0
+
+
+def _open_session(
+    arguments: argparse.Namespace, stack: contextlib.ExitStack, link: Link, streams: Streams, vehicle: Vehicle,
+    left_out: list[str], policy: Policy,
+) -> Session:  # fmt: skip
+    """The session of a drone that somebody else flies."""
+    names = ("uri", "window", "every", "rate")
+    monitor = monitor_for(
+        vehicle, policy.monitor, enabled=arguments.monitor, false_alarms_per_hour=arguments.false_alarms_per_hour
+    )
+    return open_session(
+        stack,
+        link,
+        vehicle=vehicle,
+        left_out=left_out,
+        configuration={"command": "watch", **{name: getattr(arguments, name) for name in names}},
+        estimator=new_estimator(vehicle, arguments, crazyflie=not arguments.uri.startswith("mavlink:")),
+        record=arguments.record,
+        append=arguments.append,
+        rate=arguments.rate,
+        reconnect=arguments.reconnect,
+        wrap=streams.with_stream,
+        monitor=monitor,
+    )
 
 
 def write_rules(arguments: argparse.Namespace) -> WriteRules | None:

@@ -48,6 +48,16 @@ def _push(k, dt, h, w, thrust, torque, thrust_tau, torque_tau, thrust_delay, tor
 
 
 @compiled
+def _correct(d, i, gain, row):
+    """Take the measurement of component i into the sensitivities d (12, columns): d - gain d_i; `row` is scratch."""
+    for a in range(d.shape[1]):
+        row[a] = d[i, a]
+    for j in range(12):
+        for a in range(d.shape[1]):
+            d[j, a] -= gain[j] * row[a]
+
+
+@compiled
 def sensitivities(first, last, time, kind, usable, force, thrust, torque, thrust_tau, torque_tau, thrust_delay,
                   torque_delay, theta, unit, inertia, inverse, q, r_force, lead, xf, gain, s, e, blocks, middle,
                   score):  # fmt: skip
@@ -97,19 +107,12 @@ def sensitivities(first, last, time, kind, usable, force, thrust, torque, thrust
             if s[k, i] == 0.0:
                 continue
             inv = 1.0 / s[k, i]
-            g = gain[k, i]
             for a in range(PARAMETERS):
                 da = d[i, a]
                 score[k, a] += da * e[k, i] * inv
                 for b in range(PARAMETERS):
                     info[a, b] += da * d[i, b] * inv
-            for a in range(PARAMETERS):
-                da = d[i, a]
-                for j in range(12):
-                    d2[j, a] = g[j] * da
-            for j in range(12):
-                for a in range(PARAMETERS):
-                    d[j, a] -= d2[j, a]
+            _correct(d, i, gain[k, i], d2[0])
     return info
 
 
@@ -163,11 +166,5 @@ def torque_sensitivities(first, last, time, kind, usable, force, thrust, torque,
                     cross[b, a] += d[i, b] * da
                 for b in range(sizes):
                     among[b, a] += d[i, PARAMETERS + b] * da
-            for a in range(columns):
-                da = d[i, a]
-                d2[0, a] = da
-            for j in range(12):
-                g = gain[k, i, j]
-                for a in range(columns):
-                    d[j, a] -= g * d2[0, a]
+            _correct(d, i, gain[k, i], d2[0])
     return cross, among, score
