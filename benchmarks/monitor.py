@@ -38,10 +38,10 @@ DOCS = Path(__file__).resolve().parents[1] / "docs" / "results" / "monitor.md"
 MARKS = ("<!-- monitor: table -->", "<!-- /monitor -->")
 
 
-def fly(seed: int, faults: int) -> dict[str, Any]:
+def fly(seed: int, faults: int, kinds: Sequence[str] = tuple(FAULTS)) -> dict[str, Any]:
     """One flight: what happened, what was reported, and the residuals."""
     seconds = FAULTY_SECONDS if faults else UNDISTURBED_SECONDS
-    world = draw(seed, kinds=tuple(FAULTS), faults=faults)
+    world = draw(seed, kinds=kinds, faults=faults)
     vehicle, _ = folding.fold(world.vehicle)
     reports: list[Fault] = []
     monitor = FlightMonitor(vehicle, FaultRules(), on_fault=reports.append)
@@ -81,7 +81,9 @@ def fly(seed: int, faults: int) -> dict[str, Any]:
     }
 
 
-def run(folder: Path, undisturbed: int, faulty: int, first: int, minutes: float) -> None:
+def run(
+    folder: Path, undisturbed: int, faulty: int, first: int, minutes: float, kinds: Sequence[str] = tuple(FAULTS)
+) -> None:
     """Fly what is missing."""
     folder.mkdir(parents=True, exist_ok=True)
     until = time.monotonic() + 60.0 * minutes
@@ -91,7 +93,7 @@ def run(folder: Path, undisturbed: int, faulty: int, first: int, minutes: float)
         place = folder / f"{name}.json"
         if place.exists() or time.monotonic() > until:
             continue
-        result = fly(seed, faults)
+        result = fly(seed, faults, kinds)
         place.write_text(json.dumps(result), encoding="utf-8")
         print(f"{name} {result['style']}: {[r['name'] for r in result['reports'] if not r['settled']]}", flush=True)
 
@@ -208,10 +210,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--faulty", type=int, default=100, help="flights with 3 faults each (default %(default)s)")
     parser.add_argument("--first", type=int, default=1000, help="seed (default %(default)s)")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after that; run again to go on")
+    parser.add_argument("--kind", action="append", choices=tuple(FAULTS), help="faults to draw from (default: all)")
     parser.add_argument("--docs", action="store_true", help="with score: write docs/results/monitor.md")
     a = parser.parse_args(argv)
     if a.step == "run":
-        run(a.out, a.undisturbed, a.faulty, a.first, a.minutes)
+        run(a.out, a.undisturbed, a.faulty, a.first, a.minutes, a.kind or tuple(FAULTS))
     text = page(score(a.out))
     print(text)
     if a.docs:

@@ -2,12 +2,13 @@
 
 A window opens every `SPACING` s and is kept while it is one of the newest few or its number is divisible by a power of
 two, so that their lengths grow geometrically up to `LONGEST`. Statistics of each hypothesis and length are divided by
-their own running mean without a change: a model that errs, gusts and onboard filters make them larger than the theory
-of white innovations says. That mean is known from finitely many windows, so the statistic is a Student's rather than a
-normal one. All scales that a window uses are those from before it opened.
+their own scale without a change: a model that errs makes them larger than the theory of white innovations says. That
+scale is known from finitely many windows, so the statistic is a Student's rather than a normal one. All scales that a
+window uses are those from before it opened, and those of slow errors are from before the longest window opened.
 """
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,6 +21,7 @@ from crazyem.monitoring import kernels
 from crazyem.monitoring.columns import NUISANCES, Columns, RowMaker
 from crazyem.monitoring.fault import Fault, Size
 from crazyem.monitoring.hypotheses import Hypothesis, hypotheses_for
+from crazyem.monitoring.slow_error import LAGS, slow_error
 from crazyem.monitoring.threshold import threshold_for
 from crazyem.vehicle import Vehicle
 
@@ -28,21 +30,20 @@ LEVELS = 5  # windows are up to 4 * 2^4 openings long
 LONGEST = 4 * 2 ** (LEVELS - 1)
 WINDOWS = 32  # room for windows
 ROWS_A_SECOND = 100.0  # of a log, for the threshold
-AUTOREGRESSION_MEMORY = 20.0  # s, of mean squares and products of innovations
+COVARIANCE_MEMORY = 20.0  # s, of the covariances of innovations
 SCALE_MEMORY = 60.0  # s, of the running means of the statistics
 CLIPPED = 4.0  # standard deviations as which a larger innovation counts there, and so the root of a statistic
-LEARNING, REFERENCE = 8.0, 2.0  # s in the air in which the estimator still learns; s that its parameters stay
-SCALE_BEFORE, SCALE_WEIGHT = 2.0, 10.0  # the scale before the flight: that of manoeuvres; s of flight it counts as
-SCALE_FREEDOM, REGIME = 8.0, 0.25  # degrees of freedom of the scale before the flight; s of flight that add another
-LEAST_WINDOWS = 6.0  # that must have been seen, end to end, of a length that is tested
-CALM = 3.0  # s in the air before anything is tested
+LEARNING, REFERENCE = 8.0, 2.0  # s in the air in which estimator and scales learn, untested; s that parameters stay
+# The scale before the flight, and s of flight that it counts as: undisturbed development flights had 1.1 in the
+# geometric mean; the standard deviation of the logarithm, 0.3, gives its degrees of freedom (2 / 0.3^2).
+SCALE_BEFORE, SCALE_WEIGHT, SCALE_FREEDOM = 1.5, 30.0, 30.0
+REGIME = 0.25  # s of flight that add another degree of freedom, at least
 SETTLED = 1.0  # s after the onset when the size is reported again
 LEAST_SETTLING = 0.3  # s after it was found, at least
 NEAR_ONSET = 0.2  # s by which the onset may still move
 SIGNATURE_ERROR = 0.1  # by which signatures may be wrong, relative: parameters are known to some per cent
 CLEAR, UNCLEAR = 0.95, 0.2  # probability at which a change is reported; s after which it is reported anyway
 RULED_OUT = 0.05  # probability under which a hypothesis is no look-alike
-RECOVERED = 2.0  # s below every threshold after which the model holds again
 
 
 class Detector:
@@ -78,15 +79,18 @@ class Detector:
         self.rows = np.zeros(WINDOWS, np.int64)
         self.opened = np.zeros(WINDOWS)  # s, when each opened
         self.number = np.full(WINDOWS, -1)
-        self.phi, self.weight = np.zeros((WINDOWS, 12)), np.ones((WINDOWS, 12))
-        self.d, self.d_before = np.zeros((WINDOWS, 12, size)), np.zeros((WINDOWS, 12, size))
-        self.score, self.score_n = np.zeros((WINDOWS, size)), np.zeros((WINDOWS, NUISANCES))
+        self.d, self.d_slow = np.zeros((WINDOWS, 12, size)), np.zeros((WINDOWS, 12, size))
+        self.score = np.zeros((WINDOWS, size))
         self.among, self.cross = np.zeros((WINDOWS, size, size)), np.zeros((WINDOWS, size, NUISANCES))
-        self.among_n = np.zeros((WINDOWS, NUISANCES, NUISANCES))
+        self.score_n, self.among_n = np.zeros(NUISANCES), np.zeros((NUISANCES, NUISANCES))
+        self.score_n_of = np.zeros((WINDOWS, NUISANCES))  # as it was when a window opened
+        self.among_n_of = np.zeros((WINDOWS, NUISANCES, NUISANCES))
         self.drift = np.zeros((12, 1))
-        self.n, self.n_before, self.n_now = (np.zeros((12, NUISANCES)) for _ in range(3))
-        self.e_before, self.e_now, self.plain_before = np.zeros(12), np.zeros(12), np.zeros(12)
-        self.square, self.product = np.ones(12), np.zeros(12)
+        self.n, self.n_slow, self.n_now = (np.zeros((12, NUISANCES)) for _ in range(3))
+        self.e_slow, self.e_now = np.zeros(12), np.zeros(12)
+        self.past, self.seen = np.zeros((LAGS[-1] + 1, 12)), np.zeros(12, np.int64)
+        self.covariances = np.concatenate([np.ones((1, 12)), np.zeros((len(LAGS), 12))])
+        self._slow = deque([slow_error(self.covariances)], maxlen=LONGEST + 1)  # oldest first
         self.statistic, self.determinant = np.zeros((WINDOWS, count)), np.zeros((WINDOWS, count))
         self.size, self.variance = np.zeros((WINDOWS, size)), np.ones((WINDOWS, size))
         d = self.freedom.astype(float)
@@ -108,8 +112,7 @@ class Detector:
         self._newest = -math.inf
         self._found: tuple[float, float] | None = None  # when a change was found, and its onset
         self._reported = False
-        self._exceeded = -math.inf
-        self.drift[:], self.n[:], self.n_before[:], self.e_before[:], self.plain_before[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+        self.drift[:], self.n[:], self.n_slow[:], self.e_slow[:] = 0.0, 0.0, 0.0, 0.0
 
     # rows -------------------------------------------------------------------------------------------------------
 
@@ -138,20 +141,21 @@ class Detector:
         kernels.absorb(
             begin, last, em.setup.lead, tape.time, tape.usable, tape.gain, tape.s, tape.e, tape.blocks, tape.middle,
             acting, sensed, acting_n, sensed_n, drifting, self.drift, self.columns.once, self.columns.block, slots,
-            self.rows, self.phi, self.weight, self.d, self.d_before, self.n, self.n_before, self.n_now, self.e_before,
+            self.rows, self._slow[0], self.d, self.d_slow, self.n, self.n_slow, self.n_now, self.e_slow,
             self.e_now, self.score, self.score_n, self.among, self.cross, self.among_n,
         )  # fmt: skip
         if self._found is None:
             kernels.correlate(
-                begin, last, tape.time, tape.s, tape.e, AUTOREGRESSION_MEMORY, CLIPPED, self.plain_before, self.square,
-                self.product,
+                begin, last, tape.time, tape.s, tape.e, COVARIANCE_MEMORY, CLIPPED, LAGS, self.past, self.seen,
+                self.covariances,
             )  # fmt: skip
         if now - self._newest < SPACING - 1e-3:
             return None
         passed = min(now - self._newest, 1.0) if math.isfinite(self._newest) else SPACING
         self._newest = now
         report = self._judge(now, passed, sd) if len(slots) else None
-        if self._found is None:
+        self._slow.append(slow_error(self.covariances))
+        if self._found is None and now - self._since > LEARNING:
             self._renew(now)
         return report
 
@@ -175,12 +179,10 @@ class Detector:
                 keep.append(w)
         free = next(w for w in range(WINDOWS) if w not in keep)
         self.rows[free], self.opened[free], self.number[free] = 0, now, self._count
-        correlation = np.clip(self.product / self.square, -0.95, 0.95)
-        self.phi[free] = correlation
-        self.weight[free] = 1.0 / np.sqrt(self.square * (1.0 - correlation**2))
-        for array in (self.d, self.d_before, self.score, self.score_n, self.among, self.cross, self.among_n):
+        for array in (self.d, self.d_slow, self.score, self.among, self.cross):
             array[free] = 0.0
         self.scale_of[free], self.known_of[free] = self.scale, self.known
+        self.score_n_of[free], self.among_n_of[free] = self.score_n, self.among_n
         self._open = [*keep, free]
 
     # decisions --------------------------------------------------------------------------------------------------
@@ -192,39 +194,28 @@ class Detector:
 
     def _judge(self, now: float, passed: float, sd: NDArray[np.float64]) -> Fault | None:
         slots = np.array(self._open, np.int64)
+        oldest = self._open[0]
         kernels.judge(
-            slots, self.columns.first, self._prior, self._maker.precision(sd), self.score, self.score_n, self.among,
-            self.cross, self.among_n, self.statistic, self.determinant, self.size, self.variance,
+            slots, self.columns.first, self._prior, self._maker.precision(sd), self.score,
+            self.score_n - self.score_n_of[oldest], self.among, self.cross, self.among_n - self.among_n_of[oldest],
+            self.statistic, self.determinant, self.size, self.variance,
         )  # fmt: skip
         levels = np.array([self._level(w) for w in self._open])
         statistic = self.statistic[slots]
         scale = self.scale_of[slots, levels]
-        freedom = SCALE_FREEDOM + self._freedom(levels, self.known_of[slots, levels])
+        seconds = np.maximum(SPACING * 4.0 * 2.0**levels, REGIME)
+        freedom = SCALE_FREEDOM + (np.minimum(self.known_of[slots, levels], SCALE_MEMORY) / seconds)[:, None]
         normal = freedom * np.log1p(statistic / (scale * freedom))
-        seen = self.known_of[slots, levels] > LEAST_WINDOWS * SPACING * 4.0 * 2.0**levels
-        over = np.where(seen[:, None], normal / self.threshold, 0.0)
+        over = normal / self.threshold
         if self._found is not None:
             return self._settle(now, slots, statistic, scale)
-        tested = now - self._since > CALM
-        if over.max() > 1.0 and tested:
-            self._exceeded = now
-            if self.holds:
-                self.holds = False
-                report = self._report(now, slots, statistic, scale, settled=False)
-                self._found = (now, report.onset)
-                return self._first(report, now)
-        elif not self.holds and now - self._exceeded > RECOVERED:
-            self.holds = True
+        self.holds = bool(over.max() <= 1.0)
         if self.holds:
             self._learn(levels, statistic, passed)
-        return None
-
-    @staticmethod
-    def _freedom(levels: NDArray[np.int64], known: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Degrees of freedom of the running means of each window (n, H)."""
-        lengths = np.maximum(SPACING * 4.0 * 2.0**levels, REGIME)
-        out: NDArray[np.float64] = (np.minimum(known, SCALE_MEMORY) / lengths)[:, None]
-        return out
+            return None
+        report = self._report(now, slots, statistic, scale, settled=False)
+        self._found = (now, report.onset)
+        return self._first(report, now)
 
     def _learn(self, levels: NDArray[np.int64], statistic: NDArray[np.float64], passed: float) -> None:
         """Running moments of the statistics, by length.
@@ -256,7 +247,6 @@ class Detector:
             return None
         report = self._report(now, slots, statistic, scale, settled=True)
         self._restart(now)
-        self._exceeded = now
         return report
 
     def _first(self, report: Fault, now: float) -> Fault | None:

@@ -2,8 +2,8 @@
 
 A change at the onset t0 moves what the filter does not know by d: d <- Phi d + B, and after each scalar measurement
 d <- d - gain (d_i + m_i), where m is what a sensor adds. The innovation moves by g = d_i + m_i (Willsky and Jones
-1976). Innovations are taken in their standard deviations and whitened by an autoregression of first order, the
-signatures likewise.
+1976). Innovations are taken in their standard deviations. What a slow error predicts of them (slow_error.py) is taken
+off, of the signatures likewise.
 """
 
 import numpy as np
@@ -40,7 +40,7 @@ def _step(d, scratch, blocks, dt, h, middle, acting, act, once, new):
 @compiled
 def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, sensed, acting_n, sensed_n, drifting,
            drift, once, block,
-           slots, rows, phi, weight, d, d_before, n, n_before, n_now, e_before, e_now, score, score_n, among, cross,
+           slots, rows, slow, d, d_slow, n, n_slow, n_now, e_slow, e_now, score, score_n, among, cross,
            among_n):  # fmt: skip
     """Take rows first..last-1 of the tape into every open window.
 
@@ -50,12 +50,13 @@ def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, 
         drifting (k, 1, 6): what the model's accelerations have changed by since its reference. drift: (12, 1) what the
             filter does therefore, so that innovations are those of the reference.
         slots: (w,) which windows are open. rows: (W,) rows that each has seen, counted on.
-        phi, weight: (W, 12) autoregression, and 1 over the standard deviation of what it leaves.
-        d, d_before: (W, 12, C) signatures, and their last normalised values; n, n_before, n_now: (12, M) the same.
-        e_before, e_now: (12,) last normalised innovations.
-        score (W, C), score_n (W, M), among (W, C, C) within hypotheses, cross (W, C, M), among_n (W, M, M): sums.
+        slow: (3, 12) of the slow errors: decay, gain, 1 over the standard deviation of what they leave.
+        d, d_slow: (W, 12, C) signatures, and what is predicted of them; n, n_slow: (12, M) the same of nuisances.
+        e_slow: (12,) what is predicted of the innovations. n_now, e_now: room for what is left.
+        score (W, C), among (W, C, C) within hypotheses, cross (W, C, M), score_n (M,), among_n (M, M): sums.
     """
     size, nuisances = d.shape[2], n.shape[1]
+    phi, learnt, weight = slow[0], slow[1], slow[2]
     scratch = np.empty((12, size))
     scratch_n = np.empty((12, nuisances))
     now = np.empty(size)
@@ -74,15 +75,25 @@ def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, 
                 continue
             root = 1.0 / np.sqrt(s[k, i])
             moved = drift[i, 0]
-            e_now[i] = (e[k, i] + moved) * root
+            f, q, r = phi[i], learnt[i], weight[i]
+            v = (e[k, i] + moved) * root - e_slow[i]
+            e_now[i] = r * v
+            e_slow[i] = f * (e_slow[i] + q * v)
             for a in range(nuisances):
                 part[a] = n[i, a] + sensed_n[k - first, a, i]
-                n_now[i, a] = part[a] * root
+                v = part[a] * root - n_slow[i, a]
+                n_now[i, a] = r * v
+                n_slow[i, a] = f * (n_slow[i, a] + q * v)
             for j in range(12):
                 g = gain[k, i, j]
                 drift[j, 0] -= g * moved
                 for a in range(nuisances):
                     n[j, a] -= g * part[a]
+            for a in range(nuisances):
+                v = n_now[i, a]
+                score_n[a] += v * e_now[i]
+                for b in range(a + 1):
+                    among_n[a, b] += v * n_now[i, b]
         for at in range(len(slots)):
             w = slots[at]
             dw = d[w]
@@ -92,7 +103,7 @@ def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, 
                 if s[k, i] == 0.0:
                     continue
                 root = 1.0 / np.sqrt(s[k, i])
-                f, q = phi[w, i], weight[w, i]
+                f, q, r = phi[i], learnt[i], weight[i]
                 for a in range(size):
                     now[a] = dw[i, a] + sensed[k - first, a, i]
                 for j in range(12):
@@ -100,14 +111,12 @@ def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, 
                     dj = dw[j]
                     for a in range(size):
                         dj[a] -= g * now[a]
-                before = d_before[w, i]
+                past = d_slow[w, i]
                 for a in range(size):
-                    v = now[a] * root
-                    whole[a] = q * (v - f * before[a])
-                    before[a] = v
-                for a in range(nuisances):
-                    part[a] = q * (n_now[i, a] - f * n_before[i, a])
-                left = q * (e_now[i] - f * e_before[i])
+                    v = now[a] * root - past[a]
+                    whole[a] = r * v
+                    past[a] = f * (past[a] + q * v)
+                left = e_now[i]
                 for a in range(size):
                     x = whole[a]
                     if x == 0.0:
@@ -117,36 +126,30 @@ def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, 
                         among[w, a, b] += x * whole[b]
                     row = cross[w, a]
                     for b in range(nuisances):
-                        row[b] += x * part[b]
-                for a in range(nuisances):
-                    x = part[a]
-                    score_n[w, a] += x * left
-                    row = among_n[w, a]
-                    for b in range(a + 1):
-                        row[b] += x * part[b]
-        for i in range(12):
-            if s[k, i] != 0.0:
-                e_before[i] = e_now[i]
-                for a in range(nuisances):
-                    n_before[i, a] = n_now[i, a]
+                        row[b] += x * n_now[i, b]
 
 
 @compiled
-def correlate(first, last, time, s, e, memory, most, before, square, product):
-    """Running mean square of the normalised innovations (12,), and of their products with the ones before (12,).
+def correlate(first, last, time, s, e, memory, most, lags, past, seen, moments):
+    """Running covariances of the normalised innovations: moments (1 + L, 12), at lag 0 and at `lags` (L,) samples.
 
-    `memory` s is its time constant; a value beyond `most` standard deviations counts as that.
+    `memory` s is their time constant; a value beyond `most` standard deviations counts as that. past (R, 12) and seen
+    (12,) keep the newest samples of each signal.
     """
+    room = past.shape[0]
     for k in range(first, last):
-        share = min((time[k] - time[k - 1]) / memory, 1.0)
         for i in range(12):
             if s[k, i] == 0.0:
                 continue
-            bound = most * np.sqrt(square[i])
+            share = max((time[k] - time[k - 1]) / memory, 1.0 / (2.0 + seen[i]))
+            bound = most * np.sqrt(moments[0, i])
             v = min(max(e[k, i] / np.sqrt(s[k, i]), -bound), bound)
-            square[i] += share * (v * v - square[i])
-            product[i] += share * (v * before[i] - product[i])
-            before[i] = v
+            moments[0, i] += share * (v * v - moments[0, i])
+            for j in range(len(lags)):
+                if seen[i] >= lags[j]:
+                    moments[1 + j, i] += share * (v * past[(seen[i] - lags[j]) % room, i] - moments[1 + j, i])
+            past[seen[i] % room, i] = v
+            seen[i] += 1
 
 
 @compiled
@@ -172,6 +175,8 @@ def judge(slots, first, prior, prior_n, score, score_n, among, cross, among_n, s
           variance):  # fmt: skip
     """What every open window says of every hypothesis, the nuisances integrated out.
 
+    Nuisances act before a change as well as after it: score_n (M,) and among_n (M, M) are those of the oldest window.
+
     Args:
         first (H + 1,): columns of each hypothesis. prior (C,): precisions of the sizes. prior_n (M,): of the nuisances.
         statistic (W, H): S' (J + prior)^-1 S, twice the logarithm of the likelihood ratio. determinant (W, H): log det
@@ -183,17 +188,17 @@ def judge(slots, first, prior, prior_n, score, score_n, among, cross, among_n, s
     x = np.empty((nuisances, columns + 1))
     hyp = np.empty((8, 8))
     y = np.empty(8)
+    for a in range(nuisances):
+        for b in range(a + 1):
+            m[a, b] = among_n[a, b]
+        m[a, a] += prior_n[a]
+    _factor(m, nuisances)
     for at in range(len(slots)):
         w = slots[at]
-        for a in range(nuisances):
-            for b in range(a + 1):
-                m[a, b] = among_n[w, a, b]
-            m[a, a] += prior_n[a]
-        _factor(m, nuisances)
         for a in range(nuisances):  # x = L^-1 (cross', score_n)
             for c in range(columns):
                 x[a, c] = cross[w, c, a]
-            x[a, columns] = score_n[w, a]
+            x[a, columns] = score_n[a]
             for k in range(a):
                 f = m[a, k]
                 for c in range(columns + 1):

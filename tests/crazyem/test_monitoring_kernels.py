@@ -43,7 +43,7 @@ class Made:
         self.sensed_n = random.standard_normal((n, m, 12)) * (np.arange(m) == 1)[None, :, None]
         self.once = np.array([False, False, True, False])
         self.block = np.array([0, 1, 1, 1])
-        self.phi, self.weight = random.uniform(-0.3, 0.8, 12), random.uniform(0.5, 1.5, 12)
+        self.slow = np.stack([random.uniform(-0.3, 0.8, 12), random.uniform(0, 1, 12), random.uniform(0.5, 1.5, 12)])
 
     def signatures(self, acting: NDArray, sensed: NDArray, once: NDArray) -> NDArray:
         """(n, 12, C) what each column adds to the normalised innovations, NaN where nothing was measured."""
@@ -69,14 +69,16 @@ class Made:
         return out
 
     def whitened(self, values: NDArray) -> NDArray:
-        """(n, 12, ...) less the autoregression on what was measured before, over what that leaves; 0 where missing."""
-        out, before = np.zeros_like(values), np.zeros_like(values[0])
-        for k in range(self.n):
-            seen = self.s[k + 1] > 0
-            f, q = self.phi[seen], self.weight[seen]
-            shape = (-1,) + (1,) * (values.ndim - 2)
-            out[k, seen] = q.reshape(shape) * (values[k, seen] - f.reshape(shape) * before[seen])
-            before[seen] = values[k, seen]
+        """(n, 12, ...) less what the slow error predicts, a sum over all that was measured before; 0 where missing."""
+        out = np.zeros_like(values)
+        phi, gain, weight = self.slow
+        for i in range(12):
+            rows = np.flatnonzero(self.s[1:, i] > 0)
+            for j, k in enumerate(rows):
+                past = [
+                    phi[i] * gain[i] * (phi[i] * (1 - gain[i])) ** (j - 1 - a) * values[rows[a], i] for a in range(j)
+                ]
+                out[k, i] = weight[i] * (values[k, i] - sum(past))
         return out
 
 
@@ -85,20 +87,18 @@ def test_sums_are_those_of_plain_numpy(seed: int) -> None:
     made = Made(seed)
     c, m, n = 4, made.m, made.n
     arrays = {
-        "d": np.zeros((3, 12, c)), "d_before": np.zeros((3, 12, c)), "n": np.zeros((12, m)),
-        "n_before": np.zeros((12, m)), "n_now": np.zeros((12, m)), "e_before": np.zeros(12), "e_now": np.zeros(12),
-        "score": np.zeros((3, c)), "score_n": np.zeros((3, m)), "among": np.zeros((3, c, c)),
-        "cross": np.zeros((3, c, m)), "among_n": np.zeros((3, m, m)),
+        "d": np.zeros((3, 12, c)), "d_slow": np.zeros((3, 12, c)), "n": np.zeros((12, m)),
+        "n_slow": np.zeros((12, m)), "n_now": np.zeros((12, m)), "e_slow": np.zeros(12), "e_now": np.zeros(12),
+        "score": np.zeros((3, c)), "score_n": np.zeros(m), "among": np.zeros((3, c, c)),
+        "cross": np.zeros((3, c, m)), "among_n": np.zeros((m, m)),
     }  # fmt: skip
-    phi, weight = np.zeros((3, 12)), np.ones((3, 12))
-    phi[1], weight[1] = made.phi, made.weight
     rows = np.zeros(3, np.int64)
     for first, last in ((1, 4), (4, n + 1)):  # in two parts, as updates come
         kernels.absorb(
             first, last, 0.5, made.time, made.usable, made.gain, made.s, made.e, made.blocks, made.middle,
             made.acting[first - 1 : last - 1], made.sensed[first - 1 : last - 1], made.acting_n[first - 1 : last - 1],
             made.sensed_n[first - 1 : last - 1], np.zeros((last - first, 1, 6)), np.zeros((12, 1)),
-                        made.once, made.block, np.array([1]), rows, phi, weight, *arrays.values(),
+            made.once, made.block, np.array([1]), rows, made.slow, *arrays.values(),
         )  # fmt: skip
     mine = made.whitened(made.signatures(made.acting, made.sensed, made.once)).reshape(-1, c)
     nuisance = made.whitened(
@@ -109,10 +109,10 @@ def test_sums_are_those_of_plain_numpy(seed: int) -> None:
     ).ravel()
     inside = made.block[:, None] == made.block[None, :]
     np.testing.assert_allclose(arrays["score"][1], mine.T @ left, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(arrays["score_n"][1], nuisance.T @ left, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(arrays["score_n"], nuisance.T @ left, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(arrays["cross"][1], mine.T @ nuisance, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(np.tril(arrays["among"][1]), np.tril(mine.T @ mine * inside), rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(np.tril(arrays["among_n"][1]), np.tril(nuisance.T @ nuisance), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(np.tril(arrays["among_n"]), np.tril(nuisance.T @ nuisance), rtol=1e-9, atol=1e-12)
     assert rows[1] == n
     assert not arrays["score"][[0, 2]].any()
 
@@ -126,8 +126,8 @@ def test_the_judgement_is_that_of_dense_algebra(seed: int) -> None:
     prior, prior_n = random.uniform(0.5, 2.0, c), random.uniform(0.5, 2.0, m)
     out = [np.zeros((1, 2)), np.zeros((1, 2)), np.zeros((1, c)), np.zeros((1, c))]
     kernels.judge(
-        np.array([0]), first, prior, prior_n, (x.T @ y)[None], (n.T @ y)[None], (x.T @ x)[None], (x.T @ n)[None],
-        (n.T @ n)[None], *out,
+        np.array([0]), first, prior, prior_n, (x.T @ y)[None], n.T @ y, (x.T @ x)[None], (x.T @ n)[None],
+        n.T @ n, *out,
     )  # fmt: skip
     covariance = np.eye(40) + n @ np.diag(1 / prior_n) @ n.T
     for h, (lo, hi) in enumerate(itertools.pairwise(first)):
