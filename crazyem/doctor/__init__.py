@@ -1,6 +1,58 @@
 """The doctor: what is wrong with a recording, found from its numbers; one file a check, and the lossless repairs."""
 
-from crazyem.doctor.examine import CHECKS, Check, examine
+import importlib
+from dataclasses import dataclass
+
 from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.recording import Recording
 
 __all__ = ["CHECKS", "Check", "Finding", "Fix", "Grade", "examine"]
+
+_GRADE_RANK = {Grade.UNUSABLE: 0, Grade.DEGRADES: 1, Grade.HARMLESS: 2}
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """A check: module `crazyem.doctor.<module>` with `check(recording: Recording) -> list[Finding]`.
+
+    Checks read and never change the recording, skip what is not in it, and cost at most a few seconds and some copies
+    of one signal for a recording of 600 000 samples.
+    """
+
+    module: str
+    title: str
+
+    def run(self, recording: Recording) -> list[Finding]:
+        module = importlib.import_module(f"crazyem.doctor.{self.module}")
+        return list(module.check(recording))
+
+
+CHECKS: tuple[Check, ...] = (
+    Check("numbers", "values that are no numbers or cannot be"),
+    Check("gaps", "gaps and dropped records"),
+    Check("interpolated", "samples on straight lines, never measured"),
+    Check("repeated", "repeated samples"),
+    Check("clocks", "clock wraps, jumps, drift; nominal against real rate"),
+    Check("frozen", "frozen and stuck channels"),
+    Check("saturation", "rotors at their limit"),
+    Check("rotor_sensor", "a rotor speed sensor that counts half or drops to zero"),
+    Check("angles", "angles against the quaternion: degrees for radians, inverted pitch"),
+    Check("rates", "body rate against the attitude's derivative: unit, frame, sign, scale"),
+    Check("velocities", "velocity against the position's derivative: unit, frame, scale"),
+    Check("forces", "specific force and acceleration against the velocity's derivative: unit, frame, scale"),
+    Check("tilt", "a tilted pose frame"),
+    Check("lag", "lag between streams, and its drift"),
+    Check("weight", "thrust against weight, and a mass the publisher claims"),
+    Check("onboard_drag", "an onboard estimate that was told of a drag"),
+    Check("flight", "crash, upset, never left the ground"),
+)
+
+
+def examine(recording: Recording) -> tuple[Finding, ...]:
+    """Everything odd about a recording, what its reader noticed first, the worst first within each."""
+    found = [finding for check in CHECKS for finding in check.run(recording)]
+    return (*sorted(recording.findings, key=_rank), *sorted(found, key=_rank))
+
+
+def _rank(finding: Finding) -> int:
+    return _GRADE_RANK[finding.grade]

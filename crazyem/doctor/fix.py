@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.examine import CHECKS
+from crazyem.doctor import CHECKS
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.finding import Finding, Fix
 from crazyem.recordings.ordering import sound_samples

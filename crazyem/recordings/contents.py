@@ -1,11 +1,14 @@
-"""What every reader gets: what the user has to tell it, and the bytes of a file, bounded against bombs."""
+"""What every reader gets: what the user has to tell it, the bytes of a file, bounded, and arrays that rows fill."""
 
 import gzip
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, cast
+from typing import IO, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError, UsageError
 
@@ -66,3 +69,38 @@ def contents(path: Path) -> bytes:
     if size > LARGEST_FILE:
         raise FileFormatError(f"{path} is larger than {LARGEST_FILE >> 20} MiB, more than can be read at once.")
     return b"".join(pieces(path, max(size, 1)))  # a plain file in one piece, which is not copied
+
+
+class GrowingArray:
+    """(n,) or (n, width) values to which rows are appended; a flight is held once, not as a list of blocks.
+
+    Args:
+        kind: numpy type of the values.
+        width: of a row; None for single values.
+        expected: rows, as far as known: saves moving the array while it grows.
+    """
+
+    def __init__(self, kind: Any, width: int | None = None, *, expected: int = 0) -> None:
+        self._array: NDArray[Any] = np.empty(expected if width is None else (expected, width), kind)
+        self.size = 0
+
+    def more(self, count: int) -> NDArray[Any]:
+        """Room for `count` rows after the last, to be filled."""
+        first, self.size = self.size, self.size + count
+        if self.size > len(self._array):
+            # what is never filled takes up no memory
+            larger = np.empty((max(self.size, 2 * first), *self._array.shape[1:]), self._array.dtype)
+            larger[:first] = self._array[:first]
+            self._array = larger
+        return self._array[first : self.size]
+
+    @property
+    def rows(self) -> NDArray[Any]:
+        """The rows so far."""
+        return self._array[: self.size]
+
+    def take(self) -> NDArray[Any]:
+        """The rows, handed over and not kept; a copy where much of the array was not filled."""
+        array, size = self._array, self.size
+        self._array, self.size = np.empty((0, *array.shape[1:]), array.dtype), 0
+        return array[:size] if len(array) - size < len(array) // 16 else array[:size].copy()

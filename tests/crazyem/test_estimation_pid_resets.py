@@ -8,7 +8,7 @@ import struct
 import numpy as np
 import pytest
 
-from crazyem.doctor.examine import examine
+from crazyem.doctor import examine
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.estimation.steps import StepAwareEstimator
 from crazyem.recordings.finding import Grade

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
 from crazyem.recordings.columns import MARKED_COLUMN, Description, SignalEntry, name_and_unit
-from crazyem.recordings.contents import ReadOptions
+from crazyem.recordings.contents import GrowingArray, ReadOptions
 from crazyem.recordings.csv.text import BLOCK_BYTES, LONGEST_LINE, Damage, text_blocks
 from crazyem.recordings.csv.wide import damage_notes
 from crazyem.recordings.description import from_json
 from crazyem.recordings.export import HOST_TIME, METADATA_SUFFIX, TIME
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.growing import GrowingArray
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.signals.sample import SIGNALS, components
 

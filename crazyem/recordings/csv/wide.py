@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError
+from crazyem.recordings.contents import GrowingArray
 from crazyem.recordings.csv.interpolation import CONTEXT_ROWS
 from crazyem.recordings.csv.mapping import CsvMapping, SignalColumns
 from crazyem.recordings.csv.signals import Layout, Rows, signals_of
 from crazyem.recordings.csv.text import Columns, Damage, Header, read_columns
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.growing import GrowingArray
 from crazyem.recordings.recording import Recording
 from crazyem.signals.sample import SIGNALS
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.recordings.growing import GrowingArray
+from crazyem.recordings.contents import GrowingArray
 from crazyem.recordings.mcap import scan as mcap_scan
 from crazyem.recordings.mcap import schemas
 from crazyem.recordings.mcap.messages import EVENT_TOPICS, OTHER_EVENT_TOPIC, fields_of
