@@ -1,154 +1,30 @@
-"""The protobuf messages of our MCAP files, built in memory: no generated code, and every viewer can decode them.
+"""The protobuf messages of our MCAP files, without generated code; every viewer can decode them.
 
 Log packets have one message type a block, with one field a variable, and are packed and unpacked by `struct`: all their
-fields are 8 bytes wide, so a message has a fixed length and costs about a microsecond. Every other message goes
-through google.protobuf. Field numbers are part of the file format (docs/reference/formats/mcap.md).
+fields are 8 bytes wide, so a message has a fixed length and costs about a microsecond. Every other message is in
+messages.textproto and goes through google.protobuf.
 """
 
 import functools
 import json
 import struct
 from collections.abc import Iterable
+from importlib import resources
 from typing import Any
 
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, text_format
 
 from crazyem.signals.sample import Block, Packet, Variable
 
 _F = descriptor_pb2.FieldDescriptorProto
-_TYPES = {
-    "double": _F.TYPE_DOUBLE,
-    "sfixed64": _F.TYPE_SFIXED64,
-    "fixed64": _F.TYPE_FIXED64,
-    "int64": _F.TYPE_INT64,
-    "int32": _F.TYPE_INT32,
-    "uint32": _F.TYPE_UINT32,
-    "string": _F.TYPE_STRING,
-    "bool": _F.TYPE_BOOL,
-}
-
-# message -> (field, type); numbered from 1 in this order. A type with a dot is a message; "*" after it: repeated.
-_MESSAGES: dict[str, tuple[tuple[str, str], ...]] = {
-    "crazyem.Setpoint": (
-        ("time", "double"),
-        ("host_time", "double"),
-        *((f"{what}_{axis}", "double") for what in ("position", "velocity", "acceleration") for axis in "xyz"),
-        ("yaw", "double"),
-        ("yaw_rate", "double"),
-    ),
-    "crazyem.ParameterWrite": (
-        ("host_time", "double"),
-        ("name", "string"),
-        ("value", "double"),
-        ("echoed", "double"),
-        ("verified", "bool"),
-    ),
-    "crazyem.ParameterEstimate": (
-        ("name", "string"),
-        ("value", "double"),
-        ("sd", "double"),
-        ("ci95_low", "double"),
-        ("ci95_high", "double"),
-        ("unit", "string"),
-        ("identifiable", "bool"),
-        ("reason", "string"),
-    ),
-    "crazyem.Estimate": (
-        ("time", "double"),
-        ("host_time", "double"),
-        ("parameters", "crazyem.ParameterEstimate*"),
-        ("samples", "int64"),
-        ("updates", "int64"),
-        ("converged", "bool"),
-    ),
-    # the drone's packets so far, and over the last second
-    "crazyem.Link": (
-        ("host_time", "double"),
-        ("received", "int64"),
-        ("lost", "int64"),
-        ("late", "int64"),
-        ("rate", "double"),
-        ("loss", "double"),
-        ("latency", "double"),
-        ("round_trip", "double"),
-        ("clock_offset", "double"),
-        ("clock_rate", "double"),
-        ("outages", "int64"),
-    ),
-    # what the newest sample had that the model did not predict, and the standard deviation it was expected to have
-    "crazyem.Residual": (
-        ("time", "double"),
-        ("host_time", "double"),
-        *((f"{w}_{axis}", "double") for w in ("position", "velocity", "attitude", "body_rate") for axis in "xyz"),
-        *((f"{w}_{axis}_sd", "double") for w in ("position", "velocity", "attitude", "body_rate") for axis in "xyz"),
-    ),
-    # anything that happened and has no message of its own
-    "crazyem.Event": (("time", "double"), ("kind", "string"), ("json", "string")),
-    "foxglove.Vector3": (("x", "double"), ("y", "double"), ("z", "double")),
-    "foxglove.Quaternion": (("x", "double"), ("y", "double"), ("z", "double"), ("w", "double")),
-    "foxglove.Pose": (("position", "foxglove.Vector3"), ("orientation", "foxglove.Quaternion")),
-    "foxglove.Time": (("seconds", "int64"), ("nanos", "int32")),
-}
-
-
-def _message(name: str, fields: tuple[tuple[str, str], ...]) -> descriptor_pb2.DescriptorProto:
-    message = descriptor_pb2.DescriptorProto(name=name)
-    for number, (field, kind) in enumerate(fields, start=1):
-        entry = message.field.add(name=field, number=number)
-        entry.label = _F.LABEL_REPEATED if kind.endswith("*") else _F.LABEL_OPTIONAL
-        base = kind.rstrip("*")
-        entry.type = _TYPES.get(base, _F.TYPE_MESSAGE)
-        if base not in _TYPES:
-            entry.type_name = f".{base}"
-    return message
-
-
-def _file(name: str, package: str, messages: list[descriptor_pb2.DescriptorProto], *needs: str) -> Any:
-    return descriptor_pb2.FileDescriptorProto(
-        name=name, package=package, syntax="proto3", dependency=list(needs), message_type=messages
-    )
+_TYPES = {"double": _F.TYPE_DOUBLE, "sfixed64": _F.TYPE_SFIXED64, "fixed64": _F.TYPE_FIXED64}  # of 8 bytes
 
 
 @functools.cache
 def _files() -> tuple[Any, ...]:
     """Descriptors of all fixed files, dependencies first."""
-    time = ("timestamp", "google.protobuf.Timestamp")
-    stamp = "google/protobuf/timestamp.proto"
-    ours = [_message(n.split(".")[1], f) for n, f in _MESSAGES.items() if n.startswith("crazyem.")]
-    pose = [
-        _message(n.split(".")[1], _MESSAGES[n]) for n in ("foxglove.Vector3", "foxglove.Quaternion", "foxglove.Pose")
-    ]
-    log = _message("Log", (time, ("level", "int32"), ("message", "string"), ("name", "string")))
-    log.field[1].type = _F.TYPE_ENUM
-    log.field[1].type_name = ".foxglove.Log.Level"
-    level = log.enum_type.add(name="Level")
-    for number, word in enumerate(("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")):
-        level.value.add(name=word, number=number)
-    transform = (
-        time,
-        ("parent_frame_id", "string"),
-        ("child_frame_id", "string"),
-        ("translation", "foxglove.Vector3"),
-        ("rotation", "foxglove.Quaternion"),
-    )
-    in_frame = (time, ("frame_id", "string"), ("pose", "foxglove.Pose"))
-    timestamp = _file(stamp, "google.protobuf", [_message("Timestamp", _MESSAGES["foxglove.Time"])])
-    return (
-        timestamp,
-        _file("crazyem.proto", "crazyem", ours),
-        _file("foxglove/Pose.proto", "foxglove", pose),
-        _file("foxglove/Log.proto", "foxglove", [log], stamp),
-        _file(
-            "foxglove/PoseInFrame.proto", "foxglove", [_message("PoseInFrame", in_frame)], stamp, "foxglove/Pose.proto"
-        ),
-        _file(
-            "foxglove/FrameTransform.proto",
-            "foxglove",
-            [_message("FrameTransform", transform)],
-            stamp,
-            "foxglove/Pose.proto",
-        ),
-    )
+    text = (resources.files("crazyem.recordings.mcap") / "messages.textproto").read_text(encoding="utf-8")
+    return tuple(text_format.Parse(text, descriptor_pb2.FileDescriptorSet()).file)
 
 
 @functools.cache
@@ -225,7 +101,12 @@ def block_from_metadata(metadata: dict[str, str]) -> Block:
 
 def dynamic_schema(package: str, name: str, fields: Iterable[tuple[str, str]]) -> bytes:
     """The serialised FileDescriptorSet of a message made up at run time, from (field, type) in order."""
-    file = _file(f"{package.replace('.', '/')}/{name}.proto", package, [_message(name, tuple(fields))])
+    message = descriptor_pb2.DescriptorProto(name=name)
+    for number, (field, kind) in enumerate(fields, start=1):
+        message.field.add(name=field, number=number, label=_F.LABEL_OPTIONAL, type=_TYPES[kind])
+    file = descriptor_pb2.FileDescriptorProto(
+        name=f"{package.replace('.', '/')}/{name}.proto", package=package, syntax="proto3", message_type=[message]
+    )
     return bytes(descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString())
 
 
