@@ -1,13 +1,15 @@
 """One function over many files: in this process, in processes of this machine, or on a Dask cluster."""
 
+import argparse
 import contextlib
 import os
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
-from crazyem.commands.output import Progress, Result
+from crazyem.commands.files import Files
+from crazyem.commands.output import Progress, Report, Result
 from crazyem.commands.workers import shared
 from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.extras import require
@@ -44,6 +46,41 @@ def each(
             progress.clear()
             yield result
             progress.step()
+
+
+def on_files(
+    arguments: argparse.Namespace,
+    report: Report,
+    files: Files,
+    work: Callable[..., Result],
+    rests: Iterable[tuple[Any, ...]],
+    *,
+    apart: bool = False,
+) -> None:
+    """`work(path, *rest)` of each file of a command, as --jobs and --cluster say; the results go to the report.
+
+    Args:
+        rests: further arguments for each file.
+        apart: with an empty line between two results.
+    """
+    names = [str(f.path) for f in files.found]
+    tasks = [(name, *rest) for name, rest in zip(names, rests)]
+    results = each(work, tasks, names=names, what=arguments.command, jobs=arguments.jobs, cluster=arguments.cluster)
+    for number, result in enumerate(results):
+        if apart and number:
+            report.say("")
+        report.add(result)
+
+
+def counted(results: Sequence[Result], skipped: int) -> str:
+    """How many files were read, failed and passed over, in one line."""
+    failed = sum(bool(r.error) for r in results)
+    parts = [f"{len(results) - failed} recordings"]
+    if failed:
+        parts.append(f"{failed} could not be read")
+    if skipped:
+        parts.append(f"{skipped} other files skipped")
+    return ", ".join(parts)
 
 
 def processes(jobs: int | None, files: int) -> int:

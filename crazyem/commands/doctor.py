@@ -6,14 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from crazyem.commands.batch import each, processes
+from crazyem.commands.batch import counted, on_files, processes
 from crazyem.commands.files import find, read_options, targets
-from crazyem.commands.info import counted
 from crazyem.commands.merge import merge_findings
 from crazyem.commands.output import Report, Result
 from crazyem.errors import DataError, UsageError
 from crazyem.recordings import Finding, Grade, ReadOptions, Recording, open_recording
-from crazyem.recordings.parts import can_be_parted, is_large, open_parts
+from crazyem.recordings.parts import open_parts, to_be_parted
 
 _TEXT_WIDTH = 110
 _SHOWN_INTERVALS = 4  # intervals that are written out
@@ -32,17 +31,8 @@ def run(arguments: argparse.Namespace) -> int:
         outputs = [*targets(files.found, arguments.output, ".fixed.mcap", force=arguments.force)]
     several = len(files.found) > 1
     jobs = processes(arguments.jobs, len(files.found))
-    tasks = [
-        (str(f.path), options, None if o is None else str(o), arguments.force, arguments.parts, jobs, several)
-        for f, o in zip(files.found, outputs, strict=True)
-    ]
-    names = [str(f.path) for f in files.found]
-    for number, result in enumerate(
-        each(diagnose, tasks, names=names, what="doctor", jobs=arguments.jobs, cluster=arguments.cluster)
-    ):
-        if number:
-            report.say("")
-        report.add(result)
+    rests = ((options, None if o is None else str(o), arguments.force, arguments.parts, jobs, several) for o in outputs)
+    on_files(arguments, report, files, diagnose, rests, apart=True)
     duplicates = _duplicates(report.results) if several else []
     for duplicate in duplicates:
         report.say("\n" + text_of(duplicate["finding"]))
@@ -63,8 +53,7 @@ def diagnose(
     """One file. Raises as `open_recording`, and UsageError if the repaired file cannot be written."""
     from crazyem.doctor import examine
 
-    large = parts or is_large(Path(path), jobs=jobs)
-    if large and output is None and can_be_parted(Path(path)):
+    if output is None and to_be_parted(path, asked=parts, jobs=jobs):
         source, start, end, found = "", None, None, []
         for part in open_parts(path, options):
             source = part.source

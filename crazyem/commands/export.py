@@ -1,16 +1,14 @@
 """`crazyem export FILE... -o OUT.csv|OUT.parquet`: recordings as tables for other programs, nothing resampled."""
 
 import argparse
-from pathlib import Path
 
-from crazyem.commands.batch import each, processes
+from crazyem.commands.batch import counted, on_files, processes
 from crazyem.commands.files import find, read_options, targets
-from crazyem.commands.info import counted
 from crazyem.commands.output import Report, Result, remarks
 from crazyem.errors import UsageError
 from crazyem.recordings import ReadOptions, open_recording
 from crazyem.recordings.export import EXPORT_SUFFIXES, METADATA_SUFFIX, export, export_parts
-from crazyem.recordings.parts import can_be_parted, is_large, open_parts
+from crazyem.recordings.parts import open_parts, to_be_parted
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -25,13 +23,9 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.format and output.suffix.lower() != suffix:
             raise UsageError(f"{output} does not end in {suffix}, which --format asks for.")
     options = read_options(arguments)
-    tasks = [
-        (str(f.path), str(o), options, arguments.force, arguments.parts, processes(arguments.jobs, len(files.found)))
-        for f, o in zip(files.found, outputs, strict=True)
-    ]
-    names = [str(f.path) for f in files.found]
-    for result in each(convert, tasks, names=names, what="export", jobs=arguments.jobs, cluster=arguments.cluster):
-        report.add(result)
+    jobs = processes(arguments.jobs, len(files.found))
+    rests = ((str(o), options, arguments.force, arguments.parts, jobs) for o in outputs)
+    on_files(arguments, report, files, convert, rests)
     if len(files.found) > 1 or files.skipped:
         report.say(counted(report.results, files.skipped))
     return report.close(skipped_files=files.skipped)
@@ -39,8 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def convert(path: str, output: str, options: ReadOptions, force: bool, parts: bool, jobs: int) -> Result:
     """One file. Raises as `open_recording`; UsageError if the result cannot be written."""
-    large = parts or is_large(Path(path), jobs=jobs)
-    if large and can_be_parted(Path(path)):
+    if to_be_parted(path, asked=parts, jobs=jobs):
         description = export_parts(lambda: open_parts(path, options), output, force=force)
     else:
         description = export(open_recording(path, options), output, force=force)

@@ -3,9 +3,8 @@
 import argparse
 from typing import Any
 
-from crazyem.commands.batch import each
+from crazyem.commands.batch import counted, on_files
 from crazyem.commands.files import find, read_options, targets
-from crazyem.commands.info import counted
 from crazyem.commands.output import Report, Result, remarks
 from crazyem.recordings import ReadOptions, Recording, open_recording
 
@@ -16,10 +15,7 @@ def run(arguments: argparse.Namespace) -> int:
     files = find(arguments.files, mapping=arguments.map)
     outputs = targets(files.found, arguments.output, ".mcap", force=arguments.force)
     options = read_options(arguments)
-    tasks = [(str(f.path), str(o), options, arguments.force) for f, o in zip(files.found, outputs, strict=True)]
-    names = [str(f.path) for f in files.found]
-    for result in each(convert, tasks, names=names, what="import", jobs=arguments.jobs, cluster=arguments.cluster):
-        report.add(result)
+    on_files(arguments, report, files, convert, ((str(o), options, arguments.force) for o in outputs))
     if len(files.found) > 1 or files.skipped:
         report.say(counted(report.results, files.skipped))
     return report.close(skipped_files=files.skipped)

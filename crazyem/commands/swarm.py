@@ -30,10 +30,11 @@ from crazyem.errors import CrazyemError, LinkError, UsageError
 from crazyem.links import open_link
 from crazyem.live.controllers import controller_named
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
+from crazyem.live.flight_result import result_of
 from crazyem.live.recorder import close_recorder, open_recorder
 from crazyem.live.scheduler import Scheduler, UpdateThrottle
 from crazyem.live.session import Session
-from crazyem.live.summary import build_summary, check_writable, write_json
+from crazyem.live.summary import check_writable, write_json
 from crazyem.live.swarm import (
     Course,
     Member,
@@ -397,21 +398,24 @@ def _summary(drone: Drone) -> dict[str, Any]:
             f"{drone.estimator.skipped} updates were left out because this computer could not keep up; every sample "
             "was used."
         )
-    estimate = pipeline.finish()
     extra = {
         "late": statistics.late, "plot": drone.plot, "updates_left_out": drone.estimator.skipped,
         "trajectory": " ".join(drone.member.trajectory) if drone.plan is not None else None,
         "offset": list(drone.member.offset) if drone.plan is not None else None,
     }  # fmt: skip
-    summary = build_summary(
-        log=drone.log, vehicle=drone.vehicle.name, estimate=estimate, history=history,
-        update_seconds=drone.estimator.update_seconds, received=statistics.received, lost=statistics.lost, extra=extra,
-    )  # fmt: skip
+    title = f"{drone.name}, vehicle {drone.vehicle.name}"
+    result = result_of(
+        pipeline,
+        drone.vehicle,
+        title=title,
+        log=drone.log,
+        received=statistics.received,
+        lost=statistics.lost,
+        extra=extra,
+    )
     if drone.plot is not None:
-        from crazyem.live.plot import write_plot
-
-        write_plot(drone.plot, history, drone.vehicle, title=f"{drone.name}, vehicle {drone.vehicle.name}")
-    return summary
+        result.plot(drone.plot)
+    return dict(result.summary)
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:

@@ -1,14 +1,13 @@
 """The summary plot: estimates with their intervals over time, pushes, and the tracking error."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from crazyem.estimation.result import Estimate
 from crazyem.live.history import History
-from crazyem.notebook import new_figure, saved
+from crazyem.notebook import new_figure
 from crazyem.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -21,15 +20,6 @@ PANELS = (  # parameters, factor from SI, label
     (("Izz",), 1e6, "Izz [1e-6 kg m²]"),
     (("motor_time_constant",), 1e3, "motor time constant [ms]"),
 )
-
-
-def write_plot(path: str | Path, history: History, vehicle: Vehicle, *, title: str) -> None:
-    """Draw `history` into a PNG (or any format matplotlib knows by the suffix).
-
-    Raises:
-        UsageError: the file cannot be written. MissingExtraError: no matplotlib.
-    """
-    saved(figure_of(history, vehicle, title=title), path)
 
 
 def figure_of(history: History, vehicle: Vehicle, *, title: str) -> "Figure":

@@ -19,6 +19,12 @@ def can_be_parted(path: Path) -> bool:
     return reader_of(path).has("read_parts")
 
 
+def to_be_parted(path: str | Path, *, asked: bool, jobs: int) -> bool:
+    """Whether to read a file in parts: where that was asked for or it is large, and its reader can."""
+    path = Path(path)
+    return (asked or is_large(path, jobs=jobs)) and can_be_parted(path)
+
+
 def is_large(path: Path, *, jobs: int = 1) -> bool:
     """True if reading the file whole, `jobs` such files at a time, may need more than a quarter of the free memory."""
     if not path.is_file():

@@ -17,10 +17,11 @@ from crazyem.live.clock import FirmwareClock
 from crazyem.live.guard import Decision
 from crazyem.live.history import MOST_ESTIMATES, SETTLE_SECONDS, History, Push, Track
 from crazyem.live.pipeline import Pipeline
-from crazyem.live.plot import write_plot
+from crazyem.live.plot import figure_of
 from crazyem.live.push import Pusher
 from crazyem.live.simulator import Simulator
 from crazyem.live.summary import build_summary, check_writable, live_line, text_summary, write_json
+from crazyem.notebook import saved
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle
 
@@ -119,10 +120,11 @@ def test_live_line_marks_what_is_not_identified():
 def test_plot_is_written_even_with_next_to_nothing(tmp_path):
     history = History()
     history.estimates.append(estimate())
-    write_plot(tmp_path / "p.png", history, load_vehicle("cf2"), title="t")
+    figure = figure_of(history, load_vehicle("cf2"), title="t")
+    saved(figure, tmp_path / "p.png")
     assert (tmp_path / "p.png").stat().st_size > 1000
     with pytest.raises(UsageError, match="cannot write"):
-        write_plot(tmp_path / "no" / "p.png", history, load_vehicle("cf2"), title="t")
+        saved(figure, tmp_path / "no" / "p.png")
 
 
 def test_a_long_flight_keeps_the_newest_estimates_and_fewer_of_the_old_ones():
