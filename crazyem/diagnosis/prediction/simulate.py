@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.flights.inputs import Inputs
 from crazyem.diagnosis.prediction.bias_correction import Weights
 from crazyem.diagnosis.prediction.course import ThrustCourse
-from crazyem.physics.effects.effect import Effects, Situation
+from crazyem.physics.effects.effect import LONGEST_STEP, Effects, Situation
 from crazyem.physics.effects.onboard_estimate import MEMORY_SECONDS, disturbs_attitude
 from crazyem.physics.effects.pendulum import swing_along, swing_on, watched_along
-from crazyem.physics.effects.stretches import LONGEST_STEP
 from crazyem.physics.motion import Motion, active, body_of, measured, motion
 from crazyem.physics.rotations import (
     quaternion_conjugate,

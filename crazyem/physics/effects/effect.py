@@ -19,6 +19,8 @@ from crazyem.vehicle import Vehicle
 Values = Mapping[str, Any]  # one effect: parameter -> value
 Effects = Mapping[str, Values]  # effect -> its parameters; as in a vehicle file
 
+LONGEST_STEP = 0.1  # s: across a longer one nothing is interpolated
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -327,3 +329,14 @@ class Effect:
             neutral = own.get(p.name, 0.0) if isinstance(p.neutral, float) and math.isnan(p.neutral) else p.neutral
             found[p.name] = values.get(p.name, neutral)
         return found
+
+
+def stretches(situation: Situation) -> tuple[NDArray, NDArray]:
+    """Which rows hang together: where a path is broken, nothing before it acts on what comes after.
+
+    Returns: (n,) s from the row before to each row (0 at breaks), (n,) whether a break.
+    """
+    gap = np.diff(situation.time, prepend=situation.time[:1])
+    broken = ~((situation.step > 0) & (situation.step <= LONGEST_STEP) & (gap > 0) & (gap <= LONGEST_STEP))
+    broken[:1] = True
+    return np.where(broken, 0.0, gap), broken

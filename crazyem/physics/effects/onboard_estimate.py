@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.compiled import compiled
-from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
+from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation, stretches
 from crazyem.physics.effects.prior import Conditions, Prior, Sizes
-from crazyem.physics.effects.stretches import stretches
 from crazyem.vehicle import GRAVITY
 
 CORRECTION_SECONDS = 0.04  # s, T above

@@ -3,10 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
+from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench, stretches
 from crazyem.physics.effects.pendulum import DAMPING, swing_along, watched_along
 from crazyem.physics.effects.prior import Prior
-from crazyem.physics.effects.stretches import stretches
 from crazyem.physics.rotations import skew
 
 

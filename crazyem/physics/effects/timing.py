@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation
+from crazyem.physics.effects.effect import Effect, Offset, Parameter, Situation, stretches
 from crazyem.physics.effects.onboard_estimate import attitude_error
 from crazyem.physics.effects.prior import Conditions, Limits, Prior, Sizes
-from crazyem.physics.effects.stretches import stretches
 from crazyem.physics.lag import PREDICTION_ORDER, fit_predictor
 from crazyem.physics.rotations import rotation_between
 from crazyem.physics.rotors import PITCH_SIGN, ROLL_SIGN, YAW_SIGN
