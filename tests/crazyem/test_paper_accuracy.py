@@ -121,26 +121,6 @@ def test_windows_do_not_overlap():
     assert stretches(Settings(), "flight") == [(0, 4001)]
 
 
-@pytest.mark.slow
-def test_every_window_of_a_flight_is_estimated_as_well_as_can_be():
-    rows = study("windows", "A", 7)
-    assert [(r.first, r.last) for r in rows] == [(a, a + 800) for a in range(0, 4000, 800)]
-    for r in rows:
-        assert r.converged
-        assert np.all(np.abs(np.array(r.error) / r.bound) < 4.5)
-        # nothing but the luck of the draw: the efficient estimator had the same
-        assert np.all(np.abs((np.array(r.error) - r.efficient) / r.bound) < 0.5)
-        assert np.all(np.abs(np.log(np.array(r.sd) / r.bound)) < 0.5)
-
-
-@pytest.mark.slow
-def test_the_running_estimator_is_held_against_the_rows_it_had():
-    rows = study("online", "C", 3)
-    assert [(r.first, r.last) for r in rows] == [(0, 796), *((a - 4, a + 796) for a in range(800, 4000, 800))]
-    for r in rows:
-        assert np.all(np.abs((np.array(r.error) - r.efficient) / r.bound) < 0.7)
-
-
 def test_what_does_not_exist_is_refused():
     with pytest.raises(UsageError, match="unknown part 'all'"):
         study("all", "A", 0)
@@ -201,20 +181,32 @@ def test_the_page_says_what_the_results_say():
     assert benchmark.filled(page, found) == page
 
 
+ROWS = {"flights": [(0, 4001)], "online": [(0, 796), *((a - 4, a + 796) for a in range(800, 4000, 800))]}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("part", "sensor"), [(p, PARTS[p].sensors[-1]) for p in PARTS])
 def test_results_have_not_drifted(part, sensor):
-    """The first flight again: every estimate within a twentieth of its bound of the one in the results."""
+    """The first flight again: every estimate within a twentieth of its bound of the one in the results.
+
+    And as good as can be: what it is off by, the efficient estimator is off by as well.
+    """
     found = json.loads(benchmark.RESULTS.read_text())
     if sensor not in found.get(part, {}):
         pytest.skip("not in the results yet")
     kept = [benchmark.record(r) for r in found[part][sensor]["records"]]
-    assert kept
+    assert [(r.first, r.last) for r in kept] == ROWS.get(part, [(a, a + 800) for a in range(0, 4000, 800)])
     for old, new in zip(kept, study(part, sensor, kept[0].seed), strict=True):
+        assert (new.first, new.last) == (old.first, old.last)
         assert new.bound == pytest.approx(old.bound, rel=1e-3)
         assert np.all(np.abs(np.array(new.error) - old.error) < 0.05 * np.array(old.bound))
         assert new.sd == pytest.approx(old.sd, rel=0.05)
         assert new.converged == old.converged
+        if part != "quiet":
+            assert new.converged
+            assert np.all(np.abs(np.array(new.error) / new.bound) < 4.5)
+            assert np.all(np.abs((np.array(new.error) - new.efficient) / new.bound) < 0.5)
+            assert np.all(np.abs(np.log(np.array(new.sd) / new.bound)) < 0.5)
 
 
 @pytest.mark.slow
