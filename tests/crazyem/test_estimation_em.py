@@ -163,7 +163,7 @@ def fly_many(truth) -> tuple[np.ndarray, ...]:
     errors, sds, hits, gaps = [], [], [], []
     true = np.array([truth.mass, *truth.inertia, truth.lag])
     for seed in range(SEEDS):
-        estimator = OnlineEstimator(LAGGED)
+        estimator = OnlineEstimator(LAGGED, every=12)
         last = None
         for sample in synthetic.samples(synthetic.fly(truth, seed=1000 + seed, duration=8.0)):
             last = estimator.feed(sample) or last
