@@ -79,7 +79,8 @@ def test_a_drone_that_never_moves_is_upright() -> None:
 @pytest.mark.slow
 def test_a_diagnosis_tells_whose_frame_it_turned_and_names_no_tilt() -> None:
     """Flights of one healthy drone whose frames lie 30 mrad apart, about a mean of nothing."""
-    recordings = [replace(turned(fly(seed=s), r, 0.0), path=f"{s}.csv") for s, r in enumerate((0.015, -0.015, 0.03))]
+    flown = (turned(fly(seed=s, seconds=12.0), roll, 0.0) for s, roll in enumerate((0.015, -0.015, 0.03)))
+    recordings = [replace(recording, path=f"{s}.csv") for s, recording in enumerate(flown)]
     found = diagnose(recordings[:2], DRONE, held_out=recordings[2:], wanted=["attitude_misalignment", "wind"])
     assert not found.mismatch
     document, _ = document_of(found, recordings[:2], recordings[2:])
