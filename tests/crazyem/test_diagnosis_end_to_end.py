@@ -179,7 +179,7 @@ def test_a_rotor_that_fails_in_flight_is_named_with_its_moment() -> None:
 @pytest.mark.slow
 def test_torques_that_wander_are_noise() -> None:
     """Random angular accelerations of 1 rad/s^2 with a memory of 0.5 s, as moving air brings them, are no effect."""
-    assert diagnose([fly(sway=1.0)], DRONE).effects == ()
+    assert diagnose([fly(sway=1.0, seconds=12.0)], DRONE).effects == ()
 
 
 @pytest.mark.slow
