@@ -8,6 +8,7 @@ in the tests, which say why.
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -25,6 +26,20 @@ import closed_loop, synthetic
 closed_loop.fly(seconds=1.0)
 synthetic.fly(duration=1.0)
 """
+
+# Tests that call kernels which nothing above calls: in one process each.
+OF_THE_PAPER = (
+    "paper_flight.py", "paper_bound.py::test_bound_is_that_of_a_plain_filter",
+    "paper_published.py::test_a_cold_start_with_clamped_estimates_flies", "control_lqg.py",
+    "planning.py::test_the_same_seed_gives_the_same_plan",
+    "paper_cold_start.py::test_the_same_seed_flies_the_same_flight",
+)  # fmt: skip
+OF_EFFECTS = (
+    "physics_effects_pendulum.py", "physics_sampled_commands.py",
+    "diagnosis_onboard_filter.py::test_what_a_force_changes_in_the_velocity_that_is_shown_is_a_difference_of_likelihoods",
+    "estimation_marginal.py::test_nothing_is_integrated_where_the_noise_is_known",
+    "monitoring_detector.py::test_every_column_of_the_body_is_the_derivative_of_the_model",
+)  # fmt: skip
 
 
 def python(*arguments: str) -> subprocess.Popen[str]:
@@ -44,22 +59,38 @@ def simulated(*arguments: str) -> None:
     simulator.wait()
 
 
+def tested(names: tuple[str, ...]) -> None:
+    """Whether they pass is asked later."""
+    paths = (f"tests/crazyem/test_{name}" for name in names)
+    python("-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *paths).communicate()
+
+
 def diagnosed(folder: str) -> None:
     """A shipped flight, asked for one effect."""
     log = "logs/clean_figure8.mcap"
     python("-m", "crazyem", "diagnose", log, "--candidates", "linear_drag", "--json", f"{folder}/d.json").communicate()
 
 
-def main() -> None:
-    """The estimator, then the tests' flights, beside the simulator and the diagnosis, which take as long."""
-    collection = python("-m", "pytest", "-qq", "--collect-only", "-p", "no:cacheprovider")
-    estimator = python("-c", ESTIMATOR + MADE_FLIGHTS)
+def of_the_estimator() -> None:
+    python("-c", ESTIMATOR + MADE_FLIGHTS).communicate()
     with TemporaryDirectory() as folder:
-        simulated()
-        simulated("--scenario", "firmware_sim/scenarios/payload_drop.toml")
         diagnosed(folder)
-    for one in (estimator, collection):
-        one.communicate()
+    tested(OF_EFFECTS)
+
+
+def of_the_simulator() -> None:
+    simulated()
+    simulated("--scenario", "firmware_sim/scenarios/payload_drop.toml")
+    tested(OF_THE_PAPER)
+
+
+def main() -> None:
+    """Two sequences side by side that call different kernels, each as long as the other."""
+    collection = python("-m", "pytest", "-qq", "--collect-only", "-p", "no:cacheprovider")
+    with ThreadPoolExecutor(2) as threads:
+        for done in [threads.submit(of_the_estimator), threads.submit(of_the_simulator)]:
+            done.result()
+    collection.communicate()
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -88,6 +89,13 @@ def test_processes_that_compile_at_once_leave_a_whole_cache(toy: Path, tmp_path:
     assert all(int(one.pop("compiled")) >= 1 for one in found)
     assert later.pop("compiled") == "0"
     assert found[0] == found[1] == {**found[0], **later}
+
+
+def test_what_is_compiled_first_is_asked_of_tests_that_exist() -> None:
+    first = runpy.run_path(str(ROOT / "tests" / "compile_first.py"))
+    for name in (*first["OF_THE_PAPER"], *first["OF_EFFECTS"]):
+        file, _, test = name.partition("::")
+        assert f"def {test or 'test_'}" in (ROOT / "tests" / "crazyem" / f"test_{file}").read_text(encoding="utf-8")
 
 
 BACKWARDS = """
