@@ -125,9 +125,9 @@ def test_a_prediction_gives_the_arrays_of_the_command_and_prints_nothing(tmp_pat
 def test_a_diagnosis_gives_the_document_of_the_command_and_prints_nothing(tmp_path, capfd):
     out = tmp_path / "d.json"
     effects = ["linear_drag", "thrust_scale"]
-    assert main(["diagnose", LOG, "--candidates", ",".join(effects), "--json", str(out)]) == 0
+    assert main(["diagnose", LOG, "--to", "9", "--candidates", ",".join(effects), "--json", str(out)]) == 0
     capfd.readouterr()
-    found = crazyem.diagnose(LOG, candidates=effects)
+    found = crazyem.diagnose(LOG, candidates=effects, options=crazyem.ReadOptions(end=9.0))
     assert capfd.readouterr() == ("", "")
     command = json.loads(out.read_text())
     command.pop("seconds")
