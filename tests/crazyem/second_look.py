@@ -134,10 +134,6 @@ def leaning(time: np.ndarray, felt: np.ndarray, velocity: np.ndarray, good: np.n
     return float(np.degrees(np.arctan2(np.hypot(rest[0], rest[1]), rest[2])))
 
 
-def extremes(time: np.ndarray, good: np.ndarray, **series: np.ndarray) -> Facts:
-    return {f"{name}_max": float(np.nanmax(value[good])) for name, value in series.items()}
-
-
 def limits(duty: np.ndarray, rows: np.ndarray, prefix: str = "full") -> Facts:
     """Share of the flight in which a rotor is at full duty."""
     flags = duty[rows] >= 0.999

@@ -21,7 +21,6 @@ from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording
 from crazyem.recordings.topics import MOST_RAW_SIGNALS
 
-CODES = {"float": "f", "double": "d", "uint64_t": "Q", "uint8_t": "B", "bool": "?", "int32_t": "i", "uint32_t": "I"}
 FLIP = np.diag([1.0, -1.0, -1.0])
 
 
