@@ -95,30 +95,32 @@ def test_damaged_files(files, name, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", FORMATS)
-def test_many_damaged_files_in_little_memory(name, tmp_path):
-    """In a process of its own, whose address space is capped once the libraries are loaded."""
+def test_many_damaged_files_in_little_memory(tmp_path):
+    """In a process of their own, whose address space is capped once the libraries are loaded."""
     done = subprocess.run(
-        [sys.executable, __file__, name, str(tmp_path)],
+        [sys.executable, __file__, str(tmp_path)],
         capture_output=True,
         text=True,
         cwd=Path(__file__).parent,
         timeout=1200,
         check=False,
     )
-    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.returncode == 0, done.stdout + done.stderr[-3000:]
 
 
-def main(name: str, folder: Path) -> None:
-    made = seeds(folder)[name]
+def main(folder: Path) -> None:
+    made = seeds(folder)
     path = folder / "warm.bin"
-    path.write_bytes(made)
-    attempt(path)  # loads what the reader needs, before the limit
+    for data in made.values():
+        path.write_bytes(data)
+        attempt(path)  # loads what the reader needs, before the limit
     with open("/proc/self/statm") as statm:
         used = int(statm.read().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
-    print(campaign(made, folder, seed=2, count=500))
+    for name, data in made.items():
+        print(name, flush=True)
+        campaign(data, folder, seed=2, count=500)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]))
+    main(Path(sys.argv[1]))
