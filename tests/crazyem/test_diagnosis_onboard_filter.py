@@ -143,7 +143,7 @@ def test_lags_of_the_log_are_found(name, parameter, lags):
     """
     free, found = Candidate("onboard_filter", (), ("rate_lag", "velocity_lag")), []
     for lag in lags:
-        recording = behind(fly(seconds=20.0, seed=5, rate_noise=2e-3, shake=0.05), name, lag)
+        recording = behind(fly(seconds=12.0, seed=5, rate_noise=2e-3, shake=0.05), name, lag)
         data = Data([flight_of(recording, DRONE)])
         point = nominal(data, Point(DRONE, {}, first_guess()))
         begun = point.with_effects({"onboard_filter": {"rate_lag": 0.0, "velocity_lag": 0.0}})

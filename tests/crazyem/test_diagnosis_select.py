@@ -113,7 +113,7 @@ def test_a_lag_that_makes_its_loop_swing_is_the_same_beside_the_hump(lag: float)
 def test_what_an_effect_would_gain_fitted_to_both_flights_is_the_top_of_their_likelihood(torque: float) -> None:
     """Against the likelihood of both at a number of sizes, what is always free fitted to each flight alone."""
     candidate = Candidate("torque_scale", (), ("scale",))
-    flown = fly(Hidden(torque=0.8), seconds=5, seed=5), fly(Hidden(torque=torque), seconds=15, seed=15)
+    flown = fly(Hidden(torque=0.8), seconds=5, seed=5), fly(Hidden(torque=torque), seconds=10, seed=15)
     data, apart = (Data([flight_of(f, DRONE)]) for f in flown)
     point = nominal(data, Point(DRONE, {}, first_guess()))
     begun = point.with_effects({"torque_scale": {"scale": 0.95}})
