@@ -23,9 +23,10 @@ $(FLIES): pyproject.toml  # what a flight needs; modules are compiled when they 
 	$(INSTALL) '.[plots,live]'
 	touch $(FLIES)
 
-$(READY): $(FLIES)  # and what developers need
+$(READY): pyproject.toml  # and what developers need: all of it at once
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(INSTALL) '.[dev]'
-	touch $(READY)
+	touch $(FLIES) $(READY)
 
 $(WARM): $(READY)  # once: what is compiled stays on the disk
 	$(BIN)/python tests/compile_first.py
