@@ -169,31 +169,33 @@ def score(folder: Path) -> dict[str, Any]:
 
 
 def page(table: dict[str, Any]) -> str:
-    """The tables of docs/results/monitor.md."""
+    """The table of docs/results/monitor.md."""
     low, high = table["interval"]
+    columns = ("fault", "n", "found", "delay", "90 %", "named", "settled", "error", "band", "delay")
     lines = [
-        f"Undisturbed: {table['flights']} flights, {table['hours']:.2f} h in the air, {table['false_alarms']} false "
-        f"alarms, {table['rate']:.2f} an hour [{low:.2f}, {high:.2f}]. Cost: {table['monitor_ms']:.2f} ms an update, "
-        f"beside {table['update_ms']:.2f} ms of the estimator (means of a flight, median of flights).",
+        f"undisturbed: {table['flights']} flights, {table['hours']:.2f} h in the air, {table['false_alarms']} false "
+        f"alarms: {table['rate']:.2f} an hour [{low:.2f}, {high:.2f}]",
+        f"cost: {table['monitor_ms']:.2f} ms an update, of the estimator {table['update_ms']:.2f} ms",
         "",
-        "| fault | n | found within 3 s | delay, median, s | 90 %, s | named at first | named when settled "
-        "| error of size, median | residual over a band: found | delay, s |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "{:<24}{:>4}{:>7}{:>7}{:>7}{:>7}{:>9}{:>7}{:>7}{:>7}".format(*columns),
     ]
     for kind in FAULTS:
         rows = table["kinds"].get(kind, [])
         if not rows:
             continue
-        delays = np.array([r["delay"] for r in rows])
-        others = np.array([r["residual"] for r in rows])
+        delays, others = (np.array([r[key] for r in rows]) for key in ("delay", "residual"))
         errors = np.abs([r["error"] for r in rows if r["named"] and math.isfinite(r["error"])])
-        lines.append(
-            f"| {kind} | {len(rows)} | {np.isfinite(delays).sum()} | {_quantile(delays, 0.5)} "
-            f"| {_quantile(delays, 0.9)} | {sum(r['first_named'] for r in rows)} | {sum(r['named'] for r in rows)} "
-            f"| {np.median(errors) if len(errors) else math.nan:.3g} | {np.isfinite(others).sum()} "
-            f"| {_quantile(others, 0.5)} |".replace("nan", "-")
+        found, first, named = (
+            np.isfinite(delays).sum(),
+            sum(r["first_named"] for r in rows),
+            sum(r["named"] for r in rows),
         )
-    return "\n".join(lines)
+        error = f"{np.median(errors):.3f}" if len(errors) else "-"
+        lines.append(
+            f"{kind:<24}{len(rows):>4}{found:>7}{_quantile(delays, 0.5):>7}{_quantile(delays, 0.9):>7}{first:>7}"
+            f"{named:>9}{error:>7}{np.isfinite(others).sum():>7}{_quantile(others, 0.5):>7}"
+        )
+    return "\n".join(["```text", *lines, "```"])
 
 
 def _quantile(values: NDArray[np.float64], share: float) -> str:

@@ -17,7 +17,9 @@ from crazyem.vehicle import Vehicle
 DRAG_SD = 0.2
 # That of the delay of what is measured against the commands [s]: a period of the onboard filter.
 DELAY_SD = 0.01
-NUISANCES = 16  # parameters of the estimator, drag along x, y, z, delays of the four measured quantities
+# That of the scales of velocities and body rates: a gyro's tolerance, and what an onboard filter makes of it.
+SCALE_SD = 0.02
+NUISANCES = 18  # parameters of the estimator, drag along x, y, z, delays of the four measured quantities, two scales
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ class RowMaker:
         """Acting (n, M, 6), sensed (n, M, 12), as `rows`, of what the model may be wrong in without a change.
 
         The nine parameters of the estimator as it takes them (logarithms, and units of the linear ones), drag along x,
-        y, z [1/s], delays of position, velocity, attitude and rate [s].
+        y, z [1/s], delays of position, velocity, attitude and rate [s], scales of velocity and rate.
         """
         acting = np.zeros((last - first, NUISANCES, 6))
         sensed = np.zeros((last - first, NUISANCES, 12))
@@ -149,6 +151,8 @@ class RowMaker:
         sensed[:, 13, 3:6] = -(tape.xp[first:last, 3:6] - tape.xf[first - 1 : last - 1, 3:6]) / span
         sensed[:, 14, 6:9] = -tape.xp[first:last, 10:13]
         sensed[:, 15, 9:12] = -(tape.xp[first:last, 10:13] - w) / span
+        sensed[:, 16, 3:6] = tape.xp[first:last, 3:6]
+        sensed[:, 17, 9:12] = tape.xp[first:last, 10:13]
         return acting, sensed
 
     def drifting(self, tape: Tape, p: Parameters, reference: Parameters, first: int, last: int) -> NDArray[np.float64]:
@@ -171,4 +175,5 @@ class RowMaker:
     @staticmethod
     def precision(sd: NDArray[np.float64]) -> NDArray[np.float64]:
         """(M,) precisions of the nuisances, from the standard deviations (9,) of the estimator's parameters."""
-        return np.concatenate([np.maximum(sd, 1e-6), np.full(3, DRAG_SD), np.full(4, DELAY_SD)]) ** -2.0
+        own = np.repeat([DRAG_SD, DELAY_SD, SCALE_SD], [3, 4, 2])
+        return np.concatenate([np.maximum(sd, 1e-6), own]) ** -2.0

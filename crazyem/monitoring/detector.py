@@ -153,7 +153,13 @@ class Detector:
             return None
         passed = min(now - self._newest, 1.0) if math.isfinite(self._newest) else SPACING
         self._newest = now
-        report = self._judge(now, passed, sd) if len(slots) else None
+        begun = self._open[0] if self._open else -1
+        kernels.judge(  # without windows too: so it is compiled before a flight
+            slots, self.columns.first, self._prior, self._maker.precision(sd), self.score,
+            self.score_n - self.score_n_of[begun], self.among, self.cross, self.among_n - self.among_n_of[begun],
+            self.statistic, self.determinant, self.size, self.variance,
+        )  # fmt: skip
+        report = self._judge(now, passed, slots) if self._open else None
         self._slow.append(slow_error(self.covariances))
         if self._found is None and now - self._since > LEARNING:
             self._renew(now)
@@ -192,14 +198,7 @@ class Detector:
         age = (self._newest - self.opened[w]) / SPACING
         return min(max(math.ceil(math.log2(max(age, 1.0) / 4.0)), 0), LEVELS - 1)
 
-    def _judge(self, now: float, passed: float, sd: NDArray[np.float64]) -> Fault | None:
-        slots = np.array(self._open, np.int64)
-        oldest = self._open[0]
-        kernels.judge(
-            slots, self.columns.first, self._prior, self._maker.precision(sd), self.score,
-            self.score_n - self.score_n_of[oldest], self.among, self.cross, self.among_n - self.among_n_of[oldest],
-            self.statistic, self.determinant, self.size, self.variance,
-        )  # fmt: skip
+    def _judge(self, now: float, passed: float, slots: NDArray[np.int64]) -> Fault | None:
         levels = np.array([self._level(w) for w in self._open])
         statistic = self.statistic[slots]
         scale = self.scale_of[slots, levels]
