@@ -118,6 +118,7 @@ def test_a_lag_or_a_delay_or_both_are_named():
 
 def test_flights_held_out_must_agree():
     assert late_response(found(0.045, 0.0), found(0.03, 0.0), ROTORS) is None
+    assert late_response(found(0.06, 0.0), found(0.05, 0.0), ROTORS) is None  # nearer than the file, not near
     agreed = late_response(found(0.045, 0.0), found(0.045, 0.0), ROTORS)
     assert agreed is not None
     assert agreed.held_out > ENOUGH

@@ -211,6 +211,8 @@ def late_response(found: Response, apart: Response | None, vehicle: Vehicle) -> 
         nats = alone[name][2] - nothing
     if nats < ENOUGH:
         return None
+    if apart is not None and -apart.nats(*at) > ENOUGH:
+        return None
     held = nats if apart is None else apart.nats(*at) - apart.nats(*file)
     alike = len(values) == 1 and delay > file[1] and abs(alone["motor_lag"][2] - alone["input_delay"][2]) < CLOSE
     return Late(values, nats, held, alike) if held > ENOUGH / 2 else None
