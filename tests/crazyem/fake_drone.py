@@ -67,7 +67,7 @@ class FakeLink:
         self._landing = False
         self._silent_since = None
         self._session = self._flight = None
-        self._free_until = 0  # ms of its clock: until then it waits only for what receives
+        self._free_until = {"packets": 0, "samples": 0, "flight": 0}  # ms of its clock: until then it does not wait
         self._stop = threading.Event()
         self._thread = None
 
@@ -150,16 +150,18 @@ class FakeLink:
         self._flight = None  # it ends with this, and looks no more
 
     def _outruns(self):
+        """What it would outrun: what receives, the estimator, or who flies and writes; "" if nothing."""
         s = self._session
         if s is None or s.failure is not None or s.lost is not None:
-            return False
+            return ""
         most = WAITING * len(self.blocks)
         if self.packets.qsize() > most:
-            return True
-        if self.fm < self._free_until:
-            return False
+            return "packets"
         waiting = self.packets.qsize() + (s._samples.qsize() if s._mailbox is None else len(s._mailbox._items))
-        return waiting > most or self._unseen() or (s.pusher is not None and s.pusher.busy)
+        if waiting > most and self.fm >= self._free_until["samples"]:
+            return "samples"
+        busy = self._unseen() or (s.pusher is not None and s.pusher.busy)
+        return "flight" if busy and self.fm >= self._free_until["flight"] else ""
 
     def _unseen(self):
         flight = self._flight
@@ -167,11 +169,13 @@ class FakeLink:
         return seen >= 0.0 and self.fm / 1000.0 - seen > AHEAD  # not while it has seen nothing at all
 
     def _wait(self):
+        what = ""
         for _ in range(PATIENCE):
-            if self._stop.is_set() or not self._outruns():
+            what = self._outruns()
+            if self._stop.is_set() or not what:
                 return
             time.sleep(0.001)
-        self._free_until = self.fm + 1000  # ms; it does not catch up, perhaps because it waits for the drone
+        self._free_until[what] = self.fm + 1000  # ms; it does not catch up, perhaps because it waits for the drone
 
     def _run(self):
         while not self._stop.is_set():
