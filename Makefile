@@ -13,7 +13,7 @@ SHARED := -n 4 --dist worksteal
 # Modules are compiled once: the tests start some hundred processes, each of which would compile all of them again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: fly test slow slow-fixed test-all lint bench docs concealed paper paper-docs cfclient-test simulators clean \
+.PHONY: fly test slow slow-fixed lint bench docs concealed paper paper-docs cfclient-test simulators clean \
 	setup compiled oldest
 
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable
@@ -54,9 +54,6 @@ slow: $(WARM)  ## the long ones: many seeds, many flights, and made-up examples 
 
 slow-fixed: $(WARM)  ## the long ones alone
 	$(BIN)/python -m pytest -q $(SHARED) -m slow
-
-test-all: $(WARM)  ## `test` and `slow-fixed` in one go: what waits for a clock or a socket waits beside what computes
-	$(BIN)/python -m pytest -q $(SHARED) -m ""
 
 lint: $(READY)
 	$(BIN)/ruff check .
