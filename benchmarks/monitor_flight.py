@@ -200,7 +200,7 @@ def _wind(speed: float) -> Any:
 
             return plant
 
-        return [Event(f"wind {speed:g} m/s", ("wind",), begin, speed, blow(1.0)), Event("", (), end, plant=blow(-1.0))]
+        return [Event(f"wind {speed:g} m/s", ("wind",), begin, plant=blow(1.0)), Event("", (), end, plant=blow(-1.0))]
 
     return make
 
