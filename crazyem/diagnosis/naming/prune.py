@@ -6,14 +6,14 @@ from functools import partial
 
 import numpy as np
 
-from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import TORQUES, Data, Fitted
 from crazyem.diagnosis.fitting.gram import used
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import nuisances, on_held_out, refine_base, usual_named, without
 from crazyem.diagnosis.locating.random_torques import off_peak_gram, peaks
 from crazyem.diagnosis.naming.detection_limits import at_the_end
-from crazyem.diagnosis.naming.trials import LIKELY, SURE, Step, both, significance, wald
+from crazyem.diagnosis.naming.trials import LIKELY, SURE, Selection, Step, both, significance, wald
 
 ADMITTED = 8.0  # nats of evidence that an effect must bring
 HELD = 1.0  # nats it must bring on flight held out,
@@ -26,6 +26,21 @@ OTHERWISE = 0.01  # p-value of an effect's being the same size beside what shake
 APART = 1 / 3  # of its size, at least: sampled commands make some per cent of difference
 FORCES = np.full(3, 0.2)  # m/s^2, where wandering forces begin
 WANDERING = 10.0  # nats that disturbing torques with memory must gain to be allowed for
+
+
+def pruned(
+    data: Data, nominal: Point, selection: Selection, held_out: Data | None, say: Callable[[str], None]
+) -> Selection:
+    """The selection without what is not needed, and what is doubted of the rest; `nominal`: before anything is free."""
+    fitted, accepted, steps = selection.fitted, list(selection.accepted), list(selection.steps)
+    fitted, accepted, steps = drop(data, fitted, accepted, steps, held_out, say)
+    doubted: frozenset[str] = frozenset()
+    if TRIM not in selection.final.vehicle.effects:  # both judge by the scatter of blocks (see `by_gain`)
+        fitted, accepted, steps = survive(data, fitted, accepted, steps, held_out, say)
+        doubted = shaken(data, nominal, fitted, accepted, say)
+    return replace(
+        selection, final=fitted.point, steps=tuple(steps), accepted=tuple(accepted), fitted=fitted, doubted=doubted
+    )
 
 
 def drop(

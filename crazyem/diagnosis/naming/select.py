@@ -31,7 +31,7 @@ from crazyem.diagnosis.fitting.nuisances import (
 from crazyem.diagnosis.naming.detection_limits import at_the_end, matters
 from crazyem.diagnosis.naming.evidence import gain_of_both, known_by, tuning
 from crazyem.diagnosis.naming.onset import date, onset_of
-from crazyem.diagnosis.naming.prune import ADMITTED, drop, shaken, survive
+from crazyem.diagnosis.naming.prune import ADMITTED, pruned
 from crazyem.diagnosis.naming.starting_points import best_begun
 from crazyem.diagnosis.naming.steady import as_steady, by_onsets, without_trim_rivals
 from crazyem.diagnosis.naming.steady_odds import decided_by_balance
@@ -323,17 +323,12 @@ def select(
         if unlike_a_body(point, accepted):  # told by other means, or not at all: see `diagnose`
             return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))
         held_value = on_held_out(held_out, point, accepted).loglik if held_out else 0.0
-    found = [c.effect for c in accepted]
-    fitted, accepted, steps = drop(data, fitted, accepted, steps, held_out, say)
-    doubted: frozenset[str] = frozenset()
-    if TRIM not in point.vehicle.effects:  # both judge by the scatter of blocks (see `by_gain`)
-        fitted, accepted, steps = survive(data, fitted, accepted, steps, held_out, say)
-        doubted = shaken(data, nominal_point, fitted, accepted, say)
-    chosen = Selection(nominal, fitted.point, tuple(steps), tuple(accepted), fitted, len(candidates), doubted)
-    gone = {name for name in found if all(name != c.effect for c in accepted)}
-    if len(found) < MOST or not gone:
+    found = {c.effect for c in accepted}
+    whole = Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))
+    chosen = pruned(data, nominal_point, whole, held_out, say)
+    gone = found - {c.effect for c in chosen.accepted}
+    if len(found) < MOST or not gone:  # else there was room for no more, and now there is
         return chosen
-    # there was room for no more, and now there is
     rest = [c for c in candidates if c.effect not in gone]
     return select(data, nominal_point, rest, held_out=held_out, begun=chosen, say=say)
 
