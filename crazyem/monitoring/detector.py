@@ -34,8 +34,8 @@ COVARIANCE_MEMORY = 20.0  # s, of the covariances of innovations
 SCALE_MEMORY = 60.0  # s, of the running means of the statistics
 CLIPPED = 4.0  # standard deviations as which a larger innovation counts there, and so the root of a statistic
 LEARNING, REFERENCE = 8.0, 2.0  # s in the air in which estimator and scales learn, untested; s that parameters stay
-# The scale before the flight, and s of flight that it counts as: undisturbed development flights had 1.1 in the
-# geometric mean; the standard deviation of the logarithm, 0.3, gives its degrees of freedom (2 / 0.3^2).
+# The scale before the flight, and s of flight that it counts as: above the geometric mean of undisturbed development
+# flights, 1.1. The standard deviation of the logarithm, 0.3, gives its degrees of freedom (2 / 0.3^2).
 SCALE_BEFORE, SCALE_WEIGHT, SCALE_FREEDOM = 1.5, 30.0, 30.0
 REGIME = 0.25  # s of flight that add another degree of freedom, at least
 SETTLED = 1.0  # s after the onset when the size is reported again

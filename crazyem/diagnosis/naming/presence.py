@@ -8,7 +8,7 @@ from scipy.special import expit, logit
 # was fitted to, over how much more scores scatter than the model says) - ORDER log(k) of the k-th effect found, at most
 # `CALIBRATED`. Models are approximate: wrong names gain tens of nats, with a heavy tail, so odds grow with a power of
 # what is gained and not with the nats. A file lacks one thing rather than three.
-# By maximum likelihood from 160 names in 140 random and foreign worlds (seeds 8101, 9301, 9402, 10501, 10602).
+# By maximum likelihood from 160 names in 130 random and foreign worlds (seeds 8101, 9301, 9402, 10501, 10602).
 CONSTANT, HELD_OUT, FITTED, ORDER, CALIBRATED = -2.65, 0.27, 0.54, 1.2, 0.95
 LEAST_NATS = 0.5  # on flight held out: less is chance
 MISSING = 0.05  # prior probability that one effect is missing from a vehicle file: of 20 drones one

@@ -98,7 +98,7 @@ class Prior:
         each: whether several recordings that are fitted together have a deviation each.
         together: correlation of `own` between the parameters.
         systematic: within which a parameter is never known, whatever a fit says: what no scatter shows; SI.
-        relative_error: the same as a share of the parameter, or of what `per` says.
+        relative_error: the same as a share of the parameter, of the drone's mass where `per` says so.
         relative_error_chaotic: the same in flights that drive the effect into chaos (`divergence.py`).
         usual_named: whether what is usual is named all the same, where it explains more than none of it.
         finding: (values, neutral values, conditions) -> whether that is a finding, where no single limit says so.
