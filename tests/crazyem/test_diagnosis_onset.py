@@ -19,7 +19,7 @@ def found(hidden: Hidden) -> Candidate | None:
     return onset_of(data, point, ROTOR, data.gram(point, ROTOR.columns(point)), [0])
 
 
-@pytest.mark.parametrize("onset", [5.1, 5.5, 5.9])
+@pytest.mark.parametrize("onset", [5.3, 5.7, 5.9])
 def test_a_rotor_that_weakens_within_a_block(onset: float) -> None:
     late = found(Hidden(thrust=(1.0, 0.88, 1.0, 1.0), onset=onset))
     assert late is not None
