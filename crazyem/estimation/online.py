@@ -151,6 +151,7 @@ class OnlineEstimator:
         self._refreshed = MarginalRefresh()
         self._marginal: Marginal | None = None
         self._converged = False
+        self._unconverged, self._refined = 0, 0  # full passes in a row that did not converge; update of the last one
         self._last_time = math.nan
         self.settled: Maximum | None = None
         self.counters = Counters()
@@ -391,7 +392,9 @@ class OnlineEstimator:
         self._filter_fresh(em, first)
         young = last - first < min(YOUNG, self.window)
         refresh = self._refresh if last - first == self.window else REFRESH  # what is known grows with the window
-        if young or self._moved(em) or self._updates % refresh == 0:
+        # what has not converged is refined after 1, 2, 4, ... updates: where a maximum is flat it may never do
+        due = self._unconverged > 0 and self._updates - self._refined >= 2 ** (self._unconverged - 1)
+        if young or due or self._moved(em) or self._updates % refresh == 0:
             self._owed = self._deferring and not young and self._information is not None
             if not self._owed:
                 self._full_passes()
@@ -416,6 +419,8 @@ class OnlineEstimator:
         self._converged = (
             self._information.decrement < PASSED_SCORE_TEST and self._information.noise_length < PASSED_NOISE
         )
+        self._unconverged = 0 if self._converged else self._unconverged + 1
+        self._refined = self._updates
         self._marginal = self._refreshed.refresh(em, first, last, self._information)
 
     def _with_ages(self, em: WindowEM, first: int, last: int, information: Information) -> Information:

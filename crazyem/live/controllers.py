@@ -50,6 +50,18 @@ class Controller:
         return (*mass, *inertia, *self.others)
 
     @property
+    def waits(self) -> Mapping[str, tuple[str, ...]]:
+        """Estimate -> those it is written together with: one alone would skew a gain that they share.
+
+        Scaled gains of roll and pitch share one scale. INDI's loop gain holds for roll and pitch alike, and a lag that
+        comes with a wrong inertia is wrong as well.
+        """
+        if not (self.attitude_gains or self.incremental):
+            return {}
+        both = {"Ixx": ("Iyy",), "Iyy": ("Ixx",)}
+        return both | {"motor_time_constant": ("Ixx", "Iyy")} if self.incremental else both
+
+    @property
     def parameters(self) -> tuple[str, ...]:
         """Every parameter a push may write; their values at connect are the reference for scaling."""
         held = tuple(slot.parameter for belief in self.beliefs for slot in belief.slots)

@@ -233,12 +233,13 @@ class Guard:
                     changed[name] = value
                 else:  # one step from what it believes now still leads outside
                     reasons[name] = f"the controller believes {self.beliefs[name]:.4g}, too far outside to lead it back"
-        if self.controller.attitude_gains and ("Ixx" in changed) != ("Iyy" in changed):
-            # Roll and pitch gains share one scale; one axis alone would skew it.
-            lone, other = ("Ixx", "Iyy") if "Ixx" in changed else ("Iyy", "Ixx")
-            if reasons[other] != "unchanged" or other not in self.limits.parameters:
-                del changed[lone]
-                reasons[lone] = f"waits for {other}"
+        for name, others in self.controller.waits.items():
+            late = [o for o in others if o not in changed and reasons.get(o) != "unchanged"]
+            if not self.controller.attitude_gains:  # of its own each, so a policy may leave one as it is
+                late = [o for o in late if o in self.limits.parameters]
+            if name in changed and late:
+                reasons[name] = f"waits for {late[0]}"
+        changed = {name: value for name, value in changed.items() if not reasons[name]}
         if not changed:
             return Decision(time, reason=reasons)
         writes = writes_for(self.controller, changed, beliefs=self.beliefs, originals=self.originals)

@@ -9,6 +9,7 @@ import pytest
 import synthetic
 
 from crazyem.errors import DataError, UsageError
+from crazyem.estimation.em import WindowEM
 from crazyem.estimation.online import OnlineEstimator
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import load_vehicle
@@ -362,6 +363,23 @@ def test_an_estimate_is_printed_and_serialised(plain):
         entry = final.to_json()[name]
         assert set(entry) == {"value", "sd", "ci95", "unit", "identifiable", "reason"}
         assert bool(entry["reason"]) != entry["identifiable"]
+
+
+def test_what_has_not_converged_is_refined_after_one_two_four_updates(flight, monkeypatch):
+    """An estimate that fails its score test is refined soon; one that always fails costs little."""
+    estimator, full = OnlineEstimator(LAGGED), []
+    converge = WindowEM.converge
+
+    def never(em, first, last, **settings):
+        full.append(estimator._updates)
+        information = converge(em, first, last, **settings)
+        return replace(information, decrement=1.0) if last > 260 else information
+
+    monkeypatch.setattr(WindowEM, "converge", never)
+    monkeypatch.setattr(OnlineEstimator, "_moved", lambda self, em: False)
+    feed(estimator, synthetic.samples(flight))
+    late = [n for n in full if n >= 72]  # the first beyond row 260; every 12th is full in any case
+    assert late[:8] == [72, 73, 75, 79, 84, 96, 108, 120]
 
 
 def test_one_of_many_makes_fewer_full_passes_and_says_nearly_the_same(flight):
