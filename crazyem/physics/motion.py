@@ -98,7 +98,8 @@ def rotor_thrust(
 ) -> tuple[NDArray, NDArray]:
     """Mean thrust of each rotor, and its mean derivative, over the steps that end at nodes (n,) [s].
 
-    `breaks`: rows at which a new stretch begins (their step means nothing). Returns (n, 4) N and (n, 4) N/s.
+    `breaks`: rows at which a new stretch begins; these, and the first, hold the thrust at the node itself.
+    Returns (n, 4) N and (n, 4) N/s.
     """
     thrust, lag, delay = settled(inputs, vehicle=vehicle, effects=effects)
     mode = CAUSAL if inputs.aged and (inputs.measured or lag > 0) else LINEAR if inputs.measured else HOLD
@@ -111,8 +112,13 @@ def rotor_thrust(
         begin = nodes[first] - delay - 10 * max(lag, 0.02)
         at = max(0, int(np.searchsorted(inputs.time, begin, "right")) - 1)
         state[:4], state[4] = thrust[at], inputs.time[at]
-        lagged_means(inputs.time, thrust, at, len(inputs.time), predictor, nodes, first, last, mode, lag, delay, state,
-                     mean, unused, rate)  # fmt: skip
+        # up to the first row, which gets what the rotors give there: a mean of all that was before would depend on when
+        # that began, by 10 m/s^2 where the rotors stood still
+        at = lagged_means(inputs.time, thrust, at, len(inputs.time), predictor, nodes, first, first + 1, mode, lag,
+                          delay, state, mean, unused, rate)  # fmt: skip
+        mean[first] = state[:4]
+        lagged_means(inputs.time, thrust, at, len(inputs.time), predictor, nodes, first + 1, last, mode, lag, delay,
+                     state, mean, unused, rate)  # fmt: skip
     return mean, -rate
 
 

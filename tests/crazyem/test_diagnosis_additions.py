@@ -68,7 +68,7 @@ def test_what_explains_nearly_as_much_is_compared_with_noise_of_its_own(monkeypa
     """Told apart under noise that still is the effect; with noise of its own the second is the better."""
     gained = {"torque_scale": 2000.0, "inertia": 2100.0, "wind": 5000.0}
 
-    def sharpened(basis: Any, own: Any, t: Trial) -> Trial:
+    def sharpened(basis: Any, t: Trial) -> Trial:
         return replace(t, gain=gained[t.candidate.effect], value=gained[t.candidate.effect])
 
     monkeypatch.setattr(select, "with_noise_refit", sharpened)
@@ -89,7 +89,7 @@ def test_what_turns_the_drone_as_well_is_compared_with_noise_of_its_own_however_
     """Torques 23 % too weak gained 15 nats where a longer lag gained 40, and 37 against 48 with noise of their own."""
     asked = []
 
-    def sharpened(basis: Any, own: Any, t: Trial) -> Trial:
+    def sharpened(basis: Any, t: Trial) -> Trial:
         asked.append(t.candidate.effect)
         return t
 

@@ -120,8 +120,8 @@ def test_the_better_explanation_of_all_flights_leads_whichever_ruins_those_held_
     point = Point(DRONE, {}, first_guess())
     basis = SimpleNamespace(held_out=object(), point=point, data=SimpleNamespace(workers=Workers(1)))
     own, given = object(), []
-    monkeypatch.setattr(select, "held_out_noise", lambda basis, trial: own)
-    monkeypatch.setattr(select, "with_noise_refit", lambda basis, noise, trial: given.append(noise) or trial)
+    monkeypatch.setattr(select, "with_held_out_by", lambda basis, trial: own)
+    monkeypatch.setattr(select, "with_noise_refit", lambda basis, trial: given.append(basis) or trial)
     monkeypatch.setattr(select, "by_evidence", lambda trials, counted: sorted(trials, key=lambda t: -t.evidence))
     trials, equals = select.compared_again(basis, [linear, quadratic], say=lambda text: None)
     assert trials[0] is linear

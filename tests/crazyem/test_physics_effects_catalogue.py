@@ -178,6 +178,28 @@ def test_whatever_is_admitted_is_finite(one: Effects, other: Effects, seed: int,
         assert np.isfinite(array).all()
 
 
+@given(lag=st.floats(0.02, 0.08), delay=st.floats(0.0, 0.01), stop=st.integers(1, 3))
+def test_rows_at_which_a_stretch_begins_go_by_lag_and_delay_without_jumps(lag: float, delay: float, stop: int) -> None:
+    """They hold the lagged command there, whichever command before is the first that counts."""
+    time = 0.01 * np.arange(200)
+    thrust = np.repeat(np.where(time < 0.3 * stop, 0.0, 0.07), 4).reshape(-1, 4)  # the rotors stood still, then hover
+    inputs = RotorInput(time, thrust, np.full(time.size, 4.0), time, measured=False)
+    nodes = 1.0 + 0.01 * np.arange(30)
+
+    def means(change: float) -> np.ndarray:
+        effects: Effects = {"motor_lag": {"time_constant": lag * (1 + change)}, "input_delay": {"delay": delay}}
+        return rotor_thrust(inputs, nodes, vehicle=ROTORS, effects=effects, breaks=[15])[0]
+
+    here, there = means(0.0), means(1e-4)
+    assert np.abs(there - here).max() < 1e-5
+    since = 1.0 - delay - 0.3 * stop  # s, and up to a sample more: a command may act from the middle between stamps
+    low, high = (0.07 * (1 - math.exp(-s / lag)) for s in (since, since + 0.01))
+    forgotten = 0.07 * math.exp(-10.0)  # what was commanded ten lags ago
+    assert low - forgotten <= here[0, 0] <= high + forgotten
+    assert here[15] == pytest.approx(rotor_thrust(inputs, nodes, vehicle=ROTORS, effects={
+        "motor_lag": {"time_constant": lag}, "input_delay": {"delay": delay}})[0][14:16].mean(0), rel=0.05)  # fmt: skip
+
+
 # --- one file ---------------------------------------------------------------------------------------------------------
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "effects.md"

@@ -65,6 +65,7 @@ class Data:
         self.workers = workers or Workers(1)
         self.informed = Informed()
         self.constrained: frozenset[str] = frozenset()  # effects that are not free here, though they usually are
+        self.own: Point | None = None  # of flights held out: their noise, and where what is free of them begins
 
     def constraining(self, effect: str) -> "Data":
         """A twin in which an effect is as the vehicle file has it, though it is free usually."""
@@ -77,7 +78,7 @@ class Data:
         twin = Data((), self.workers)
         twin.models = [m.twin() for m in self.models]
         twin.informed = self.informed.copy()
-        twin.constrained = self.constrained
+        twin.constrained, twin.own = self.constrained, self.own
         return twin
 
     def together_with(self, other: "Data | None") -> "Data":

@@ -225,8 +225,8 @@ def with_nuisances(point: Point, free: Nuisances) -> Point:
 
 
 def on_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate], *, noise: bool = False) -> Fitted:
-    """The model on flights kept apart: effects as they are, what is always free belongs to each flight; the noise too
-    where wanted (but with a trim: see `steadied`).
+    """The model on flights kept apart: effects as they are, what is always free belongs to each flight, and so do noise
+    scales where these are known (`as_held_out`), or are fitted with `noise`.
 
     Where an effect is of a kind that is always free, it is so about what was found: otherwise inertias as fitted would
     be compared with torques that come with inertias to each flight's liking.
@@ -234,8 +234,26 @@ def on_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate], *, 
     free = nuisances(held_out, point, ())
     found = {c.effect for c in accepted}
     bare = point.with_effects({c.effect: c.neutral(point) for c, _ in free if c.effect not in found})
-    noise = noise and TRIM not in point.vehicle.effects
-    return refine(held_out, bare, (), nuisances=free, about=bare, rounds=2, noise=noise)
+    start = bare
+    if held_out.own is not None:
+        own = {c.effect: held_out.own.effects.get(c.effect) for c, _ in free if c.effect not in found}
+        start = replace(bare.with_effects({n: v for n, v in own.items() if v}), noise=held_out.own.noise)
+    return refine(held_out, start, (), nuisances=free, about=bare, rounds=2, noise=noise)
+
+
+def as_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate]) -> Data:
+    """A twin of flights kept apart that knows its noise scales and what is free of it by this model.
+
+    Noise belongs to a recording: slow and fast flights differ by thousands of nats in it. Models that are compared
+    begin where one of them ended, or maxima beside each other differ by ten. With a trim in the file noise stays that
+    of the flights fitted: what is steady would pass for a torque with memory.
+    """
+    twin = held_out.twin()
+    twin.own = None
+    there = on_held_out(twin, point, accepted, noise=TRIM not in point.vehicle.effects).point
+    gone = {c.effect for c in accepted}
+    twin.own = replace(there, effects={n: v for n, v in there.effects.items() if n not in gone})
+    return twin
 
 
 def _let_go(point: Point, accepted: Sequence[Candidate], free: Nuisances) -> Point:

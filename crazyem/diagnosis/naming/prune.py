@@ -10,7 +10,14 @@ from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import TORQUES, Data, Fitted
 from crazyem.diagnosis.fitting.gram import used
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.nuisances import nuisances, on_held_out, refine_base, usual_named, without
+from crazyem.diagnosis.fitting.nuisances import (
+    as_held_out,
+    nuisances,
+    on_held_out,
+    refine_base,
+    usual_named,
+    without,
+)
 from crazyem.diagnosis.locating.random_torques import off_peak_gram, peaks
 from crazyem.diagnosis.naming.detection_limits import at_the_end
 from crazyem.diagnosis.naming.trials import LIKELY, SURE, Selection, Step, both, significance, wald
@@ -20,7 +27,7 @@ HELD = 1.0  # nats it must bring on flight held out,
 TELLING = 6.0  # if so many are to be expected there; else it must not cost what it must bring
 MISLED = 0.1  # share of its gain that it may cost where it cannot be seen: hovers have biases of their own
 # Share of what it should bring that an effect of a kind that is always free may cost: a flight goes half-way to it by
-# itself and then brings nothing, whether it is there or not (2046/0221: 97 nats, -0.01 held out, 21 expected)
+# itself and then brings nothing, whether it is there or not
 AGAINST = 0.25
 OTHERWISE = 0.01  # p-value of an effect's being the same size beside what shakes (Hausman 1978)
 APART = 1 / 3  # of its size, at least: sampled commands make some per cent of difference
@@ -33,6 +40,7 @@ def pruned(
 ) -> Selection:
     """The selection without what is not needed, and what is doubted of the rest; `nominal`: before anything is free."""
     fitted, accepted, steps = selection.fitted, list(selection.accepted), list(selection.steps)
+    held_out = held_out and as_held_out(held_out, fitted.point, accepted)
     fitted, accepted, steps = drop(data, fitted, accepted, steps, held_out, say)
     doubted: frozenset[str] = frozenset()
     if TRIM not in selection.final.vehicle.effects:  # both judge by the scatter of blocks (see `by_gain`)
@@ -71,7 +79,7 @@ def drop(
             held = (held_here - held_less) / step.taken.dispersion
             need = -max(ADMITTED, MISLED * gain)
             # what should bring little of what it gains is not to be seen there either: sampled commands took 52 nats
-            # from a rotor inertia that gained 2373, where 19 were to be expected (2045/0285)
+            # from a rotor inertia that gained 2373, where 19 were to be expected
             least = max(TELLING, MISLED * gain) * step.taken.dispersion
             should = np.inf if held_out is None else expected(held_out, fitted, accepted, c)
             if should > least:
@@ -104,7 +112,7 @@ def expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], cand
     A hover says nothing of a damping, whether it is there or not. Without the bounds of what is always free, so rather
     too little: an order of magnitude, no more.
     """
-    point = fitted.point
+    point = fitted.point if held_out.own is None else replace(fitted.point, noise=held_out.own.noise)
     rest = [c for c in accepted if c is not candidate]
     free = nuisances(held_out, point, accepted)
     columns = [x for c in [candidate, *rest, *(c for c, _ in free)] for x in c.columns(point)]

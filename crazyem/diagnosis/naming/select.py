@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, freedom_of, held_near, local_precision
 from crazyem.diagnosis.fitting.gram import Solution, neutral_gain
-from crazyem.diagnosis.fitting.model import Column, Noise, Point
+from crazyem.diagnosis.fitting.model import Column, Point
 from crazyem.diagnosis.fitting.nuisances import (
+    as_held_out,
     by_gain,
     nuisances,
     on_held_out,
@@ -151,6 +152,14 @@ class Basis:
     held_value: float
 
 
+def held_out_value(held_out: Data | None, point: Point, accepted: Sequence[Candidate]) -> tuple[Data | None, float]:
+    """The flights held out as they are by this model, and its log-likelihood there."""
+    if held_out is None:
+        return None, 0.0
+    apart = as_held_out(held_out, point, accepted)
+    return apart, on_held_out(apart, point, accepted).loglik
+
+
 def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str], None]) -> Trial:
     """The trial of the linear approximation after a fit without it; changes nothing of the basis."""
     basis = constrained_basis(basis, trial.candidate)
@@ -175,44 +184,30 @@ def constrained_basis(basis: Basis, candidate: Candidate) -> Basis:
     return replace(basis, data=data, held_out=apart, value=fit.loglik, held_value=held)
 
 
-@dataclass(frozen=True)
-class HeldOutNoise:
-    """Noise of the flights held out as they have it themselves, and what it gains there [nats]."""
-
-    noise: Noise
-    gain: float
-
-
-def held_out_noise(basis: Basis, trial: Trial) -> HeldOutNoise | None:
-    """The noise of the flights held out under a trial; None where it stays that of the flights fitted."""
-    if basis.held_out is None or TRIM in basis.point.vehicle.effects:
-        return None
+def with_held_out_by(basis: Basis, trial: Trial) -> Basis:
+    """The basis with flights held out as they are by a trial: in noise of a model without either, two names differ."""
+    if basis.held_out is None:
+        return basis
     assert trial.fitted is not None
-    apart = basis.held_out.twin()
-    there = on_held_out(apart, trial.fitted.point, [*basis.accepted, trial.candidate])
-    own = apart.fit_noise(there.point)
-    gain = apart.loglik(own) - apart.loglik(there.point)
-    return HeldOutNoise(own.noise, gain) if np.isfinite(gain) else None
+    apart = as_held_out(basis.held_out, trial.fitted.point, [*basis.accepted, trial.candidate])
+    before = on_held_out(apart.twin(), basis.point, basis.accepted).loglik
+    return replace(basis, held_out=apart, held_value=before)
 
 
-def with_noise_refit(basis: Basis, own: HeldOutNoise | None, trial: Trial) -> Trial:
+def with_noise_refit(basis: Basis, trial: Trial) -> Trial:
     """A trial with noise scales of its own: under those of the model before it, the right explanation gains little."""
     assert trial.fitted is not None
     basis = constrained_basis(basis, trial.candidate)
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
     try:
         fit = refine_anew(data, trial.fitted.point, mine, rounds=3)
-        return compared(basis, trial, data, fit, own=own)
+        return compared(basis, trial, data, fit)
     except DivergedError:
         return trial
 
 
-def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted, *, own: HeldOutNoise | None = None) -> Trial:
-    """The trial with what its fit gains, on the flights fitted (`data`, where the fit is) and on those held out.
-
-    With `own` its value is that with noise of their own: under that of the flights fitted, a few per cent in scales
-    that these hardly tell are ten nats, by which two names of one thing were told apart.
-    """
+def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
+    """The trial with what its fit gains, on the flights fitted (`data`, where the fit is) and on those held out."""
     gain = fit.loglik - basis.value
     blocks, recording = data.block_loglik(fit.point), data.recordings_of_blocks()
     held, value, mine = trial.held_out, gain, [*basis.accepted, trial.candidate]
@@ -220,14 +215,10 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted, *, own: HeldOu
         apart = basis.held_out.twin()
         there = on_held_out(apart, fit.point, mine)
         held = there.loglik - basis.held_value
-        value += held
-        if own is not None:
-            there = on_held_out(apart, replace(fit.point, noise=own.noise), mine, noise=True)
-            value = gain + there.loglik - own.gain - basis.held_value
         more, beyond, covariance = gain_of_both(fit, apart, there, mine)
         blocks = np.append(blocks, beyond)
         recording = np.append(recording, len(data.models) + apart.recordings_of_blocks())
-        value += more
+        value += held + more
     else:
         covariance = known_by(fit, mine)
     k = len(trial.candidate.free)
@@ -289,7 +280,7 @@ def select(
     point, value = fitted.point, fitted.loglik
     accepted: list[Candidate] = [] if begun is None else list(begun.accepted)
     steps: list[Step] = [] if begun is None else [s for s in begun.steps if s.taken]
-    held_value = on_held_out(held_out, point, accepted).loglik if held_out else 0.0
+    apart, held_value = held_out_value(held_out, point, accepted)
     first = len(accepted)
     while True:
         rest = [c for c in candidates if may_join(c.effect, {a.effect for a in accepted})]
@@ -301,7 +292,7 @@ def select(
         if len(accepted) >= MOST:  # what stands beside the last is all that is asked
             steps.append(Step(tuple(t for t, _ in linear), None))
             break
-        steps.append(step_of(Basis(data, held_out, point, tuple(accepted), value, held_value), linear, say=say))
+        steps.append(step_of(Basis(data, apart, point, tuple(accepted), value, held_value), linear, say=say))
         taken = steps[-1].taken
         if taken is None:
             break
@@ -322,7 +313,7 @@ def select(
         point, value = fitted.point, fitted.loglik
         if unlike_a_body(point, accepted):  # told by other means, or not at all: see `diagnose`
             return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))
-        held_value = on_held_out(held_out, point, accepted).loglik if held_out else 0.0
+        apart, held_value = held_out_value(held_out, point, accepted)
     found = {c.effect for c in accepted}
     whole = Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))
     chosen = pruned(data, nominal_point, whole, held_out, say)
@@ -393,7 +384,7 @@ def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], No
     if len(equals) == 1:
         return trials, equals
     say(f"  comparing {', '.join(t.candidate.label for t in equals)}")
-    again = basis.data.workers.map(partial(with_noise_refit, basis, held_out_noise(basis, trials[0])), equals)
+    again = basis.data.workers.map(partial(with_noise_refit, with_held_out_by(basis, trials[0])), equals)
     rest = [t for t in trials if all(t is not e for e in equals)]
     trials = by_evidence([*again, *rest], counted=counted)
     close = [t for t in trials if any(t.candidate is a.candidate for a in again)]
