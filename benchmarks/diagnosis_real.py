@@ -310,10 +310,11 @@ def tables(done: dict[str, Any]) -> str:
             out.append(f"| {name} | {s['pos']} | {s['vel']} | {s['rot']} | {s['omega']} |")
         out.append("")
     if "alignment" in done:
-        out += ["| run | raw: delay, roll, pitch ms | processed |", "| --- | --- | --- |"]
+        out += ["| delay ms, runs 1 to 4 | raw | processed |", "| --- | --- | --- |"]
         delays = done["alignment"]["delays"]
-        for name in (n.split("/")[1] for n in delays if n.startswith("raw/")):
-            out.append(f"| {name} | {_delay(delays[f'raw/{name}'])} | {_delay(delays.get(f'processed/{name}'))} |")
+        for kind in dict.fromkeys(name.split("/")[1].split("_")[0] for name in delays):
+            of = [_delays(delays, f"{form}/{kind}_") for form in ("raw", "processed")]
+            out.append(f"| {kind} | {' | '.join(of)} |")
         out.append("")
     if "nanobench" in done:
         out += ["| nanobench, types left out | force residual x, y, z m/s² | by `predict` | position after 0.5 s m | "
@@ -335,10 +336,10 @@ def public(value: Any) -> Any:
     return [public(v) for v in value] if isinstance(value, list) else value
 
 
-def _delay(entry: dict[str, float] | None) -> str:
-    if not entry:
-        return "not told"
-    return f"{entry['delay_ms']:+.1f} ± {entry['sd_ms']:.1f}, {entry['roll_ms']:+.1f}, {entry['pitch_ms']:+.1f}"
+def _delays(delays: dict[str, dict[str, float] | None], begin: str) -> str:
+    """Of all runs whose names begin so."""
+    told = [entry for name, entry in sorted(delays.items()) if name.startswith(begin)]
+    return ", ".join(f"{entry['delay_ms']:+.1f} ± {entry['sd_ms']:.1f}" if entry else "not told" for entry in told)
 
 
 def main() -> None:

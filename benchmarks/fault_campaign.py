@@ -183,7 +183,6 @@ ROWS = (
     ("flights", "flights"),
     ("crashed", "crashed"),
     ("crashed_because_of_a_write", "crashed, and not without writes"),
-    ("hangs", f"over {LIMIT:.0f} s of wall time"),
     ("failures", "ended by an error of crazyem's own"),
     ("flights_with_writes", "flights in which anything was written"),
     ("writes", "parameter writes"),
@@ -192,7 +191,6 @@ ROWS = (
     ("flights_with_undone_sets", "flights in which half a set was undone"),
     ("median_last_mass_error", "last mass written, median error, %"),
     ("largest_last_mass_error", "largest, %"),
-    ("processor_s", "processor time a flight, median, s"),
 )
 
 

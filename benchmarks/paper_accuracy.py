@@ -77,19 +77,22 @@ def results(path: Path) -> dict[str, Any]:
 
 
 def blocks(found: Mapping[str, Any]) -> dict[str, str]:
-    """What stands between the markers of the docs, by part: the last sensor whole, a line for each."""
+    """What stands between the markers of the docs, by part: the last sensor whole, and a sentence on each."""
     out = {}
     for part, sensors in found.items():
-        lines = [_narrow(table(list(sensors.items())[-1:])), ""]
-        for sensor, s in sensors.items():
-            said = len(s["missed"]) or "none"
-            lines.append(
-                f"{sensor}: seeds {s['seeds'][0]} to {s['seeds'][1]}; mass off by {100 * s['mass_bias'][0][0]:+.4f} ± "
-                f"{100 * s['mass_bias'][0][1]:.4f} %; converged {100 * s['converged']:.1f} %; "
-                f"median {s['passes']:.0f} passes; aims missed: {said}."
-            )
-            lines.append("")
-        out[part] = "\n".join(lines).strip()
+        seeds = next(iter(sensors.values()))["seeds"]
+        said = [
+            f"{name} {100 * s['mass_bias'][0][0]:+.3f} ± {100 * s['mass_bias'][0][1]:.3f} %, "
+            f"{100 * s['converged']:.1f} %, {s['passes']:.0f}, {len(s['missed']) or 'none'}"
+            for name, s in sensors.items()
+        ]
+        lines = [
+            _narrow(table(list(sensors.items())[-1:])),
+            "",
+            f"Seeds {seeds[0]} to {seeds[1]}. Mass off by, converged, median passes, aims missed:",
+            f"{'; '.join(said)}.",
+        ]
+        out[part] = "\n".join(lines)
     return out
 
 
