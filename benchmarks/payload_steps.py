@@ -342,20 +342,18 @@ def _seconds(pair: Sequence[float | None]) -> str:
 def tables(table: Mapping[str, Any]) -> str:
     """The two tables of the page."""
     lines = [
-        "| case | flights | found | found after, s | mass within 2 % from 1 s on | largest error from 1 s on, % "
-        "| in the controller after, s | furthest from the setpoint, m | reverts |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| case | flights | found | found after, s | mass within 2 % from 1 s on | in the controller after, s "
+        "| furthest from the setpoint, m |",
+        "|---|---|---|---|---|---|---|",
     ]
     for case in (*CASES, *UNAWARE):
         row = table.get(case.name)
         if row and case.size:
-            error = "{:.2f}, {:.2f}".format(*(100 * x for x in row["worst_after_1s"]))
             missing = row["flights"] - row["in_controller"]
             controller = _seconds(row["in_controller_s"]) + (f" ({missing} not within {AFTER:g} s)" if missing else "")
             lines.append(
                 f"| {case.name} | {row['flights']} | {row['found']} | {_seconds(row['found_s'])} "
-                f"| {row['within_aim_at_1s']} of {row['flights']} | {error} | {controller} "
-                f"| {_seconds(row['furthest_m'])} | {row['reverts']} |"
+                f"| {row['within_aim_at_1s']} of {row['flights']} | {controller} | {_seconds(row['furthest_m'])} |"
             )
     lines += ["", "| without a step | flights | noticed | taken for a step | largest error of the mass, % |"]
     lines.append("|---|---|---|---|---|")
