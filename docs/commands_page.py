@@ -53,7 +53,7 @@ def _entry(action: argparse.Action) -> list[str]:
     elif action.nargs in ("+", "*"):
         value += "..."
     head = " ".join(filter(None, [", ".join(action.option_strings), value]))
-    text = textwrap.wrap(action.help or "", WIDTH - COLUMN - 2) or [""]
+    text = textwrap.wrap((action.help or "").replace("%%", "%"), WIDTH - COLUMN - 2) or [""]
     lines = [f"{head:<{COLUMN}}  {text[0]}"] if len(head) <= COLUMN else [head, " " * (COLUMN + 2) + text[0]]
     return [line.rstrip() for line in (*lines, *(" " * (COLUMN + 2) + line for line in text[1:])) if line.strip()]
 
