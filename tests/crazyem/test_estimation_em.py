@@ -165,7 +165,7 @@ def fly_many(truth) -> tuple[np.ndarray, ...]:
     for seed in range(SEEDS):
         estimator = OnlineEstimator(LAGGED, every=12)
         last = None
-        for sample in synthetic.samples(synthetic.fly(truth, seed=1000 + seed, duration=8.0)):
+        for sample in synthetic.samples(synthetic.fly(truth, seed=1000 + seed, duration=5.0)):
             last = estimator.feed(sample) or last
         final = estimator.finish()
         assert last is not None
@@ -182,7 +182,7 @@ def fly_many(truth) -> tuple[np.ndarray, ...]:
 @pytest.mark.slow
 @pytest.mark.parametrize("dither", [2e-4, 0.0], ids=["dither", "hover"])
 def test_intervals_cover_and_nothing_is_biased(dither):
-    """40 flights of 8 s each: 95 % intervals cover, errors are no larger than promised, and their mean is near zero.
+    """40 flights of 5 s each: 95 % intervals cover, errors are no larger than promised, and their mean is near zero.
 
     With coverage 0.95 fewer than 34 hits of 40 have probability 0.0033 (binomial), so 85 % is the bound; the
     intervals may be conservative (noise of sampled commands is counted in), so 40 of 40 is fine.
