@@ -187,14 +187,14 @@ SEEDS = 60
 @pytest.mark.slow
 @pytest.mark.parametrize("regime", ["quiet", "ordinary", "known"])
 def test_intervals_cover(regime):
-    """One window of 4 s from each of 60 flights; with coverage 0.95, fewer than 52 hits of 60 happen once in 250."""
+    """One window of 2.5 s from each of 60 flights; with coverage 0.95, fewer than 52 hits of 60 happen once in 250."""
     assert binom.cdf(51, SEEDS, 0.95) < 0.01
     quiet = regime == "quiet"
     force, torque = (FORCE, TORQUE) if quiet else (0.005, 0.002)
     known = KnownNoise(force=force, torque=torque, lateral_force=0.0) if regime == "known" else None
     errors, sds, hits, steps, conv = [], [], [], [], []
     for seed in range(SEEDS):
-        flight = zhao_flight.fly(seed=1000 + seed, force=force, torque=torque)
+        flight = zhao_flight.fly(seed=1000 + seed, seconds=2.5, force=force, torque=torque)
         signals = MEASURED if quiet else ("position", "velocity", "body_rate")
         em, n = window(flight, signals=signals, known=known), len(flight.time)
         noise = true_noise(1.3 * force, 1.3 * torque)
