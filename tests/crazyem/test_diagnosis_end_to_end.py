@@ -162,7 +162,7 @@ def test_ten_seconds_are_enough_for_what_is_plain() -> None:
 
 @pytest.mark.slow
 def test_a_rotor_that_fails_in_flight_is_named_with_its_moment() -> None:
-    found = diagnose([fly(Hidden(thrust=(1, 1, 0.9, 1), onset=8.37))], DRONE)
+    found = diagnose([fly(Hidden(thrust=(1, 1, 0.9, 1), onset=8.37), seconds=14.0)], DRONE)
     assert found.effects[0].name == "rotor_fault"
     holds(found, "rotor_fault", scale=0.9)
     chosen: Any = found.effects[0].chosen
@@ -181,7 +181,7 @@ def test_torques_that_wander_are_noise() -> None:
 @pytest.mark.slow
 def test_a_pull_on_one_side_is_left_unexplained_there() -> None:
     """Beyond x = 0.1 m something pulls with 20 mN: no effect of the catalogue does."""
-    found = diagnose([fly(Hidden(rope=0.02))], DRONE)
+    found = diagnose([fly(Hidden(rope=0.02), seconds=12.0)], DRONE)
     assert found.mismatch
     assert found.unexplained.found
     worst = found.unexplained.findings[0]
