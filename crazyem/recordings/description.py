@@ -68,10 +68,7 @@ def from_json(table: Any) -> Description:
     if not isinstance(table, dict):
         raise ValueError("it is no table")
     table = {key: value if key == "metadata" else _back(value) for key, value in table.items()}
-    try:
-        file = msgspec.convert(table, _File, dec_hook=_rows)
-    except msgspec.ValidationError as error:
-        raise ValueError(str(error)) from None
+    file = msgspec.convert(table, _File, dec_hook=_rows)
     return Description(
         file.source,
         tuple(SignalEntry(**msgspec.structs.asdict(signal)) for signal in file.signals),

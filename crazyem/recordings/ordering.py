@@ -20,12 +20,10 @@ def sound_rows(value: Array) -> Flags:
     return sound
 
 
-def ordered(array: SignalArray, *, finite: bool = True) -> tuple[Array, Array]:
-    """(n,) times and (n, c) values with increasing times; rows with NaN dropped if `finite`. No copy if avoidable."""
+def ordered(array: SignalArray) -> tuple[Array, Array]:
+    """(n,) times and (n, c) values with increasing times, rows with NaN dropped. No copy if avoidable."""
     time, value = array.time, array.value
-    keep = np.isfinite(time)
-    if finite:
-        keep &= sound_rows(value)
+    keep = np.isfinite(time) & sound_rows(value)
     if not keep.all():
         time, value = time[keep], value[keep]
     if time.size > 1 and (time[1:] < time[:-1]).any():

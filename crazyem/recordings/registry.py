@@ -3,16 +3,14 @@
 A reader for a new format is one file with `recognises` and `read`, and one line in `READERS`.
 """
 
-import gzip
 import importlib
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
 from crazyem.errors import FileFormatError, KnownFileError, UsageError
-from crazyem.recordings.contents import ReadOptions
+from crazyem.recordings.contents import ReadOptions, pieces
 from crazyem.recordings.cut import cut, cut_parts
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.stamps import screened, screened_parts
@@ -118,14 +116,4 @@ def reader_of(path: Path) -> Reader:
 
 def head_of(path: Path) -> bytes:
     """The first bytes of a file, unpacked if it is a gzip file."""
-    try:
-        with path.open("rb") as raw:
-            start = raw.read(_HEAD_BYTES)
-        if start[:2] == b"\x1f\x8b":
-            with gzip.open(path, "rb") as packed:
-                return packed.read(_HEAD_BYTES)
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise FileFormatError(f"{path} is not a readable gzip file ({error}).") from error
-    except OSError as error:
-        raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
-    return start
+    return next(pieces(path, _HEAD_BYTES), b"")

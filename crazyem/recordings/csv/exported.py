@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -39,11 +40,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
 
     Raises: FileFormatError naming line or column.
     """
-    table = _Table(path)
-    held = _Held(table.description.entries)
-    for batch, first in table.batches():
-        held.add(batch, first, path)
-    return table.recording(held)
+    return next(read_parts(path, options, seconds=math.inf))
 
 
 def read_parts(path: Path, options: ReadOptions, seconds: float = 60.0) -> Iterator[Recording]:

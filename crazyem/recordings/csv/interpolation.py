@@ -10,13 +10,7 @@ ABSOLUTE_TOLERANCE = 4e-9  # decimals of the file: nine digits, rounded
 _CHUNK_ROWS = 1 << 16  # rows looked at together, to bound memory
 
 
-def interpolated_rows(
-    time: NDArray[np.float64],
-    values: NDArray[np.float64],
-    *,
-    relative_tolerance: float = RELATIVE_TOLERANCE,
-    absolute_tolerance: float = ABSOLUTE_TOLERANCE,
-) -> NDArray[np.bool_]:
+def interpolated_rows(time: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Rows inside runs of three or more samples that lie on one straight line in every component.
 
     One packet carries all components, so a lost packet shows in all of them at once. Constant components are no
@@ -25,8 +19,6 @@ def interpolated_rows(
     Args:
         time: (n,) s, may be unevenly spaced.
         values: (n, c), any unit.
-        relative_tolerance: deviation from the line that still counts as none, over the change across two steps.
-        absolute_tolerance: the same, absolute; the rounding of the file.
 
     Returns: (n,) True for every row of such a run, its ends included.
     """
@@ -34,24 +26,22 @@ def interpolated_rows(
     rows = np.zeros(n, bool)
     for start in range(0, max(n - 2, 0), _CHUNK_ROWS):
         part = slice(start, min(start + _CHUNK_ROWS + 2, n))
-        centres = _centres(time[part], values[part], relative_tolerance, absolute_tolerance)
+        centres = _centres(time[part], values[part])
         for shift in (0, 1, 2):
             rows[start + shift : start + shift + centres.size] |= centres
     return rows
 
 
-def _centres(
-    time: NDArray[np.float64], values: NDArray[np.float64], relative_tolerance: float, absolute_tolerance: float
-) -> NDArray[np.bool_]:
+def _centres(time: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.bool_]:
     """(n - 2,) whether each row but the first and last lies on the line through its neighbours, and moves."""
     span = time[2:] - time[:-2]
     share = np.where(span > 0, (time[1:-1] - time[:-2]) / np.where(span > 0, span, 1.0), np.nan)
     with np.errstate(invalid="ignore", over="ignore"):
         change = values[2:] - values[:-2]
         deviation = np.abs(values[1:-1] - values[:-2] - share[:, None] * change)
-        on_line = (deviation <= absolute_tolerance + relative_tolerance * np.abs(change)).all(axis=1)
+        on_line = (deviation <= ABSOLUTE_TOLERANCE + RELATIVE_TOLERANCE * np.abs(change)).all(axis=1)
         # A change near the rounding of the file would pass as straight whatever it did.
-        moving = (np.abs(change) > 1e3 * absolute_tolerance).any(axis=1)
+        moving = (np.abs(change) > 1e3 * ABSOLUTE_TOLERANCE).any(axis=1)
     return np.asarray(on_line & moving)
 
 
@@ -81,7 +71,6 @@ def corners(
     *,
     starts: bool = True,
     ends: bool = True,
-    absolute_tolerance: float = ABSOLUTE_TOLERANCE,
 ) -> Corners:
     """Recover the samples from which a polygon was drawn: where two of its lines meet, between two rows or on one.
 
@@ -93,7 +82,6 @@ def corners(
         time: (n,) s, may be unevenly spaced.
         value: (n,)
         starts, ends: whether row 0 and row n-1 are the first and last there are.
-        absolute_tolerance: deviation from a line that still counts as none; the rounding of the file.
     """
     n = time.size
     if n < 4:
@@ -102,7 +90,7 @@ def corners(
         share = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
         deviation = np.abs(value[1:-1] - value[:-2] - share * (value[2:] - value[:-2]))
     off = np.zeros(n, bool)
-    off[1:-1] = ~(deviation <= absolute_tolerance)  # NaN is off every line
+    off[1:-1] = ~(deviation <= ABSOLUTE_TOLERANCE)  # NaN is off every line
     edges = np.flatnonzero(np.diff(np.concatenate([[False], off, [False]]).astype(np.int8)))
     begin, length = edges[::2], edges[1::2] - edges[::2]
     pairs = [

@@ -86,7 +86,7 @@ def signals_of(layout: Layout, rows: Rows) -> tuple[dict[str, SignalArray], list
             signals[name] = kept.slow(source, place, step)
         else:
             value, marked = kept.values(name, source)
-            signals[name] = kept.array(value, marked, place, step, source)
+            signals[name] = kept.signal(source, value, kept.number * step + place, marked)
         uses.subtract(source.columns)
         for column in source.columns:
             if not uses[column]:
@@ -131,22 +131,17 @@ class _Kept:
     def column(self, name: str) -> Array:
         return self.rows.columns[name][self.slice]
 
-    def array(
-        self, value: Array, marked: NDArray[np.bool_], place: int, step: int, source: SignalColumns
-    ) -> SignalArray:
+    def signal(
+        self, source: SignalColumns, value: Array, order: NDArray[np.int64], marked: NDArray[np.bool_],
+        *, time: Array | None = None, host: Array | None = None,
+    ) -> SignalArray:  # fmt: skip
+        """A signal of the vocabulary; without times of its own it was sampled with the rows."""
+        _, unit, frame = SIGNALS[source.quantity]
+        clock = self.layout.clock if source.clock is None else source.clock
         return SignalArray(
-            self.time,
-            value,
-            self.number * step + place,
-            self.host,
-            marked,
-            quantity=source.quantity,
-            unit=SIGNALS[source.quantity][1],
-            frame=SIGNALS[source.quantity][2],
-            clock=self.layout.clock if source.clock is None else source.clock,
-            stream=source.stream,
-            source=source.columns,
-        )
+            self.time if time is None else time, value, order, self.host if host is None else host, marked,
+            source.quantity, unit, frame, clock, source.stream, source.columns,
+        )  # fmt: skip
 
     def raw(self, column: str, unit: str, packet: str | None, step: int) -> SignalArray:
         """A column as it stands; all of them have the last place of their row."""
@@ -183,19 +178,9 @@ class _Kept:
         value = source.converted(found.value[mine, None])
         missing = self._missing(source, found.value[mine, None])
         value[missing] = np.nan
-        return SignalArray(
-            time,
-            value,
-            (found.row[mine] - first + self.rows.number) * step + place,
-            time + self.rows.origin if self.layout.clock == "host" else np.full(time.size, np.nan),
-            missing[:, 0],
-            quantity=source.quantity,
-            unit=SIGNALS[source.quantity][1],
-            frame=SIGNALS[source.quantity][2],
-            clock=self.layout.clock if source.clock is None else source.clock,
-            stream=source.stream,
-            source=source.columns,
-        )
+        order = (found.row[mine] - first + self.rows.number) * step + place
+        host = time + self.rows.origin if self.layout.clock == "host" else np.full(time.size, np.nan)
+        return self.signal(source, value, order, missing[:, 0], time=time, host=host)
 
     def values(self, name: str, source: SignalColumns) -> tuple[Array, NDArray[np.bool_]]:
         """(n, c) SI, our frames, NaN where missing; (n,) where that is ours."""

@@ -55,18 +55,12 @@ def reopen(path: Path) -> Continued:
     damaged = next((p for p in problems if p.loss is Loss.DAMAGED), None)
     if damaged is not None:
         raise FileFormatError(f"{path} is damaged at byte {damaged.offset}; recover it before it is continued.")
-    if any(topic.startswith("/signals/") for _, topic, _, _ in found.book.channels.values()):
+    if any(topic.startswith("/signals/") for topic in (c.topic for c in found.book.channels.values())):
         raise FileFormatError(f"{path} is an imported recording, to which no flight can be added.")
     missing = found.close_chunk()
     stream = _Tail(path, found.end, missing)
-    return Continued(
-        stream,
-        found.end + len(missing),
-        found.book,
-        found.sequence,
-        min(found.book.end or 0, 2**63 - 1),
-        found.sessions,
-    )
+    log_time = min(found.book.end or 0, 2**63 - 1)
+    return Continued(stream, found.end + len(missing), found.book, found.sequence, log_time, found.sessions)
 
 
 class _Found:
@@ -87,7 +81,9 @@ class _Found:
             self.close_chunk()
         self.end = record.end
         for entry in part.announced:
-            self._announce(entry)
+            self.book.announce(entry)
+            number = "1" if isinstance(entry, Schema) else entry.metadata.get("session", "1")
+            self.sessions = max(self.sessions, int(number) if number.isdecimal() and len(number) < 6 else 1)
         if part.chunk is not None:
             self._chunk = part
         if part.scan is not None and part.scan.messages.size:
@@ -97,15 +93,6 @@ class _Found:
             if metadata is not None:
                 entry = MetadataIndex(length=record.end - record.offset, name=metadata.name, offset=record.offset)
                 self.book.metadata.append(entry)
-
-    def _announce(self, entry: Any) -> None:
-        if isinstance(entry, Schema):
-            self.book.schemas[entry.id] = (entry.name, entry.encoding, entry.data)
-        else:
-            told = (entry.schema_id, entry.topic, entry.message_encoding, entry.metadata)
-            self.book.channels[entry.id] = told
-            number = entry.metadata.get("session", "1")
-            self.sessions = max(self.sessions, int(number) if number.isdecimal() and len(number) < 6 else 1)
 
     def close_chunk(self) -> bytes:
         """Enter the last chunk; returns the index records that should follow it if the file was cut among them."""

@@ -8,15 +8,35 @@ a file can be continued.
 import errno
 import os
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO
 
 import numpy as np
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
 from numpy.typing import NDArray
 
 from crazyem.recordings.mcap.scan import HEAD, MCAP_MAGIC, MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX
 
+# a chunk is closed before it grows beyond this; a single larger message makes a larger chunk
 CHUNK_BYTES = 256 * 1024
 ANNOUNCE_EVERY = 20  # chunks
 
@@ -26,21 +46,25 @@ class Book:
     """What the summary of a file says: kept while writing, or made again from a file.
 
     Attributes:
-        schemas: identifier -> (name, encoding, data).
-        channels: identifier -> (schema identifier, topic, message encoding, metadata).
-        chunks, attachments, metadata: index records of the mcap library.
+        schemas, channels: by identifier.
+        chunks, attachments, metadata: where they are in the file.
         counts: messages of each channel.
         start, end: log times of the first and last message [ns], None without messages.
     """
 
-    schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
-    channels: dict[int, tuple[int, str, str, dict[str, str]]] = field(default_factory=dict)
-    chunks: list[Any] = field(default_factory=list)
-    attachments: list[Any] = field(default_factory=list)
-    metadata: list[Any] = field(default_factory=list)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    chunks: list[ChunkIndex] = field(default_factory=list)
+    attachments: list[AttachmentIndex] = field(default_factory=list)
+    metadata: list[MetadataIndex] = field(default_factory=list)
     counts: dict[int, int] = field(default_factory=dict)
     start: int | None = None
     end: int | None = None
+
+    def announce(self, record: Schema | Channel) -> None:
+        """A schema or channel that stands in the file; the first word on a number counts."""
+        known: dict[int, Any] = self.channels if isinstance(record, Channel) else self.schemas
+        known.setdefault(record.id, record)
 
     def count(self, channel: int, messages: int, start: int, end: int) -> None:
         """Add `messages` of a channel with log times from `start` to `end` [ns]."""
@@ -55,17 +79,13 @@ class Output:
     Args:
         stream: opened for writing, positioned where the next record goes; stays open.
         book, offset: of a file that is continued: what is in it, and the place [bytes] of the next record.
-        chunk_bytes: a chunk is closed before it grows beyond this (a single larger message makes a larger chunk).
 
     Raises: OSError from the stream, as it comes.
     """
 
-    def __init__(
-        self, stream: BinaryIO, *, book: Book | None = None, offset: int = 0, chunk_bytes: int = CHUNK_BYTES
-    ) -> None:
+    def __init__(self, stream: BinaryIO, *, book: Book | None = None, offset: int = 0) -> None:
         self.book = book or Book()
         self._stream, self._offset = stream, offset
-        self._limit = chunk_bytes
         self._buffer = bytearray()
         self._index: dict[int, list[tuple[int, int]]] = {}
         self._since = 0  # chunks since everything was announced
@@ -76,35 +96,32 @@ class Output:
 
     def start(self, profile: str, library: str) -> None:
         """Magic bytes and header of a new file."""
-        from mcap.records import Header
-
         self._put(MCAP_MAGIC + _bytes(Header(profile, library)))
 
     # --- announcements ------------------------------------------------------------------------------------------
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
         """Announce a schema; returns its identifier, the same for the same schema."""
-        entry = (name, encoding, data)
-        for known, other in self.book.schemas.items():
-            if other == entry:
-                return known
-        identifier = max(self.book.schemas, default=0) + 1
-        self.book.schemas[identifier] = entry
-        self._buffer += _bytes(_schema(identifier, entry))
-        return identifier
+        for known in self.book.schemas.values():
+            if (known.name, known.encoding, known.data) == (name, encoding, data):
+                return known.id
+        schema = Schema(id=max(self.book.schemas, default=0) + 1, name=name, encoding=encoding, data=data)
+        self.book.schemas[schema.id] = schema
+        self._buffer += _bytes(schema)
+        return schema.id
 
     def channel(self, topic: str, encoding: str, schema: int, metadata: Mapping[str, str] | None = None) -> int:
         """Announce a channel; returns its new identifier. Raises ValueError when all 65535 are taken."""
         identifier = max(self.book.channels, default=0) + 1
         if identifier > 0xFFFF:
             raise ValueError("too many channels for one file")
-        self.book.channels[identifier] = (schema, topic, encoding, dict(metadata or {}))
-        self._buffer += _bytes(_channel(identifier, self.book.channels[identifier]))
+        channel = Channel(identifier, topic, encoding, dict(metadata or {}), schema_id=schema)
+        self.book.channels[identifier] = channel
+        self._buffer += _bytes(channel)
         return identifier
 
     def _announcements(self) -> bytes:
-        schemas = b"".join(_bytes(_schema(i, entry)) for i, entry in self.book.schemas.items())
-        return schemas + b"".join(_bytes(_channel(i, entry)) for i, entry in self.book.channels.items())
+        return b"".join(map(_bytes, (*self.book.schemas.values(), *self.book.channels.values())))
 
     def announce_again(self) -> None:
         """Put everything announced so far in front of the next chunk's messages."""
@@ -122,7 +139,7 @@ class Output:
         """One message; times in ns since the epoch. Closes the chunk before it, if it would grow too large."""
         head = MESSAGE_HEAD.pack(MESSAGE, 22 + len(data), channel, sequence & 0xFFFFFFFF, log_time, publish_time)
         record = head + data
-        if self._index and len(self._buffer) + len(record) > self._limit:
+        if self._index and len(self._buffer) + len(record) > CHUNK_BYTES:
             self.flush()
         self._index.setdefault(channel, []).append((log_time, self._place()))
         self._buffer += record
@@ -144,7 +161,7 @@ class Output:
         """Offset of the next message in the chunk; repeats the announcements first where that is due."""
         if not self._index and self._since >= ANNOUNCE_EVERY:
             announcements = self._announcements()
-            if len(announcements) <= self._limit // 4:
+            if len(announcements) <= CHUNK_BYTES // 4:
                 self._buffer[:] = announcements
             self._since = 0
         return len(self._buffer)
@@ -153,7 +170,7 @@ class Output:
     def room(self) -> int:
         """Bytes of messages that fit into the next chunk of `messages`."""
         waiting = len(self._buffer) if not self._index else 0
-        return max(1, self._limit - max(waiting, len(self._announcements()) if self._since >= ANNOUNCE_EVERY else 0))
+        return max(1, CHUNK_BYTES - max(waiting, len(self._announcements()) if self._since >= ANNOUNCE_EVERY else 0))
 
     def flush(self, *, sync: bool = False) -> None:
         """Close the chunk in progress, if it has messages, and hand everything to the operating system.
@@ -172,8 +189,6 @@ class Output:
                     raise
 
     def _close_chunk(self, index: Mapping[int, NDArray[np.uint64]]) -> None:
-        import zstandard
-
         raw = bytes(self._buffer)
         self._buffer.clear()
         self._index = {}
@@ -187,19 +202,8 @@ class Output:
 
         Everything it needs must have been announced, or stand in it.
         """
-        from mcap.records import Chunk
-
         start, end = _span(index)
-        record = _bytes(
-            Chunk(
-                compression=compression,
-                data=packed,
-                message_start_time=start,
-                message_end_time=end,
-                uncompressed_crc=crc,
-                uncompressed_size=size,
-            )
-        )
+        record = _bytes(Chunk(compression, packed, end, start, uncompressed_crc=crc, uncompressed_size=size))
         offset = self._offset
         indexes = {channel: index_record(channel, pairs) for channel, pairs in index.items()}
         self._put(b"".join((record, *indexes.values())))
@@ -209,16 +213,12 @@ class Output:
 
     def metadata(self, name: str, entries: Mapping[str, str]) -> None:
         """A metadata record: it goes into the file at once, before the chunk in progress."""
-        from mcap.records import Metadata, MetadataIndex
-
         record = _bytes(Metadata(name=_text(name), metadata={_text(k): _text(v) for k, v in entries.items()}))
         self.book.metadata.append(MetadataIndex(offset=self._offset, length=len(record), name=_text(name)))
         self._put(record)
 
-    def attachment(self, record: Any) -> None:
-        """An attachment: a record of the mcap library."""
-        from mcap.records import AttachmentIndex
-
+    def attachment(self, record: Attachment) -> None:
+        """An attachment, at once like metadata."""
         data = _bytes(record)
         entry = AttachmentIndex(
             offset=self._offset,
@@ -234,8 +234,6 @@ class Output:
 
     def finish(self) -> None:
         """Everything that waits, then the summary; the file is complete."""
-        from mcap.records import DataEnd
-
         self.flush()
         self._put(_bytes(DataEnd(0)))
         self._put(_summary(self.book, self._offset) + MCAP_MAGIC)
@@ -253,8 +251,6 @@ def note_chunk(
     indexes: Mapping[int, bytes],
 ) -> None:
     """Enter a chunk at `offset` into the book, whose index records (`indexes`) follow it in this order."""
-    from mcap.records import ChunkIndex
-
     start, end = _span(index)
     places, at = {}, offset + length
     for channel, record in indexes.items():
@@ -285,9 +281,6 @@ def index_record(channel: int, pairs: NDArray[np.uint64]) -> bytes:
 
 
 def _summary(book: Book, offset: int) -> bytes:
-    from mcap.opcode import Opcode
-    from mcap.records import Footer, Statistics, SummaryOffset
-
     statistics = Statistics(
         attachment_count=len(book.attachments),
         channel_count=len(book.channels),
@@ -299,9 +292,9 @@ def _summary(book: Book, offset: int) -> bytes:
         metadata_count=len(book.metadata),
         schema_count=len(book.schemas),
     )
-    groups = (
-        (Opcode.SCHEMA, [_schema(i, entry) for i, entry in book.schemas.items()]),
-        (Opcode.CHANNEL, [_channel(i, entry) for i, entry in book.channels.items()]),
+    groups: tuple[tuple[Opcode, Iterable[McapRecord]], ...] = (
+        (Opcode.SCHEMA, book.schemas.values()),
+        (Opcode.CHANNEL, book.channels.values()),
         (Opcode.STATISTICS, [statistics]),
         (Opcode.CHUNK_INDEX, book.chunks),
         (Opcode.ATTACHMENT_INDEX, book.attachments),
@@ -325,23 +318,7 @@ def _span(index: Mapping[int, NDArray[np.uint64]]) -> tuple[int, int]:
     return (int(min(t.min() for t in times)), int(max(t.max() for t in times))) if times else (0, 0)
 
 
-def _schema(identifier: int, entry: tuple[str, str, bytes]) -> Any:
-    from mcap.records import Schema
-
-    name, encoding, data = entry
-    return Schema(id=identifier, data=data, encoding=encoding, name=name)
-
-
-def _channel(identifier: int, entry: tuple[int, str, str, dict[str, str]]) -> Any:
-    from mcap.records import Channel
-
-    schema, topic, encoding, metadata = entry
-    return Channel(id=identifier, topic=topic, message_encoding=encoding, metadata=metadata, schema_id=schema)
-
-
-def _bytes(record: Any) -> bytes:
-    from mcap.data_stream import RecordBuilder
-
+def _bytes(record: McapRecord) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
     return bytes(builder.end())

@@ -46,17 +46,8 @@ class Report:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {
-            "profile": self.profile,
-            "messages": self.messages,
-            "chunks": self.chunks,
-            "metadata": self.metadata,
-            "attachments": self.attachments,
-            "lost_messages": self.lost_messages,
-            "lost_bytes": self.lost_bytes,
-            "closed": self.closed,
-            "problems": [{"kind": str(p.loss), "offset": p.offset, "end": p.end, "text": p.why} for p in self.problems],
-        }
+        problems = [{"kind": str(p.loss), "offset": p.offset, "end": p.end, "text": p.why} for p in self.problems]
+        return {**vars(self), "lost_bytes": self.lost_bytes, "closed": self.closed, "problems": problems}
 
     def __str__(self) -> str:
         lines = [f"{self.messages} messages in {self.chunks} chunks recovered"]
@@ -108,7 +99,7 @@ def _copy(source: Path, head: bytes, output: Output) -> Report:
         summary = summary or part.record.opcode == mcap_scan.DATA_END
         for entry in part.announced:
             if not summary:
-                _announce(output, entry)
+                output.book.announce(entry)
                 seen.add((type(entry).__name__, entry.id))
         if part.scan is not None:
             _restore(output, part, known, seen)
@@ -126,14 +117,6 @@ def _copy(source: Path, head: bytes, output: Output) -> Report:
     return report
 
 
-def _announce(output: Output, entry: Any) -> None:
-    if hasattr(entry, "topic"):
-        told = (entry.schema_id, entry.topic, entry.message_encoding, entry.metadata)
-        output.book.channels.setdefault(entry.id, told)
-    else:
-        output.book.schemas.setdefault(entry.id, (entry.name, entry.encoding, entry.data))
-
-
 def _restore(output: Output, part: Part, known: dict[tuple[str, int], Any], seen: set[tuple[str, int]]) -> None:
     """Announce what the messages of this part need and nothing before has announced, from the summary."""
     assert part.scan is not None
@@ -148,7 +131,7 @@ def _restore(output: Output, part: Part, known: dict[tuple[str, int], Any], seen
         needed.append(entry)
     for entry in needed:
         seen.add((type(entry).__name__, entry.id))
-        _announce(output, entry)
+        output.book.announce(entry)
     if needed:
         output.announce_again()
 
@@ -181,7 +164,7 @@ def _messages(output: Output, part: Part, report: Report) -> None:
 def _defined(output: Output) -> list[int]:
     """Channels whose messages a reader can decode, as far as announced."""
     schemas = output.book.schemas
-    return [i for i, (schema, _, _, _) in output.book.channels.items() if schema == 0 or schema in schemas]
+    return [c.id for c in output.book.channels.values() if c.schema_id == 0 or c.schema_id in schemas]
 
 
 def _rewrite(output: Output, scan: Scan, messages: NDArray[np.int64]) -> None:

@@ -37,28 +37,21 @@ _EPOCH_RANGE = (9.0e8, 4.2e9)  # s: stamps between 1998 and 2103 are taken for t
 _LOG_LEVELS = {Grade.HARMLESS: 2, Grade.DEGRADES: 3, Grade.UNUSABLE: 4}  # of foxglove.Log
 
 
-def write_recording(
-    recording: Recording,
-    path: str | Path,
-    *,
-    metadata: Mapping[str, Mapping[str, str]] | None = None,
-    replace: bool = False,
-) -> None:
+def write_recording(recording: Recording, path: str | Path, *, replace: bool = False) -> None:
     """Write a recording as MCAP, whole or not at all.
 
     Args:
         recording: from any reader.
         path: the file.
-        metadata: sections to add to those of the recording.
         replace: an existing file may be replaced.
 
     Raises: UsageError if the file exists or cannot be written.
     """
     with new_file(Path(path), force=replace) as temporary, temporary.open("wb") as stream:
-        _write(recording, Output(stream), {**recording.metadata, **(metadata or {})})
+        _write(recording, Output(stream))
 
 
-def _write(recording: Recording, output: Output, metadata: Mapping[str, Mapping[str, str]]) -> None:
+def _write(recording: Recording, output: Output) -> None:
     output.start(PROFILE, f"crazyem {versions()['crazyem']}")
     own = {
         **versions(),
@@ -68,7 +61,7 @@ def _write(recording: Recording, output: Output, metadata: Mapping[str, Mapping[
         "findings": findings_to_json(recording.findings),
     }
     output.metadata(IMPORT_METADATA, own)
-    for section, entries in metadata.items():
+    for section, entries in recording.metadata.items():
         output.metadata(section, entries)
     ranks = _ranks(recording.signals)
     streams = [_Stream(output, group) for group in _groups(recording.signals, ranks)]
@@ -147,7 +140,7 @@ class _Stream:
     """A group as a channel: encodes any of its rows."""
 
     def __init__(self, output: Output, group: _Group) -> None:
-        taken = {topic.removeprefix("/signals/") for _, topic, _, _ in output.book.channels.values()}
+        taken = {topic.removeprefix("/signals/") for topic in (c.topic for c in output.book.channels.values())}
         # rows in processing order; where that is not the order of the arrays, messages say which row they are
         self.rows = np.argsort(group.base, kind="stable")
         shuffled = not np.array_equal(self.rows, np.arange(self.rows.size))
@@ -157,11 +150,10 @@ class _Stream:
             identifier=unique_name(group.stream or "table", taken),
             stream=group.stream,
             signals=tuple(
-                Column(n, i, a.value.shape[1], a.quantity, a.unit, a.frame, a.clock, a.source)
+                Column(n, i, _components(a), a.quantity, a.unit, a.frame, a.clock, a.source)
                 for n, i, a in zip(group.names, group.indices, group.arrays, strict=True)
             ),
             rows=shuffled,
-            components=tuple(_components(a) for a in group.arrays),
         )
         schema = output.schema(self.layout.schema_name, "protobuf", self.layout.schema_data())
         topic = f"/signals/{self.layout.identifier}"
@@ -185,7 +177,7 @@ class _Stream:
 def _components(array: SignalArray) -> tuple[str, ...]:
     width = array.value.shape[1]
     names = array.components
-    return names if len(names) == width else () if width == 1 else tuple(str(i) for i in range(width))
+    return names if len(names) == width else ("",) if width == 1 else tuple(str(i) for i in range(width))
 
 
 # --- times and order in the file --------------------------------------------------------------------------------------
@@ -308,9 +300,9 @@ def _running(time: NDArray[np.float64]) -> NDArray[np.uint64]:
 
 
 def _channel(output: Output, topic: str, schema_name: str) -> int:
-    for identifier, (_, known, _, _) in output.book.channels.items():
-        if known == topic:
-            return identifier
+    for known in output.book.channels.values():
+        if known.topic == topic:
+            return known.id
     schema = output.schema(schema_name, "protobuf", schemas.schema_data(schema_name))
     return output.channel(topic, "protobuf", schema)
 

@@ -7,10 +7,11 @@ Two kinds of channels use them: log blocks as flown (schemas.BlockCodec) and sig
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -80,17 +81,22 @@ class Column:
 
     Attributes:
         index: its place among the signals of the recording.
-        width: number of components.
+        components: their names; in a file, those of the fields of its messages.
     """
 
     name: str
     index: int
-    width: int
+    components: tuple[str, ...]
     quantity: str = ""
     unit: str = ""
     frame: str = ""
     clock: str = ""
     source: tuple[str, ...] = ()
+
+    @property
+    def width(self) -> int:
+        """Number of components."""
+        return len(self.components)
 
 
 @dataclass(frozen=True)
@@ -102,14 +108,12 @@ class StreamLayout:
         stream: as in `SignalArray`.
         signals: in processing order.
         rows: messages carry their row in the arrays, where that is not the order in which they were processed.
-        components: names of the components, one tuple a signal.
     """
 
     identifier: str
     stream: str
     signals: tuple[Column, ...]
     rows: bool = False
-    components: tuple[tuple[str, ...], ...] = ()
 
     @property
     def schema_name(self) -> str:
@@ -130,8 +134,8 @@ class StreamLayout:
         fields = [("time", "double"), ("host_time", "double"), ("marked", "fixed64")]
         fields += [("row", "sfixed64")] if self.rows else []
         taken = {name for name, _ in fields}
-        for signal, names in zip(self.signals, self.components, strict=True):
-            for component in names or ("",) * signal.width:
+        for signal in self.signals:
+            for component in signal.components:
                 name = unique_name(f"{signal.name}_{component}" if component else signal.name, taken)
                 fields.append((name, "double"))
         return fields
@@ -142,40 +146,15 @@ class StreamLayout:
 
     def metadata(self) -> dict[str, str]:
         """What the channel says of its signals, enough to make them again."""
-        names = [name for name, _ in self.fields()[self.first :]]
-        signals = []
-        for s in self.signals:
-            own, names = names[: s.width], names[s.width :]
-            signals.append(
-                {
-                    "name": s.name,
-                    "quantity": s.quantity,
-                    "unit": s.unit,
-                    "frame": s.frame,
-                    "clock": s.clock,
-                    "source": list(s.source),
-                    "components": own,
-                    "index": s.index,
-                }
-            )
-        return {"stream": self.stream, "rows": str(int(self.rows)), "signals": json.dumps(signals)}
+        names = iter([name for name, _ in self.fields()[self.first :]])
+        signals = [replace(s, components=tuple(next(names) for _ in s.components)) for s in self.signals]
+        text = json.dumps([asdict(s) for s in signals])
+        return {"stream": self.stream, "rows": str(int(self.rows)), "signals": text}
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> "StreamLayout":
-        """Inverse of `metadata`, of what reading needs. Raises ValueError, KeyError or TypeError on anything else."""
-        columns = tuple(
-            Column(
-                name=str(entry["name"]),
-                index=int(entry["index"]),
-                width=len(list(entry["components"])),
-                quantity=str(entry["quantity"]),
-                unit=str(entry["unit"]),
-                frame=str(entry["frame"]),
-                clock=str(entry["clock"]),
-                source=tuple(str(v) for v in entry["source"]),
-            )
-            for entry in json.loads(metadata["signals"])
-        )
+        """Inverse of `metadata`, of what reading needs. Raises ValueError or KeyError on anything else."""
+        columns = msgspec.json.decode(metadata["signals"], type=tuple[Column, ...])
         if not columns or len(columns) > MOST_SIGNALS or sum(c.width for c in columns) > MOST_FIELDS:
             raise ValueError("not a stream of signals")
         return cls("", str(metadata["stream"]), columns, metadata["rows"] == "1")

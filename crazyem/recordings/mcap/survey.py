@@ -36,13 +36,10 @@ class Part:
     announced: list[Any] = field(default_factory=list)
 
 
-def parts(
-    path: Path, problems: list[Problem], *, limit: int = mcap_scan.LARGEST_CHUNK, most: int | None = None
-) -> Iterator[Part]:
+def parts(path: Path, problems: list[Problem], *, most: int | None = None) -> Iterator[Part]:
     """All that can be read of a file, in its order; what cannot goes to `problems`.
 
     Args:
-        limit: bytes of the largest chunk that is unpacked.
         most: bytes of all chunks unpacked; None: a chunk, and so many times the size of the file.
 
     Raises: UsageError if it cannot be opened, FileFormatError for a decompression bomb.
@@ -51,12 +48,12 @@ def parts(
         with path.open("rb") as stream:
             if most is None:
                 most = mcap_scan.LARGEST_CHUNK + LARGEST_UNPACKED_RATIO * path.stat().st_size
-            yield from _parts(path, stream, problems, limit, most)
+            yield from _parts(path, stream, problems, most)
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror or error}.") from error
 
 
-def _parts(path: Path, stream: BinaryIO, problems: list[Problem], limit: int, most: int) -> Iterator[Part]:
+def _parts(path: Path, stream: BinaryIO, problems: list[Problem], most: int) -> Iterator[Part]:
     loose: list[Record] = []
     unpacked = waiting = 0
     for record in mcap_scan.records(stream, problems):
@@ -76,10 +73,10 @@ def _parts(path: Path, stream: BinaryIO, problems: list[Problem], limit: int, mo
             continue
         try:
             chunk = mcap_scan.parse_chunk(record.data)
-            unpacked += min(chunk.size, limit)
+            unpacked += min(chunk.size, mcap_scan.LARGEST_CHUNK)
             if unpacked > most:
                 raise FileFormatError(f"{path} unpacks to more than {most} bytes; it is no recording of a flight.")
-            scan = mcap_scan.scan(mcap_scan.unpack(chunk, limit=limit))
+            scan = mcap_scan.scan(mcap_scan.unpack(chunk))
         except ValueError as error:
             problems.append(Problem(Loss.DAMAGED, record.offset, record.end, str(error)))
             continue
