@@ -199,16 +199,21 @@ def finding(faults: Sequence[Fault], signals: Iterable[str] = ()) -> list[Findin
     evidence = {"records": float(count), "streams": float(len(faults))}
     if moved:
         evidence["shift_s"] = moved[0].example
-    return [
-        Finding(
-            STAMP_CHECK,
-            Grade.DEGRADES if grave else Grade.HARMLESS,
-            f"Stamps that cannot be: {'; '.join(said)}.",
-            evidence=evidence,
-            advice=advice,
-            fix=Fix(STAMP_CHECK, names) if names else None,
-        )
-    ]
+    found = Finding(
+        STAMP_CHECK,
+        Grade.DEGRADES if grave else Grade.HARMLESS,
+        f"Stamps that cannot be: {'; '.join(said)}.",
+        evidence=evidence,
+        advice=advice,
+        fix=Fix(STAMP_CHECK, names) if names else None,
+    )
+    return [found]
+
+
+def finding_in(faults: Sequence[Fault], signals: Mapping[str, SignalArray]) -> list[Finding]:
+    """As `finding`, of those of the signals whose stream is concerned."""
+    streams = {fault.stream for fault in faults}
+    return finding(faults, [name for name, array in signals.items() if array.stream in streams])
 
 
 def _words(fault: Fault) -> str:

@@ -16,8 +16,8 @@ from pymavlink.generator.mavcrc import x25crc
 from scipy.spatial.transform import Rotation
 
 from crazyem.errors import CrazyemError, FileFormatError
+from crazyem.links.mavlink.frames import checksum
 from crazyem.recordings.autopilots.tlog_file import read, recognises
-from crazyem.recordings.autopilots.tlog_frames import checksum
 from crazyem.recordings.contents import ReadOptions
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.registry import open_recording

@@ -5,6 +5,7 @@ bytes. Source: mavlink.io/en/guide/serialization.html.
 """
 
 import binascii
+import re
 import struct
 from collections import deque
 from collections.abc import Mapping
@@ -14,7 +15,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega
 
-_V1, _V2 = 0xFE, 0xFD
+FRAME_MARKS = _V1, _V2 = 0xFE, 0xFD
 _SIGNED, _SIGNATURE = 1, 13
 _LARGEST_BUFFER = 4096  # bytes that may wait for the rest of their frame; a frame has at most 280
 _REVERSED_BITS = bytes(int(f"{i:08b}"[::-1], 2) for i in range(256))
@@ -34,7 +35,7 @@ class Definition:
 def _definitions() -> dict[int, Definition]:
     found = {}
     for number, message in ardupilotmega.mavlink_map.items():
-        counts = [n if code != "s" else 0 for n, code in _layout(message.unpacker.format)]
+        counts = [n if code != "s" else 0 for n, code in layout(message.unpacker.format)]
         arrays = message.array_lengths
         fields = tuple((name, n if a and n else 0) for name, n, a in zip(message.ordered_fieldnames, counts, arrays))
         found[number] = Definition(message.msgname, number, message.crc_extra, message.unpacker, fields)
@@ -44,16 +45,9 @@ def _definitions() -> dict[int, Definition]:
     return found
 
 
-def _layout(form: str) -> list[tuple[int, str]]:
+def layout(form: str) -> list[tuple[int, str]]:
     """Count and letter of each part of a struct format."""
-    parts, digits = [], ""
-    for letter in form.lstrip("<"):
-        if letter.isdigit():
-            digits += letter
-        else:
-            parts.append((int(digits or 1), letter))
-            digits = ""
-    return parts
+    return [(int(count or 1), letter) for count, letter in re.findall(r"(\d*)([a-zA-Z])", form)]
 
 
 @cache
@@ -72,6 +66,30 @@ def checksum(data: bytes) -> int:
     """CRC-16/MCRF4XX: the reflected twin of the CCITT polynomial that binascii has in C."""
     straight = binascii.crc_hqx(data.translate(_REVERSED_BITS), 0xFFFF)
     return _REVERSED_BITS[straight & 0xFF] << 8 | _REVERSED_BITS[straight >> 8]
+
+
+def header(data: bytes, at: int) -> tuple[int, int, int, int, int, int, int] | None:
+    """Sequence, system, component, message; where the payload begins and ends, and where the frame at `at` ends.
+
+    None where no frame begins that is known here, or the data end within its head.
+    """
+    head = 10 if data[at] == _V2 else 6
+    if data[at] not in FRAME_MARKS or len(data) - at < head:
+        return None
+    if head == 10:
+        flags, _, sequence, system, component = data[at + 2 : at + 7]
+        number = int.from_bytes(data[at + 7 : at + 10], "little")
+    else:
+        flags, (sequence, system, component, number) = 0, data[at + 2 : at + 6]
+    if flags & ~_SIGNED:  # incompatible with what we know
+        return None
+    end = at + head + data[at + 1]
+    return sequence, system, component, number, at + head, end, end + 2 + (_SIGNATURE if flags else 0)
+
+
+def is_sound(data: bytes, at: int, end: int, seed: int) -> bool:
+    """Whether the checksum behind the payload that ends at `end` is that of the frame at `at`."""
+    return checksum(data[at + 1 : end] + bytes((seed,))) == data[end] | data[end + 1] << 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,38 +152,27 @@ class FrameParser:
 
     def _take(self, data: bytes, at: int, found: list[Frame]) -> int:
         """Bytes to go on by; 0: the frame that begins here is not complete."""
-        second = data[at] == _V2
-        head = 10 if second else 6
-        if len(data) - at < head:
+        if len(data) - at < (10 if data[at] == _V2 else 6):
             return 0
-        length = data[at + 1]
-        flags = data[at + 2] if second else 0
-        if flags & ~_SIGNED:  # incompatible with what we know
+        head = header(data, at)
+        if head is None:
             self.skipped += 1
             return 1
-        end = at + head + length
-        after = end + 2 + (_SIGNATURE if flags else 0)
-        if second:
-            sequence, system, component = data[at + 4 : at + 7]
-            number = int.from_bytes(data[at + 7 : at + 10], "little")
-        else:
-            sequence, system, component, number = data[at + 2 : at + 6]
+        sequence, system, component, number, start, end, after = head
         definition = definitions().get(number)
         if after > len(data):
             return 0
         if definition is None:
-            if after == len(data) or data[after] in (_V1, _V2):
+            if after == len(data) or data[after] in FRAME_MARKS:
                 self.unknown += 1
                 return after - at
             self.skipped += 1
             return 1
-        seeded = data[at + 1 : end] + bytes((definition.seed,))
-        if checksum(seeded) != data[end] | data[end + 1] << 8:
+        if not is_sound(data, at, end, definition.seed):
             self.damaged += 1
             self.skipped += 1
             return 1  # a frame may begin inside of what was taken for one
-        payload = data[at + head : end]
-        found.append(Frame(system, component, number, sequence, payload, data[at:after]))
+        found.append(Frame(system, component, number, sequence, data[start:end], data[at:after]))
         return after - at
 
 

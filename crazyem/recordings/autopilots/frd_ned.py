@@ -5,7 +5,7 @@ that it counts counter-clockwise seen from above. Both frames turn by half a tur
 vector v becomes D v and an attitude R becomes D R D, whose quaternion has the same scalar and x.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from crazyem.physics.rotations import euler_from_quaternion
 from crazyem.recordings.topics import floats
 
 Columns = Sequence[NDArray[np.generic]]
+Turn = Callable[[Columns], NDArray[np.float64]]
 
 WORLD = "world, north-west-up"
 ATTITUDE = "quaternion x y z w, body (FLU) to world (north-west-up)"
@@ -43,6 +44,16 @@ def quaternions(columns: Columns) -> NDArray[np.float64]:
 def euler(columns: Columns) -> NDArray[np.float64]:
     """(n, 3) roll, pitch, yaw [rad] of FLU to NWU from those of FRD to NED, both in order ZYX."""
     return vectors(columns)
+
+
+def scaled(factor: float, turned: Turn = stacked) -> Turn:
+    """What `turned` makes of columns, times a factor."""
+    return lambda columns: turned(columns) * factor
+
+
+def angles_of_quaternions(columns: Columns) -> NDArray[np.float64]:
+    """(n, 3) roll, pitch, yaw [rad] of FLU to NWU from columns w x y z of FRD to NED."""
+    return euler_from_quaternions(quaternions(columns))
 
 
 def euler_from_quaternions(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ numbers of MAVLink: a rate that changes is no loss.
 
 import itertools
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -196,26 +196,24 @@ class Link:
     before: NDArray[np.int64]
     after: NDArray[np.int64]
 
-    def findings(self, time: Callable[[NDArray[np.int64]], NDArray[np.float64]]) -> list[Finding]:
+    def findings(self, time: Callable[[NDArray[np.int64]], NDArray[np.float64]]) -> Iterator[Finding]:
         """One finding, with where messages are missing; none if nothing is.
 
         Args:
             time: from arrivals [us] to times on the axis of the recording [s].
         """
         if not self.lost:
-            return []
+            return
         share = self.lost / (self.lost + self.received)
         places = zip(time(self.before).tolist(), time(self.after).tolist(), strict=True)
-        return [
-            Finding(
-                "gaps",
-                Grade.HARMLESS if share < 0.02 else Grade.DEGRADES,
-                f"By their sequence numbers at least {self.lost} messages of the vehicle never reached the log "
-                f"({100.0 * share:.1f} %).",
-                intervals=tuple(places),
-                evidence={"lost": float(self.lost), "received": float(self.received), "share": share},
-            )
-        ]
+        yield Finding(
+            "gaps",
+            Grade.HARMLESS if share < 0.02 else Grade.DEGRADES,
+            f"By their sequence numbers at least {self.lost} messages of the vehicle never reached the log "
+            f"({100.0 * share:.1f} %).",
+            intervals=tuple(places),
+            evidence={"lost": float(self.lost), "received": float(self.received), "share": share},
+        )
 
 
 def link(found: Frameset, system: int, component: int, starts: NDArray[np.int64]) -> Link:

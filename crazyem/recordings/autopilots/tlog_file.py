@@ -20,7 +20,7 @@ from crazyem.recordings.autopilots.tlog_signals import RAW_IMU, TLOG_SIGNALS
 from crazyem.recordings.contents import ReadOptions, contents
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Event, Recording
-from crazyem.recordings.stamps import finding
+from crazyem.recordings.stamps import finding_in
 from crazyem.recordings.topics import Topic, damage, seconds, signals_of, text_of, unconnected
 
 _ARDUPILOT = 3
@@ -70,10 +70,9 @@ def read(path: Path, options: ReadOptions) -> Recording:
     signals, left_out = signals_of(topics, [m for source in sources for m in source.of(topics)])
     absent, unplugged = unconnected(topics, sources, signals)
     losses = link(found, system, clocks.component, clocks.starts)
-    streams = {fault.stream for fault in clocks.faults}
-    odd = finding(clocks.faults, [name for name, array in signals.items() if array.stream in streams])
-    findings = [*damage(found.skipped, size, "MAVLink frame"), *losses.findings(clocks.arrival), *others, *odd]
-    findings += [*clocks.findings(), *left_out, *unplugged, *_notes(signals, found, autopilot == _ARDUPILOT)]
+    findings = [*damage(found.skipped, size, "MAVLink frame"), *losses.findings(clocks.arrival), *others]
+    findings += [*finding_in(clocks.faults, signals), *clocks.findings(), *left_out, *unplugged]
+    findings += _notes(signals, found, autopilot == _ARDUPILOT)
     metadata = {
         "tlog": _about(found, system, clocks),
         "vehicle": vehicle_of(kind),

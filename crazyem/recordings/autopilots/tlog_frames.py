@@ -5,7 +5,6 @@ decodes one message at a time into an object; here the frames of one message are
 types, order and checksum seed that pymavlink knows. Source: mavlink.io/en/guide/serialization.html.
 """
 
-import binascii
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,16 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega
 
+from crazyem.links.mavlink.frames import FRAME_MARKS, header, is_sound, layout
+
 MESSAGES: Mapping[int, Any] = ardupilotmega.mavlink_map
 _EARLIEST_STAMP = 946_684_800_000_000  # us: the year 2000
 _LATEST_STAMP = 4_102_444_800_000_000  # us: the year 2100
-_V1, _V2 = 0xFE, 0xFD
-_SIGNED = 1
-_SIGNATURE = 13  # bytes
-_REVERSED_BITS = bytes(int(f"{i:08b}"[::-1], 2) for i in range(256))
 # where a frame may begin: a time of arrival between those years, and the mark of a frame
 _START = re.compile(rb"(?s)(?=\x00[\x03-\x0e].{6}[\xfd\xfe])")
-_TYPE = re.compile(r"(\d*)([a-zA-Z])")
 
 Key = tuple[int, int, int]  # system, component, message
 
@@ -56,12 +52,6 @@ class Frameset:
     total: int = 0
 
 
-def checksum(data: bytes) -> int:
-    """CRC-16/MCRF4XX, the checksum of MAVLink: the reflected twin of the CCITT polynomial that binascii has in C."""
-    straight = binascii.crc_hqx(data.translate(_REVERSED_BITS), 0xFFFF)
-    return _REVERSED_BITS[straight & 0xFF] << 8 | _REVERSED_BITS[straight >> 8]
-
-
 def scan(data: bytes, at_most: int | None = None) -> Frameset:
     """All sound frames of a log, or the first `at_most`."""
     found = Frameset()
@@ -84,25 +74,11 @@ def _frame(data: bytes, at: int, found: Frameset | None) -> int:
     stamp = int.from_bytes(data[at : at + 8], "big")
     if not _EARLIEST_STAMP < stamp < _LATEST_STAMP:
         return 0
-    magic, length = data[at + 8], data[at + 9]
-    if magic == _V2:
-        if at + 8 + 12 > len(data) or data[at + 10] & ~_SIGNED:
-            return 0
-        start = at + 18
-        after = start + length + 2 + (_SIGNATURE if data[at + 10] else 0)
-        key = (data[at + 13], data[at + 14], int.from_bytes(data[at + 15 : at + 18], "little"))
-        sequence = data[at + 12]
-    elif magic == _V1:
-        start = at + 14
-        after = start + length + 2
-        key = (data[at + 11], data[at + 12], data[at + 13])
-        sequence = data[at + 10]
-    else:
+    head = header(data, at + 8)
+    if head is None or head[-1] > len(data):
         return 0
-    if after > len(data):
-        return 0
+    sequence, *key, start, end, after = head
     message = MESSAGES.get(key[2])
-    end = start + length
     if message is None:
         if not _looks_like_frame(data, after):
             return 0
@@ -110,12 +86,10 @@ def _frame(data: bytes, at: int, found: Frameset | None) -> int:
             found.unknown += 1
             found.total += 1
         return after
-    if checksum(data[at + 9 : end] + bytes((message.crc_extra,))) != data[end] | data[end + 1] << 8:
+    if not is_sound(data, at + 8, end, message.crc_extra):
         return 0
     if found is not None:
-        frames = found.frames.get(key)
-        if frames is None:
-            frames = found.frames[key] = Frames()
+        frames = found.frames.setdefault((key[0], key[1], key[2]), Frames())
         frames.stamps.append(stamp)
         frames.places.append(found.total)
         frames.sequence.append(sequence)
@@ -130,7 +104,7 @@ def _looks_like_frame(data: bytes, at: int) -> bool:
         return True
     if at + 9 > len(data):
         return False
-    return _EARLIEST_STAMP < int.from_bytes(data[at : at + 8], "big") < _LATEST_STAMP and data[at + 8] in (_V1, _V2)
+    return _EARLIEST_STAMP < int.from_bytes(data[at : at + 8], "big") < _LATEST_STAMP and data[at + 8] in FRAME_MARKS
 
 
 def _resume(data: bytes, damaged: int) -> int:
@@ -149,7 +123,7 @@ def columns_of(message: Any, payloads: list[bytes]) -> dict[str, NDArray[np.gene
     """
     names: list[str] = []
     kinds: list[Any] = []
-    for field_name, (count, code) in zip(message.ordered_fieldnames, _layout(message), strict=True):
+    for field_name, (count, code) in zip(message.ordered_fieldnames, layout(message.unpacker.format), strict=True):
         if code == "s":
             names.append(field_name)
             kinds.append(f"S{count}")
@@ -163,11 +137,6 @@ def columns_of(message: Any, payloads: list[bytes]) -> dict[str, NDArray[np.gene
     size = dtype.itemsize
     table = np.frombuffer(b"".join([p[:size].ljust(size, b"\0") for p in payloads]), dtype)
     return {name: table[name] for name in names}
-
-
-def _layout(message: Any) -> list[tuple[int, str]]:
-    """Count and struct letter of each field, in the order in which they are sent."""
-    return [(int(count or 1), code) for count, code in _TYPE.findall(message.unpacker.format)]
 
 
 def units_of(message: Any, columns: Mapping[str, object]) -> dict[str, str]:

@@ -16,9 +16,10 @@ from crazyem.recordings.autopilots.frd_ned import (
     MOTORS,
     WORLD,
     Columns,
+    angles_of_quaternions,
     euler,
-    euler_from_quaternions,
     quaternions,
+    scaled,
     stacked,
     vectors,
 )
@@ -28,18 +29,8 @@ from crazyem.signals.mavlink import RPM_IN_RAD_PER_S, mapping
 ARMED = 128  # in HEARTBEAT.base_mode
 
 
-def _scaled(
-    factor: float, turned: Callable[[Columns], NDArray[np.float64]] = stacked
-) -> Callable[[Columns], NDArray[np.float64]]:
-    return lambda columns: turned(columns) * factor
-
-
 def _quaternions_of_angles(columns: Columns) -> NDArray[np.float64]:
     return quaternion_from_euler(*euler(columns).T)
-
-
-def _angles_of_quaternion(columns: Columns) -> NDArray[np.float64]:
-    return euler_from_quaternions(quaternions(columns))
 
 
 def _cells(columns: Columns) -> NDArray[np.float64]:
@@ -75,7 +66,7 @@ def _shared(signal: str, message: str) -> Source:
     row = mapping(signal, message)
     turned = {"vector": vectors, "quaternion": quaternions, "angles": _quaternions_of_angles}[row.kind]
     frame = {"position": WORLD, "velocity": WORLD, "attitude": ATTITUDE}.get(signal, BODY)
-    return Source(signal, message, row.fields, _scaled(row.factor, turned), frame=frame)
+    return Source(signal, message, row.fields, scaled(row.factor, turned), frame=frame)
 
 
 _XYZ = named("*", "x y z")
@@ -98,14 +89,14 @@ TLOG_SIGNALS: tuple[Source, ...] = (
     _shared("body_rate", "ATTITUDE"),
     _shared("specific_force", "HIGHRES_IMU"),
     _shared("specific_force", "SCALED_IMU"),
-    Source("rotor_speed", "ESC_STATUS", _RPMS, _scaled(RPM_IN_RAD_PER_S), frame=MOTORS, zero_is_absent=True),
-    Source("rotor_speed", "ESC_TELEMETRY_1_TO_4", _RPMS, _scaled(RPM_IN_RAD_PER_S), frame=MOTORS, zero_is_absent=True),
+    Source("rotor_speed", "ESC_STATUS", _RPMS, scaled(RPM_IN_RAD_PER_S), frame=MOTORS, zero_is_absent=True),
+    Source("rotor_speed", "ESC_TELEMETRY_1_TO_4", _RPMS, scaled(RPM_IN_RAD_PER_S), frame=MOTORS, zero_is_absent=True),
     Source("voltage", "BATTERY_STATUS", _VOLTAGES, _cells, _equal("voltages[0]", 65535), zero_is_absent=True),
     Source(
         "voltage",
         "SYS_STATUS",
         ("voltage_battery",),
-        _scaled(1e-3),
+        scaled(1e-3),
         _equal("voltage_battery", 65535),
         zero_is_absent=True,
     ),
@@ -122,7 +113,7 @@ TLOG_SIGNALS: tuple[Source, ...] = (
     Source("flying", "HEARTBEAT", ("base_mode",), _armed, frame="1 while armed"),
     Source("euler", "ATTITUDE", _ANGLES, euler, frame="roll, pitch, yaw (ZYX), body FLU to world (north-west-up)"),
     Source("setpoint_acceleration", _TARGET, named("af*", "x y z"), vectors, _masked(0x3C0, local=True), frame=WORLD),
-    Source("setpoint_euler", "ATTITUDE_TARGET", _Q, _angles_of_quaternion, _masked(0x80)),
+    Source("setpoint_euler", "ATTITUDE_TARGET", _Q, angles_of_quaternions, _masked(0x80)),
     Source("setpoint_rate", "ATTITUDE_TARGET", _BODY_RATES, vectors, _masked(0x07), frame=BODY),
     Source("position", "ATT_POS_MOCAP", _XYZ, vectors, frame=WORLD, origin="mocap"),
     Source("attitude", "ATT_POS_MOCAP", _Q, quaternions, frame=ATTITUDE, origin="mocap"),

@@ -6,7 +6,6 @@ Decoding is pyulog's; `ulog_scan` decides before what of a file is sound. What b
 
 import contextlib
 import io
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -23,9 +22,10 @@ from crazyem.recordings.autopilots.frd_ned import (
     MOTORS,
     WORLD,
     Columns,
+    angles_of_quaternions,
     euler,
-    euler_from_quaternions,
     quaternions,
+    scaled,
     stacked,
     vectors,
     vehicle_of,
@@ -33,15 +33,15 @@ from crazyem.recordings.autopilots.frd_ned import (
 from crazyem.recordings.autopilots.ulog_scan import HEADER_BYTES, ULOG_MAGIC, Scan, scan, unknown_flags
 from crazyem.recordings.contents import ReadOptions, contents
 from crazyem.recordings.finding import Finding, Grade, note
-from crazyem.recordings.recording import Recording, SignalArray
-from crazyem.recordings.stamps import Fault, believed, finding
+from crazyem.recordings.recording import Recording
+from crazyem.recordings.stamps import Fault, believed, finding_in
 from crazyem.recordings.topics import Source, Topic, damage, named, ranks, seconds, signals_of, text_of, unconnected
+from crazyem.signals.mavlink import RPM_IN_RAD_PER_S
 
 if TYPE_CHECKING:
     from pyulog import ULog
 
 AUTOPILOT_CLOCK = "autopilot"  # microseconds since boot
-_RPM = 2.0 * math.pi / 60.0
 _MOST_PARAMETERS = 4000  # that are kept as metadata
 _MOST_MESSAGES = 500  # texts of the autopilot that are kept
 _SECOND = 1_000_000  # us
@@ -75,15 +75,10 @@ def read(path: Path, options: ReadOptions) -> Recording:
     mapped = [m for source in _ULOG_SIGNALS for m in source.of(topics)]
     signals, left_out = signals_of(topics, mapped)
     absent, unplugged = unconnected(topics, _ULOG_SIGNALS, signals)
-    findings = [*_integrity(sound, topics, log), *finding(faults, _concerned(signals, faults)), *left_out]
+    findings = [*_integrity(sound, topics, log), *finding_in(faults, signals), *left_out]
     findings += [*unplugged, *_notes(signals)]
     metadata = _metadata(log) | {"vehicle": vehicle_of(_kind(log)), "not_measured": absent}
     return Recording(str(path), "ulog", signals, {k: v for k, v in metadata.items() if v}, tuple(findings))
-
-
-def _concerned(signals: Mapping[str, SignalArray], faults: list[Fault]) -> list[str]:
-    streams = {fault.stream for fault in faults}
-    return [name for name, array in signals.items() if array.stream in streams]
 
 
 def _kind(log: "ULog") -> int:
@@ -175,16 +170,8 @@ def _other_frame(topic: Topic) -> NDArray[np.bool_]:
     return np.ones(topic.time.size, bool) if frame is None else frame != 1
 
 
-def _rad_per_s(columns: Columns) -> NDArray[np.float64]:
-    return stacked(columns) * _RPM
-
-
 def _not(columns: Columns) -> NDArray[np.float64]:
     return (stacked(columns) == 0).astype(float)
-
-
-def _angles_of_quaternion(columns: Columns) -> NDArray[np.float64]:
-    return euler_from_quaternions(quaternions(columns))
 
 
 def _odometry(topic: str, origin: str) -> tuple[Source, Source]:
@@ -199,6 +186,7 @@ def _odometry(topic: str, origin: str) -> tuple[Source, Source]:
 _XYZ = named("*", "x y z")
 _THREE = "0 1 2"
 _FOUR = "0 1 2 3"
+_SPEED = scaled(RPM_IN_RAD_PER_S)
 
 _LOCAL = "vehicle_local_position"
 _TARGET = "vehicle_local_position_setpoint"
@@ -211,7 +199,7 @@ _ULOG_SIGNALS: tuple[Source, ...] = (
     Source("body_rate", "vehicle_attitude", named("*speed", "roll pitch yaw"), vectors, frame=BODY),
     Source("specific_force", "sensor_combined", named("accelerometer_m_s2[*]", _THREE), vectors, frame=BODY),
     Source("specific_force", "vehicle_acceleration", named("xyz[*]", _THREE), vectors, frame=BODY),
-    Source("rotor_speed", "esc_status", named("esc[*].esc_rpm", _FOUR), _rad_per_s, frame=MOTORS, zero_is_absent=True),
+    Source("rotor_speed", "esc_status", named("esc[*].esc_rpm", _FOUR), _SPEED, frame=MOTORS, zero_is_absent=True),
     Source("voltage", "battery_status", ("voltage_v",), stacked, zero_is_absent=True),
     Source("setpoint_position", _TARGET, _XYZ, vectors, absent_is_nan=True, frame=WORLD),
     Source("setpoint_velocity", _TARGET, named("*", "vx vy vz"), vectors, absent_is_nan=True, frame=WORLD),
@@ -222,7 +210,7 @@ _ULOG_SIGNALS: tuple[Source, ...] = (
         "setpoint_acceleration", _TARGET, named("acceleration[*]", _THREE), vectors, absent_is_nan=True, frame=WORLD
     ),
     Source("setpoint_acceleration", _TARGET, named("*", "acc_x acc_y acc_z"), vectors, absent_is_nan=True, frame=WORLD),
-    Source("setpoint_euler", "vehicle_attitude_setpoint", named("q_d[*]", _FOUR), _angles_of_quaternion),
+    Source("setpoint_euler", "vehicle_attitude_setpoint", named("q_d[*]", _FOUR), angles_of_quaternions),
     Source("setpoint_euler", "vehicle_attitude_setpoint", named("*_body", "roll pitch yaw"), euler),
     Source(
         "setpoint_rate",

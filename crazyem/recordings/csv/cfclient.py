@@ -24,7 +24,7 @@ from crazyem.recordings.contents import ReadOptions, contents
 from crazyem.recordings.csv.file import read as read_csv
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Recording
-from crazyem.recordings.stamps import Fault, finding
+from crazyem.recordings.stamps import Fault, finding_in
 from crazyem.recordings.tables import Table, signals_from_tables
 
 _VARIABLE = re.compile(r"[A-Za-z_]\w*\.[\w\[\]]+")
@@ -33,14 +33,7 @@ _DATE_FORMAT = "%Y%m%dT%H-%M-%S"
 _ONE_SESSION = 120.0  # s between estimates of when the drone was switched on: one session, blocks started late
 _MOST_FILES = 256  # in a folder
 _MOST_SIBLINGS = 32  # looked at where one file is read alone
-_RECORDING_SUFFIXES = {
-    "",
-    ".mcap",
-    ".ulg",
-    ".tlog",
-    ".db3",
-    ".parquet",
-}  # endings of what would be a recording of its own
+_RECORDING_SUFFIXES = {"", ".mcap", ".ulg", ".tlog", ".db3", ".parquet"}  # of what would be a recording of its own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,8 +113,7 @@ def read(path: Path, options: ReadOptions) -> Recording:
     metadata = {"cfclient": _metadata(path, full)}
     meaning = motor_meaning.decide(tables, given=options.motor, metadata=metadata)
     signals = signals_from_tables(tables, motor=meaning.meaning)
-    streams = {fault.stream for fault in faults}
-    findings += finding(faults, [name for name, array in signals.items() if array.stream in streams])
+    findings += finding_in(faults, signals)
     return Recording(str(path), "csv:cfclient", signals, metadata | meaning.metadata, (*findings, *meaning.findings))
 
 

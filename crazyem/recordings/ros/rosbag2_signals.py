@@ -16,7 +16,7 @@ from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.ros.ros2_messages import MessageType, Rows, rows_of
-from crazyem.recordings.stamps import Fault, finding
+from crazyem.recordings.stamps import Fault, finding_in
 from crazyem.recordings.tables import Table, signals_from_tables
 from crazyem.recordings.topics import Mapped, Topic, ranks, seconds, signals_of, text_of
 
@@ -171,13 +171,7 @@ def _damage(decoded: Sequence[_Decoded]) -> list[Finding]:
 
 def _stamp_faults(decoded: Sequence[_Decoded], signals: Mapping[str, SignalArray]) -> list[Finding]:
     """Stamps of the host's clock that were not believed."""
-    faults = []
-    for d in decoded:
-        if d.moved and d.clock == HOST_CLOCK:
-            first = float(d.rows.stamp[d.unknown][0]) / _NS
-            faults.append(Fault(_label(d), int(d.unknown.sum()), d.unknown.size, "placed by arrival", first))
-    streams = {fault.stream for fault in faults}
-    return finding(faults, [name for name, array in signals.items() if array.stream in streams])
+    return finding_in([d.fault() for d in decoded if d.moved and d.clock == HOST_CLOCK], signals)
 
 
 _PREFERRED = {"mocap": 1, "tf": 2}
