@@ -2,12 +2,12 @@
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import NO_FLOAT_WARNINGS, Cadence, Stream, cadence, listed, longest, streams
+from crazyem.doctor.streams import Cadence, Stream, cadence, listed, longest, streams
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.stamps import RESTART_SECONDS
@@ -29,7 +29,6 @@ _USUAL_RATES = (
 CLOCK_JUMP = 0.3  # s by which two clocks may part from one packet to the next: a radio link stalls for less
 
 
-@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """Findings per stream, and for the drone's clock against the host's."""
     found = []
@@ -46,7 +45,7 @@ def check(recording: Recording) -> list[Finding]:
             continue
         found += _jumps(stream, *arrivals)
         if arrivals[0].size > drifts.get(stream.clock, (0, []))[0]:
-            drifts[stream.clock] = (arrivals[0].size, _drift(arrivals[0], arrivals[1], several=several))
+            drifts[stream.clock] = (arrivals[0].size, [*_drift(*arrivals[:2], several=several)])
     found += [_rate_finding(nominal, real, names) for (nominal, real), names in rates.items()]
     return [*found, *(finding for _, findings in drifts.values() for finding in findings)]
 
@@ -216,7 +215,7 @@ def _arrivals(stream: Stream) -> tuple[Column, Column, NDArray[np.int64]] | None
     return time, offset, np.flatnonzero(known)
 
 
-def _jumps(stream: Stream, time: Column, offset: Column, rows: NDArray[np.int64]) -> list[Finding]:
+def _jumps(stream: Stream, time: Column, offset: Column, rows: NDArray[np.int64]) -> Iterator[Finding]:
     # a late packet leaves the line and comes back; a jump stays: compare the medians of what is around
     candidates = np.flatnonzero(np.abs(np.diff(offset)) > CLOCK_JUMP)
     sizes = []
@@ -227,52 +226,48 @@ def _jumps(stream: Stream, time: Column, offset: Column, rows: NDArray[np.int64]
         if abs(size) > CLOCK_JUMP:
             sizes.append((int(i), size))
     if not sizes:
-        return []
+        return
     worst = max(sizes, key=lambda pair: abs(pair[1]))
     forward = worst[1] < 0
-    return [
-        Finding(
-            "clocks",
-            Grade.DEGRADES,
-            f"{stream.name}: the drone's clock jumps {len(sizes)} times against the host's, at most by "
-            f"{abs(worst[1]):.3f} s {'ahead' if forward else 'back'}.",
-            intervals=longest((float(time[i]), float(time[i + 1])) for i, _ in sizes),
-            evidence={"jumps": len(sizes), "largest_s": -worst[1]},
-            advice="Take the jumps out (--fix), or use a part between them (--from, --to).",
-            fix=Fix(
-                "unwrap",
-                stream.names,
-                factor=tuple(size for _, size in sizes),
-                rows=np.array([rows[i + 1] for i, _ in sizes], np.int64),
-            ),
-        )
-    ]
+    yield Finding(
+        "clocks",
+        Grade.DEGRADES,
+        f"{stream.name}: the drone's clock jumps {len(sizes)} times against the host's, at most by "
+        f"{abs(worst[1]):.3f} s {'ahead' if forward else 'back'}.",
+        intervals=longest((float(time[i]), float(time[i + 1])) for i, _ in sizes),
+        evidence={"jumps": len(sizes), "largest_s": -worst[1]},
+        advice="Take the jumps out (--fix), or use a part between them (--from, --to).",
+        fix=Fix(
+            "unwrap",
+            stream.names,
+            factor=tuple(size for _, size in sizes),
+            rows=np.array([rows[i + 1] for i, _ in sizes], np.int64),
+        ),
+    )
 
 
-def _drift(time: Column, offset: Column, *, several: bool) -> list[Finding]:
+def _drift(time: Column, offset: Column, *, several: bool) -> Iterator[Finding]:
     """Slope of the earliest arrivals of each of twenty spans: delays only ever add."""
     duration = float(time[-1] - time[0])
     if duration < 5.0 or np.abs(np.diff(offset)).max() > CLOCK_JUMP:
-        return []
+        return
     edges = np.searchsorted(time, np.linspace(time[0], time[-1], 21))
     picks = [a + int(np.argmin(offset[a:b])) for a, b in itertools.pairwise(edges.tolist()) if b > a]
     if len(picks) < 8:
-        return []
+        return
     x, y = time[picks], offset[picks]
     line, covariance = np.polyfit(x - x.mean(), y, 1, cov=True)
     slope = float(line[0])
     deviation = 2.1 * float(np.sqrt(covariance[0, 0]))  # 95 % of Student's t at 18 degrees of freedom
     apart = abs(slope) * duration
     if abs(slope) < 2.0 * deviation or apart < 0.005 or abs(slope) < 2e-5:
-        return []
+        return
     ppm = -1e6 * slope
-    return [
-        Finding(
-            "clocks",
-            Grade.DEGRADES if several and apart > 0.02 else Grade.HARMLESS,
-            f"The drone's clock runs {abs(ppm):.0f} ppm {'fast' if ppm > 0 else 'slow'} against the host's: "
-            f"{1000 * apart:.1f} ms over the recording.",
-            evidence={"drift_ppm": ppm, "ci95_ppm": 1e6 * deviation, "apart_s": apart, "duration_s": duration},
-            advice="Compare streams of the two clocks only after a fit of offset and drift.",
-        )
-    ]
+    yield Finding(
+        "clocks",
+        Grade.DEGRADES if several and apart > 0.02 else Grade.HARMLESS,
+        f"The drone's clock runs {abs(ppm):.0f} ppm {'fast' if ppm > 0 else 'slow'} against the host's: "
+        f"{1000 * apart:.1f} ms over the recording.",
+        evidence={"drift_ppm": ppm, "ci95_ppm": 1e6 * deviation, "apart_s": apart, "duration_s": duration},
+        advice="Compare streams of the two clocks only after a fit of offset and drift.",
+    )

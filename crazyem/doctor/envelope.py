@@ -1,5 +1,6 @@
 """How hard a recording flew while it was in the air."""
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -52,44 +53,49 @@ def envelope(recording: Recording, air: Airtime) -> Envelope:
         found["speed_from"], velocity = speed
         norm = np.linalg.norm(velocity, axis=1)
         found["speed_max_m_s"], found["speed_rms_m_s"] = float(norm.max()), float(np.sqrt(np.mean(norm**2)))
-        found["vertical_speed_min_m_s"] = float(velocity[:, 2].min())
-        found["vertical_speed_max_m_s"] = float(velocity[:, 2].max())
-        del velocity, norm  # of a long flight, one signal at a time
-    del speed
-    for name, upright in (("attitude", _upright_of_quaternion), ("euler", _upright_of_euler)):
+        found |= _range("vertical_speed_{}_m_s", velocity[:, 2])
+        del speed, velocity, norm  # of a long flight, one signal at a time
+    for name, extremes in _EXTREMES.items():
         value = inside_of(recording, name, air)
-        if value is not None:
-            found["tilt_from"] = name
-            found["tilt_max_deg"] = float(np.degrees(np.arccos(np.clip(upright(value).min(), -1.0, 1.0))))
-            break
-    value = None
-    rate = inside_of(recording, "body_rate", air)
-    if rate is not None:
-        found["body_rate_max_rad_s"] = tuple(float(r) for r in np.abs(rate).max(axis=0))
-    del rate
-    position = inside_of(recording, "position", air)
-    if position is not None:
-        found["altitude_min_m"], found["altitude_max_m"] = float(position[:, 2].min()), float(position[:, 2].max())
-    del position
-    acceleration = inside_of(recording, "acceleration", air)
-    if acceleration is not None:
-        found["acceleration_max_m_s2"] = float(np.linalg.norm(acceleration, axis=1).max())
-    del acceleration
-    force = inside_of(recording, "specific_force", air)
-    if force is not None:
-        norm = np.linalg.norm(force, axis=1)
-        found["specific_force_min_m_s2"], found["specific_force_max_m_s2"] = float(norm.min()), float(norm.max())
-        del norm
-    del force
-    voltage = inside_of(recording, "voltage", air)
-    if voltage is not None:
-        found["voltage_start_V"], found["voltage_end_V"] = float(voltage[0, 0]), float(voltage[-1, 0])
-        found["voltage_min_V"] = float(voltage.min())
-    command = inside_of(recording, "motor_command", air)
-    if command is not None:
-        found["motor_command_max"] = float(command.max())
-        found["motor_saturated_share"] = float((command >= SATURATED_DUTY).any(axis=1).mean())
+        if value is not None and not (name == "euler" and "tilt_from" in found):
+            found |= extremes(value)
+        del value
     return Envelope(air.seconds, air.judged_by, airborne_intervals_s=air.flown, **found)
+
+
+def _range(key: str, value: Array) -> dict[str, float]:
+    return {key.format("min"): float(value.min()), key.format("max"): float(value.max())}
+
+
+def _tilt(source: str, upright: Array) -> dict[str, Any]:
+    """From the cosines (n,) of the tilt."""
+    return {"tilt_from": source, "tilt_max_deg": float(np.degrees(np.arccos(np.clip(upright.min(), -1.0, 1.0))))}
+
+
+def _upright(q: Array) -> Array:
+    """Cosine of the tilt, from (n, 4) x y z w of any length but zero."""
+    square = np.sum(q**2, axis=1)
+    return 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2) / np.where(square > 0.0, square, 1.0)
+
+
+# Signal -> what its samples in the air (n, c) say; angles where there is no quaternion.
+_EXTREMES: dict[str, Callable[[Array], dict[str, Any]]] = {
+    "attitude": lambda q: _tilt("attitude", _upright(q)),
+    "euler": lambda angles: _tilt("euler", np.cos(angles[:, 0]) * np.cos(angles[:, 1])),
+    "body_rate": lambda rate: {"body_rate_max_rad_s": tuple(float(r) for r in np.abs(rate).max(axis=0))},
+    "position": lambda position: _range("altitude_{}_m", position[:, 2]),
+    "acceleration": lambda a: {"acceleration_max_m_s2": float(np.linalg.norm(a, axis=1).max())},
+    "specific_force": lambda force: _range("specific_force_{}_m_s2", np.linalg.norm(force, axis=1)),
+    "voltage": lambda volts: {
+        "voltage_start_V": float(volts[0, 0]),
+        "voltage_end_V": float(volts[-1, 0]),
+        "voltage_min_V": float(volts.min()),
+    },
+    "motor_command": lambda duty: {
+        "motor_command_max": float(duty.max()),
+        "motor_saturated_share": float((duty >= SATURATED_DUTY).any(axis=1).mean()),
+    },
+}
 
 
 def inside_of(recording: Recording, name: str, air: Airtime) -> Array | None:
@@ -124,14 +130,3 @@ def _speed(recording: Recording, air: Airtime) -> tuple[str, Array] | None:
         return None
     span = time[later[whole]] - time[whole]
     return "position", (position[later[whole]] - position[whole]) / span[:, None]
-
-
-def _upright_of_quaternion(q: Array) -> Array:
-    """Cosine of the tilt, from (n, 4) x y z w of any length but zero."""
-    square = np.sum(q**2, axis=1)
-    return 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2) / np.where(square > 0.0, square, 1.0)
-
-
-def _upright_of_euler(angles: Array) -> Array:
-    """Cosine of the tilt, from (n, 3) roll, pitch, yaw [rad]."""
-    return np.cos(angles[:, 0]) * np.cos(angles[:, 1])

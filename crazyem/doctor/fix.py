@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.doctor import CHECKS
+from crazyem.doctor.kinematics import continuous
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.finding import Finding, Fix
 from crazyem.recordings.ordering import sound_samples
@@ -184,9 +185,7 @@ def _on_rows(old: Array, new: Array, rows: NDArray[np.int64] | None) -> Array:
 
 def _attitude_at(stamps: Array, attitude: Array, time: Array) -> Array:
     """Unit quaternions (n, 4) at times (n,), between neighbours; NaN where none is near."""
-    flips = np.append(0, np.cumsum(np.sum(attitude[1:] * attitude[:-1], axis=1) < 0.0))
-    continuous = attitude * np.where(flips % 2 == 1, -1.0, 1.0)[:, None]
-    mixed = np.column_stack([np.interp(time, stamps, column) for column in continuous.T])
+    mixed = np.column_stack([np.interp(time, stamps, column) for column in continuous(attitude).T])
     mixed /= np.linalg.norm(mixed, axis=1, keepdims=True)
     after = np.minimum(np.searchsorted(stamps, time), stamps.size - 1)
     before = np.maximum(after - 1, 0)

@@ -5,13 +5,14 @@ what a landing does not have: a fast fall or slide into the ground, a drone that
 """
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import NO_FLOAT_WARNINGS, longest, runs
+from crazyem.doctor.streams import longest, runs
 from crazyem.recordings.airborne import Airtime, airtime
-from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.finding import Finding, Grade, intervals_of
 from crazyem.recordings.ordering import Intervals, inside, ordered
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.thrust import is_rotorcraft, kind_objection
@@ -25,7 +26,6 @@ CARRIED_HEIGHT = 0.3  # m of height that a drone changes whose rotors do not tur
 DROP_HEIGHT = 0.4  # m above ground at which rotors stop
 
 
-@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """No flight, a recording that is cut, upsets and crashes."""
     flight = airtime(recording)
@@ -69,7 +69,7 @@ def _no_flight(flight: Airtime) -> Finding:
     )
 
 
-def _course(flight: Airtime) -> list[Finding]:
+def _course(flight: Airtime) -> Iterator[Finding]:
     """Where a recording begins or ends in the air, or holds several flights: the times in the air."""
     at_work = flight.airborne if flight.by_height_alone else flight.lifting
     starts, ends = at_work[0][0] <= flight.begin, at_work[-1][1] >= flight.end
@@ -83,23 +83,21 @@ def _course(flight: Airtime) -> list[Finding]:
     if ends:
         remarks.append(f"ends {where}")
     if not remarks:
-        return []
+        return
     total = flight.seconds
     evidence = {"airborne_s": total, "flights": float(count)}
     if not starts:
         evidence["take_off_s"] = flight.flown[0][0]
     if not ends:
         evidence["landing_s"] = flight.flown[-1][1]
-    return [
-        Finding(
-            "flight",
-            Grade.HARMLESS,
-            f"The recording {' and '.join(remarks)}; {total:.1f} s in the air.",
-            intervals=longest(flight.flown),
-            evidence=evidence,
-            advice="Nothing to do.",
-        )
-    ]
+    yield Finding(
+        "flight",
+        Grade.HARMLESS,
+        f"The recording {' and '.join(remarks)}; {total:.1f} s in the air.",
+        intervals=longest(flight.flown),
+        evidence=evidence,
+        advice="Nothing to do.",
+    )
 
 
 # -- attitude ---------------------------------------------------------------------------------------------------------
@@ -120,9 +118,9 @@ def _tilt(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64
     return time, np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))
 
 
-def _upsets(flight: Airtime, tilt: tuple[NDArray[np.float64], NDArray[np.float64]] | None) -> list[Finding]:
+def _upsets(flight: Airtime, tilt: tuple[NDArray[np.float64], NDArray[np.float64]] | None) -> Iterator[Finding]:
     if tilt is None:
-        return []
+        return
     time, angle = tilt
     rows = inside(time, flight.airborne) & (angle > UPSET_TILT)
     # one wild sample is a bad number, not a roll-over
@@ -130,22 +128,20 @@ def _upsets(flight: Airtime, tilt: tuple[NDArray[np.float64], NDArray[np.float64
         if last - first < 3:
             rows[first:last] = False
     if not rows.any():
-        return []
-    spans = [(float(time[a]), float(time[b - 1])) for a, b in runs(rows)]
-    return [
-        Finding(
-            "flight",
-            Grade.DEGRADES,
-            f"The drone is upside down in the air {len(spans)} times (tilt up to {angle[rows].max():.0f} degrees).",
-            intervals=longest(spans),
-            evidence={
-                "tilt_deg": float(angle[rows].max()),
-                "times": len(spans),
-                "lasting_s": sum(b - a for a, b in spans),
-            },
-            advice="If that was no flip on purpose, use the flight before it only.",
-        )
-    ]
+        return
+    spans = intervals_of(time, rows)
+    yield Finding(
+        "flight",
+        Grade.DEGRADES,
+        f"The drone is upside down in the air {len(spans)} times (tilt up to {angle[rows].max():.0f} degrees).",
+        intervals=longest(spans),
+        evidence={
+            "tilt_deg": float(angle[rows].max()),
+            "times": len(spans),
+            "lasting_s": sum(b - a for a, b in spans),
+        },
+        advice="If that was no flip on purpose, use the flight before it only.",
+    )
 
 
 def _lying(
@@ -211,11 +207,11 @@ def _path(recording: Recording) -> tuple[NDArray[np.float64], NDArray[np.float64
     return None
 
 
-def _impacts(recording: Recording, flight: Airtime) -> list[Finding]:
+def _impacts(recording: Recording, flight: Airtime) -> Iterator[Finding]:
     """Speed of the approach to the ground, over the last tenth of a second before it."""
     path = _path(recording)
     if path is None or not math.isfinite(flight.ground):
-        return []
+        return
     time, position = path
     hits: list[tuple[float, float]] = []
     for start, end in flight.airborne:
@@ -234,20 +230,18 @@ def _impacts(recording: Recording, flight: Airtime) -> list[Finding]:
                 if HARD_LANDING_SPEED < speed < IMPOSSIBLE_SPEED and down > 0.5 * HARD_LANDING_SPEED:
                     hits.append((float(time[i]), speed))
     if not hits:
-        return []
+        return
     when, speed = max(hits, key=lambda hit: hit[1])
     spans: Intervals = tuple((t - 0.1, t + 0.5) for t, _ in hits)
     over = all(end < hits[0][0] for _, end in flight.lifting)
-    return [
-        Finding(
-            "flight",
-            Grade.HARMLESS if over else Grade.DEGRADES,
-            f"The drone hits the ground at {speed:.1f} m/s{', its rotors already stopped' if over else ''}.",
-            intervals=longest(spans),
-            evidence={"speed_m_s": speed, "time_s": when, **_violence(recording, when)},
-            advice=f"Use the flight up to about {when - 0.1:.1f} s; the onboard filter suffers from such a shock.",
-        )
-    ]
+    yield Finding(
+        "flight",
+        Grade.HARMLESS if over else Grade.DEGRADES,
+        f"The drone hits the ground at {speed:.1f} m/s{', its rotors already stopped' if over else ''}.",
+        intervals=longest(spans),
+        evidence={"speed_m_s": speed, "time_s": when, **_violence(recording, when)},
+        advice=f"Use the flight up to about {when - 0.1:.1f} s; the onboard filter suffers from such a shock.",
+    )
 
 
 def _drops(recording: Recording, flight: Airtime) -> list[Finding]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from crazyem.doctor import axes
-from crazyem.doctor.hypotheses import Comparison, compare_hypotheses, misread
+from crazyem.doctor.hypotheses import Comparison, compare_hypotheses, misread, wrong_unit
 from crazyem.doctor.kinematics import (
     GRAVITY,
     GRID_STEP,
@@ -32,6 +32,24 @@ LEAST_EXPLAINED_SHARE = 0.5  # share of the variance about the mean that a hypot
 SCALE_FAULT = 0.05
 VELOCITY_TOLERANCE = 0.04  # how far a velocity may be from its position's derivative to be trusted
 HOVER_SPEED_RMS = 0.03  # m/s rms
+_WITHOUT_GRAVITY = "it is the acceleration in the {} frame without gravity, not the specific force"
+_AS_ACCELERATION = "Read it as acceleration; add gravity to get the specific force."
+_FORCE_MISREAD = {
+    "world": ("it is in the world frame, not the body frame", "Rotate it into the body frame by the attitude."),
+    "body, gravity removed": (_WITHOUT_GRAVITY.format("body"), _AS_ACCELERATION),
+    "world, gravity removed": (_WITHOUT_GRAVITY.format("world"), _AS_ACCELERATION),
+    "turned twice": (
+        "it was turned from world to body although it was in the body frame already",
+        "Read it as a specific force, not as one of the world.",
+    ),
+}
+_ACCELERATION_MISREAD = {
+    "specific force": (
+        "it is the specific force in the body frame, not the acceleration in the world frame",
+        "Correct it where it is read.",
+    ),
+    "body, gravity removed": ("it is in the body frame, not the world frame", "Correct it where it is read."),
+}
 FORCE_UNITS = {"g": 1.0 / GRAVITY, "mg": 1e3 / GRAVITY, "cm/s^2": 1e2, "mm/s^2": 1e3, "g taken twice": GRAVITY}
 
 
@@ -154,9 +172,8 @@ def _judge_level(
     advice = "Correct its unit where it is read."
     for unit, factor in FORCE_UNITS.items():
         if abs(math.log(max(abs(level), 1e-9) / factor)) < math.log(1.3) and (level > 0 or not signed):
-            what = _unit_said(unit) + ", not m/s^2"
-            fix = Fix("scale", (name,), (1.0 / factor,) * 3)
-            return [Finding("forces", Grade.UNUSABLE, f"{head}{what}.", name, (), evidence, advice, fix)]
+            text = f"{head}{_unit_said(unit)}, not m/s^2."
+            return [wrong_unit("forces", name, text, factor, evidence, advice)]
     if seen is None and not signed:
         return []
     if abs(level) < 0.3:
@@ -166,8 +183,7 @@ def _judge_level(
             return [Finding("forces", Grade.UNUSABLE, text, name, (), evidence, "Add gravity again, or read it so.")]
         return []
     if level < -0.7:
-        fix = Fix("scale", (name,), (-1.0,) * 3)
-        return [Finding("forces", Grade.UNUSABLE, f"{head}its sign is inverted.", name, (), evidence, advice, fix)]
+        return [wrong_unit("forces", name, f"{head}its sign is inverted.", -1.0, evidence, advice)]
     if seen is not None and abs(level - 1.0) >= SCALE_FAULT and abs(level - 1.0) > 4.0 * error:
         return [_scale(name, level, error, seen, evidence)]
     return []
@@ -200,23 +216,12 @@ def _scale(name: str, level: float, error: float, seen: Comparison, evidence: Ma
 
 
 def _structure(name: str, seen: Comparison) -> Finding:
-    choice = seen.choice
-    head = f"{name} against {seen.against}: "
-    tail = (
-        f" ({100.0 * seen.evidence()['explained']:.1f} % of its variance explained, "
-        f"as declared {100.0 * choice.explained[seen.declared]:.1f} %)."
-    )
-    text = ""
-    if choice.name == "world" and abs(_level(seen)[0]) < 0.3 * abs(seen.whole.value if seen.whole else 1.0):
-        text = f"{head}it is the acceleration in the world frame without gravity, not the specific force{tail}"
-        advice = "Read it as acceleration."
-    elif choice.name.endswith("gravity removed"):
-        where = choice.name.partition(",")[0]
-        text = f"{head}it is the acceleration in the {where} frame without gravity, not the specific force{tail}"
-        advice = "Read it as acceleration; add gravity to get the specific force."
-    if text:
-        return Finding("forces", Grade.UNUSABLE, text, name, (), seen.evidence(), advice)
-    return misread("forces", name, seen, noun="specific force", head=head, tail=tail)
+    known = _FORCE_MISREAD
+    fix: Fix | None = Fix("world_to_body", (name,))
+    if abs(_level(seen)[0]) < 0.3 * abs(seen.whole.value if seen.whole else 1.0):  # of a force it would be gravity
+        known = known | {"world": (_WITHOUT_GRAVITY.format("world"), "Read it as acceleration.")}
+        fix = None
+    return misread("forces", name, seen, known, noun="specific force", what="", fix=fix)
 
 
 def _acceleration(name: str, array: SignalArray, recording: Recording, attitudes: list[Pose]) -> list[Finding]:
@@ -243,13 +248,11 @@ def _acceleration(name: str, array: SignalArray, recording: Recording, attitudes
     evidence = seen.evidence()
     head = f"{name} against {seen.against}: "
     if seen.choice.denied:
-        return [_acceleration_structure(name, head, seen)]
+        return [misread("forces", name, seen, _ACCELERATION_MISREAD, noun="world's", what="")]
     unit = axes.known_factor(seen.whole, FORCE_UNITS)
     if unit:
         text = f"{head}it is {seen.whole.value:.4g} times as large: {_unit_said(unit[0])}, not m/s^2."
-        fix = Fix("scale", (name,), (1.0 / unit[1],) * 3)
-        advice = "Correct its unit where it is read."
-        return [Finding("forces", Grade.UNUSABLE, text, name, (), evidence, advice, fix)]
+        return [wrong_unit("forces", name, text, unit[1], evidence, "Correct its unit where it is read.")]
     level = float(seen.mean[2] - seen.whole.value * seen.predicted[2]) / (GRAVITY * seen.whole.value)
     if abs(level - 1.0) < 0.3:
         text = f"{head}gravity is still in it (its mean is {seen.mean[2]:.2f} m/s^2 along z)."
@@ -264,22 +267,3 @@ def _acceleration(name: str, array: SignalArray, recording: Recording, attitudes
         "Use the derivative of the velocity; a tilt that its filter takes for larger than it is makes such a factor."
     )
     return [Finding("forces", Grade.DEGRADES, text, name, (), numbers, advice)]
-
-
-def _acceleration_structure(name: str, head: str, seen: Comparison) -> Finding:
-    choice = seen.choice
-    fix: Fix | None = None
-    if choice.name == "specific force":
-        what = "it is the specific force in the body frame, not the acceleration in the world frame"
-    elif choice.name == "body, gravity removed":
-        what = "it is in the body frame, not the world frame"
-    elif choice.name.startswith("world "):
-        signs = choice.name.removeprefix("world ")
-        factor = axes.sign_factor(signs)
-        fix = Fix("scale", (name,), factor) if factor else None
-        what = f"its components are {signs} of the world's"
-    else:
-        what = "it is not what it is declared to be, but which axes or frame it has cannot be told"
-    share, declared = 100.0 * seen.evidence()["explained"], 100.0 * choice.explained[seen.declared]
-    text = f"{head}{what} ({share:.1f} % of its variance explained, as declared {declared:.1f} %)."
-    return Finding("forces", Grade.UNUSABLE, text, name, (), seen.evidence(), "Correct it where it is read.", fix)

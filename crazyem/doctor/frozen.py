@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import COMMAND_SIGNALS, NO_FLOAT_WARNINGS, listed, longest, runs
+from crazyem.doctor.streams import COMMAND_SIGNALS, listed, longest, runs
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.ordering import inside
@@ -39,7 +39,6 @@ _LEAST_MOTION = {
 }  # m, m/s, rad meanwhile, as others say
 
 
-@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """Whole signals and single components that stand still in flight; constant columns, in one finding."""
     flight = airtime(recording)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import NO_FLOAT_WARNINGS, Cadence, Stream, cadence, graded, listed, longest, streams
+from crazyem.doctor.streams import Cadence, Stream, cadence, graded, listed, longest, streams
 from crazyem.recordings.finding import Finding, Grade, percent
 from crazyem.recordings.ordering import Intervals
 from crazyem.recordings.recording import Recording
@@ -20,7 +20,6 @@ _CATCH_UP_INTERVALS = 3  # neighbouring intervals over which a late record may c
 _RATE_WINDOW, _SLOWER_RATIO, _INTERVAL_TOLERANCE, _EQUAL_INTERVAL_SHARE = 9, 1.5, 0.2, 0.8
 
 
-@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """Records missing within streams, streams that stop early or start late, and silence of everything."""
     groups = [stream for stream in streams(recording) if stream.time.size > 1]

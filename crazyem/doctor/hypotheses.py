@@ -181,30 +181,48 @@ def agreed_scale(looks: Sequence[Comparison], least: float) -> tuple[Comparison,
     return (*best, len(found)) if len(directions) == 1 else None
 
 
-def misread(check: str, name: str, seen: Comparison, *, noun: str, head: str, tail: str) -> Finding:
+def misread(
+    check: str,
+    name: str,
+    seen: Comparison,
+    known: Mapping[str, tuple[str, str]],
+    *,
+    noun: str,
+    what: str = "the derivative of ",
+    fix: Fix | None = None,
+) -> Finding:
     """The finding that a vector is in another frame or has other axes than declared.
 
     Args:
-        check: whose finding. name: signal. noun: what the vector is ("body rate").
-        head, tail: what the text begins and ends with.
+        check: whose finding. name: signal. noun: what the components are of ("body rate").
+        known: hypothesis -> what the vector then is, and what to do.
+        what: was made of what it was compared with.
+        fix: repairs the first of the known.
     """
-    choice = seen.choice.name
-    fix: Fix | None = None
+    choice, frame = seen.choice.name, seen.declared
     advice = "Correct its frame, axes or signs where it is read."
-    if choice == "world":
-        text, fix = "it is in the world frame, not the body frame", Fix("world_to_body", (name,))
-        advice = "Rotate it into the body frame by the attitude."
-    elif choice == "turned twice":
-        text = "it was turned from world to body although it was in the body frame already"
-        advice = f"Read it as a {noun}, not as one of the world."
-    elif choice.startswith("body "):
-        signs = choice.removeprefix("body ")
+    if choice in known:
+        text, advice = known[choice]
+        fix = fix if choice == next(iter(known)) else None
+    elif choice.startswith(f"{frame} "):
+        signs = choice.removeprefix(f"{frame} ")
         text = f"its components are {signs} of the {noun}"
         factor = axes.sign_factor(signs)
         fix = Fix("scale", (name,), factor) if factor else None
     else:
-        text = "it is not what it is declared to be, but which axes or frame it has cannot be told"
-    return Finding(check, Grade.UNUSABLE, f"{head}{text}{tail}", name, (), seen.evidence(), advice, fix)
+        text, fix = "it is not what it is declared to be, but which axes or frame it has cannot be told", None
+    share, declared = 100.0 * seen.evidence()["explained"], 100.0 * seen.choice.explained[frame]
+    tail = f" ({share:.2f} % of its variance explained, as declared {declared:.2f} %)."
+    text = f"{name} against {what}{seen.against}: {text}{tail}"
+    return Finding(check, Grade.UNUSABLE, text, name, (), seen.evidence(), advice, fix)
+
+
+def wrong_unit(
+    check: str, name: str, text: str, factor: float, evidence: Mapping[str, float], advice: str = "Correct its unit."
+) -> Finding:
+    """The finding that a vector is `factor` times what it would be in SI."""
+    fix = Fix("scale", (name,), (1.0 / factor,) * 3)
+    return Finding(check, Grade.UNUSABLE, text, name, (), evidence, advice, fix)
 
 
 def wrong_scale(

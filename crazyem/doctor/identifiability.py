@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from crazyem.doctor import excitation
 from crazyem.doctor.excitation import Steps
+from crazyem.doctor.kinematics import continuous
 from crazyem.doctor.regression import Fit, linear_fit
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.airborne import Airtime
@@ -399,8 +400,8 @@ def _with_attitude(velocity: tuple[Array, Array], attitude: tuple[Array, Array] 
     velocity = excitation.thinned(*velocity)
     good = _near(attitude[0], velocity[0])
     time = velocity[0][good]
-    continuous = attitude[1] * _signs(attitude[1])[:, None]
-    return time, np.column_stack([velocity[1][good], _unit(_interpolated((attitude[0], continuous), time))])
+    turned = _interpolated((attitude[0], continuous(attitude[1])), time)
+    return time, np.column_stack([velocity[1][good], _unit(turned)])
 
 
 def _near(stamps: Array, time: Array) -> NDArray[np.bool_]:
@@ -415,12 +416,6 @@ def _near(stamps: Array, time: Array) -> NDArray[np.bool_]:
 
 def _interpolated(signal: tuple[Array, Array], at: Array) -> Array:
     return np.column_stack([np.interp(at, signal[0], column) for column in signal[1].T])
-
-
-def _signs(attitude: Array) -> Array:
-    """+-1 (n,) that make successive quaternions neighbours."""
-    flips = np.sum(attitude[1:] * attitude[:-1], axis=1) < 0.0
-    return np.where(np.append(0, np.cumsum(flips)) % 2 == 1, -1.0, 1.0)
 
 
 def _unit(q: Array) -> Array:

@@ -5,12 +5,13 @@ by less than 1e-4 of the change (stamps are rounded, too) plus the signal's own 
 come close to that without being interpolated; then near misses are as frequent as hits, and nothing is reported.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import COMMAND_SIGNALS, NO_FLOAT_WARNINGS, cadence, graded, places, runs
+from crazyem.doctor.streams import COMMAND_SIGNALS, cadence, graded, places, runs
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -32,10 +33,9 @@ class Straightness:
     bend: NDArray[np.bool_]
 
 
-@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """Runs of interpolated samples and whole signals drawn up from a slower rate, one signal at a time."""
-    found = []
+    found: list[Finding] = []
     for name, array in recording.signals.items():
         if array.quantity and array.quantity not in COMMAND_SIGNALS and array.time.size >= 8:
             found += _signal(name, array)
@@ -83,7 +83,7 @@ def _resolution(column: NDArray[np.float64]) -> float:
     return float(np.diff(values).min()) if values.size > 1 else 0.0
 
 
-def _signal(name: str, array: SignalArray) -> list[Finding]:
+def _signal(name: str, array: SignalArray) -> Iterator[Finding]:
     time, value = array.time, array.value
     if (time[1:] <= time[:-1]).any():
         keep = np.concatenate([[True], time[1:] > np.maximum.accumulate(time)[:-1]])
@@ -92,14 +92,14 @@ def _signal(name: str, array: SignalArray) -> list[Finding]:
     else:
         rows = np.arange(time.size)
     if time.size < 8:
-        return []
+        return
     line = straightness(time, value)
     hits, misses = int(line.on.sum()), int(line.near.sum())
     # a smooth signal has nine near misses for every hit by chance
     if hits < 2 or hits < 0.5 * misses:
-        return []
+        return
     if array.marked.any() and hits < DEGRADING_INTERPOLATED_SHARE * time.size:
-        return []  # the reader has dealt with this signal, by its own rule
+        return  # the reader has dealt with this signal, by its own rule
     present = int(np.isfinite(value).all(axis=1).sum())
     share = hits / present
     wide = line.on.copy()
@@ -116,27 +116,24 @@ def _signal(name: str, array: SignalArray) -> list[Finding]:
         beat = cadence(time[knots[:, 0]]).period if len(knots) else 0.0
         rate = 1.0 / beat if beat > 0 else len(knots) / max(duration, 1e-9)
         stored = (time.size - 1) / max(duration, 1e-9)
-        return [
-            Finding(
-                "interpolated",
-                Grade.HARMLESS if array.quantity in _SLOW_SIGNALS else Grade.DEGRADES,
-                f"{name} was measured at about {rate:.3g} Hz and drawn with straight lines to {stored:.0f} Hz.",
-                signal=name,
-                evidence={**evidence, "rate_hz": rate, "stored_hz": stored},
-                advice="Mark the samples in between as missing (--fix); they hold nothing new.",
-                fix=fix,
-            )
-        ]
-    return [
-        Finding(
+        yield Finding(
             "interpolated",
-            graded(share, degrades=DEGRADING_INTERPOLATED_SHARE, unusable=0.6),
-            f"{percent(share)} of {name} lie on straight lines ({len(spans)} runs, the longest {lasting:.2f} s): "
-            "drawn across lost samples, not measured.",
+            Grade.HARMLESS if array.quantity in _SLOW_SIGNALS else Grade.DEGRADES,
+            f"{name} was measured at about {rate:.3g} Hz and drawn with straight lines to {stored:.0f} Hz.",
             signal=name,
-            intervals=places(time, wide),
-            evidence=evidence,
-            advice="Mark them as missing (--fix).",
+            evidence={**evidence, "rate_hz": rate, "stored_hz": stored},
+            advice="Mark the samples in between as missing (--fix); they hold nothing new.",
             fix=fix,
         )
-    ]
+        return
+    yield Finding(
+        "interpolated",
+        graded(share, degrades=DEGRADING_INTERPOLATED_SHARE, unusable=0.6),
+        f"{percent(share)} of {name} lie on straight lines ({len(spans)} runs, the longest {lasting:.2f} s): "
+        "drawn across lost samples, not measured.",
+        signal=name,
+        intervals=places(time, wide),
+        evidence=evidence,
+        advice="Mark them as missing (--fix).",
+        fix=fix,
+    )

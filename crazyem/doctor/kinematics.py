@@ -97,7 +97,7 @@ def _lightened(array: SignalArray, quantity: str) -> SignalArray:
         near = np.abs(time - float(np.median(time))) <= 0.5 * LONGEST_GRID_SECONDS
         time, value = time[near], value[near]
     if quantity == "attitude":
-        value = _continuous(value)
+        value = continuous(value)
     period = _period(time)
     many = int(min(GRID_STEP / period + 1e-6, MOST_AVERAGED_SAMPLES)) if period > 0 else 1
     if many > 1:
@@ -254,7 +254,7 @@ def _turn(first: Array, second: Array) -> Array:
     return rotation_vector_from_quaternion(quaternion_product(quaternion_conjugate(first), second))
 
 
-def _continuous(q: Array) -> Array:
+def continuous(q: Array) -> Array:
     """Quaternions with signs chosen so that neighbours are near: q and -q are one attitude."""
     flips = np.where(np.einsum("ij,ij->i", q[1:], q[:-1]) < 0.0, -1.0, 1.0)
     return q * np.concatenate([[1.0], np.cumprod(flips)])[:, None]

@@ -1,13 +1,13 @@
 """Check: values that are no numbers or that no drone can have, leaps that no drone can make, coarse positions."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import NO_FLOAT_WARNINGS, listed, longest, places, same_as_before
+from crazyem.doctor.streams import listed, longest, places, same_as_before
 from crazyem.recordings.finding import Finding, Fix, Grade
 from crazyem.recordings.ordering import sound_rows
 from crazyem.recordings.recording import Recording, SignalArray
@@ -96,7 +96,6 @@ def _unconnected(name: str, array: SignalArray) -> Finding:
     )
 
 
-@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """NaN and infinities that are the file's own, impossible values and leaps, stamps that are no numbers."""
     found: list[Finding] = []
@@ -130,20 +129,18 @@ def check(recording: Recording) -> list[Finding]:
     return found
 
 
-def _stamps(name: str, array: SignalArray) -> list[Finding]:
+def _stamps(name: str, array: SignalArray) -> Iterator[Finding]:
     bad = ~np.isfinite(array.time)
     if not bad.any():
-        return []
-    return [
-        Finding(
-            "numbers",
-            Grade.UNUSABLE,
-            f"{name} has {int(bad.sum())} samples whose stamp is not a number.",
-            signal=name,
-            evidence={"samples": int(bad.sum()), "share": float(bad.mean())},
-            advice="Remove these rows from the source; a sample without a time says nothing.",
-        )
-    ]
+        return
+    yield Finding(
+        "numbers",
+        Grade.UNUSABLE,
+        f"{name} has {int(bad.sum())} samples whose stamp is not a number.",
+        signal=name,
+        evidence={"samples": int(bad.sum()), "share": float(bad.mean())},
+        advice="Remove these rows from the source; a sample without a time says nothing.",
+    )
 
 
 def _not_numbers(name: str, array: SignalArray, bad: Rows) -> Finding:
@@ -160,18 +157,19 @@ def _not_numbers(name: str, array: SignalArray, bad: Rows) -> Finding:
     )
 
 
-def _impossible(name: str, array: SignalArray, limit: Limit, sound: Rows) -> list[Finding]:
+def _impossible(name: str, array: SignalArray, limit: Limit, sound: Rows) -> Iterator[Finding]:
     if limit.measure is not _norm:
         low, high = float(array.value.min()), float(array.value.max())  # NaN fails both comparisons
         if low >= (limit.low if limit.low != 0.0 else -limit.high) and high <= limit.high:
-            return []
+            return
     with np.errstate(invalid="ignore", over="ignore"):
         measure = limit.measure(array.value)
         bad = ((measure < limit.low) | (measure > limit.high)) & sound
     if not bad.any():
-        return []
+        return
     if array.quantity in ZERO_WITHOUT_SENSOR and not array.value[sound].any():
-        return [_unconnected(name, array)]
+        yield _unconnected(name, array)
+        return
     share = float(bad.mean())
     good = measure[sound & ~bad]
     worst = measure[bad]
@@ -187,18 +185,16 @@ def _impossible(name: str, array: SignalArray, limit: Limit, sound: Rows) -> lis
     evidence = {"samples": int(bad.sum()), "share": share, "worst": worst_value}
     if good.size:
         evidence["largest_possible"] = float(good.max())
-    return [
-        Finding(
-            "numbers",
-            Grade.UNUSABLE if share > 0.2 else Grade.DEGRADES,
-            f"{name} is {limit.words} in {int(bad.sum())} of {bad.size} samples (worst {worst_value:.6g}).",
-            signal=name,
-            intervals=places(array.time, bad),
-            evidence=evidence,
-            advice=advice,
-            fix=fix,
-        )
-    ]
+    yield Finding(
+        "numbers",
+        Grade.UNUSABLE if share > 0.2 else Grade.DEGRADES,
+        f"{name} is {limit.words} in {int(bad.sum())} of {bad.size} samples (worst {worst_value:.6g}).",
+        signal=name,
+        intervals=places(array.time, bad),
+        evidence=evidence,
+        advice=advice,
+        fix=fix,
+    )
 
 
 Array = NDArray[np.float64]
@@ -240,10 +236,10 @@ def _neighbour_velocity(velocity: Array) -> Array:
 
 def _found(
     name: str, array: SignalArray, sound: Indices, time: Array, value: Array, rows: Indices, off: Array
-) -> list[Finding]:
+) -> Iterator[Finding]:
     """One finding for all leaps: those that come back can be marked."""
     if not rows.size:
-        return []
+        return
     flags = np.zeros(array.time.size, bool)
     spans: list[tuple[float, float]] = []
     away = 0
@@ -268,41 +264,37 @@ def _found(
     marked = int(flags.sum())
     times = "once" if len(spans) == 1 else f"{len(spans)} times"
     back_again = "" if not marked else " and back" if not away else f", {len(spans) - away} of them back"
-    return [
-        Finding(
-            "numbers",
-            Grade.DEGRADES,
-            f"{name} leaps {times}{back_again}, by up to {off[worst]:.2f} m in {1e3 * lasting:.0f} ms "
-            f"({speed:.0f} m/s): no drone moves like that.",
-            signal=name,
-            intervals=longest(spans),
-            evidence={"leaps": len(spans), "size_m": float(off[worst]), "speed_m_s": speed, "samples": marked},
-            advice="Mark the samples away from the path as missing (--fix)."
-            if marked
-            else "Another frame from there on, or a jump of the filter on board: use the parts before and after.",
-            fix=Fix("mark", (name,), rows=np.flatnonzero(flags)) if marked else None,
-        )
-    ]
+    yield Finding(
+        "numbers",
+        Grade.DEGRADES,
+        f"{name} leaps {times}{back_again}, by up to {off[worst]:.2f} m in {1e3 * lasting:.0f} ms "
+        f"({speed:.0f} m/s): no drone moves like that.",
+        signal=name,
+        intervals=longest(spans),
+        evidence={"leaps": len(spans), "size_m": float(off[worst]), "speed_m_s": speed, "samples": marked},
+        advice="Mark the samples away from the path as missing (--fix)."
+        if marked
+        else "Another frame from there on, or a jump of the filter on board: use the parts before and after.",
+        fix=Fix("mark", (name,), rows=np.flatnonzero(flags)) if marked else None,
+    )
 
 
-def _coarse(name: str, array: SignalArray, value: Array) -> list[Finding]:
+def _coarse(name: str, array: SignalArray, value: Array) -> Iterator[Finding]:
     """A note where the position is stored in coarse steps."""
     grains = [_grain(column) for column in value.T]
     known = [g for g in grains if math.isfinite(g)]
     if not known or min(known) < COARSE_RESOLUTION:
-        return []
+        return
     grain = min(known)
-    return [
-        Finding(
-            "numbers",
-            Grade.HARMLESS,
-            f"{name} is stored in steps of {100.0 * grain:.2g} cm.",
-            signal=name,
-            evidence={"resolution_m": grain},
-            advice="Log it with more digits: a velocity over 0.1 s is known to no better than "
-            f"{grain / 0.1:.2g} m/s from it.",
-        )
-    ]
+    yield Finding(
+        "numbers",
+        Grade.HARMLESS,
+        f"{name} is stored in steps of {100.0 * grain:.2g} cm.",
+        signal=name,
+        evidence={"resolution_m": grain},
+        advice="Log it with more digits: a velocity over 0.1 s is known to no better than "
+        f"{grain / 0.1:.2g} m/s from it.",
+    )
 
 
 def _grain(column: Array) -> float:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from crazyem.doctor import axes
-from crazyem.doctor.hypotheses import Comparison, compare_hypotheses, misread, wrong_scale
+from crazyem.doctor.hypotheses import Comparison, compare_hypotheses, misread, wrong_scale, wrong_unit
 from crazyem.doctor.kinematics import Pose, Track, grid_of, measurements, poses, rate_of_attitude, width_for
 from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Fix, Grade
@@ -18,6 +18,17 @@ SCALE_FAULT = 0.05  # scale fault reported from here on, if attitudes of two ori
 SCALE_FAULT_ONE_ORIGIN = 0.10  # if there is only one: an onboard attitude follows the gyro by a filter of its own
 REPORTED_BIAS = 0.05  # rad/s, reported from here on
 RATE_WINDOW = 0.24  # s: a gyro in flight is loud
+_UNITS = {
+    "deg/s": "it is in deg/s, not rad/s",
+    "converted": "it was in rad/s and was converted from deg/s once too often",
+}
+_MISREAD = {
+    "world": ("it is in the world frame, not the body frame", "Rotate it into the body frame by the attitude."),
+    "turned twice": (
+        "it was turned from world to body although it was in the body frame already",
+        "Read it as a body rate, not as one of the world.",
+    ),
+}
 
 
 def check(recording: Recording) -> list[Finding]:
@@ -55,35 +66,18 @@ def _judge(name: str, looks: list[Comparison]) -> list[Finding]:
     if whole is None or best.explained < LEAST_EXPLAINED_SHARE:
         return []
     if best.choice.denied:
-        return [_structure(name, best)]
+        return [misread("rates", name, best, _MISREAD, noun="body rate", fix=Fix("world_to_body", (name,)))]
     unit = axes.known_factor(whole, {"deg/s": DEGREES, "converted": 1.0 / DEGREES})
     if unit:
-        head = f"{name} is {whole.value:.4g} times the derivative of {best.against}: "
-        text = head + (
-            "it is in deg/s, not rad/s."
-            if unit[0] == "deg/s"
-            else "it was in rad/s and was converted from deg/s once too often."
-        )
-        fix = Fix("scale", (name,), (1.0 / unit[1],) * 3)
+        text = f"{name} is {whole.value:.4g} times the derivative of {best.against}: {_UNITS[unit[0]]}."
         advice = "Multiply it by the factor of the fix, or correct its unit where it is read."
-        return [Finding("rates", Grade.UNUSABLE, text, name, (), best.evidence(), advice, fix)]
-    return [*_scale(name, looks), *_bias(name, best)]
-
-
-def _structure(name: str, seen: Comparison) -> Finding:
-    choice = seen.choice
-    share, declared = 100.0 * seen.evidence()["explained"], 100.0 * choice.explained["body"]
-    head = f"{name} against the derivative of {seen.against}: "
-    tail = f" ({share:.2f} % of its variance explained, as declared {declared:.2f} %)."
-    return misread("rates", name, seen, noun="body rate", head=head, tail=tail)
-
-
-def _scale(name: str, looks: list[Comparison]) -> list[Finding]:
-    return wrong_scale(
+        return [wrong_unit("rates", name, text, unit[1], best.evidence(), advice)]
+    scale = wrong_scale(
         "rates", name, looks, SCALE_FAULT if len(looks) > 1 else SCALE_FAULT_ONE_ORIGIN,
         alone="One of the two is wrong; a third measurement, or the range of the gyro, must say which.",
         agreed="Attitudes of two origins agree against it: divide the rate by the factor.",
     )  # fmt: skip
+    return [*scale, *_bias(name, best)]
 
 
 def _bias(name: str, seen: Comparison) -> list[Finding]:

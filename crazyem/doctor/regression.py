@@ -68,7 +68,7 @@ def block_sums(block: NDArray[np.int64], *columns: Array) -> Array:
     return np.column_stack([np.bincount(block, weights=c, minlength=count) for c in columns])
 
 
-def slope(x: Array, y: Array, block: NDArray[np.int64], *, offset: bool = True) -> Slope | None:
+def slope(x: Array, y: Array, block: NDArray[np.int64]) -> Slope | None:
     """Slope of y against x, both (n, c) or (n,); None with too few blocks or no common variance.
 
     Rows far from the line are left out: by five times the median distance, and by as much as they are large (what is
@@ -77,7 +77,7 @@ def slope(x: Array, y: Array, block: NDArray[np.int64], *, offset: bool = True) 
     x, y = np.atleast_2d(x.T).T, np.atleast_2d(y.T).T
     keep = np.ones(len(x), bool)
     for _ in range(3):
-        sums = _moments(x[keep], y[keep], block[keep], offset)
+        sums = _moments(x[keep], y[keep], block[keep])
         if sums is None:
             return None
         total = sums.sum(axis=0)
@@ -85,16 +85,14 @@ def slope(x: Array, y: Array, block: NDArray[np.int64], *, offset: bool = True) 
         if factor is None:
             return None
         middle = math.copysign(math.sqrt(abs(factor[0] * factor[1])), factor[0])
-        mx = np.median(x[keep], axis=0) if offset else 0.0
-        my = np.median(y[keep], axis=0) if offset else 0.0
-        line = middle * (x - mx)
-        away = np.linalg.norm((y - my) - line, axis=1)
+        line = middle * (x - np.median(x[keep], axis=0))
+        away = np.linalg.norm((y - np.median(y[keep], axis=0)) - line, axis=1)
         limit = 5.0 * float(np.median(away[keep])) / 0.6745
         following = away <= np.maximum(limit, np.linalg.norm(line, axis=1) + 1e-12)
         if (following == keep).all():
             break
         keep = following
-    sums = _moments(x[keep], y[keep], block[keep], offset)
+    sums = _moments(x[keep], y[keep], block[keep])
     if sums is None:
         return None
     total = sums.sum(axis=0)
@@ -126,12 +124,11 @@ def slope(x: Array, y: Array, block: NDArray[np.int64], *, offset: bool = True) 
     )
 
 
-def _moments(x: Array, y: Array, block: NDArray[np.int64], offset: bool) -> Array | None:
-    """(blocks, 3) sums of xx, xy, yy, about the mean where there is an offset."""
+def _moments(x: Array, y: Array, block: NDArray[np.int64]) -> Array | None:
+    """(blocks, 3) sums of xx, xy, yy, about the mean."""
     if len(x) < 20:
         return None
-    if offset:
-        x, y = x - x.mean(axis=0), y - y.mean(axis=0)
+    x, y = x - x.mean(axis=0), y - y.mean(axis=0)
     number = np.asarray(np.unique(block, return_inverse=True)[1], np.int64)
     return block_sums(number, (x * x).sum(axis=1), (x * y).sum(axis=1), (y * y).sum(axis=1))
 

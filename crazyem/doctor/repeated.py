@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from crazyem.doctor.streams import (
     COMMAND_SIGNALS,
-    NO_FLOAT_WARNINGS,
     Stream,
     cadence,
     listed,
@@ -34,7 +33,6 @@ FINE_STEP_SHARE = 0.05  # share of the steps of a fine component that are within
 ONE_PACKET_SHARE = 0.9  # share of common repeats from which signals came in one packet
 
 
-@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """Repeated rows of each stream, then signals that are held between slower measurements of their own."""
     flight = airtime(recording)

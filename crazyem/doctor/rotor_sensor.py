@@ -6,14 +6,15 @@ the other rotors, make one expect. A fraction for the whole flight is told from 
 are looked for beside it: a sensor that misses every second pulse often misses all of them for a while.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import NO_FLOAT_WARNINGS, cadence, listed, longest, runs
+from crazyem.doctor.streams import cadence, listed, longest, runs
 from crazyem.recordings.airborne import airtime
-from crazyem.recordings.finding import Finding, Fix, Grade, percent
+from crazyem.recordings.finding import Finding, Fix, Grade, intervals_of, percent
 from crazyem.recordings.ordering import Intervals, inside, ordered
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -41,7 +42,6 @@ STOPPED_RATIO = 0.1  # of what is expected: standing still
 _MOST_JUMPS = 5000
 
 
-@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """Findings for each rotor of each rotor_speed signal, within the time in the air."""
     flight = airtime(recording)
@@ -241,7 +241,7 @@ def _finding(
     rows: NDArray[np.bool_],
 ) -> Finding:
     share = float(flags.sum()) / float(rows.sum())
-    spans = [(float(array.time[a]), float(array.time[b - 1])) for a, b in runs(flags)]
+    spans = intervals_of(array.time, flags)
     what = "drops to zero while the rotor must turn" if fraction == 0.0 else f"counts {words} of the turns"
     return Finding(
         "rotor_sensor",
@@ -262,24 +262,22 @@ def _finding(
     )
 
 
-def _missing(name: str, array: SignalArray, rows: NDArray[np.bool_]) -> list[Finding]:
+def _missing(name: str, array: SignalArray, rows: NDArray[np.bool_]) -> Iterator[Finding]:
     """What the sensor itself said it does not know, a finding for all rotors."""
     nan = ~np.isfinite(array.value)
     flags = nan.any(axis=1) & array.marked & rows
     if not flags.any():
-        return []
+        return
     counts = nan[flags].sum(axis=0)
     share = float(flags.sum()) / float(rows.sum())
-    spans = [(float(array.time[a]), float(array.time[b - 1])) for a, b in runs(flags)]
+    spans = intervals_of(array.time, flags)
     which = [f"m{i + 1} {int(count)}" for i, count in enumerate(counts) if count]
-    return [
-        Finding(
-            "rotor_sensor",
-            Grade.DEGRADES if share > 0.05 else Grade.HARMLESS,
-            f"{name} is missing in {int(flags.sum())} samples in the air ({percent(share)}; {listed(which)}).",
-            signal=name,
-            intervals=longest(spans),
-            evidence={"samples": int(flags.sum()), "share": share, "longest_s": max(b - a for a, b in spans)},
-            advice="Nothing to repair; they are treated as missing.",
-        )
-    ]
+    yield Finding(
+        "rotor_sensor",
+        Grade.DEGRADES if share > 0.05 else Grade.HARMLESS,
+        f"{name} is missing in {int(flags.sum())} samples in the air ({percent(share)}; {listed(which)}).",
+        signal=name,
+        intervals=longest(spans),
+        evidence={"samples": int(flags.sum()), "share": share, "longest_s": max(b - a for a, b in spans)},
+        advice="Nothing to repair; they are treated as missing.",
+    )

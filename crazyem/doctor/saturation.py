@@ -1,11 +1,13 @@
 """Check: rotors at their upper or lower limit in flight."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import NO_FLOAT_WARNINGS, longest, runs
+from crazyem.doctor.streams import longest, runs
 from crazyem.recordings.airborne import Airtime, airtime
-from crazyem.recordings.finding import Finding, Grade, percent
+from crazyem.recordings.finding import Finding, Grade, intervals_of, percent
 from crazyem.recordings.ordering import Intervals, inside, ordered
 from crazyem.recordings.recording import Recording
 
@@ -16,11 +18,10 @@ _CEILING_RUN = 3  # samples at exactly the same greatest value: a cap, not a max
 _COMMAND_WORDS = {"motor_command": "duty", "motor_request": "thrust request"}
 
 
-@NO_FLOAT_WARNINGS
 def check(recording: Recording) -> list[Finding]:
     """Upper limit, and lower limit while airborne, of commanded duty and of requested thrust, a rotor at a time."""
     flight = airtime(recording)
-    found = []
+    found: list[Finding] = []
     for name in ("motor_command", "motor_request"):
         array = recording.signals.get(name)
         if array is None or array.time.size < 20:
@@ -38,7 +39,7 @@ def check(recording: Recording) -> list[Finding]:
 
 def _upper(
     recording: Recording, name: str, time: NDArray[np.float64], value: NDArray[np.float64], rows: NDArray[np.bool_]
-) -> list[Finding]:
+) -> Iterator[Finding]:
     flags = np.zeros(value.shape, bool)
     ceilings = []
     for rotor, column in enumerate(value.T):
@@ -50,10 +51,10 @@ def _upper(
             ceilings.append(top)
     shares = flags[rows].mean(axis=0)
     if not flags.any():
-        return []
+        return
     any_rotor: NDArray[np.bool_] = np.logical_or.reduce(flags, axis=1)
     share = float(any_rotor[rows].mean())
-    spans = _merged(time, any_rotor)
+    spans = intervals_of(time, any_rotor)
     lasting = max(b - a for a, b in spans)
     evidence: dict[str, float] = {"share": share, "longest_s": lasting}
     evidence |= {f"share_m{i + 1}": float(s) for i, s in enumerate(shares)}
@@ -66,18 +67,16 @@ def _upper(
         evidence["voltage_V"] = volts
         if volts / max(1, round(volts / 3.8)) < LOW_CELL:
             text += f", on a low battery ({volts:.2f} V)"
-    return [
-        Finding(
-            "saturation",
-            Grade.DEGRADES if share >= DEGRADING_SATURATED_SHARE else Grade.HARMLESS,
-            text + ".",
-            signal=name,
-            intervals=longest(spans),
-            evidence=evidence,
-            advice="The controller did not get what it asked for: the firmware takes the excess of one rotor from all "
-            "four. Use the duty that was sent, not the thrust asked for, and charge the battery or fly gentler.",
-        )
-    ]
+    yield Finding(
+        "saturation",
+        Grade.DEGRADES if share >= DEGRADING_SATURATED_SHARE else Grade.HARMLESS,
+        text + ".",
+        signal=name,
+        intervals=longest(spans),
+        evidence=evidence,
+        advice="The controller did not get what it asked for: the firmware takes the excess of one rotor from all "
+        "four. Use the duty that was sent, not the thrust asked for, and charge the battery or fly gentler.",
+    )
 
 
 def _is_ceiling(column: NDArray[np.float64], top: float, rows: NDArray[np.bool_]) -> bool:
@@ -96,12 +95,12 @@ def _lower(
     value: NDArray[np.float64],
     rows: NDArray[np.bool_],
     flight: Airtime,
-) -> list[Finding]:
+) -> Iterator[Finding]:
     """Rotors at idle or off while airborne, but not in the first and last half second, when they start and stop."""
     inner: Intervals = tuple((a + 0.5, b - 0.5) for a, b in flight.airborne if b - a > 1.5)
     rows = rows & inside(time, inner)
     if rows.sum() < 20:
-        return []
+        return
     flags = np.zeros(value.shape, bool)
     floor = float(value.min())
     running = value[value > 0.02]
@@ -114,30 +113,24 @@ def _lower(
     any_rotor: NDArray[np.bool_] = np.logical_or.reduce(flags, axis=1)
     share = float(any_rotor[rows].mean())
     if any_rotor.sum() < 3 or share < 5e-4:
-        return []
+        return
     shares = flags[rows].mean(axis=0)
-    spans = _merged(time, any_rotor)
+    spans = intervals_of(time, any_rotor)
     words = ", ".join(f"m{i + 1} {percent(s)}" for i, s in enumerate(shares) if s > 0)
-    return [
-        Finding(
-            "saturation",
-            Grade.DEGRADES if share >= 4.0 * DEGRADING_SATURATED_SHARE else Grade.HARMLESS,
-            f"The {_COMMAND_WORDS[name]} of a rotor is at its lower limit in {percent(share)} of the flight ({words}).",
-            signal=name,
-            intervals=longest(spans),
-            evidence={
-                "share": share,
-                "longest_s": max(b - a for a, b in spans),
-                "floor": float(value[any_rotor].min()),
-                **{f"share_m{i + 1}": float(s) for i, s in enumerate(shares)},
-            },
-            advice="At idle the thrust law is least certain; leave these stretches out of fits of the thrust curve.",
-        )
-    ]
-
-
-def _merged(time: NDArray[np.float64], flags: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    return [(float(time[a]), float(time[b - 1])) for a, b in runs(flags)]
+    yield Finding(
+        "saturation",
+        Grade.DEGRADES if share >= 4.0 * DEGRADING_SATURATED_SHARE else Grade.HARMLESS,
+        f"The {_COMMAND_WORDS[name]} of a rotor is at its lower limit in {percent(share)} of the flight ({words}).",
+        signal=name,
+        intervals=longest(spans),
+        evidence={
+            "share": share,
+            "longest_s": max(b - a for a, b in spans),
+            "floor": float(value[any_rotor].min()),
+            **{f"share_m{i + 1}": float(s) for i, s in enumerate(shares)},
+        },
+        advice="At idle the thrust law is least certain; leave these stretches out of fits of the thrust curve.",
+    )
 
 
 def _voltage(recording: Recording, times: NDArray[np.float64]) -> float:

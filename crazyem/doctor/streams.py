@@ -4,12 +4,11 @@ import math
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.recordings.finding import Grade
+from crazyem.recordings.finding import Grade, intervals_of
 from crazyem.recordings.ordering import Intervals
 from crazyem.recordings.recording import Recording, SignalArray
 
@@ -72,10 +71,6 @@ class Stream:
     def slow(self) -> bool:
         """True if it varies so slowly that a lost sample does not matter: the voltage alone."""
         return all(array.quantity == "voltage" for array in self.arrays)
-
-
-# Hostile values may overflow anywhere; what comes out then is compared, and compares false.
-NO_FLOAT_WARNINGS: Any = np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore")
 
 
 def streams(recording: Recording) -> list[Stream]:
@@ -173,7 +168,7 @@ def longest(intervals: Iterable[tuple[float, float]]) -> Intervals:
 
 def places(time: NDArray[np.float64], flags: NDArray[np.bool_]) -> Intervals:
     """Intervals of the runs of True, the longest ones."""
-    return longest((float(time[a]), float(time[b - 1])) for a, b in runs(flags))
+    return longest(intervals_of(time, flags))
 
 
 def same_as_before(value: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -1,10 +1,17 @@
 """Check: velocity against the position's derivative, and positions of two origins: unit, frame, sign, scale."""
 
 from crazyem.doctor import axes
-from crazyem.doctor.hypotheses import Comparison, agreed_scale, compare_hypotheses, wrong_scale
+from crazyem.doctor.hypotheses import (
+    Comparison,
+    agreed_scale,
+    compare_hypotheses,
+    misread,
+    wrong_scale,
+    wrong_unit,
+)
 from crazyem.doctor.kinematics import Pose, Track, difference, grid_of, measurements, poses, track, width_for
 from crazyem.physics.rotations import rotate
-from crazyem.recordings.finding import Finding, Fix, Grade
+from crazyem.recordings.finding import Finding, Grade
 from crazyem.recordings.recording import Recording, SignalArray
 
 LEAST_VELOCITY_RMS = 0.04  # m/s rms along an axis, below which nothing is said
@@ -15,6 +22,7 @@ SCALE_FAULT = 0.05
 # slope of velocity against the position's derivative -> what that means, and which of the two is implausible
 VELOCITY_UNITS = {"mm/s": 1e3, "cm/s": 1e2}
 POSITION_UNITS = {"mm": 1e-3, "cm": 1e-2}
+_MISREAD = {"body": ("it is in the body frame, not the world frame", "Rotate it into the world frame by the attitude.")}
 
 
 def check(recording: Recording) -> list[Finding]:
@@ -78,20 +86,18 @@ def _judge(name: str, looks: list[Comparison], blamed: set[str]) -> list[Finding
     head = f"{name} against the derivative of {best.against}: "
     evidence = best.evidence()
     if best.choice.denied:
-        return [_structure("velocities", name, head, best)]
+        return [misread("velocities", name, best, _MISREAD, noun="world")]
     unit = axes.known_factor(whole, VELOCITY_UNITS)
     if unit:
         text = f"{head}it is {whole.value:.4g} times as large: it is in {unit[0]}, not m/s."
-        fix = Fix("scale", (name,), (1.0 / unit[1],) * 3)
-        return [Finding("velocities", Grade.UNUSABLE, text, name, (), evidence, "Correct its unit.", fix)]
+        return [wrong_unit("velocities", name, text, unit[1], evidence)]
     unit = axes.known_factor(whole, POSITION_UNITS)
     if unit:
         if best.against in blamed:
             return []
         blamed.add(best.against)
         text = f"The derivative of {best.against} is {1 / whole.value:.4g} times {name}: it is in {unit[0]}, not m."
-        fix = Fix("scale", (best.against,), (unit[1],) * 3)
-        return [Finding("velocities", Grade.UNUSABLE, text, best.against, (), evidence, "Correct its unit.", fix)]
+        return [wrong_unit("velocities", best.against, text, 1.0 / unit[1], evidence)]
     return wrong_scale(
         "velocities", name, looks, SCALE_FAULT,
         alone="One of the two is wrong, and a third measurement must say which.",
@@ -106,21 +112,18 @@ def _judge_position(name: str, looks: list[Comparison], blamed: set[str]) -> lis
     assert whole is not None
     head = f"{name} against {seen.against}: "
     if seen.choice.denied:
-        return [_structure("velocities", name, head, seen)]
+        return [misread("velocities", name, seen, _MISREAD, noun="world", what="")]
     unit = axes.known_factor(whole, POSITION_UNITS)
     if unit:
         blamed.add(seen.against)
         text = (
             f"{seen.against} against {name}: it is {1.0 / whole.value:.4g} times as large: it is in {unit[0]}, not m."
         )
-        fix = Fix("scale", (seen.against,), (unit[1],) * 3)
-        advice = "Correct its unit."
-        return [Finding("velocities", Grade.UNUSABLE, text, seen.against, (), seen.evidence(), advice, fix)]
+        return [wrong_unit("velocities", seen.against, text, 1.0 / unit[1], seen.evidence())]
     unit = axes.known_factor(whole, {key: 1.0 / factor for key, factor in POSITION_UNITS.items()})
     if unit:
         text = f"{head}it is {whole.value:.4g} times as large: it is in {unit[0]}, not m."
-        fix = Fix("scale", (name,), (1.0 / unit[1],) * 3)
-        return [Finding("velocities", Grade.UNUSABLE, text, name, (), seen.evidence(), "Correct its unit.", fix)]
+        return [wrong_unit("velocities", name, text, unit[1], seen.evidence())]
     agreed = agreed_scale(looks, SCALE_FAULT)
     if agreed is None:
         return []
@@ -128,25 +131,3 @@ def _judge_position(name: str, looks: list[Comparison], blamed: set[str]) -> lis
     text = f"{name} and {seen.against} differ in scale: {agreed[1].text}, if {seen.against} is right."
     advice = "Find out which of the two is calibrated."
     return [Finding("velocities", Grade.DEGRADES, text, name, (), numbers, advice)]
-
-
-def _structure(check_name: str, name: str, head: str, seen: Comparison) -> Finding:
-    choice = seen.choice
-    tail = (
-        f" ({100.0 * seen.evidence()['explained']:.2f} % of it explained, "
-        f"as declared {100.0 * choice.explained[seen.declared]:.2f} %)."
-    )
-    fix: Fix | None = None
-    if choice.name == "body":
-        text = f"{head}it is in the body frame, not the world frame{tail}"
-        advice = "Rotate it into the world frame by the attitude."
-    elif choice.name.startswith("world "):
-        signs = choice.name.removeprefix("world ")
-        text = f"{head}its components are {signs} of the world{tail}"
-        factor = axes.sign_factor(signs)
-        fix = Fix("scale", (name,), factor) if factor else None
-        advice = "Correct its axes or signs where it is read."
-    else:
-        text = f"{head}it is not what it is declared to be, but which axes or frame it has cannot be told{tail}"
-        advice = "Correct its frame, axes or signs where it is read."
-    return Finding(check_name, Grade.UNUSABLE, text, name, (), seen.evidence(), advice, fix)

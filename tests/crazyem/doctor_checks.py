@@ -1,9 +1,8 @@
 """What the tests of the stream checks share: running one check or all, and planting values into a recording."""
 
-import importlib
-
 from made_flight import changed
 
+from crazyem.doctor import CHECKS as CHECKS_OF_DOCTOR
 from crazyem.recordings.finding import Finding
 from crazyem.recordings.recording import Recording
 
@@ -11,7 +10,7 @@ CHECKS = ("numbers", "gaps", "interpolated", "repeated", "clocks", "frozen", "sa
 
 
 def run(check: str, recording: Recording) -> list[Finding]:
-    return importlib.import_module(f"crazyem.doctor.{check}").check(recording)
+    return next(c for c in CHECKS_OF_DOCTOR if c.module == check).run(recording)
 
 
 def everything(recording: Recording) -> list[Finding]:
