@@ -72,6 +72,13 @@ def on_files(
         report.add(result)
 
 
+def close(report: Report, files: Files) -> int:
+    """The count of files where there were several, and the JSON; returns the exit code."""
+    if len(files.found) > 1 or files.skipped:
+        report.say(counted(report.results, files.skipped))
+    return report.close(skipped_files=files.skipped)
+
+
 def counted(results: Sequence[Result], skipped: int) -> str:
     """How many files were read, failed and passed over, in one line."""
     failed = sum(bool(r.error) for r in results)

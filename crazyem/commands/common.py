@@ -26,9 +26,9 @@ class LiveLine:
         quiet: whether something else shows it now.
     """
 
-    def __init__(self, session: Any, *, prefix: str = "", quiet: Callable[[], bool] = lambda: False) -> None:
-        self.session = session
-        self.prefix, self.quiet = prefix, quiet
+    def __init__(self, session: Any, *, prefix: str = "") -> None:
+        self.session, self.prefix = session, prefix
+        self.quiet: Callable[[], bool] = lambda: False
         self.phase, self.seconds = "connected", 0.0
         self._steps_said = 0
         self._faults_said: Sequence[Fault] = ()

@@ -1,14 +1,13 @@
 """`crazyem diagnose RECORDING...`: where simulation and recording part, which physics was left out, and the fit."""
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
 
 from crazyem.atomic_file import write_file
 from crazyem.commands.files import read_options
-from crazyem.commands.output import put
+from crazyem.commands.output import deliver
 from crazyem.live.summary import check_writable
 
 
@@ -46,10 +45,5 @@ def run(arguments: argparse.Namespace) -> int:
         write_file(arguments.write_vehicle, found.named_vehicle(Path(arguments.write_vehicle).stem).to_toml())
     if arguments.report:
         found.report(arguments.report)
-    if arguments.json == "-":
-        put(json.dumps(document, indent=1))
-        return 0
-    if arguments.json:
-        write_file(arguments.json, json.dumps(document, indent=1) + "\n")
-    put(text_of(document))
+    deliver(document, arguments.json, text_of(document))
     return 0

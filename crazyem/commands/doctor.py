@@ -1,10 +1,11 @@
 """`crazyem doctor FILE...`: what is wrong with recordings, and with --fix the lossless repairs into new files."""
 
 import argparse
+import math
 import textwrap
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from crazyem.commands.batch import counted, on_files, processes
 from crazyem.commands.files import find, read_options, targets
@@ -13,6 +14,9 @@ from crazyem.commands.output import Report, Result
 from crazyem.errors import DataError, UsageError
 from crazyem.recordings import Finding, Grade, ReadOptions, Recording, open_recording
 from crazyem.recordings.parts import open_parts, to_be_parted
+
+if TYPE_CHECKING:
+    from crazyem.doctor.duplicates import Duplicate
 
 _TEXT_WIDTH = 110
 _SHOWN_INTERVALS = 4  # intervals that are written out
@@ -35,13 +39,10 @@ def run(arguments: argparse.Namespace) -> int:
     on_files(arguments, report, files, diagnose, rests, apart=True)
     duplicates = _duplicates(report.results) if several else []
     for duplicate in duplicates:
-        report.say("\n" + text_of(duplicate["finding"]))
+        report.say("\n" + text_of(duplicate.finding()))
     if several or files.skipped:
         report.say(f"\n{_graded(report.results)}; {counted(report.results, files.skipped)}")
-    code = report.close(
-        duplicates=[d["json"] for d in duplicates],
-        skipped_files=files.skipped,
-    )
+    code = report.close(duplicates=[d.to_dict() for d in duplicates], skipped_files=files.skipped)
     if code == 0 and arguments.strict and any(r.data.get("grade") == str(Grade.UNUSABLE) for r in report.results):
         return DataError.exit_code
     return code
@@ -52,35 +53,27 @@ def diagnose(
 ) -> Result:
     """One file. Raises as `open_recording`, and UsageError if the repaired file cannot be written."""
     from crazyem.doctor import examine
+    from crazyem.doctor.duplicates import fingerprint
 
     if output is None and to_be_parted(path, asked=parts, jobs=jobs):
-        source, start, end, found = "", None, None, []
+        source, start, end, found = "", math.inf, -math.inf, []
         for part in open_parts(path, options):
             source = part.source
             # a slow stream may have nothing to say in a part; that is no finding
             signals = {name: array for name, array in part.signals.items() if array.time.size}
-            for array in signals.values():
-                low, high = float(array.time.min()), float(array.time.max())
-                start = low if start is None else min(start, low)
-                end = high if end is None else max(end, high)
+            start = min([start, *(float(array.time.min()) for array in signals.values())])
+            end = max([end, *(float(array.time.max()) for array in signals.values())])
             found.append(examine(replace(part, signals=signals)))
         findings = merge_findings(found)
-        duration = (end - start) if start is not None and end is not None else 0.0
-        return _result(path, source, duration, findings, {}, [], None)
+        return _result(path, source, max(end - start, 0.0), findings, {}, [], None)
     recording = open_recording(path, options)
     findings = examine(recording)
-    detail = _fingerprint(recording) if several else None
+    detail = fingerprint(recording) if several else None
     fixed: dict[str, Any] = {}
     lines: list[str] = []
     if output is not None:
         fixed, lines = _repair(recording, findings, output, force)
     return _result(path, recording.source, recording.duration, findings, fixed, lines, detail)
-
-
-def _fingerprint(recording: Recording) -> Any:
-    from crazyem.doctor.duplicates import fingerprint
-
-    return fingerprint(recording)
 
 
 def _repair(
@@ -186,14 +179,8 @@ def _graded(results: list[Result]) -> str:
     return "recordings by their worst finding: " + ", ".join(f"{n} {g}" for g in names if (n := grades.count(g)))
 
 
-def _duplicates(results: list[Result]) -> list[dict[str, Any]]:
+def _duplicates(results: list[Result]) -> "list[Duplicate]":
     """Flights that are in more than one of the files."""
     from crazyem.doctor.duplicates import find_duplicates
 
-    prints = [r.detail for r in results if r.detail is not None]
-    return [_duplicate(d) for d in find_duplicates(prints)]
-
-
-def _duplicate(found: Any) -> dict[str, Any]:
-    finding = found if isinstance(found, Finding) else found.finding()
-    return {"finding": finding, "json": found.to_dict()}
+    return find_duplicates([r.detail for r in results if r.detail is not None])

@@ -2,7 +2,7 @@
 
 import argparse
 
-from crazyem.commands.batch import counted, on_files, processes
+from crazyem.commands.batch import close, on_files, processes
 from crazyem.commands.files import find, read_options, targets
 from crazyem.commands.output import Report, Result, remarks
 from crazyem.errors import UsageError
@@ -26,9 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     jobs = processes(arguments.jobs, len(files.found))
     rests = ((str(o), options, arguments.force, arguments.parts, jobs) for o in outputs)
     on_files(arguments, report, files, convert, rests)
-    if len(files.found) > 1 or files.skipped:
-        report.say(counted(report.results, files.skipped))
-    return report.close(skipped_files=files.skipped)
+    return close(report, files)
 
 
 def convert(path: str, output: str, options: ReadOptions, force: bool, parts: bool, jobs: int) -> Result:

@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from crazyem.commands.batch import counted, on_files
+from crazyem.commands.batch import close, on_files
 from crazyem.commands.files import find, read_options, targets
 from crazyem.commands.output import Report, Result, remarks
 from crazyem.recordings import ReadOptions, Recording, open_recording
@@ -16,9 +16,7 @@ def run(arguments: argparse.Namespace) -> int:
     outputs = targets(files.found, arguments.output, ".mcap", force=arguments.force)
     options = read_options(arguments)
     on_files(arguments, report, files, convert, ((str(o), options, arguments.force) for o in outputs))
-    if len(files.found) > 1 or files.skipped:
-        report.say(counted(report.results, files.skipped))
-    return report.close(skipped_files=files.skipped)
+    return close(report, files)
 
 
 def convert(path: str, output: str, options: ReadOptions, force: bool) -> Result:
@@ -28,7 +26,8 @@ def convert(path: str, output: str, options: ReadOptions, force: bool) -> Result
     recording = open_recording(path, options)
     write_recording(recording, output, replace=force)
     data = {"output": output, **summary(recording)}
-    text = f"{path} -> {output}: {recording.source}, {_counts(data)}"
+    counts = f"{recording.duration:.2f} s, {len(recording.signals)} signals, {len(recording)} samples"
+    text = f"{path} -> {output}: {recording.source}, {counts}"
     return Result(path, data, "\n".join([text, *remarks(recording.findings)]))
 
 
@@ -42,7 +41,3 @@ def summary(recording: Recording) -> dict[str, Any]:
         "events": len(recording.events),
         "findings": [f.to_dict() for f in recording.findings],
     }
-
-
-def _counts(data: dict[str, Any]) -> str:
-    return f"{data['duration_s']:.2f} s, {len(data['signals'])} signals, {data['samples']} samples"

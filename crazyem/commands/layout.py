@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from crazyem.atomic_file import write_file
 from crazyem.commands.output import check_json
 from crazyem.errors import UsageError
 
@@ -22,10 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
     if Path(target).exists() and not arguments.force and arguments.output:
         raise UsageError(f"{target} exists already (--force replaces it).")
     check_json(target)
-    try:
-        Path(target).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"cannot write {target}: {error.strerror}.") from None
+    write_file(target, text)
     return 0
 
 

@@ -1,6 +1,7 @@
 """What the commands on recordings say and where: text without control characters, JSON, progress on standard error."""
 
 import argparse
+import json
 import sys
 import time
 from collections.abc import Iterable, Mapping
@@ -9,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from crazyem.atomic_file import write_file
 from crazyem.errors import UsageError
 from crazyem.live.summary import check_writable, write_json
 from crazyem.recordings.finding import Finding, Grade
@@ -26,6 +28,20 @@ def put(text: str) -> None:
     """A result, to standard output."""
     encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
     print(plain(text).encode(encoding, "replace").decode(encoding), flush=True)
+
+
+def deliver(document: Mapping[str, Any], path: str | None, text: str) -> None:
+    """A result as JSON, indented, where --json says, and as text unless standard output has the JSON.
+
+    Raises: UsageError if the file cannot be written.
+    """
+    whole = json.dumps(document, indent=1)
+    if path == "-":
+        put(whole)
+        return
+    if path:
+        write_file(path, whole + "\n")
+    put(text)
 
 
 def complain(text: str) -> None:

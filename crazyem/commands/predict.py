@@ -16,10 +16,10 @@ def run(arguments: argparse.Namespace) -> int:
     """The command."""
     from crazyem.api.diagnosing import predict
 
-    if arguments.ensemble:
-        return _ensemble(arguments)
     recording = Path(arguments.file)
     output = targets([Found(recording)], arguments.output, ".npz", force=arguments.force)[0]
+    if arguments.ensemble:
+        return _ensemble(arguments, output)
     with Progress("predict", 0, "starts") as progress:
         found = predict(
             recording,
@@ -44,14 +44,12 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _ensemble(arguments: argparse.Namespace) -> int:
+def _ensemble(arguments: argparse.Namespace, output: Path) -> int:
     """A band `horizon` steps ahead, by drones as the vehicle may be."""
     from crazyem.api.vehicles import predict_ensemble
 
-    recording = Path(arguments.file)
-    output = targets([Found(recording)], arguments.output, ".npz", force=arguments.force)[0]
     found = predict_ensemble(
-        recording,
+        arguments.file,
         arguments.vehicle,
         count=arguments.ensemble,
         horizon=arguments.horizon,

@@ -95,14 +95,14 @@ class Drone:
             self.shown.ended = self.outcome
 
 
-def path_for(base: str | None, name: str, suffix: str = "") -> str | None:
+def path_for(base: str | None, name: str) -> str | None:
     """`flights.mcap` -> `flights.NAME.mcap`."""
     if base is None:
         return None
     path = Path(base)
     ending = next((s for s in RESULT_SUFFIXES if path.name.endswith(s) and path.name != s), path.suffix)
     stem = path.name.removesuffix(ending)
-    return str(path.with_name(f"{stem}.{name}{suffix or ending}"))
+    return str(path.with_name(f"{stem}.{name}{ending}"))
 
 
 def members(arguments: argparse.Namespace, trajectory: Sequence[str] = ("hover",)) -> list[Member]:

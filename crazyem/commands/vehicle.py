@@ -1,15 +1,13 @@
 """`crazyem vehicle convert | check | sample`: files of simulators."""
 
 import argparse
-import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from crazyem.atomic_file import write_file
 from crazyem.commands.common import say
 from crazyem.commands.files import read_options
-from crazyem.commands.output import put
+from crazyem.commands.output import deliver
 from crazyem.errors import DataError, UsageError
 from crazyem.live.summary import check_writable
 
@@ -71,7 +69,8 @@ def _convert(arguments: argparse.Namespace) -> int:
     document["remarks"] = remarks
     lines = [f"{output}: {to}, from {arguments.source} ({source.format}), vehicle {source.vehicle.name}"]
     lines += [f"  {remark}" for remark in remarks]
-    lines += _listed("not held by this file:", made.omissions)
+    if made.omissions:
+        lines += ["  not held by this file:", *(f"    {omission}" for omission in made.omissions)]
     return _report(arguments, document, lines)
 
 
@@ -149,16 +148,6 @@ def _check_target(output: Path, arguments: argparse.Namespace) -> None:
         check_writable(arguments.json)
 
 
-def _listed(head: str, entries: Sequence[Any]) -> list[str]:
-    return [f"  {head}", *(f"    {entry}" for entry in entries)] if entries else []
-
-
 def _report(arguments: argparse.Namespace, document: dict[str, Any], lines: list[str]) -> int:
-    text = json.dumps(document, indent=1)
-    if arguments.json == "-":
-        put(text)
-        return 0
-    if arguments.json:
-        write_file(arguments.json, text + "\n")
-    put("\n".join(lines))
+    deliver(document, arguments.json, "\n".join(lines))
     return 0

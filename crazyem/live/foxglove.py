@@ -5,8 +5,8 @@ flight and its recording alike. The server is foxglove-sdk's, with threads of it
 """
 
 import contextlib
-import math
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping
 from types import ModuleType
 from typing import Any
 
@@ -56,14 +56,13 @@ class FoxgloveServer:
         """Where a viewer connects to."""
         return f"ws://{FOXGLOVE_HOST}:{self.port}"
 
-    def recorder(self, name: str = "", metadata: Mapping[str, Mapping[str, str]] | None = None) -> RecordingWriter:
+    def recorder(self, name: str = "") -> RecordingWriter:
         """What a session streams through.
 
         Args:
             name: of the drone, put before its topics (/NAME/estimate, frame NAME); "" where there is only one.
-            metadata: as of a recording; viewers do not get it.
         """
-        return RecordingWriter("", metadata, output=Topics(self._context, name))
+        return RecordingWriter("", output=Topics(self._context, name))
 
     def close(self) -> None:
         """End the server."""
@@ -135,9 +134,9 @@ class Topics:
 
 
 class Both:
-    """Two recorders as one: a file, and a stream beside it.
+    """Two recorders as one: a file, and a stream beside it. What is called is called of both.
 
-    The file counts: its path, its failure. A stream that fails ends alone.
+    The file counts: its path, its failure, "" without one. A stream that fails ends alone.
     """
 
     def __init__(self, file: Recorder | None, stream: Recorder) -> None:
@@ -146,47 +145,20 @@ class Both:
 
     @property
     def path(self) -> str:
-        """Of the file, "" without one."""
+        """Of the file."""
         return self._file.path if self._file is not None else ""
 
     @property
     def failure(self) -> str:
-        """Of the file, "" without one."""
+        """Of the file."""
         return self._file.failure if self._file is not None else ""
 
-    def blocks(self, blocks: Sequence[Any]) -> None:
-        """See `Recorder`; so are the others."""
-        self._each("blocks", blocks)
-
-    def packet(self, packet: Any) -> None:
-        self._each("packet", packet)
-
     def frame(self, *arguments: Any) -> None:
+        """As `FrameRecorder`, which asks for it by name."""
         self._each("frame", *arguments)
 
-    def setpoint(self, time: float, reference: Any) -> None:
-        self._each("setpoint", time, reference)
-
-    def parameter_write(self, write: Any) -> None:
-        self._each("parameter_write", write)
-
-    def estimate(self, estimate: Any) -> None:
-        self._each("estimate", estimate)
-
-    def link(self, statistics: Any, latency: float = math.nan) -> None:
-        self._each("link", statistics, latency)
-
-    def residual(self, time: float, values: Sequence[float], sd: Sequence[float]) -> None:
-        self._each("residual", time, values, sd)
-
-    def metadata(self, section: str, entries: Mapping[str, str]) -> None:
-        self._each("metadata", section, entries)
-
-    def event(self, text: str) -> None:
-        self._each("event", text)
-
-    def close(self) -> None:
-        self._each("close")
+    def __getattr__(self, method: str) -> Callable[..., None]:
+        return functools.partial(self._each, method)
 
     def _each(self, method: str, *arguments: Any) -> None:
         for recorder in self._all:
