@@ -267,21 +267,7 @@ def observed(flight: Flight, sensor: str, first: int, last: int, *, acceleromete
     return y
 
 
-@compiled
-def _whiten(low, rows):
-    """low^-1 rows for a lower triangle low (m, m), in place of rows (m, n): each row is a vector operation."""
-    for i in range(len(low)):
-        for j in range(i):
-            c = low[i, j]
-            for a in range(rows.shape[1]):
-                rows[i, a] -= c * rows[j, a]
-        c = 1.0 / low[i, i]
-        for a in range(rows.shape[1]):
-            rows[i, a] *= c
-
-
-@compiled
-def _add(seen, e, cov, step, information, score):
+def _add(seen: NDArray, e: NDArray, cov: NDArray, step: float, information: NDArray, score: NDArray) -> None:
     """Add what some rows say to the information (p, p) and the score (p,), both filled in place.
 
     Args:
@@ -289,49 +275,15 @@ def _add(seen, e, cov, step, information, score):
         e, cov: (2 p + 1, n, 15), (2 p + 1, n, 15, 15) of the truth, then a step up and one down for each parameter.
         step: of the logarithms.
     """
-    m, count = len(seen), len(score)
-    low = np.zeros((m, m))  # Cholesky factor of the covariance: it whitens, and the sums become plain products
-    white = np.empty((m, 1 + count))  # innovation, and its derivative by each parameter
-    spread = np.empty((m, count * m))  # derivatives of the covariance, side by side
-    turned = np.empty((m, count * m))
-    terms = np.empty((count, m * m))
-    for k in range(e.shape[1]):
-        for i in range(m):
-            for j in range(i + 1):
-                v = cov[0, k, seen[i], seen[j]]
-                for c in range(j):
-                    v -= low[i, c] * low[j, c]
-                low[i, j] = np.sqrt(v) if i == j else v / low[j, j]
-        for i in range(m):
-            white[i, 0] = e[0, k, seen[i]]
-            for u in range(count):
-                up, down = 2 * u + 1, 2 * u + 2
-                white[i, 1 + u] = (e[up, k, seen[i]] - e[down, k, seen[i]]) / (2 * step)
-                for j in range(m):
-                    spread[i, u * m + j] = (cov[up, k, seen[i], seen[j]] - cov[down, k, seen[i], seen[j]]) / (2 * step)
-        _whiten(low, white)
-        _whiten(low, spread)
-        for u in range(count):
-            for i in range(m):
-                for j in range(m):
-                    turned[j, u * m + i] = spread[i, u * m + j]
-        _whiten(low, turned)
-        for u in range(count):
-            for i in range(m):
-                score[u] -= white[i, 1 + u] * white[i, 0] + 0.5 * turned[i, u * m + i]
-                for j in range(m):
-                    terms[u, i * m + j] = turned[i, u * m + j]
-                    score[u] += 0.5 * turned[i, u * m + j] * white[i, 0] * white[j, 0]
-            for w in range(u + 1):
-                v = 0.0
-                for a in range(m * m):
-                    v += terms[u, a] * terms[w, a]
-                v *= 0.5
-                for i in range(m):
-                    v += white[i, 1 + u] * white[i, 1 + w]
-                information[u, w] += v
-                if w < u:
-                    information[w, u] += v
+    e, cov = e[:, :, seen], cov[:, :, seen[:, None], seen]
+    white = np.linalg.inv(np.linalg.cholesky(cov[0]))  # it whitens: the sums become plain products
+    error = (white @ e[0, ..., None])[..., 0]
+    slope = (white @ ((e[1::2] - e[2::2]) / (2.0 * step))[..., None])[..., 0]
+    spread = white @ ((cov[1::2] - cov[2::2]) / (2.0 * step)) @ white.transpose(0, 2, 1)
+    flat_slope, flat_spread = slope.reshape(len(score), -1), spread.reshape(len(score), -1)
+    information += flat_slope @ flat_slope.T + 0.5 * flat_spread @ flat_spread.T
+    size = np.eye(len(seen)) - error[:, :, None] * error[:, None, :]
+    score -= flat_slope @ error.ravel() + 0.5 * flat_spread @ size.ravel()
 
 
 def bound(

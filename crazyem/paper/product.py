@@ -165,11 +165,10 @@ class ProductOnline:
         settings: Settings,
         sensor: str,
         *,
-        known: KnownNoise | None = None,
         accelerometer: bool = True,
     ) -> None:
         """Args: as for `estimator_for`."""
-        self.estimator = estimator_for(settings, sensor, known=known, accelerometer=accelerometer)
+        self.estimator = estimator_for(settings, sensor, accelerometer=accelerometer)
         self.estimate: Estimate | None = None
         self._sensor = sensor
         self._mass = settings.mass_start

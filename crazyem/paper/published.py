@@ -18,39 +18,18 @@ from numpy.typing import NDArray
 from crazyem.compiled import compiled
 from crazyem.errors import UsageError
 from crazyem.paper.flight import Flight
-from crazyem.paper.plant import derivative
+from crazyem.paper.plant import derivative, transition
 from crazyem.paper.published_values import CORRECTIONS, Correction
 from crazyem.paper.settings import Settings
 from crazyem.vehicle import GRAVITY
 
 
 @compiled
-def _blocks(x, dt, a, b):
-    """Rows of the angles in eq. 59: a (3, 3) by angles, b (3, 3) by rates."""
-    s, c = np.sin(x[6]), np.cos(x[6])
-    sp, cp = np.sin(x[7]), np.cos(x[7])
-    t = sp / cp
-    wy, wz = x[10], x[11]
-    a[0, 0] = 1.0 + dt * t * (c * wy - s * wz)
-    a[0, 1] = dt * (s * wy + c * wz) / cp**2
-    a[1, 0] = dt * (-s * wy - c * wz)
-    a[1, 1] = 1.0
-    a[2, 0] = dt * (c * wy - s * wz) / cp
-    a[2, 1] = dt * (s * wy + c * wz) * sp / cp**2
-    b[0, 0] = dt
-    b[0, 1] = dt * s * t
-    b[0, 2] = dt * c * t
-    b[1, 0] = 0.0
-    b[1, 1] = dt * c
-    b[1, 2] = -dt * s
-    b[2, 0] = 0.0
-    b[2, 1] = dt * s / cp
-    b[2, 2] = dt * c / cp
-
-
-@compiled
 def _predict_angular(p, a, b, q, half):
-    """Eq. 89 for angles and rates: p (6, 6) in place, both triangles; half (3, 6) is scratch."""
+    """Eq. 89 for angles and rates: p (6, 6) in place, both triangles; half (3, 6) is scratch.
+
+    a (3, 3) by angles, b (3, 3) by rates: rows of the angles in eq. 59.
+    """
     for i in range(3):
         for j in range(6):
             total = a[i, 0] * p[0, j] + a[i, 1] * p[1, j]
@@ -156,8 +135,8 @@ def expectation(
     The smoothed covariance (eq. 98) is left out: neither eq. 107 nor the appendix reads it.
     """
     n = observed.shape[0]
-    a = np.zeros((3, 3))
-    b = np.zeros((3, 3))
+    phi = np.empty((12, 12))
+    a, b = phi[6:9, 6:9], phi[6:9, 9:12]
     half = np.empty((3, 6))
     gain = np.empty(6)
     rate = np.empty(12)
@@ -170,7 +149,7 @@ def expectation(
         pa[i, i] = p0
     for k in range(n):
         if k:
-            _blocks(x, dt, a, b)
+            transition(x, dt, phi)
             derivative(x, wrench[k - 1, 0], wrench[k - 1, 1:], mass, inertia, rate)
             for i in range(12):
                 x[i] += dt * rate[i]
@@ -316,9 +295,7 @@ def _check(sensor: str, angles: str) -> None:
         raise UsageError(f'angles that sensor C lacks are "zero" or "dead-reckoned", not {angles!r}')
 
 
-def published_offline(
-    flight: Flight, sensor: str, *, angles: Angles = "zero", iterations: int = 20, clamp: bool = False
-) -> PublishedFit:
+def published_offline(flight: Flight, sensor: str, *, angles: Angles = "zero", iterations: int = 20) -> PublishedFit:
     """EM over all rows of a flight, from m0 and I0 (eq. 116, 117).
 
     Args:
@@ -327,7 +304,6 @@ def published_offline(
         angles: how C's missing angles are taken: read as "zero", as the printed bias implies, or "dead-reckoned" from
             the start (their rows dropped from H).
         iterations: of EM.
-        clamp: as in `PublishedOnline`; offline nothing needs it.
 
     Raises:
         UsageError: no such sensor or way to take the angles; fewer than two rows.
@@ -346,7 +322,7 @@ def published_offline(
     theta[0] = (s.mass_start, *s.inertia_start)
     for i in range(iterations):
         theta[i + 1] = work.iterate(
-            observed, flight.wrench[: flight.size], first, theta[i], sees_angles=sees, clamp=clamp
+            observed, flight.wrench[: flight.size], first, theta[i], sees_angles=sees, clamp=False
         )
     return PublishedFit(theta)
 
