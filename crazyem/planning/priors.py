@@ -80,7 +80,7 @@ def nuisances_of(flight: Flight, point: Point, apart_from: Sequence[str]) -> lis
             continue
         never = {} if any(p.chosen for p in effect.parameters) else effect.prior.systematic
         sizes = {**never, **effect.prior.usual_in(conditions)}
-        centre = tuple((n, c) for n, c in effect.prior.centre.items() if n in sizes)
+        centre = tuple((n, c) for n, c in effect.prior.centre_in(conditions).items() if n in sizes)
         found += [
             (Candidate(name, centre, (n,), both_ways=effect.prior.signed), _size(effect, n, sizes, point))
             for n in sizes if sizes[n] > 0.0

@@ -18,7 +18,8 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
-from crazyem.diagnosis.naming.detection_limits import matters
+from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.prior import Conditions
 
 GYRO = Candidate("measurement_delay", (("streams", ("gyro",)),), ("delay",))
 
@@ -39,12 +40,18 @@ def test_a_late_gyro_is_late_by_what_it_was_shifted(late: float) -> None:
     assert total == pytest.approx(late, abs=0.6e-3)
 
 
-@pytest.mark.parametrize(("streams", "told"), [(("gyro",), True), (("state",), False)])
-def test_less_of_a_gyro_matters_than_of_a_state(streams: tuple[str, ...], told: bool) -> None:
-    point = Point(DRONE, {"measurement_delay": {"delay": 0.0025, "streams": streams}}, first_guess())
-    candidate = Candidate("measurement_delay", (("streams", streams),), ("delay",))
-    assert matters(point, candidate) is told
-    assert not matters(point.with_effects({"measurement_delay": {"delay": 0.0019}}), candidate)
+@pytest.mark.parametrize(("onboard", "gyro", "state"), [(True, 0.002, 0.006), (False, 0.003, 0.003)])
+def test_less_of_a_gyro_matters_where_the_attitude_is_made_of_it(onboard: bool, gyro: float, state: float) -> None:
+    prior, conditions = CATALOGUE["measurement_delay"].prior, Conditions(onboard=onboard)
+    for streams, limit in ((("gyro",), gyro), (("state",), state)):
+        assert prior.detection_limit_in({"streams": streams}, conditions)["delay"][1] == limit
+    lags = CATALOGUE["onboard_filter"].prior
+    signals = frozenset({"position", "attitude", "body_rate"})
+    mean = lags.centre_in(replace(conditions, signals=signals))["rate_lag"]
+    sd = lags.usual_in(replace(conditions, signals=signals))["rate_lag"]
+    # a gyro without a filter, and the Crazyflie's of 80 Hz beside a pose that is not made of it
+    assert abs(mean - 0.0) <= 2.0 * sd
+    assert onboard or abs(mean - np.sqrt(2.0) / (2.0 * np.pi * 80.0)) < 1e-4
 
 
 def test_rates_of_motion_alone_are_turned_by_what_acts() -> None:

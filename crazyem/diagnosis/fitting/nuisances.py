@@ -50,7 +50,7 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
             candidate: Candidate = of_recordings(effect.name, tuple(sizes), data.flights)
             precision = tuple(sd**-2 for sd in sizes.values()) * (len(candidate.free) // len(sizes))
         else:
-            centre = tuple((n, c) for n, c in prior.centre.items() if n in sizes)
+            centre = tuple((n, c) for n, c in prior.centre_in(facts).items() if n in sizes)
             tails = prior.freedom_in(facts) if trim_known(point.vehicle) else math.inf
             candidate = Candidate(effect.name, centre, tuple(sizes), both_ways=prior.signed, freedom=tails)
             neutral = candidate.neutral(point)

@@ -136,9 +136,20 @@ def _lags(conditions: Conditions) -> Sizes:
     if not {"attitude", "position"} & conditions.signals:
         return {}
     made = conditions.onboard and {"velocity", "position"} <= conditions.signals
-    found = {"rate_lag": 0.7e-3} if "body_rate" in conditions.signals else {}
+    found = {"rate_lag": RATE_LAGS[conditions.onboard][1]} if "body_rate" in conditions.signals else {}
     found |= {"velocity_lag": 2e-3 if made else 0.7e-3} if "velocity" in conditions.signals else {}
     return found | ({"lateral_time_constant": 0.2} if made and found else {})
+
+
+# s, mean and standard deviation of a gyro's lag, by whether the attitude beside it is made on board. A second-order
+# low-pass filter of f Hz is sqrt(2) / (2 pi f) late: 2.8 ms for the Crazyflie's 80 Hz (sensors_bmi088_bmp3xx.c), 5.6 ms
+# for the 40 Hz of PX4 (IMU_GYRO_CUTOFF), nothing in many simulators. An attitude made of that gyro is late as well.
+RATE_LAGS = {True: (1.2e-3, 0.7e-3), False: (2.8e-3, 1.5e-3)}
+
+
+def _mean_lags(conditions: Conditions) -> Sizes:
+    """s: see `_lags`."""
+    return {"rate_lag": RATE_LAGS[conditions.onboard][0], "velocity_lag": 0.6e-3, "lateral_time_constant": 0.2}
 
 
 ONBOARD_FILTER = Effect(
@@ -152,7 +163,7 @@ ONBOARD_FILTER = Effect(
     order=85,
     measured=filtered,
     uses_force=True,
-    prior=Prior(usual=_lags, centre={"rate_lag": 1.2e-3, "velocity_lag": 0.6e-3, "lateral_time_constant": 0.2}),
+    prior=Prior(usual=_lags, centre=_mean_lags),
     needs=("velocity", "body_rate"),
     words="filters on board",
     belongs_to="recording",

@@ -92,7 +92,7 @@ class Prior:
         usual: from recording to recording; or as a function of the conditions.
         per: what the sizes of a parameter are shares of: "mass" or "inertia" (about x) of the vehicle, or
             "neutral", the parameter's own neutral value; SI where absent.
-        centre: what recordings have on average anyway, where that is not neutral.
+        centre: what recordings have on average anyway, where that is not neutral; or as a function of the conditions.
         freedom: degrees of freedom of Student's t distribution, which `usual` is the scale of; infinite: a normal one.
         signed: `usual` goes below the physical range, too: a delay that is counted may be counted too long.
         each: whether several recordings that are fitted together have a deviation each.
@@ -109,7 +109,7 @@ class Prior:
     own: Sizes = field(default_factory=dict)
     usual: Sizes | Callable[[Conditions], Sizes] = field(default_factory=dict)
     per: Mapping[str, str] = field(default_factory=dict)
-    centre: Sizes = field(default_factory=dict)
+    centre: Sizes | Callable[[Conditions], Sizes] = field(default_factory=dict)
     freedom: float | Callable[[Conditions], float] = math.inf
     signed: bool = False
     each: Callable[[Conditions], bool] = lambda conditions: False
@@ -124,6 +124,10 @@ class Prior:
     def usual_in(self, conditions: Conditions) -> Sizes:
         """From recording to recording, under some conditions."""
         return self.usual(conditions) if callable(self.usual) else self.usual
+
+    def centre_in(self, conditions: Conditions) -> Sizes:
+        """On average, under some conditions."""
+        return self.centre(conditions) if callable(self.centre) else self.centre
 
     def freedom_in(self, conditions: Conditions) -> float:
         """Degrees of freedom, under some conditions."""
