@@ -235,8 +235,8 @@ class Guard:
                     reasons[name] = f"the controller believes {self.beliefs[name]:.4g}, too far outside to lead it back"
         for name, others in self.controller.waits.items():
             late = [o for o in others if o not in changed and reasons.get(o) != "unchanged"]
-            if not self.controller.attitude_gains:  # of its own each, so a policy may leave one as it is
-                late = [o for o in late if o in self.limits.parameters]
+            if not self.controller.attitude_gains:  # of its own each: a policy may leave one, and a refuted one hurries
+                late = [] if self._refuted(name) else [o for o in late if o in self.limits.parameters]
             if name in changed and late:
                 reasons[name] = f"waits for {late[0]}"
         changed = {name: value for name, value in changed.items() if not reasons[name]}
