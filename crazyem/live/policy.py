@@ -58,7 +58,7 @@ class MonitorLimits:
     before: float = 2.0
     settle: float = 0.5
     after: float = 2.5
-    unjudged: int = 4
+    unjudged: int = 6
     tracking_ratio: float = 1.5
     tracking: float = 0.10
     tracking_alarm: float = 0.50
