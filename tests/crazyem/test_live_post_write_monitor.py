@@ -156,8 +156,9 @@ def test_writes_that_follow_each_other_are_judged_against_the_time_before_the_fi
     assert verdict == "worse"
     assert "0.050 m before" in why
     assert watch.unjudged == 3
-    assert not watch.full
-    watch.on_write(WRITE + 1.5, WRITE + 1.53)
+    for k in range(watch.limits.unjudged - 3):
+        assert not watch.full
+        watch.on_write(WRITE + 1.5 + 0.5 * k, WRITE + 1.53 + 0.5 * k)
     assert watch.full
 
 
