@@ -76,17 +76,17 @@ def test_a_steady_torque_that_nothing_explains_is_written_as_a_trim() -> None:
 def test_a_drone_whose_commands_shake_has_a_trim_first() -> None:
     """As those of real drones with a deck, logged at 100 Hz; judged by a file that knows no trim, then by its own."""
     strong = 1.04  # within what any drone may have, and part of its file all the same
-    healthy = shaking(fly(Hidden(twist=TWIST, thrust=(strong,) * 4), seconds=14.0, seed=8), seed=1)
+    healthy = shaking(fly(Hidden(twist=TWIST, thrust=(strong,) * 4), seconds=10.0, seed=8), seed=1)
     found = diagnose([healthy], DRONE)
     assert [e.name for e in found.effects] == [TRIM]
     assert found.fitted_vehicle.effects["thrust_scale"]["scale"] == pytest.approx(strong, abs=0.005)
     assert found.effects[0].name == TRIM
     assert found.effects[0].parameters["z"].value == pytest.approx(TWIST, rel=0.1)
     assert {"inertia", "motor_lag", "center_of_mass"} <= set(found.left_out)
-    again = shaking(fly(Hidden(twist=TWIST, thrust=(strong,) * 4), seconds=14.0, seed=9), seed=2)
+    again = shaking(fly(Hidden(twist=TWIST, thrust=(strong,) * 4), seconds=10.0, seed=9), seed=2)
     assert not diagnose([again], found.fitted_vehicle).mismatch
     weak = Hidden(twist=TWIST, thrust=(strong, strong, 0.72 * strong, strong))
-    cut = diagnose([shaking(fly(weak, seconds=14.0, seed=10), seed=3)], found.fitted_vehicle)
+    cut = diagnose([shaking(fly(weak, seconds=10.0, seed=10), seed=3)], found.fitted_vehicle)
     assert (cut.effects[0].name, cut.effects[0].chosen["rotor"]) == ("rotor_fault", 3)
     assert cut.effects[0].parameters["scale"].value == pytest.approx(0.72, abs=0.05)
 

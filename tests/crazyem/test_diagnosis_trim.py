@@ -1,5 +1,6 @@
 """Real drones: trims as part of the vehicle file, commands sampled too coarsely, rotors relabelled by symmetry."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +28,7 @@ from crazyem.diagnosis.naming.detection_limits import usual_gusts
 from crazyem.diagnosis.naming.steady_odds import explanations
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings import open_recording
+from crazyem.recordings.cut import cut
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
 
@@ -186,6 +188,17 @@ def test_rotors_relabelled_by_symmetry_give_the_relabelled_odds(name: str) -> No
     np.testing.assert_allclose(other[np.array(to) - 1], one, atol=2.0 * ENOUGH)  # either fit may end so early
 
 
+@pytest.fixture
+def flown_by(shared_recordings) -> Callable[..., Recording]:
+    """The first seconds of 26 s of a flight of drone E8."""
+
+    def begun(name: str, seconds: float = 26.0) -> Recording:
+        whole = open_recording(shared_recordings / "crazypad" / name)
+        return cut(whole, None, whole.signals["position"].time[0] + seconds)
+
+    return begun
+
+
 @pytest.fixture(scope="module")
 def healthy(shared_recordings, made_once) -> Vehicle:
     """The file of drone E8 by a flight with whole propellers, as a user would make it: a preset and nothing named."""
@@ -198,17 +211,14 @@ def healthy(shared_recordings, made_once) -> Vehicle:
 
 
 @pytest.mark.slow
-def test_a_cut_propeller_is_named_with_what_it_lacks_also_where_rotors_are_relabelled(
-    shared_recordings, healthy
-) -> None:
+def test_a_cut_propeller_is_named_with_what_it_lacks_also_where_rotors_are_relabelled(flown_by, healthy) -> None:
     """Rotor 3 of a real drone has 3.5 mm less on each blade; the file is of a flight with whole propellers.
 
     Flights logged in different tables, one of them relabelled. Cuts of 1.5 mm are within days.
     """
     polar, to = SYMMETRIES["left and right"]
     motor, controller = (
-        open_recording(shared_recordings / "crazypad" / f"{table}__cut_propeller_M3_3.5mm_3.5mm_40mm__E8_log00")
-        for table in ("motor", "controller")
+        flown_by(f"{table}__cut_propeller_M3_3.5mm_3.5mm_40mm__E8_log00") for table in ("motor", "controller")
     )
     values = []
     for flown, vehicle, rotor in (
@@ -224,43 +234,38 @@ def test_a_cut_propeller_is_named_with_what_it_lacks_also_where_rotors_are_relab
 
 
 @pytest.mark.slow
-def test_healthy_flights_tell_a_smaller_cut(shared_recordings) -> None:
+def test_healthy_flights_tell_a_smaller_cut(flown_by) -> None:
     """2.5 mm, by three healthy flights of other days; the rotor that is cut, and about as much as others say."""
-    folder = shared_recordings / "crazypad"
-    flights = [open_recording(folder / f"motor__normal_flight__E8_log0{i}") for i in (0, 1, 3)]
+    flights = [flown_by(f"motor__normal_flight__E8_log0{i}", 17.0) for i in (0, 1, 3)]
     vehicle = with_baseline(load_vehicle("cf2-legacy"), flights)
     assert vehicle.days is not None
     assert vehicle.days.flights == 3
-    cut = open_recording(folder / "motor__cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00")
-    effect = next(e for e in diagnose([cut], vehicle).effects if e.name == "rotor_fault")
+    damaged = flown_by("motor__cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00", 17.0)
+    effect = next(e for e in diagnose([damaged], vehicle).effects if e.name == "rotor_fault")
     assert effect.chosen["rotor"] == 3
     assert effect.parameters["scale"].value == pytest.approx(0.82, abs=0.05)
 
 
 @pytest.mark.slow
-def test_another_day_of_a_healthy_drone_is_no_finding(shared_recordings, healthy) -> None:
+def test_another_day_of_a_healthy_drone_is_no_finding(flown_by, healthy) -> None:
     """Torques of one rotor at random are at the limit of being told (11.5 nats, by the rounding of the machine)."""
-    name = "controller__normal_flight__E8_log00"
-    found = diagnose([open_recording(shared_recordings / "crazypad" / name)], healthy)
+    found = diagnose([flown_by("controller__normal_flight__E8_log00")], healthy)
     assert not found.effects
     assert all(f.signal == "torque" and f.nats < 15.0 for f in found.unexplained.findings)
 
 
 @pytest.mark.slow
-def test_tape_on_a_propeller_is_no_effect_of_the_catalogue(shared_recordings, healthy) -> None:
+def test_tape_on_a_propeller_is_no_effect_of_the_catalogue(flown_by, healthy) -> None:
     """A tilt of 15 mrad in the second half, made from accelerations, may stay unexplained (28 nats; 25 are told)."""
-    name = "motor__tape_on_propeller_M3__E8_log00"
-    found = diagnose([open_recording(shared_recordings / "crazypad" / name)], healthy)
+    found = diagnose([flown_by("motor__tape_on_propeller_M3__E8_log00")], healthy)
     assert not found.effects
     assert all(f.signal == "attitude" for f in found.unexplained.findings)
 
 
 @pytest.mark.slow
-def test_a_weight_by_two_rotors_is_one_or_those_are_weak(shared_recordings, healthy) -> None:
+def test_a_weight_by_two_rotors_is_one_or_those_are_weak(flown_by, healthy) -> None:
     """Taped between rotors 3 and 4, on the left; in steady flight two weak rotors there do the same."""
-    found = diagnose(
-        [open_recording(shared_recordings / "crazypad" / "controller__add_weight_W1_near_M3_M4__E8_log00")], healthy
-    )
+    found = diagnose([flown_by("controller__add_weight_W1_near_M3_M4__E8_log00", 17.0)], healthy)
     load = found.effects[0]
     assert load.name == "payload"
     assert load.parameters["y"].value > 0.01
