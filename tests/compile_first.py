@@ -6,6 +6,8 @@ Kernels to machine code, and the modules of the tests to bytecode. `make test` r
 in the tests, which say why.
 """
 
+import hashlib
+import json
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -13,6 +15,20 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+FLIGHT = ("logs/payload_excite.mcap", "--to", "6")
+REPLAYED = REPOSITORY / "tests" / "__pycache__" / "replayed_while_compiling.json"
+
+# A replay by kernels that are compiled in its process, all of them; kept for test_kernel_cache.py.
+REPLAY = f"""
+import json
+from crazyem import compiled
+from crazyem.cli import main
+
+main(["replay", *{FLIGHT}, "--json", {str(REPLAYED)!r}])
+if any(sum(k.stats.cache_hits.values()) for k in compiled._KERNELS if hasattr(k, "stats")):
+    raise SystemExit("some kernels came from the disk")
+"""
+
 ESTIMATOR = """
 from crazyem.live.warm_up import warm_up
 from crazyem.vehicle import load_vehicle
@@ -73,7 +89,30 @@ def diagnosed(folder: str) -> None:
     python("-m", "crazyem", "diagnose", log, "--candidates", "linear_drag", "--json", f"{folder}/d.json").communicate()
 
 
+def of_what() -> str:
+    """What the numbers of a replay follow from: our sources, the flight, numba and the processor."""
+    import llvmlite.binding as llvm
+    import numba
+
+    digest = hashlib.sha256(f"{numba.__version__} {llvm.get_host_cpu_name()} {FLIGHT}".encode())
+    for path in (REPOSITORY / FLIGHT[0], *sorted((REPOSITORY / "crazyem").rglob("*.py"))):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def replayed() -> None:
+    REPLAYED.parent.mkdir(exist_ok=True)
+    process = python("-c", REPLAY)
+    process.communicate()
+    if process.returncode == 0:
+        said = json.loads(REPLAYED.read_text(encoding="utf-8"))
+        REPLAYED.write_text(json.dumps({"of": of_what(), "said": said}), encoding="utf-8")
+    else:
+        REPLAYED.unlink(missing_ok=True)
+
+
 def of_the_estimator() -> None:
+    replayed()
     python("-c", ESTIMATOR + MADE_FLIGHTS).communicate()
     with TemporaryDirectory() as folder:
         diagnosed(folder)
