@@ -66,13 +66,10 @@ ALLOWED: dict[str, set[str]] = {
 
 # The same for the folders of the diagnosis, in the order in which data pass through them; `workers` serves all.
 DIAGNOSIS: dict[str, set[str]] = {
-    "workers": set(),
-    "flights": set(),
-    "prediction": {"flights"},
-    "fitting": {"flights", "workers"},
+    "workers": set(), "flights": set(), "prediction": {"flights"}, "fitting": {"flights", "workers"},
     "locating": {"flights", "fitting", "workers"},
     "naming": {"flights", "prediction", "fitting", "locating", "workers"},
-}
+}  # fmt: skip
 
 # Finer than folders: the only modules that a part may import from another. Each says what the exception is for.
 ONLY: dict[tuple[str, str], set[str]] = {

@@ -16,13 +16,8 @@ def test_indi_with_half_its_effectiveness_is_right_within_two_seconds() -> None:
 
 def test_the_table_says_what_came_out() -> None:
     low = {
-        "crashed": False,
-        "reverted": False,
-        "within_s": 1.5,
-        "error_2s": 0.02,
-        "overshoot": -0.1,
-        "worst_error": 0.5,
-    }
+        "crashed": False, "reverted": False, "within_s": 1.5, "error_2s": 0.02, "overshoot": -0.1, "worst_error": 0.5,
+    }  # fmt: skip
     text = table({1: {"low": low, "ideal": {**low, "overshoot": -0.12}}})
     assert "|INDI, g1 × 0.5: 5 % reached|1.50 (1.50 to 1.50) s|2 s 1/1|" in text
     assert "|INDI, g1 × 0.5: overshoot less ideal|2.00 (2.00 to 2.00) %|10 % 1/1|" in text

@@ -12,21 +12,17 @@ PX4, ARDUPILOT = 12, 3
 _PLACES = ((0.1, 0.1), (-0.1, -0.1), (0.1, -0.1), (-0.1, 0.1))  # forward, right, of motors 1..4 of an X quad
 PARAMETERS = {
     PX4: {
-        "MPC_THR_HOVER": (0.5, 9),
-        "MPC_USE_HTE": (1, 6),
+        "MPC_THR_HOVER": (0.5, 9), "MPC_USE_HTE": (1, 6),
         **{f"PWM_MAIN_FUNC{n}": (100 + n, 6) for n in range(1, 5)},
         **{f"PWM_MAIN_MIN{n}": (1000, 6) for n in range(1, 5)},
         **{f"PWM_MAIN_MAX{n}": (2000, 6) for n in range(1, 5)},
         **{f"CA_ROTOR{n}_P{a}": (v, 9) for n, place in enumerate(_PLACES) for a, v in zip("XY", place, strict=True)},
     },
     ARDUPILOT: {
-        "MOT_THST_HOVER": (0.35, 9),
-        "MOT_HOVER_LEARN": (2, 1),
-        "MOT_PWM_MIN": (1100, 4),
-        "MOT_PWM_MAX": (1900, 4),
+        "MOT_THST_HOVER": (0.35, 9), "MOT_HOVER_LEARN": (2, 1), "MOT_PWM_MIN": (1100, 4), "MOT_PWM_MAX": (1900, 4),
         **{f"SERVO{n}_FUNCTION": (32 + n, 4) for n in range(1, 5)},
     },
-}
+}  # fmt: skip
 
 
 class FakeAutopilot:

@@ -29,8 +29,7 @@ def where(axis: str, regime: str, interval: list[float], size: float) -> dict[st
 
 def document() -> dict[str, Any]:
     return {
-        "format": "crazyem-diagnosis",
-        "mismatch": True,
+        "format": "crazyem-diagnosis", "mismatch": True,
         "recordings": ["flights/circle_fast_1.csv", "flights/figure8_2.csv"],
         "vehicle": "cf2",
         "where": [
@@ -58,20 +57,13 @@ def document() -> dict[str, Any]:
         "ranking": [
             {"name": "thrust_scale", "held_out_nats": 812.4, "p_value": 1e-30, "note": "claimed"},
             {
-                "name": "payload",
-                "gain_nats": 3815.4,
-                "held_out_nats": 811.0,
-                "p_value": 1e-29,
+                "name": "payload", "gain_nats": 3815.4, "held_out_nats": 811.0, "p_value": 1e-29,
                 "note": "cannot be told from thrust scale",
             },
             {"name": "linear_drag", "held_out_nats": 95.1, "p_value": 3e-9, "note": "claimed"},
             {
-                "name": "battery_sag",
-                "label": "battery_sag[gain_per_second]",
-                "words": "battery sag with time",
-                "held_out_nats": 60.0,
-                "p_value": 1e-4,
-                "note": "",
+                "name": "battery_sag", "label": "battery_sag[gain_per_second]", "words": "battery sag with time",
+                "held_out_nats": 60.0, "p_value": 1e-4, "note": "",
             },
             {"name": "ground_effect", "held_out_nats": -2.5, "p_value": 0.4, "note": "no better on held-out flight"},
         ],
@@ -85,28 +77,16 @@ def document() -> dict[str, Any]:
         "not_identifiable": ["inertia", "mass against thrust"],
         "left_free": [
             {
-                "name": "input_delay",
-                "words": "input delay",
-                "parameter": "delay",
-                "value": -0.0026,
-                "sd": 0.0006,
-                "unit": "s",
-                "expected": 0.0,
-                "usual": 0.002,
+                "name": "input_delay", "words": "input delay", "parameter": "delay", "value": -0.0026, "sd": 0.0006,
+                "unit": "s", "expected": 0.0, "usual": 0.002,
             },
             {
-                "name": None,
-                "words": "rotor clock",
-                "parameter": "delay, circle_fast_1.csv",
-                "value": 0.0123,
-                "sd": 0.0011,
-                "unit": "s",
-                "expected": 0.0,
-                "usual": None,
+                "name": None, "words": "rotor clock", "parameter": "delay, circle_fast_1.csv", "value": 0.0123,
+                "sd": 0.0011, "unit": "s", "expected": 0.0, "usual": None,
             },
         ],
         "notices": ["the battery voltage was withheld"],
-    }
+    }  # fmt: skip
 
 
 def pictures() -> dict[str, Series]:

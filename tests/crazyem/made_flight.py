@@ -22,17 +22,9 @@ ROTOR_CONSTANT = 3.0e-8  # N/(rad/s)^2
 
 # Standard deviation of the noise of each quantity at `noise=1`, in its own unit (rad for attitudes).
 NOISE: dict[str, float] = {
-    "position": 5e-4,
-    "velocity": 1e-2,
-    "attitude": 2e-3,
-    "body_rate": 2e-2,
-    "specific_force": 0.15,
-    "motor_command": 2e-3,
-    "rotor_speed": 3.0,
-    "voltage": 5e-3,
-    "acceleration": 0.1,
-    "euler": 2e-3,
-}
+    "position": 5e-4, "velocity": 1e-2, "attitude": 2e-3, "body_rate": 2e-2, "specific_force": 0.15,
+    "motor_command": 2e-3, "rotor_speed": 3.0, "voltage": 5e-3, "acceleration": 0.1, "euler": 2e-3,
+}  # fmt: skip
 
 # stream -> (rate in Hz, quantities sampled together)
 STREAMS: dict[str, tuple[float, tuple[str, ...]]] = {

@@ -19,19 +19,13 @@ def seeds(folder: Path) -> dict[str, bytes]:
     from test_recordings_usd import small_log
 
     return {
-        "usd1": small_log(1)[2],
-        "usd2": small_log(2)[2],
-        "ulog": ulog(rows=6)[0],
-        "tlog": tlog(rows=4)[0],
+        "usd1": small_log(1)[2], "usd2": small_log(2)[2], "ulog": ulog(rows=6)[0], "tlog": tlog(rows=4)[0],
         "cfclient": as_cfclient(STATE, rows_of(STATE)).encode(),
         "nanobench": _nanobench(),
         "nanobench.gz": gzip.compress(_nanobench(), mtime=0),
-        "long": _long(),
-        "mcap": _ours(folder / "ours.mcap"),
-        "imported": _imported(folder),
-        "exported": _exported(folder),
-        "rosbag2": _rosbag2(folder / "bag.mcap"),
-    }
+        "long": _long(), "mcap": _ours(folder / "ours.mcap"), "imported": _imported(folder),
+        "exported": _exported(folder), "rosbag2": _rosbag2(folder / "bag.mcap"),
+    }  # fmt: skip
 
 
 def _nanobench() -> bytes:

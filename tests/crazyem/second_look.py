@@ -62,14 +62,10 @@ def stream(time: np.ndarray) -> Facts:
         lost, places = lost + max(missing, 0), places + (missing > 0)
     span = float(time[-1] - time[0])
     return {
-        "rows": float(time.size),
-        "duration_s": span,
-        "rate_hz": (time.size - 1) / span,
-        "longest_gap_s": float(step.max()),
-        "lost": float(lost),
-        "gaps": float(places),
+        "rows": float(time.size), "duration_s": span, "rate_hz": (time.size - 1) / span,
+        "longest_gap_s": float(step.max()), "lost": float(lost), "gaps": float(places),
         "real_hz": (time.size - 1 + lost) / span,
-    }
+    }  # fmt: skip
 
 
 def scale(time: np.ndarray, value: np.ndarray, rate: np.ndarray, good: np.ndarray, span: float = 0.3) -> float:

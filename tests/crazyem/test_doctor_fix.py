@@ -266,11 +266,8 @@ def test_a_finding_of_the_reader_is_applied_as_it_is_and_no_longer_said() -> Non
 @pytest.mark.parametrize(
     "bad",
     [
-        Fix("melt", ("body_rate",)),
-        Fix("scale", ("nothing",), (2.0,)),
-        Fix("scale", ()),
-        Fix("scale", ("body_rate",), (2.0, 2.0)),
-        Fix("scale", ("body_rate",), (0.0,)),
+        Fix("melt", ("body_rate",)), Fix("scale", ("nothing",), (2.0,)), Fix("scale", ()),
+        Fix("scale", ("body_rate",), (2.0, 2.0)), Fix("scale", ("body_rate",), (0.0,)),
         Fix("scale", ("body_rate",), (float("nan"),)),
         Fix("shift", ("body_rate",), ()),
         Fix("shift", ("body_rate",), (float("inf"),)),
@@ -281,7 +278,7 @@ def test_a_finding_of_the_reader_is_applied_as_it_is_and_no_longer_said() -> Non
         Fix("mark", ("body_rate",), (), np.array([-1])),
         Fix("world_to_body", ("voltage",)),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_repair_is_passed_over(bad: Fix) -> None:
     result, applied = apply_fixes(GOOD, [Finding("reader", Grade.DEGRADES, "odd", fix=bad)])
     assert result is GOOD

@@ -148,18 +148,12 @@ FAULTS = {
     "acc FRD": ("forces", "specific_force", _value("specific_force") * [1, -1, -1], "x, -y, -z", True),
     "acc less 1 g": ("forces", "specific_force", _value("specific_force") - G * UP, "gravity was removed", False),
     "acc less gravity": (
-        "forces",
-        "specific_force",
+        "forces", "specific_force",
         _value("specific_force") - _TURN.attitude(FLIGHT.signals["specific_force"].time).inv().apply(G * UP),
-        "in the body frame without gravity",
-        False,
+        "in the body frame without gravity", False,
     ),
     "acc is acceleration": (
-        "forces",
-        "specific_force",
-        _world("specific_force") - G * UP,
-        "in the world frame without gravity",
-        False,
+        "forces", "specific_force", _world("specific_force") - G * UP, "in the world frame without gravity", False,
     ),
     "acc z bias": ("forces", "specific_force", _value("specific_force") + 0.8 * UP, "a bias of 0.80", False),
     "acceleration in g": ("forces", "acceleration", _value("acceleration") / G, "in g, not", True),
@@ -178,7 +172,7 @@ FAULTS = {
     "inverted pitch": ("angles", "euler", _value("euler") * [1, -1, 1], "sign of pitch is inverted", True),
     "degrees, inverted": ("angles", "euler", _value("euler") * [DEGREES, -DEGREES, DEGREES], "and it is in deg", True),
     "yaw first": ("angles", "euler", _value("euler")[:, ::-1], "yaw, pitch, roll", False),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("fault", FAULTS)

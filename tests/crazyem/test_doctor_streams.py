@@ -127,17 +127,10 @@ def test_nan_is_found_unless_it_is_marked(good, at, count, bad):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("position", 2e4),
-        ("velocity", -200.0),
-        ("attitude", 0.0),
-        ("body_rate", 120.0),
-        ("specific_force", 1e3),
-        ("motor_command", 1.01),
-        ("motor_command", -0.01),
-        ("rotor_speed", 33035.6),
-        ("voltage", 0.0),
+        ("position", 2e4), ("velocity", -200.0), ("attitude", 0.0), ("body_rate", 120.0), ("specific_force", 1e3),
+        ("motor_command", 1.01), ("motor_command", -0.01), ("rotor_speed", 33035.6), ("voltage", 0.0),
     ],
-)
+)  # fmt: skip
 def test_impossible_values_are_found_and_can_be_marked(good, name, value):
     finding = only("numbers", with_values(good, name, slice(700, 703), value))
     assert (finding.signal, finding.evidence["samples"], finding.grade) == (name, 3, Grade.DEGRADES)

@@ -44,13 +44,10 @@ def copy(
         inside = (array.time >= start) & (array.time <= end)
         value = array.value[inside] * scale
         signals[name] = replace(
-            array,
-            time=array.time[inside] + shift,
+            array, time=array.time[inside] + shift,
             value=value if digits is None else np.round(value, digits),
-            order=array.order[inside],
-            host_time=array.host_time[inside],
-            marked=array.marked[inside],
-        )
+            order=array.order[inside], host_time=array.host_time[inside], marked=array.marked[inside],
+        )  # fmt: skip
     return replace(recording, signals=signals, path=path)
 
 

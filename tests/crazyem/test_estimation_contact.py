@@ -42,11 +42,8 @@ def test_a_slow_take_off_is_believed_when_it_is_seen_again_and_again():
     # what was counted before a touch-down does not count after it
     down = [(0.5, HOVER), (0.0, HOVER), *low * CONFIRMING_HEIGHTS]
     assert run((0.0, 0.0), *low * CONFIRMING_HEIGHTS, *down)[CONFIRMING_HEIGHTS + 1 :] == [
-        True,
-        False,
-        *[False] * (CONFIRMING_HEIGHTS - 1),
-        True,
-    ]
+        True, False, *[False] * (CONFIRMING_HEIGHTS - 1), True,
+    ]  # fmt: skip
 
 
 def test_far_above_is_flight_at_once():

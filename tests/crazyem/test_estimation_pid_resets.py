@@ -35,11 +35,7 @@ def hover(vx, vy):
 
 def flown(platform):
     """Under PID, from place to speed and back every second: eight resets."""
-    table = {
-        "platform": platform,
-        "vehicle": {"mass": MASS[platform]},
-        "sensors": {"rotor_speed_invalid": LOST},
-    }
+    table = {"platform": platform, "vehicle": {"mass": MASS[platform]}, "sensors": {"rotor_speed_invalid": LOST}}
     scenario = parse_scenario(table, "test")
     firmware = Firmware(Flight(scenario, 3), platform=platform, seed=3)
     names = standard_variables([item.name for item in firmware.log.table.items])

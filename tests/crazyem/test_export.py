@@ -187,12 +187,8 @@ def test_streams_of_different_rates_stay_apart(tmp_path: Path) -> None:
     export(recording, tmp_path / "f.csv")
     table = pd.read_csv(tmp_path / "f.csv")
     assert list(table.columns[:5]) == [
-        "time [s]",
-        "host_time [s]",
-        "position_x [m]",
-        "position_y [m]",
-        "position_z [m]",
-    ]
+        "time [s]", "host_time [s]", "position_x [m]", "position_y [m]", "position_z [m]",
+    ]  # fmt: skip
     for column, name in (("body_rate_x [rad/s]", "body_rate"), ("voltage [V]", "voltage")):
         rows = table[table[column].notna()]
         assert np.array_equal(rows["time [s]"].to_numpy(), recording.signals[name].time)

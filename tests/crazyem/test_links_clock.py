@@ -48,13 +48,9 @@ def test_losses_are_counted_exactly_under_jitter(seed, period, share):
 
 
 @given(
-    st.integers(0, 2**32 - 1),
-    st.sampled_from([10, 20, 100]),
-    st.floats(0.0, 0.3),
-    st.floats(0.0, 0.5),
-    st.integers(1, 3),
-    st.integers(0, 20),
-)
+    st.integers(0, 2**32 - 1), st.sampled_from([10, 20, 100]), st.floats(0.0, 0.3), st.floats(0.0, 0.5),
+    st.integers(1, 3), st.integers(0, 20),
+)  # fmt: skip
 def test_duplicates_cancel_no_loss(seed, period, share, doubled, copies, delay):
     """Whatever is lost and doubled, at once or up to 20 packets later.
 

@@ -109,14 +109,10 @@ def test_unanswered_read_is_an_error(fake_peer):
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("fake.nothing", 1.0, "no parameter"),
-        ("nonsense", 1.0, "no parameter"),
-        ("fake.fixed", 1.0, "read-only"),
-        ("fake.byte", 256.0, "cannot hold"),
-        ("fake.byte", 0.5, "whole number"),
-        ("ctrlLee.mass", 1e300, "cannot hold"),
+        ("fake.nothing", 1.0, "no parameter"), ("nonsense", 1.0, "no parameter"), ("fake.fixed", 1.0, "read-only"),
+        ("fake.byte", 256.0, "cannot hold"), ("fake.byte", 0.5, "whole number"), ("ctrlLee.mass", 1e300, "cannot hold"),
     ],
-)
+)  # fmt: skip
 def test_writes_that_cannot_be_made(fake_peer, name, value, message):
     with connected(fake_peer) as link, pytest.raises(UsageError, match=message):
         link.write_parameter(name, value)

@@ -81,19 +81,10 @@ def test_limits_have_one_sentence_each():
 @pytest.mark.parametrize(
     ("rate", "period"),
     [
-        (100, 10),
-        (50, 20),
-        (99.0, 10),
-        (30, 30),
-        (1, 1000),
-        (0.4, 2500),
-        (101, 10),
-        (200, 5),
-        (333, 3),
-        (500, 2),
+        (100, 10), (50, 20), (99.0, 10), (30, 30), (1, 1000), (0.4, 2500), (101, 10), (200, 5), (333, 3), (500, 2),
         (1000, 1),
     ],
-)
+)  # fmt: skip
 def test_periods(rate, period):
     assert period_of(rate) == period
 

@@ -19,15 +19,8 @@ def test_standard_blocks_stream_at_100_hz(resting):
     table = decoders(blocks)
     samples = [s for p in came for s in table[p.block].decode(p)]
     assert {s.signal for s in samples} >= {
-        "position",
-        "velocity",
-        "attitude",
-        "body_rate",
-        "specific_force",
-        "motor_command",
-        "voltage",
-        "flying",
-    }
+        "position", "velocity", "attitude", "body_rate", "specific_force", "motor_command", "voltage", "flying",
+    }  # fmt: skip
     force = [s.value for s in samples if s.signal == "specific_force"]
     mean = [sum(v[i] for v in force) / len(force) for i in range(3)]
     assert mean == pytest.approx([0.0, 0.0, 9.81], abs=0.1)  # at rest on the ground

@@ -65,14 +65,11 @@ def test_one_drone_shows_values_intervals_reasons_link_guard_writes_and_alarms()
         ({"decision": ""}, "waits for estimates"),
         ({"link": LinkView(gone=True)}, "link lost"),
         ({"link": LinkView()}, "- packets/s, lost - (0 in all)"),
-        ({"parameters": ()}, "no estimate yet"),
-        ({"skipped": 31}, "31 left out"),
-        ({"behind": 2.5}, "2.5 s behind"),
+        ({"parameters": ()}, "no estimate yet"), ({"skipped": 31}, "31 left out"), ({"behind": 2.5}, "2.5 s behind"),
         ({"ended": "landed on request"}, "landed on request"),
-        ({"marks": 3}, "3 marks"),
-        ({"height": float("nan")}, "height - m"),
+        ({"marks": 3}, "3 marks"), ({"height": float("nan")}, "height - m"),
     ],
-)
+)  # fmt: skip
 def test_each_state_has_its_words(change, says):
     assert says in shown([replace(DRONE, **change)])
 

@@ -50,22 +50,16 @@ ATTITUDE = '[signals.attitude]\ncolumns = ["qx", "qy", "qz", "qw"]\n'
 @pytest.mark.parametrize(
     ("signal", "columns", "unit", "factor"),
     [
-        ("position", "p", "mm", 1e-3),
-        ("position", "p", "ft", 0.3048),
-        ("velocity", "v", "km/h", 1 / 3.6),
-        ("specific_force", "a", "g", 9.81),
-        ("specific_force", "a", "m/s²", 1.0),
-        ("acceleration", "a", "mg", 9.81e-3),
+        ("position", "p", "mm", 1e-3), ("position", "p", "ft", 0.3048), ("velocity", "v", "km/h", 1 / 3.6),
+        ("specific_force", "a", "g", 9.81), ("specific_force", "a", "m/s²", 1.0), ("acceleration", "a", "mg", 9.81e-3),
         ("body_rate", "w", "deg/s", math.pi / 180),
-        ("body_rate", "w", "dps", math.pi / 180),
-        ("body_rate", "w", "mrad/s", 1e-3),
-        ("euler", "e", "degrees", math.pi / 180),
-        ("motor_command", "m", "%", 0.01),
+        ("body_rate", "w", "dps", math.pi / 180), ("body_rate", "w", "mrad/s", 1e-3),
+        ("euler", "e", "degrees", math.pi / 180), ("motor_command", "m", "%", 0.01),
         ("motor_request", "m", "pwm", 1 / 65535),
         ("rotor_speed", "m", "rpm", 2 * math.pi / 60),
         ("rotor_speed", "m", "Hz", 2 * math.pi),
     ],
-)
+)  # fmt: skip
 def test_units(tmp_path, signal, columns, unit, factor):
     table = table_of()
     names = [n for n in table if n.rstrip("0123456789") == columns]

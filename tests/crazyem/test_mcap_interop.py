@@ -97,18 +97,12 @@ def record_everything(path, *, append=False):
 
 
 LIVE = {
-    "/log/0": "crazyem.log.Block0",
-    "/log/1": "crazyem.log.Block1",
-    "/log/2": "crazyem.log.Block2",
-    "/pose": "foxglove.PoseInFrame",
-    "/tf": "foxglove.FrameTransform",
-    "/setpoint": "crazyem.Setpoint",
+    "/log/0": "crazyem.log.Block0", "/log/1": "crazyem.log.Block1", "/log/2": "crazyem.log.Block2",
+    "/pose": "foxglove.PoseInFrame", "/tf": "foxglove.FrameTransform", "/setpoint": "crazyem.Setpoint",
     "/parameter_write": "crazyem.ParameterWrite",
-    "/estimate": "crazyem.Estimate",
-    "/residual": "crazyem.Residual",
-    "/link": "crazyem.Link",
+    "/estimate": "crazyem.Estimate", "/residual": "crazyem.Residual", "/link": "crazyem.Link",
     "/events": "foxglove.Log",
-}
+}  # fmt: skip
 
 
 def test_a_flight_is_decoded_without_crazyem(tmp_path):

@@ -97,16 +97,11 @@ def recordings(draw):
             signals[name] = SignalArray(
                 time,
                 draw(hnp.arrays(float, (rows, width), elements=numbers)),
-                row_orders * 1000 + place,
-                host,
-                draw(hnp.arrays(bool, rows)),
-                quantity=name if known else "",
+                row_orders * 1000 + place, host, draw(hnp.arrays(bool, rows)), quantity=name if known else "",
                 unit=SIGNALS[name][1] if known else draw(texts),
-                frame=draw(texts),
-                clock=clock,
-                stream=stream,
+                frame=draw(texts), clock=clock, stream=stream,
                 source=tuple(draw(st.lists(texts, max_size=2))),
-            )
+            )  # fmt: skip
             place += 1
     events = draw(
         st.lists(

@@ -59,10 +59,7 @@ def test_stretches_of_one_flight_count_as_one():
     assert twice["ratio"] == once["ratio"]
 
 
-@given(
-    st.lists(st.tuples(*[st.floats(-3, 3)] * 4), min_size=2, max_size=20),
-    st.floats(-0.5, 0.5),
-)
+@given(st.lists(st.tuples(*[st.floats(-3, 3)] * 4), min_size=2, max_size=20), st.floats(-0.5, 0.5))
 def test_luck_of_the_draw_is_taken_out(draws, waste):
     """An efficient estimator has a paired ratio of 1 with no error; one off by a constant is off by just that."""
     said = summary([made(i, z) for i, z in enumerate(draws)])

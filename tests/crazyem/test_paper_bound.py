@@ -39,12 +39,7 @@ def plain_motion(x, u, noise, dt, mass, inertia):
     body_z = Rotation.from_euler("xyz", x[6:9]).as_matrix()[:, 2]
     momentum = np.diag(inertia) @ x[9:]
     rates = np.linalg.solve(np.diag(inertia), u[1:] + noise[1:] - np.cross(x[9:], momentum))
-    slope = [
-        *x[3:6],
-        *(body_z * (u[0] + noise[0]) / mass - [0, 0, GRAVITY]),
-        *np.linalg.solve(to_body, x[9:]),
-        *rates,
-    ]
+    slope = [*x[3:6], *(body_z * (u[0] + noise[0]) / mass - [0, 0, GRAVITY]), *np.linalg.solve(to_body, x[9:]), *rates]
     return x + dt * np.array(slope)
 
 
@@ -184,12 +179,7 @@ def test_an_efficient_estimator_errs_as_much_as_the_bound_says():
 # what is known helps -----------------------------------------------------------------------------------------------
 
 
-@given(
-    seed=st.integers(0, 50),
-    sensor=st.sampled_from("ABC"),
-    first=st.integers(0, 700),
-    length=st.integers(120, 800),
-)
+@given(seed=st.integers(0, 50), sensor=st.sampled_from("ABC"), first=st.integers(0, 700), length=st.integers(120, 800))
 @hypothesis_settings(max_examples=8)
 def test_more_data_and_more_knowledge_never_hurt(seed, sensor, first, length):
     flight = fly(Settings(duration=8.0), seed)

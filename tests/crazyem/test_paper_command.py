@@ -271,14 +271,10 @@ def test_a_task_that_fails_is_one_sentence(
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["--experiment", "both"],
-        ["--sensor", "D"],
-        ["--seeds", "0"],
-        ["--seeds", "x"],
-        ["--jobs", "0"],
+        ["--experiment", "both"], ["--sensor", "D"], ["--seeds", "0"], ["--seeds", "x"], ["--jobs", "0"],
         ["--set", "mass"],
     ],
-)
+)  # fmt: skip
 def test_wrong_arguments(arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["paper", "--out", str(tmp_path / "out"), *arguments]) == 2
     assert capsys.readouterr().err.count("\n") == 1

@@ -44,24 +44,18 @@ def test_the_other_reading(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("assignment", "says"),
     [
-        ("mass", "not NAME=VALUE"),
-        ("weight=1", "no setting 'weight'"),
-        ("mass=heavy", "not a number between"),
-        ("mass=nan", "not a number between"),
-        ("mass=-0.18", "not a number between"),
+        ("mass", "not NAME=VALUE"), ("weight=1", "no setting 'weight'"), ("mass=heavy", "not a number between"),
+        ("mass=nan", "not a number between"), ("mass=-0.18", "not a number between"),
         ("window=100.5", "not a whole number"),
         ("window=19", "not a number between 20 and 20000"),
         ("window=5000", "longer than the flight"),
-        ("every=801", "leaves gaps"),
-        ("inertia=1e-4,2e-4", "not 3 numbers"),
+        ("every=801", "leaves gaps"), ("inertia=1e-4,2e-4", "not 3 numbers"),
         ("inertia=1e-4,1e-4,3e-4", "largest moment of inertia"),
         ("smooth=perhaps", "neither true nor false"),
         ("waypoints=" + ";".join(["1,2,3"] * 101), "too many"),
-        ("dt=0.0001", None),
-        ("duration=600", None),
-        ("waypoints=1,2,3;4,5,6", None),
+        ("dt=0.0001", None), ("duration=600", None), ("waypoints=1,2,3;4,5,6", None),
     ],
-)
+)  # fmt: skip
 def test_settings_that_are_refused(assignment: str, says: str | None) -> None:
     if says is None:
         settings_with([assignment])

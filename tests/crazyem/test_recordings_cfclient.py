@@ -71,17 +71,11 @@ def about(recording, check):
 
 @given(
     st.lists(
-        st.tuples(
-            st.integers(0, 3000),
-            st.floats(width=32),
-            st.integers(0, 2**32 - 1),
-            st.floats(allow_nan=True),
-        ),
-        min_size=1,
-        max_size=40,
+        st.tuples(st.integers(0, 3000), st.floats(width=32), st.integers(0, 2**32 - 1), st.floats(allow_nan=True)),
+        min_size=1, max_size=40,
     ),
     st.integers(0, WRAP - 1),
-)
+)  # fmt: skip
 def test_every_value_comes_back(tmp_path_factory, steps, first):
     stamps = first + np.cumsum([s for s, *_ in steps]) - steps[0][0]
     rows = [(int(t), *values) for t, (_, *values) in zip(stamps, steps, strict=True)]

@@ -99,12 +99,8 @@ def test_many_damaged_files_in_little_memory(tmp_path):
     """In a process of their own, whose address space is capped once the libraries are loaded."""
     done = subprocess.run(
         [sys.executable, __file__, str(tmp_path)],
-        capture_output=True,
-        text=True,
-        cwd=Path(__file__).parent,
-        timeout=1200,
-        check=False,
-    )
+        capture_output=True, text=True, cwd=Path(__file__).parent, timeout=1200, check=False,
+    )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr[-3000:]
 
 

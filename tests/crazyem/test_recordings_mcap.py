@@ -77,11 +77,7 @@ def test_samples_come_back_bit_for_bit_and_in_order(tmp_path):
 numbers = st.floats(width=64, allow_nan=True, allow_infinity=True)
 
 
-@given(
-    st.integers(-(2**62), 2**62),
-    st.floats(0, 2e9),
-    st.lists(numbers, min_size=26, max_size=26).map(tuple),
-)
+@given(st.integers(-(2**62), 2**62), st.floats(0, 2e9), st.lists(numbers, min_size=26, max_size=26).map(tuple))
 def test_every_number_survives_the_codec(stamp, host_time, values):
     packet = Packet(2, stamp, host_time, values)
     back = BlockCodec(WIDE).decode(BlockCodec(WIDE).encode(packet))

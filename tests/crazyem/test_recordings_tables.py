@@ -106,21 +106,12 @@ def test_host_times_are_kept():
 @pytest.mark.parametrize(
     ("name", "unit"),
     [
-        ("motor.m1", "count"),
-        ("motor.m4req", "count"),
-        ("motor.m2_rpm", "rpm"),
-        ("pwm.m3_pwm", "count"),
-        ("pm.vbatMV", "mV"),
-        ("stateEstimate.ax", "g"),
-        ("stateEstimateZ.az", "mm/s^2"),
-        ("ctrltarget.ax", "m/s^2"),
-        ("ctrltarget.yaw", "deg/s"),
-        ("ctrlLee.torquez", "N m"),
-        ("ctrlLee.omegarx", "rad/s"),
-        ("gyro.xRaw", ""),
+        ("motor.m1", "count"), ("motor.m4req", "count"), ("motor.m2_rpm", "rpm"), ("pwm.m3_pwm", "count"),
+        ("pm.vbatMV", "mV"), ("stateEstimate.ax", "g"), ("stateEstimateZ.az", "mm/s^2"), ("ctrltarget.ax", "m/s^2"),
+        ("ctrltarget.yaw", "deg/s"), ("ctrlLee.torquez", "N m"), ("ctrlLee.omegarx", "rad/s"), ("gyro.xRaw", ""),
         ("mode", ""),
     ],
-)
+)  # fmt: skip
 def test_units_of_variables_outside_the_vocabulary(name, unit):
     assert unit_of(name) == unit
 

@@ -58,17 +58,14 @@ def flight(rows: int = 30, seed: int = 2, *, old: bool = False) -> tuple[bytes, 
     """A log and what went in (source frames); messages arrive 3 ms after they were stamped."""
     rng = np.random.default_rng(seed)
     truth = {
-        "t": START + np.arange(rows) * 20_000,
-        "local": rng.normal(size=(rows, 6)),
+        "t": START + np.arange(rows) * 20_000, "local": rng.normal(size=(rows, 6)),
         "q": Rotation.random(rows, random_state=seed).as_quat()[:, [3, 0, 1, 2]],
         "angles": rng.uniform(-1.2, 1.2, (rows, 3)),
-        "rate": rng.normal(size=(rows, 6)),
-        "imu": rng.normal(size=(rows, 6)),
+        "rate": rng.normal(size=(rows, 6)), "imu": rng.normal(size=(rows, 6)),
         "milli": rng.integers(-4000, 4000, (rows, 9)),
-        "rpm": rng.integers(0, 20000, (rows, 4)),
-        "target": rng.normal(size=(rows, 9)),
+        "rpm": rng.integers(0, 20000, (rows, 4)), "target": rng.normal(size=(rows, 9)),
         "cells": rng.integers(3000, 4200, (rows, 2)),
-    }
+    }  # fmt: skip
     log = Log()
     for i in range(rows):
         t = int(truth["t"][i])

@@ -67,19 +67,11 @@ FORMATS = {
     "vehicle_mocap_odometry": "uint64_t timestamp;uint8_t pose_frame;float[3] position;float[4] q;",
 }
 LAYOUTS = {
-    "vehicle_local_position": "QQ9f4?",
-    "vehicle_attitude": "Q4f",
-    "vehicle_angular_velocity": "Q3f",
-    "sensor_combined": "Q6f",
-    "actuator_motors": "Q12f",
-    "esc_status": "QB" + "Qif" * 8,
-    "battery_status": "Q2f",
-    "vehicle_land_detected": "Q?",
-    "vehicle_local_position_setpoint": "Q9f",
-    "vehicle_attitude_setpoint": "Q4f",
-    "vehicle_rates_setpoint": "Q3f",
-    "vehicle_mocap_odometry": "QB7f",
-}
+    "vehicle_local_position": "QQ9f4?", "vehicle_attitude": "Q4f", "vehicle_angular_velocity": "Q3f",
+    "sensor_combined": "Q6f", "actuator_motors": "Q12f", "esc_status": "QB" + "Qif" * 8, "battery_status": "Q2f",
+    "vehicle_land_detected": "Q?", "vehicle_local_position_setpoint": "Q9f", "vehicle_attitude_setpoint": "Q4f",
+    "vehicle_rates_setpoint": "Q3f", "vehicle_mocap_odometry": "QB7f",
+}  # fmt: skip
 NUMBERS = {name: i for i, name in enumerate(LAYOUTS)}
 
 
@@ -116,19 +108,15 @@ def flight(rows: int = 40, seed: int = 1) -> tuple[bytes, dict[str, np.ndarray]]
     rng = np.random.default_rng(seed)
     t = 2_000_000 + np.arange(rows) * 4000
     truth = {
-        "t": t,
-        "local": rng.normal(size=(rows, 9)),
+        "t": t, "local": rng.normal(size=(rows, 9)),
         "q": Rotation.random(rows, random_state=seed).as_quat()[:, [3, 0, 1, 2]],
-        "rate": rng.normal(size=(rows, 3)),
-        "imu": rng.normal(size=(rows, 6)),
-        "motors": rng.uniform(size=(rows, 12)),
+        "rate": rng.normal(size=(rows, 3)), "imu": rng.normal(size=(rows, 6)), "motors": rng.uniform(size=(rows, 12)),
         "rpm": rng.integers(0, 30000, (rows, 8)),
         "voltage": rng.uniform(3.0, 4.2, (rows, 2)),
         "target": rng.normal(size=(rows, 9)),
         "q_d": Rotation.random(rows, random_state=seed + 1).as_quat()[:, [3, 0, 1, 2]],
-        "rates": rng.normal(size=(rows, 3)),
-        "mocap": rng.normal(size=(rows, 7)),
-    }
+        "rates": rng.normal(size=(rows, 3)), "mocap": rng.normal(size=(rows, 7)),
+    }  # fmt: skip
     parts = [header(), definitions()]
     for i in range(rows):
         at = int(t[i])

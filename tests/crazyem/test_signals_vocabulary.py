@@ -72,16 +72,11 @@ def test_euler_against_scipy(roll, pitch, yaw):
 def test_units_and_signs():
     got = decode(
         {
-            "stateEstimateZ.x": 1500,
-            "stateEstimateZ.y": -20,
-            "stateEstimateZ.z": 3,
-            "stateEstimateZ.rateRoll": 100,
-            "stateEstimateZ.ratePitch": 200,
-            "stateEstimateZ.rateYaw": -300,
-            "pm.vbatMV": 3987,
+            "stateEstimateZ.x": 1500, "stateEstimateZ.y": -20, "stateEstimateZ.z": 3, "stateEstimateZ.rateRoll": 100,
+            "stateEstimateZ.ratePitch": 200, "stateEstimateZ.rateYaw": -300, "pm.vbatMV": 3987,
             "supervisor.info": 0x020E,
         }
-    )
+    )  # fmt: skip
     assert got["position"] == (1.5, -0.02, 0.003)
     assert got["body_rate"] == (0.1, -0.2, -0.3)
     assert got["voltage"] == (3.9875,)  # the firmware cuts millivolts off: 3.987 to 3.988 V

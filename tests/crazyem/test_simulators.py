@@ -36,16 +36,13 @@ HOLDS = {
     "gazebo": BODY | PRODUCTS | CENTRE | ARMS | SPEEDS | {"lag", "drag_x", "drag_y"},
     "rotorpy": BODY | PRODUCTS | CENTRE | ARMS | SPEEDS | DRAG | QUADRATIC | {"lag"},
     "crazyswarm2": BODY,
-    "px4-sih": BODY
-    | PRODUCTS
-    | ARMS
-    | DRAG
-    | {"torque_per_thrust", "thrust_max", "lag"}
-    | {f"damping_{a}" for a in "xyz"},
+    "px4-sih": BODY | PRODUCTS | ARMS | DRAG | {
+        "torque_per_thrust", "thrust_max", "lag",
+    } | {f"damping_{a}" for a in "xyz"},
     "omnidrones": BODY | PRODUCTS | ARMS | SPEEDS,
     "l2f": BODY | PRODUCTS | CENTRE | ARMS | {"torque_per_thrust", "thrust_max", "lag"},
     "rotorpy-json": BODY | PRODUCTS | CENTRE | ARMS | SPEEDS | DRAG | QUADRATIC | {"lag"},
-}
+}  # fmt: skip
 ONE_ARM, ONE_DRAG_XY, ONE_DRAG = (
     {"crazyflow"},
     {"gym-pybullet-drones", "gazebo", "rotorpy", "rotorpy-json"},

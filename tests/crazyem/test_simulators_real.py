@@ -135,13 +135,8 @@ def test_rotorpy() -> None:
     for n in range(0, len(reference.state), 5):  # twenty starts: its integrator takes its time
         s = reference.state[n]
         state = {
-            "x": s[:3],
-            "v": s[3:6],
-            "q": s[6:10],
-            "w": s[10:],
-            "wind": np.zeros(3),
-            "rotor_speeds": begin[n][order],
-        }
+            "x": s[:3], "v": s[3:6], "q": s[6:10], "w": s[10:], "wind": np.zeros(3), "rotor_speeds": begin[n][order],
+        }  # fmt: skip
         for command in speeds[n]:
             state = simulator.step(state, {"cmd_motor_speeds": command[order]}, STEP)
         ends.append(np.concatenate([state["x"], state["v"], state["q"], state["w"]]))

@@ -78,13 +78,10 @@ def vehicles(draw):
     rotor = draw(st.none() | positive)
     rotors = bool(curve) or rotor is not None
     return Vehicle(
-        name=draw(text),
-        mass=draw(positive),
-        inertia=moments,
+        name=draw(text), mass=draw(positive), inertia=moments,
         inertia_products=draw(st.just((0.0, 0.0, 0.0)) | st.just(products)),
         arm=draw(st.tuples(st.floats(-1, 1), st.floats(-1, 1))),
-        thrust_curve=curve,
-        rotor_constant=rotor,
+        thrust_curve=curve, rotor_constant=rotor,
         torque_per_thrust=draw(positive) if rotors else 0.0,
         motor_time_constant=draw(st.floats(0, 1)),
         thrust_max=draw(positive | st.just(math.inf)),
@@ -93,7 +90,7 @@ def vehicles(draw):
         mass_sd=draw(st.none() | spread),
         inertia_sd=draw(st.none() | st.tuples(spread, spread, spread)),
         motor_time_constant_sd=draw(st.none() | spread),
-    )
+    )  # fmt: skip
 
 
 def test_the_brushless_preset_is_the_mean_of_its_sources_and_as_unsure_as_they_disagree():
@@ -164,12 +161,8 @@ MALFORMED = {
     "not a number": ("mass", 'mass = "heavy"'),
     "a truth is no number": ("mass", "mass = true"),
     "negative mass": ("mass", "mass = -0.03"),
-    "zero mass": ("mass", "mass = 0"),
-    "NaN mass": ("mass", "mass = nan"),
-    "missing mass": ("mass", ""),
-    "missing name": ("name", ""),
-    "name not text": ("name", "name = 3"),
-    "missing inertia": ("inertia", ""),
+    "zero mass": ("mass", "mass = 0"), "NaN mass": ("mass", "mass = nan"), "missing mass": ("mass", ""),
+    "missing name": ("name", ""), "name not text": ("name", "name = 3"), "missing inertia": ("inertia", ""),
     "inertia too short": ("inertia", "inertia = [1e-5, 1e-5]"),
     "inertia with five numbers": ("inertia", "inertia = [1e-5, 1e-5, 1e-5, 0, 0]"),
     "inertia a text": ("inertia", 'inertia = "round"'),
@@ -192,7 +185,7 @@ MALFORMED = {
     "effects not tables": ("effects", "effects = 3"),
     "effects of numbers": ("effects", "effects = {drag = 3}"),
     "unknown key": ("wings", "wings = 2"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("key", "line"), MALFORMED.values(), ids=MALFORMED)

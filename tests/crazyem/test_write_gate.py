@@ -63,14 +63,10 @@ def test_what_belongs_into_the_air_passes_there_and_nowhere_else(purpose):
 @pytest.mark.parametrize(
     ("above", "climb", "passes"),
     [
-        (0.3, -0.5, True),
-        (0.15, -0.5, False),
-        (0.15, 0.0, True),
-        (0.15, 0.5, True),
-        (0.6, -2.5, False),
+        (0.3, -0.5, True), (0.15, -0.5, False), (0.15, 0.0, True), (0.15, 0.5, True), (0.6, -2.5, False),
         (0.6, math.nan, True),
     ],
-)
+)  # fmt: skip
 def test_nothing_is_sent_to_a_drone_that_is_down_when_it_arrives(above, climb, passes):
     """0.3 s at its present descent: telemetry is late, and so is a write."""
     telemetry = at(0.3 + above, telemetry=flown())

@@ -36,20 +36,14 @@ THRUST = 0.03 * PWM / 65535 * 4.2  # N, of a linear curve on a battery that neve
 
 PLAIN = {
     "vehicle": {
-        "mass": MASS,
-        "inertia": INERTIA,
-        "arm": ARM,
-        "torque_per_thrust": K,
-        "thrust_curve": [0.0, 0.03],
-        "thrust_max": 1.0,
-        "motor_time_constant": 0.0,
-        "rotor_constant": 2e-8,
+        "mass": MASS, "inertia": INERTIA, "arm": ARM, "torque_per_thrust": K, "thrust_curve": [0.0, 0.03],
+        "thrust_max": 1.0, "motor_time_constant": 0.0, "rotor_constant": 2e-8,
     },
     "noise": {"thrust": 0.0, "torque": 0.0},
     "battery": {"resistance": 0.0, "power_coefficient": 0.0, "electronics_power": 0.0},
     "ground": {"height": -1000.0},
     "start": {"velocity": [0.4, -0.3, 0.2], "yaw": 0.7},
-}
+}  # fmt: skip
 
 
 OMEGA = np.array([1.5, -2.0, 1.0])  # rad/s, at the start

@@ -141,17 +141,11 @@ def test_any_table_is_a_scenario_or_a_scenario_error(effects: dict, hidden: dict
 
 
 VEHICLE = Vehicle(
-    name="measured",
-    mass=0.0312,
-    inertia=(1.8e-5, 1.9e-5, 3.1e-5),
-    inertia_products=(1e-7, -2e-7, 3e-7),
-    arm=(0.031, 0.033),
-    thrust_curve=(0.0, 0.02, 0.004),
-    rotor_constant=2.1e-8,
-    torque_per_thrust=0.0061,
+    name="measured", mass=0.0312, inertia=(1.8e-5, 1.9e-5, 3.1e-5), inertia_products=(1e-7, -2e-7, 3e-7),
+    arm=(0.031, 0.033), thrust_curve=(0.0, 0.02, 0.004), rotor_constant=2.1e-8, torque_per_thrust=0.0061,
     motor_time_constant=0.043,
     effects={"linear_drag": {"x": 0.01, "y": 0.012}, "rotor_fault": {"rotor": 3, "scale": 0.9, "onset_time": 4.0}},
-)
+)  # fmt: skip
 
 
 def test_a_vehicle_file_is_the_truth(tmp_path: Path) -> None:

@@ -71,10 +71,7 @@ def single_effects(draw: st.DrawFn) -> dict:
     return {"platform": draw(st.sampled_from(["cf2", "cf21bl"])), section: {effect.name: values}}
 
 
-@settings(
-    suppress_health_check=[HealthCheck.filter_too_much],
-    phases=[Phase.explicit, Phase.reuse, Phase.generate],
-)
+@settings(suppress_health_check=[HealthCheck.filter_too_much], phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(table=single_effects(), controller=st.sampled_from([1, 2, 5, 6]), seed=st.integers(0, 1000))
 def test_no_effect_at_any_edge_gives_what_is_not_a_number(table: dict, controller: int, seed: int) -> None:
     try:

@@ -26,12 +26,9 @@ def test_suspended_load(c: tuple[float, ...]) -> None:
     x[at.LOAD : at.LOAD + 3], x[at.LOAD_RATE : at.LOAD_RATE + 3] = n, np.cross(n, [2.0, 1.0, -3.0])
     model = Model(
         J_origin=about_origin(MASS, matrix(INERTIA), np.array(c)),
-        c=c,
-        load=(0.006, 0.25),
-        friction=0.1,
-        air=wind,
-        force=lambda p, v, w, R: (-0.01 * (v - np.array(wind)), np.zeros(3)),
-    )
+        c=c, load=(0.006, 0.25), friction=0.1, air=wind, force=lambda p, v, w,
+        R: (-0.01 * (v - np.array(wind)), np.zeros(3)),
+    )  # fmt: skip
     compare(model, truth, x, tolerance=2e-6)
 
 

@@ -13,14 +13,9 @@ from firmware_sim.scenario import parse_scenario
 
 TAU, GAIN = 0.05, 0.03
 VEHICLE = {
-    "mass": 0.03,
-    "arm": [0.03, 0.035],
-    "torque_per_thrust": 0.006,
-    "thrust_curve": [0.0, GAIN],
-    "thrust_max": 0.12,
-    "motor_time_constant": TAU,
-    "rotor_constant": 2e-8,
-}
+    "mass": 0.03, "arm": [0.03, 0.035], "torque_per_thrust": 0.006, "thrust_curve": [0.0, GAIN], "thrust_max": 0.12,
+    "motor_time_constant": TAU, "rotor_constant": 2e-8,
+}  # fmt: skip
 QUIET = {
     "noise": {"thrust": 0.0, "torque": 0.0},
     "battery": {"resistance": 0.0, "power_coefficient": 0.0, "electronics_power": 0.0},

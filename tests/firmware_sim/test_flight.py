@@ -185,13 +185,10 @@ def test_lands_and_stays() -> None:
     "beliefs",
     [
         {"mass": 0.001, "J_x": 1e-4, "J_y": 2e-4, "J_z": 1e-4},
-        {"mass": 1.0},
-        {"mass": -0.03},
-        {"mass": 0.0, "J_x": 0.0},
-        {"J_x": -1e-4, "J_y": 1.0},
+        {"mass": 1.0}, {"mass": -0.03}, {"mass": 0.0, "J_x": 0.0}, {"J_x": -1e-4, "J_y": 1.0},
         {"mass": float("nan"), "J_z": float("inf")},
     ],
-)
+)  # fmt: skip
 def test_absurd_beliefs_crash_but_do_not_break(controller: int, beliefs: dict) -> None:
     group = {5: "ctrlLee", 6: "ctrlLqg"}[controller]
     flight = boot(None, 0, stabilizer__controller=controller, **{f"{group}__{k}": v for k, v in beliefs.items()})

@@ -154,16 +154,10 @@ FAULTS = st.builds(
     st.sampled_from(["drop", "duplicate", "reorder", "delay", "corrupt", "silence"]),
     rate=st.floats(0.0, 1.0),
     direction=st.sampled_from([UP, DOWN, "both"]),
-    start=st.floats(0.0, 0.5),
-    end=st.floats(0.6, 5.0),
-    skip=st.integers(0, 5),
-    count=st.integers(0, 20),
-    ms=st.floats(0.0, 30.0),
-    jitter_ms=st.floats(0.0, 30.0),
-    distance=st.integers(1, 5),
-    bits=st.integers(1, 8),
+    start=st.floats(0.0, 0.5), end=st.floats(0.6, 5.0), skip=st.integers(0, 5), count=st.integers(0, 20),
+    ms=st.floats(0.0, 30.0), jitter_ms=st.floats(0.0, 30.0), distance=st.integers(1, 5), bits=st.integers(1, 8),
     copies=st.integers(1, 4),
-)
+)  # fmt: skip
 
 
 @given(st.lists(FAULTS, max_size=4), st.integers(0, 2**31), st.lists(st.binary(min_size=1, max_size=40), max_size=60))

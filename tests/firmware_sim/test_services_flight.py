@@ -164,11 +164,8 @@ def test_localisation_reaches_the_estimator(client):
     client.ask(6, 1, b"\x09" + struct.pack("<BhhhI", 0xE7, 1000, 0, -500, 3 << 30))
     client.ask(6, 2, struct.pack("<BhhhBhhh", 0x01, 9, 9, 9, 0xE7, 100, 200, 300))
     assert client.flight.fixes == [
-        [1.0, 2.0, 3.0],
-        [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0],
-        [1.0, 0.0, -0.5, 0.0, 0.0, 0.0, 1.0],
-        [0.1, 0.2, 0.3],
-    ]
+        [1.0, 2.0, 3.0], [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0], [1.0, 0.0, -0.5, 0.0, 0.0, 0.0, 1.0], [0.1, 0.2, 0.3],
+    ]  # fmt: skip
 
 
 def test_boot_console_text_and_splitting():

@@ -60,9 +60,7 @@ def test_a_file_says_what_differs(tmp_path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("", "at least one"),
-        ("drone = 3", "at least one"),
-        ("drone = []", "at least one"),
+        ("", "at least one"), ("drone = 3", "at least one"), ("drone = []", "at least one"),
         ("x = 1\n[[drone]]\n", "x is not part of a swarm"),
         ("[[drone]]\nspeed = 2", "drone 0: speed is not a key"),
         ('[[drone]]\nname = "../a"', "drone 0: name must be"),
@@ -75,10 +73,9 @@ def test_a_file_says_what_differs(tmp_path):
         ("[[drone]]\nscenario = 3", "drone 0: scenario"),
         ("[[drone]]\nport = 5000\n[[drone]]\nport = 5000", "two drones have the port 5000"),
         ('[[drone]]\nname = "a"\n[[drone]]\nname = "a"', "two drones have the name a"),
-        ("[[drone]]\n" * 101, "at most 100"),
-        ("[[drone", "not a TOML file"),
+        ("[[drone]]\n" * 101, "at most 100"), ("[[drone", "not a TOML file"),
     ],
-)
+)  # fmt: skip
 def test_wrong_files_are_named(tmp_path, text, says):
     with pytest.raises(ScenarioError, match=r"swarm\.toml") as caught:
         drones(tmp_path, text)
