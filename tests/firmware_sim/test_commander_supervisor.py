@@ -46,13 +46,6 @@ class Bench:
         assert self.run(80) == State.FLYING
 
 
-def test_a_brushed_drone_arms_itself_and_shows_the_measured_idle_bits():
-    bench = Bench()
-    assert bench.run(200) == State.READY
-    bench.supervisor.planner_bits = 0x200
-    assert bench.supervisor.info == 0x020E
-
-
 @pytest.mark.parametrize(("limit", "seen", "crashes"), [(0.0, 9.0, False), (3.0, 4.5, True), (3.0, 3.5, False)])
 def test_a_knock_beyond_crash_detect_gs_is_a_crash(limit, seen, crashes):
     """| |acc| - 1 g | > supervisor.crashDetectGs, 0 switches it off (supervisor.c); accNorm shows what it looks at."""
@@ -67,49 +60,6 @@ def test_a_knock_beyond_crash_detect_gs_is_a_crash(limit, seen, crashes):
     assert array[index] == pytest.approx(seen)
     assert (bench.supervisor.state == State.CRASHED) == crashes
     assert any("Crash detected" in text for text in bench.console) == crashes
-
-
-def test_a_brushless_drone_must_be_armed_and_disarms_by_itself():
-    bench = Bench(auto_arm=False)
-    assert bench.run(400) == State.CHECKS_PASSED
-    assert bench.supervisor.info == 0x0001
-    assert not bench.supervisor.motors_allowed
-    assert bench.supervisor.request_arming(True)
-    assert bench.run(80) == State.READY
-    assert bench.run(29000) == State.READY
-    assert bench.run(1200) in {State.CHECKS_NOT_PASSED, State.CHECKS_PASSED}  # pre-flight timeout
-    assert not bench.supervisor.armed
-    bench.supervisor.request_arming(True)
-    bench.set("motor.m2", 7000.0)  # idle is not flying
-    assert bench.run(200) == State.READY
-    bench.set("motor.m2", 7001.0)
-    assert bench.run(80) == State.FLYING
-    assert not bench.supervisor.request_arming(True) or bench.supervisor.armed
-    bench.set("motor.m2", 0.0)
-    assert bench.run(2100) == State.LANDED
-    assert bench.run(2800) == State.LANDED
-    bench.run(400)
-    assert not bench.supervisor.armed
-    assert bench.console.count("SUP: Disarming\n") == 2
-
-
-def test_brushless_rotors_must_spin_up():
-    bench = Bench(auto_arm=False, rpm=True)
-    bench.run(200)
-    bench.supervisor.request_arming(True)
-    assert bench.run(1000) == State.SPINNING_UP
-    assert bench.supervisor.motors_allowed
-    assert not bench.supervisor.can_fly
-    for n in range(1, 5):
-        bench.set(f"motor.m{n}_rpm", 2000.0)
-    assert bench.run(160) == State.SPINNING_UP
-    assert bench.run(160) == State.READY
-    bench.supervisor.request_arming(False)
-    bench.run(200)
-    bench.set("motor.m3_rpm", 900.0)
-    bench.supervisor.request_arming(True)
-    bench.run(2400)
-    assert not bench.supervisor.armed
 
 
 def test_arming_is_refused_before_the_checks_have_passed():
@@ -164,25 +114,6 @@ def test_free_fall_is_no_tumble():
     bench.fly()
     bench.set("acc.z", 0.05)
     assert bench.run(3000) == State.FLYING
-
-
-def test_emergency_stops():
-    bench = Bench()
-    bench.fly()
-    bench.supervisor.emergency_stop_watchdog()
-    assert bench.run(900) == State.FLYING
-    bench.supervisor.emergency_stop_watchdog()
-    assert bench.run(900) == State.FLYING
-    assert bench.run(300) == State.LOCKED
-    bench = Bench()
-    bench.run(200)
-    bench.supervisor.emergency_stop()
-    assert bench.run(120) == State.LOCKED
-    bench = Bench()
-    bench.run(200)
-    array, index = bench.supervisor.param["stabilizer.stop"]
-    array[index] = 1.0
-    assert bench.run(120) == State.LOCKED
 
 
 def test_any_low_level_setpoint_locks_the_high_level_out_until_notified():

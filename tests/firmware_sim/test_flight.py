@@ -97,14 +97,6 @@ def test_motors_hover_at_the_voltage_of_the_thrust_curve() -> None:
     assert volts.mean() == pytest.approx(roots[np.abs(roots.imag) < 1e-9].real[0], rel=0.005)
 
 
-def test_a_mass_believed_too_low_hangs_low_until_it_is_corrected() -> None:
-    flight = boot({"vehicle": HEAVY}, stabilizer__controller=5, ctrlLee__mass=0.029)
-    low = hold(flight, (0, 0, 1.0), 7.0)[-300:, at.POS + 2].mean() - 1.0
-    assert low == pytest.approx(-9.81 * (0.036 / 0.029 - 1) / 7, abs=0.01)  # Kpos_Pz = 7
-    write(flight, "ctrlLee.mass", 0.036)
-    assert abs(hold(flight, (0, 0, 1.0), 4.0)[-200:, at.POS + 2].mean() - 1.0) < 0.01
-
-
 @pytest.mark.parametrize(("mass_thrust", "scale"), [(132000.0, 4 * 0.2 * 132000 / 65535), (81919.0, 1.0)])
 def test_mellinger_mass_is_a_mass_only_with_the_right_mass_thrust(mass_thrust: float, scale: float) -> None:
     flight = boot({"platform": "cf21bl"}, stabilizer__controller=2, ctrlMel__massThrust=mass_thrust, ctrlMel__ki_z=0.0)

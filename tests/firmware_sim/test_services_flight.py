@@ -110,37 +110,6 @@ def test_uploaded_trajectory(client):
     assert client.flight.setpoint[[sp.X, sp.Z]] == pytest.approx([0.15, 0.5], abs=0.003)
 
 
-def test_a_closing_link_locks_the_high_level_out_until_a_notice(client):
-    client.ask(3, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, 0))
-    assert high_level(client, "<BBff?f", 7, 0, 1.0, 0.0, True, 0.5)[0][3] == 0  # the reply says nothing
-    client.firmware.advance(600)
-    assert client.flight.setpoint[sp.MODE_Z] == 0
-    client.ask(7, 1, b"\x00" + struct.pack("<I", 0))
-    high_level(client, "<BB", 3, 0)
-    high_level(client, "<BBff?f", 7, 0, 1.0, 0.0, True, 0.5)
-    client.firmware.advance(600)
-    assert client.flight.setpoint[sp.Z] == pytest.approx(1.0)
-    client.ask(3, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, 0))  # the same packet in flight cuts the motors
-    client.firmware.advance(60)
-    assert client.flight.setpoint[sp.MODE_Z] == 0
-
-
-def test_a_stream_that_dries_up_levels_out_and_locks(client):
-    hover = b"\x0a" + struct.pack("<ffff", 0.2, 0.0, 0.0, 0.7)
-    for _ in range(10):
-        client.ask(7, 0, hover)
-        client.firmware.advance(50)
-    assert client.flight.setpoint[[sp.VX, sp.Z]] == pytest.approx([0.2, 0.7])
-    client.firmware.advance(600)
-    assert client.flight.setpoint[sp.MODE_X] == sp.DISABLE
-    assert client.flight.setpoint[sp.Z] == pytest.approx(0.7)
-    client.firmware.advance(1600)
-    assert not client.flight.motors_allowed
-    assert client.ask(9, 0, b"\x07") == [b"\x87\x01"]
-    assert high_level(client, "<BBff?f", 7, 0, 1.0, 0.0, True, 0.5)[0][3] == 16  # EBUSY
-    assert client.ask(9, 1, b"\x01\x01") == [b"\x81\x00\x00"]
-
-
 def test_brushless_arming_over_both_ports():
     client = Client("cf21bl")
     assert client.ask(9, 0, b"\x0c") == [b"\x8c" + struct.pack("<H", 0x0201)]
