@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from recording_files import fails, flight_fixture, folder_fixture, link_pair, run
@@ -100,16 +101,6 @@ def test_errors_stay_with_their_file_and_results_in_order() -> None:
     assert results[5].data["square"] == 25
 
 
-@pytest.mark.slow
-def test_processes_give_what_one_process_gives(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
-    told = []
-    for jobs in (1, 2):
-        code, out, _ = run(capsys, "info", folder, "--jobs", jobs, "--json")
-        assert code == 3
-        told.append(json.loads(out))
-    assert told[0] == told[1]
-
-
 def test_a_worker_that_is_killed_is_one_sentence() -> None:
     assert list(shared(pow, [(2, n) for n in range(5)], 2)) == [1, 2, 4, 8, 16]
     with pytest.raises(CrazyemError, match="a worker process ended before its work was done"):
@@ -143,13 +134,17 @@ def test_without_dask_it_says_how_to_get_it(
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_a_cluster_gives_what_one_process_gives(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
+def test_processes_and_a_cluster_give_what_one_process_gives(capsys: pytest.CaptureFixture[str], folder: Path) -> None:
+    def told(*how: Any) -> Any:
+        code, out, _ = run(capsys, "info", folder, *how, "--json")
+        assert code == 3
+        return json.loads(out)
+
+    alone = told("--jobs", 1)
+    assert told("--jobs", 2) == alone
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
-        code, out, _ = run(capsys, "info", folder, "--cluster", cluster.scheduler_address, "--json")
-    assert code == 3
-    _, alone, _ = run(capsys, "info", folder, "--jobs", 1, "--json")
-    assert json.loads(out) == json.loads(alone)
+        assert told("--cluster", cluster.scheduler_address) == alone
 
 
 def test_the_report_keeps_the_first_error(capsys: pytest.CaptureFixture[str]) -> None:
