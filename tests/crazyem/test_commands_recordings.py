@@ -1,18 +1,23 @@
-"""The commands on recordings: which files are found, and `info` on one, on many and in parts."""
+"""Commands on recordings: which files, what is said, what is made of them."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import pandas as pd
 import pytest
-from made_flight import made_flight
+from made_flight import Motion, changed, made_flight
 from recording_files import cut, fails, flight_fixture, folder_fixture, link_pair, run, save
 
 from crazyem.commands import files
 from crazyem.commands.merge import merge_findings, merge_inventories
 from crazyem.doctor.inventory import inventory
 from crazyem.errors import UsageError
-from crazyem.recordings import Finding, Grade
+from crazyem.recordings import Finding, Grade, open_recording
+from crazyem.recordings.mcap.signals import write_recording
 
 flight = pytest.fixture(scope="module")(flight_fixture)
 folder = pytest.fixture(folder_fixture)
@@ -160,3 +165,194 @@ def test_findings_of_parts_become_one() -> None:
     assert [(f.check, f.grade) for f in merged] == [("lag", Grade.UNUSABLE), ("gaps", Grade.DEGRADES)]
     assert merged[1].intervals == ((1.0, 2.0), (70.0, 75.0))
     assert dict(merged[1].evidence) == {"longest_s": 5.0, "parts": 2.0}
+
+
+# commands that make files of recordings: doctor and its fixes, import, export, recover, layout
+
+
+# --- doctor -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def in_degrees(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording whose gyro is in deg/s but says rad/s."""
+    recording = made_flight(Motion(seconds=15.0, size=0.2))  # slow enough to be below what no gyro can show
+    rate = recording.signals["body_rate"].value
+    return save(changed(recording, "body_rate", value=np.degrees(rate)), tmp_path_factory.mktemp("ill") / "gyro.csv")
+
+
+def test_doctor_names_grades_and_advises(capsys: pytest.CaptureFixture[str], in_degrees: Path) -> None:
+    code, out, err = run(capsys, "doctor", in_degrees)
+    assert (code, err) == (0, "")
+    assert "UNUSABLE  rates body_rate" in out
+    assert "evidence: " in out
+    assert "advice: " in out
+    code, out, _ = run(capsys, "doctor", in_degrees, "--strict", "--json")
+    assert code == 5
+    told = json.loads(out)["files"][0]
+    assert told["grade"] == "unusable"
+    assert any(f["check"] == "rates" and f["fix"]["kind"] == "scale" for f in told["findings"] if f["fix"])
+
+
+def test_fix_writes_a_new_file_that_is_cured(
+    capsys: pytest.CaptureFixture[str], in_degrees: Path, tmp_path: Path
+) -> None:
+    before = in_degrees.read_bytes()
+    target = tmp_path / "fixed.mcap"
+    code, out, _ = run(capsys, "doctor", in_degrees, "--fix", "-o", target)
+    assert code == 0
+    assert "applied: rates" in out
+    assert in_degrees.read_bytes() == before
+    repaired = open_recording(target).signals["body_rate"].value
+    assert repaired == pytest.approx(np.radians(open_recording(in_degrees).signals["body_rate"].value), rel=1e-2)
+    code, out, _ = run(capsys, "doctor", target, "--json")
+    assert not any(f["check"] == "rates" for f in json.loads(out)["files"][0]["findings"])
+    assert "exists already" in fails(capsys, "doctor", in_degrees, "--fix", "-o", target, code=2)
+
+
+def test_fix_goes_beside_the_recording_and_never_onto_it(
+    capsys: pytest.CaptureFixture[str], in_degrees: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "gyro.csv"
+    link_pair(in_degrees, path)
+    assert run(capsys, "doctor", path, "--fix")[0] == 0
+    assert (tmp_path / "gyro.fixed.mcap").exists()
+    said = fails(capsys, "doctor", path, "--fix", "--force", "-o", path, code=2)
+    assert "never written in place" in said
+    assert "-o is where --fix writes" in fails(capsys, "doctor", path, "-o", tmp_path / "x.mcap", code=2)
+
+
+def test_what_is_sound_is_not_rewritten(capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path) -> None:
+    target = tmp_path / "new.mcap"
+    code, out, _ = run(capsys, "doctor", flight, "--fix", "-o", target, "--json")
+    fixed = json.loads(out)["files"][0]["fixed"]
+    assert code == 0
+    assert fixed["applied"] == []
+    assert fixed["output"] is None
+    assert not target.exists()
+
+
+def test_copies_among_several_are_told(capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path) -> None:
+    link_pair(flight, tmp_path / "copy.csv")
+    save(made_flight(seconds=8.0, seed=5), tmp_path / "other.csv")
+    code, out, _ = run(capsys, "doctor", flight, tmp_path, "--jobs", 1, "--json")
+    assert code == 0
+    told = json.loads(out)["duplicates"]
+    assert len(told) == 1
+    assert {"flight.csv", "copy.csv"} <= {Path(w).name for w in words(told[0])}
+    assert "other.csv" not in {Path(w).name for w in words(told[0])}
+
+
+def words(value: Any) -> Iterator[str]:
+    """Every string in a JSON value."""
+    if isinstance(value, dict | list):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from words(item)
+    elif isinstance(value, str):
+        yield value
+
+
+# --- import, export -----------------------------------------------------------------------------------------------
+
+
+def test_import_then_export_loses_nothing(capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path) -> None:
+    mcap, table = tmp_path / "f.mcap", tmp_path / "again.csv"
+    assert run(capsys, "import", flight, "-o", mcap)[0] == 0
+    code, out, _ = run(capsys, "export", mcap, "-o", table, "--json")
+    assert code == 0
+    assert json.loads(out)["files"][0]["output"] == [str(table), f"{table}-metadata.json"]
+    a, b = open_recording(flight), open_recording(table)
+    for name, array in a.signals.items():
+        for field in ("time", "value", "host_time", "marked"):
+            assert np.array_equal(getattr(array, field), getattr(b.signals[name], field), equal_nan=field != "marked")
+        assert (array.unit, array.frame, array.clock, array.stream) == (
+            b.signals[name].unit, b.signals[name].frame, b.signals[name].clock, b.signals[name].stream,
+        )  # fmt: skip
+    assert run(capsys, "export", mcap, "-o", tmp_path / "f.parquet")[0] == 0
+    assert pd.read_parquet(tmp_path / "f.parquet").attrs["units"]["voltage"] == "V"
+
+
+def test_several_go_into_a_folder_that_keeps_theirs(
+    capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path
+) -> None:
+    (folder / "broken.csv").unlink()
+    write_recording(made_flight(seconds=2.0), folder / "a.mcap")
+    out = tmp_path / "new" / "tables"
+    code, _, _ = run(capsys, "export", folder, "-o", out, "--format", "parquet", "--jobs", 1)
+    assert code == 0
+    made = sorted(str(p.relative_to(out)) for p in out.rglob("*") if p.is_file())
+    assert made == ["a.csv.parquet", "a.mcap.parquet", "b.parquet", "day two/a.parquet"]
+    said = fails(capsys, "import", folder / "a.csv", folder / "b.csv", "-o", folder / "README.txt", code=2)
+    assert "not a folder" in said
+    said = fails(capsys, "import", folder / "a.csv", folder / "day two" / "a.csv", "-o", tmp_path / "m", code=2)
+    assert "one at a time" in said
+
+
+def test_nothing_is_replaced_unless_asked_and_never_an_input(
+    capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path
+) -> None:
+    path, target = tmp_path / "f.csv", tmp_path / "old.mcap"
+    link_pair(flight, path)
+    target.write_bytes(b"mine")
+    (tmp_path / "link.csv").symlink_to(path)
+    assert "exists already" in fails(capsys, "import", path, "-o", target, code=2)
+    assert target.read_bytes() == b"mine"
+    assert run(capsys, "import", path, "-o", target, "--force")[0] == 0
+    assert open_recording(target).signals
+    for same in (path, tmp_path / "link.csv", tmp_path / "." / "f.csv"):
+        assert "never written in place" in fails(capsys, "export", path, "-o", same, "--force", code=2)
+    assert path.read_bytes() == flight.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("argv", "says"),
+    [
+        (["import", "{f}"], "-o"),
+        (["import", "{f}", "-o", "/proc/x.mcap"], "/proc/x.mcap"),
+        (["import", "{f}", "-o", "no/such/folder/x.mcap"], "cannot write"),
+        (["export", "{f}", "-o", "x.xlsx"], "ends in .csv or .parquet"),
+        (["export", "{f}", "-o", "x.csv", "--format", "parquet"], "--format"),
+        (["info"], "FILE"),
+        (["info", "{f}", "--jobs", "0"], "--jobs"),
+        (["info", "{f}", "--vehicle", "nimbus"], "unknown vehicle"),
+        (["recover", "none.mcap", "-o", "x.mcap"], "none.mcap"),
+        (["recover", "{f}", "-o", "{f}"], "never written in place"),
+        (["layout", "-o", "no/such/folder/x.json"], "cannot write"),
+    ],
+)
+def test_wrong_usage_is_one_sentence(
+    capsys: pytest.CaptureFixture[str], flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    argv: list[str], says: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert says in fails(capsys, *(a.format(f=flight) for a in argv), code=2)
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- recover, layout ----------------------------------------------------------------------------------------------
+
+
+def test_recover_a_cut_recording(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    whole, broken, target = tmp_path / "w.mcap", tmp_path / "b.mcap", tmp_path / "r.mcap"
+    write_recording(made_flight(seconds=60.0), whole)
+    broken.write_bytes(whole.read_bytes()[: whole.stat().st_size * 2 // 3])
+    code, out, _ = run(capsys, "recover", broken, "-o", target, "--json")
+    told = json.loads(out)["files"][0]
+    assert code == 0
+    assert told["messages"] > 0
+    a, b = open_recording(whole).signals["body_rate"], open_recording(target).signals["body_rate"]
+    assert 0 < b.time.size < a.time.size
+    assert np.array_equal(a.value[: b.time.size], b.value)
+    assert "exists already" in fails(capsys, "recover", broken, "-o", target, code=2)
+    (tmp_path / "n.mcap").write_bytes(b"not an MCAP file")
+    assert "n.mcap" in fails(capsys, "recover", tmp_path / "n.mcap", "-o", tmp_path / "m.mcap", code=3)
+
+
+def test_layout_is_json(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    code, out, _ = run(capsys, "layout")
+    assert code == 0
+    assert json.loads(out)["configById"]
+    target = tmp_path / "layout.json"
+    assert run(capsys, "layout", "-o", target)[0] == 0
+    assert json.loads(target.read_text()) == json.loads(out)
+    assert "exists already" in fails(capsys, "layout", "-o", target, code=2)

@@ -1,15 +1,16 @@
-"""The rigid body against closed forms, conservation laws and the statistics of its noise."""
+"""The plant alone: rigid body and noise, floor and contact, gyro and battery."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import signal
 
 from firmware_sim.controllers.tick import plant_step
 from firmware_sim.plant import layout as at
 from firmware_sim.plant.quaternion import compress
-from firmware_sim.plant.rotors import lag, wrench
-from firmware_sim.plant.sensors import NoiseSource
+from firmware_sim.plant.rotors import battery_step, lag, open_circuit, wrench
+from firmware_sim.plant.sensors import NoiseSource, low_pass, sensors_step, settle
 from firmware_sim.scenario import Scenario, parse_scenario
 
 QUIET = {"noise": {"thrust": 0.0, "torque": 0.0}, "ground": {"height": -1000.0}}
@@ -122,3 +123,128 @@ def test_compressed_quaternion_comes_back(values: list[float]) -> None:
     out[largest] = np.sqrt(max(0.0, 1 - out @ out))
     assert abs(out @ q) == pytest.approx(1.0, abs=3e-6)  # 0.16 degrees and no axis mixed up
     assert min(np.abs(out - q).max(), np.abs(out + q).max()) < 2.5e-3
+
+
+# the floor: stands still, leaves when thrust exceeds weight, lands without bouncing off
+
+
+def drone(thrust: float, start: dict | None = None, height: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Constants and state with rotors that give `thrust` N each whatever the command (unless it is 0)."""
+    table = {
+        "vehicle": {"thrust_curve": [thrust], "thrust_max": 1.0, "motor_time_constant": 0.0},
+        "start": start or {"position": [0.0, 0.0, height]},
+        "ground": {"height": height},
+    }
+    scenario = parse_scenario(table, "test")
+    x = scenario.start_state()
+    x[at.PWM : at.PWM + 4] = 1000 if thrust > 0 else 0
+    return scenario.truth(), x
+
+
+@pytest.mark.parametrize(("fraction", "leaves"), [(0.0, False), (0.25, False), (0.95, False), (1.05, True)])
+def test_leaves_the_floor_when_thrust_exceeds_weight(fraction: float, leaves: bool) -> None:
+    truth, x = drone(fraction * 0.029 * 9.81 / 4, height=1.5)
+    rng = np.random.default_rng(0)
+    for _ in range(1000):
+        plant_step(truth, x, rng.standard_normal(at.NOISE_WIDTH), 1e-3)
+    if leaves:
+        assert x[at.POS + 2] - 1.5 == pytest.approx(0.5 * 0.05 * 9.81, rel=0.2)
+    else:
+        assert abs(x[at.POS + 2] - 1.5) < 1e-3
+        assert np.abs(x[at.VEL : at.VEL + 3]).max() < 1e-3
+        assert np.abs(x[[at.POS, at.POS + 1]]).max() < 1e-3
+
+
+def test_resting_reads_one_g() -> None:
+    truth, x = drone(0.0)
+    for _ in range(10):
+        plant_step(truth, x, STILL, 1e-3)
+    assert x[at.ASLEEP] == 1.0
+    assert x[at.ACC : at.ACC + 3] == pytest.approx([0, 0, 9.81])
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.5, 3.0])
+def test_a_fall_ends_at_rest_on_the_floor(speed: float) -> None:
+    truth, x = drone(0.0, {"position": [0.0, 0.0, 0.5], "velocity": [speed, 0.0, -speed]})
+    for _ in range(4000):
+        plant_step(truth, x, STILL, 1e-3)
+    assert x[at.ASLEEP] == 1.0
+    assert abs(x[at.POS + 2]) < 1e-3
+    up = 1 - 2 * (x[at.QUAT + 1] ** 2 + x[at.QUAT + 2] ** 2)
+    assert abs(abs(up) - 1.0) < 1e-2  # on its feet or on its back, nothing between
+
+
+def test_gentle_landing_stays_below_four_g() -> None:
+    truth, x = drone(0.0, {"position": [0.0, 0.0, 0.001], "velocity": [0.0, 0.0, -0.3]})
+    peak = 0.0
+    for _ in range(500):
+        plant_step(truth, x, STILL, 1e-3)
+        peak = max(peak, x[at.ACC + 2] / 9.81)
+    assert 1.0 < peak < 6.0
+
+
+# filters, sensor noise and battery against textbook results
+
+
+@pytest.mark.parametrize("cutoff", [30.0, 80.0])
+def test_filter_is_the_butterworth_of_scipy(cutoff: float) -> None:
+    data = np.random.default_rng(0).standard_normal(500)
+    memory = np.zeros(2)
+    ours = [low_pass(memory, 0, v, cutoff) for v in data]
+    b, a = signal.butter(2, cutoff, fs=1000.0)
+    assert ours == pytest.approx(signal.lfilter(b, a, data), abs=1e-12)
+
+
+def test_settled_filter_holds_its_value() -> None:
+    memory = np.zeros(2)
+    settle(memory, 0, 9.81, 30.0)
+    assert low_pass(memory, 0, 9.81, 30.0) == pytest.approx(9.81, rel=1e-12)
+
+
+def test_gyro_noise_density() -> None:
+    density = 3e-4
+    scenario = parse_scenario({"sensors": {"gyro_noise": density, "gyro_bias_walk": 0.0}}, "test")
+    truth, state, sensor = scenario.truth(), scenario.start_state(), np.zeros(at.SENSOR_SIZE)
+    rng = np.random.default_rng(0)
+    samples = np.empty((20000, 3))
+    for n in range(len(samples)):
+        sensors_step(truth, state, sensor, rng.standard_normal(at.NOISE_WIDTH), n)
+        samples[n] = sensor[at.GYRO : at.GYRO + 3]
+    frequency, power = signal.welch(samples[100:], fs=1000.0, nperseg=1000, axis=0)
+    flat = power[(frequency > 2) & (frequency < 30)].mean()  # one-sided, below the 80 Hz cut-off
+    assert np.sqrt(flat) == pytest.approx(density, rel=0.05)
+
+
+def test_battery_voltage_is_measured_ten_times_a_second() -> None:
+    scenario = parse_scenario({"battery": {"noise": 0.01}}, "test")
+    truth, state, sensor = scenario.truth(), scenario.start_state(), np.zeros(at.SENSOR_SIZE)
+    rng = np.random.default_rng(0)
+    seen = []
+    for n in range(1000):
+        sensors_step(truth, state, sensor, rng.standard_normal(at.NOISE_WIDTH), n)
+        seen.append(sensor[at.VBAT])
+    assert len(set(seen)) == 10
+    assert np.flatnonzero(np.diff(seen)).tolist() == [99 + 100 * k for k in range(9)]
+
+
+def test_battery_sags_and_empties_as_charge_and_power_say() -> None:
+    table = {"battery": {"capacity": 0.1, "resistance": 0.1, "power_coefficient": 100.0, "electronics_power": 0.5}}
+    scenario = parse_scenario(table, "test")
+    truth, state = scenario.truth(), scenario.start_state()
+    state[at.ROTOR : at.ROTOR + 4] = 0.07
+    for _ in range(100):
+        battery_step(truth, state, 1e-3)
+    power = 0.5 + 4 * 100.0 * 0.07**1.5
+    current = power / state[at.VOLTS]
+    assert state[at.VOLTS] == pytest.approx(4.2 - 0.1 * current, abs=2e-3)
+    assert 360.0 - state[at.CHARGE] == pytest.approx(current * 0.1, rel=0.02)
+    for _ in range(200_000):
+        battery_step(truth, state, 1e-3)
+    assert state[at.CHARGE] == 0.0
+    assert 0.5 <= state[at.VOLTS] < 3.0
+
+
+def test_open_circuit_voltage_rises_with_charge() -> None:
+    volts = [open_circuit(s) for s in np.linspace(0, 1, 101)]
+    assert np.all(np.diff(volts) > 0)
+    assert (volts[0], volts[-1]) == pytest.approx((3.0, 4.2))
