@@ -397,18 +397,6 @@ def test_a_damaged_description_is_one_sentence(exported: Path, data: st.DataObje
         assert complaint(path) in ("", "FileFormatError")
 
 
-@given(st.data())
-def test_damaged_bytes_are_one_sentence(exported: Path, data: st.DataObject) -> None:
-    content = bytearray(exported.read_bytes()[: data.draw(st.integers(0, 4000))])
-    for _ in range(data.draw(st.integers(1, 5))):
-        at = data.draw(st.integers(0, len(content)))
-        content[at:at] = data.draw(st.binary(max_size=6))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "f.csv"
-        path.write_bytes(bytes(content))
-        complaint(path)
-
-
 def test_what_is_large_depends_on_the_memory_that_is_free(tmp_path: Path) -> None:
     path = tmp_path / "f.bin"
     path.write_bytes(b"x")

@@ -65,13 +65,6 @@ def test_wrong_swarm_files_are_named_with_drone_and_key(tmp_path, text, says):
     assert says in str(caught.value)
 
 
-def test_a_swarm_file_that_is_not_there_or_far_too_large(tmp_path):
-    with pytest.raises(UsageError, match="cannot read"):
-        read_swarm(tmp_path / "no.toml", vehicle="cf2", trajectory=("hover",))
-    with pytest.raises(FileFormatError, match="larger than"):
-        read(tmp_path, "#" * 300_000)
-
-
 def test_drones_of_the_command_line_have_numbers_and_are_given_once():
     many = members_of(["udp://h:1", "udp://h:2"], vehicle="cf2", trajectory=["figure8"])
     assert [m.name for m in many] == ["drone0", "drone1"]

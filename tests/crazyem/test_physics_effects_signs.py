@@ -13,107 +13,98 @@ from crazyem.physics.motion import RotorInput, measured, motion, rotor_thrust
 from crazyem.physics.rotations import axes, rotation_between
 
 M = CF2.mass
-IXX, IYY, IZZ = CF2.inertia
+IYY = CF2.inertia[1]
 ARM = CF2.arm[0]
-
-
-def moved(situation: Situation, effects: Effects) -> tuple[np.ndarray, np.ndarray]:
-    """Force [N] and torque [N m] on the body in the first row, beyond those of the plain rotors."""
-    plain, with_it = (motion(situation, vehicle=ROTORS, effects=e) for e in ({}, effects))
-    force = M * (with_it.specific_force - plain.specific_force)[0]
-    return force, np.diag([IXX, IYY, IZZ]) @ (with_it.angular_acceleration - plain.angular_acceleration)[0]
-
-
-def close(found, force, torque) -> None:
-    np.testing.assert_allclose(found[0], force, atol=1e-12)
-    np.testing.assert_allclose(found[1], torque, atol=1e-15)
 
 
 YAWED = Rotation.from_euler("z", np.pi / 2).as_matrix()  # nose to world +y
 
 
-def test_linear_drag_is_against_the_velocity_in_body_axes() -> None:
+KAPPA = CF2.torque_per_thrust
+# what the drone does, its effects -> force and torque that they add
+BY_HAND: dict[str, tuple[Situation, Effects, list[float], list[float]]] = {
     # flying along world +x with the nose to +y: the air comes from the right, v_body = (0, -2, 0)
-    situation = still(velocity=[2.0, 0, 0], rotation=YAWED)
-    close(moved(situation, {"linear_drag": {"x": 0.5, "y": 0.01}}), [0, 0.02, 0], [0, 0, 0])
-
-
-def test_quadratic_drag_takes_the_whole_airspeed() -> None:
-    situation = still(velocity=[3.0, 0, 4.0])
-    close(moved(situation, {"quadratic_drag": {"x": 0.001, "z": 0.002}}), [-0.015, 0, -0.04], [0, 0, 0])
-
-
-def test_velocity_moment() -> None:
-    situation = still(velocity=[2.0, 3.0, 0])
-    found = moved(situation, {"velocity_moment": {"roll_per_vy": 1e-5, "pitch_per_vx": -2e-5}})
-    close(found, [0, 0, 0], [3e-5, -4e-5, 0])
-
-
-def test_rate_damping() -> None:
-    situation = still(body_rate=[0, 0, 2.0])
-    close(moved(situation, {"rate_damping": {"z": 1e-5}}), [0, 0, 0], [0, 0, -2e-5])
-
-
-def test_wind_alone_is_a_constant_force_in_the_world() -> None:
-    situation = still(velocity=[5.0, 5.0, 0], rotation=YAWED)
-    close(moved(situation, {"wind": {"x": 2.0}}), [0, -0.014, 0], [0, 0, 0])
-
-
-def test_wind_with_drag_blows_on_the_drone() -> None:
-    situation = still(velocity=[1.0, 0, 0])
-    close(moved(situation, {"wind": {"x": 3.0}, "linear_drag": {"x": 0.01}}), [0.02, 0, 0], [0, 0, 0])
+    "linear drag is against the velocity in body axes": (
+        still(velocity=[2.0, 0, 0], rotation=YAWED), {"linear_drag": {"x": 0.5, "y": 0.01}}, [0, 0.02, 0], [0, 0, 0],
+    ),
+    "quadratic drag takes the whole airspeed": (
+        still(velocity=[3.0, 0, 4.0]), {"quadratic_drag": {"x": 0.001, "z": 0.002}}, [-0.015, 0, -0.04], [0, 0, 0],
+    ),
+    "velocity moment": (
+        still(velocity=[2.0, 3.0, 0]), {"velocity_moment": {"roll_per_vy": 1e-5, "pitch_per_vx": -2e-5}},
+        [0, 0, 0], [3e-5, -4e-5, 0],
+    ),
+    "rate damping": (still(body_rate=[0, 0, 2.0]), {"rate_damping": {"z": 1e-5}}, [0, 0, 0], [0, 0, -2e-5]),
+    "wind alone is a constant force in the world": (
+        still(velocity=[5.0, 5.0, 0], rotation=YAWED), {"wind": {"x": 2.0}}, [0, -0.014, 0], [0, 0, 0],
+    ),
+    "wind with drag blows on the drone": (
+        still(velocity=[1.0, 0, 0]), {"wind": {"x": 3.0}, "linear_drag": {"x": 0.01}}, [0.02, 0, 0], [0, 0, 0],
+    ),
     # the moment of the air feels the wind, but is no drag: the wind's constant force stays
-    found = moved(situation, {"wind": {"x": 3.0}, "velocity_moment": {"pitch_per_vx": -1e-5}})
-    close(found, [0.021, 0, 0], [0, 2e-5, 0])
-
-
-def test_thrust_scale_also_scales_the_drag_torque() -> None:
-    situation = still(thrust=[0.1, 0, 0, 0])
-    kappa = CF2.torque_per_thrust
-    close(
-        moved(situation, {"thrust_scale": {"scale": 1.1}}), [0, 0, 0.01], 0.01 * np.array([-ARM, -ARM, -kappa])
-    )  # M1 is front right: left side down, nose up
-
-
-def test_rotor_fault_from_its_onset() -> None:
+    "wind with a moment": (
+        still(velocity=[1.0, 0, 0]), {"wind": {"x": 3.0}, "velocity_moment": {"pitch_per_vx": -1e-5}},
+        [0.021, 0, 0], [0, 2e-5, 0],
+    ),
+    # M1 is front right: left side down, nose up
+    "thrust scale also scales the drag torque": (
+        still(thrust=[0.1, 0, 0, 0]), {"thrust_scale": {"scale": 1.1}},
+        [0, 0, 0.01], [-0.01 * ARM, -0.01 * ARM, -0.01 * KAPPA],
+    ),
     # M2 back right loses a tenth: the right sinks (positive roll), the tail sinks (negative pitch), less positive yaw
-    kappa = CF2.torque_per_thrust
-    effects: Effects = {"rotor_fault": {"rotor": 2, "scale": 0.9}}
-    close(moved(still(thrust=0.1), effects), [0, 0, -0.01], 0.01 * np.array([ARM, -ARM, -kappa]))
-    path = still(6)
+    "rotor fault": (
+        still(thrust=0.1), {"rotor_fault": {"rotor": 2, "scale": 0.9}},
+        [0, 0, -0.01], [0.01 * ARM, -0.01 * ARM, -0.01 * KAPPA],
+    ),
+    # front stronger: nose up, negative pitch
+    "torque scale": (
+        still(thrust=[0.08, 0.07, 0.07, 0.08]), {"torque_scale": {"scale": 1.5}}, [0, 0, 0], [0, -0.01 * ARM, 0],
+    ),
+    # one height up: a fraction 1/e of the strength
+    "ground effect": (
+        still(thrust=0.07, height=[0.1]), {"ground_effect": {"strength": 0.2, "height": 0.1}},
+        [0, 0, 0.28 * 0.2 / math.e], [0, 0, 0],
+    ),
+    # only M1 turns, counter-clockwise: H along +z. Rolling right-handed about x turns H towards -y; the reaction is +y.
+    "rotor inertia is a gyroscope": (
+        still(thrust=[0.1, 0, 0, 0], body_rate=[2.0, 0, 0]), {"rotor_inertia": {"inertia": 2e-8}},
+        [0, 0, 0], [0, 2.0 * 2e-8 * math.sqrt(0.1 / 2.5e-8), 0],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BY_HAND.values(), ids=BY_HAND)
+def test_force_and_torque_of_an_effect(case: tuple[Situation, Effects, list[float], list[float]]) -> None:
+    situation, effects, force, torque = case
+    plain, with_it = (motion(situation, vehicle=ROTORS, effects=e) for e in ({}, effects))
+    added = M * (with_it.specific_force - plain.specific_force)[0]
+    turning = np.diag(CF2.inertia) @ (with_it.angular_acceleration - plain.angular_acceleration)[0]
+    np.testing.assert_allclose(added, force, atol=1e-12)
+    np.testing.assert_allclose(turning, torque, atol=1e-15)
+
+
+def test_a_rotor_fails_at_its_onset() -> None:
     dated: Effects = {"rotor_fault": {"rotor": 2, "scale": 0.9, "onset_time": 0.0225}}
-    lost = 4 * 0.07 - M * motion(path, vehicle=ROTORS, effects=dated).specific_force[:, 2]
+    lost = 4 * 0.07 - M * motion(still(6), vehicle=ROTORS, effects=dated).specific_force[:, 2]
     np.testing.assert_allclose(lost / 0.007, [0, 0, 0, 0.75, 1, 1], atol=1e-9)
 
 
 def test_torque_scale_leaves_the_torque_of_a_shifted_centre() -> None:
-    situation = still(thrust=[0.08, 0.07, 0.07, 0.08])  # front stronger: nose up, negative pitch
-    pitch = -0.02 * ARM
-    close(moved(situation, {"torque_scale": {"scale": 1.5}}), [0, 0, 0], [0, 0.5 * pitch, 0])
     both: Effects = {"torque_scale": {"scale": 1.5}, "center_of_mass": {"x": 0.002}}
     # thrust F at O, centre of mass 2 mm in front: torque -c x F = +0.002 F about y, unscaled
+    situation = still(thrust=[0.08, 0.07, 0.07, 0.08])
     turned = motion(situation, vehicle=ROTORS, effects=both).angular_acceleration[0, 1] * IYY
-    assert turned == pytest.approx(1.5 * pitch + 0.002 * 0.3)
+    assert turned == pytest.approx(1.5 * -0.02 * ARM + 0.002 * 0.3)
 
 
-def test_ground_effect_at_one_height() -> None:
-    situation = still(thrust=0.07, height=[0.1])
-    close(
-        moved(situation, {"ground_effect": {"strength": 0.2, "height": 0.1}}), [0, 0, 0.28 * 0.2 / math.e], [0, 0, 0]
-    )  # one height up: a fraction 1/e of the strength
-
-
-def test_rotor_inertia_reacts_to_spin_up_and_is_a_gyroscope() -> None:
-    # only M1 turns, counter-clockwise: H along +z. Rolling right-handed about x turns H towards -y; the reaction is +y.
-    k = 2.5e-8
-    speed = math.sqrt(0.1 / k)
-    rolling = still(thrust=[0.1, 0, 0, 0], body_rate=[2.0, 0, 0])
-    close(moved(rolling, {"rotor_inertia": {"inertia": 2e-8}}), [0, 0, 0], [0, 2.0 * 2e-8 * speed, 0])
+def test_a_rotor_that_speeds_up_turns_the_body_the_other_way() -> None:
     spinning = still(thrust=[0.1, 0, 0, 0], thrust_rate=[0.05, 0, 0, 0])
-    rate = 0.05 / (2 * math.sqrt(k * 0.1))  # dW/dt: M1 speeding up turns the body clockwise
-    np.testing.assert_allclose(
-        moved(spinning, {"rotor_inertia": {"inertia": 2e-8}})[1], [0, 0, -2e-8 * rate], rtol=1e-6
+    rate = 0.05 / (2 * math.sqrt(2.5e-8 * 0.1))  # dW/dt of M1, counter-clockwise
+    plain, with_it = (
+        motion(spinning, vehicle=ROTORS, effects=e).angular_acceleration[0] * CF2.inertia
+        for e in ({}, {"rotor_inertia": {"inertia": 2e-8}})
     )
+    np.testing.assert_allclose(with_it - plain, [0, 0, -2e-8 * rate], rtol=1e-6, atol=1e-18)
 
 
 def test_rotor_inertia_goes_with_the_speed_and_not_with_a_lost_blade() -> None:
@@ -151,29 +142,33 @@ def settled(effects: Effects, *, thrust=0.07, voltage=4.0, flown=10.0, speeds=Fa
     return rotor_thrust(inputs, np.array([0.9, 0.91]), vehicle=ROTORS, effects=effects)[0][-1]
 
 
-def test_thrust_curve_turns_about_hover() -> None:
-    hover = M * G / 4
-    np.testing.assert_allclose(settled({"thrust_curve": {"slope_error": 0.2}}, thrust=hover), hover)
-    np.testing.assert_allclose(settled({"thrust_curve": {"slope_error": 0.2}}, thrust=hover + 0.01), hover + 0.012)
-    np.testing.assert_allclose(settled({"thrust_curve": {"slope_error": 3.0}}, thrust=0.119), CF2.thrust_max)
-    np.testing.assert_allclose(settled({"thrust_curve": {"slope_error": 2.0}}, thrust=0.01), 0.0)
-    np.testing.assert_allclose(settled({"thrust_curve": {"slope_error": -0.5}}, thrust=0.0), 0.0)
-    np.testing.assert_allclose(settled({"thrust_curve": {"slope_error": 0.2}}, thrust=0.09, speeds=True), 0.09)
+HOVER = M * G / 4
 
 
-def test_battery_sag_by_voltage_and_by_time() -> None:
-    np.testing.assert_allclose(settled({"battery_sag": {"gain_per_volt": 0.2}}, voltage=3.2), 0.07 * 0.9)
-    np.testing.assert_allclose(settled({"battery_sag": {"gain_per_volt": 0.2}}, voltage=math.nan), 0.07)
-    np.testing.assert_allclose(settled({"battery_sag": {"gain_per_second": -0.004}}, flown=25.0), 0.07 * 0.9)
-    np.testing.assert_allclose(settled({"battery_sag": {"gain_per_second": -0.004}}, flown=-25.0), 0.07)
-    np.testing.assert_allclose(settled({"battery_sag": {"gain_per_second": -0.1}}, flown=25.0), 0.0)
-    np.testing.assert_allclose(settled({"battery_sag": {"gain_per_volt": 0.2}}, voltage=3.2, speeds=True), 0.07)
+@pytest.mark.parametrize(
+    ("effect", "values", "seen", "expected"),
+    [
+        ("thrust_curve", {"slope_error": 0.2}, {"thrust": HOVER}, HOVER),
+        ("thrust_curve", {"slope_error": 0.2}, {"thrust": HOVER + 0.01}, HOVER + 0.012),
+        ("thrust_curve", {"slope_error": 3.0}, {"thrust": 0.119}, CF2.thrust_max),
+        ("thrust_curve", {"slope_error": 2.0}, {"thrust": 0.01}, 0.0),
+        ("thrust_curve", {"slope_error": -0.5}, {"thrust": 0.0}, 0.0),
+        ("thrust_curve", {"slope_error": 0.2}, {"thrust": 0.09, "speeds": True}, 0.09),
+        ("battery_sag", {"gain_per_volt": 0.2}, {"voltage": 3.2}, 0.07 * 0.9),
+        ("battery_sag", {"gain_per_volt": 0.2}, {"voltage": math.nan}, 0.07),
+        ("battery_sag", {"gain_per_second": -0.004}, {"flown": 25.0}, 0.07 * 0.9),
+        ("battery_sag", {"gain_per_second": -0.004}, {"flown": -25.0}, 0.07),
+        ("battery_sag", {"gain_per_second": -0.1}, {"flown": 25.0}, 0.0),
+        ("battery_sag", {"gain_per_volt": 0.2}, {"voltage": 3.2, "speeds": True}, 0.07),
+    ],
+)
+def test_thrust_curve_and_battery_sag(effect, values, seen, expected) -> None:
+    np.testing.assert_allclose(settled({effect: values}, **seen), expected, atol=1e-15)
 
 
 def test_thrust_curve_comes_before_sag() -> None:
     both: Effects = {"battery_sag": {"gain_per_volt": 0.2}, "thrust_curve": {"slope_error": 0.5}}
-    hover = M * G / 4
-    np.testing.assert_allclose(settled(both, thrust=hover + 0.01, voltage=3.2), 0.9 * (hover + 0.015))
+    np.testing.assert_allclose(settled(both, thrust=HOVER + 0.01, voltage=3.2), 0.9 * (HOVER + 0.015))
 
 
 def test_rotor_sensor_that_counts_too_much_hides_a_weaker_rotor() -> None:

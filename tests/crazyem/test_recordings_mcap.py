@@ -153,7 +153,15 @@ def test_a_cut_file_says_so(small, tmp_path):
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.sampled_from(
-        [b"", b"\x89MCAP0\r\n", b"\x1f\x8b", b"\x1f\x8b\x08\x00", b"t,px,", b"host_t,block,fw_ms,name,value\n"]
+        [
+            b"",
+            b"\x89MCAP0\r\n",
+            b"ULog\x01\x12\x35",
+            b"\x1f\x8b",
+            b"\x1f\x8b\x08\x00",
+            b"t,px,",
+            b"host_t,block,fw_ms,name,value\n",
+        ]
     ),
     st.binary(max_size=300),
 )

@@ -3,7 +3,6 @@
 import contextlib
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from crazyem.errors import CrazyemError, FileFormatError, UsageError
+from crazyem.errors import FileFormatError, UsageError
 from crazyem.estimation.model import SPREAD, setup_for
 from crazyem.vehicle import Days, Vehicle, load_vehicle, parse_vehicle, preset_names
 
@@ -211,15 +210,6 @@ def test_any_text_is_a_vehicle_or_a_user_error(source):
         parse_vehicle(source)
 
 
-def test_not_toml_not_text_not_there(tmp_path: Path):
-    path = tmp_path / "broken.toml"
-    path.write_text("mass = = 3")
-    with pytest.raises(FileFormatError, match="not valid TOML"):
-        load_vehicle(path)
-    path.write_bytes(b"\xff\xfe\x00mass")
-    with pytest.raises(FileFormatError, match="not UTF-8"):
-        load_vehicle(path)
+def test_a_name_that_is_no_preset():
     with pytest.raises(UsageError, match=r"unknown vehicle 'cf3'.*cf2, .*cf2-legacy"):
         load_vehicle("cf3")
-    with pytest.raises(CrazyemError):
-        load_vehicle(tmp_path)  # a folder
