@@ -1,6 +1,6 @@
 """From the decoded topics of a bag to a recording: clocks, log blocks with their variables, types with a meaning."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from crazyem.errors import FileFormatError
 from crazyem.links.clock import STAMP_MODULUS, StampUnwrapper
 from crazyem.physics.rotations import rotate
-from crazyem.recordings.autopilots.frd_ned import euler_from_quaternions, stacked
+from crazyem.recordings.autopilots.frd_ned import Columns, Turn, euler_from_quaternions, stacked
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.recording import Recording, SignalArray
 from crazyem.recordings.ros.ros2_messages import MessageType, Rows, rows_of
 from crazyem.recordings.stamps import Fault, finding_in
 from crazyem.recordings.tables import Table, signals_from_tables
-from crazyem.recordings.topics import Mapped, Topic, ranks, seconds, signals_of, text_of
+from crazyem.recordings.topics import Mapped, Source, Topic, ranks, seconds, signals_of, text_of
 
 HOST_CLOCK = "ros"  # the clock of the host's ROS nodes
 FIRMWARE_CLOCK = "firmware"
@@ -29,19 +29,14 @@ _ODOMETRY = "nav_msgs/Odometry"
 _TF, _MOCAP = "tf2_msgs/TFMessage", "motion_capture_tracking_interfaces/NamedPoseArray"
 # types by which a namespace is known to be a robot's
 ROBOT_TYPES = {
-    _LOG,
-    _STATUS,
-    _FULL_STATE,
-    "geometry_msgs/PoseStamped",
-    "geometry_msgs/PoseWithCovarianceStamped",
-    "nav_msgs/Odometry",
-    "sensor_msgs/Imu",
+    *(_LOG, _STATUS, _FULL_STATE, _ODOMETRY),
+    *("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped", "sensor_msgs/Imu"),
 }
 WORLD_TOPICS = {"/tf", "/poses"}  # of all robots
 _FLYING_BIT = 16  # supervisor.info
 _NS = 1_000_000_000
 _SAME_EPOCH = 3600 * _NS  # a stamp further from the time of recording is of a simulation or an unset clock
-_XYZ, _XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
+_XYZ, _XYZW = "xyz", "xyzw"
 
 
 @dataclass(slots=True)
@@ -308,72 +303,77 @@ def _together(
     }
 
 
-def _meaning(d: _Decoded, topic: Topic, mapping: BagMapping, notes: list[Finding]) -> Iterator[Mapped]:
-    """Signals of the vocabulary in a topic, by the type of its messages."""
-    match d.topic.kind.name:
-        case "geometry_msgs/PoseStamped":
-            yield from _pose(topic, "pose.")
-        case "geometry_msgs/PoseWithCovarianceStamped":
-            yield from _pose(topic, "pose.pose.")
-        case "nav_msgs/Odometry":
-            yield from _odometry(d, topic, mapping, notes)
-        case "sensor_msgs/Imu":
-            yield from _columns(topic, "body_rate", "angular_velocity.", _XYZ)
-            yield from _columns(topic, "specific_force", "linear_acceleration.", _XYZ)
-            yield from _quaternion(topic, "orientation.")
-        case "sensor_msgs/BatteryState":
-            yield from _columns(topic, "voltage", "", ("voltage",))
-        case "crazyflie_interfaces/Status":
-            yield from _columns(topic, "voltage", "", ("battery_voltage",))
-            info = topic.columns.get("supervisor_info")
-            if info is not None:
-                flag = ((np.asarray(info).astype(np.int64) & _FLYING_BIT) != 0).astype(float)[:, None]
-                yield Mapped("flying", topic, flag, ("supervisor_info",))
-        case "crazyflie_interfaces/FullState":
-            yield from _columns(topic, "setpoint_position", "pose.position.", _XYZ)
-            yield from _columns(topic, "setpoint_velocity", "twist.linear.", _XYZ)
-            yield from _columns(topic, "setpoint_acceleration", "acc.", _XYZ)
-            yield from _columns(topic, "setpoint_rate", "twist.angular.", _XYZ)
-            for m in _quaternion(topic, "pose.orientation."):
-                yield replace(m, quantity="setpoint_euler", value=euler_from_quaternions(m.value), frame="")
-        case "crazyflie_interfaces/Position":
-            yield from _columns(topic, "setpoint_position", "", _XYZ)
-        case "tf2_msgs/TFMessage":
-            yield from (replace(m, origin="tf") for m in _pose(topic, ""))
-        case "motion_capture_tracking_interfaces/NamedPoseArray":
-            yield from (replace(m, origin="mocap") for m in _pose(topic, ""))
+def _flying(columns: Columns) -> NDArray[np.float64]:
+    return ((stacked(columns).astype(np.int64) & _FLYING_BIT) != 0).astype(float)
 
 
-def _columns(topic: Topic, quantity: str, prefix: str, parts: tuple[str, ...]) -> Iterator[Mapped]:
-    names = tuple(prefix + part for part in parts)
-    if set(names) <= topic.columns.keys():
-        yield Mapped(quantity, topic, stacked([topic.columns[n] for n in names]), names)
+def _no_attitude(prefix: str) -> Callable[[Topic], NDArray[np.bool_]]:
+    """Rows whose quaternion is all zeros, or whose covariance says that there is none (sensor_msgs/Imu)."""
 
-
-def _quaternion(topic: Topic, prefix: str) -> Iterator[Mapped]:
-    """An attitude, unless no message has one: all zeros, or a covariance that says so (sensor_msgs/Imu)."""
-    for m in _columns(topic, "attitude", prefix, _XYZW):
+    def absent(topic: Topic) -> NDArray[np.bool_]:
+        rows = ~stacked([topic.columns[prefix + c] for c in _XYZW]).any(axis=1)
         unknown = topic.columns.get("orientation_covariance[0]")
-        absent = np.asarray(~m.value.any(axis=1), bool)
-        if unknown is not None:
-            absent |= np.asarray(unknown == -1, bool)
-        if not absent.all():
-            yield replace(m, value=np.where(absent[:, None], np.nan, m.value), marked=absent)
+        return np.asarray(rows if unknown is None else rows | (unknown == -1), bool)
+
+    return absent
 
 
-def _pose(topic: Topic, prefix: str) -> Iterator[Mapped]:
-    yield from _columns(topic, "position", prefix + "position.", _XYZ)
-    yield from _quaternion(topic, prefix + "orientation.")
+def _source(
+    quantity: str, prefix: str, parts: Sequence[str] = _XYZ, convert: Turn = stacked, origin: str = ""
+) -> Source:
+    invalid = _no_attitude(prefix) if parts == _XYZW else None
+    return Source(quantity, "", tuple(prefix + c for c in parts), convert, invalid, origin=origin)
 
 
-def _odometry(d: _Decoded, topic: Topic, mapping: BagMapping, notes: list[Finding]) -> Iterator[Mapped]:
-    """Pose, velocity in the world, body rate. crazyswarm2's C++ server leaves rates at 0 and the child frame empty."""
-    pose = list(_pose(topic, "pose.pose."))
-    yield from pose
+def _pose(prefix: str, origin: str = "") -> tuple[Source, Source]:
+    place = _source("position", prefix + "position.", origin=origin)
+    return place, _source("attitude", prefix + "orientation.", _XYZW, origin=origin)
+
+
+# type of messages -> signals of the vocabulary, of whichever topic
+_MEANING: Mapping[str, tuple[Source, ...]] = {
+    "geometry_msgs/PoseStamped": _pose("pose."),
+    "geometry_msgs/PoseWithCovarianceStamped": _pose("pose.pose."),
+    _ODOMETRY: _pose("pose.pose."),
+    "sensor_msgs/Imu": (
+        _source("body_rate", "angular_velocity."),
+        _source("specific_force", "linear_acceleration."),
+        _source("attitude", "orientation.", _XYZW),
+    ),
+    "sensor_msgs/BatteryState": (_source("voltage", "", ["voltage"]),),
+    _STATUS: (_source("voltage", "", ["battery_voltage"]), _source("flying", "", ["supervisor_info"], _flying)),
+    _FULL_STATE: (
+        _source("setpoint_position", "pose.position."),
+        _source("setpoint_velocity", "twist.linear."),
+        _source("setpoint_acceleration", "acc."),
+        _source("setpoint_rate", "twist.angular."),
+        _source("setpoint_euler", "pose.orientation.", _XYZW, lambda c: euler_from_quaternions(stacked(c))),
+    ),
+    "crazyflie_interfaces/Position": (_source("setpoint_position", ""),),
+    _TF: _pose("", "tf"),
+    _MOCAP: _pose("", "mocap"),
+}
+
+
+def _meaning(d: _Decoded, topic: Topic, mapping: BagMapping, notes: list[Finding]) -> list[Mapped]:
+    """Signals of the vocabulary in a topic, by the type of its messages."""
+    kind = d.topic.kind.name
+    found = _of(topic, *_MEANING.get(kind, ()))
+    return [*found, *_twist(d, topic, found, mapping, notes)] if kind == _ODOMETRY else found
+
+
+def _of(topic: Topic, *sources: Source) -> list[Mapped]:
+    return [m for source in sources for m in replace(source, topic=topic.name).of([topic])]
+
+
+def _twist(
+    d: _Decoded, topic: Topic, pose: Sequence[Mapped], mapping: BagMapping, notes: list[Finding]
+) -> Iterator[Mapped]:
+    """Velocity in the world and body rate. crazyswarm2's C++ server leaves rates at 0 and the child frame empty."""
     attitude = next((m.value for m in pose if m.quantity == "attitude"), None)
     child = d.rows.texts.get("child_frame_id", "")
     frame = mapping.twist or ("body" if child else "world")
-    for m in _columns(topic, "velocity", "twist.twist.linear.", _XYZ):
+    for m in _of(topic, _source("velocity", "twist.twist.linear.")):
         if frame == "body" and attitude is None:
             continue
         value = m.value if frame == "world" or attitude is None else rotate(attitude, m.value)
@@ -383,6 +383,6 @@ def _odometry(d: _Decoded, topic: Topic, mapping: BagMapping, notes: list[Findin
         advice = 'If that is wrong, say twist = "world" or twist = "body" in a mapping file (--map).'
         notes.append(Finding("mapping", Grade.HARMLESS, text, "velocity", advice=advice))
         yield replace(m, value=value)
-    for m in _columns(topic, "body_rate", "twist.twist.angular.", _XYZ):
+    for m in _of(topic, _source("body_rate", "twist.twist.angular.")):
         if m.value.any():
             yield m
