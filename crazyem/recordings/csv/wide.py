@@ -1,5 +1,6 @@
 """Wide CSV files, a row an instant: read at once, or in parts when they are larger than memory."""
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -46,7 +47,7 @@ class _Held:
 
     def add(self, block: Columns) -> None:
         """Append rows."""
-        more = next(iter(block.values())).size
+        more = next((values.size for values in block.values()), 0)
         for c, values in block.items():
             self.arrays.setdefault(c, GrowingArray(float)).more(more)[:] = values
         self.rows += more
@@ -115,40 +116,31 @@ def _parts(plan: _Plan, damage: Damage, seconds: float) -> Iterator[tuple[Column
     """(rows of a part, some rows after it, whether the file ends with them)."""
     held = _Held()
     number = 0
-    for block in read_columns(plan.path, plan.header, plan.needed, plan.wanted, damage, stamp=plan.stamp):
+    blocks = read_columns(plan.path, plan.header, plan.needed, plan.wanted, damage, stamp=plan.stamp)
+    # what was kept back at the end may be several parts, since neighbours were waited for
+    for block, neighbours in itertools.chain(zip(blocks, itertools.repeat(CONTEXT_ROWS)), [({}, 1)]):
         held.add(block)
-        while held.rows > CONTEXT_ROWS:
-            cut = _cut(plan, held, number, seconds)
-            if cut is None:
-                break
-            part, rest = _cut_columns(held.joined(), cut)
+        while (cut := _cut(plan, held, number, seconds, neighbours)) is not None:
+            columns = held.joined()
+            rest = {c: v[cut:].copy() for c, v in columns.items()}
             number += cut
             held = _Held()
             held.add(rest)
-            yield part, {c: v[:CONTEXT_ROWS] for c, v in rest.items()}, False
-    if not held.rows and not number:
-        raise FileFormatError(f"{plan.path}: there is a header but not a single sample.")
+            yield {c: v[:cut] for c, v in columns.items()}, {c: v[:CONTEXT_ROWS] for c, v in rest.items()}, False
     if held.rows:
-        # what was kept back may be several parts, since neighbours were waited for
-        while (cut := _cut(plan, held, number, seconds, neighbours=1)) is not None:
-            part, rest = _cut_columns(held.joined(), cut)
-            number += cut
-            held = _Held()
-            held.add(rest)
-            yield part, {c: v[:CONTEXT_ROWS] for c, v in rest.items()}, False
         yield held.joined(), {}, True
+    elif not number:
+        raise FileFormatError(f"{plan.path}: there is a header but not a single sample.")
 
 
-def _cut(plan: _Plan, held: _Held, number: int, seconds: float, neighbours: int = CONTEXT_ROWS) -> int | None:
+def _cut(plan: _Plan, held: _Held, number: int, seconds: float, neighbours: int) -> int | None:
     """Rows that make the next part, None if it is not complete yet."""
+    if held.rows <= neighbours:
+        return None
     stamp = _stamps(plan, held.joined(), held.rows, number)
     late = stamp >= stamp[0] + seconds
     cut = max(1, min(int(np.argmax(late)) if late.any() else held.rows + 1, _MOST_ROWS))
     return cut if cut + neighbours <= held.rows else None
-
-
-def _cut_columns(columns: Columns, cut: int) -> tuple[Columns, Columns]:
-    return {c: v[:cut] for c, v in columns.items()}, {c: v[cut:].copy() for c, v in columns.items()}
 
 
 def _concatenated(parts: list[Columns]) -> Columns:

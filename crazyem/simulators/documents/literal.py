@@ -85,7 +85,7 @@ class LiteralDocument(Spliced):
 
     def get(self, path: Path) -> float | None:
         """The number at a path; None if there is none."""
-        return as_number(self.value(path), self.where)
+        return as_number(self.value(path))
 
     def put(self, path: Path, value: float) -> bool:
         """Let a number stand at a path; False if there is no such place. A missing key is added to its dict."""
@@ -115,8 +115,7 @@ class LiteralDocument(Spliced):
         quote = chr(self._data[self._span(node.keys[-1])[0]])
         column = node.keys[-1].col_offset
         gap = "\n" + " " * column if node.keys[-1].lineno > node.lineno else " "
-        present = self._edits.get((end, end), b"").decode()
-        self._place((end, end), f"{present},{gap}{quote}{key}{quote}: {number_text(value)}")
+        self._insert(end, f",{gap}{quote}{key}{quote}: {number_text(value)}")
         return True
 
     def _down(self, path: Path) -> tuple[ast.expr | None, Path]:

@@ -17,7 +17,7 @@ def number_text(value: float) -> str:
     return repr(float(f"{value:.12g}"))
 
 
-def as_number(text: Any, where: str) -> float | None:
+def as_number(text: Any) -> float | None:
     """The number that a text holds; None if it is no number."""
     if isinstance(text, bool) or text is None:
         return None
@@ -45,6 +45,10 @@ class Spliced:
         """Let `text` stand where bytes start to end stand now; a span of no length inserts."""
         self._edits[span] = text.encode()
 
+    def _insert(self, at: int, text: str) -> None:
+        """Let `text` stand before byte `at`, after what was inserted there before."""
+        self._place((at, at), self._edits.get((at, at), b"").decode() + text)
+
     @property
     def text(self) -> str:
         """The text with all edits."""
@@ -69,12 +73,28 @@ _LINE = re.compile(
 )
 
 
-class ParamDocument(Spliced):
-    """A file of parameters; a path is one name. Of a name that is set twice the last counts, as in a script."""
+class SplicedText(Spliced):
+    """A text whose places are known in characters."""
 
     def __init__(self, text: str, where: str) -> None:
         super().__init__(text, where)
         self._text = text
+
+    def _at(self, character: int) -> int:
+        """The byte at which a character begins."""
+        return len(self._text[:character].encode())
+
+    def _line_end(self, character: int) -> int:
+        """The byte at which the line of a character ends."""
+        end = self._text.find("\n", character)
+        return self._at(len(self._text) if end < 0 else end)
+
+
+class ParamDocument(SplicedText):
+    """A file of parameters; a path is one name. Of a name that is set twice the last counts, as in a script."""
+
+    def __init__(self, text: str, where: str) -> None:
+        super().__init__(text, where)
         self._found = {m["name"]: m for m in _LINE.finditer(text)}
 
     def names(self) -> list[str]:
@@ -84,23 +104,18 @@ class ParamDocument(Spliced):
     def get(self, path: Path) -> float | None:
         """The number of a parameter; None if it is not set."""
         found = self._found.get(path[0])
-        return None if found is None else as_number(found["value"], self.where)
+        return None if found is None else as_number(found["value"])
 
     def put(self, path: Path, value: float) -> bool:
         """Set a parameter; one that is missing is set after the last one."""
         found = self._found.get(path[0])
         if found is not None:
-            self._place(self._span(found.start("value"), found.end("value")), number_text(value))
+            self._place((self._at(found.start("value")), self._at(found.end("value"))), number_text(value))
             return True
         last = next(reversed(self._found.values()), None)
         if last is None:
             return False
-        end = self._text.find("\n", last.end())
-        span = self._span(*((len(self._text),) * 2 if end < 0 else (end, end)))
         kind = "\t9" if last["head"][0].isdigit() else ""  # a ground station's code for a float
-        present = self._edits.get(span, b"").decode()
-        self._place(span, f"{present}\n{last['head']}{path[0]}{last['gap']}{number_text(value)}{kind}")
+        text = f"\n{last['head']}{path[0]}{last['gap']}{number_text(value)}{kind}"
+        self._insert(self._line_end(last.end()), text)
         return True
-
-    def _span(self, start: int, end: int) -> tuple[int, int]:
-        return len(self._text[:start].encode()), len(self._text[:end].encode())

@@ -5,7 +5,7 @@ from typing import Any
 
 from crazyem.errors import FileFormatError
 from crazyem.extras import require
-from crazyem.simulators.documents.spliced import Path, Spliced, as_number, number_text
+from crazyem.simulators.documents.spliced import Path, SplicedText, as_number, number_text
 
 
 class TomlDocument:
@@ -31,7 +31,7 @@ class TomlDocument:
 
     def get(self, path: Path) -> float | None:
         """The number at a path; None if there is none."""
-        return as_number(self._at(path), self.where)
+        return as_number(self._at(path))
 
     def put(self, path: Path, value: float) -> bool:
         """Let a number stand at a path; False if there is no such place. A missing key is added to its table."""
@@ -53,13 +53,12 @@ class TomlDocument:
         return found
 
 
-class YamlDocument(Spliced):
+class YamlDocument(SplicedText):
     """A YAML file. Raises FileFormatError if it is none, MissingExtraError without ruamel.yaml."""
 
     def __init__(self, text: str, where: str) -> None:
         super().__init__(text, where)
         yaml = require("ruamel.yaml", "A YAML file")
-        self._text = text
         try:
             self.root: Any = yaml.YAML(typ="safe", pure=True).compose(text)
         except (yaml.error.YAMLError, ValueError, RecursionError) as error:
@@ -79,7 +78,7 @@ class YamlDocument(Spliced):
     def get(self, path: Path) -> float | None:
         """The number at a path; None if there is none."""
         node = self._node(path)
-        return None if node is None or not isinstance(node.value, str) else as_number(node.value, self.where)
+        return None if node is None or not isinstance(node.value, str) else as_number(node.value)
 
     def put(self, path: Path, value: float) -> bool:
         """Let a number stand at a path; False if there is no such place. A missing key is added to its mapping."""
@@ -88,7 +87,7 @@ class YamlDocument(Spliced):
             return self._added(path, value)
         if not isinstance(node.value, str):
             return False
-        self._place(self._span(node.start_mark.index, node.end_mark.index), number_text(value))
+        self._place((self._at(node.start_mark.index), self._at(node.end_mark.index)), number_text(value))
         return True
 
     def _added(self, path: Path, value: float) -> bool:
@@ -98,14 +97,11 @@ class YamlDocument(Spliced):
             return False
         key, last = parent.value[-1]
         indent = key.start_mark.column
-        end = len(self._text[: last.end_mark.index].rstrip())
-        line = self._text.find("\n", end)
-        end = len(self._text) if line < 0 else line
+        end = self._line_end(len(self._text[: last.end_mark.index].rstrip()))
         deeper = path[known:]
         text = "".join(f"\n{' ' * (indent + 2 * k)}{step}:" for k, step in enumerate(deeper)) + f" {number_text(value)}"
-        span = self._span(end, end)
-        present = self._edits.get(span, b"").decode()
-        self._place(span, _merged(present, text))
+        present = self._edits.get((end, end), b"").decode()
+        self._place((end, end), _merged(present, text))
         return True
 
     def _node(self, path: Path) -> Any:
@@ -119,10 +115,6 @@ class YamlDocument(Spliced):
                 pairs = node.value if _is_mapping(node) else []
                 node = next((v for k, v in pairs if str(k.value) == step), None)
         return node
-
-    def _span(self, start: int, end: int) -> tuple[int, int]:
-        """Bytes of characters."""
-        return len(self._text[:start].encode()), len(self._text[:end].encode())
 
 
 def _is_mapping(node: Any) -> bool:

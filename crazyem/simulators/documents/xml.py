@@ -89,6 +89,11 @@ class XmlDocument(Spliced):
             element = found[int(index or 0)]
         return element
 
+    def all(self, path: Path, tag: str) -> list[Element]:
+        """Children of a tag of the element of a path; none if there is no such element."""
+        element = self.find(path)
+        return [] if element is None else element.all(tag)
+
     def inner(self, element: Element) -> str:
         """The text of an element, as it was read."""
         return self._data[element.inside : element.end].decode()
@@ -109,14 +114,14 @@ class XmlDocument(Spliced):
         """The number at a path; None if there is none."""
         found = self.words(path)
         at = path[-1] if isinstance(path[-1], int) else 0
-        return None if found is None or at >= len(found[0]) else as_number(found[0][at], self.where)
+        return None if found is None or at >= len(found[0]) else as_number(found[0][at])
 
     def put(self, path: Path, value: float) -> bool:
         """Let a number stand at a path; False if there is no such place."""
         found = self.words(path)
         at = path[-1] if isinstance(path[-1], int) else 0
         if found is None:
-            return self._added(path, value)
+            return self._added(path, number_text(value))
         words, start, end = found
         if at >= len(words):
             return False
@@ -129,14 +134,11 @@ class XmlDocument(Spliced):
         """Let numbers stand in a text, which is added if there is none."""
         found, text = self.words(path), " ".join(map(number_text, values))
         if found is None:
-            return self._insert(path, text)
+            return self._added(path, text)
         self._place((found[1], found[2]), text)
         return True
 
-    def _added(self, path: Path, value: float) -> bool:
-        return self._insert(path, number_text(value))
-
-    def _insert(self, path: Path, text: str) -> bool:
+    def _added(self, path: Path, text: str) -> bool:
         """A missing leaf `<tag>value</tag>` as the last child of its parent."""
         if path[-1] != "#" or len(path) < 2:
             return False
@@ -146,7 +148,5 @@ class XmlDocument(Spliced):
         sibling = parent.children[-1]
         before = self._data[: sibling.start].decode()
         indent = before[len(before.rstrip(" \t\r\n")) :]
-        span = (sibling.last, sibling.last)
-        present = self._edits.get(span, b"").decode()
-        self._place(span, f"{present}{indent}<{path[-2]}>{text}</{path[-2]}>")
+        self._insert(sibling.last, f"{indent}<{path[-2]}>{text}</{path[-2]}>")
         return True

@@ -86,7 +86,7 @@ def _parts(document: XmlDocument) -> _Parts:
     others = [k for k in range(len(links)) if k not in props and links[k].all("inertial")]
     if not others:
         raise FileFormatError(f"{document.where}: the model has no body with <inertial>")
-    body = max(others, key=lambda k: _mass(links[k], document))
+    body = max(others, key=lambda k: _number(links[k], document, "mass"))
     inertia = _inertia(links[body], document)
     places = np.array([_pose(links[k], document)[:3] for k in props])
     own = np.zeros((3, 3))
@@ -94,30 +94,27 @@ def _parts(document: XmlDocument) -> _Parts:
         matrix = _inertia(links[k], document)
         own += np.diag([matrix[0, 0], matrix[1, 1], 0.0])
     centre = _pose(links[body], document)[:3] + _pose(links[body].all("inertial")[0], document)[:3]
-    masses = np.array([_mass(links[k], document) for k in props])
-    return _Parts(body, props, _mass(links[body], document), centre, inertia, masses, places, own)
+    masses = np.array([_number(links[k], document, "mass") for k in props])
+    return _Parts(body, props, _number(links[body], document, "mass"), centre, inertia, masses, places, own)
 
 
-def _mass(link: Element, document: XmlDocument) -> float:
-    inertial = link.all("inertial")
-    text = _text(inertial[0], "mass", document) if inertial else ""
+def _number(link: Element, document: XmlDocument, *path: str) -> float:
+    """A number of the inertial of a link; 0 where it is not said."""
+    elements = [link]
+    for tag in ("inertial", *path[:-1]):
+        elements = elements[0].all(tag) if elements else []
+    text = _text(elements[0], path[-1], document) if elements else ""
     try:
         return float(text or 0.0)
     except ValueError:
-        raise FileFormatError(f"{document.where}: {link.name()}.inertial.mass is no number: '{text}'") from None
+        where = ".".join((link.name(), "inertial", *path))
+        raise FileFormatError(f"{document.where}: {where} is no number: '{text}'") from None
 
 
 def _inertia(link: Element, document: XmlDocument) -> Array:
     matrix = np.zeros((3, 3))
-    element = (link.all("inertial") or [link])[0].all("inertia")
     for name, i, j in _ELEMENTS:
-        text = _text(element[0], name, document) if element else ""
-        try:
-            matrix[i, j] = matrix[j, i] = float(text or 0.0)
-        except ValueError:
-            raise FileFormatError(
-                f"{document.where}: {link.name()}.inertial.inertia.{name} is no number: '{text}'"
-            ) from None
+        matrix[i, j] = matrix[j, i] = _number(link, document, "inertia", name)
     return matrix
 
 

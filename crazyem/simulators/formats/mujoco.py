@@ -15,8 +15,7 @@ _FULL = ("xx", "yy", "zz", "xy", "xz", "yz")
 
 def _body(document: XmlDocument) -> tuple[tuple[str, ...], Element]:
     """The path of the first body that is free, else of the first with a mass of its own, and the body."""
-    world = document.find(("worldbody",))
-    bodies = [] if world is None else world.all("body")
+    bodies = document.all(("worldbody",), "body")
     free = [k for k, body in enumerate(bodies) if _is_free(body)]
     for k in [*free, *(k for k, body in enumerate(bodies) if body.all("inertial"))]:
         return ("worldbody", f"body[{k}]"), bodies[k]
@@ -33,8 +32,7 @@ def _gear(motor: Element) -> list[float]:
 
 def _motors(document: XmlDocument) -> list[tuple[int, Element]]:
     """Motors that push along the body's z axis."""
-    actuator = document.find(("actuator",))
-    motors = [] if actuator is None else actuator.all("motor")
+    motors = document.all(("actuator",), "motor")
     return [(k, m) for k, m in enumerate(motors) if len(_gear(m)) >= 3 and _gear(m)[2] > 0.0]
 
 
@@ -71,8 +69,7 @@ def _fields(document: XmlDocument, name: str) -> list[Field]:
             found += [Field((*place, a), f"arm_{'xy'[a]}", "m", magnitude=True) for a in (0, 1)]
             found.append(Field(("actuator", f"motor[{k}]", "@gear", 5), "torque_per_thrust", "m", magnitude=True))
     hover = "hover_thrust" if each else "weight"
-    key = (document.find(("keyframe",)) or Element("", {}, 0, 0)).all("key")
-    for k, _ in enumerate(key):
+    for k, _ in enumerate(document.all(("keyframe",), "key")):
         found += [
             Field(("keyframe", f"key[{k}]", "@ctrl", n), hover, "N", factor=1.0 / _gear(motor)[2], given=False)
             for n, motor in motors
@@ -95,8 +92,7 @@ def _write_more(document: XmlDocument, name: str, constants: Any) -> None:
 
 def tiny_limits(document: XmlDocument) -> list[str]:
     """A remark where torque motors can hardly turn the drone."""
-    actuator = document.find(("actuator",))
-    for k, motor in enumerate([] if actuator is None else actuator.all("motor")):
+    for k, motor in enumerate(document.all(("actuator",), "motor")):
         gear, limit = _gear(motor), document.get(("actuator", f"motor[{k}]", "@ctrlrange", 1))
         if limit and len(gear) == 6 and not any(gear[:3]) and max(map(abs, gear)) * limit < 1e-4:
             name = motor.name() or f"motor {k}"
