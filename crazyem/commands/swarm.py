@@ -16,22 +16,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from crazyem.commands.common import (
-    LiveLine,
-    compile_kernels,
-    new_estimator,
-    say,
-)
+from crazyem.commands.common import LiveLine, compile_kernels, new_estimator, say
 from crazyem.commands.flights import follow, interrupts, write_rules
 from crazyem.commands.output import put
 from crazyem.commands.view import Streams, SwarmInterrupts, Viewed, landing, live_view, wants_view
 from crazyem.control.named_trajectories import DEFAULT_HEIGHT, duration_note, trajectory_maker
 from crazyem.errors import CrazyemError, LinkError, UsageError
-from crazyem.links import open_link
+from crazyem.links.base import Link
 from crazyem.live.controllers import controller_named
 from crazyem.live.flight import Flight, FlightInterruptedError, FlightPlan, Interrupts, MotorsCutError
-from crazyem.live.flight_result import result_of
-from crazyem.live.recorder import close_recorder, open_recorder
+from crazyem.live.flight_result import FlightResult
+from crazyem.live.runner import connect, finished, open_session
 from crazyem.live.scheduler import Scheduler, UpdateThrottle
 from crazyem.live.session import Session
 from crazyem.live.summary import check_writable, write_json
@@ -56,7 +51,8 @@ class Drone:
     """One drone of a running command.
 
     Attributes:
-        error: what ended it early, None if all is well. outcome: in a few words.
+        stack: closes its session, recording and link.
+        error: what ended it early, None if all is well. outcome: in a few words. result: of what it flew.
     """
 
     member: Member
@@ -65,16 +61,15 @@ class Drone:
     log: str | None = None
     plot: str | None = None
     plan: FlightPlan | None = None
-    link: Any = None
+    stack: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
     session: Session | None = None
     estimator: UpdateThrottle | None = None
-    recorder: Any = None
     line: LiveLine | None = None
     shown: Viewed | None = None
     interrupts: Interrupts = field(default_factory=Interrupts)
     error: BaseException | None = None
     outcome: str = ""
-    row: dict[str, Any] = field(default_factory=dict)
+    result: FlightResult | None = None
 
     @property
     def name(self) -> str:
@@ -106,11 +101,7 @@ def path_for(base: str | None, name: str) -> str | None:
 
 
 def members(arguments: argparse.Namespace, trajectory: Sequence[str] = ("hover",)) -> list[Member]:
-    """The drones of the command line or of a swarm file.
-
-    Raises:
-        UsageError, FileFormatError: they cannot be used.
-    """
+    """The drones of the command line or of a swarm file. Raises UsageError, FileFormatError: they cannot be used."""
     uris = [*([arguments.uri] if arguments.uri else []), *arguments.uris]
     if arguments.swarm and uris:
         raise UsageError("give the drones in a swarm file or on the command line, not both.")
@@ -203,15 +194,14 @@ def _connect(
 ) -> None:
     """Links, recordings and sessions; a drone that cannot be reached is left behind."""
 
-    def connect(number: int) -> None:
+    def reach(number: int) -> None:
         drone = drones[number]
         if everyone.count:
             drone.failed(FlightInterruptedError())
             return
         try:
-            drone.link = open_link(drone.member.uri)
-            drone.link.connect()
-            _begin(arguments, drone, number, len(drones), wrench=wrench, streams=streams, scheduler=scheduler)
+            link = connect(drone.stack, drone.member.uri)
+            _begin(arguments, drone, link, number, len(drones), wrench=wrench, streams=streams, scheduler=scheduler)
             say(f"{drone.name}: connected to {drone.member.uri}")
         except CrazyemError as error:
             drone.failed(error)
@@ -219,12 +209,13 @@ def _connect(
             drone.failed(CrazyemError(f"connecting failed: {error!r}."))
 
     with concurrent.futures.ThreadPoolExecutor(CONNECTIONS_AT_ONCE, thread_name_prefix="crazyem-connect") as pool:
-        list(pool.map(connect, range(len(drones))))
+        list(pool.map(reach, range(len(drones))))
 
 
 def _begin(
     arguments: argparse.Namespace,
     drone: Drone,
+    link: Link,
     number: int,
     of: int,
     *,
@@ -243,29 +234,25 @@ def _begin(
             "duration": arguments.duration, "push": plan.push,
             "guard": plan.rules.mode if plan.push and plan.rules is not None else "no push",
         }  # fmt: skip
-    recorder = open_recorder(
-        drone.log, configuration=configuration, vehicle=drone.vehicle, link=drone.link, append=arguments.append
-    )
-    drone.recorder = streams.with_stream(recorder, m.name)
     drone.estimator = estimator = UpdateThrottle(
-        new_estimator(drone.vehicle, arguments),
-        number=number,
-        of=of,
-        late=arguments.every / arguments.rate,
+        new_estimator(drone.vehicle, arguments), number=number, of=of, late=arguments.every / arguments.rate
     )
-    session = Session(
-        drone.link,
+    drone.session = session = open_session(
+        drone.stack,
+        link,
         vehicle=drone.vehicle,
+        left_out=drone.left_out,
         estimator=estimator,
-        recorder=drone.recorder,
-        wrench=wrench,
+        configuration=configuration,
+        record=drone.log,
+        append=arguments.append,
         rate=arguments.rate,
-        reconnect_within=arguments.reconnect,
+        reconnect=arguments.reconnect,
+        wrench=wrench,
+        wrap=functools.partial(streams.with_stream, name=m.name),
         scheduler=scheduler,
     )
     estimator.newest = lambda: session.clock.newest
-    drone.session = session
-    session.history.notice(folding.notice(drone.left_out))
     drone.line = LiveLine(session, prefix=f"{m.name:<8} ")
     land = landing(drone.interrupts) if plan is not None else None
     drone.shown = Viewed(session, drone.line, name=m.name, land=land)
@@ -273,11 +260,7 @@ def _begin(
 
 
 def _check_separation(drones: Sequence[Drone]) -> None:
-    """Positions first, then what each will fly from there.
-
-    Raises:
-        UsageError: two would come too close.
-    """
+    """Positions first, then what each will fly from there. Raises UsageError: two would come too close."""
     until = time.monotonic() + POSITION_TIMEOUT
     courses = {}
     for drone in drones:
@@ -335,35 +318,56 @@ def _together(drones: Sequence[Drone], work: Callable[[Drone], None], *, quiet: 
 
 
 def _close(drone: Drone) -> None:
-    """Session, recording, link; whatever fails with one drone."""
+    """Session, recording, link, and the result; whatever fails with one drone."""
     try:
-        if drone.session is not None:
+        with drone.stack:
+            if drone.session is None or drone.estimator is None:
+                return
             drone.session.close()
-            if drone.recorder is not None:
-                if drone.estimator is not None:
-                    drone.recorder.metadata("estimator", {"updates_left_out": str(drone.estimator.skipped)})
-                close_recorder(drone.recorder, drone.link.statistics(), drone.session.history)
+            skipped = drone.estimator.skipped
+            if drone.session.recorder is not None:
+                drone.session.recorder.metadata("estimator", {"updates_left_out": str(skipped)})
+            if skipped:
+                drone.session.history.notice(
+                    f"{skipped} updates were left out because this computer could not keep up; every sample was used."
+                )
+            extra = {
+                "plot": drone.plot, "updates_left_out": skipped,
+                "trajectory": " ".join(drone.member.trajectory) if drone.plan is not None else None,
+                "offset": list(drone.member.offset) if drone.plan is not None else None,
+            }  # fmt: skip
+            title = f"{drone.name}, vehicle {drone.vehicle.name}"
+            drone.result, error = finished(drone.session, title=title, log=drone.log, extra=extra, error=drone.error)
+            if error is not drone.error and error is not None:
+                drone.failed(error)
     except CrazyemError as error:
         drone.failed(error)
-    finally:
-        if drone.link is not None:
-            drone.link.close()
+
+
+def _row(drone: Drone) -> dict[str, Any]:
+    """The summary of a single flight, where there was one; its plot is drawn here."""
+    try:
+        if drone.result is not None:
+            if drone.plot is not None:
+                drone.result.plot(drone.plot)
+            return dict(drone.result.summary)
+    except CrazyemError as error:
+        if drone.error is None:
+            drone.failed(error)
+    notices = list(drone.session.history.notices) if drone.session is not None else []
+    return {"log": drone.log, "vehicle": drone.vehicle.name, "notices": notices}
 
 
 def _report(arguments: argparse.Namespace, drones: Sequence[Drone]) -> int:
-    for drone in drones:
-        try:
-            drone.row = _summary(drone)
-        except CrazyemError as error:
-            if drone.error is None:
-                drone.failed(error)
-            notices = list(drone.session.history.notices) if drone.session is not None else []
-            drone.row = {"log": drone.log, "vehicle": drone.vehicle.name, "notices": notices}
+    results = [_row(drone) for drone in drones]
     errors = [d.error for d in drones if d.error is not None]
     stopped = any(isinstance(e, FlightInterruptedError | MotorsCutError) for e in errors)
     real = [e for e in errors if not isinstance(e, FlightInterruptedError | MotorsCutError)]
     code = _exit_code(real[0]) if real else 130 if stopped else 0
-    rows = [{"name": d.name, "uri": d.member.uri, "outcome": d.outcome, **d.row, **_error(d)} for d in drones]
+    rows = [
+        {"name": d.name, "uri": d.member.uri, "outcome": d.outcome, **row, **_error(d)}
+        for d, row in zip(drones, results)
+    ]
     text = table(rows)
     if arguments.json == "-":
         say(text)
@@ -382,40 +386,6 @@ def _error(drone: Drone) -> dict[str, Any]:
     if drone.error is None or isinstance(drone.error, FlightInterruptedError | MotorsCutError):
         return {}
     return {"error": str(drone.error), "exit_code": _exit_code(drone.error)}
-
-
-def _summary(drone: Drone) -> dict[str, Any]:
-    """As of a single flight, and what the scheduler left out.
-
-    Raises:
-        DataError: nothing was flown that could be estimated from.
-    """
-    if drone.session is None or drone.estimator is None:
-        raise drone.error or CrazyemError("it was not connected.")
-    pipeline, history, statistics = drone.session.pipeline, drone.session.history, drone.link.statistics()
-    if drone.estimator.skipped:
-        history.notice(
-            f"{drone.estimator.skipped} updates were left out because this computer could not keep up; every sample "
-            "was used."
-        )
-    extra = {
-        "late": statistics.late, "plot": drone.plot, "updates_left_out": drone.estimator.skipped,
-        "trajectory": " ".join(drone.member.trajectory) if drone.plan is not None else None,
-        "offset": list(drone.member.offset) if drone.plan is not None else None,
-    }  # fmt: skip
-    title = f"{drone.name}, vehicle {drone.vehicle.name}"
-    result = result_of(
-        pipeline,
-        drone.vehicle,
-        title=title,
-        log=drone.log,
-        received=statistics.received,
-        lost=statistics.lost,
-        extra=extra,
-    )
-    if drone.plot is not None:
-        result.plot(drone.plot)
-    return dict(result.summary)
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:

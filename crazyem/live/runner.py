@@ -11,6 +11,7 @@ from crazyem.live.flight_monitor import FlightMonitor
 from crazyem.live.flight_result import FlightResult, result_of
 from crazyem.live.pipeline import Estimator
 from crazyem.live.recorder import Recorder, close_recorder, open_recorder
+from crazyem.live.scheduler import Scheduler
 from crazyem.live.session import Session
 from crazyem.monitoring.fault import Fault
 from crazyem.physics import folding
@@ -39,6 +40,7 @@ def open_session(
     reconnect: float,
     wrench: str = "ctrlLee",
     wrap: Callable[[Recorder | None], Recorder | None] = lambda recorder: recorder,
+    scheduler: Scheduler | None = None,
     monitor: FlightMonitor | None = None,
     on_fault: Callable[[Fault], None] | None = None,
 ) -> Session:
@@ -50,7 +52,7 @@ def open_session(
         record, append: path of the recording, None: none; continue an existing one.
         rate: of the log, Hz. reconnect: how long a lost link is tried again, s.
         wrench: log group of the controller whose commanded thrust and torque are recorded.
-        monitor: of faults in flight; on_fault: takes its reports.
+        scheduler: of updates where drones are many. monitor: of faults in flight; on_fault: takes its reports.
         wrap: adds what else takes the recorder's messages, such as a live stream.
     """
     recorder = wrap(open_recorder(record, configuration=configuration, vehicle=vehicle, link=link, append=append))
@@ -64,6 +66,7 @@ def open_session(
         wrench=wrench,
         rate=rate,
         reconnect_within=reconnect,
+        scheduler=scheduler,
         monitor=monitor,
         on_fault=on_fault,
     )

@@ -18,7 +18,7 @@ from crazyem.cli import main, parser
 from crazyem.commands import swarm as command
 from crazyem.commands import view
 from crazyem.errors import CrazyemError, DataError, LinkError, UsageError
-from crazyem.live import flight
+from crazyem.live import flight, runner
 from crazyem.live.flight import Flight, Interrupts
 from crazyem.live.swarm import members_of
 from crazyem.recordings import open_recording
@@ -42,7 +42,7 @@ def fake(monkeypatch, tmp_path):
         link = FakeLink(speed=20.0)
         link.uri, link.wanted = f"fake://{i}", (float(i), 0.0, 0.0)
         links[link.uri] = link
-    monkeypatch.setattr(command, "open_link", open_link)
+    monkeypatch.setattr(runner, "open_link", open_link)
     monkeypatch.setattr(command, "compile_kernels", lambda vehicle: None)
     monkeypatch.setattr(command, "new_estimator", lambda vehicle, arguments, **_: FakeEstimator())
     monkeypatch.setattr(command, "Flight", flight_of)

@@ -156,10 +156,10 @@ def test_a_swarm_writes_in_the_air_only_and_begins_no_set_once_it_is_left(monkey
     for i, link in enumerate(links.values()):
         link.uri, link.wanted, link.write_parameter = f"fake://{i}", (float(i), 0.0, 0.0), writes(link)
     monkeypatch.setattr(swarm, "SwarmInterrupts", caught)
-    monkeypatch.setattr(swarm, "open_link", links.__getitem__)
+    monkeypatch.setattr(runner, "open_link", links.__getitem__)
     monkeypatch.setattr(swarm, "compile_kernels", lambda vehicle: None)
     monkeypatch.setattr(swarm, "new_estimator", lambda vehicle, arguments, **_: fake.FakeEstimator())
-    monkeypatch.setattr(swarm, "Session", make_session)
+    monkeypatch.setattr(runner, "Session", make_session)
     monkeypatch.setattr(swarm, "Flight", make_flight)
     code = main(["fly", "--uri", "fake://0", "--uri", "fake://1", "--duration", "6", "--push", "--no-live"])
     assert code == {"landed": 0, "first Ctrl-C": 130, "second Ctrl-C": 130, "estimator fails": 1, "link lost": 4}[way]
