@@ -67,8 +67,7 @@ def say_faults(history: History, told: Sequence[Fault], *, prefix: str = "") -> 
 def plot_path(arguments: argparse.Namespace, *others: str | None) -> str | None:
     """--plot, or a PNG beside the recording or the summary; None where no file was asked for, or nothing can draw.
 
-    Raises:
-        MissingExtraError: --plot without matplotlib.
+    Raises: MissingExtraError: --plot without matplotlib.
     """
     if arguments.plot:
         require("matplotlib", "--plot")
@@ -88,11 +87,7 @@ def plot_path(arguments: argparse.Namespace, *others: str | None) -> str | None:
 
 
 def report(arguments: argparse.Namespace, result: FlightResult, *, plot: str | None) -> None:
-    """Summary on the terminal, JSON and plot, where these are wanted.
-
-    Raises:
-        UsageError: a file cannot be written.
-    """
+    """Summary on the terminal, JSON and plot, where these are wanted. Raises UsageError: a file cannot be written."""
     text = str(result)
     if arguments.json == "-":
         say(text)

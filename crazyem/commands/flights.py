@@ -40,8 +40,7 @@ def write_rules(arguments: argparse.Namespace, uri: str | None = None, *, name: 
         uri: of the drone; None takes that of the command line.
         name: of the drone, for sentences.
 
-    Raises:
-        UsageError, FileFormatError: the policy cannot be used.
+    Raises: UsageError, FileFormatError: the policy cannot be used.
     """
     rules = write_rules_for(
         arguments.uri or "" if uri is None else uri,
@@ -80,8 +79,7 @@ def confirm_in_terminal(question: str, ended: threading.Event) -> bool:
 def follow(session: Session, stop: Interrupts, duration: float | None, line: LiveLine) -> None:
     """Until Ctrl-C, or `duration` [s] of the drone's clock; a line a second.
 
-    Raises:
-        CrazyemError: what went wrong in the session.
+    Raises: CrazyemError: what went wrong in the session.
     """
     begun, shown = math.nan, time.monotonic()
     while not stop.count:

@@ -21,8 +21,7 @@ _PREFERENCE = ("radio", "usb", "udp")  # what can be said to be a drone, nearest
 def run(arguments: argparse.Namespace) -> int:
     """Scan and show; 0 whether anything was found or not: nothing there is an answer, too.
 
-    Raises:
-        UsageError: an unusable port, or the JSON cannot be written.
+    Raises: UsageError: an unusable port, or the JSON cannot be written.
     """
     ports = arguments.ports or UDP_PORTS
     if not all(0 < port < 65536 for port in ports):

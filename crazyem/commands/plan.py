@@ -18,8 +18,7 @@ class NoManoeuvreError(CrazyemError):
 def run(arguments: argparse.Namespace) -> int:
     """Plan, say what to expect, write the file.
 
-    Raises:
-        NoManoeuvreError: none will do; the sentence says why, and what measurement would.
+    Raises: NoManoeuvreError: none will do; the sentence says why, and what measurement would.
     """
     from crazyem.api.planning import plan
 

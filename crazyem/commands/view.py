@@ -19,8 +19,7 @@ def wants_view(arguments: argparse.Namespace) -> bool:
 
     It is drawn on standard error, so that a summary may go to a file. --confirm asks its question on plain lines.
 
-    Raises:
-        UsageError: --live without a terminal, or with --confirm. MissingExtraError: --live without rich.
+    Raises: UsageError: --live without a terminal, or with --confirm. MissingExtraError: --live without rich.
     """
     if arguments.no_live:
         return False

@@ -8,15 +8,7 @@ import argparse
 import contextlib
 import math
 
-from crazyem.commands.common import (
-    LiveLine,
-    compile_kernels,
-    new_estimator,
-    plot_path,
-    raise_after,
-    report,
-    say,
-)
+from crazyem.commands.common import LiveLine, compile_kernels, new_estimator, plot_path, raise_after, report, say
 from crazyem.commands.flights import confirm_in_terminal, follow, interrupts
 from crazyem.commands.view import Streams, Viewed, live_view, wants_view
 from crazyem.errors import CrazyemError, LinkError, UsageError
@@ -115,8 +107,7 @@ def _open_session(
 def write_rules(arguments: argparse.Namespace) -> WriteRules | None:
     """Policy and mode of the guard, None where nothing is to be written or said about it.
 
-    Raises:
-        UsageError: asked to write to a drone that only `crazyem fly` writes to; no such policy. FileFormatError.
+    Raises: UsageError: asked to write to a drone that only `crazyem fly` writes to; no such policy. FileFormatError.
     """
     mavlink = arguments.uri.startswith("mavlink:")
     writes = arguments.push or arguments.confirm

@@ -135,11 +135,7 @@ def _upsets(flight: Airtime, tilt: tuple[NDArray[np.float64], NDArray[np.float64
         Grade.DEGRADES,
         f"The drone is upside down in the air {len(spans)} times (tilt up to {angle[rows].max():.0f} degrees).",
         intervals=longest(spans),
-        evidence={
-            "tilt_deg": float(angle[rows].max()),
-            "times": len(spans),
-            "lasting_s": sum(b - a for a, b in spans),
-        },
+        evidence={"tilt_deg": float(angle[rows].max()), "times": len(spans), "lasting_s": sum(b - a for a, b in spans)},
         advice="If that was no flip on purpose, use the flight before it only.",
     )
 

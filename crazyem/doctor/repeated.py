@@ -8,16 +8,7 @@ packet.
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import (
-    COMMAND_SIGNALS,
-    Stream,
-    cadence,
-    listed,
-    places,
-    runs,
-    same_as_before,
-    streams,
-)
+from crazyem.doctor.streams import COMMAND_SIGNALS, Stream, cadence, listed, places, runs, same_as_before, streams
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.ordering import inside, sound_rows

@@ -90,11 +90,7 @@ def _is_ceiling(column: NDArray[np.float64], top: float, rows: NDArray[np.bool_]
 
 
 def _lower(
-    name: str,
-    time: NDArray[np.float64],
-    value: NDArray[np.float64],
-    rows: NDArray[np.bool_],
-    flight: Airtime,
+    name: str, time: NDArray[np.float64], value: NDArray[np.float64], rows: NDArray[np.bool_], flight: Airtime
 ) -> Iterator[Finding]:
     """Rotors at idle or off while airborne, but not in the first and last half second, when they start and stop."""
     inner: Intervals = tuple((a + 0.5, b - 0.5) for a, b in flight.airborne if b - a > 1.5)

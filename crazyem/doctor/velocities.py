@@ -1,14 +1,7 @@
 """Check: velocity against the position's derivative, and positions of two origins: unit, frame, sign, scale."""
 
 from crazyem.doctor import axes
-from crazyem.doctor.hypotheses import (
-    Comparison,
-    agreed_scale,
-    compare_hypotheses,
-    misread,
-    wrong_scale,
-    wrong_unit,
-)
+from crazyem.doctor.hypotheses import Comparison, agreed_scale, compare_hypotheses, misread, wrong_scale, wrong_unit
 from crazyem.doctor.kinematics import Pose, Track, difference, grid_of, measurements, poses, track, width_for
 from crazyem.physics.rotations import rotate
 from crazyem.recordings.finding import Finding, Grade

@@ -64,8 +64,7 @@ class Belief:
 def indi_beliefs(vehicle: Vehicle) -> tuple[Belief, ...]:
     """Inertia as control effectiveness g1 = torque of a unit / inertia, g2 where the rotors' inertia is known, lag.
 
-    Raises:
-        ValueError: one sentence on what the vehicle file lacks.
+    Raises: ValueError: one sentence on what the vehicle file lacks.
     """
     torque = effectiveness_torque(vehicle)
     slots = [[Slot(f"ctrlINDI.g1_{axis}", "reciprocal", t)] for axis, t in zip("pqr", torque)]
@@ -79,8 +78,7 @@ def indi_beliefs(vehicle: Vehicle) -> tuple[Belief, ...]:
 def mass_thrust_belief(vehicle: Vehicle) -> tuple[Belief, float]:
     """Mellinger's massThrust and the value [1/N] that makes ctrlMel.mass a mass.
 
-    Raises:
-        ValueError: one sentence on what the vehicle file lacks.
+    Raises: ValueError: one sentence on what the vehicle file lacks.
     """
     value = mass_thrust(vehicle, force=vehicle.mass * GRAVITY, volts=NOMINAL_VOLTS)
     return Belief("mass_thrust", (Slot("ctrlMel.massThrust"),)), value

@@ -66,8 +66,7 @@ class FlightPlan:
 def select_controller(link: Link, controller: Controller) -> None:
     """Make the firmware run `controller`, verified by a fresh read: the firmware overrules silently.
 
-    Raises:
-        UsageError: this firmware does not have it. LinkError: no answer.
+    Raises: UsageError: this firmware does not have it. LinkError: no answer.
     """
     if "stabilizer.controller" not in link.parameters:
         raise UsageError("the drone has no parameter stabilizer.controller.")

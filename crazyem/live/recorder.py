@@ -48,8 +48,7 @@ def open_recorder(
         link: connected; its tables and what the firmware says of itself are stored, as far as it knows them.
         append: continue an existing recording as its next session (after a reconnect) instead of replacing it.
 
-    Raises:
-        UsageError: the file cannot be created. FileFormatError: it cannot be continued.
+    Raises: UsageError: the file cannot be created. FileFormatError: it cannot be continued.
     """
     if path is None:
         return None

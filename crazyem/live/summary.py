@@ -62,11 +62,7 @@ def build_summary(
 
 
 def write_json(summary: Mapping[str, Any], path: str) -> None:
-    """Write the summary to a file, or to standard output for '-'.
-
-    Raises:
-        UsageError: the file cannot be written.
-    """
+    """Write the summary to a file, or to standard output for '-'. Raises UsageError: the file cannot be written."""
     text = json.dumps(finite(summary), indent=2, allow_nan=False) + "\n"
     if path == "-":
         sys.stdout.write(text)
@@ -80,8 +76,7 @@ def write_json(summary: Mapping[str, Any], path: str) -> None:
 def check_writable(path: str | None) -> None:
     """Find out before the flight, not after it, that a result cannot be written.
 
-    Raises:
-        UsageError: the file cannot be opened for writing.
+    Raises: UsageError: the file cannot be opened for writing.
     """
     if path is None or path == "-":
         return

@@ -80,8 +80,7 @@ def read_swarm(path: str | Path, *, vehicle: str, trajectory: Sequence[str]) -> 
     Args:
         vehicle, trajectory: of drones that do not say.
 
-    Raises:
-        FileFormatError: not a swarm file; names the drone and the key. UsageError: no such file.
+    Raises: FileFormatError: not a swarm file; names the drone and the key. UsageError: no such file.
     """
     table = read_toml(path, what="swarm file", largest=LARGEST_SWARM_FILE)
     entries = table.pop("drone", None)

@@ -225,8 +225,7 @@ class Bound:
                 ratio is known) or known.
             sensors: free or known: standard deviations of the measurements.
 
-        Raises:
-            UsageError: there is no such option, or this bound lacks the scales.
+        Raises: UsageError: there is no such option, or this bound lacks the scales.
         """
         if noise not in NOISE_CASES:
             raise UsageError(f"unknown noise '{noise}' (known: {', '.join(NOISE_CASES)})")
@@ -250,8 +249,7 @@ class Bound:
 def observed(flight: Flight, sensor: str, first: int, last: int, *, accelerometer: bool = True) -> NDArray:
     """(last - first, 15) what sensor A, B or C read in these rows, NaN for what it does not read.
 
-    Raises:
-        UsageError: there is no such sensor, or the flight has no such rows.
+    Raises: UsageError: there is no such sensor, or the flight has no such rows.
     """
     if sensor not in MEASURED:
         raise UsageError(f"unknown sensor '{sensor}' (known: {', '.join(MEASURED)})")
@@ -307,8 +305,7 @@ def bound(
         accelerometer: whether sensor A reads the specific force, too.
         start_sd: (12,) standard deviations of what is known of the state at the start [m, m/s, rad, rad/s].
 
-    Raises:
-        UsageError: no such sensor, rows or option.
+    Raises: UsageError: no such sensor, rows or option.
     """
     last = flight.size if last is None else last
     y = observed(flight, sensor, first, last, accelerometer=accelerometer)

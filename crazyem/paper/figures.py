@@ -36,8 +36,7 @@ def draw_all(records: Sequence[Record], settings: Settings, folder: Path) -> lis
 
     Returns: number, file (without suffix), caption, note (what differs from the paper's) of each, in order.
 
-    Raises:
-        UsageError: a file cannot be written. MissingExtraError: no matplotlib.
+    Raises: UsageError: a file cannot be written. MissingExtraError: no matplotlib.
     """
     require("matplotlib", "The paper's figures")
     import matplotlib

@@ -176,8 +176,7 @@ class Flight:
 
         A mass of None says that none is known yet, which a take-off from the floor can wait for.
 
-        Raises:
-            UsageError: no mass is known and there is no floor, or the reference has begun.
+        Raises: UsageError: no mass is known and there is no floor, or the reference has begun.
         """
         s = self.settings
         if mass is None and (not self.ground or self.lift_off >= 0):

@@ -76,8 +76,7 @@ def estimator_for(
         known: noise it is told.
         accelerometer: whether A's is used.
 
-    Raises:
-        UsageError: there is no such sensor, or a value the estimator refuses.
+    Raises: UsageError: there is no such sensor, or a value the estimator refuses.
     """
     if sensor not in {"A", "B", "C"}:
         raise UsageError(f"unknown sensor '{sensor}' (known: A, B, C)")
@@ -115,8 +114,7 @@ def product_offline(
         sensor, mass, inertia, known, accelerometer: as for `estimator_for`.
         first, last: rows; last defaults to all that is known.
 
-    Raises:
-        UsageError: no such sensor, or too few rows.
+    Raises: UsageError: no such sensor, or too few rows.
     """
     last = flight.size if last is None else last
     if not 0 <= first < last <= flight.size:
@@ -160,13 +158,7 @@ class ProductOnline:
         estimator: the product's own.
     """
 
-    def __init__(
-        self,
-        settings: Settings,
-        sensor: str,
-        *,
-        accelerometer: bool = True,
-    ) -> None:
+    def __init__(self, settings: Settings, sensor: str, *, accelerometer: bool = True) -> None:
         """Args: as for `estimator_for`."""
         self.estimator = estimator_for(settings, sensor, accelerometer=accelerometer)
         self.estimate: Estimate | None = None

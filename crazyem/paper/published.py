@@ -305,8 +305,7 @@ def published_offline(flight: Flight, sensor: str, *, angles: Angles = "zero", i
             the start (their rows dropped from H).
         iterations: of EM.
 
-    Raises:
-        UsageError: no such sensor or way to take the angles; fewer than two rows.
+    Raises: UsageError: no such sensor or way to take the angles; fewer than two rows.
     """
     _check(sensor, angles)
     if flight.size < 2:

@@ -75,21 +75,13 @@ def task_file(folder: Path, task: Task) -> Path:
 
 
 def run_and_store(task: Task, settings: Settings, folder: str, stamp: str) -> None:
-    """Run a task and write its record, whole or not at all.
-
-    Raises:
-        UsageError: it cannot be written.
-    """
+    """Run a task and write its record, whole or not at all. Raises UsageError: it cannot be written."""
     record = run_task(task, settings)
     write_file(task_file(Path(folder), task), json.dumps({"fingerprint": stamp, "record": record}, allow_nan=False))
 
 
 def prepare(folder: Path) -> None:
-    """Make the output folder.
-
-    Raises:
-        UsageError: it cannot be made, or is something else.
-    """
+    """Make the output folder. Raises UsageError: it cannot be made, or is something else."""
     try:
         (folder / "tasks").mkdir(parents=True, exist_ok=True)
         (folder / "figures").mkdir(exist_ok=True)

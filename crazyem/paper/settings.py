@@ -116,8 +116,7 @@ def settings_with(assignments: Iterable[str], base: Settings | None = None) -> S
     Args:
         assignments: NAME=VALUE each; numbers in SI, three numbers as x,y,z, waypoints as x,y,z;x,y,z;...
 
-    Raises:
-        UsageError: unknown name, a value of another type or out of range, or values that do not go together.
+    Raises: UsageError: unknown name, a value of another type or out of range, or values that do not go together.
     """
     settings = base or Settings()
     known = {f.name: getattr(settings, f.name) for f in fields(settings)}

@@ -183,8 +183,7 @@ def without_effects(vehicle: Vehicle) -> Vehicle:
 def to_vehicle(c: Constants, base: Vehicle | None = None) -> Vehicle:
     """The vehicle of constants; what they do not say is that of `base` (its law from command to thrust, above all).
 
-    Raises:
-        ValueError: no mass or no inertia.
+    Raises: ValueError: no mass or no inertia.
     """
     matrix = inertia_of(c)
     if c.mass is None or matrix is None:

@@ -126,8 +126,7 @@ def load_source(
         base: what a simulator's file does not say.
         strict: contradictory fields are an error.
 
-    Raises:
-        UsageError: no such file, format or drone. FileFormatError: it cannot be used; the sentence names the field.
+    Raises: UsageError: no such file, format or drone. FileFormatError: it cannot be used; the sentence names the field.
     """
     path = str(name_or_path)
     if form in (None, OWN) and path in preset_names():

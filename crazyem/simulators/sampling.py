@@ -67,8 +67,7 @@ def sample(
         mass_sd: relative standard deviation of the mass, with which inertia, thrust and drag go; 0 where it was
             weighed.
 
-    Raises:
-        UsageError: the vehicle has no posterior. DataError: hardly any drone of its posterior can be.
+    Raises: UsageError: the vehicle has no posterior. DataError: hardly any drone of its posterior can be.
     """
     posterior = vehicle.posterior
     if posterior is None:

@@ -213,12 +213,7 @@ _ULOG_SIGNALS: tuple[Source, ...] = (
     Source("setpoint_euler", "vehicle_attitude_setpoint", named("q_d[*]", _FOUR), angles_of_quaternions),
     Source("setpoint_euler", "vehicle_attitude_setpoint", named("*_body", "roll pitch yaw"), euler),
     Source(
-        "setpoint_rate",
-        "vehicle_rates_setpoint",
-        named("*", "roll pitch yaw"),
-        vectors,
-        absent_is_nan=True,
-        frame=BODY,
+        "setpoint_rate", "vehicle_rates_setpoint", named("*", "roll pitch yaw"), vectors, absent_is_nan=True, frame=BODY
     ),
     *_odometry("vehicle_mocap_odometry", "mocap"),
     *_odometry("vehicle_visual_odometry", "vision"),

@@ -66,11 +66,7 @@ class Corners:
 
 
 def corners(
-    time: NDArray[np.float64],
-    value: NDArray[np.float64],
-    *,
-    starts: bool = True,
-    ends: bool = True,
+    time: NDArray[np.float64], value: NDArray[np.float64], *, starts: bool = True, ends: bool = True
 ) -> Corners:
     """Recover the samples from which a polygon was drawn: where two of its lines meet, between two rows or on one.
 

@@ -12,13 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.errors import FileFormatError, UsageError
-from crazyem.recordings.csv.mapping_units import (
-    counts_turns,
-    is_electrical,
-    time_divisor,
-    unit_factor,
-    unit_offset,
-)
+from crazyem.recordings.csv.mapping_units import counts_turns, is_electrical, time_divisor, unit_factor, unit_offset
 from crazyem.signals.sample import SIGNALS, components
 from crazyem.toml_file import parse_toml, read_text
 

@@ -168,10 +168,7 @@ class _Kept:
         """A stream that was drawn onto the rows by straight lines: the samples it was drawn from."""
         first, last = self.rows.keep
         found = corners(
-            self.whole_time,
-            self.rows.columns[source.columns[0]],
-            starts=self.rows.starts,
-            ends=self.rows.ends,
+            self.whole_time, self.rows.columns[source.columns[0]], starts=self.rows.starts, ends=self.rows.ends
         )
         mine = (found.row >= first) & (found.row < last)
         time = found.time[mine]

@@ -257,12 +257,7 @@ def _recording(plan: _Plan, rows: Rows, damage: Damage, *, last: bool) -> Record
     if plan.mapping.claims:
         metadata["claims"] = dict(plan.mapping.claims)
     return Recording(
-        str(plan.path),
-        f"csv:{plan.mapping.name}",
-        signals,
-        metadata,
-        (*notes, *findings),
-        origin=rows.origin,
+        str(plan.path), f"csv:{plan.mapping.name}", signals, metadata, (*notes, *findings), origin=rows.origin
     )
 
 

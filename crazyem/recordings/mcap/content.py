@@ -12,13 +12,7 @@ from crazyem.recordings.contents import GrowingArray
 from crazyem.recordings.mcap import scan as mcap_scan
 from crazyem.recordings.mcap import schemas
 from crazyem.recordings.mcap.messages import EVENT_TOPICS, OTHER_EVENT_TOPIC, fields_of
-from crazyem.recordings.mcap.stream_codec import (
-    MOST_FIELDS,
-    MOST_SIGNALS,
-    FixedMessages,
-    StreamLayout,
-    block_messages,
-)
+from crazyem.recordings.mcap.stream_codec import MOST_FIELDS, MOST_SIGNALS, FixedMessages, StreamLayout, block_messages
 from crazyem.recordings.mcap.survey import Part, parse
 from crazyem.recordings.recording import Event, SignalArray
 from crazyem.recordings.tables import Table

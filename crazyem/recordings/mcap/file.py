@@ -125,15 +125,7 @@ class _Reading:
         metadata = {name: entries for name, entries in self.content.metadata.items() if name != IMPORT_METADATA}
         metadata.update({name: dict(entries) for name, entries in self._decided.items()})
         origin, source, imported = _imported(own)
-        return Recording(
-            str(self.path),
-            source,
-            signals,
-            metadata,
-            (*imported, *self._findings()),
-            events,
-            origin,
-        )
+        return Recording(str(self.path), source, signals, metadata, (*imported, *self._findings()), events, origin)
 
     def _signals(self, sessions: Mapping[int, list[Table]]) -> dict[str, SignalArray]:
         if not sessions:

@@ -199,12 +199,7 @@ def _check(name: str, spec: _Spec) -> None:
 
 
 def _leaves(
-    kind: str,
-    spec: _Spec,
-    prefix: str,
-    scalars: list[str],
-    arrays: list[tuple[str, int]],
-    strings: list[str],
+    kind: str, spec: _Spec, prefix: str, scalars: list[str], arrays: list[tuple[str, int]], strings: list[str]
 ) -> None:
     """Dotted names of what a message holds; arrays of messages are left out."""
     if kind in _TIMES and kind not in spec:
