@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _TEXT_WIDTH = 110
 _SHOWN_INTERVALS = 4  # intervals that are written out
-_WORST_FIRST = (Grade.UNUSABLE, Grade.DEGRADES, Grade.HARMLESS)
+_WORST_FIRST = sorted(Grade, key=lambda grade: grade.rank)
 
 
 def run(arguments: argparse.Namespace) -> int:

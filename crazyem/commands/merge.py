@@ -1,17 +1,18 @@
 """What parts of a recording too large for memory add up to: one inventory, one list of findings."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 from crazyem.doctor.envelope import Envelope
 from crazyem.doctor.identifiability import Verdict
 from crazyem.doctor.inventory import ClockRow, Inventory, SignalRow
 from crazyem.recordings.finding import Finding, Grade
 
+Row = TypeVar("Row", SignalRow, ClockRow, Verdict)
+
 _VERDICT_RANK = {"yes": 0, "weak": 1, "no": 2}
-_GRADE_RANK = {Grade.UNUSABLE: 0, Grade.DEGRADES: 1, Grade.HARMLESS: 2}
 
 
 def merge_inventories(parts: Iterable[Inventory]) -> Inventory:
@@ -29,29 +30,32 @@ def merge_inventories(parts: Iterable[Inventory]) -> Inventory:
 
 
 def _add(a: Inventory, b: Inventory) -> Inventory:
-    rows = {row.name: row for row in a.signals}
-    for row in b.signals:
-        rows[row.name] = _add_rows(rows[row.name], row) if row.name in rows else row
-    clocks = {row.name: row for row in a.clocks}
-    for clock in b.clocks:
-        clocks[clock.name] = _add_clocks(clocks[clock.name], clock) if clock.name in clocks else clock
-    starts = [row.start_s for row in rows.values() if row.start_s is not None]
-    ends = [row.end_s for row in rows.values() if row.end_s is not None]
+    rows = _united(a.signals, b.signals, _add_rows)
+    starts = [row.start_s for row in rows if row.start_s is not None]
+    ends = [row.end_s for row in rows if row.end_s is not None]
     return replace(
         a,
         duration_s=max(ends) - min(starts) if starts and ends else 0.0,
         samples=a.samples + b.samples,
-        signals=tuple(rows.values()),
-        clocks=tuple(clocks.values()),
+        signals=rows,
+        clocks=_united(a.clocks, b.clocks, _add_clocks),
         metadata={**a.metadata, **b.metadata},
         events={kind: a.events.get(kind, 0) + b.events.get(kind, 0) for kind in (*a.events, *b.events)},
         envelope=_add_envelopes(a.envelope, b.envelope),
-        verdicts=_best(a.verdicts, b.verdicts),
+        verdicts=_united(a.verdicts, b.verdicts, lambda a, b: b if _order(b) < _order(a) else a),
         # what stands against a part stands against the whole only if no part is free of it
         on_the_ground=a.on_the_ground and b.on_the_ground,
         no_replay=a.no_replay and b.no_replay,
         unlike=a.unlike and b.unlike,
     )
+
+
+def _united(a: Iterable[Row], b: Iterable[Row], add: Callable[[Row, Row], Row]) -> tuple[Row, ...]:
+    """Rows of both, those of one name added."""
+    rows = {row.name: row for row in a}
+    for row in b:
+        rows[row.name] = add(rows[row.name], row) if row.name in rows else row
+    return tuple(rows.values())
 
 
 def _add_rows(a: SignalRow, b: SignalRow) -> SignalRow:
@@ -117,15 +121,6 @@ def _weighted(x: float, a: float, y: float, b: float) -> float:
     return (x * a + y * b) / (a + b) if a + b > 0.0 else x
 
 
-def _best(a: tuple[Verdict, ...], b: tuple[Verdict, ...]) -> tuple[Verdict, ...]:
-    best = {verdict.name: verdict for verdict in a}
-    for verdict in b:
-        known = best.get(verdict.name)
-        if known is None or _order(verdict) < _order(known):
-            best[verdict.name] = verdict
-    return tuple(best.values())
-
-
 def _order(verdict: Verdict) -> tuple[int, float]:
     sd = verdict.relative_sd if verdict.relative_sd is not None else verdict.sd
     return _VERDICT_RANK.get(str(verdict.verdict), 3), math.inf if sd is None else sd
@@ -175,12 +170,12 @@ def merge_findings(parts: Iterable[tuple[Finding, ...]]) -> tuple[Finding, ...]:
             if known is None:
                 merged[key] = replace(finding, fix=None)
                 continue
-            worse = finding if _GRADE_RANK[finding.grade] < _GRADE_RANK[known.grade] else known
+            worse = finding if finding.grade.rank < known.grade.rank else known
             intervals = known.intervals
             if finding.intervals != known.intervals[-len(finding.intervals) :]:
                 intervals = (*known.intervals, *finding.intervals)
             merged[key] = replace(worse, intervals=intervals, fix=None)
     return tuple(
         replace(finding, evidence={**finding.evidence, "parts": float(counts[key])}) if counts[key] > 1 else finding
-        for key, finding in sorted(merged.items(), key=lambda item: _GRADE_RANK[item[1].grade])
+        for key, finding in sorted(merged.items(), key=lambda item: item[1].grade.rank)
     )

@@ -10,8 +10,6 @@ from crazyem.recordings.recording import Recording
 
 __all__ = ["CHECKS", "Check", "Finding", "Fix", "Grade", "examine"]
 
-_GRADE_RANK = {Grade.UNUSABLE: 0, Grade.DEGRADES: 1, Grade.HARMLESS: 2}
-
 
 @dataclass(frozen=True, slots=True)
 class Check:
@@ -26,9 +24,7 @@ class Check:
 
     def run(self, recording: Recording) -> list[Finding]:
         module = importlib.import_module(f"crazyem.doctor.{self.module}")
-        with np.errstate(
-            all="ignore"
-        ):  # hostile values may overflow; what comes out then is compared, and compares false
+        with np.errstate(all="ignore"):  # hostile values may overflow; what comes out compares false
             return list(module.check(recording))
 
 
@@ -56,8 +52,4 @@ CHECKS: tuple[Check, ...] = (
 def examine(recording: Recording) -> tuple[Finding, ...]:
     """Everything odd about a recording, what its reader noticed first, the worst first within each."""
     found = [finding for check in CHECKS for finding in check.run(recording)]
-    return (*sorted(recording.findings, key=_rank), *sorted(found, key=_rank))
-
-
-def _rank(finding: Finding) -> int:
-    return _GRADE_RANK[finding.grade]
+    return tuple(f for group in (recording.findings, found) for f in sorted(group, key=lambda f: f.grade.rank))

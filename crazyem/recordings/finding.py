@@ -16,6 +16,11 @@ class Grade(StrEnum):
     DEGRADES = "degrades"  # results are worse or partly wrong unless it is dealt with
     UNUSABLE = "unusable"  # the signal, or the recording, must not be used as it is
 
+    @property
+    def rank(self) -> int:
+        """0 for the worst."""
+        return [*reversed(Grade)].index(self)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fix:
