@@ -17,8 +17,9 @@ from crazyem.vehicle import Vehicle
 DRAG_SD = 0.2
 # That of the delay of what is measured against the commands [s]: a period of the onboard filter.
 DELAY_SD = 0.01
-# That of the scales of velocities and body rates: a gyro's tolerance, and what an onboard filter makes of it.
-SCALE_SD = 0.02
+# Those of the scales of velocities and body rates: an onboard filter that knows no drag errs by 9 cm/s at 1.45 m/s
+# (docs: controller_parameters.md); a gyro's tolerance (BMI088: sensitivity within 1 %, and 1 % with temperature).
+VELOCITY_SCALE_SD, RATE_SCALE_SD = 0.06, 0.02
 NUISANCES = 18  # parameters of the estimator, drag along x, y, z, delays of the four measured quantities, two scales
 
 
@@ -175,5 +176,5 @@ class RowMaker:
     @staticmethod
     def precision(sd: NDArray[np.float64]) -> NDArray[np.float64]:
         """(M,) precisions of the nuisances, from the standard deviations (9,) of the estimator's parameters."""
-        own = np.repeat([DRAG_SD, DELAY_SD, SCALE_SD], [3, 4, 2])
+        own = np.repeat([DRAG_SD, DELAY_SD, VELOCITY_SCALE_SD, RATE_SCALE_SD], [3, 4, 1, 1])
         return np.concatenate([np.maximum(sd, 1e-6), own]) ** -2.0
