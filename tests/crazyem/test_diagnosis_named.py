@@ -47,7 +47,7 @@ def test_chance_tells_one_factor_as_several_in_one_of_twenty():
 
 
 def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_asked(monkeypatch):
-    flown = fly(Hidden(torque=0.7), seconds=20.0, seed=6)
+    flown = fly(Hidden(torque=0.7), seconds=12.0, seed=6)
     brought = []
     monkeypatch.setattr(answer, "trust", lambda remains, nats: brought.append(nats) or 1.0)
     monkeypatch.setattr(trials, "presence", lambda held_out, fitted, order: 0.123)

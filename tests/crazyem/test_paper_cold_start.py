@@ -177,7 +177,7 @@ def test_what_cannot_be_flown(seed, sensor):
 @pytest.mark.parametrize("sensor", ["A", "B", "C"])
 def test_a_touch_down_in_flight_is_taken_out_of_the_window(sensor):
     """Up, down to the floor because the controller believes in too light a drone, and up again."""
-    settings = replace(SHORT, duration=4.5)
+    settings = replace(SHORT, duration=4.5, every=20)
     flight = Flight(settings, 4, ground=True)
     estimator = estimator_for(settings, sensor)
     used, judged = np.zeros(settings.steps + 1, bool), 0
