@@ -6,7 +6,9 @@ Ctrl-C reaches the programs that tests start even where a shell has started the 
 """
 
 import gc
+import re
 import signal
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -32,6 +34,16 @@ LONGEST = (
     "test_a_payload_hung_under_in_flight_is_found_told_pushed_and_replayed", "test_every_command_and_peer_runs",
     "test_mass_is_found_pushed_as_hover_thrust_and_replayed_bit_for_bit", "test_the_site_builds_with_strict_links",
 )  # fmt: skip
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """A file none of whose tests would run is not imported: all of them long, or none of them."""
+    if collection_path.suffix != ".py" or config.option.markexpr not in ("slow", "not slow"):
+        return None
+    text = collection_path.read_text(encoding="utf-8")
+    if config.option.markexpr == "slow":
+        return True if "mark.slow" not in text else None
+    return True if re.search(r"^pytestmark = pytest\.mark\.slow\b", text, re.MULTILINE) else None
 
 
 @pytest.hookimpl(trylast=True)  # after those that `-m` and `-k` leave out are gone

@@ -33,6 +33,8 @@ from scipy.optimize import approx_fprime
 from crazyem.paper import plant
 from crazyem.vehicle import GRAVITY
 
+pytestmark = pytest.mark.slow  # about the paper: no code of ours but its plant is in it
+
 SEEN_A = [0, 1, 2, 9, 10, 11]  # rows of eq. 72
 HOVER = np.array([MASS * G, 0, 0, 0])
 

@@ -41,6 +41,8 @@ from crazyem.paper import plant
 from crazyem.physics.rotations import quaternion_from_euler, rotation_matrix
 from crazyem.vehicle import GRAVITY
 
+pytestmark = pytest.mark.slow  # about the paper: no code of ours but its plant is in it
+
 
 def _angles(seed: int = 0, n: int = 20) -> np.ndarray:
     return np.random.default_rng(seed).uniform([-1.2, -1.2, -3.0], [1.2, 1.2, 3.0], (n, 3))
