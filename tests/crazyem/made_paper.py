@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from crazyem.paper.experiments import PATH_POINTS, thin
 from crazyem.paper.settings import Settings
@@ -90,3 +91,20 @@ def results_of(records: list[dict[str, Any]], settings: Settings | None = None) 
     settings = settings or Settings()
     timing = {"jobs": 2, "tasks_reused": 0, "simulations_s": 1.0, "figures": 0, "figures_s": 1.0, "wall_s": 2.0}
     return assemble(records, settings, {**derive(records, settings), "figures": []}, timing)
+
+
+def plain_motion(x, u, noise, dt, mass, inertia):
+    """x (12,) one explicit Euler step later; Euler rates by inverting the map to body rates, attitude by scipy."""
+    roll, pitch, _ = x[6:9]
+    to_body = np.array(
+        [
+            [1, 0, -np.sin(pitch)],
+            [0, np.cos(roll), np.sin(roll) * np.cos(pitch)],
+            [0, -np.sin(roll), np.cos(roll) * np.cos(pitch)],
+        ]
+    )
+    body_z = Rotation.from_euler("xyz", x[6:9]).as_matrix()[:, 2]
+    momentum = np.diag(inertia) @ x[9:]
+    rates = np.linalg.solve(np.diag(inertia), u[1:] + noise[1:] - np.cross(x[9:], momentum))
+    slope = [*x[3:6], *(body_z * (u[0] + noise[0]) / mass - [0, 0, 9.81]), *np.linalg.solve(to_body, x[9:]), *rates]
+    return x + dt * np.array(slope)

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
+from made_paper import plain_motion
 from scipy import stats
-from scipy.spatial.transform import Rotation
 
 from crazyem.errors import UsageError
 from crazyem.paper.bound import MEASURED, NOISE_CASES, START_SD, bound, observed
@@ -24,23 +24,6 @@ def flight() -> Flight:
 
 
 # a slow plain form: matrices, numerical Jacobians, the disturbance as part of the state ---------------------------
-
-
-def plain_motion(x, u, noise, dt, mass, inertia):
-    """x (12,) one explicit Euler step later; Euler rates by inverting the map to body rates, attitude by scipy."""
-    roll, pitch, _ = x[6:9]
-    to_body = np.array(
-        [
-            [1, 0, -np.sin(pitch)],
-            [0, np.cos(roll), np.sin(roll) * np.cos(pitch)],
-            [0, -np.sin(roll), np.cos(roll) * np.cos(pitch)],
-        ]
-    )
-    body_z = Rotation.from_euler("xyz", x[6:9]).as_matrix()[:, 2]
-    momentum = np.diag(inertia) @ x[9:]
-    rates = np.linalg.solve(np.diag(inertia), u[1:] + noise[1:] - np.cross(x[9:], momentum))
-    slope = [*x[3:6], *(body_z * (u[0] + noise[0]) / mass - [0, 0, GRAVITY]), *np.linalg.solve(to_body, x[9:]), *rates]
-    return x + dt * np.array(slope)
 
 
 def jacobian(function, at, step=1e-6):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from made_paper import plain_motion
 from scipy.spatial.transform import Rotation
 
 from crazyem.errors import UsageError
@@ -121,27 +122,16 @@ def e_step(observed, wrench, first, theta, dt, p0, q, r, *, sees_angles):
     return predicted, filtered, linear, angular, smoothed
 
 
-def plain_motion(x, u, dt, theta):
+def plain_step(x, u, dt, theta):
     """Eq. 54, 56 without noise."""
-    roll, pitch, _ = x[6:9]
-    to_body = np.array(
-        [
-            [1, 0, -np.sin(pitch)],
-            [0, np.cos(roll), np.sin(roll) * np.cos(pitch)],
-            [0, -np.sin(roll), np.cos(roll) * np.cos(pitch)],
-        ]
-    )
-    body_z = Rotation.from_euler("xyz", x[6:9]).as_matrix()[:, 2]
-    acceleration = body_z * u[0] / theta[0] - [0, 0, GRAVITY]
-    turn = np.linalg.solve(np.diag(theta[1:]), u[1:] - np.cross(x[9:], theta[1:] * x[9:]))
-    return x + dt * np.concatenate([x[3:6], acceleration, np.linalg.solve(to_body, x[9:]), turn])
+    return plain_motion(x, u, np.zeros(4), dt, theta[0], theta[1:])
 
 
 def printed_jacobian(x, dt):
     """Eq. 59 by differences of eq. 58, in which acceleration is an input and the rate stays."""
 
     def motion(x):
-        still = plain_motion(x, np.array([1.0, 0, 0, 0]), dt, np.array([1.0, 1.0, 1.0, 1.0]))
+        still = plain_step(x, np.array([1.0, 0, 0, 0]), dt, np.array([1.0, 1.0, 1.0, 1.0]))
         still[3:6], still[9:] = x[3:6], x[9:]
         return still
 
@@ -159,7 +149,7 @@ def plain_e_step(observed, wrench, first, theta, dt, p0, q, r, *, sees_angles):
     for k, y in enumerate(observed):
         if k:
             phi = printed_jacobian(x, dt)
-            x = plain_motion(x, wrench[k - 1], dt, theta)
+            x = plain_step(x, wrench[k - 1], dt, theta)
             p = phi @ p @ phi.T + q * np.eye(12)
         gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + r * np.eye(len(h)))
         x = x + gain @ (y[keep] - x[keep])
@@ -169,7 +159,7 @@ def plain_e_step(observed, wrench, first, theta, dt, p0, q, r, *, sees_angles):
     smoothed = [means[-1]]
     for k in range(len(observed) - 2, -1, -1):
         c = covariances[k] @ np.linalg.inv(covariances[k] + q * np.eye(12))
-        smoothed.append(means[k] + c @ (smoothed[-1] - plain_motion(means[k], wrench[k], dt, theta)))
+        smoothed.append(means[k] + c @ (smoothed[-1] - plain_step(means[k], wrench[k], dt, theta)))
     return np.array(smoothed[::-1]), np.array(covariances)
 
 
