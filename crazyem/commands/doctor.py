@@ -5,7 +5,7 @@ import math
 import textwrap
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from crazyem.commands.batch import counted, on_files, processes
 from crazyem.commands.files import find, read_options, targets
@@ -15,9 +15,6 @@ from crazyem.errors import DataError, UsageError
 from crazyem.recordings import Finding, Grade, ReadOptions, Recording, open_recording
 from crazyem.recordings.parts import open_parts, to_be_parted
 
-if TYPE_CHECKING:
-    from crazyem.doctor.duplicates import Duplicate
-
 _TEXT_WIDTH = 110
 _SHOWN_INTERVALS = 4  # intervals that are written out
 _WORST_FIRST = sorted(Grade, key=lambda grade: grade.rank)
@@ -25,6 +22,8 @@ _WORST_FIRST = sorted(Grade, key=lambda grade: grade.rank)
 
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
+    from crazyem.doctor.duplicates import find_duplicates
+
     report = Report(arguments)
     if arguments.output is not None and not arguments.fix:
         raise UsageError("-o is where --fix writes; without --fix nothing is written.")
@@ -37,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     jobs = processes(arguments.jobs, len(files.found))
     rests = ((options, None if o is None else str(o), arguments.force, arguments.parts, jobs, several) for o in outputs)
     on_files(arguments, report, files, diagnose, rests, apart=True)
-    duplicates = _duplicates(report.results) if several else []
+    duplicates = find_duplicates([r.detail for r in report.results if r.detail is not None])
     for duplicate in duplicates:
         report.say("\n" + text_of(duplicate.finding()))
     if several or files.skipped:
@@ -177,10 +176,3 @@ def _graded(results: list[Result]) -> str:
     grades = [r.data.get("grade") for r in results if not r.error]
     names = [*(str(g) for g in _WORST_FIRST), "sound"]
     return "recordings by their worst finding: " + ", ".join(f"{n} {g}" for g in names if (n := grades.count(g)))
-
-
-def _duplicates(results: list[Result]) -> "list[Duplicate]":
-    """Flights that are in more than one of the files."""
-    from crazyem.doctor.duplicates import find_duplicates
-
-    return find_duplicates([r.detail for r in results if r.detail is not None])

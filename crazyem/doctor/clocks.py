@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import Cadence, Stream, cadence, listed, longest, streams
+from crazyem.doctor.streams import Cadence, Stream, cadence, listed, longest, sole, streams
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.stamps import RESTART_SECONDS
@@ -81,45 +81,35 @@ def _order(stream: Stream) -> list[Finding]:
 def _wrap(stream: Stream, rows: NDArray[np.int64], span: float, words: str, period: float) -> Finding:
     at = [(float(stream.time[i - 1]), float(stream.time[i - 1])) for i in rows]
     step = float(np.median(stream.time[rows] - stream.time[rows - 1])) + span
-    return Finding(
-        "clocks",
-        Grade.DEGRADES,
-        f"{stream.name}: the clock overflows {len(rows)} times and starts again from zero: a counter of {words}.",
-        signal=stream.names[0] if len(stream.names) == 1 else "",
-        intervals=longest(at),
-        evidence={"wraps": len(rows), "wrap_s": span, "step_across_s": step, "period_s": period},
-        advice="Unwrap it (--fix).",
-        fix=Fix("unwrap", stream.names, factor=(span,) * len(rows), rows=rows.astype(np.int64)),
-    )
+    text = f"{stream.name}: the clock overflows {len(rows)} times and starts again from zero: a counter of {words}."
+    evidence = {"wraps": len(rows), "wrap_s": span, "step_across_s": step, "period_s": period}
+    fix = Fix("unwrap", stream.names, factor=(span,) * len(rows), rows=rows.astype(np.int64))
+    return Finding("clocks", Grade.DEGRADES, text, sole(stream.names), longest(at), evidence, "Unwrap it (--fix).", fix)
 
 
 def _restart(stream: Stream, rows: NDArray[np.int64]) -> Finding:
     back = stream.time[rows] - stream.time[rows + 1]
-    return Finding(
-        "clocks",
-        Grade.UNUSABLE,
+    text = (
         f"{stream.name}: the clock goes back {len(rows)} times, by up to {back.max():.3f} s: "
-        "it was set, or the drone restarted.",
-        signal=stream.names[0] if len(stream.names) == 1 else "",
-        intervals=longest((float(stream.time[i + 1]), float(stream.time[i])) for i in rows),
-        evidence={"jumps": len(rows), "largest_s": float(back.max()), "first_row": int(rows[0]) + 1},
-        advice="Write a file for each part and use these as recordings of their own.",
+        "it was set, or the drone restarted."
     )
+    evidence = {"jumps": len(rows), "largest_s": float(back.max()), "first_row": int(rows[0]) + 1}
+    advice = "Write a file for each part and use these as recordings of their own."
+    spans = longest((float(stream.time[i + 1]), float(stream.time[i])) for i in rows)
+    return Finding("clocks", Grade.UNUSABLE, text, sole(stream.names), spans, evidence, advice)
 
 
 def _late(stream: Stream, rows: NDArray[np.int64], *, clean: bool) -> Finding:
     back = stream.time[rows] - stream.time[rows + 1]
     share = rows.size / stream.time.size
-    return Finding(
-        "clocks",
-        Grade.DEGRADES,
-        f"{stream.name}: {rows.size} records ({percent(share)}) are out of order, by up to {1000 * back.max():.1f} ms.",
-        signal=stream.names[0] if len(stream.names) == 1 else "",
-        intervals=longest((float(stream.time[i + 1]), float(stream.time[i])) for i in rows),
-        evidence={"records": int(rows.size), "share": share, "largest_s": float(back.max())},
-        advice="Sort by stamp (--fix)." if clean else "Deal with the jumps of the clock first.",
-        fix=Fix("sort", stream.names) if clean else None,
+    text = (
+        f"{stream.name}: {rows.size} records ({percent(share)}) are out of order, by up to {1000 * back.max():.1f} ms."
     )
+    evidence = {"records": int(rows.size), "share": share, "largest_s": float(back.max())}
+    advice = "Sort by stamp (--fix)." if clean else "Deal with the jumps of the clock first."
+    spans = longest((float(stream.time[i + 1]), float(stream.time[i])) for i in rows)
+    fix = Fix("sort", stream.names) if clean else None
+    return Finding("clocks", Grade.DEGRADES, text, sole(stream.names), spans, evidence, advice, fix)
 
 
 def _twice(stream: Stream, rows: NDArray[np.int64]) -> Finding:
@@ -130,18 +120,17 @@ def _twice(stream: Stream, rows: NDArray[np.int64]) -> Finding:
     share = rows.size / stream.time.size
     copies = int(alike.sum())
     all_copies = copies == rows.size
+    grade = Grade.DEGRADES if share > 0.01 else Grade.HARMLESS
     return Finding(
         "clocks",
-        Grade.DEGRADES if share > 0.01 else Grade.HARMLESS,
+        grade,
         f"{stream.name}: {rows.size} records ({percent(share)}) carry the stamp of the record before, "
         + ("with the same values." if all_copies else f"{rows.size - copies} of them with other values."),
-        signal=stream.names[0] if len(stream.names) == 1 else "",
-        intervals=longest((float(stream.time[i]), float(stream.time[i])) for i in rows),
-        evidence={"records": int(rows.size), "share": share, "copies": copies},
-        advice="Mark the copies as missing (--fix)."
-        if copies
-        else "Their time is known to one step of the clock only.",
-        fix=Fix("mark", stream.names, rows=rows[alike].astype(np.int64) + 1) if copies else None,
+        sole(stream.names),
+        longest((float(stream.time[i]), float(stream.time[i])) for i in rows),
+        {"records": int(rows.size), "share": share, "copies": copies},
+        "Mark the copies as missing (--fix)." if copies else "Their time is known to one step of the clock only.",
+        Fix("mark", stream.names, rows=rows[alike].astype(np.int64) + 1) if copies else None,
     )
 
 
@@ -189,14 +178,13 @@ def _claimed(metadata: Mapping[str, Mapping[str, str]], stream: str, real: float
 def _rate_finding(nominal: float, real: float, names: list[str]) -> Finding:
     percent = 100.0 * (real / nominal - 1.0)
     wrong = abs(percent) > 100.0 * WRONG_RATE_DEVIATION
-    return Finding(
-        "clocks",
-        Grade.DEGRADES if wrong else Grade.HARMLESS,
+    grade = Grade.DEGRADES if wrong else Grade.HARMLESS
+    text = (
         f"{listed(names)}: really {real:.4g} Hz, {abs(percent):.2f} % {'faster' if percent > 0 else 'slower'} than "
-        f"{nominal:g} Hz.",
-        evidence={"nominal_hz": nominal, "real_hz": real, "deviation_percent": percent},
-        advice="Use the stamps; never count rows as time.",
+        f"{nominal:g} Hz."
     )
+    evidence = {"nominal_hz": nominal, "real_hz": real, "deviation_percent": percent}
+    return Finding("clocks", grade, text, "", (), evidence, "Use the stamps; never count rows as time.")
 
 
 # -- against the host -------------------------------------------------------------------------------------------------
@@ -229,21 +217,19 @@ def _jumps(stream: Stream, time: Column, offset: Column, rows: NDArray[np.int64]
         return
     worst = max(sizes, key=lambda pair: abs(pair[1]))
     forward = worst[1] < 0
-    yield Finding(
-        "clocks",
-        Grade.DEGRADES,
+    text = (
         f"{stream.name}: the drone's clock jumps {len(sizes)} times against the host's, at most by "
-        f"{abs(worst[1]):.3f} s {'ahead' if forward else 'back'}.",
-        intervals=longest((float(time[i]), float(time[i + 1])) for i, _ in sizes),
-        evidence={"jumps": len(sizes), "largest_s": -worst[1]},
-        advice="Take the jumps out (--fix), or use a part between them (--from, --to).",
-        fix=Fix(
-            "unwrap",
-            stream.names,
-            factor=tuple(size for _, size in sizes),
-            rows=np.array([rows[i + 1] for i, _ in sizes], np.int64),
-        ),
+        f"{abs(worst[1]):.3f} s {'ahead' if forward else 'back'}."
     )
+    advice = "Take the jumps out (--fix), or use a part between them (--from, --to)."
+    spans = longest((float(time[i]), float(time[i + 1])) for i, _ in sizes)
+    fix = Fix(
+        "unwrap",
+        stream.names,
+        factor=tuple(size for _, size in sizes),
+        rows=np.array([rows[i + 1] for i, _ in sizes], np.int64),
+    )
+    yield Finding("clocks", Grade.DEGRADES, text, "", spans, {"jumps": len(sizes), "largest_s": -worst[1]}, advice, fix)
 
 
 def _drift(time: Column, offset: Column, *, several: bool) -> Iterator[Finding]:

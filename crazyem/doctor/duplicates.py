@@ -111,20 +111,16 @@ class Duplicate:
             what = f"{self.second} is a part of {self.first}"
         else:
             what = f"{self.second} and {self.first} have a part in common"
-        return Finding(
-            "duplicate",
-            Grade.DEGRADES,
-            f"{what}: {self.overlap_s:.1f} s, {self.offset_s:+.3f} s apart on their time axes.",
-            intervals=((self.start_s, self.end_s),),
-            evidence={
-                "overlap_s": self.overlap_s,
-                "offset_s": self.offset_s,
-                "share_first": self.share_first,
-                "share_second": self.share_second,
-                "matches": self.matches,
-            },
-            advice="Use one of them only: as two they count one flight twice, in training and test they leak.",
-        )
+        text = f"{what}: {self.overlap_s:.1f} s, {self.offset_s:+.3f} s apart on their time axes."
+        evidence = {
+            "overlap_s": self.overlap_s,
+            "offset_s": self.offset_s,
+            "share_first": self.share_first,
+            "share_second": self.share_second,
+            "matches": self.matches,
+        }
+        advice = "Use one of them only: as two they count one flight twice, in training and test they leak."
+        return Finding("duplicate", Grade.DEGRADES, text, "", ((self.start_s, self.end_s),), evidence, advice)
 
 
 def fingerprint(recording: Recording) -> Fingerprint:

@@ -106,7 +106,9 @@ def lagged(
 
 def predictor_of(inputs: Inputs, steps: Steps) -> Array:
     """How the next command follows from those before, in these stretches: see crazyem.physics.lag."""
-    return fit_predictor(_all_between(inputs, steps)) if inputs.lagged else hold_predictor()
+    if not inputs.lagged:
+        return hold_predictor()
+    return fit_predictor(inputs.wrench[np.concatenate([_indices(inputs, nodes) for nodes in steps.nodes])])
 
 
 def rotation_fit(inputs: Inputs, steps: Steps, vehicle: Vehicle) -> Fit | None:
@@ -320,7 +322,3 @@ def _sampled(pieces: list[tuple[Array, Array]], total: int) -> list[tuple[Array,
 
 def _indices(inputs: Inputs, nodes: Array) -> NDArray[np.int64]:
     return np.arange(np.searchsorted(inputs.time, nodes[0]), np.searchsorted(inputs.time, nodes[-1], "right"))
-
-
-def _all_between(inputs: Inputs, steps: Steps) -> Array:
-    return inputs.wrench[np.concatenate([_indices(inputs, nodes) for nodes in steps.nodes])]

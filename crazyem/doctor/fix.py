@@ -127,10 +127,6 @@ def _scale(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
     return replace(array, value=_on_rows(array.value, array.value * factor, fix.rows))
 
 
-def _shift(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
-    return replace(array, time=_on_rows(array.time, array.time + fix.factor[0], fix.rows))
-
-
 def _unwrap(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
     assert fix.rows is not None
     steps = np.zeros(array.time.size)
@@ -143,10 +139,6 @@ def _mark(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
     value, marked = array.value.copy(), array.marked.copy()
     value[fix.rows], marked[fix.rows] = np.nan, True
     return replace(array, value=value, marked=marked)
-
-
-def _sort(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
-    return array.rows(np.argsort(array.time, kind="stable"))
 
 
 def _world_to_body(array: SignalArray, fix: Fix, recording: Recording) -> SignalArray:
@@ -166,12 +158,12 @@ def _world_to_body(array: SignalArray, fix: Fix, recording: Recording) -> Signal
 
 _REPAIRS: dict[str, Callable[[SignalArray, Fix, Recording], SignalArray]] = {
     "scale": _scale,
-    "shift": _shift,
+    "shift": lambda array, fix, _: replace(array, time=_on_rows(array.time, array.time + fix.factor[0], fix.rows)),
     "unwrap": _unwrap,
     "mark": _mark,
-    "sort": _sort,
+    "sort": lambda array, fix, _: array.rows(np.argsort(array.time, kind="stable")),
     "world_to_body": _world_to_body,
-    "stamps": lambda array, fix, recording: array,
+    "stamps": lambda array, fix, _: array,
 }
 
 

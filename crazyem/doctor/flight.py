@@ -60,13 +60,8 @@ def _no_flight(flight: Airtime) -> Finding:
     text = f"The drone never flew: {flight.reason}."
     if not flight.lifting and flight.climbed > CARRIED_HEIGHT and not flight.by_height_alone:
         text += " Somebody carried it, or the motor signal is not what it says."
-    return Finding(
-        "flight",
-        Grade.UNUSABLE,
-        text,
-        evidence=evidence,
-        advice="There is nothing to estimate from; use another recording.",
-    )
+    advice = "There is nothing to estimate from; use another recording."
+    return Finding("flight", Grade.UNUSABLE, text, "", (), evidence, advice)
 
 
 def _course(flight: Airtime) -> Iterator[Finding]:
@@ -90,14 +85,8 @@ def _course(flight: Airtime) -> Iterator[Finding]:
         evidence["take_off_s"] = flight.flown[0][0]
     if not ends:
         evidence["landing_s"] = flight.flown[-1][1]
-    yield Finding(
-        "flight",
-        Grade.HARMLESS,
-        f"The recording {' and '.join(remarks)}; {total:.1f} s in the air.",
-        intervals=longest(flight.flown),
-        evidence=evidence,
-        advice="Nothing to do.",
-    )
+    text = f"The recording {' and '.join(remarks)}; {total:.1f} s in the air."
+    yield Finding("flight", Grade.HARMLESS, text, "", longest(flight.flown), evidence, "Nothing to do.")
 
 
 # -- attitude ---------------------------------------------------------------------------------------------------------
@@ -130,14 +119,10 @@ def _upsets(flight: Airtime, tilt: tuple[NDArray[np.float64], NDArray[np.float64
     if not rows.any():
         return
     spans = intervals_of(time, rows)
-    yield Finding(
-        "flight",
-        Grade.DEGRADES,
-        f"The drone is upside down in the air {len(spans)} times (tilt up to {angle[rows].max():.0f} degrees).",
-        intervals=longest(spans),
-        evidence={"tilt_deg": float(angle[rows].max()), "times": len(spans), "lasting_s": sum(b - a for a, b in spans)},
-        advice="If that was no flip on purpose, use the flight before it only.",
-    )
+    text = f"The drone is upside down in the air {len(spans)} times (tilt up to {angle[rows].max():.0f} degrees)."
+    evidence = {"tilt_deg": float(angle[rows].max()), "times": len(spans), "lasting_s": sum(b - a for a, b in spans)}
+    advice = "If that was no flip on purpose, use the flight before it only."
+    yield Finding("flight", Grade.DEGRADES, text, "", longest(spans), evidence, advice)
 
 
 def _lying(
@@ -164,16 +149,11 @@ def _lying(
             if last < LYING_TILT:
                 continue
             moment = float(time[np.searchsorted(time, end)])
-            return [
-                Finding(
-                    "flight",
-                    Grade.DEGRADES,
-                    f"The drone crashed: after the rotors stopped it lies tilted by {last:.0f} degrees.",
-                    intervals=((max(end - 1.0, flight.begin), moment),),
-                    evidence={"rest_tilt_deg": last, "rotors_stop_s": end, **_violence(recording, end)},
-                    advice=f"Use the flight up to about {end - 1.0:.1f} s (told by the {words}).",
-                )
-            ]
+            text = f"The drone crashed: after the rotors stopped it lies tilted by {last:.0f} degrees."
+            evidence = {"rest_tilt_deg": last, "rotors_stop_s": end, **_violence(recording, end)}
+            advice = f"Use the flight up to about {end - 1.0:.1f} s (told by the {words})."
+            spans = ((max(end - 1.0, flight.begin), moment),)
+            return [Finding("flight", Grade.DEGRADES, text, "", spans, evidence, advice)]
     return []
 
 
@@ -230,14 +210,10 @@ def _impacts(recording: Recording, flight: Airtime) -> Iterator[Finding]:
     when, speed = max(hits, key=lambda hit: hit[1])
     spans: Intervals = tuple((t - 0.1, t + 0.5) for t, _ in hits)
     over = all(end < hits[0][0] for _, end in flight.lifting)
-    yield Finding(
-        "flight",
-        Grade.HARMLESS if over else Grade.DEGRADES,
-        f"The drone hits the ground at {speed:.1f} m/s{', its rotors already stopped' if over else ''}.",
-        intervals=longest(spans),
-        evidence={"speed_m_s": speed, "time_s": when, **_violence(recording, when)},
-        advice=f"Use the flight up to about {when - 0.1:.1f} s; the onboard filter suffers from such a shock.",
-    )
+    text = f"The drone hits the ground at {speed:.1f} m/s{', its rotors already stopped' if over else ''}."
+    evidence = {"speed_m_s": speed, "time_s": when, **_violence(recording, when)}
+    advice = f"Use the flight up to about {when - 0.1:.1f} s; the onboard filter suffers from such a shock."
+    yield Finding("flight", Grade.HARMLESS if over else Grade.DEGRADES, text, "", longest(spans), evidence, advice)
 
 
 def _drops(recording: Recording, flight: Airtime) -> list[Finding]:
@@ -260,14 +236,9 @@ def _drops(recording: Recording, flight: Airtime) -> list[Finding]:
         later = position[(time > end) & (time < end + 1.0), 2]
         fell = height - (float(later.min()) - flight.ground) if later.size else 0.0
         if height > DROP_HEIGHT and fell > 0.5 * height:
-            found.append(
-                Finding(
-                    "flight",
-                    Grade.DEGRADES,
-                    f"The rotors stop {height:.2f} m above the ground, and the drone falls.",
-                    intervals=((end, min(end + 1.0, flight.end)),),
-                    evidence={"height_m": height, "time_s": end, **_violence(recording, end)},
-                    advice=f"Use the flight up to {end:.1f} s.",
-                )
-            )
+            text = f"The rotors stop {height:.2f} m above the ground, and the drone falls."
+            evidence = {"height_m": height, "time_s": end, **_violence(recording, end)}
+            advice = f"Use the flight up to {end:.1f} s."
+            spans = ((end, min(end + 1.0, flight.end)),)
+            found.append(Finding("flight", Grade.DEGRADES, text, "", spans, evidence, advice))
     return found

@@ -114,13 +114,9 @@ def _constant(value: NDArray[np.float64]) -> bool:
 
 
 def _idle(names: list[str]) -> Finding:
-    return Finding(
-        "frozen",
-        Grade.HARMLESS,
-        f"{listed(names)}: never {'changes' if len(names) == 1 else 'change'}; not in use in this flight.",
-        evidence={"columns": len(names)},
-        advice="Nothing to do, unless you expected them to change.",
-    )
+    text = f"{listed(names)}: never {'changes' if len(names) == 1 else 'change'}; not in use in this flight."
+    advice = "Nothing to do, unless you expected them to change."
+    return Finding("frozen", Grade.HARMLESS, text, "", (), {"columns": len(names)}, advice)
 
 
 def _flat_voltage(recording: Recording, array: SignalArray) -> Finding:
@@ -131,14 +127,10 @@ def _flat_voltage(recording: Recording, array: SignalArray) -> Finding:
         if matters
         else " Nothing here needs it."
     )
-    return Finding(
-        "frozen",
-        Grade.DEGRADES if matters else Grade.HARMLESS,
-        f"voltage is {volts:.3f} V throughout the flight, though rotors load a battery.{cost}",
-        signal="voltage",
-        evidence={"voltage_V": volts},
-        advice="Look at what writes it. A supply or a simulation may hold its voltage; a battery does not.",
-    )
+    text = f"voltage is {volts:.3f} V throughout the flight, though rotors load a battery.{cost}"
+    evidence = {"voltage_V": volts}
+    advice = "Look at what writes it. A supply or a simulation may hold its voltage; a battery does not."
+    return Finding("frozen", Grade.DEGRADES if matters else Grade.HARMLESS, text, "voltage", (), evidence, advice)
 
 
 def _signal(recording: Recording, name: str, array: SignalArray, flight: Airtime) -> list[_Stuck]:

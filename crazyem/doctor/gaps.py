@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import Cadence, Stream, cadence, graded, listed, longest, streams
+from crazyem.doctor.streams import Cadence, Stream, cadence, graded, listed, longest, sole, streams
 from crazyem.recordings.finding import Finding, Grade, percent
 from crazyem.recordings.ordering import Intervals
 from crazyem.recordings.recording import Recording
@@ -109,14 +109,10 @@ def _pause_finding(pauses: Intervals) -> Finding:
     total = sum(b - a for a, b in pauses)
     lasting = max(b - a for a, b in pauses)
     times = "once" if len(pauses) == 1 else f"{len(pauses)} times"
-    return Finding(
-        "gaps",
-        Grade.DEGRADES,
-        f"Everything falls silent {times}, for {total:.2f} s in all (the longest {lasting:.2f} s).",
-        intervals=longest(pauses),
-        evidence={"pauses": len(pauses), "silent_s": total, "longest_s": lasting},
-        advice="Treat the parts before and after as flights of their own (--from, --to).",
-    )
+    text = f"Everything falls silent {times}, for {total:.2f} s in all (the longest {lasting:.2f} s)."
+    evidence = {"pauses": len(pauses), "silent_s": total, "longest_s": lasting}
+    advice = "Treat the parts before and after as flights of their own (--from, --to)."
+    return Finding("gaps", Grade.DEGRADES, text, "", longest(pauses), evidence, advice)
 
 
 def local_periods(time: NDArray[np.float64], period: float) -> NDArray[np.float64]:
@@ -168,24 +164,20 @@ def _drops(
     names = [name for stream in sharing for name in stream.names]
     if all(stream.slow for stream in sharing):
         grade = Grade.HARMLESS
-    return [
-        Finding(
-            "gaps",
-            grade,
-            f"{listed([stream.name for stream in sharing])}: {_number(count, 'record')} ({percent(share)}) missing "
-            f"in {_number(rows.size, 'place')}, the longest gap {1000 * lasting:.0f} ms.",
-            signal=names[0] if len(names) == 1 else "",
-            intervals=longest((float(time[i]), float(time[i + 1])) for i in rows),
-            evidence={
-                "lost": count,
-                "share": share,
-                "gaps": int(rows.size),
-                "longest_s": lasting,
-                "period_s": rhythm.period,
-            },
-            advice="Nothing to repair: use the stamps, never the row number, and look at the link or the log rate.",
-        )
-    ]
+    text = (
+        f"{listed([stream.name for stream in sharing])}: {_number(count, 'record')} ({percent(share)}) missing "
+        f"in {_number(rows.size, 'place')}, the longest gap {1000 * lasting:.0f} ms."
+    )
+    evidence = {
+        "lost": count,
+        "share": share,
+        "gaps": int(rows.size),
+        "longest_s": lasting,
+        "period_s": rhythm.period,
+    }
+    advice = "Nothing to repair: use the stamps, never the row number, and look at the link or the log rate."
+    spans = longest((float(time[i]), float(time[i + 1])) for i in rows)
+    return [Finding("gaps", grade, text, sole(names), spans, evidence, advice)]
 
 
 def _number(count: int, word: str) -> str:
@@ -233,15 +225,9 @@ def _end_findings(ends: list[_End], duration: float) -> list[Finding]:
         names = [name for e in close for name in e.names]
         silent = max(e.end - e.start for e in close)
         share = silent / max(duration, 1e-9)
-        found.append(
-            Finding(
-                "gaps",
-                graded(share, degrades=0.1),
-                f"{listed(names)}: no values in the {'last' if one.last else 'first'} {silent:.1f} s of the recording.",
-                signal=names[0] if len(names) == 1 else "",
-                intervals=((min(e.start for e in close), max(e.end for e in close)),),
-                evidence={"silent_s": silent, "share": share, "signals": len(names)},
-                advice="Use only the part of the flight in which all needed signals are there (--from, --to).",
-            )
-        )
+        text = f"{listed(names)}: no values in the {'last' if one.last else 'first'} {silent:.1f} s of the recording."
+        evidence = {"silent_s": silent, "share": share, "signals": len(names)}
+        advice = "Use only the part of the flight in which all needed signals are there (--from, --to)."
+        spans = ((min(e.start for e in close), max(e.end for e in close)),)
+        found.append(Finding("gaps", graded(share, degrades=0.1), text, sole(names), spans, evidence, advice))
     return found

@@ -108,7 +108,7 @@ def replay_objection(recording: Recording, vehicle: Vehicle) -> str:
     inputs = inputs_of(recording, vehicle)
     if isinstance(inputs, str):
         return inputs
-    lacking = [name for name in ("position", "attitude") if not _has(recording, name)]
+    lacking = [name for name in ("position", "attitude") if _sound(recording, name) is None]
     lacking += [] if inputs.voltage_known else ["voltage"]
     return f"it has no {' and no '.join(lacking)}" if lacking else ""
 
@@ -134,8 +134,8 @@ def _vertical(recording: Recording, air: Airtime) -> _Vertical | None:
             response, tilts = [], []
             for t, v in zip(steps.nodes, steps.values):
                 force = np.diff(v[:, :3], axis=0) / np.diff(t)[:, None] + np.array([0.0, 0.0, GRAVITY])
-                up = _up(0.5 * (v[1:, 3:] + v[:-1, 3:])) if attitude is not None else np.array([0.0, 0.0, 1.0])
-                response.append(np.sum(force * up, axis=1))
+                turned = rotation_matrix(_unit(0.5 * (v[1:, 3:] + v[:-1, 3:]))) if attitude is not None else np.eye(3)
+                response.append(np.sum(force * turned[..., :, 2], axis=1))
                 tilts.append(v[:, :2])
             if attitude is not None:
                 return _Vertical(steps, response, "velocity and attitude", 0.0)
@@ -423,15 +423,6 @@ def _unit(q: Array) -> Array:
     return q / np.where(norm > 0.0, norm, 1.0)
 
 
-def _up(attitude: Array) -> Array:
-    """Body z in the world (k, 3)."""
-    return rotation_matrix(_unit(attitude))[..., :, 2]
-
-
 def _sound(recording: Recording, name: str) -> tuple[Array, Array] | None:
     array = recording.signals.get(name)
     return None if array is None else sound_samples(array)
-
-
-def _has(recording: Recording, name: str) -> bool:
-    return _sound(recording, name) is not None

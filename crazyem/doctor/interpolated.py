@@ -126,14 +126,9 @@ def _signal(name: str, array: SignalArray) -> Iterator[Finding]:
             fix=fix,
         )
         return
-    yield Finding(
-        "interpolated",
-        graded(share, degrades=DEGRADING_INTERPOLATED_SHARE, unusable=0.6),
+    grade = graded(share, degrades=DEGRADING_INTERPOLATED_SHARE, unusable=0.6)
+    text = (
         f"{percent(share)} of {name} lie on straight lines ({len(spans)} runs, the longest {lasting:.2f} s): "
-        "drawn across lost samples, not measured.",
-        signal=name,
-        intervals=places(time, wide),
-        evidence=evidence,
-        advice="Mark them as missing (--fix).",
-        fix=fix,
+        "drawn across lost samples, not measured."
     )
+    yield Finding("interpolated", grade, text, name, places(time, wide), evidence, "Mark them as missing (--fix).", fix)

@@ -232,15 +232,12 @@ def _against_host(array: SignalArray) -> float | None:
 
 def _short(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, str]]:
     """Metadata without what is too long to read, such as whole tables and vehicle files."""
-    kept = {
-        section: {key: str(value) for key, value in values.items() if _is_short(str(value))}
-        for section, values in metadata.items()
-    }
-    return {section: values for section, values in kept.items() if values}
-
-
-def _is_short(value: str) -> bool:
-    return len(value) <= _LONGEST_TEXT and "\n" not in value
+    kept: dict[str, dict[str, str]] = {}
+    for section, values in metadata.items():
+        for key, value in values.items():
+            if len(text := str(value)) <= _LONGEST_TEXT and "\n" not in text:
+                kept.setdefault(section, {})[key] = text
+    return kept
 
 
 def _listed(values: dict[str, Any]) -> dict[str, Any]:

@@ -86,14 +86,9 @@ def _unit_of_motors(array: SignalArray, values: NDArray[np.float64]) -> str:
 
 def _unconnected(name: str, array: SignalArray) -> Finding:
     sensor = ZERO_WITHOUT_SENSOR[array.quantity]
-    return Finding(
-        "numbers",
-        Grade.HARMLESS,
-        f"{name} reads 0 in all of its {array.time.size} samples: no {sensor} is connected, {name} is not measured.",
-        signal=name,
-        evidence={"samples": array.time.size},
-        advice="Nothing to do, unless you expected it.",
-    )
+    text = f"{name} reads 0 in all of its {array.time.size} samples: no {sensor} is connected, {name} is not measured."
+    evidence = {"samples": array.time.size}
+    return Finding("numbers", Grade.HARMLESS, text, name, (), evidence, "Nothing to do, unless you expected it.")
 
 
 def check(recording: Recording) -> list[Finding]:
@@ -118,14 +113,9 @@ def check(recording: Recording) -> list[Finding]:
             found += position_jumps(name, array, furthest=VALUE_LIMITS["position"].high)
     if unmapped:
         names = [name for name, _ in unmapped]
-        found.append(
-            Finding(
-                "numbers",
-                Grade.HARMLESS,
-                f"{listed(names)} hold values that are no numbers; nothing here uses these columns.",
-                evidence={"columns": len(names), "samples": sum(count for _, count in unmapped)},
-            )
-        )
+        text = f"{listed(names)} hold values that are no numbers; nothing here uses these columns."
+        evidence = {"columns": len(names), "samples": sum(count for _, count in unmapped)}
+        found.append(Finding("numbers", Grade.HARMLESS, text, "", (), evidence))
     return found
 
 
@@ -133,28 +123,21 @@ def _stamps(name: str, array: SignalArray) -> Iterator[Finding]:
     bad = ~np.isfinite(array.time)
     if not bad.any():
         return
-    yield Finding(
-        "numbers",
-        Grade.UNUSABLE,
-        f"{name} has {int(bad.sum())} samples whose stamp is not a number.",
-        signal=name,
-        evidence={"samples": int(bad.sum()), "share": float(bad.mean())},
-        advice="Remove these rows from the source; a sample without a time says nothing.",
-    )
+    text = f"{name} has {int(bad.sum())} samples whose stamp is not a number."
+    evidence = {"samples": int(bad.sum()), "share": float(bad.mean())}
+    advice = "Remove these rows from the source; a sample without a time says nothing."
+    yield Finding("numbers", Grade.UNUSABLE, text, name, (), evidence, advice)
 
 
 def _not_numbers(name: str, array: SignalArray, bad: Rows) -> Finding:
     share = float(bad.mean())
-    return Finding(
-        "numbers",
-        Grade.UNUSABLE if share > 0.5 else Grade.DEGRADES,
-        f"{name} is not a number in {int(bad.sum())} of {bad.size} samples, and the file does not say why.",
-        signal=name,
-        intervals=places(array.time, bad),
-        evidence={"samples": int(bad.sum()), "share": share},
-        advice="Mark them as missing (--fix); a replay refuses them otherwise.",
-        fix=Fix("mark", (name,), rows=np.flatnonzero(bad)),
-    )
+    text = f"{name} is not a number in {int(bad.sum())} of {bad.size} samples, and the file does not say why."
+    evidence = {"samples": int(bad.sum()), "share": share}
+    advice = "Mark them as missing (--fix); a replay refuses them otherwise."
+    spans = places(array.time, bad)
+    fix = Fix("mark", (name,), rows=np.flatnonzero(bad))
+    grade = Grade.UNUSABLE if share > 0.5 else Grade.DEGRADES
+    return Finding("numbers", grade, text, name, spans, evidence, advice, fix)
 
 
 def _impossible(name: str, array: SignalArray, limit: Limit, sound: Rows) -> Iterator[Finding]:
@@ -185,16 +168,10 @@ def _impossible(name: str, array: SignalArray, limit: Limit, sound: Rows) -> Ite
     evidence = {"samples": int(bad.sum()), "share": share, "worst": worst_value}
     if good.size:
         evidence["largest_possible"] = float(good.max())
-    yield Finding(
-        "numbers",
-        Grade.UNUSABLE if share > 0.2 else Grade.DEGRADES,
-        f"{name} is {limit.words} in {int(bad.sum())} of {bad.size} samples (worst {worst_value:.6g}).",
-        signal=name,
-        intervals=places(array.time, bad),
-        evidence=evidence,
-        advice=advice,
-        fix=fix,
-    )
+    text = f"{name} is {limit.words} in {int(bad.sum())} of {bad.size} samples (worst {worst_value:.6g})."
+    spans = places(array.time, bad)
+    grade = Grade.UNUSABLE if share > 0.2 else Grade.DEGRADES
+    yield Finding("numbers", grade, text, name, spans, evidence, advice, fix)
 
 
 Array = NDArray[np.float64]
@@ -286,15 +263,9 @@ def _coarse(name: str, array: SignalArray, value: Array) -> Iterator[Finding]:
     if not known or min(known) < COARSE_RESOLUTION:
         return
     grain = min(known)
-    yield Finding(
-        "numbers",
-        Grade.HARMLESS,
-        f"{name} is stored in steps of {100.0 * grain:.2g} cm.",
-        signal=name,
-        evidence={"resolution_m": grain},
-        advice="Log it with more digits: a velocity over 0.1 s is known to no better than "
-        f"{grain / 0.1:.2g} m/s from it.",
-    )
+    text = f"{name} is stored in steps of {100.0 * grain:.2g} cm."
+    advice = f"Log it with more digits: a velocity over 0.1 s is known to no better than {grain / 0.1:.2g} m/s from it."
+    yield Finding("numbers", Grade.HARMLESS, text, name, (), {"resolution_m": grain}, advice)
 
 
 def _grain(column: Array) -> float:

@@ -8,7 +8,7 @@ packet.
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import COMMAND_SIGNALS, Stream, cadence, listed, places, runs, same_as_before, streams
+from crazyem.doctor.streams import COMMAND_SIGNALS, Stream, cadence, listed, places, runs, same_as_before, sole, streams
 from crazyem.recordings.airborne import Airtime, airtime
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.ordering import inside, sound_rows
@@ -135,14 +135,9 @@ def _creeps(array: SignalArray) -> bool:
 
 def _held_finding(name: str, share: float, stored: float, beat: float) -> Finding:
     rate = stored / beat
-    return Finding(
-        "repeated",
-        Grade.HARMLESS,
-        f"{name} is measured at about {rate:.0f} Hz and held in between (stored at {stored:.0f} Hz).",
-        signal=name,
-        evidence={"share": share, "rate_hz": rate, "stored_hz": stored},
-        advice="Count it at its real rate.",
-    )
+    text = f"{name} is measured at about {rate:.0f} Hz and held in between (stored at {stored:.0f} Hz)."
+    evidence = {"share": share, "rate_hz": rate, "stored_hz": stored}
+    return Finding("repeated", Grade.HARMLESS, text, name, (), evidence, "Count it at its real rate.")
 
 
 def _finding(
@@ -157,7 +152,7 @@ def _finding(
         Grade.DEGRADES if share > DEGRADING_REPEAT_SHARE else Grade.HARMLESS,
         f"{percent(share)} of the {what} of {listed(names)} in flight repeat the one before: "
         f"stored at {stored:.0f} Hz, measured at about {rate:.0f} Hz.",
-        signal=names[0] if len(names) == 1 else "",
+        signal=sole(names),
         intervals=places(time, rows),
         evidence={
             "samples": int(rows.sum()),

@@ -220,15 +220,11 @@ def _constant_fraction(ratio: NDArray[np.float64]) -> str:
 def _constant(name: str, array: SignalArray, rotor: int, words: str, ratio: float) -> Finding:
     factor = [1.0] * array.value.shape[1]
     factor[rotor] = 1.0 / CONSTANT_FRACTIONS[words]
-    return Finding(
-        "rotor_sensor",
-        Grade.DEGRADES,
-        f"The speed sensor of m{rotor + 1} counts {words} of the turns all the time.",
-        signal=name,
-        evidence={"rotor": rotor + 1, "ratio": ratio, "share": 1.0},
-        advice=f"Check its number of poles or blades; scale m{rotor + 1} by {factor[rotor]:.3g} (--fix).",
-        fix=Fix("scale", (name,), factor=tuple(factor)),
-    )
+    text = f"The speed sensor of m{rotor + 1} counts {words} of the turns all the time."
+    evidence = {"rotor": rotor + 1, "ratio": ratio, "share": 1.0}
+    advice = f"Check its number of poles or blades; scale m{rotor + 1} by {factor[rotor]:.3g} (--fix)."
+    fix = Fix("scale", (name,), factor=tuple(factor))
+    return Finding("rotor_sensor", Grade.DEGRADES, text, name, (), evidence, advice, fix)
 
 
 def _finding(
@@ -272,12 +268,8 @@ def _missing(name: str, array: SignalArray, rows: NDArray[np.bool_]) -> Iterator
     share = float(flags.sum()) / float(rows.sum())
     spans = intervals_of(array.time, flags)
     which = [f"m{i + 1} {int(count)}" for i, count in enumerate(counts) if count]
-    yield Finding(
-        "rotor_sensor",
-        Grade.DEGRADES if share > 0.05 else Grade.HARMLESS,
-        f"{name} is missing in {int(flags.sum())} samples in the air ({percent(share)}; {listed(which)}).",
-        signal=name,
-        intervals=longest(spans),
-        evidence={"samples": int(flags.sum()), "share": share, "longest_s": max(b - a for a, b in spans)},
-        advice="Nothing to repair; they are treated as missing.",
-    )
+    text = f"{name} is missing in {int(flags.sum())} samples in the air ({percent(share)}; {listed(which)})."
+    evidence = {"samples": int(flags.sum()), "share": share, "longest_s": max(b - a for a, b in spans)}
+    advice = "Nothing to repair; they are treated as missing."
+    grade = Grade.DEGRADES if share > 0.05 else Grade.HARMLESS
+    yield Finding("rotor_sensor", grade, text, name, longest(spans), evidence, advice)

@@ -67,16 +67,12 @@ def _upper(
         evidence["voltage_V"] = volts
         if volts / max(1, round(volts / 3.8)) < LOW_CELL:
             text += f", on a low battery ({volts:.2f} V)"
-    yield Finding(
-        "saturation",
-        Grade.DEGRADES if share >= DEGRADING_SATURATED_SHARE else Grade.HARMLESS,
-        text + ".",
-        signal=name,
-        intervals=longest(spans),
-        evidence=evidence,
-        advice="The controller did not get what it asked for: the firmware takes the excess of one rotor from all "
-        "four. Use the duty that was sent, not the thrust asked for, and charge the battery or fly gentler.",
+    grade = Grade.DEGRADES if share >= DEGRADING_SATURATED_SHARE else Grade.HARMLESS
+    advice = (
+        "The controller did not get what it asked for: the firmware takes the excess of one rotor from all "
+        "four. Use the duty that was sent, not the thrust asked for, and charge the battery or fly gentler."
     )
+    yield Finding("saturation", grade, text + ".", name, longest(spans), evidence, advice)
 
 
 def _is_ceiling(column: NDArray[np.float64], top: float, rows: NDArray[np.bool_]) -> bool:

@@ -93,6 +93,11 @@ def streams(recording: Recording) -> list[Stream]:
     return found
 
 
+def sole(names: Sequence[str]) -> str:
+    """The name of the only signal, "" of several: what a finding calls its signal."""
+    return names[0] if len(names) == 1 else ""
+
+
 def listed(names: Sequence[str], most: int = 4) -> str:
     """ "a, b and 3 more"."""
     if len(names) <= most:
