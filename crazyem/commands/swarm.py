@@ -169,7 +169,10 @@ def _run(
         scheduler = Scheduler()
         stack.callback(scheduler.close)
         try:
-            _connect(arguments, drones, wrench=wrench, streams=streams, scheduler=scheduler, everyone=everyone)
+            begin = functools.partial(
+                _begin, arguments, of=len(drones), wrench=wrench, streams=streams, scheduler=scheduler
+            )
+            _connect(drones, begin, everyone)
             before([d for d in drones if d.error is None])
             with live_view(view, lambda: [d.shown for d in drones if d.shown is not None]) as showing:
                 try:
@@ -183,15 +186,7 @@ def _run(
         return _report(arguments, drones)
 
 
-def _connect(
-    arguments: argparse.Namespace,
-    drones: Sequence[Drone],
-    *,
-    wrench: str,
-    streams: Streams,
-    scheduler: Scheduler,
-    everyone: Interrupts,
-) -> None:
+def _connect(drones: Sequence[Drone], begin: Callable[[Drone, Link, int], None], everyone: Interrupts) -> None:
     """Links, recordings and sessions; a drone that cannot be reached is left behind."""
 
     def reach(number: int) -> None:
@@ -201,7 +196,7 @@ def _connect(
             return
         try:
             link = connect(drone.stack, drone.member.uri)
-            _begin(arguments, drone, link, number, len(drones), wrench=wrench, streams=streams, scheduler=scheduler)
+            begin(drone, link, number)
             say(f"{drone.name}: connected to {drone.member.uri}")
         except CrazyemError as error:
             drone.failed(error)
@@ -217,8 +212,8 @@ def _begin(
     drone: Drone,
     link: Link,
     number: int,
-    of: int,
     *,
+    of: int,
     wrench: str,
     streams: Streams,
     scheduler: Scheduler,

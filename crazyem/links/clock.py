@@ -9,6 +9,7 @@ from itertools import pairwise
 STAMP_MODULUS = 1 << 24  # ms; the firmware sends the low 24 bits of its millisecond counter: wraps at 16777.216 s
 _HALF_MODULUS = STAMP_MODULUS // 2
 _STALL_SECONDS = 0.4  # s of host time by which all packets come later than before, after a clock stood still
+_KEPT_SECONDS = 600
 _STALL_BINS = 5  # bins (seconds of firmware time) in which not one packet was as early as before
 
 
@@ -128,11 +129,10 @@ class ClockRelation:
     """Fits the host clock against the firmware clock through the least-delayed packet of every second.
 
     Queues and schedulers only ever delay a packet, so the lower edge of (host - firmware) is the clock relation and
-    the rest is delay. Memory is bounded: one candidate a second, the newest `seconds` of them.
+    the rest is delay. Memory is bounded: one candidate a second, the newest ten minutes of them.
     """
 
-    def __init__(self, seconds: int = 600) -> None:
-        self._seconds = seconds
+    def __init__(self) -> None:
         self._origin: tuple[float, float] | None = None
         self._bins: dict[int, tuple[float, float]] = {}  # second of firmware time -> (firmware, host) from the origin
         self._newest = (0.0, 0.0)
@@ -152,7 +152,7 @@ class ClockRelation:
         best = self._bins.get(key)
         if best is None or y - rate * x < best[1] - rate * best[0]:
             self._bins[key] = (x, y)
-            while len(self._bins) > self._seconds:
+            while len(self._bins) > _KEPT_SECONDS:
                 self._bins.pop(next(iter(self._bins)))
 
     def _forget_before_stall(self) -> None:

@@ -47,7 +47,8 @@ def new_crazyflie(uri: str) -> Any:
     import cflib.crtp
     from cflib.crazyflie import Crazyflie
 
-    if not cflib.crtp.CLASSES or (uri.startswith("serial") and "SerialDriver" not in map(_name, cflib.crtp.CLASSES)):
+    drivers = [driver.__name__ for driver in cflib.crtp.CLASSES]
+    if not drivers or (uri.startswith("serial") and "SerialDriver" not in drivers):
         cflib.crtp.CLASSES.clear()
         cflib.crtp.init_drivers(enable_serial_driver=uri.startswith("serial"))
     crazyflie = Crazyflie(ro_cache=None, rw_cache=None)
@@ -56,10 +57,6 @@ def new_crazyflie(uri: str) -> Any:
     latency = crazyflie.link_statistics.latency
     latency.stop = latency._stop_event.set
     return crazyflie
-
-
-def _name(driver: type) -> str:
-    return driver.__name__
 
 
 class _Progress:

@@ -63,7 +63,11 @@ def pack(
     Raises: UsageError naming the variable that does not exist, or what does not fit.
     """
     wanted = list(dict.fromkeys(variables))
-    _check_loggable(wanted, available)
+    for name in wanted:
+        if name not in available:
+            raise UsageError(f'The drone has no log variable "{name}"{_hint(name, available)}.')
+        if available[name] not in CTYPE_SIZES:
+            raise UsageError(f'The log variable "{name}" has type {available[name]}, which cannot be logged.')
     if variables_in_use + len(wanted) > MAX_VARIABLES:
         taken = f" ({variables_in_use} are in use already)" if variables_in_use else ""
         raise UsageError(f"{len(wanted)} variables do not fit: the firmware logs {MAX_VARIABLES} at once{taken}.")
@@ -82,14 +86,6 @@ def pack(
         Block(first_identifier + i, tuple(Variable(n, available[n]) for n in names), period_ms)
         for i, names in enumerate(ordered)
     )
-
-
-def _check_loggable(names: Sequence[str], available: Mapping[str, str]) -> None:
-    for name in names:
-        if name not in available:
-            raise UsageError(f'The drone has no log variable "{name}"{_hint(name, available)}.')
-        if available[name] not in CTYPE_SIZES:
-            raise UsageError(f'The log variable "{name}" has type {available[name]}, which cannot be logged.')
 
 
 def _first_fit(units: Sequence[tuple[str, ...]], size: Mapping[str, int]) -> list[list[str]]:

@@ -350,7 +350,8 @@ class Flight:
         if newest != self._moved[0] or self.session.reconnecting:
             self._moved = (newest, now)
         elif now - self._moved[1] > LOST_AFTER_SILENCE and self.session.lost is None:
-            raise LinkError(self._silent())
+            gone = f"the drone at {self.link.uri} was lost: nothing was received for {LOST_AFTER_SILENCE:g} s."
+            raise LinkError(gone)
         if self.session.lost is not None or (self.session.failure is not None and self.phase != "landing"):
             self.session.raise_if_failed()
         if self.session.outages and self._may_fly and self.telemetry.grounded_reason():
@@ -362,9 +363,6 @@ class Flight:
         if now - self._report >= REPORT_EVERY:
             self._report = now
             self.progress(self.phase, clock_seconds(self.session.clock.newest, self._phase_start))
-
-    def _silent(self) -> str:
-        return f"the drone at {self.link.uri} was lost: nothing was received for {LOST_AFTER_SILENCE:g} s."
 
 
 def clock_seconds(now: float, start: float) -> float:

@@ -24,14 +24,9 @@ WRITE_ATTEMPTS = 9  # of a write, 3.6 s in all: an outage is noticed within 2 s,
 TELEMETRY_POLL = 0.01  # s between looks for fresh telemetry
 
 
-def running_controller(link: Link) -> int:
-    """Number of the controller that really runs (stabilizer.controller, freshly read; the firmware may overrule)."""
-    return int(link.read_parameter("stabilizer.controller"))
-
-
 def push_target(link: Link, vehicle: Vehicle) -> tuple[Controller | None, str]:
     """Where estimates can be pushed to on this drone now, or None and one sentence why not."""
-    number = running_controller(link)
+    number = int(link.read_parameter("stabilizer.controller"))  # freshly read: the firmware may overrule
     plain = CONTROLLERS.get(number)
     if plain is None:
         return None, without_target(number)
@@ -238,21 +233,14 @@ class Pusher:
         """Send it once; "" if the drone confirmed it, else why not."""
         try:
             write = self.link.write_parameter(name, value, timeout=self.timeout)
-        except CrazyemError as error:
-            self._record(self._unconfirmed(name, value))
-            return str(error) or type(error).__name__
         except Exception as error:  # a fault of ours ends the pushing, not the flight; the sentence names it
-            self._record(self._unconfirmed(name, value))
-            return repr(error)
+            # of the write nothing is known: its packet may have left before the link failed
+            self._record(ParameterWrite(name, value, None, False, clock.time()))
+            return (str(error) or type(error).__name__) if isinstance(error, CrazyemError) else repr(error)
         self._record(write)
         if write.verified:
             return ""
         return "no echo came" if write.echoed is None else f"the drone echoed {write.echoed:.6g}"
-
-    @staticmethod
-    def _unconfirmed(name: str, value: float) -> ParameterWrite:
-        """A write of which nothing is known: its packet may have left before the link failed."""
-        return ParameterWrite(name, value, None, False, clock.time())
 
     def _record(self, write: ParameterWrite) -> None:
         try:

@@ -24,7 +24,6 @@ class Simulator:
         scenario: the truth, a file only the simulator reads; None for its defaults.
         seed: of every noise in it.
         speed: firmware seconds per second.
-        truth: CSV file for the true state, or None.
         command: what to start instead (tests).
 
     Raises:
@@ -38,7 +37,6 @@ class Simulator:
         scenario: str | Path | None = None,
         seed: int = 0,
         speed: float = 1.0,
-        truth: str | Path | None = None,
         command: Sequence[str] | None = None,
         timeout: float = START_TIMEOUT,
     ) -> None:
@@ -49,8 +47,6 @@ class Simulator:
         self._command += ["--port", "0", "--seed", str(seed), "--speed", f"{speed:g}"]
         if scenario is not None:
             self._command += ["--scenario", str(scenario)]
-        if truth is not None:
-            self._command += ["--truth", str(truth)]
         self._process: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> "Simulator":

@@ -293,7 +293,6 @@ def bound(
     noise: str = "free",
     sensors: str = "free",
     accelerometer: bool = True,
-    start_sd: NDArray = START_SD,
 ) -> Bound:
     """Cramer-Rao bound of mass and inertia from rows first..last-1 of a flight.
 
@@ -303,7 +302,6 @@ def bound(
         first, last: rows; last defaults to all that is known.
         noise, sensors: what is known of the noise, see `Bound.under`.
         accelerometer: whether sensor A reads the specific force, too.
-        start_sd: (12,) standard deviations of what is known of the state at the start [m, m/s, rad, rad/s].
 
     Raises: UsageError: no such sensor, rows or option.
     """
@@ -321,7 +319,7 @@ def bound(
     for i in free:
         factor = np.exp(DERIVATIVE_STEP * (np.arange(len(truth)) == i))
         points += [truth * factor, truth / factor]
-    runs = [(point, flight.truth[first].copy(), np.diag(np.square(start_sd))) for point in points]
+    runs = [(point, flight.truth[first].copy(), np.diag(np.square(START_SD))) for point in points]
     information, score = np.zeros((len(free), len(free))), np.zeros(len(free))
     for begin in range(0, len(y), CHUNK_ROWS):
         end = min(begin + CHUNK_ROWS, len(y))

@@ -83,7 +83,8 @@ def run_task(task: Task, settings: Settings) -> dict[str, Any]:
         ("table1", "filter"): _table1,
         ("offline", "published"): _offline_published,
         ("offline", "crazyem"): _offline_crazyem,
-        ("offline", "bound"): _offline_bound,
+        # of the whole flight; the methods' flights are the same, so it stands once for both
+        ("offline", "bound"): lambda task, of: _bounds(fly(of, task.seed), task.sensor, 0, of.steps + 1),
         ("online", "published"): _online_published,
         ("online", "crazyem"): _online_crazyem,
     }[task.experiment, task.method]
@@ -142,11 +143,6 @@ def _offline_crazyem(task: Task, settings: Settings) -> dict[str, Any]:
         "final": short(fit.value), "sd": short(fit.sd), "ci95": short(fit.ci95), "converged": bool(fit.converged),
         "theta": None if history is None or not len(history) else short(np.asarray(history)[:, :4]),
     }  # fmt: skip
-
-
-def _offline_bound(task: Task, settings: Settings) -> dict[str, Any]:
-    """Of the whole flight; the methods' flights are the same, so it stands once for both."""
-    return _bounds(fly(settings, task.seed), task.sensor, 0, settings.steps + 1)
 
 
 def _bounds(flight: Flight, sensor: str, first: int, last: int) -> dict[str, Any]:

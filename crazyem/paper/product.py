@@ -6,7 +6,6 @@ nor noise: the paper's cold start (eq. 116, 117) stands where the vehicle file's
 """
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -128,7 +127,8 @@ def product_offline(
     begin = time.perf_counter()
     estimate = estimator.finish()
     seconds = time.perf_counter() - begin
-    trace = np.array([theta[:4] for theta in _trace(estimator)]).reshape(-1, 4)
+    # parameters before each full pass of the last convergence, and at its end, where the estimator keeps them
+    trace = np.array([theta[:4] for theta in getattr(estimator, "trace", ())]).reshape(-1, 4)
     said = [estimate[name] for name in PARAMETERS]
     return Fit(
         value=np.array([p.value for p in said]),
@@ -140,11 +140,6 @@ def product_offline(
         noise=dict(estimate.noise),
         seconds=seconds,
     )
-
-
-def _trace(estimator: OnlineEstimator) -> Sequence[NDArray]:
-    """Parameters (9,) before each full pass of the last convergence, and at its end, where the estimator keeps them."""
-    return getattr(estimator, "trace", ())
 
 
 class ProductOnline:

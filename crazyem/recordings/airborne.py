@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crazyem.recordings.finding import intervals_of
 from crazyem.recordings.ordering import Array, Flags, Intervals, common, inside, ordered, thinned
-from crazyem.recordings.recording import Recording, SignalArray
+from crazyem.recordings.recording import Recording
 
 SHORTEST_FLIGHT = 0.4  # s of lift; less is a hop or a test of the rotors
 LONGEST_FALL = 0.6  # s without lift that a manoeuvre may have
@@ -363,10 +362,6 @@ def _parted(start: float, end: float, hits: Array) -> list[tuple[float, float]]:
 
 
 def _all_time(recording: Recording) -> Intervals:
-    times: list[NDArray[np.float64]] = [_finite(array) for array in recording.signals.values()]
-    times = [t for t in times if t.size]
+    finite = [array.time[np.isfinite(array.time)] for array in recording.signals.values()]
+    times = [t for t in finite if t.size]
     return ((float(min(t.min() for t in times)), float(max(t.max() for t in times))),) if times else ()
-
-
-def _finite(array: SignalArray) -> Array:
-    return array.time[np.isfinite(array.time)]

@@ -129,9 +129,8 @@ def _answer(decided: str | None, reason: str, given: str | None, evidence: dict[
     if decided is None and given is None:
         either = f"{_MEANING_NAMES['duty']}, or {_MEANING_NAMES['request']}"
         text = f"What motor.m1..4 is cannot be told ({reason}): it may be {either}."
-        finding = Finding(
-            "motor_meaning", Grade.DEGRADES, text, evidence=evidence, advice="Say --motor duty or --motor request."
-        )
+        grade = Grade.DEGRADES
+        finding = Finding("motor_meaning", grade, text, "", (), evidence, "Say --motor duty or --motor request.")
         return Meaning(None, reason, evidence, (finding,))
     if decided is None:
         reason = f"said by the user; {reason}"

@@ -199,14 +199,9 @@ def finding(faults: Sequence[Fault], signals: Iterable[str] = ()) -> list[Findin
     evidence = {"records": float(count), "streams": float(len(faults))}
     if moved:
         evidence["shift_s"] = moved[0].example
-    found = Finding(
-        STAMP_CHECK,
-        Grade.DEGRADES if grave else Grade.HARMLESS,
-        f"Stamps that cannot be: {'; '.join(said)}.",
-        evidence=evidence,
-        advice=advice,
-        fix=Fix(STAMP_CHECK, names) if names else None,
-    )
+    text = f"Stamps that cannot be: {'; '.join(said)}."
+    fix = Fix(STAMP_CHECK, names) if names else None
+    found = Finding(STAMP_CHECK, Grade.DEGRADES if grave else Grade.HARMLESS, text, "", (), evidence, advice, fix)
     return [found]
 
 

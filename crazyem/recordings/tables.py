@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.recordings.recording import SignalArray
+from crazyem.recordings.topics import Topic
 from crazyem.signals.firmware_units import unit_of
 from crazyem.signals.sample import SIGNALS
 from crazyem.signals.vocabulary import DUTY_SOURCES, REQUEST_SOURCES, SOURCES, Source
@@ -16,24 +17,13 @@ MOTOR_MEANINGS = ("duty", "request")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Table:
-    """Rows of variables that were sampled together: a log block, a uSD event, a topic.
+class Table(Topic):
+    """Rows of firmware variables that were sampled together: a log block, a uSD event, a topic.
 
     Attributes:
-        name: of the table; becomes the `stream` of its signals.
-        columns: firmware variable -> (n,) raw values, firmware units, in the type they were stored in.
-        time: (n,) s.
-        order: (n,) position of each row among the rows of all tables of the recording, as processed.
-        host_time: (n,) s since the epoch, None where unknown.
-        clock: as in `SignalArray`.
         ctypes: firmware variable -> C type, where known.
     """
 
-    name: str
-    columns: Mapping[str, NDArray[np.generic]]
-    time: NDArray[np.float64]
-    order: NDArray[np.int64]
-    host_time: NDArray[np.float64] | None = None
     clock: str = "firmware"
     ctypes: Mapping[str, str] = field(default_factory=dict)
 

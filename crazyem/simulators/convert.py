@@ -237,7 +237,8 @@ def _omissions(
         if same(full, held, quantities) or (name == "arm" and full.arm_x is None):
             continue
         silent = all(getattr(held, q) is None for q in quantities)
-        why = "the file has no field for it" if silent else f"the file says {_said(held, quantities)}"
+        said = ", ".join(f"{held.or_(q, 0.0):.3g}" for q in quantities)
+        why = "the file has no field for it" if silent else f"the file says {said}"
         if name == "arm" and silent:
             continue  # of rotors, below
         changed: dict[str, Any] = {q: held.or_(q, 0.0) for q in quantities}
@@ -276,10 +277,6 @@ def same(first: Constants, second: Constants, quantities: tuple[str, ...]) -> bo
     # products of inertia are small or large against moments, not against themselves
     scale = max(scale, 1e-6 * first.or_("inertia_xx", 0.0)) if quantities[0] == "inertia_xy" else scale
     return all(abs(a - b) <= max(HELD * scale, floor) for a, b in pairs)
-
-
-def _said(c: Constants, quantities: tuple[str, ...]) -> str:
-    return ", ".join(f"{c.or_(q, 0.0):.3g}" for q in quantities)
 
 
 def known_formats() -> dict[str, str]:

@@ -83,7 +83,8 @@ def sample(
             drawn = _drawn(vehicle, posterior.parameters, theta)
             if days:
                 drawn = _another_day(drawn, rng)
-            drawn = rescaled(drawn, from_mass(drawn) * math.exp(mass_sd * rng.standard_normal()))
+            mass = from_vehicle(drawn)[0].or_("mass", drawn.mass)  # of the whole drone
+            drawn = rescaled(drawn, mass * math.exp(mass_sd * rng.standard_normal()))
             if _possible(drawn):
                 break
         else:
@@ -93,11 +94,6 @@ def sample(
         vehicles.append(drawn)
         draws.append(theta)
     return VehicleSample(tuple(vehicles), posterior.parameters, np.array(draws), seed)
-
-
-def from_mass(vehicle: Vehicle) -> float:
-    """The mass of the whole drone [kg]."""
-    return from_vehicle(vehicle)[0].or_("mass", vehicle.mass)
 
 
 def _check(posterior: Posterior, vehicle: Vehicle) -> None:

@@ -206,14 +206,12 @@ class Link:
             return
         share = self.lost / (self.lost + self.received)
         places = zip(time(self.before).tolist(), time(self.after).tolist(), strict=True)
-        yield Finding(
-            "gaps",
-            Grade.HARMLESS if share < 0.02 else Grade.DEGRADES,
+        text = (
             f"By their sequence numbers at least {self.lost} messages of the vehicle never reached the log "
-            f"({100.0 * share:.1f} %).",
-            intervals=tuple(places),
-            evidence={"lost": float(self.lost), "received": float(self.received), "share": share},
+            f"({100.0 * share:.1f} %)."
         )
+        evidence = {"lost": float(self.lost), "received": float(self.received), "share": share}
+        yield Finding("gaps", Grade.HARMLESS if share < 0.02 else Grade.DEGRADES, text, "", tuple(places), evidence)
 
 
 def link(found: Frameset, system: int, component: int, starts: NDArray[np.int64]) -> Link:

@@ -29,18 +29,10 @@ from crazyem.signals.mavlink import RPM_IN_RAD_PER_S, mapping
 ARMED = 128  # in HEARTBEAT.base_mode
 
 
-def _quaternions_of_angles(columns: Columns) -> NDArray[np.float64]:
-    return quaternion_from_euler(*euler(columns).T)
-
-
 def _cells(columns: Columns) -> NDArray[np.float64]:
     """V of a battery from its cells [mV]; 65535 is a cell that is not there, 0 one of the extension that is not."""
     cells = stacked(columns)
     return np.where(cells == 65535, 0.0, cells).sum(axis=1, keepdims=True) * 1e-3
-
-
-def _in_air(columns: Columns) -> NDArray[np.float64]:
-    return (stacked(columns) >= 2).astype(float)
 
 
 def _armed(columns: Columns) -> NDArray[np.float64]:
@@ -64,9 +56,9 @@ def _masked(bits: int, *, local: bool = False) -> Callable[[Topic], NDArray[np.b
 def _shared(signal: str, message: str) -> Source:
     """What a live link reads from a message, read from a log the same way."""
     row = mapping(signal, message)
-    turned = {"vector": vectors, "quaternion": quaternions, "angles": _quaternions_of_angles}[row.kind]
+    kinds = {"vector": vectors, "quaternion": quaternions, "angles": lambda c: quaternion_from_euler(*euler(c).T)}
     frame = {"position": WORLD, "velocity": WORLD, "attitude": ATTITUDE}.get(signal, BODY)
-    return Source(signal, message, row.fields, scaled(row.factor, turned), frame=frame)
+    return Source(signal, message, row.fields, scaled(row.factor, kinds[row.kind]), frame=frame)
 
 
 _XYZ = named("*", "x y z")
@@ -106,7 +98,7 @@ TLOG_SIGNALS: tuple[Source, ...] = (
         "flying",
         "EXTENDED_SYS_STATE",
         ("landed_state",),
-        _in_air,
+        lambda columns: (stacked(columns) >= 2).astype(float),
         _equal("landed_state", 0),
         frame="1 while in the air, taking off or landing",
     ),

@@ -227,16 +227,10 @@ def _integrity(sound: Scan, topics: list[Topic], log: "ULog") -> list[Finding]:
     if log.dropouts:
         intervals = tuple((d.timestamp / 1e6, d.timestamp / 1e6 + d.duration / 1e3) for d in log.dropouts)
         total, longest = sum(d.duration for d in log.dropouts) / 1e3, max(d.duration for d in log.dropouts) / 1e3
-        found.append(
-            Finding(
-                "gaps",
-                Grade.DEGRADES,
-                f"The logger dropped messages {len(intervals)} times, {total:.3f} s in all, {longest:.3f} s at most.",
-                intervals=intervals[:1000],
-                evidence={"dropouts": float(len(intervals)), "total_s": total, "longest_s": longest},
-                advice="Log fewer topics or use a faster card; do not fit across the gaps.",
-            )
-        )
+        text = f"The logger dropped messages {len(intervals)} times, {total:.3f} s in all, {longest:.3f} s at most."
+        evidence = {"dropouts": float(len(intervals)), "total_s": total, "longest_s": longest}
+        advice = "Log fewer topics or use a faster card; do not fit across the gaps."
+        found.append(Finding("gaps", Grade.DEGRADES, text, "", intervals[:1000], evidence, advice))
     return found
 
 

@@ -175,7 +175,8 @@ def scan(data: bytes) -> Scan:
         found.skipped.append((position, again - position))
         start = position = again
     kept.append(view[start:size])
-    found.data = data if whole and len(kept) == 1 else b"".join([_plain_header(data), *kept])
+    header = data[:7] + b"\x01" + data[8:HEADER_BYTES]  # without the mark of appended data
+    found.data = data if whole and len(kept) == 1 else b"".join([header, *kept])
     return found
 
 
@@ -291,8 +292,3 @@ def unknown_flags(data: bytes) -> bool:
         return False
     flags = data[HEADER_BYTES + 11 : HEADER_BYTES + 19]
     return bool(flags[0] & ~1) or any(flags[1:])
-
-
-def _plain_header(data: bytes) -> bytes:
-    """The file's header without the mark of appended data."""
-    return data[:7] + b"\x01" + data[8:HEADER_BYTES]

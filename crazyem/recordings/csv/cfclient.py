@@ -26,6 +26,7 @@ from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.stamps import Fault, finding_in
 from crazyem.recordings.tables import Table, signals_from_tables
+from crazyem.recordings.topics import ranks
 
 _VARIABLE = re.compile(r"[A-Za-z_]\w*\.[\w\[\]]+")
 _FILE_NAME = re.compile(r"(.+)-(\d{8}T\d\d-\d\d-\d\d)\.csv(\.gz)?")
@@ -309,19 +310,15 @@ def _tables(parts: Sequence[_Part]) -> list[Table]:
         blocks.setdefault((part.block, part.variables), []).append(part)
     stamps = [np.concatenate([p.stamp for p in group]) for group in blocks.values()]
     # rows of a file stay in order, even where its clock jumps back
-    keys = np.concatenate([np.maximum.accumulate(s) for s in stamps])
-    order = np.empty(keys.size, np.int64)
-    order[np.argsort(keys, kind="stable")] = np.arange(keys.size)
+    orders = ranks([np.maximum.accumulate(s) for s in stamps])
     tables: list[Table] = []
     names: set[str] = set()
-    at = 0
-    for ((block, variables), group), stamp in zip(blocks.items(), stamps, strict=True):
+    for ((block, variables), group), stamp, order in zip(blocks.items(), stamps, orders, strict=True):
         name = block if block not in names else f"{block}#{len(names) + 1}"
         names.add(name)
         values = np.concatenate([p.values for p in group])
         columns = {variable: values[:, i] for i, variable in enumerate(variables)}
-        tables.append(Table(name, columns, stamp / 1000.0, order[at : at + stamp.size]))
-        at += stamp.size
+        tables.append(Table(name, columns, stamp / 1000.0, order))
     return tables
 
 

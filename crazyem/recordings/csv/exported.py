@@ -199,7 +199,8 @@ class _Table:
             try:
                 table = pa_csv.read_csv(pa.py_buffer(rows), reading, convert_options=converting)
             except pa.ArrowException as error:
-                raise FileFormatError(f"{self.path}: a line cannot be read ({_sentence(error)}).") from None
+                why = str(error).strip().rstrip(".")[:200]
+                raise FileFormatError(f"{self.path}: a line cannot be read ({why}).") from None
             for batch in table.to_batches():
                 yield batch, first
                 first += batch.num_rows
@@ -254,7 +255,3 @@ def _vocabulary_entry(names: list[str]) -> SignalEntry | None:
         if parts and base.split("@")[0] == quantity and names[:count] == [f"{base}_{part}" for part in parts]:
             return SignalEntry(base, parts, quantity, unit, frame, "", "", tuple(names[:count]))
     return None
-
-
-def _sentence(error: Exception) -> str:
-    return str(error).strip().rstrip(".")[:200]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from crazyem.errors import FileFormatError
 from crazyem.recordings.contents import GrowingArray
 from crazyem.recordings.csv.interpolation import CONTEXT_ROWS
-from crazyem.recordings.csv.mapping import CsvMapping, SignalColumns
+from crazyem.recordings.csv.mapping import CsvMapping
 from crazyem.recordings.csv.signals import Layout, Rows, signals_of
 from crazyem.recordings.csv.text import Columns, Damage, Header, read_columns
 from crazyem.recordings.finding import Finding, Grade, note
@@ -88,7 +88,8 @@ def read_wide_parts(
     number = 0
     for part, after, ends in _parts(plan, damage, seconds):
         rows = next(iter(part.values())).size
-        window = _concatenated([b for b in (before, part, after) if b])
+        blocks = [block for block in (before, part, after) if block]
+        window = {c: np.concatenate([block[c] for block in blocks]) for c in part}
         lead = next(iter(before.values())).size if before else 0
         total = next(iter(window.values())).size
         stamp = _stamps(plan, window, total, number - lead)
@@ -143,10 +144,6 @@ def _cut(plan: _Plan, held: _Held, number: int, seconds: float, neighbours: int)
     return cut if cut + neighbours <= held.rows else None
 
 
-def _concatenated(parts: list[Columns]) -> Columns:
-    return {c: np.concatenate([part[c] for part in parts]) for c in parts[0]}
-
-
 def _origin(plan: _Plan) -> float:
     """The first stamp if all stamps can be told from their distance to it, else 0: one pass over the stamps alone."""
     if plan.stamp is None:
@@ -185,7 +182,9 @@ def _planned(path: Path, header: Header, mapping: CsvMapping, as_published: bool
         for name, s in given.items()
         if not present.issuperset(s.columns)
     ]
-    signals = _in_order({n: s for n, s in given.items() if present.issuperset(s.columns)})
+    # the vocabulary's own signals first, in its order, as the live loop sees them; then further measurements
+    ranked = [*(n for n in SIGNALS if n in given), *(n for n in given if n not in SIGNALS)]
+    signals = {n: given[n] for n in ranked if present.issuperset(given[n].columns)}
     if not signals and given:
         name, source = next(iter(given.items()))
         gone = next(c for c in source.columns if c not in present)
@@ -234,12 +233,6 @@ def _planned(path: Path, header: Header, mapping: CsvMapping, as_published: bool
     }
     layout = Layout(signals, raw, {p: members for p, members in packets.items() if members}, mapping.clock)
     return _Plan(path, header, mapping, layout, stamp, tuple(needed), wanted, tuple(notes), as_published)
-
-
-def _in_order(signals: dict[str, SignalColumns]) -> dict[str, SignalColumns]:
-    """The vocabulary's own signals first, in its order, as the live loop sees them; then further measurements."""
-    first = [name for name in SIGNALS if name in signals]
-    return {name: signals[name] for name in [*first, *(n for n in signals if n not in SIGNALS)]}
 
 
 def _recording(plan: _Plan, rows: Rows, damage: Damage, *, last: bool) -> Recording:

@@ -236,17 +236,11 @@ def join(sessions: Iterable[Mapping[str, SignalArray]]) -> dict[str, SignalArray
     after = 0
     for signals in sessions:
         for name, unmoved in signals.items():
-            array = _moved(unmoved, after)
+            array = replace(unmoved, order=unmoved.order + after) if after else unmoved
             before = joined.get(name)
             joined[name] = array if before is None else _appended(before, array)
         after = max((int(a.order.max()) + 1 for a in joined.values() if a.order.size), default=0)
     return joined
-
-
-def _moved(array: SignalArray, after: int) -> SignalArray:
-    if not after or not array.order.size:
-        return array
-    return replace(array, order=array.order + after)
 
 
 def _appended(a: SignalArray, b: SignalArray) -> SignalArray:

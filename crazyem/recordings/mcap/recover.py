@@ -140,7 +140,9 @@ def _messages(output: Output, part: Part, report: Report) -> None:
     """A chunk goes over as it stands, byte for byte; records outside chunks into chunks."""
     assert part.scan is not None
     messages = part.scan.messages
-    defined = np.isin(messages[:, 2], _defined(output))
+    book = output.book
+    known = [c.id for c in book.channels.values() if c.schema_id == 0 or c.schema_id in book.schemas]
+    defined = np.isin(messages[:, 2], known)  # messages that a reader can decode, as far as announced
     if not defined.all():
         why = f"{int((~defined).sum())} messages of channels that nothing announces any more"
         report.problems.append(Problem(Loss.DAMAGED, part.record.offset, part.record.end, why))
@@ -159,12 +161,6 @@ def _messages(output: Output, part: Part, report: Report) -> None:
         output.chunk(chunk.compression, bytes(chunk.packed), size=chunk.size, crc=chunk.crc, index=index)
     else:
         output.messages(part.scan.data.tobytes(), index)
-
-
-def _defined(output: Output) -> list[int]:
-    """Channels whose messages a reader can decode, as far as announced."""
-    schemas = output.book.schemas
-    return [c.id for c in output.book.channels.values() if c.schema_id == 0 or c.schema_id in schemas]
 
 
 def _rewrite(output: Output, scan: Scan, messages: NDArray[np.int64]) -> None:

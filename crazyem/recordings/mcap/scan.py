@@ -205,13 +205,10 @@ def parse_chunk(data: bytes) -> PackedChunk:
     return PackedChunk(start, end, size, crc, compression, memoryview(data)[at:])
 
 
-def unpack(chunk: PackedChunk, *, limit: int = LARGEST_CHUNK) -> bytes:
-    """The records of a chunk, unpacked and checked; never more than `limit` bytes of memory.
-
-    Raises: ValueError, with the reason.
-    """
-    if chunk.size > limit:
-        raise ValueError(f"a chunk claims {chunk.size} bytes, more than {limit}")
+def unpack(chunk: PackedChunk) -> bytes:
+    """The records of a chunk, unpacked and checked. Raises ValueError, with the reason."""
+    if chunk.size > LARGEST_CHUNK:
+        raise ValueError(f"a chunk claims {chunk.size} bytes, more than {LARGEST_CHUNK}")
     if chunk.compression == "zstd":
         data = _unpack_zstd(chunk)
     elif chunk.compression == "lz4":

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crazyem.atomic_file import new_file
-from crazyem.recordings.finding import Finding, Grade
+from crazyem.recordings.finding import Grade
 from crazyem.recordings.mcap import schemas
 from crazyem.recordings.mcap.findings import IMPORT_METADATA, findings_to_json
 from crazyem.recordings.mcap.messages import (
@@ -32,6 +32,7 @@ from crazyem.recordings.mcap.output import Output
 from crazyem.recordings.mcap.scan import MESSAGE, MESSAGE_HEAD
 from crazyem.recordings.mcap.stream_codec import MOST_FIELDS, MOST_SIGNALS, Column, StreamLayout, unique_name
 from crazyem.recordings.recording import Event, Recording, SignalArray
+from crazyem.recordings.topics import ranks
 
 _EPOCH_RANGE = (9.0e8, 4.2e9)  # s: stamps between 1998 and 2103 are taken for times since 1970
 _LOG_LEVELS = {Grade.HARMLESS: 2, Grade.DEGRADES: 3, Grade.UNUSABLE: 4}  # of foxglove.Log
@@ -63,26 +64,16 @@ def _write(recording: Recording, output: Output) -> None:
     output.metadata(IMPORT_METADATA, own)
     for section, entries in recording.metadata.items():
         output.metadata(section, entries)
-    ranks = _ranks(recording.signals)
-    streams = [_Stream(output, group) for group in _groups(recording.signals, ranks)]
+    # place of each sample among all samples of the recording, in processing order
+    places = dict(zip(recording.signals, ranks([array.order for array in recording.signals.values()]), strict=True))
+    streams = [_Stream(output, group) for group in _groups(recording.signals, places)]
     clock = _Clock(recording, streams)
-    extras = [*_poses(output, recording, ranks, clock), *_events(output, recording, clock), *_notes(output, recording)]
+    extras = [*_poses(output, recording, places, clock), *_events(output, recording, clock), *_notes(output, recording)]
     _Merge(output, streams, extras, clock).write()
     output.finish()
 
 
 # --- which signals share messages -------------------------------------------------------------------------------------
-
-
-def _ranks(signals: Mapping[str, SignalArray]) -> dict[str, NDArray[np.int64]]:
-    """Place of each sample among all samples of the recording, in processing order."""
-    if not signals:
-        return {}
-    order = np.concatenate([array.order for array in signals.values()])
-    ranks = np.empty(order.size, np.int64)
-    ranks[np.argsort(order, kind="stable")] = np.arange(order.size)
-    ends = np.cumsum([array.order.size for array in signals.values()])
-    return dict(zip(signals, np.split(ranks, ends[:-1]), strict=True))
 
 
 class _Group:
@@ -118,17 +109,17 @@ def _same_bits(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
     return np.array_equal(np.ascontiguousarray(a).view(np.int64), np.ascontiguousarray(b).view(np.int64))
 
 
-def _groups(signals: Mapping[str, SignalArray], ranks: Mapping[str, NDArray[np.int64]]) -> list[_Group]:
+def _groups(signals: Mapping[str, SignalArray], places: Mapping[str, NDArray[np.int64]]) -> list[_Group]:
     """Groups in order of their first sample, which is the order of the channels."""
     index = {name: i for i, name in enumerate(signals)}
     groups: list[_Group] = []
-    for name in sorted(signals, key=lambda n: (int(ranks[n][0]) if ranks[n].size else -1, index[n])):
+    for name in sorted(signals, key=lambda n: (int(places[n][0]) if places[n].size else -1, index[n])):
         array = signals[name]
         # the newest group of a stream only: its neighbours in the processing order come one after the other
         newest = next((g for g in reversed(groups) if g.stream == array.stream), None)
-        if newest is None or not newest.takes(array, ranks[name]):
+        if newest is None or not newest.takes(array, places[name]):
             newest = _Group(array.stream)
-            newest.base = ranks[name]
+            newest.base = places[name]
             groups.append(newest)
         newest.names.append(name)
         newest.indices.append(index[name])
@@ -307,7 +298,9 @@ def _channel(output: Output, topic: str, schema_name: str) -> int:
     return output.channel(topic, "protobuf", schema)
 
 
-def _poses(output: Output, recording: Recording, ranks: Mapping[str, NDArray[np.int64]], clock: _Clock) -> list[_Extra]:
+def _poses(
+    output: Output, recording: Recording, places: Mapping[str, NDArray[np.int64]], clock: _Clock
+) -> list[_Extra]:
     """foxglove.PoseInFrame and FrameTransform at 25 Hz, for the 3D panels of viewers; never read back."""
     position, attitude = recording.signals.get("position"), recording.signals.get("attitude")
     if position is None or attitude is None or not position.time.size or not attitude.time.size:
@@ -315,17 +308,17 @@ def _poses(output: Output, recording: Recording, ranks: Mapping[str, NDArray[np.
     if position.value.shape[1] != 3 or attitude.value.shape[1] != 4:
         return []
     whole = np.asarray(np.isfinite(attitude.value).all(axis=1))
-    turns = np.argsort(ranks["attitude"])
+    turns = np.argsort(places["attitude"])
     turns = turns[whole[turns]]
     log_times = clock.of(position.time, position.host_time)
-    known = ranks["attitude"][turns]
+    known = places["attitude"][turns]
     extras, newest = [], -math.inf
-    for row in np.argsort(ranks["position"]).tolist():
+    for row in np.argsort(places["position"]).tolist():
         time = float(position.time[row])
         if not abs(time - newest) >= POSE_PERIOD:
             continue
         # the attitude known by then; the sample after the position if it was taken at the same time
-        at = int(np.searchsorted(known, ranks["position"][row] + 1, side="right")) - 1
+        at = int(np.searchsorted(known, places["position"][row] + 1, side="right")) - 1
         if at < 0 or not np.isfinite(position.value[row]).all():
             continue
         newest = time
@@ -333,7 +326,7 @@ def _poses(output: Output, recording: Recording, ranks: Mapping[str, NDArray[np.
         rotation = dict(zip("xyzw", attitude.value[turns[at]].tolist(), strict=True))
         translation = dict(zip("xyz", position.value[row].tolist(), strict=True))
         nanoseconds = int(min(max(stamp, 0.0), 9.0e18))
-        key = float(ranks["position"][row]) + 0.25
+        key = float(places["position"][row]) + 0.25
         for topic, schema, fields in pose_messages(nanoseconds, translation, rotation):
             data = schemas.message_class(schema)(**fields).SerializeToString()
             extras.append(_Extra(_channel(output, topic, schema), data, key=key, log_time=nanoseconds))
@@ -382,13 +375,9 @@ def _notes(output: Output, recording: Recording) -> list[_Extra]:
         fields = {
             "timestamp": {},
             "level": _LOG_LEVELS[finding.grade],
-            "message": _line(finding),
+            "message": f"{finding.signal}: {finding.text}" if finding.signal else finding.text,
             "name": finding.check,
         }
         data = schemas.message_class("foxglove.Log")(**fields).SerializeToString()
         extras.append(_Extra(_channel(output, FINDINGS_TOPIC, "foxglove.Log"), data, log_time=0))
     return extras
-
-
-def _line(finding: Finding) -> str:
-    return f"{finding.signal}: {finding.text}" if finding.signal else finding.text

@@ -144,7 +144,7 @@ def recording_of(
         (
             *findings,
             *_damage(decoded),
-            *_stamp_faults(decoded, signals),
+            *finding_in([d.fault() for d in decoded if d.moved and d.clock == HOST_CLOCK], signals),
             *clock_notes,
             *log_notes,
             *meaning.findings,
@@ -164,20 +164,14 @@ def _damage(decoded: Sequence[_Decoded]) -> list[Finding]:
     ]
 
 
-def _stamp_faults(decoded: Sequence[_Decoded], signals: Mapping[str, SignalArray]) -> list[Finding]:
-    """Stamps of the host's clock that were not believed."""
-    return finding_in([d.fault() for d in decoded if d.moved and d.clock == HOST_CLOCK], signals)
-
-
 _PREFERRED = {"mocap": 1, "tf": 2}
 # crazyflie_server.py: `_log_odom_data_callback` copies gyro.* and stabilizer.pitch as the firmware logs them
-_PYTHON_SERVER = Finding(
-    "mapping",
-    Grade.DEGRADES,
+text = (
     "The odometry looks like that of crazyswarm2's Python server, which wrote rates in deg/s and the firmware's "
-    "inverted pitch; it is read as published.",
-    advice="Run crazyem doctor, which tells from the numbers; prefer log blocks.",
+    "inverted pitch; it is read as published."
 )
+advice = "Run crazyem doctor, which tells from the numbers; prefer log blocks."
+_PYTHON_SERVER = Finding("mapping", Grade.DEGRADES, text, "", (), {}, advice)
 
 
 def _label(d: _Decoded) -> str:

@@ -118,9 +118,8 @@ def integrity(
             "at least one byte is not what was written."
         )
         evidence = {"stored": float(checksum.stored or 0), "computed": float(checksum.computed or 0)}
-        finding = Finding(
-            "integrity", Grade.DEGRADES, text, evidence=evidence, advice="Copy the file from the card again."
-        )
+        grade = Grade.DEGRADES
+        finding = Finding("integrity", grade, text, "", (), evidence, "Copy the file from the card again.")
         return "wrong", [finding]
     text = (
         f"The file was cut off (power lost while logging?): there is no CRC, {left} bytes are left over after "

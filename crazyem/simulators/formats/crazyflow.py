@@ -107,10 +107,6 @@ def _scale(document: TomlDocument, name: str, key: str, wanted: float, rpm: floa
             document.put((name, key, k), value * (wanted / now))
 
 
-def _names(document: TomlDocument) -> list[str]:
-    return [k for k in document.keys(()) if "rpm2thrust" in document.keys((k,))]
-
-
 def _key(name: str) -> str:
     return name if name.replace("_", "").replace("-", "").isalnum() else '"' + name.replace('"', "") + '"'
 
@@ -122,7 +118,7 @@ CRAZYFLOW = Format(
     words="crazyflow's first-principles parameters (TOML)",
     open=TomlDocument,
     recognises=lambda text: "rpm2thrust" in text and "rotor_dyn_coef" in text and "=" in text and "<" not in text[:1],
-    names=_names,
+    names=lambda document: [k for k in document.keys(()) if "rpm2thrust" in document.keys((k,))],
     fields=_fields,
     skeleton=template("crazyflow.toml", named=_key),
     read_more=_read_more,

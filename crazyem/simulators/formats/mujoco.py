@@ -36,10 +36,6 @@ def _motors(document: XmlDocument) -> list[tuple[int, Element]]:
     return [(k, m) for k, m in enumerate(motors) if len(_gear(m)) >= 3 and _gear(m)[2] > 0.0]
 
 
-def _sites(document: XmlDocument) -> dict[str, int]:
-    return {site.name(): k for k, site in enumerate(_body(document)[1].all("site"))}
-
-
 def _fields(document: XmlDocument, name: str) -> list[Field]:
     path, body = _body(document)
     inertial = body.all("inertial")
@@ -58,7 +54,7 @@ def _fields(document: XmlDocument, name: str) -> list[Field]:
     ]
     motors = _motors(document)
     each = len(motors) == 4
-    sites = _sites(document)
+    sites = {site.name(): k for k, site in enumerate(body.all("site"))}
     for k, motor in motors if len(motors) in (1, 4) else []:
         scale = 1.0 / _gear(motor)[2]
         limit = "thrust_max" if each else "total_thrust_max"
