@@ -134,22 +134,6 @@ def test_flights_held_out_are_asked_where_they_can_answer(monkeypatch, expected,
     assert accepted == ([DRAG] if kept else [])
 
 
-@pytest.mark.parametrize(("held", "kept"), [(0.0, True), (-4.9, True), (-5.1, False)])
-def test_what_a_flight_held_out_goes_half_way_to_must_cost_there_to_be_left_out(monkeypatch, held, kept):
-    """A torque scale that should bring 20 nats, of a kind that is always free: none is neither for nor against."""
-    torques = Candidate("torque_scale", (), ("scale",))
-    step = replace(TAKEN, taken=replace(TAKEN.taken, candidate=torques, dispersion=1.0))
-    fitted, bare = (SimpleNamespace(point=POINT, loglik=nats) for nats in (0.0, -90.0))
-    monkeypatch.setattr(prune, "nuisances", lambda *a: [(torques, (1.0,))])
-    monkeypatch.setattr(prune, "expected", lambda *a: 20.0)
-    monkeypatch.setattr(prune, "bare_fit", lambda *a: (bare, -held))
-    monkeypatch.setattr(prune, "on_held_out", lambda *a: SimpleNamespace(loglik=0.0))
-    monkeypatch.setattr(prune, "refine_base", lambda *a, **k: bare)
-    data = SimpleNamespace(loglik=lambda point, passes: 0.0, workers=Workers(1))
-    _, accepted, _ = prune.drop(data, fitted, [torques], [step], SimpleNamespace(), lambda text: None)
-    assert accepted == ([torques] if kept else [])
-
-
 def test_what_no_flight_needs_goes_before_what_one_speaks_against(monkeypatch):
     """A payload of no mass beside a load on a string, which a hover does not confirm while the payload is there."""
     payload, load = (Candidate(n, (), ("mass",)) for n in ("payload", "suspended_load"))

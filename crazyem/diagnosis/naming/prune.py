@@ -26,9 +26,6 @@ ADMITTED = 8.0  # nats of evidence that an effect must bring
 HELD = 1.0  # nats it must bring on flight held out,
 TELLING = 6.0  # if so many are to be expected there; else it must not cost what it must bring
 MISLED = 0.1  # share of its gain that it may cost where it cannot be seen: hovers have biases of their own
-# Share of what it should bring that an effect of a kind that is always free may cost: a flight goes half-way to it by
-# itself and then brings nothing, whether it is there or not
-AGAINST = 0.25
 OTHERWISE = 0.01  # p-value of an effect's being the same size beside what shakes (Hausman 1978)
 APART = 1 / 3  # of its size, at least: sampled commands make some per cent of difference
 FORCES = np.full(3, 0.2)  # m/s^2, where wandering forces begin
@@ -66,7 +63,6 @@ def drop(
     """
     accepted, steps = list(accepted), list(steps)
     kept = [s.taken.candidate for s in steps if s.taken and s.taken.log_odds is not None]  # by other evidence
-    usual = set() if held_out is None else {c.effect for c, _ in nuisances(held_out, fitted.point, ())}
     while accepted:
         here = data.loglik(fitted.point, passes=2)
         held_here = on_held_out(held_out, fitted.point, accepted).loglik if held_out else 0.0
@@ -83,7 +79,7 @@ def drop(
             least = max(TELLING, MISLED * gain) * step.taken.dispersion
             should = np.inf if held_out is None else expected(held_out, fitted, accepted, c)
             if should > least:
-                need = HELD if c.effect not in usual else -AGAINST * should / step.taken.dispersion
+                need = HELD
             brings = gain - len(c.free) + held
             held_up = held + ADMITTED - need if held_out else np.inf
             # what no flight needs goes first: beside a payload of no mass, a load on a string failed on a hover
