@@ -233,13 +233,7 @@ class Guard:
                     changed[name] = value
                 else:  # one step from what it believes now still leads outside
                     reasons[name] = f"the controller believes {self.beliefs[name]:.4g}, too far outside to lead it back"
-        for name, others in self.controller.waits.items():
-            late = [o for o in others if o not in changed and reasons.get(o) != "unchanged"]
-            if not self.controller.attitude_gains:  # of its own each: a policy may leave one, and a refuted one hurries
-                late = [] if self._refuted(name) else [o for o in late if o in self.limits.parameters]
-            if name in changed and late:
-                reasons[name] = f"waits for {late[0]}"
-        changed = {name: value for name, value in changed.items() if not reasons[name]}
+        changed = self._together(changed, reasons)
         if not changed:
             return Decision(time, reason=reasons)
         writes = writes_for(self.controller, changed, beliefs=self.beliefs, originals=self.originals)
@@ -249,6 +243,16 @@ class Guard:
         if "mass" in changed:
             self._step = None
         return Decision(time, writes=writes, reason=reasons)
+
+    def _together(self, changed: Mapping[str, float], reasons: dict[str, str]) -> dict[str, float]:
+        """Without what waits for others (`Controller.waits`), which gets a reason."""
+        for name, others in self.controller.waits.items():
+            late = [o for o in others if o not in changed and reasons.get(o) != "unchanged"]
+            if not self.controller.attitude_gains:  # of its own each: a policy may leave one, and a refuted one hurries
+                late = [] if self._refuted(name) else [o for o in late if o in self.limits.parameters]
+            if name in changed and late:
+                reasons[name] = f"waits for {late[0]}"
+        return {name: value for name, value in changed.items() if not reasons[name]}
 
     def _remember(self, estimate: Estimate, time: float) -> None:
         values = {n: self._found(estimate, n).value for n in self.beliefs}
