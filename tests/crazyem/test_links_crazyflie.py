@@ -48,19 +48,6 @@ def test_tables_and_log_data(fake_peer):
     assert [p.firmware_time_ms for p in packets] == [10 * n for n in range(20)]
 
 
-def test_stamps_are_unwrapped_and_lost_packets_counted(fake_peer):
-    fake_peer.first_stamp = (1 << 24) - 100
-    fake_peer.skip = lambda number: number in (5, 6, 12)
-    with connected(fake_peer) as link:
-        link.subscribe(NAMES, 100.0)
-        packets = collect(link, 30)
-        statistics = link.statistics()
-    assert packets[-1].firmware_time_ms - packets[0].firmware_time_ms == 10 * 32
-    assert statistics.lost == 3
-    assert statistics.received >= 30
-    assert statistics.per_block[0] == (statistics.received, 3, statistics.late)
-
-
 def test_write_is_verified_by_its_echo(fake_peer):
     with connected(fake_peer) as link:
         write = link.write_parameter("ctrlLee.mass", 0.034)
