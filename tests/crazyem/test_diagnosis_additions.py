@@ -26,14 +26,11 @@ def trial(effect: str, gain: float, *, fitted: bool = True, fixed: tuple[tuple[s
 def test_what_keeps_its_gain_is_another_thing() -> None:
     step = Step(
         (
-            trial("thrust_scale", 500.0),
-            trial("payload", 490.0),
-            trial("velocity_scale", 480.0),
-            trial("wind", 100.0, fitted=False),
-            trial("gyro_bias", -3.0),
+            trial("thrust_scale", 500.0), trial("payload", 490.0), trial("velocity_scale", 480.0),
+            trial("wind", 100.0, fitted=False), trial("gyro_bias", -3.0),
         ),
         None,
-    )
+    )  # fmt: skip
     later = [
         trial("payload", 2.0),
         trial("velocity_scale", 300.0),

@@ -258,16 +258,9 @@ anything = st.recursive(
     max_leaves=6,
 )
 KEYS = (
-    "left_free",
-    "mismatch",
-    "where",
-    "effects",
-    "indistinguishable",
-    "would_separate",
-    "unexplained",
-    "fit",
+    "left_free", "mismatch", "where", "effects", "indistinguishable", "would_separate", "unexplained", "fit",
     "not_identifiable",
-)
+)  # fmt: skip
 
 
 @given(st.dictionaries(st.sampled_from((*KEYS, "ranking", "notices", "recordings", "vehicle", "against")), anything))

@@ -154,17 +154,12 @@ def test_a_cut_file_says_so(small, tmp_path):
 @given(
     st.sampled_from(
         [
-            b"",
-            b"\x89MCAP0\r\n",
-            b"ULog\x01\x12\x35",
-            b"\x1f\x8b",
-            b"\x1f\x8b\x08\x00",
-            b"t,px,",
+            b"", b"\x89MCAP0\r\n", b"ULog\x01\x12\x35", b"\x1f\x8b", b"\x1f\x8b\x08\x00", b"t,px,",
             b"host_t,block,fw_ms,name,value\n",
         ]
     ),
     st.binary(max_size=300),
-)
+)  # fmt: skip
 def test_random_bytes_are_no_recording(tmp_path, start, rest):
     path = tmp_path / "noise"
     path.write_bytes(start + rest)
