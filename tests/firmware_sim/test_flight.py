@@ -97,13 +97,6 @@ def test_motors_hover_at_the_voltage_of_the_thrust_curve() -> None:
     assert volts.mean() == pytest.approx(roots[np.abs(roots.imag) < 1e-9].real[0], rel=0.005)
 
 
-@pytest.mark.parametrize(("mass_thrust", "scale"), [(132000.0, 4 * 0.2 * 132000 / 65535), (81919.0, 1.0)])
-def test_mellinger_mass_is_a_mass_only_with_the_right_mass_thrust(mass_thrust: float, scale: float) -> None:
-    flight = boot({"platform": "cf21bl"}, stabilizer__controller=2, ctrlMel__massThrust=mass_thrust, ctrlMel__ki_z=0.0)
-    high = hold(flight, (0, 0, 1.0), 7.0)[-300:, at.POS + 2].mean() - 1.0
-    assert high == pytest.approx(0.0393 * 9.81 * (1 - 1 / scale) / 1.25, abs=0.01)  # kp_z = 1.25 N/m
-
-
 def test_pid_has_no_mass_and_integrates_the_load_away() -> None:
     flight = boot({"vehicle": HEAVY})
     low = hold(flight, (0, 0, 1.0), 4.0)[-50:, at.POS + 2].mean() - 1.0
