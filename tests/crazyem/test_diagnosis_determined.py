@@ -137,7 +137,7 @@ def test_an_axis_without_any_is_no_reason_and_intervals_end_where_the_range_does
 
 @pytest.fixture(scope="module")
 def dragged() -> Data:
-    return Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02)), seconds=8.0), DRONE)])
+    return Data([flight_of(fly(Hidden(drag=(0.02, 0.02, 0.02)), seconds=6.0), DRONE)])
 
 
 def selected(data: Data, *candidates: Candidate, **values: dict[str, float]) -> Selection:
@@ -171,7 +171,7 @@ def test_a_number_at_its_end_is_held_at_none_and_the_others_told(monkeypatch: py
     """A load 40 mm above the rotors; its weight and where it draws the drone are determined."""
     monkeypatch.setattr(deciding, "improbable", lambda chance: "")  # however sure it is
     load = Candidate("payload", (), ("mass", "x", "y", "z"))
-    flown = Data([flight_of(fly(Hidden(thrust=(0.9,) * 4), seconds=8.0), DRONE)])
+    flown = Data([flight_of(fly(Hidden(thrust=(0.9,) * 4), seconds=6.0), DRONE)])
     selection = selected(flown, load, payload={"mass": 0.004, "x": 0.0, "y": 0.0, "z": 0.04})
     values = {**selection.final.effects["payload"], "z": 0.04}
     selection = replace(selection, final=selection.final.with_effects({"payload": values}))
@@ -188,7 +188,7 @@ def test_a_number_at_its_end_is_held_at_none_and_the_others_told(monkeypatch: py
 @pytest.fixture(scope="module")
 def scaled() -> tuple[Recording, Diagnosis]:
     """A flight whose estimate of velocity is a fifth too large, and what is said of it."""
-    flown = fly(seconds=8.0)
+    flown = fly(seconds=6.0)
     velocity = flown.signals["velocity"]
     flown = replace(flown, signals={**flown.signals, "velocity": replace(velocity, value=velocity.value * 1.2)})
     filed = replace(DRONE, effects={"linear_drag": {"x": 1e-4}})

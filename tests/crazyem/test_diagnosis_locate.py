@@ -12,7 +12,7 @@ from crazyem.diagnosis.locating.locate import Located, locate
 
 def located(hidden: Hidden, seed: int) -> Located:
     """Of the nominal model; the drone's yaw swings by 0.8 rad."""
-    data = Data([flight_of(fly(hidden, seed=seed, seconds=8.0), DRONE)])
+    data = Data([flight_of(fly(hidden, seed=seed, seconds=6.0), DRONE)])
     return locate(data, nominal(data, Point(DRONE, {}, first_guess())))
 
 
