@@ -73,7 +73,8 @@ DIAGNOSIS: dict[str, set[str]] = {
 
 # Finer than folders: the only modules that a part may import from another. Each says what the exception is for.
 ONLY: dict[tuple[str, str], set[str]] = {
-    ("recordings", "links"): {"crazyem.links.base", "crazyem.links.clock"},  # a type, and 24-bit stamps
+    # a type, 24-bit stamps, and how MAVLink frames are found and checked
+    ("recordings", "links"): {"crazyem.links.base", "crazyem.links.clock", "crazyem.links.mavlink.frames"},
     ("recordings", "estimation"): {"crazyem.estimation.result"},  # the type it writes
 }
 
