@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.doctor.streams import Cadence, Stream, cadence, listed, longest, sole, streams
+from crazyem.doctor.streams import Stream, cadence, listed, longest, sole, streams
 from crazyem.recordings.finding import Finding, Fix, Grade, percent
 from crazyem.recordings.recording import Recording
 from crazyem.recordings.stamps import RESTART_SECONDS
@@ -152,14 +152,11 @@ def _rate(
     nominal = claimed if claimed is not None else min(_USUAL_RATES, key=lambda rate: abs(math.log(real / rate)))
     deviation = real / nominal - 1.0
     limit = WRONG_RATE_DEVIATION if claimed is None else math.inf
-    if max(RATE_DEVIATION, 4.0 * _uncertainty(time, rhythm)) < abs(deviation) < limit:
+    # relative error of the period: windows of sixteen samples, each as uncertain as the jitter
+    uncertainty = rhythm.jitter / (rhythm.period * 16.0 * math.sqrt(max(time.size / 16.0, 1.0)))
+    if max(RATE_DEVIATION, 4.0 * uncertainty) < abs(deviation) < limit:
         key = next((k for k in rates if k[0] == nominal and abs(k[1] / real - 1.0) < 5e-4), (nominal, real))
         rates.setdefault(key, []).append(stream.name)
-
-
-def _uncertainty(time: Column, rhythm: Cadence) -> float:
-    """Relative error of the period: windows of sixteen samples, each as uncertain as the jitter."""
-    return rhythm.jitter / (rhythm.period * 16.0 * math.sqrt(max(time.size / 16.0, 1.0)))
 
 
 def _claimed(metadata: Mapping[str, Mapping[str, str]], stream: str, real: float) -> float | None:

@@ -112,16 +112,16 @@ def _specific_force(name: str, array: SignalArray, recording: Recording, attitud
         valid = acceleration.valid & attitude.valid
         kinematic = acceleration.value
         force = kinematic + GRAVITY * UP
+        turned = rotate(attitude.value, force, inverse=True)
         candidates = {
-            "body": (0, Track(rotate(attitude.value, force, inverse=True), valid)),
+            "body": (0, Track(turned, valid)),
             "world": (1, Track(force, valid)),
             "body, gravity removed": (1, Track(rotate(attitude.value, kinematic, inverse=True), valid)),
-            "turned twice": (2, Track(_twice(attitude.value, force), valid)),
+            "turned twice": (2, Track(rotate(attitude.value, turned, inverse=True), valid)),
             "world, gravity removed": (2, Track(kinematic, valid)),
         }
-        one = compare_hypotheses(
-            array, grid, f"{pose.name} and motion", candidates, width=_width(array, pose, moving), least=LEAST_FORCE_RMS
-        )
+        width, source = max(FORCE_WINDOW, width_for(array, pose.array, moving)), f"{pose.name} and motion"
+        one = compare_hypotheses(array, grid, source, candidates, width=width, least=LEAST_FORCE_RMS)
         if one is not None:
             looks.append(one)
     looks.sort(key=lambda one: -one.explained)
@@ -132,14 +132,6 @@ def _specific_force(name: str, array: SignalArray, recording: Recording, attitud
         level, error = _level(seen)
         return _judge_level(name, level, error, seen)
     return _by_weight(name, array, attitudes)
-
-
-def _twice(attitude: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    return rotate(attitude, rotate(attitude, vector, inverse=True), inverse=True)
-
-
-def _width(array: SignalArray, pose: Pose, moving: SignalArray) -> float:
-    return max(FORCE_WINDOW, width_for(array, pose.array, moving))
 
 
 def _level(seen: Comparison) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from typing import Any
 
 from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import ParameterWrite
-from crazyem.links.retry import replies, send
+from crazyem.links.requests import replies, send
 
 _READ_CHANNEL = 1
 _WRITE_CHANNEL = 2

@@ -222,12 +222,11 @@ def _within_bounds(raw: list[tuple[Topic, str]]) -> tuple[list[tuple[Topic, str]
     if len(kept) == len(raw):
         return raw, []
     first = next(f"{t.name}.{c}" for i, (t, c) in enumerate(raw) if i not in kept)
-    finding = note(
-        "mapping",
+    text = (
         f"{len(raw) - len(kept)} of {len(raw)} columns without a meaning here were left out to bound memory, "
-        f"the first is {first}.",
-        left_out=float(len(raw) - len(kept)),
+        f"the first is {first}."
     )
+    finding = note("mapping", text, left_out=float(len(raw) - len(kept)))
     return [pair for i, pair in enumerate(raw) if i in kept], [finding]
 
 

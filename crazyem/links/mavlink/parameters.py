@@ -13,7 +13,7 @@ from typing import Any
 
 from crazyem.errors import LinkError, UsageError
 from crazyem.links.base import ParameterWrite
-from crazyem.links.retry import replies
+from crazyem.links.requests import replies
 
 RESEND_AFTER = 0.3  # s
 # MAV_PARAM_TYPE -> name, struct format

@@ -51,6 +51,11 @@ def scaled(factor: float, turned: Turn = stacked) -> Turn:
     return lambda columns: turned(columns) * factor
 
 
+def bit(mask: int) -> Turn:
+    """1 where a number has this bit set, else 0."""
+    return lambda columns: ((stacked(columns).astype(np.int64) & mask) != 0).astype(float)
+
+
 def angles_of_quaternions(columns: Columns) -> NDArray[np.float64]:
     """(n, 3) roll, pitch, yaw [rad] of FLU to NWU from columns w x y z of FRD to NED."""
     return euler_from_quaternions(quaternions(columns))

@@ -17,6 +17,7 @@ from crazyem.recordings.autopilots.frd_ned import (
     WORLD,
     Columns,
     angles_of_quaternions,
+    bit,
     euler,
     quaternions,
     scaled,
@@ -33,10 +34,6 @@ def _cells(columns: Columns) -> NDArray[np.float64]:
     """V of a battery from its cells [mV]; 65535 is a cell that is not there, 0 one of the extension that is not."""
     cells = stacked(columns)
     return np.where(cells == 65535, 0.0, cells).sum(axis=1, keepdims=True) * 1e-3
-
-
-def _armed(columns: Columns) -> NDArray[np.float64]:
-    return ((np.asarray(columns[0]).astype(np.int64) & ARMED) != 0).astype(float)[:, None]
 
 
 def _equal(column: str, value: int) -> Callable[[Topic], NDArray[np.bool_]]:
@@ -102,7 +99,7 @@ TLOG_SIGNALS: tuple[Source, ...] = (
         _equal("landed_state", 0),
         frame="1 while in the air, taking off or landing",
     ),
-    Source("flying", "HEARTBEAT", ("base_mode",), _armed, frame="1 while armed"),
+    Source("flying", "HEARTBEAT", ("base_mode",), bit(ARMED), frame="1 while armed"),
     Source("euler", "ATTITUDE", _ANGLES, euler, frame="roll, pitch, yaw (ZYX), body FLU to world (north-west-up)"),
     Source("setpoint_acceleration", _TARGET, named("af*", "x y z"), vectors, _masked(0x3C0, local=True), frame=WORLD),
     Source("setpoint_euler", "ATTITUDE_TARGET", _Q, angles_of_quaternions, _masked(0x80)),

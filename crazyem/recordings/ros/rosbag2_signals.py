@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from crazyem.errors import FileFormatError
 from crazyem.links.clock import STAMP_MODULUS, StampUnwrapper
 from crazyem.physics.rotations import rotate
-from crazyem.recordings.autopilots.frd_ned import Columns, Turn, euler_from_quaternions, stacked
+from crazyem.recordings.autopilots.frd_ned import Turn, bit, euler_from_quaternions, stacked
 from crazyem.recordings.finding import Finding, Grade, note
 from crazyem.recordings.motor_meaning import decide
 from crazyem.recordings.recording import Recording, SignalArray
@@ -297,10 +297,6 @@ def _together(
     }
 
 
-def _flying(columns: Columns) -> NDArray[np.float64]:
-    return ((stacked(columns).astype(np.int64) & _FLYING_BIT) != 0).astype(float)
-
-
 def _no_attitude(prefix: str) -> Callable[[Topic], NDArray[np.bool_]]:
     """Rows whose quaternion is all zeros, or whose covariance says that there is none (sensor_msgs/Imu)."""
 
@@ -335,7 +331,10 @@ _MEANING: Mapping[str, tuple[Source, ...]] = {
         _source("attitude", "orientation.", _XYZW),
     ),
     "sensor_msgs/BatteryState": (_source("voltage", "", ["voltage"]),),
-    _STATUS: (_source("voltage", "", ["battery_voltage"]), _source("flying", "", ["supervisor_info"], _flying)),
+    _STATUS: (
+        _source("voltage", "", ["battery_voltage"]),
+        _source("flying", "", ["supervisor_info"], bit(_FLYING_BIT)),
+    ),
     _FULL_STATE: (
         _source("setpoint_position", "pose.position."),
         _source("setpoint_velocity", "twist.linear."),
