@@ -144,7 +144,7 @@ def selected(data: Data, *candidates: Candidate, **values: dict[str, float]) -> 
     """A selection of these effects, fitted from these values, the first the weakest."""
     point = nominal(data, POINT)
     fitted = refine_base(data, point.with_effects(values), candidates, rounds=4, noise=False)
-    steps = tuple(Step((), Trial(c, 9.0 + k, 900.0, 1.0, 1e-9, 9.0 + k)) for k, c in enumerate(candidates))
+    steps = tuple(Step((), Trial(c, 900.0 + k, 900.0, 1.0, 1e-9, 9.0 + k)) for k, c in enumerate(candidates))
     steps = tuple(replace(s, taken=s.trials[0]) if s.trials else Step((), s.taken) for s in steps)
     return Selection(point, fitted.point, steps, candidates, fitted, 2)
 
