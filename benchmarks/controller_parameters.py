@@ -30,7 +30,7 @@ from firmware_sim.scenario import Scenario, parse_scenario
 MELLINGER, INDI, LEE = 2, 3, 5  # stabilizer.controller
 AXES = "pqr"
 EXCITED, REST, STEP, AFTER = 4.0, 1.0, 0.5, 2.0  # s, s, m, s: excitation, hover, step of the place, hover
-LATERAL, ANGULAR, RAMP = 0.9, 6.0, 0.5  # m/s^2, rad/s^2, s of the excitation
+LATERAL, ANGULAR, RAMP = 0.9, 9.0, 0.5  # m/s^2, rad/s^2, s of the excitation
 TILT_LIMIT = math.radians(10.0)  # posCtrlIndi.pq_clamping: what a step of the place asks for
 WITHIN = 0.05  # of the true g1
 SPEED = 1.5  # m/s, the highest of the figure
