@@ -104,7 +104,7 @@ class Plan:
         if self.odds is not None:
             for name, e, d, w in zip(self.odds.effects, self.odds.expected, self.odds.decided, self.odds.wrong):
                 lines.append(
-                    f"  if it is {name:<18}odds of 20 to 1 for it in {100 * d:.0f} of 100 drones, against it in "
+                    f"  if it is {name:<17} odds of 20 to 1 for it in {100 * d:.0f} of 100 drones, against it in "
                     f"{100 * w:.0f}; log odds {e:.3g} in the mean"
                 )
         at = self.largest()
