@@ -37,8 +37,7 @@ REFRESH = 12  # updates between two full passes with information
 YOUNG = 200  # samples below which every update is a full pass
 NEWBORN = 24  # samples below which it takes as many passes as it needs: a cold start flies with what comes out
 CLOSE = 0.1  # standard deviations from the maximum at which full passes end
-# standard deviations that a noise scale may be off where estimates count as converged: some 5 % of an interval
-PASSED_NOISE = 2.0
+PASSED_NOISE = 2.0  # standard deviations that a noise scale may be off at convergence: some 5 % of an interval
 # Change of a parameter's logarithm that calls for full passes: a share of its standard deviation, between two limits.
 MOVED_SD, MOVED, MOVED_FAR = 0.5, 0.02, 0.1
 
@@ -182,8 +181,7 @@ class OnlineEstimator:
         k = self._fresh - 1
         if self._em is None or k < 0 or k >= self._tape.size or self._tape.kind[k]:
             return None
-        variance = self._tape.s[k]
-        sd = np.sqrt(np.where(variance > 0, variance, np.nan))
+        sd = np.sqrt(np.where((variance := self._tape.s[k]) > 0, variance, np.nan))
         return float(self._tape.time[k]), np.where(variance > 0, self._tape.e[k], np.nan), sd
 
     def feed(self, sample: Sample) -> Estimate | None:
@@ -387,8 +385,7 @@ class OnlineEstimator:
         em, tape = self._em, self._tape
         assert em is not None
         self._updates += 1
-        last = tape.size
-        first = max(0, last - self.window)
+        first, last = max(0, tape.size - self.window), tape.size
         self._filter_fresh(em, first)
         young = last - first < min(YOUNG, self.window)
         refresh = self._refresh if last - first == self.window else REFRESH  # what is known grows with the window
@@ -416,11 +413,9 @@ class OnlineEstimator:
         self.full_updates += 1
         self._information = self._with_ages(em, first, last, em.converge(first, last, passes=passes, tolerance=CLOSE))
         self._reference = em.parameters
-        self._converged = (
-            self._information.decrement < PASSED_SCORE_TEST and self._information.noise_length < PASSED_NOISE
-        )
-        self._unconverged = 0 if self._converged else self._unconverged + 1
-        self._refined = self._updates
+        found = self._information
+        self._converged = found.decrement < PASSED_SCORE_TEST and found.noise_length < PASSED_NOISE
+        self._unconverged, self._refined = 0 if self._converged else self._unconverged + 1, self._updates
         self._marginal = self._refreshed.refresh(em, first, last, self._information)
 
     def _with_ages(self, em: WindowEM, first: int, last: int, information: Information) -> Information:
