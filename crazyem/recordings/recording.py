@@ -215,10 +215,18 @@ def onboard_attitude(recording: Recording) -> bool:
     return claimed or _named(attitude, ONBOARD_PREFIXES) or any(carries_attitude(s) for s in attitude.source)
 
 
+def onboard_estimate(recording: Recording) -> bool:
+    """Whether a filter on board made the attitude, or the velocity of a recording that has no attitude."""
+    velocity = recording.signals.get("velocity")
+    if "attitude" in recording.signals or velocity is None:
+        return onboard_attitude(recording)
+    return "mavlink" in recording.metadata or _named(velocity, (*CRAZYFLIE_PREFIXES, "vehicle_local_position."))
+
+
 def crazyflie_attitude(recording: Recording) -> bool:
     """Whether the attitude is that of a Crazyflie's own filter: by its name, whatever the rate."""
     return "attitude" in recording.signals and _named(recording.signals["attitude"], CRAZYFLIE_PREFIXES)
 
 
-def _named(attitude: SignalArray, prefixes: tuple[str, ...]) -> bool:
-    return any(s.rsplit("/", 1)[-1].startswith(prefixes) for s in attitude.source)
+def _named(signal: SignalArray, prefixes: tuple[str, ...]) -> bool:
+    return any(s.rsplit("/", 1)[-1].startswith(prefixes) for s in signal.source)

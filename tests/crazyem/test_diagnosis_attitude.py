@@ -14,7 +14,7 @@ from crazyem.diagnosis.fitting.noise import first_guess
 from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.estimation import steps
-from crazyem.recordings.recording import Recording, crazyflie_attitude, onboard_attitude
+from crazyem.recordings.recording import Recording, crazyflie_attitude, onboard_attitude, onboard_estimate
 from crazyem.signals.vocabulary import MAVLINK_SOURCES, SOURCES
 
 PULL, TILT = 0.04, 4e-3  # s, rad: how long an error lasts, and its standard deviation
@@ -68,6 +68,17 @@ def test_attitudes_that_a_filter_on_board_made(
     assert onboard_attitude(flown) is expected
     # which filter: a Crazyflie's is told by its names, at the same 100 Hz as an autopilot's
     assert crazyflie_attitude(flown) is source.startswith(("stateEstimateZ", "kalman"))
+
+
+def test_without_an_attitude_the_velocity_says_whether_a_filter_made_the_states() -> None:
+    flown = fly(seconds=2.0)
+    for source, expected in (("stateEstimate.vx", True), ("vehicle_local_position.vx", True), ("mocap.vx", False)):
+        velocity = replace(flown.signals["velocity"], source=(source,) * 3)
+        blind = {n: a for n, a in flown.signals.items() if n != "attitude"} | {"velocity": velocity}
+        assert onboard_estimate(replace(flown, signals=blind)) is expected
+        assert not onboard_attitude(replace(flown, signals=blind))
+    still = {n: a for n, a in flown.signals.items() if n not in ("attitude", "velocity")}
+    assert not onboard_estimate(replace(flown, signals=still))
 
 
 def test_every_attitude_that_a_link_gives_is_of_a_filter_on_board() -> None:

@@ -14,7 +14,7 @@ from crazyem.errors import DataError
 from crazyem.physics.motion import RotorInput
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.ordering import ordered
-from crazyem.recordings.recording import Recording, onboard_attitude
+from crazyem.recordings.recording import Recording, onboard_estimate
 from crazyem.vehicle import GRAVITY, Vehicle
 
 SAME_NODE = 1.5e-3  # s: measurements closer than this belong to one node
@@ -77,7 +77,7 @@ class Flight:
         block: (n,) int: consecutive stretches of about a second, of half a second in short flights.
         inputs: what the rotors were told.
         signals: names of what is measured.
-        fused: a filter on board made the attitude.
+        fused: a filter on board made the attitude, or the velocity where there is none.
         levelled: the voltage is not recorded, and the thrust of its beginning is the weight by assumption.
         coarse: what turned the drone is not in the commands as recorded (see `always.FAR_OUT`).
         differs: there are several recordings, and each may have a thrust of its own (see `model.OWN`).
@@ -177,7 +177,7 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
         flown=time - air.flown[0][0], ground=ground, block=_blocks(time), inputs=inputs,
         signals=frozenset(n for n in (*measured, "specific_force", "voltage", "rotor_speed", *COMMANDS)
                           if n in recording.signals or (n == "body_rate" and n in measured)),
-        fused=onboard_attitude(recording), grounded=bool(np.isfinite(air.ground)),
+        fused=onboard_estimate(recording), grounded=bool(np.isfinite(air.ground)),
         levelled=found.level is not None, alignment=found.alignment, notices=found.notices,
     )  # fmt: skip
     if flight.duration < SHORTEST:

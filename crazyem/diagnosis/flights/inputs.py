@@ -17,7 +17,7 @@ from crazyem.physics.motion import RotorInput
 from crazyem.physics.rotors import thrust_from_command, thrust_from_speed, wrench
 from crazyem.recordings.airborne import LARGEST_COMMAND, Airtime, airtime
 from crazyem.recordings.ordering import ordered
-from crazyem.recordings.recording import Recording, onboard_attitude
+from crazyem.recordings.recording import Recording, onboard_estimate
 from crazyem.recordings.thrust import kind_objection, signal_for, too_slow
 from crazyem.vehicle import Vehicle
 
@@ -50,7 +50,7 @@ class Inputs:
         took_off: when the drone first left the floor [s]; the first input where that is unknown.
         alignment: how late measured rotor speeds are behind the body rates, in this recording; None where unknown.
         level: the voltage that was taken, where none is recorded and the flight shows one; else None.
-        fused: whether a filter on board made the recorded attitude.
+        fused: whether a filter on board made the recorded attitude, or the velocity where there is none.
     """
 
     rotor: RotorInput
@@ -115,7 +115,7 @@ def inputs_of(
         measured=name == "rotor_speed",
         delay=late,
     )
-    fused = onboard_attitude(recording)
+    fused = onboard_estimate(recording)
     return Inputs(rotor, name, found.vehicle or vehicle, notices, ground, took_off, alignment, level, fused)
 
 
