@@ -248,7 +248,7 @@ class Guard:
         """Without what waits for others (`Controller.waits`), which gets a reason."""
         for name, others in self.controller.waits.items():
             late = [o for o in others if o not in changed and reasons.get(o) != "unchanged"]
-            if not self.controller.attitude_gains:  # of its own each: a policy may leave one, and a refuted one hurries
+            if not self.controller.attitude_gains:  # a g1 for each axis: what is refuted, or alone in a policy, goes
                 late = [] if self._refuted(name) else [o for o in late if o in self.limits.parameters]
             if name in changed and late:
                 reasons[name] = f"waits for {late[0]}"

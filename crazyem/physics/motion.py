@@ -98,7 +98,7 @@ def rotor_thrust(
 ) -> tuple[NDArray, NDArray]:
     """Mean thrust of each rotor, and its mean derivative, over the steps that end at nodes (n,) [s].
 
-    `breaks`: rows at which a new stretch begins; these, and the first, hold the thrust at the node itself.
+    `breaks`: rows at which a new stretch begins; these, and the first, hold the thrust at the node, and no rate.
     Returns (n, 4) N and (n, 4) N/s.
     """
     thrust, lag, delay = settled(inputs, vehicle=vehicle, effects=effects)
@@ -112,11 +112,11 @@ def rotor_thrust(
         begin = nodes[first] - delay - 10 * max(lag, 0.02)
         at = max(0, int(np.searchsorted(inputs.time, begin, "right")) - 1)
         state[:4], state[4] = thrust[at], inputs.time[at]
-        # up to the first row, which gets what the rotors give there: a mean of all that was before would depend on when
-        # that began, by 10 m/s^2 where the rotors stood still
+        # Up to the first row, which gets the thrust there. A mean of all commands before would depend on which of them
+        # is the first, by 10 m/s^2 where the rotors stood still; so would its rate.
         at = lagged_means(inputs.time, thrust, at, len(inputs.time), predictor, nodes, first, first + 1, mode, lag,
                           delay, state, mean, unused, rate)  # fmt: skip
-        mean[first] = state[:4]
+        mean[first], rate[first] = state[:4], 0.0
         lagged_means(inputs.time, thrust, at, len(inputs.time), predictor, nodes, first + 1, last, mode, lag, delay,
                      state, mean, unused, rate)  # fmt: skip
     return mean, -rate

@@ -186,12 +186,14 @@ def test_rows_at_which_a_stretch_begins_go_by_lag_and_delay_without_jumps(lag: f
     inputs = RotorInput(time, thrust, np.full(time.size, 4.0), time, measured=False)
     nodes = 1.0 + 0.01 * np.arange(30)
 
-    def means(change: float) -> np.ndarray:
+    def thrusts(change: float) -> tuple[np.ndarray, np.ndarray]:
         effects: Effects = {"motor_lag": {"time_constant": lag * (1 + change)}, "input_delay": {"delay": delay}}
-        return rotor_thrust(inputs, nodes, vehicle=ROTORS, effects=effects, breaks=[15])[0]
+        return rotor_thrust(inputs, nodes, vehicle=ROTORS, effects=effects, breaks=[15])
 
-    here, there = means(0.0), means(1e-4)
+    (here, rate), (there, other) = thrusts(0.0), thrusts(1e-4)
     assert np.abs(there - here).max() < 1e-5
+    assert np.abs(other - rate).max() < 1e-3
+    assert not rate[[0, 15]].any()
     since = 1.0 - delay - 0.3 * stop  # s, and up to a sample more: a command may act from the middle between stamps
     low, high = (0.07 * (1 - math.exp(-s / lag)) for s in (since, since + 0.01))
     forgotten = 0.07 * math.exp(-10.0)  # what was commanded ten lags ago

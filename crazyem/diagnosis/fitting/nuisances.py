@@ -268,7 +268,7 @@ def _let_go(point: Point, accepted: Sequence[Candidate], free: Nuisances) -> Poi
 def refine_base(
     data: Data, point: Point, accepted: Sequence[Candidate], *, rounds: int = 5, noise: bool = True
 ) -> Fitted:
-    """`refine` with what is always free; with a trim, noise scales stay as they are (see `steadied`)."""
+    """`refine` with what is always free; with a trim, noise scales stay as they are (see `with_trim_noise`)."""
     noise = noise and TRIM not in point.vehicle.effects
     free = nuisances(data, point, accepted)
     point = _let_go(point, accepted, free)

@@ -10,7 +10,7 @@ from crazyem.diagnosis.flights.flight import Flight
 
 # Below these a flight hovers [m/s, horizontal; rad/s]: simulated hovers have 0.006 to 0.08 and 0.08 to 0.4 (in gusts),
 # small shakes from 0.128 and 0.74 on. There velocities are mostly the jitter of the onboard estimate (see
-# `nuisances.jittery`), and a drag is whatever that looks like.
+# `sensing.jitter`), and a drag is whatever that looks like.
 STILL, STEADY = 0.1, 0.5
 LIVELIER = 3.0  # times as quick, at least: rooms are never still, and flights of a kind differ by chance
 

@@ -74,8 +74,7 @@ def drop(
             gain = (here - less.loglik) / step.taken.dispersion
             held = (held_here - held_less) / step.taken.dispersion
             need = -max(ADMITTED, MISLED * gain)
-            # what should bring little of what it gains is not to be seen there either: sampled commands took 52 nats
-            # from a rotor inertia that gained 2373, where 19 were to be expected
+            # what should bring little of what it gains is not to be seen there either
             least = max(TELLING, MISLED * gain) * step.taken.dispersion
             should = np.inf if held_out is None else expected(held_out, fitted, accepted, c)
             if should > least:

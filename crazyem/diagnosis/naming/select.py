@@ -273,7 +273,7 @@ def select(
     say: Callable[[str], None] = lambda text: None,
 ) -> Selection:
     """The effects that the flights ask for; beyond those `begun` with, where there are some."""
-    # with a trim in the file noise stays (see `steadied`), or what is steady would pass for a torque with memory
+    # with a trim in the file noise stays (`with_trim_noise`), or what is steady would pass for a torque with memory
     begin = refine_base if TRIM in nominal_point.vehicle.effects else refine_anew
     fitted = begin(data, nominal_point, ()) if begun is None else begun.fitted
     nominal = fitted.point if begun is None else begun.nominal

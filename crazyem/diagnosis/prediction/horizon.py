@@ -144,7 +144,7 @@ def open_loop(
         vehicle: other constants than the recording was read with (mass, inertia, arm, lag; not the law of thrust).
         effects: None takes those of the vehicle.
         measured_attitude: follow the recorded attitude and rate, so that forces are judged alone.
-        weights: what was learned before each start (see `earned`); None: the model alone.
+        weights: what was learned before each start (see `bias_correction.py`); None: the model alone.
         substep: largest step of the integration [s].
     """
     simulator = Simulator(shown.inputs, effects, vehicle=vehicle)

@@ -235,7 +235,8 @@ def predict(
         step: s between predicted states; None: the recording's own samples, so that row h of start i is the state at
             sample i + h + 1, at its own stamp.
         every: samples from one start to the next.
-        plain: the model alone; else its torque is believed as much as it was right before the start (see `earned`).
+        plain: the model alone; else its torque is believed as much as it was right before the start
+            (`bias_correction.py`).
         progress: told how many starts of how many are done.
 
     Raises:

@@ -178,7 +178,7 @@ class Simulator:
             given: (n,) s until when inputs may be known, after which the last is held; None: the beginning of the last
                 step.
             substep: largest step of the integration [s].
-            weights: what was learned before each start (see `earned`); None: the model alone.
+            weights: what was learned before each start (see `bias_correction.py`); None: the model alone.
 
         Returns: (n, N, 13), as the recording would show them.
         """
