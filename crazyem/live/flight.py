@@ -306,6 +306,7 @@ class Flight:
         if self._stream is not None:
             self._stream.stop()
         self._may_fly = False
+        self.session.stop_pushing(motors_cut=True)
         with contextlib.suppress(Exception):
             self.link.stop()
 

@@ -204,9 +204,13 @@ class Session:
         self.pipeline.guard = self.write_supervisor = write_supervisor
         return note
 
-    def stop_pushing(self) -> None:
-        """Begin no new set of writes from now on: the first step of every way out."""
+    def stop_pushing(self, *, motors_cut: bool = False) -> None:
+        """Begin no new set of writes from now on: the first step of every way out.
+
+        motors_cut: nor complete one, whatever telemetry still says of the drone.
+        """
         if self.write_supervisor is not None:
+            self.write_supervisor.gate.motors_cut |= motors_cut
             self.write_supervisor.stop()
 
     def end_pushing(self, outcome: str) -> None:

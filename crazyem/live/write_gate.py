@@ -42,6 +42,7 @@ class WriteGate:
     ) -> None:
         self.telemetry, self.rate, self.now = telemetry, rate, now
         self.limits = limits or HealthLimits()
+        self.motors_cut = False  # by this program: telemetry says so up to 0.3 s later
         self._voltages: deque[tuple[float, float]] = deque(maxlen=2000)
         self._tilt = math.nan
         self._low = False
@@ -57,6 +58,8 @@ class WriteGate:
         """Why a write for this purpose (`Push.purpose`) does not belong where the drone is, one clause; else ""."""
         if purpose == "restore":
             return "the drone still flies" if self.telemetry.has(FLYING) else ""
+        if self.motors_cut:
+            return "the motors were cut"
         if not self.telemetry.airborne:
             return "the drone is not in the air"
         return "the drone is about to land" if self.telemetry.landing else ""

@@ -56,6 +56,10 @@ def test_what_belongs_into_the_air_passes_there_and_nowhere_else(purpose):
     assert gate.objection(purpose) == ""
     at(0.8, duty=0.0, telemetry=telemetry)  # landed on something: the firmware says for 2 s more that it flies
     assert gate.objection(purpose) != ""
+    at(1.3, telemetry=telemetry)
+    gate.motors_cut = True  # telemetry says that it flies, for 0.3 s or so
+    assert gate.objection(purpose) == "the motors were cut"
+    gate.motors_cut = False
     at(1.3, flying=False, telemetry=telemetry)
     assert gate.objection(purpose) != ""
 
@@ -320,7 +324,13 @@ def test_a_flight_writes_in_the_air_only_and_restores_on_the_ground(way):
             session.pipeline.estimator.error = ValueError("boom") if way == "estimator fails" else None
         return write(name, value, timeout)
 
-    link.write_parameter = write_and_end
+    link.write_parameter, stop, cut = write_and_end, link.stop, []
+
+    def stop_motors():
+        cut.append(session.write_supervisor.gate.motors_cut)
+        stop()
+
+    link.stop = stop_motors
     try:
         flight.fly()
     except (FlightInterruptedError, MotorsCutError, Exception):
@@ -334,6 +344,7 @@ def test_a_flight_writes_in_the_air_only_and_restores_on_the_ground(way):
     for purpose, air in zip(pushes, link.sent, strict=True):
         assert air is (purpose != "restore")
     assert ("restore" in pushes) is (way != "link lost")
+    assert cut[0] is (way in ("second Ctrl-C", "link lost"))  # known before the motors stop, not 0.3 s after
 
 
 def test_a_decision_that_comes_after_the_end_is_dropped():
