@@ -205,13 +205,9 @@ class Session:
         return note
 
     def stop_pushing(self, *, motors_cut: bool = False) -> None:
-        """Begin no new set of writes from now on: the first step of every way out.
-
-        motors_cut: nor complete one, whatever telemetry still says of the drone.
-        """
+        """Begin no new set of writes: the first step of every way out. motors_cut: nor complete one."""
         if self.write_supervisor is not None:
-            self.write_supervisor.gate.motors_cut |= motors_cut
-            self.write_supervisor.stop()
+            self.write_supervisor.stop(motors_cut=motors_cut)
 
     def end_pushing(self, outcome: str) -> None:
         """The flight is over, `landed`, `interrupted`, `failed` or `link_lost`: keep or restore, as the policy says."""

@@ -182,8 +182,12 @@ class WriteSupervisor:
             self.good = dict(self.originals)
         return self._revert(self.now(), "asked for by the user", asked=True)
 
-    def stop(self) -> None:
-        """No new set is written from now on: the first step of every way out, before anything else ends."""
+    def stop(self, *, motors_cut: bool = False) -> None:
+        """No new set is written from now on: the first step of every way out, before anything else ends.
+
+        motors_cut: nor is a set completed, whatever telemetry still says of the drone.
+        """
+        self.gate.motors_cut |= motors_cut
         self._ended.set()
         if self._stopped is None:
             self._stopped = self.guard.stopped  # the end of the flight is no reason worth telling
