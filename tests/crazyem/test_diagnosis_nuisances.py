@@ -140,7 +140,7 @@ def data_of(flights):
 def test_of_flights_whose_commands_do_not_turn_the_drone_nothing_fast_is_asked():
     flights = [SimpleNamespace(coarse=c, levelled=False) for c in (True, True)]
     sideways = ("payload", "center_of_mass", "rotor_fault")  # told from a thrust scale by their torque alone
-    fast = [n for n, effect in CATALOGUE.items() if effect.needs_fast_commands]
+    fast = [n for n, effect in CATALOGUE.items() if effect.needs_torques]
     candidates = [Candidate(n, (), ()) for n in (*fast, *sideways, "linear_drag", "wind", "thrust_scale")]
     kept, reasons = abstained(data_of(flights), POINT, candidates, {})
     slow = ["thrust_curve", "motor_lag", "input_delay"]  # shown by forces

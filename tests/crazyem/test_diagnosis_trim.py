@@ -20,13 +20,12 @@ from crazyem.diagnosis.fitting.nuisances import (
     refine_base,
     without,
 )
-from crazyem.diagnosis.fitting.sampling import coarsely_sampled, fast_share, held, of_a_real_drone
+from crazyem.diagnosis.fitting.sampling import fast_share, held, of_a_real_drone
 from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.naming.balance import balance_of
 from crazyem.diagnosis.naming.baseline import with_baseline
 from crazyem.diagnosis.naming.detection_limits import usual_gusts
 from crazyem.diagnosis.naming.steady_odds import explanations
-from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings import open_recording
 from crazyem.recordings.cut import cut
 from crazyem.recordings.recording import Recording
@@ -94,31 +93,33 @@ def test_a_trim_is_looked_for_only_if_asked_for() -> None:
         assert any(c.effect == TRIM for c in found) is there
 
 
-@pytest.mark.parametrize(("white", "coarse"), [(False, False), (True, True)])
-def test_commands_that_are_faster_than_their_sampling_say_nothing_of_inertia(white: bool, coarse: bool) -> None:
+@pytest.mark.parametrize("white", [False, True])
+def test_a_trim_is_assumed_where_commands_shake_and_hold_a_steady_torque(white: bool) -> None:
     flight = flight_of(fly(seconds=8.0), DRONE)
     rotor = flight.inputs
     rng = np.random.default_rng(1)
     if white:
         rotor = replace(rotor, thrust=0.08 + 0.01 * rng.standard_normal(rotor.thrust.shape))
-    data, point = Data([replace(flight, inputs=rotor)]), point_of(TRIMMED)
-    share = fast_share(data.flights[0], DRONE)
+    flights = [replace(flight, inputs=rotor)]
+    share = fast_share(flights[0], DRONE)
     assert share == pytest.approx(0.5, abs=0.1) if white else share < 0.15
-    assert coarsely_sampled(data.flights, TRIMMED) is coarse
-    assert not coarsely_sampled(data.flights, DRONE)
-    assert of_a_real_drone(data.flights, DRONE) is DRONE  # whatever shakes: nothing steady is held against
+    assert of_a_real_drone(flights, DRONE) is DRONE  # whatever shakes: nothing steady is held against
     twisted = rotor.thrust * np.array([1.1, 0.9, 1.1, 0.9])
     held_against = [replace(flight, inputs=replace(rotor, thrust=twisted))]
     assert held(held_against[0], DRONE)[2] == pytest.approx(-0.1 * DRONE.torque_per_thrust, rel=0.1)
     assumed = of_a_real_drone(held_against, DRONE)
-    assert (assumed.effects.get(TRIM) == {"x": 0.0, "y": 0.0, "z": 0.0}) is coarse
-    assert of_a_real_drone(data.flights, TRIMMED) is TRIMMED
-    candidates, _ = candidates_for(point, flight.signals, measured_speeds=False)
+    assert (assumed.effects.get(TRIM) == {"x": 0.0, "y": 0.0, "z": 0.0}) is white
+    assert of_a_real_drone(flights, TRIMMED) is TRIMMED
+
+
+@pytest.mark.parametrize("coarse", [False, True])
+def test_without_torques_the_height_of_a_load_is_not_told(coarse: bool) -> None:
+    data, point = Data([replace(flight_of(fly(seconds=8.0), DRONE), coarse=coarse)]), point_of(TRIMMED)
+    candidates, _ = candidates_for(point, data.signals, measured_speeds=False)
     left, reasons = abstained(data, point, candidates, {"gusts": "why not"})
-    assert ({c.effect for c in left} & {n for n, e in CATALOGUE.items() if e.needs_fast_commands} == set()) is coarse
     assert ("inertia" in reasons) is coarse
-    load = next(c for c in left if c.effect == "payload")
-    assert load.free == (("mass", "x", "y") if coarse else ("mass", "x", "y", "z"))  # no torque tells its height
+    load = [c for c in left if c.effect == "payload"]
+    assert [c.free for c in load] == ([] if coarse else [("mass", "x", "y", "z")])
     assert reasons["gusts"] == "why not"
 
 

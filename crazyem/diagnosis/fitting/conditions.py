@@ -6,7 +6,7 @@ import numpy as np
 
 from crazyem.diagnosis.fitting.days import day_freedom, day_sd
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.sampling import coarsely_sampled, interval, unlogged_share
+from crazyem.diagnosis.fitting.sampling import interval, unlogged_share
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.effects.prior import Conditions
 
@@ -29,7 +29,6 @@ def conditions_of(flights: Sequence[Flight], point: Point) -> Conditions:
         speed=rms_speed(flights),
         period=max(interval(f) for f in flights),
         unlogged_share=unlogged_share(flights, vehicle),
-        coarse_commands=coarsely_sampled(flights, vehicle),
         other_clock=all(f.coarse for f in flights),
         rotor_inertia=float(point.effects.get("rotor_inertia", {}).get("inertia", 0.0)),
         gyro_bias=float(np.linalg.norm([float(v) for v in point.effects.get("gyro_bias", {}).values()])),

@@ -13,7 +13,6 @@ from crazyem.diagnosis.fitting.days import trim_known
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, refine, remembering, remembering_anew
 from crazyem.diagnosis.fitting.gram import Solution, used
 from crazyem.diagnosis.fitting.model import Point
-from crazyem.diagnosis.fitting.sampling import coarsely_sampled
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effect
@@ -31,7 +30,7 @@ FAR_OUT = 2.0
 # m/s. Nor does a body turn as in honey: a rotor loses thrust with the speed at which its air comes, all of it at twice
 # the speed that it gives to the air (4 m/s in a Crazyflie's hover; half of that is less than any small drone's).
 INDUCED = 2.0
-COARSE_REASON = "the recorded commands are mostly faster than their sampling: what acted in between is not known"
+COARSE_REASON = "the turning does not follow the commands as they were recorded: they are on another clock"
 TRIM_REASON = "a shifted centre of mass is a trim, and that changes from day to day"
 LEVEL_REASON = "no battery voltage is recorded, so how heavy or strong the drone is cannot be told"
 SOMETIMES_FREE = ("torque_scale", "rate_damping")  # by what was found: until a lag is, and beside a rotor inertia
@@ -96,23 +95,16 @@ def abstained(
         gone = {c.effect: TRIM_REASON for c in candidates if c.effect == "center_of_mass"}
     if all(f.levelled for f in data.flights):
         gone |= {c.effect: LEVEL_REASON for c in candidates if CATALOGUE[c.effect].needs_voltage}
-    if coarsely_sampled(data.flights, point.vehicle):
-        # torques on another clock say nothing; how thrust goes with the command, and how late, shows in forces
-        gone |= {
-            c.effect: COARSE_REASON
-            for c in candidates
-            if _beyond_sampling(CATALOGUE[c.effect], other_clock=data.coarse)
-        }
+    if data.coarse:
+        gone |= {c.effect: COARSE_REASON for c in candidates if _turns(CATALOGUE[c.effect])}
         candidates = [replace(c, free=_without_height(c)) for c in candidates]
     return [c for c in candidates if c.effect not in gone], {**left_out, **gone}
 
 
-def _beyond_sampling(effect: Effect, *, other_clock: bool) -> bool:
-    """Whether coarsely sampled commands, or commands of another clock, say nothing of an effect."""
+def _turns(effect: Effect) -> bool:
+    """Whether only torques tell of an effect: how thrust goes with the command, and how late, shows in forces, too."""
     before_rotors = effect.commanded is not None or effect.timing is not None
-    if not other_clock:
-        return effect.needs_fast_commands
-    return effect.steady_torque or (effect.needs_fast_commands and not before_rotors)
+    return effect.steady_torque or (effect.needs_torques and not before_rotors)
 
 
 def _without_height(candidate: Candidate) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Commands that are mostly faster than their sampling, as those of real drones that shake are, and what follows."""
+"""Commands that are faster than their sampling, as those of real drones that shake are, and what follows."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,24 +10,17 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.candidates import TRIM
 from crazyem.diagnosis.fitting.days import TRIM_SD
 from crazyem.diagnosis.flights.flight import Flight
+from crazyem.physics.effects.timing import LOOP
 from crazyem.physics.rotors import wrench
 from crazyem.vehicle import Vehicle
 
 # Commands of a loop at 500 Hz that answer to vibration, logged at 100 Hz, are nearly white: most of what is logged acts
-# for 2 ms only, and what acts was not logged. That is an error in the input, under which every fit makes the drone look
-# heavy and damped. Share of the power of roll and pitch torques above half of the Nyquist frequency (white: a half):
+# for 2 ms only, and what acts was not logged. The effect `sampled_commands` models what is white; this is an error in
+# the input all the same, under which a fit makes the drone look heavy and damped.
+# Share of the power of roll and pitch torques above half of the Nyquist frequency (white: a half), of real drones:
 COARSE = 0.2  # simulated flights have up to 0.12, whatever is wrong with the drone
 NEGLIGIBLE = 1e-3  # relative error of torques: a tenth of what is not known of inertias (`nuisances.INERTIA_SD`)
-LOOP = 2e-3  # s between commands of the loop (500 Hz, crazyflie-firmware stabilizer.c)
 EDGE, SLOW = 0.5, 1.0  # s left out at either end; Hz below which torques say nothing of sampling
-
-
-def coarsely_sampled(flights: Sequence[Flight], vehicle: Vehicle) -> bool:
-    """Whether the commands of most flights are faster than their sampling, or on another clock.
-
-    The first is asked of vehicles with a trim alone, as all are that fly so (`of_a_real_drone`).
-    """
-    return all(f.coarse for f in flights) or (TRIM in vehicle.effects and shaken_commands(flights, vehicle))
 
 
 def shaken_commands(flights: Sequence[Flight], vehicle: Vehicle) -> bool:

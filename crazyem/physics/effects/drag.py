@@ -88,7 +88,7 @@ def _sampled(conditions: Conditions) -> Sizes:
     """N m s: what is sent between two logged commands looks like a damping. Speeds logged at 100 Hz: of 1 to 11e-6 in
     quick flights of 11 drones with nothing hidden. With heavy rotors: about z of 1e-5 to 1.9e-4 in 11 flights."""
     usual = 6e-6 if conditions.measured_speeds or conditions.heavy_rotors else 0.0
-    tilting = 3e-4 if conditions.coarse_commands else math.hypot(usual, 3e-4 * conditions.unlogged_share)
+    tilting = 3e-4 if conditions.other_clock else math.hypot(usual, 3e-4 * conditions.unlogged_share)
     if not conditions.shows_rotation or tilting == 0.0:
         return {}
     return in_turn("x y z", tilting, tilting, 1e-4 if conditions.heavy_rotors else tilting)
@@ -134,5 +134,5 @@ RATE_DAMPING = Effect(
         "turn at several steady yaw rates; and step roll and pitch with the gyro logged at 500 Hz or more (a lag shows"
         " in the first 50 ms, damping throughout)"
     ),
-    needs_fast_commands=True,
+    needs_torques=True,
 )

@@ -235,7 +235,7 @@ class Effect:
         belongs_to: "vehicle", or "recording" where each recording has its own: what a sensor or a filter on board shows
             on that day, which no vehicle file is to have.
         prior: how large its parameters are.
-        needs_fast_commands: told by torques from sample to sample, of which coarsely sampled commands say nothing.
+        needs_torques: told by torques from sample to sample, of which commands on another clock say nothing.
         steady_force: told by forces that last, which no torque at random looks like.
         steady_torque: whether it makes a torque that lasts, as a trim does.
         shifts_centre: whether it moves the centre of mass.
@@ -287,7 +287,7 @@ class Effect:
     words: str = ""
     belongs_to: str = "vehicle"
     prior: Prior = field(default_factory=Prior)
-    needs_fast_commands: bool = False
+    needs_torques: bool = False
     steady_force: bool = False
     steady_torque: bool = False
     shifts_centre: bool = False

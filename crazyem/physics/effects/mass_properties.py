@@ -32,11 +32,11 @@ def _moments(conditions: Conditions) -> Sizes:
     """Relative. In 76 flights of known torques over inertias their differences scatter by 1.2 % between roll and pitch
     and by 2.0 % to yaw beyond what fits say of themselves (figures 8 by 2.1 and 3.0 %, shakes by 0.5 and 1.3 %).
 
-    Commands that are faster than their sampling say nothing of it. With heavy rotors yaw looks too heavy by 20 to 40 %.
+    Commands on another clock say nothing of it. With heavy rotors yaw looks too heavy by 20 to 40 %.
     """
     if not conditions.shows_rotation:
         return {}
-    sampled = 1.0 if conditions.coarse_commands else conditions.unlogged_share
+    sampled = 1.0 if conditions.other_clock else conditions.unlogged_share
     x, y, z = (math.hypot(share, sampled) for share in (0.01, 0.01, 0.02))
     return in_turn("xx yy zz", x, y, AT_ONCE_SD if conditions.heavy_rotors else z)
 
@@ -59,7 +59,7 @@ INERTIA = Effect(
         detection_limit=alike("xx yy zz", 0.08),
     ),
     alike=0.9,  # what is heavier about one axis is so about the others: they differ by a third of what they are more
-    needs_fast_commands=True,
+    needs_torques=True,
     twins=("torque_scale",),
 )
 
@@ -73,7 +73,7 @@ INERTIA_PRODUCTS = Effect(
     needs=("body_rate", "attitude"),
     separates="excite one axis at a time: roll, pitch and yaw for 5 s each at 2 Hz",
     prior=Prior(alike("xy xz yz", 0.15), per=dict.fromkeys(("xy", "xz", "yz"), "inertia")),
-    needs_fast_commands=True,
+    needs_torques=True,
 )
 
 

@@ -39,8 +39,7 @@ class Conditions:
         speed: (3,) m/s, root mean square of the velocity, world axes.
         period: s between commands (or speeds) of the rotors, as a model uses them.
         unlogged_share: 0 to 1, by how much commands between the logged ones may falsify torques, relative.
-        coarse_commands: what turned the drone is not in the commands: faster than their sampling, or `other_clock`.
-        other_clock: the commands are on another clock.
+        other_clock: the commands are on another clock: what turned the drone is not in them.
         rotor_inertia: kg m^2, gyro_bias: rad/s; of the model.
     """
 
@@ -57,7 +56,6 @@ class Conditions:
     speed: NDArray = field(default_factory=lambda: np.ones(3))
     period: float = 0.01
     unlogged_share: float = 0.0
-    coarse_commands: bool = False
     other_clock: bool = False
     rotor_inertia: float = 0.0
     gyro_bias: float = 0.0
@@ -75,7 +73,7 @@ class Conditions:
     @property
     def heavy_rotors(self) -> bool:
         """Rotors that are heavy answer with torque at once, without the lag that hides what sampled commands miss."""
-        return not self.coarse_commands and not self.measured_speeds and self.rotor_inertia > 0.0
+        return not self.other_clock and not self.measured_speeds and self.rotor_inertia > 0.0
 
 
 Sizes = Mapping[str, float]  # parameter -> standard deviation

@@ -93,7 +93,7 @@ ROTOR_FAULT = Effect(
 def _torques(conditions: Conditions) -> Sizes:
     """Relative: in ten flights with nothing hidden, with the lag free, torques look 2 +- 2 % too strong (-0.5 to +4 %);
     a longer lag with more torque is nearly the same to a loop whose commands are sampled."""
-    return {"scale": 0.03} if conditions.shows_rotation and not conditions.coarse_commands else {}
+    return {"scale": 0.03} if conditions.shows_rotation and not conditions.other_clock else {}
 
 
 TORQUE_SCALE = Effect(
@@ -107,7 +107,7 @@ TORQUE_SCALE = Effect(
     twins=("inertia", "motor_lag"),  # angular acceleration is torque over inertia: both at once would be any size
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum): torque over inertia is all that a flight shows",
-    needs_fast_commands=True,
+    needs_torques=True,
 )
 
 
@@ -205,5 +205,5 @@ ROTOR_INERTIA = Effect(
     prior=Prior(own={"inertia": 4e-8}, relative_error={"inertia": AT_ONCE_SD}, detection_limit={"inertia": 3e-9}),
     needs=("body_rate", "attitude"),
     separates="yaw for 5 s at 2 Hz (spin-up), and roll while turning about yaw (gyroscope); weigh a propeller",
-    needs_fast_commands=True,
+    needs_torques=True,
 )

@@ -122,7 +122,6 @@ GYRO_BIAS = Effect(
     needs=("body_rate",),
     belongs_to="recording",  # it drifts with the temperature
     separates="record the gyro for 10 s with the drone at rest",
-    needs_fast_commands=True,
 )
 
 VELOCITY_SCALE = Effect(

@@ -47,7 +47,7 @@ THRUST_CURVE = Effect(
         detection_limit={"slope_error": 0.06},
     ),
     separates="climb and sink hard with the same battery, or measure thrust over command on a stand",
-    needs_fast_commands=True,
+    needs_torques=True,
     steady_force=True,
     lifts=True,
 )

@@ -28,6 +28,7 @@ from crazyem.physics.rotors import PITCH_SIGN, ROLL_SIGN, YAW_SIGN
 
 # Columns: all together, about x, about y, about z; orthonormal
 MODES = 0.5 * np.stack([np.ones(4), ROLL_SIGN, PITCH_SIGN, YAW_SIGN], axis=1)
+LOOP = 2e-3  # s between commands of the loop (500 Hz, crazyflie-firmware stabilizer.c)
 
 
 def shrunk(thrust: NDArray, *, tilt: float, turn: float, **_: Any) -> NDArray:
@@ -44,16 +45,21 @@ def shrunk(thrust: NDArray, *, tilt: float, turn: float, **_: Any) -> NDArray:
     return modes @ MODES.T
 
 
+def _unlogged(conditions: Conditions) -> Sizes:
+    """Shares of a log that is slower than the loop: all from 0, of commands that are smooth, to most of what is new."""
+    slower = conditions.period > 1.5 * LOOP and not conditions.measured_speeds
+    return {"tilt": 0.4, "turn": 0.4} if slower and conditions.shows_rotation else {}
+
+
 SAMPLED_COMMANDS = Effect(
     "sampled_commands",
     (Parameter("tilt", "", 0.0, 0.0, 1.0, 0.05), Parameter("turn", "", 0.0, 0.0, 1.0, 0.05)),
     order=21,
     commanded=shrunk,
-    prior=Prior(usual={"tilt": 0.4, "turn": 0.4}),
+    prior=Prior(usual=_unlogged),
     needs=("motor_command",),
     words="commands between samples",
     belongs_to="recording",
-    own_likelihood=True,  # `nuisances` has other inertias and delays instead
     separates="log motor commands at 500 Hz",
 )
 
@@ -100,7 +106,7 @@ MOTOR_LAG = Effect(
     needs=("motor_command",),
     separates="log rotor speeds; or log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
     spared={"rotor_speed": "log rotor speeds; or "},
-    needs_fast_commands=True,
+    needs_torques=True,
     twins=("torque_scale",),  # a longer lag with more torque is nearly the same as neither
     # a heavier drone with as much more thrust has more torque and nothing else: beside a lag that is the same again
     never_beside=(frozenset({"payload", "thrust_scale"}),),
@@ -115,7 +121,7 @@ INPUT_DELAY = Effect(
     same_as=("measurement_delay",),  # of all that is measured
     needs=("motor_command", "rotor_speed"),
     separates="log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
-    needs_fast_commands=True,
+    needs_torques=True,
 )
 
 
@@ -216,5 +222,4 @@ MEASUREMENT_DELAY = Effect(
     needs=("position", "velocity", "attitude", "body_rate", "specific_force"),
     belongs_to="recording",
     separates="log the gyro and the pose at 100 Hz or more, and turn and stop sharply several times",
-    needs_fast_commands=True,
 )
