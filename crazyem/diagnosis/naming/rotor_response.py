@@ -8,12 +8,12 @@ h a first-order lag of the thrust f answers to the commands u by
 with g a parabola, the same within a flight, each rotor its own. The slow part is left out: it is the battery's.
 
 All of it has errors: speeds have noise, commands are sampled, air disturbs the rotors and the loop answers to that.
-Least squares would be wrong by any of them, by up to a half. Errors of a sample have no part in samples before it, so
-these are instruments (Söderström and Stoica, System Identification, 1989, ch. 8): parameters are those under which e
-does not follow from earlier commands and thrusts. Where instruments say little of how f changes, no lag is told.
+Each of them biases least squares, noise of 1 % by a fifth. Errors of a sample have no part in samples before it, so
+earlier commands and thrusts are instruments (Söderström and Stoica, System Identification, 1989, ch. 8): of the true
+lag and delay, e does not follow from them. Where instruments say little of how f changes, the flight tells no lag.
 
-What a rotor does of its own shows in what commands have that no thrusts before and after explain. Three of four rotors
-leave the same; one that sticks, slips or misfires leaves more.
+Commands regressed on the thrusts around leave residuals. Those of three of four rotors are alike; a rotor that sticks,
+slips or misfires has larger ones.
 """
 
 from collections.abc import Sequence
@@ -40,12 +40,12 @@ EDGE = 0.5  # s left out at either end of a flight
 STARTS = (0.01, 0.03, 0.08)  # s
 SHORTEST, LONGEST, LATEST = 2e-3, 0.5, 0.1  # s
 INSTRUMENTS = 8  # earlier samples of the command, and of the thrust
-SPLINE = 2  # samples about a time that decide most of a spline there
+SPLINE = 2  # samples about a time that a spline there depends on most
 AROUND = (-1, 3)  # samples of the thrust about a command, from the one before it to the second after it
 # First-stage F statistic of the weakest direction (Cragg and Donald, 1993). In ten flights of two simulators with known
 # lags: off by 5 % at most (rms 3 %) from 2.3 on, by up to 34 % below 1.2.
 STRONG = 2.0
-LAG_SD, DELAY_SD, TOGETHER = 0.05, 1.4e-3, -0.5  # relative; s; correlation
+LAG_SD, DELAY_SD, TOGETHER = 0.05, 1.4e-3, -0.5  # what scatter does not show: relative; s; correlation
 # Power of what a rotor leaves over that of the middle one of the others, in every recording that tells: up to 1.2 in 13
 # simulated drones, 5.5 and more in ten flights of five with a rotor that sticks within 1.4 to 5 % of full command.
 DISOBEYS = 3.0
@@ -140,26 +140,26 @@ def _of_one(recording: Recording, vehicle: Vehicle) -> Answer | None:
     if step > FASTEST or not np.all(np.std(wanted, axis=0) > 0):
         return None
     thrust = CubicSpline(when, thrust_from_speed(speed, rotor_constant=vehicle.rotor_constant))
-    problem = _Problem.of(at, wanted, thrust, step)
+    equation = _LagEquation.of(at, wanted, thrust, step)
     bounds = (np.array([SHORTEST, -LATEST / 2]), np.array([LONGEST, LATEST]))
     tries = [
-        least_squares(problem.moments, [s, 0.0], bounds=bounds, x_scale=[0.01, 0.01], diff_step=1e-3) for s in STARTS
+        least_squares(equation.moments, [s, 0.0], bounds=bounds, x_scale=[0.01, 0.01], diff_step=1e-3) for s in STARTS
     ]
     best = min(tries, key=lambda t: float(t.cost))
-    if np.linalg.matrix_rank(best.jac) < 2 or problem.strength(best.x) < STRONG:
+    if np.linalg.matrix_rank(best.jac) < 2 or equation.strength(best.x) < STRONG:
         return None
-    plain, _ = problem.errors(best.x)
-    free = best.fun.size - best.x.size - 4 * problem.shapes.shape[2]
+    plain, _ = equation.errors(best.x)
+    free = best.fun.size - best.x.size - 4 * equation.shapes.shape[2]
     variance = max(float(np.mean(plain**2)), 2.0 * best.cost / free)  # the second is more where errors have a memory
     covariance = variance * np.linalg.inv(best.jac.T @ best.jac)
-    return Answer(best.x, covariance, _disobeyed(at, wanted, thrust, step), (float(at[0]), float(at[-1])), step)
+    return Answer(best.x, covariance, _command_residuals(at, wanted, thrust, step), (float(at[0]), float(at[-1])), step)
 
 
-def _disobeyed(at: NDArray, wanted: NDArray, thrust: CubicSpline, step: float) -> NDArray:
-    """(4, n) N: what is left of commands (n, 4) at (n,) s when the thrusts around have explained what they can."""
+def _command_residuals(at: NDArray, wanted: NDArray, thrust: CubicSpline, step: float) -> NDArray:
+    """(4, n) N: residuals of commands (n, 4) at (n,) s, regressed on the thrusts around."""
     near = thrust(at[:, None] + step * np.arange(*AROUND))  # (n, samples, 4)
-    shapes = _quick(np.concatenate([near, near[:, :1] ** 2 / near.mean()], axis=1), step)
-    fast, left = _quick(wanted, step), []
+    shapes = _high_pass(np.concatenate([near, near[:, :1] ** 2 / near.mean()], axis=1), step)
+    fast, left = _high_pass(wanted, step), []
     for rotor in range(4):
         fit = np.linalg.lstsq(shapes[:, :, rotor], fast[:, rotor], rcond=None)[0]
         slope = fit[:-1].sum() + 2.0 * fit[-1] * near[:, 0, rotor].mean() / near.mean()
@@ -168,8 +168,8 @@ def _disobeyed(at: NDArray, wanted: NDArray, thrust: CubicSpline, step: float) -
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
-    """Thrusts over their mean as they follow from commands, on a grid, without what is slow.
+class _LagEquation:
+    """The first-order lag of thrusts over their mean, on a grid, and its instruments.
 
     Attributes:
         grid: (n,) s, every `step`. thrust: at any time (m,) [s] -> (m, 4) N. mean: (4,) N.
@@ -187,43 +187,43 @@ class _Problem:
     instruments: NDArray
 
     @classmethod
-    def of(cls, at: NDArray, wanted: NDArray, thrust: CubicSpline, step: float) -> "_Problem":
+    def of(cls, at: NDArray, wanted: NDArray, thrust: CubicSpline, step: float) -> "_LagEquation":
         """Of commands (k, 4) at (k,) s, held until the next, and thrusts."""
         grid = np.arange(at[0], at[-1], step)
         held = wanted[np.searchsorted(at, grid + 1e-3 * step, "right") - 1]
         relative = held / wanted.mean(axis=0)
-        shapes = _quick(np.stack([relative, relative**2], 2), step)
+        shapes = _high_pass(np.stack([relative, relative**2], 2), step)
         mean = thrust(grid).mean(axis=0)
         steps = max(1, round(SPACING / step))
         edge = round(EDGE / step)  # where a high-pass does not yet know what is slow
         row = np.arange(edge + INSTRUMENTS, grid.size - edge - steps)
-        before = np.roll(_quick(thrust(grid) / mean, step), SPLINE, axis=0)  # of samples with no part in f(t + d)
+        before = np.roll(_high_pass(thrust(grid) / mean, step), SPLINE, axis=0)  # of samples with no part in f(t + d)
         earlier = np.concatenate([shapes[:, :, 0], before], axis=1)
         past = np.stack([earlier[row - j] for j in range(1, INSTRUMENTS + 1)], 2)  # (m, 8, j)
         instruments = [np.linalg.qr(past[:, (r, r + 4)].reshape(row.size, -1))[0] for r in range(4)]
         return cls(grid, step, steps, thrust, mean, shapes, row, np.stack(instruments))
 
     def errors(self, x: NDArray) -> tuple[NDArray, NDArray]:
-        """(4, m) e of lag and delay [s], and (4, p) e as it follows from the instruments."""
+        """(4, m) e of a lag and a delay [s], and (4, p) its projection on the instruments."""
         keep = np.exp(-self.step / x[0])
-        now = _quick(self.thrust(self.grid + x[1]) / self.mean, self.step)
+        now = _high_pass(self.thrust(self.grid + x[1]) / self.mean, self.step)
         change = now[self.row + self.steps] - keep**self.steps * now[self.row]
         share = [(1.0 - keep) * keep ** (self.steps - 1 - j) for j in range(self.steps)]
-        told = sum(w * self.shapes[self.row + j] for j, w in enumerate(share))
+        regressors = sum(w * self.shapes[self.row + j] for j, w in enumerate(share))
         plain, projected = [], []
         for rotor, q in enumerate(self.instruments):
-            seen, asked = q.T @ change[:, rotor], q.T @ told[:, rotor]
-            shape = np.linalg.lstsq(asked, seen, rcond=None)[0]
-            plain.append(change[:, rotor] - told[:, rotor] @ shape)
-            projected.append(seen - asked @ shape)
+            target, projection = q.T @ change[:, rotor], q.T @ regressors[:, rotor]
+            gains = np.linalg.lstsq(projection, target, rcond=None)[0]
+            plain.append(change[:, rotor] - regressors[:, rotor] @ gains)
+            projected.append(target - projection @ gains)
         return np.stack(plain), np.stack(projected)
 
     def moments(self, x: NDArray) -> NDArray:
-        """(4 p,) what ought to be 0."""
+        """(4 p,) projections of e, which are 0 of the true lag and delay but for chance."""
         return self.errors(x)[1].ravel()
 
     def strength(self, x: NDArray) -> float:
-        """F statistic of the instruments, for that mixture of lag and delay of which they say least."""
+        """First-stage F statistic of the instruments, in the direction of lag and delay of which they say least."""
         little = 1e-4  # s
         base = self.errors(x)
         change = [tuple((a - b) / little for a, b in zip(self.errors(x + d), base)) for d in little * np.eye(2)]
@@ -232,8 +232,8 @@ class _Problem:
         return float(eigh(explained.T @ explained, unexplained, eigvals_only=True)[0]) / len(explained)
 
 
-def _quick(values: NDArray, step: float) -> NDArray:
-    """Without what is slower than `SLOW`."""
+def _high_pass(values: NDArray, step: float) -> NDArray:
+    """Values (n, ...) every `step` s without what is slower than `SLOW`."""
     return np.asarray(sosfiltfilt(butter(2, SLOW * 2 * step, "high", output="sos"), values, axis=0))
 
 
