@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from closed_loop import DRONE, fly
 from made_flight import array_of, made_flight, without
 from numpy.typing import NDArray
 
+from crazyem.diagnosis.flights.flight import flight_of
 from crazyem.diagnosis.flights.inputs import NOMINAL_VOLTAGE, inputs_of, rotor_input
 from crazyem.errors import DataError, FileFormatError
 from crazyem.physics import folding
@@ -179,3 +181,12 @@ def test_a_wrong_effect_in_a_file_is_named(tmp_path: Path, text: str, words: str
     with pytest.raises(FileFormatError, match=words) as caught:
         folding.load(path)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(("fall", "there"), [(0.0, False), (0.05, True)])
+def test_a_voltage_that_does_not_change_tells_nothing_of_a_battery(fall: float, there: bool) -> None:
+    flown = fly(seconds=8.0)
+    time = flown.signals["position"].time
+    volts = 4.0 - fall * time / time[-1] + 3e-3 * np.random.default_rng(1).normal(size=time.size)
+    made = replace(flown, signals={**flown.signals, "voltage": array_of("voltage", time, volts[:, None], place=70)})
+    assert ("voltage" in flight_of(made, DRONE).signals) is there
