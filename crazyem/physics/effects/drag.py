@@ -5,8 +5,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
+from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Values, Wrench
 from crazyem.physics.effects.prior import Conditions, Prior, Sizes, alike, in_turn
+from crazyem.vehicle import GRAVITY, Vehicle
 
 
 def linear_force(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
@@ -116,7 +117,19 @@ VELOCITY_MOMENT = Effect(
     ),
     needs=("velocity", "position"),
     separates="fly straight legs forward and back, then left and right, at 1 and 2 m/s, and hover between them",
+    slow_torque=True,
 )
+
+# m/s: a rotor loses thrust with the speed at which its air comes, all of it at twice the speed that it gives to the air
+# (4 m/s in a Crazyflie's hover; half of that is less than any small drone's).
+INDUCED = 2.0
+
+
+def _as_in_honey(values: Values, vehicle: Vehicle) -> bool:
+    """Whether no rotors can damp a turn as much (see `INDUCED`)."""
+    most = vehicle.mass * GRAVITY * float(np.hypot(*vehicle.arm)) ** 2 / (2.0 * INDUCED)
+    return max(values.values()) > most
+
 
 RATE_DAMPING = Effect(
     "rate_damping",
@@ -125,7 +138,8 @@ RATE_DAMPING = Effect(
     constants={a: f"damping_{a}" for a in "xyz"},
     about=("damping",),
     external=damping,
-    prior=Prior(alike("x y z", 2e-5), _sampled),
+    prior=Prior(alike("x y z", 2e-5), _sampled, conditional=True),
+    unphysical=_as_in_honey,
     # rotors that are heavy look like a damping about z to commands that are sampled, and their derivative at none may
     # have the wrong sign: begun as a bar of 0.3 g and 46 mm would be
     imitators={"rotor_inertia": {"inertia": 5e-8}},

@@ -233,17 +233,25 @@ class Effect:
         sizes: values of the amplitude with which beginnings are compared in full, where a small one says little.
         words: the effect for people; "": the name with spaces.
         belongs_to: "vehicle", or "recording" where each recording has its own: what a sensor or a filter on board shows
-            on that day, which no vehicle file is to have.
+            on that day, which no vehicle file is to have; or "day": of the air or the link of that day, which the
+            vehicle file has and no simulator's.
         prior: how large its parameters are.
         needs_torques: told by torques from sample to sample, of which commands on another clock say nothing.
         steady_force: told by forces that last, which no torque at random looks like.
         steady_torque: whether it makes a torque that lasts, as a trim does.
         shifts_centre: whether it moves the centre of mass.
+        slow_torque: whether it acts by a torque that goes with velocity, which commands on another clock still show.
+        imbalance: what it does to the steady thrust and torque of a drone: "thrust", all rotors lack a share; "mean
+            thrust", so on average over a flight; "rotor", one rotor lacks a share; "load", a weight sits on board;
+            "air", a torque about x and y; "", nothing that is known.
         lifts: whether it acts up and down as a weight does.
         needs_voltage: whether nothing can be said of its size without the voltage of the battery.
         twins: effects that are nearly the same to every signal: fitted where it is fitted, and never beside it.
         never_beside: sets of effects that together are the same as it.
-        same_as: effects that are exactly the same to every signal.
+        same_as: effects that are exactly the same to every signal -> their choices with which they are.
+        common_factor: the effect that it is where all its parameters change by one factor; "": none.
+        fixed_beside: effects found beside which it is not free within what is usual: both go along a ridge.
+        mistaken_for: effects that are named where it is there, which is itself never named.
         imitators: effects that may look like it although derivatives at nothing say nothing of them -> where such a fit
             begins.
         own_likelihood: whether another likelihood than that of the filter speaks of it, or none.
@@ -251,6 +259,8 @@ class Effect:
         of_healthy_rotors: whether flights of the healthy drone give the vehicle file its values.
         admitted: choices -> (low, high) of parameters while they are fitted, less than a file may have.
         most_per_mass: of a parameter over the drone's mass, in its unit over kg: more is something else.
+        unphysical: (values; vehicle) -> whether they are more than a drone of this mass and size can have.
+        linear_range: departures of its parameters from neutral that one pass of a fit finds; 0: none.
         random: a random process, which adds nothing to the mean motion.
         gain: "thrust" or "torque" where its one parameter multiplies that of all rotors.
         own: vehicle -> values of the parameters whose neutral value is the vehicle's.
@@ -291,17 +301,24 @@ class Effect:
     steady_force: bool = False
     steady_torque: bool = False
     shifts_centre: bool = False
+    slow_torque: bool = False
+    imbalance: str = ""
     lifts: bool = False
     needs_voltage: bool = False
     twins: tuple[str, ...] = ()
     never_beside: tuple[frozenset[str], ...] = ()
-    same_as: tuple[str, ...] = ()
+    same_as: Mapping[str, Values] = field(default_factory=dict)
+    common_factor: str = ""
+    fixed_beside: tuple[str, ...] = ()
+    mistaken_for: tuple[str, ...] = ()
     imitators: Mapping[str, Values] = field(default_factory=dict)
     own_likelihood: bool = False
     on_request: bool = False
     of_healthy_rotors: bool = False
     admitted: Callable[[Values], Mapping[str, tuple[float, float]]] = lambda chosen: {}
     most_per_mass: float = math.inf
+    unphysical: Callable[[Values, Vehicle], bool] | None = None
+    linear_range: float = 0.0
     random: bool = False
     gain: str = ""
     own: Callable[[Vehicle], dict[str, float]] | None = None

@@ -48,7 +48,9 @@ WIND = Effect(
     prior=Prior(in_turn("x y z", 2.0, 2.0, 0.7), finding=_blows),
     needs=("velocity", "position"),  # a force that goes on moves the drone; an accelerometer alone is only tilted by it
     separates="hover for 5 s at each of four headings: wind stays in the world, a tilted frame turns with the drone",
+    belongs_to="day",
     steady_force=True,
+    imbalance="air",
 )
 
 GUSTS = Effect(
@@ -67,6 +69,7 @@ GUSTS = Effect(
         detection_limit=lambda chosen, conditions: {"standard_deviation": CALM if conditions.individual_file else 0.4},
     ),
     separates="fly the same manoeuvre in still air",
+    belongs_to="day",
     amplitude="standard_deviation",
 )
 
@@ -98,5 +101,6 @@ FORCE_BY_PLACE = Effect(
         {**in_turn("x y z", 4e-4, 4e-4, 1e-3), **dict.fromkeys((p.name for p in SLOPES), 5e-4)},
     ),
     needs=("position",),
+    mistaken_for=("wind", "ground_effect"),
     separates="fly the same path elsewhere in the room",
 )

@@ -7,9 +7,12 @@ import numpy as np
 
 from crazyem.physics.effects.effect import Body, Effect, Parameter
 from crazyem.physics.effects.prior import AT_ONCE_SD, Conditions, Prior, Sizes, alike, in_turn
+from crazyem.vehicle import Vehicle
 
 ON_BOARD = 0.04  # m from the middle of the rotors: no part of a Crazyflie is further away
 WITHIN = dict.fromkeys("xyz", (-ON_BOARD, ON_BOARD))
+# No drone is as heavy to turn as if all its mass were this many times as far out as its rotors.
+FAR_OUT = 2.0
 
 
 def diagonal(body: Body, *, xx: float, yy: float, zz: float) -> Body:
@@ -41,6 +44,11 @@ def _moments(conditions: Conditions) -> Sizes:
     return in_turn("xx yy zz", x, y, AT_ONCE_SD if conditions.heavy_rotors else z)
 
 
+def largest_inertia(vehicle: Vehicle) -> float:
+    """kg m^2 that a drone of this mass and size can have (see `FAR_OUT`)."""
+    return vehicle.mass * (FAR_OUT * float(np.hypot(*vehicle.arm))) ** 2
+
+
 INERTIA = Effect(
     "inertia",
     tuple(Parameter(axis, "kg m^2", math.nan, 1e-7, 1e-1, 3e-7) for axis in ("xx", "yy", "zz")),
@@ -61,6 +69,8 @@ INERTIA = Effect(
     alike=0.9,  # what is heavier about one axis is so about the others: they differ by a third of what they are more
     needs_torques=True,
     twins=("torque_scale",),
+    common_factor="torque_scale",
+    unphysical=lambda values, vehicle: max(values.values()) > largest_inertia(vehicle),
 )
 
 INERTIA_PRODUCTS = Effect(
@@ -145,6 +155,7 @@ PAYLOAD = Effect(
     amplitude="mass",
     steady_torque=True,
     shifts_centre=True,
+    imbalance="load",
     lifts=True,
     needs_voltage=True,
     admitted=lambda chosen: WITHIN,

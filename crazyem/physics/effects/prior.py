@@ -92,6 +92,7 @@ class Prior:
             "neutral", the parameter's own neutral value; SI where absent.
         centre: what recordings have on average anyway, where that is not neutral; or as a function of the conditions.
         freedom: degrees of freedom of Student's t distribution, which `usual` is the scale of; infinite: a normal one.
+        conditional: `usual` depends on what was found, so that of one recording it may be none under some models.
         signed: `usual` goes below the physical range, too: a delay that is counted may be counted too long.
         each: whether several recordings that are fitted together have a deviation each.
         together: correlation of `own` between the parameters.
@@ -109,6 +110,7 @@ class Prior:
     per: Mapping[str, str] = field(default_factory=dict)
     centre: Sizes | Callable[[Conditions], Sizes] = field(default_factory=dict)
     freedom: float | Callable[[Conditions], float] = math.inf
+    conditional: bool = False
     signed: bool = False
     each: Callable[[Conditions], bool] = lambda conditions: False
     together: float = 0.0

@@ -11,8 +11,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
+from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Values, Wrench
+from crazyem.physics.effects.mass_properties import largest_inertia
 from crazyem.physics.effects.prior import AT_ONCE_SD, Conditions, Prior, Sizes, in_turn
+from crazyem.vehicle import Vehicle
 
 
 def scaled(situation: Situation, *, scale: float) -> NDArray:
@@ -65,6 +67,7 @@ THRUST_SCALE = Effect(
     ),
     separates="weigh the drone; without its weight thrust and mass are one number",
     steady_force=True,
+    imbalance="thrust",
     lifts=True,
     needs_voltage=True,
 )
@@ -80,6 +83,7 @@ ROTOR_FAULT = Effect(
     rotors=faulty,
     prior=Prior(own={"scale": 0.1}),
     steady_torque=True,
+    imbalance="rotor",
     # a worn, cut or bent propeller pulls less than the others, a new one among worn ones a little more; none gets
     # stronger in flight
     admitted=lambda chosen: {"scale": (0.0, 1.1 if chosen.get("onset_time") is None else 1.0)},
@@ -96,6 +100,11 @@ def _torques(conditions: Conditions) -> Sizes:
     return {"scale": 0.03} if conditions.shows_rotation and not conditions.other_clock else {}
 
 
+def _too_weak(values: Values, vehicle: Vehicle) -> bool:
+    """Torques too weak are inertias too large."""
+    return max(vehicle.inertia) > largest_inertia(vehicle) * float(values["scale"])
+
+
 TORQUE_SCALE = Effect(
     "torque_scale",
     (Parameter("scale", "", 1.0, 0.0, 5.0, 0.02),),
@@ -103,8 +112,10 @@ TORQUE_SCALE = Effect(
     gain="torque",
     about=("torque_per_thrust", "arm", "inertia"),
     turning=turned,
-    prior=Prior(own={"scale": 0.2}, usual=_torques, detection_limit={"scale": 0.08}),
+    prior=Prior(own={"scale": 0.2}, usual=_torques, conditional=True, detection_limit={"scale": 0.08}),
     twins=("inertia", "motor_lag"),  # angular acceleration is torque over inertia: both at once would be any size
+    fixed_beside=("motor_lag",),  # with it free, a lag that has no prior was 8 ms too long
+    unphysical=_too_weak,
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum): torque over inertia is all that a flight shows",
     needs_torques=True,

@@ -130,6 +130,7 @@ VELOCITY_SCALE = Effect(
     order=83,
     measured=scaled_velocity,
     prior=Prior(alike("x y z", 0.12), _jittery, detection_limit=_scale_limit),
+    linear_range=0.01,
     needs=("velocity",),
     words="velocity scale of the onboard estimate",
     belongs_to="recording",  # in a vehicle it cost 27 % of position error on other flights of the same drone

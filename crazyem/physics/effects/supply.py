@@ -80,5 +80,6 @@ BATTERY_SAG = Effect(
     separates="log pm.vbat, and fly the same battery from full to empty",
     spared={"voltage": "log pm.vbat, and "},
     steady_force=True,
+    imbalance="mean thrust",
     lifts=True,
 )

@@ -76,5 +76,6 @@ SUSPENDED_LOAD = Effect(
     nudge={"mass": 5e-4},
     amplitude="mass",
     beginnings={"length": LENGTHS},
+    imbalance="mean thrust",
     sizes=(1e-3, 2e-3, 4e-3),  # where it shakes, a load is followed only by one that pulls about as much
 )

@@ -118,7 +118,8 @@ INPUT_DELAY = Effect(
     order=23,
     timing=late,
     prior=Prior(own={"delay": 8e-3}, usual=_clock, signed=True, detection_limit={"delay": 4e-3}),
-    same_as=("measurement_delay",),  # of all that is measured
+    same_as={"measurement_delay": {"streams": ("state", "gyro")}},  # of all that is measured
+    belongs_to="day",
     needs=("motor_command", "rotor_speed"),
     separates="log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
     needs_torques=True,
