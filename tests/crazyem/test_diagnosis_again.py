@@ -12,7 +12,6 @@ from closed_loop import DRONE, Hidden, fly
 
 from crazyem.diagnosis import diagnose as diagnosing
 from crazyem.diagnosis.diagnose import diagnose
-from crazyem.diagnosis.fitting import nuisances
 from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, nominal
 from crazyem.diagnosis.fitting.model import Point
@@ -27,6 +26,7 @@ from crazyem.diagnosis.naming.named import DOUBTFUL, trust
 from crazyem.diagnosis.naming.select import select
 from crazyem.diagnosis.naming.trials import Selection
 from crazyem.diagnosis.naming.unexplained import Unexplained, notable
+from crazyem.physics.effects import mass_properties
 
 DRAG = Candidate("linear_drag", (), ("x", "y", "z"))
 THRUST = Candidate("thrust_scale", (), ("scale",))
@@ -46,7 +46,7 @@ def test_an_inertia_that_no_body_has_leaves_open_what_turns_the_drone(slow_to_tu
     found = diagnose([slow_to_turn], DRONE, wanted=wanted)
     assert {e.name for e in found.effects} == {"inertia", "linear_drag"}
     assert not found.left_out
-    monkeypatch.setattr(nuisances, "FAR_OUT", 0.1)  # as if the drone were that much smaller than what it needs
+    monkeypatch.setattr(mass_properties, "FAR_OUT", 0.1)  # as if the drone were that much smaller than what it needs
     said = []
     again = diagnose([slow_to_turn], DRONE, wanted=wanted, say=said.append)
     assert [e.name for e in again.effects] == ["linear_drag"]

@@ -9,11 +9,12 @@ from typing import Any
 from crazyem.diagnosis.fitting.model import OWN, Column, Point
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.errors import UsageError
+from crazyem.physics.effects import rotors
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effect, Parameter
 from crazyem.physics.motion import vehicle_values
 
-TRIM = "trim"
+TRIM = rotors.TRIM.name
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,9 @@ class Candidate:
             low, high = self.range_of(name)
             found[name] = min(max(found[name], low), high)
         return found
+
+
+THRUST = Candidate(rotors.THRUST_SCALE.name, (), ("scale",))
 
 
 class OfRecordings(Candidate):

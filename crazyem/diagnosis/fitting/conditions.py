@@ -9,6 +9,8 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.sampling import interval, unlogged_share
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.effects.prior import Conditions
+from crazyem.physics.effects.rotors import ROTOR_INERTIA
+from crazyem.physics.effects.sensing import GYRO_BIAS
 
 
 def conditions_of(flights: Sequence[Flight], point: Point) -> Conditions:
@@ -30,8 +32,8 @@ def conditions_of(flights: Sequence[Flight], point: Point) -> Conditions:
         period=max(interval(f) for f in flights),
         unlogged_share=unlogged_share(flights, vehicle),
         other_clock=all(f.coarse for f in flights),
-        rotor_inertia=float(point.effects.get("rotor_inertia", {}).get("inertia", 0.0)),
-        gyro_bias=float(np.linalg.norm([float(v) for v in point.effects.get("gyro_bias", {}).values()])),
+        rotor_inertia=float(point.effects.get(ROTOR_INERTIA.name, {}).get("inertia", 0.0)),
+        gyro_bias=float(np.linalg.norm([float(v) for v in point.effects.get(GYRO_BIAS.name, {}).values()])),
     )
 
 

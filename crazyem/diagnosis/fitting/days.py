@@ -4,13 +4,13 @@ A vehicle file may say so (`Days`, from healthy flights). Else the spread of oth
 effect `trim`.
 """
 
-from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.prior import Conditions
+from crazyem.physics.effects.rotors import THRUST_SCALE, TRIM
 from crazyem.vehicle import Vehicle
 
-_TRIM, _REAL = CATALOGUE["trim"].prior, Conditions(file_effects=frozenset({"trim"}))
-TRIM_SD = tuple(_TRIM.usual_in(_REAL).values())  # m, torque over thrust about x, y, z
-THRUST_SD = CATALOGUE["thrust_scale"].prior.usual_in(_REAL)["scale"]  # relative
+_REAL = Conditions(file_effects=frozenset({TRIM.name}))
+TRIM_SD = tuple(TRIM.prior.usual_in(_REAL).values())  # m, torque over thrust about x, y, z
+THRUST_SD = THRUST_SCALE.prior.usual_in(_REAL)["scale"]  # relative
 # Flights that the spread of other drones is worth beside a drone's own: the two drones of CrazyPAD differ by a factor
 # of four in it, so other drones say little.
 PRIOR_FLIGHTS = 2.0
@@ -18,7 +18,7 @@ PRIOR_FLIGHTS = 2.0
 
 def trim_known(vehicle: Vehicle) -> bool:
     """Whether the file has the drone's own trim; one of 0 only says that it is a real drone."""
-    return any(float(v) for v in vehicle.effects.get("trim", {}).values())
+    return any(float(v) for v in vehicle.effects.get(TRIM.name, {}).values())
 
 
 def day_sd(vehicle: Vehicle) -> tuple[float, ...]:
@@ -30,4 +30,4 @@ def day_sd(vehicle: Vehicle) -> tuple[float, ...]:
 
 def day_freedom(vehicle: Vehicle) -> float:
     """Degrees of freedom of Student's t distribution of a day."""
-    return _TRIM.freedom_in(_REAL) if vehicle.days is None else PRIOR_FLIGHTS + vehicle.days.flights - 1.0
+    return TRIM.prior.freedom_in(_REAL) if vehicle.days is None else PRIOR_FLIGHTS + vehicle.days.flights - 1.0

@@ -22,7 +22,7 @@ REACH = 2.5  # standard deviations within which a nuisance stays
 TORQUES = np.full(3, 0.5)  # rad/s^2, where disturbing torques with memory begin
 WANDER = 0.5  # s: memory of torques that moving air brings
 SAMPLED, WANDERING = 3.0, 2.0  # nats; nats a second: that torques with the memory of the lag, of the air must gain
-PASSES, CONVERGED, SLIGHT = 8, 0.2, 0.01  # passes, nats, relative error of velocity that one pass finds
+PASSES, CONVERGED = 8, 0.2  # passes, nats
 ENOUGH = 0.05  # nats: a round that gains less ends the fit
 NOTHING = 0.005  # nats: a step that promises less, a tenth of a standard deviation, is not taken
 TRIES = 6  # of a step, each a third of the one before
@@ -193,7 +193,9 @@ def strongly_shown(name: str, values: Mapping[str, Any]) -> bool:
     """Whether an effect moves what sensors show so far from the state that one pass does not find it."""
     if name.startswith(OWN) or CATALOGUE[name].measured is None:
         return False
-    return name != "velocity_scale" or any(abs(values.get(a, 1.0) - 1.0) > SLIGHT for a in "xyz")
+    slight = CATALOGUE[name].linear_range
+    parameters = CATALOGUE[name].parameters if slight else ()
+    return not slight or any(abs(values.get(p.name, p.neutral) - p.neutral) > slight for p in parameters)
 
 
 def nominal(data: Data, point: Point) -> Point:

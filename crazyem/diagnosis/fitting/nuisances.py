@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, of_recordings
+from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate, of_recordings
 from crazyem.diagnosis.fitting.conditions import conditions_of
 from crazyem.diagnosis.fitting.days import trim_known
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, refine, remembering, remembering_anew
@@ -17,33 +17,27 @@ from crazyem.diagnosis.flights.flight import Flight
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effect
 from crazyem.physics.effects.prior import Prior
-from crazyem.vehicle import GRAVITY, Vehicle
+from crazyem.physics.effects.timing import MOTOR_LAG
+from crazyem.vehicle import Vehicle
 
 # s: fits find the rotors' lag off all the same: in sixteen more flights with nothing hidden 47 to 55 ms, 3.1 ms (rms),
 # with inertias 3 % too small for each ms too long where the drone turns little.
 LAG_OFF = 3e-3
 SEVERAL = 3  # recordings whose commands are known, from which on each has a thrust of its own
-# Streams that were put onto another clock by straight lines do not look white any more. Their torques explain so little
-# of the turning that the drone would have to be as heavy to turn as if all its mass were this many times as far out as
-# its rotors: no body of that size is, and what it stands for says nothing of the drone.
-FAR_OUT = 2.0
-# m/s. Nor does a body turn as in honey: a rotor loses thrust with the speed at which its air comes, all of it at twice
-# the speed that it gives to the air (4 m/s in a Crazyflie's hover; half of that is less than any small drone's).
-INDUCED = 2.0
 COARSE_REASON = "the turning does not follow the commands as they were recorded: they are on another clock"
 TRIM_REASON = "a shifted centre of mass is a trim, and that changes from day to day"
 LEVEL_REASON = "no battery voltage is recorded, so how heavy or strong the drone is cannot be told"
-SOMETIMES_FREE = ("torque_scale", "rate_damping")  # by what was found: until a lag is, and beside a rotor inertia
 Nuisances = list[tuple[Candidate, tuple[float, ...]]]  # with the precision of each free parameter
 
 
 def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisances:
     """What is always free, with the precisions of its priors about neutral: the usual deviations of every effect."""
     facts = conditions_of(data.flights, point)
+    taken = {c.effect for c in accepted} | data.constrained
     found: Nuisances = []
     for effect in CATALOGUE.values():
         prior, sizes = effect.prior, effect.prior.usual_in(facts)
-        if not sizes or effect.own_likelihood:
+        if not sizes or effect.own_likelihood or not taken.isdisjoint(effect.fixed_beside):
             continue
         if prior.each(facts):
             candidate: Candidate = of_recordings(effect.name, tuple(sizes), data.flights)
@@ -56,9 +50,6 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
             body = {"mass": point.vehicle.mass, "inertia": point.vehicle.inertia[0]}
             precision = tuple((sd * prior.share(n, **body, neutral=neutral[n])) ** -2.0 for n, sd in sizes.items())
         found.append((candidate, precision))
-    taken = {c.effect for c in accepted} | data.constrained
-    if "motor_lag" in taken:  # both free, with a lag that has no prior, go along their ridge: a lag 8 ms too long
-        taken.add("torque_scale")
     return [(c, p) for c, p in found if c.effect not in taken]
 
 
@@ -74,16 +65,13 @@ def differing(flights: Sequence[Flight], kept_apart: Sequence[Flight], vehicle: 
 
 def unlike_a_body(point: Point, accepted: Sequence[Candidate]) -> bool:
     """Whether the inertia, the lack of torque or the damping that was found is more than a drone of this mass and size
-    can have (see `FAR_OUT`, `INDUCED`)."""
-    mass, arm = point.vehicle.mass, float(np.hypot(*point.vehicle.arm))
-    most = {"inertia": mass * (FAR_OUT * arm) ** 2, "rate_damping": mass * GRAVITY * arm**2 / (2.0 * INDUCED)}
-    if arm > 0 and any(c.effect == "torque_scale" for c in accepted):  # torques too weak are inertias too large
-        weak = float(point.effects["torque_scale"]["scale"])
-        if max(point.vehicle.inertia) > most["inertia"] * weak:
-            return True
-    return arm > 0 and any(
-        float(v) > most[c.effect] for c in accepted if c.effect in most for v in c.values(point).values()
-    )
+    can have.
+
+    Streams that were put onto another clock by straight lines do not look white any more. Their torques explain so
+    little of the turning that what is found in its place says nothing of the drone.
+    """
+    tests = [(CATALOGUE[c.effect].unphysical, c.values(point)) for c in accepted]
+    return any(point.vehicle.arm) and any(test(values, point.vehicle) for test, values in tests if test)
 
 
 def abstained(
@@ -92,13 +80,18 @@ def abstained(
     """The candidates without those that such recordings cannot speak of, and the reasons with theirs."""
     gone = {}
     if TRIM in point.vehicle.effects:
-        gone = {c.effect: TRIM_REASON for c in candidates if c.effect == "center_of_mass"}
+        gone = {c.effect: TRIM_REASON for c in candidates if _only_shifts(CATALOGUE[c.effect])}
     if all(f.levelled for f in data.flights):
         gone |= {c.effect: LEVEL_REASON for c in candidates if CATALOGUE[c.effect].needs_voltage}
     if data.coarse:
         gone |= {c.effect: COARSE_REASON for c in candidates if _turns(CATALOGUE[c.effect])}
         candidates = [replace(c, free=_without_height(c)) for c in candidates]
     return [c for c in candidates if c.effect not in gone], {**left_out, **gone}
+
+
+def _only_shifts(effect: Effect) -> bool:
+    """Whether an effect moves the centre of mass and weighs nothing."""
+    return effect.shifts_centre and not effect.lifts
 
 
 def _turns(effect: Effect) -> bool:
@@ -121,7 +114,7 @@ def with_trim_noise(data: Data, point: Point) -> Point:
     """
     if TRIM not in point.vehicle.effects:
         return point
-    free = [Candidate(TRIM, (), ("x", "y", "z")), Candidate("thrust_scale", (), ("scale",))]
+    free = [Candidate(TRIM, (), ("x", "y", "z")), THRUST]
     rest = [(c, p) for c, p in nuisances(data, point, free)]
     start = with_nuisances(point, [*rest, *((c, ()) for c in free)])
     found = start
@@ -196,7 +189,7 @@ def by_a_wrong_lag(data: Data, fitted: Fitted) -> dict[tuple[str, str], float]:
     the lag is free beside them, but no finding."""
     own = [(c.effect, name) for c in fitted.candidates for name in c.free]
     free = [(c.effect, name) for c, _ in nuisances(data, fitted.point, fitted.candidates) for name in c.free]
-    lag, names = ("motor_lag", "time_constant"), own + free
+    lag, names = (MOTOR_LAG.name, "time_constant"), own + free
     if lag not in free or len(names) != fitted.gram.size:
         return {}
     at = names.index(lag)
@@ -252,8 +245,8 @@ def _let_go(point: Point, accepted: Sequence[Candidate], free: Nuisances) -> Poi
     """The point with what is free no longer (see `nuisances`) as the vehicle file has it, instead of where it was left:
     nobody is told of it, and a torque scale of 0.925 that stayed made a centre of mass 8 % too small."""
     kept = {c.effect for c in (*accepted, *(c for c, _ in free))}
-    for name in SOMETIMES_FREE:
-        point = point if name in kept else without(point, name)
+    for name, effect in CATALOGUE.items():
+        point = without(point, name) if effect.prior.conditional and name not in kept else point
     return point
 
 

@@ -80,7 +80,7 @@ class Flight:
         signals: names of what is measured.
         fused: a filter on board made the attitude, or the velocity where there is none.
         levelled: the voltage is not recorded, and the thrust of its beginning is the weight by assumption.
-        coarse: what turned the drone is not in the commands as recorded (see `nuisances.FAR_OUT`).
+        coarse: what turned the drone is not in the commands as recorded (see `nuisances.unlike_a_body`).
         differs: there are several recordings, and each may have a thrust of its own (see `model.OWN`).
         alignment: how late measured rotor speeds are; they are moved already. None where unknown.
         frame: how the pose lies against that of other recordings; it is turned back already. None where alike.
