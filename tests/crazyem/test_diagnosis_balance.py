@@ -32,6 +32,7 @@ from crazyem.diagnosis.naming.balance import (
     without_each,
 )
 from crazyem.diagnosis.naming.trials import Trial
+from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.vehicle import Vehicle
 
 DAYS = 8.0  # degrees of freedom
@@ -98,8 +99,9 @@ def test_no_load_is_further_out_than_the_drone() -> None:
 
 def test_a_healthy_drone_is_best_explained_by_nothing_and_two_weak_rotors_by_a_load() -> None:
     assert all(
-        balance_loglik(balance(np.zeros(4)), name, {"rotor": 1}) == pytest.approx(-n, abs=1e-6)
-        for name, n in FREE.items()
+        balance_loglik(balance(np.zeros(4)), name, {"rotor": 1}) == pytest.approx(-FREE[effect.imbalance], abs=1e-6)
+        for name, effect in CATALOGUE.items()
+        if effect.imbalance
     )
     two = balance(0.2 * (EACH[2] + EACH[3]))
     assert balance_loglik(two, "payload", {}) == pytest.approx(-3.0, abs=1e-3)  # left rotors: their drags cancel

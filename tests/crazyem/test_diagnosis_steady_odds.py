@@ -33,9 +33,9 @@ def test_a_rotor_that_is_weak_in_every_flight_is_found_with_its_share(number):
     rng = np.random.default_rng(number)
     days = [0.3 * EACH[number - 1] + SD * rng.standard_normal(4) for _ in range(3)]
     chance, found = chances(*days)
-    assert max(chance, key=chance.get) == ("rotor_fault", number)
-    assert chance["rotor_fault", number] > 0.9
-    assert found["rotor_fault", number][1][0] == pytest.approx(0.3, abs=0.08)
+    assert max(chance, key=chance.get) == ("rotor", number)
+    assert chance["rotor", number] > 0.9
+    assert found["rotor", number][1][0] == pytest.approx(0.3, abs=0.08)
 
 
 def test_days_that_differ_are_nothing():
@@ -52,15 +52,15 @@ def test_healthy_drones_are_rarely_accused():
     accused = 0
     for _ in range(200):
         chance, _ = chances(*(SD * stats.t.rvs(8, size=4, random_state=rng) for _ in range(2)))
-        accused += sum(p for (name, _), p in chance.items() if name in ("rotor_fault", "payload")) > 0.5
+        accused += sum(p for (name, _), p in chance.items() if name in ("rotor", "load")) > 0.5
     assert accused <= 6
 
 
 def test_a_load_has_no_torque_about_z():
     heavier = np.array([0.15, 0.15 * 0.02, -0.15 * 0.01, 0.0])
     chance, found = chances(heavier, heavier)
-    assert max(chance, key=chance.get) == ("payload", 0)
-    assert found["payload", 0][1][0] == pytest.approx(0.15, abs=0.02)
+    assert max(chance, key=chance.get) == ("load", 0)
+    assert found["load", 0][1][0] == pytest.approx(0.15, abs=0.02)
 
 
 def test_a_load_is_as_sure_as_the_day_s_thrust_and_at_the_edge_as_the_torque_that_needs_it():

@@ -176,7 +176,7 @@ def odds(recording: Recording, vehicle: Vehicle) -> NDArray:
     """(4,) nats by which the balance prefers a fault of each rotor to none."""
     data = Data([flight_of(recording, vehicle)])
     found = explanations([balance_of(data, nominal(data, replace(point_of(vehicle), noise=first_guess())))])
-    return np.array([found["rotor_fault", r][0] - found["", 0][0] for r in (1, 2, 3, 4)])
+    return np.array([found["rotor", r][0] - found["", 0][0] for r in (1, 2, 3, 4)])
 
 
 @pytest.mark.parametrize("name", SYMMETRIES)

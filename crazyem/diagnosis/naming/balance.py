@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import lsq_linear, minimize_scalar
 
-from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate
 from crazyem.diagnosis.fitting.days import day_freedom, day_sd
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, refine
 from crazyem.diagnosis.fitting.model import Point
@@ -24,13 +24,15 @@ from crazyem.diagnosis.fitting.nuisances import nuisances, solved, with_nuisance
 from crazyem.diagnosis.naming.alternatives import exchanged
 from crazyem.diagnosis.naming.corroboration import TELLING
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
-from crazyem.physics.effects.mass_properties import ON_BOARD
+from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.mass_properties import ON_BOARD, PAYLOAD
+from crazyem.physics.effects.rotors import ROTOR_FAULT
 from crazyem.physics.rotors import wrench
 
 HEAVIEST = 1.0  # a load's weight over the drone's
-# How many of the four numbers each moves freely; a rotor's are in one ratio, a load's bounded by where it can be.
-FREE = {"rotor_fault": 1, "thrust_scale": 1, "battery_sag": 1, "suspended_load": 1, "wind": 3, "payload": 3}
-BY_THRUST = ("thrust_scale", "battery_sag", "suspended_load")
+# `Effect.imbalance` -> how many of the four numbers it moves freely; a rotor's are in one ratio, a load's bounded by
+# where it can be.
+FREE = {"rotor": 1, "thrust": 1, "mean thrust": 1, "air": 3, "load": 3}
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,7 @@ class Balance:
 def balance_of(data: Data, point: Point) -> Balance:
     """The balance of flights; `point` is a model of a vehicle whose file has a trim, of which the noise is taken."""
     point = replace(point, effects={n: dict(v) for n, v in point.vehicle.effects.items()})
-    free = [Candidate("thrust_scale", (), ("scale",)), Candidate(TRIM, (), ("x", "y", "z"))]
+    free = [THRUST, Candidate(TRIM, (), ("x", "y", "z"))]
     rest = nuisances(data, point, free)
     start = with_nuisances(point, [*rest, *((c, ()) for c in free)])
     fitted = refine(data.twin(), start, free, nuisances=rest, rounds=4, noise=False)
@@ -79,19 +81,20 @@ def without_each(data: Data, point: Point) -> NDArray:
 def balance_loglik(balance: Balance, effect: str, fixed: Mapping[str, Any]) -> float | None:
     """Log-likelihood [nats] of the balance with an effect, at its best, less the number of numbers it moves; None where
     nothing is known of what it does to it."""
-    if effect not in FREE:
+    kind = CATALOGUE[effect].imbalance
+    if not kind:
         return None
     root = np.linalg.cholesky(np.linalg.inv(balance.covariance)).T
     lack = root @ balance.lack
-    if effect == "rotor_fault":
+    if kind == "rotor":
         moved = root @ balance.rotors[int(fixed["rotor"]) - 1]
         rest = lack - moved * np.clip(moved @ lack / (moved @ moved), 0.0, 1.0)
-        return likely(float(rest @ rest), balance.freedom) - FREE[effect]
-    if effect == "payload":
-        return likely(_loaded(root, lack), balance.freedom) - FREE[effect]
-    moves = root[:, [0]] if effect in BY_THRUST else root[:, 1:3]
+        return likely(float(rest @ rest), balance.freedom) - FREE[kind]
+    if kind == "load":
+        return likely(_loaded(root, lack), balance.freedom) - FREE[kind]
+    moves = root[:, 1:3] if kind == "air" else root[:, [0]]
     rest = lack - moves @ np.linalg.lstsq(moves, lack, rcond=None)[0]
-    return likely(float(rest @ rest), balance.freedom) - FREE[effect]
+    return likely(float(rest @ rest), balance.freedom) - FREE[kind]
 
 
 def likely(distance: float, freedom: float) -> float:
@@ -124,6 +127,16 @@ def steady(candidate: Candidate) -> bool:
     return dict(candidate.fixed).get("onset_time") is None
 
 
+def _unbalances(candidate: Candidate) -> bool:
+    """Whether something is known of what it does to the balance."""
+    return bool(CATALOGUE[candidate.effect].imbalance)
+
+
+def _numbers(candidate: Candidate) -> int:
+    """How many numbers of the balance it moves freely."""
+    return FREE[CATALOGUE[candidate.effect].imbalance]
+
+
 def how_weak(balance: Balance, rotor: int) -> tuple[float, float]:
     """Share of its thrust that rotor 1 to 4 lacks by the balance, and its standard deviation."""
     root = np.linalg.cholesky(np.linalg.inv(balance.covariance)).T
@@ -136,14 +149,14 @@ def hidden_by_the_day(data: Data, selection: Selection, asked: Sequence[Candidat
 
     Empty where there is nothing to be weighed, or weak rotors were not among the candidates `asked`.
     """
-    steadied = TRIM in selection.nominal.vehicle.effects and not any(c.effect in FREE for c in selection.accepted)
-    if not steadied or all(c.effect != "rotor_fault" for c in asked):
+    steadied = TRIM in selection.nominal.vehicle.effects and not any(map(_unbalances, selection.accepted))
+    if not steadied or all(c.effect != ROTOR_FAULT.name for c in asked):
         return {}
     try:
         balance = balance_of(data, selection.nominal)
     except (DivergedError, np.linalg.LinAlgError):
         reason = "not asked: what is steady in this flight fits no model"
-        return {"rotor_fault": reason, "payload": reason}
+        return {ROTOR_FAULT.name: reason, PAYLOAD.name: reason}
     lacks = [how_weak(balance, rotor) for rotor in (1, 2, 3, 4)]
     reach = float(stats.t.ppf(0.975, balance.freedom)) * max(sd for _, sd in lacks)
     each = ", ".join(str(round(100 * lack)) for lack, _ in lacks)
@@ -151,7 +164,7 @@ def hidden_by_the_day(data: Data, selection: Selection, asked: Sequence[Candidat
         f"what changes from day to day hides a rotor that lacks up to {100 * reach:.0f} % of its thrust; by what is "
         f"steady rotors 1 to 4 lack {each} %, each +- {100 * reach:.0f} (95 %), as if it alone were weak"
     )
-    return {"rotor_fault": text}
+    return {ROTOR_FAULT.name: text}
 
 
 def by_balance(data: Data, selection: Selection) -> tuple[Selection, Balance | None]:
@@ -164,8 +177,8 @@ def by_balance(data: Data, selection: Selection) -> tuple[Selection, Balance | N
     names = {c.effect for c in selection.accepted}
     decided = {s.taken.candidate: s.taken.size for s in selection.steps if s.taken and s.taken.log_odds is not None}
     mine = next((c for c in selection.accepted if c in decided), None)
-    mine = mine or next((c for c in selection.accepted if c.effect in FREE), None)
-    single = mine in decided or (len(names & set(FREE)) == 1 and TRIM not in names)
+    mine = mine or next((c for c in selection.accepted if _unbalances(c)), None)
+    single = mine in decided or (sum(bool(CATALOGUE[n].imbalance) for n in names) == 1 and TRIM not in names)
     if TRIM not in selection.nominal.vehicle.effects or mine is None or not single or not steady(mine):
         return selection, None
     try:
@@ -173,7 +186,7 @@ def by_balance(data: Data, selection: Selection) -> tuple[Selection, Balance | N
         if mine in decided:
             return _sized(data, selection, mine, {n: decided[mine][n] for n in mine.free}), balance
         selection, mine = _named(data, selection, mine, balance)
-        if mine.effect == "rotor_fault":
+        if CATALOGUE[mine.effect].imbalance == "rotor":
             lack = how_weak(balance, int(dict(mine.fixed)["rotor"]))[0]
             if 0.0 < lack < 1.0:
                 selection = _sized(data, selection, mine, {"scale": 1.0 - lack})
@@ -192,7 +205,7 @@ def _named(data: Data, selection: Selection, mine: Candidate, balance: Balance) 
         if nats is not None and trial.fitted is not None:
             rivals.append((nats, trial))
     beaten = [r for r in rivals if r[0] < -TELLING]
-    simpler = [r for r in rivals if r[0] < TELLING and FREE[r[1].candidate.effect] < FREE[mine.effect]]
+    simpler = [r for r in rivals if r[0] < TELLING and _numbers(r[1].candidate) < _numbers(mine)]
     if not beaten and not simpler:
         return selection, mine
     best = min(beaten or simpler, key=lambda entry: entry[0])[1]

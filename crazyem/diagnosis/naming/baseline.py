@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting.candidates import TRIM
+from crazyem.diagnosis.fitting.candidates import THRUST, TRIM
 from crazyem.diagnosis.fitting.days import PRIOR_FLIGHTS, day_sd
 from crazyem.diagnosis.fitting.fit import REACH, Data
 from crazyem.diagnosis.fitting.fit import nominal as nominal_of
@@ -48,9 +48,9 @@ def with_baseline(
     data = Data(flights)
     together = refine_base(data, _nominal(data, known), ()).point
     mean, sd = spread_of(np.array(lacks), np.array(day_sd(known)))
-    thrust = float(known.effects.get("thrust_scale", {}).get("scale", 1.0)) * (1.0 - float(mean[0]))
+    thrust = float(known.effects.get(THRUST.effect, {}).get("scale", 1.0)) * (1.0 - float(mean[0]))
     own = {axis: float(trim[axis] + m) for axis, m in zip("xyz", mean[1:], strict=True)}
-    effects = {**known.effects, **rotor_aerodynamics(data, together), TRIM: own, "thrust_scale": {"scale": thrust}}
+    effects = {**known.effects, **rotor_aerodynamics(data, together), TRIM: own, THRUST.effect: {"scale": thrust}}
     days = Days(len(recordings), float(sd[0]), (float(sd[1]), float(sd[2]), float(sd[3])))
     return replace(known, effects=effects, days=days)
 

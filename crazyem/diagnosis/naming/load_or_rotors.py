@@ -12,19 +12,20 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import on_held_out, refine_base, without
 from crazyem.diagnosis.naming.evidence import gain_of_both, known_by, tuning
 from crazyem.diagnosis.naming.trials import Selection, Trial
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.mass_properties import CENTER_OF_MASS, PAYLOAD
 from crazyem.vehicle import Vehicle
 
-LOAD = "payload"
+LOAD = PAYLOAD.name
 HEAVIER = Candidate(LOAD, (), ("mass", "x", "y", "z"))
-WEAKER = Candidate("thrust_scale", (), ("scale",))
-SHIFTED = Candidate("center_of_mass", (), ("x", "y", "z"))
+WEAKER = THRUST
+SHIFTED = Candidate(CENTER_OF_MASS.name, (), ("x", "y", "z"))
 
 
 def instead_of_a_load(vehicle: Vehicle) -> list[Candidate]:

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from crazyem.diagnosis.fitting.candidates import Candidate
+from crazyem.diagnosis.fitting.candidates import THRUST, Candidate
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Column, Point
@@ -66,8 +66,8 @@ def larger(data: Data, point: Point, family: Sequence[Candidate]) -> Candidate |
     def gain(tried: tuple[float, Candidate]) -> float:
         size, candidate = tried
         values = {**candidate.neutral(point), **dict(candidate.begin), effect.amplitude: size}
-        scale = point.effects.get("thrust_scale", {}).get("scale", 1.0) * (1.0 + size / point.vehicle.mass)
-        return data.twin().loglik(point.with_effects({effect.name: values, "thrust_scale": {"scale": scale}})) - nothing
+        scale = point.effects.get(THRUST.effect, {}).get("scale", 1.0) * (1.0 + size / point.vehicle.mass)
+        return data.twin().loglik(point.with_effects({effect.name: values, THRUST.effect: {"scale": scale}})) - nothing
 
     tried = list(product(effect.sizes, family))
     gains = data.workers.map(gain, tried)

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from crazyem.diagnosis.fitting.candidates import TRIM, Candidate
+from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate
 from crazyem.diagnosis.fitting.fit import Data, DivergedError, nominal, refine
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
@@ -23,9 +23,8 @@ from crazyem.diagnosis.naming.trials import Selection, Trial, distinguishable
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.rotors import TORQUE_SCALE
 from crazyem.vehicle import Vehicle
-
-THRUST = Candidate("thrust_scale", (), ("scale",))
 
 
 def left_as_trim(flights: Sequence[Flight], vehicle: Vehicle, remains: Unexplained, workers: Workers) -> Vehicle:
@@ -65,10 +64,10 @@ def with_exact_torques(data: Data, selection: Selection) -> Selection:
     """
     names = {c.effect for c in selection.accepted}
     centred = any(CATALOGUE[n].shifts_centre for n in names)
-    if not centred or "torque_scale" in names or TRIM in selection.final.vehicle.effects:
+    if not centred or TORQUE_SCALE.name in names or TRIM in selection.final.vehicle.effects:
         return selection
-    point = without(selection.final, "torque_scale")
-    free = [(c, p) for c, p in nuisances(data, point, selection.accepted) if c.effect != "torque_scale"]
+    point = without(selection.final, TORQUE_SCALE.name)
+    free = [(c, p) for c, p in nuisances(data, point, selection.accepted) if c.effect != TORQUE_SCALE.name]
     try:
         start = with_nuisances(point, free)
         fitted = refine(data, start, selection.accepted, nuisances=free, rounds=4, noise=False)

@@ -21,6 +21,7 @@ from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.diagnosis.naming.balance import FREE, HEAVIEST, Balance, balance_of, likely, steady
 from crazyem.diagnosis.naming.presence import LEAST_PROBABILITY, MISSING
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
+from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.mass_properties import ON_BOARD
 from crazyem.vehicle import Vehicle
 
@@ -47,15 +48,15 @@ def _air(x: NDArray, balance: Balance) -> NDArray:
 
 
 def explanations(balances: Sequence[Balance]) -> dict[tuple[str, int], tuple[float, NDArray]]:
-    """(effect, rotor; 0 for others) -> log posterior weight [nats] and its numbers; ("", 0): nothing but the days.
+    """(`Effect.imbalance`, rotor; 0 for others) -> log posterior weight [nats] and its numbers; ("", 0): only the days.
 
     The most that each explains of all balances together, less one nat a number (`FREE`).
     """
     asked: dict[tuple[str, int], tuple[Lack, list[tuple[float, float]]]] = {
-        **{("rotor_fault", r): _rotor(r - 1) for r in (1, 2, 3, 4)},
-        ("payload", 0): (_load, [(0.0, HEAVIEST / (1.0 + HEAVIEST)), (-EDGE, EDGE), (-EDGE, EDGE)]),
-        ("thrust_scale", 0): (_thrust, [(-1.0, 1.0)]),
-        ("wind", 0): (_air, [(-ON_BOARD, ON_BOARD)] * 2),
+        **{("rotor", r): _rotor(r - 1) for r in (1, 2, 3, 4)},
+        ("load", 0): (_load, [(0.0, HEAVIEST / (1.0 + HEAVIEST)), (-EDGE, EDGE), (-EDGE, EDGE)]),
+        ("thrust", 0): (_thrust, [(-1.0, 1.0)]),
+        ("air", 0): (_air, [(-ON_BOARD, ON_BOARD)] * 2),
     }
     roots = [np.linalg.cholesky(np.linalg.inv(b.covariance)).T for b in balances]
 
@@ -64,7 +65,7 @@ def explanations(balances: Sequence[Balance]) -> dict[tuple[str, int], tuple[flo
         return sum(likely(float(r @ r), b.freedom) for r, b in zip(rest, balances, strict=True))
 
     found = {("", 0): (np.log1p(-MISSING) + loglik(lambda b: np.zeros(4)), np.zeros(0))}
-    for (effect, rotor), (lack, ends) in asked.items():
+    for (kind, rotor), (lack, ends) in asked.items():
         starts = [np.array([0.1 * high, *(0.0 for _ in ends[1:])]) for high in (ends[0][1], 3.0 * ends[0][1])]
         best = min(
             (
@@ -73,8 +74,8 @@ def explanations(balances: Sequence[Balance]) -> dict[tuple[str, int], tuple[flo
             ),
             key=lambda r: float(r.fun),
         )
-        prior = np.log(MISSING / sum(e == effect for e, _ in asked))
-        found[effect, rotor] = (prior - float(best.fun) - FREE[effect], best.x)
+        prior = np.log(MISSING / sum(k == kind for k, _ in asked))
+        found[kind, rotor] = (prior - float(best.fun) - FREE[kind], best.x)
     return found
 
 
@@ -119,18 +120,18 @@ def steady_selection(
 
 def decided_by_balance(vehicle: Vehicle, candidate: Candidate) -> bool:
     """Whether a candidate is told by the balance alone: a weak rotor or a load, where the vehicle's trim is known."""
-    return trim_known(vehicle) and candidate.effect in ("rotor_fault", "payload") and steady(candidate)
+    return trim_known(vehicle) and CATALOGUE[candidate.effect].imbalance in ("rotor", "load") and steady(candidate)
 
 
 def _is(candidate: Candidate, name: tuple[str, int]) -> bool:
-    fixed = dict(candidate.fixed)
-    return candidate.effect == name[0] and fixed.get("rotor", 0) == name[1] and steady(candidate)
+    kind, rotor = CATALOGUE[candidate.effect].imbalance, dict(candidate.fixed).get("rotor", 0)
+    return bool(kind) and (kind, rotor) == name and steady(candidate)
 
 
 def _values(candidate: Candidate, numbers: NDArray, point: Point) -> Mapping[str, float]:
     """Numbers of a balance as parameters of the effect."""
     values = candidate.neutral(point)
-    if candidate.effect == "rotor_fault":
+    if CATALOGUE[candidate.effect].imbalance == "rotor":
         return {**values, "scale": 1.0 - float(numbers[0])}
     mass = point.vehicle.mass * float(numbers[0]) / (1.0 - float(numbers[0]))
     # a load at (x, y) turns the drone by -y about x and by x about y, per weight
