@@ -4,7 +4,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from crazyem.diagnosis.fitting.candidates import TRIM, Candidate, candidates_for
+from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate, candidates_for
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.fit import nominal as nominal_of
 from crazyem.diagnosis.fitting.model import Point, deviations
@@ -20,7 +20,7 @@ from crazyem.diagnosis.locating.heading import heading_by_place
 from crazyem.diagnosis.locating.locate import Located, locate
 from crazyem.diagnosis.locating.place import depends_on_place
 from crazyem.diagnosis.naming.alternatives import exchanged, named_again
-from crazyem.diagnosis.naming.answer import MEASURED_LATE, Answer, answer_of, strongest_first
+from crazyem.diagnosis.naming.answer import Answer, answer_of, strongest_first
 from crazyem.diagnosis.naming.balance import by_balance, hidden_by_the_day
 from crazyem.diagnosis.naming.corroboration import TELLING, false_speed, late_measurements
 from crazyem.diagnosis.naming.determined import determined, without_undetermined
@@ -38,11 +38,14 @@ from crazyem.diagnosis.naming.trials import Selection, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained, unexplained
 from crazyem.diagnosis.workers import Workers
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.rotors import ROTOR_FAULT
+from crazyem.physics.effects.sensing import ROTOR_SENSOR
+from crazyem.physics.effects.timing import INPUT_DELAY
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
 Say = Callable[[str], None]
-WEAK_OR_MISREAD = ("rotor_fault", "rotor_sensor")
+WEAK, MISREAD = ROTOR_FAULT.name, ROTOR_SENSOR.name
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,7 @@ def diagnose(
     left_out = {**chosen.left_out, **hidden_by_the_day(data, selection, chosen.candidates)}
     pulled = pull is not None or (place is not None and not place.pushed)
     beside = other_likelihoods(data, apart, selection.final, remains, wanted, left_out, pulled, say)
-    if any(e.name == "gusts" for e in beside):
+    if any(CATALOGUE[e.name].random for e in beside):
         remains = remains.without_force()
     answer = answer_of(
         data, selection, remains, corroborated=corroborated, in_place=_in_place(data, apart, selection), balance=balance
@@ -282,7 +285,7 @@ def _late_rotors(
     # the body answers to the speeds that were measured, so this says nothing against what was told of it
     deaf = disobedient([*here, *there])
     remains = remains.with_finding(deaf) if deaf else remains
-    if any(e.name == "input_delay" for e in answer.effects):
+    if any(e.name == INPUT_DELAY.name for e in answer.effects):
         return answer, [], remains
     late, alike = late_rotors(here, there, vehicle, asked.wanted, left_out, deaf=deaf is not None)
     separate = (*answer.separate, *(CATALOGUE[n].separates for g in alike for n in g))
@@ -300,17 +303,17 @@ def _corroborated(
     corroborated: set[str] = set()
     punctual = replace(selection.nominal, effects={n: dict(v) for n, v in selection.nominal.vehicle.effects.items()})
     for candidate in selection.accepted:
-        if candidate.effect == "input_delay":
+        if candidate.effect == INPUT_DELAY.name:
             nats = late_measurements(data.together_with(apart), punctual, candidate.values(selection.final)["delay"])
             if nats is not None and abs(nats) > TELLING:
-                corroborated |= {MEASURED_LATE if nats > 0 else "input_delay", "input_delay"}
-        elif candidate.effect in WEAK_OR_MISREAD and dict(candidate.fixed).get("onset_time") is None:
+                corroborated |= {INPUT_DELAY.name, *(INPUT_DELAY.same_as if nats > 0 else ())}
+        elif candidate.effect in (WEAK, MISREAD) and dict(candidate.fixed).get("onset_time") is None:
             nats, other, start = _misread_or_weak(candidate, selection, recordings)
             if nats is not None and abs(nats) > TELLING:
                 corroborated |= {candidate.effect, other.effect}
                 if nats > 0:
                     selection = exchanged(data, selection, candidate, other, [start])
-            weak = candidate.effect == WEAK_OR_MISREAD[0]
+            weak = candidate.effect == WEAK
             for_sensor = (nats or 0.0) if weak else -(nats or 0.0)
             if for_sensor > (TELLING if weak else 0.0):
                 # a healthy rotor turns as a weak one does: what commands say against that they say for the sensor
@@ -324,19 +327,19 @@ def _misread_or_weak(
     """For a weak rotor the sensor that would be wrong, for a wrong sensor the rotor that would be weak: the nats that
     commands speak for it, its candidate, and where it begins."""
     rotor, scale = dict(candidate.fixed)["rotor"], candidate.values(selection.final)["scale"]
-    weak = candidate.effect == WEAK_OR_MISREAD[0]
+    weak = candidate.effect == WEAK
     reading = scale**-0.5 if weak else scale
     nats = false_speed(recordings, rotor, reading, selection.nominal.vehicle.motor_time_constant)
     fixed: tuple[tuple[str, Any], ...] = (("rotor", rotor),)
     if weak:
-        return nats, Candidate("rotor_sensor", fixed, ("scale",)), reading
-    return None if nats is None else -nats, Candidate("rotor_fault", fixed, ("scale",)), reading**-2
+        return nats, Candidate(MISREAD, fixed, ("scale",)), reading
+    return None if nats is None else -nats, Candidate(WEAK, fixed, ("scale",)), reading**-2
 
 
 def _strengths(selection: Selection) -> dict[str, float]:
     """Name of the recording -> its thrust over what the fitted vehicle says; none where each has not its own."""
-    shared = float(selection.final.effects.get("thrust_scale", {}).get("scale", 1.0))
-    found = deviations(selection.final.effects, "thrust_scale")
+    shared = float(selection.final.effects.get(THRUST.effect, {}).get("scale", 1.0))
+    found = deviations(selection.final.effects, THRUST.effect)
     return {name: 1.0 + own["scale"] / shared for name, own in found.items()}
 
 

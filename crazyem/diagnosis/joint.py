@@ -58,9 +58,6 @@ def _columns(diagnosis: Diagnosis) -> Iterator[tuple[str, float]]:
         effect = CATALOGUE.get(candidate.effect)
         for name in candidate.free:
             key = f"{candidate.effect}.{name}"
-            of_drone = effect is not None and effect.belongs_to == "vehicle" and candidate.effect not in OF_LOOP
+            of_drone = effect is not None and effect.belongs_to == "vehicle"
             yield (key if of_drone and key not in seen else ""), float(values[name])
             seen.add(key)
-
-
-OF_LOOP = ("input_delay", "velocity_scale", "wind", "gusts")  # of a recording or a day, and in no simulator's file

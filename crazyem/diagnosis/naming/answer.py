@@ -24,16 +24,12 @@ from crazyem.diagnosis.naming.trials import Selection, Step, Trial, distinguisha
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.mass_properties import ON_BOARD
+from crazyem.physics.effects.rotors import ROTOR_FAULT
 
 WITHIN = 0.05  # p-value from which an effect's own uncertainty holds that there is none of it
 SHAKES = "hold the drone with its rotors turning: what shakes then is not the loop that swings with a wrong model"
 # Exactly the same to every signal, but for forces of the air: two things at once, more mass and inertias to match.
 HEAVIER = "weigh the drone: with {:.3g} times its mass and its inertias it would fly the same"
-MEASURED_LATE = "measurement_delay"
-BY_TORQUE = ("velocity_moment",)  # of what is asked of flights whose torques say little, what they alone can tell
-# Two weak rotors beside each other lack thrust and tilt the drone as a weight on their side does, with no torque about
-# z; only what turns tells, which a drone whose trim changes from day to day does not show.
-WEAK_ROTOR = "rotor_fault"
 
 
 @dataclass(frozen=True)
@@ -92,9 +88,10 @@ def answer_of(
             confidence = min(confidence, DOUBTFUL)
         p_value = min(1.0, step.taken.p_value * max(1, selection.tried))
         # late inputs and late measurements are one model, so it is fitted as the first, whatever it is called
-        late = candidate.effect == "input_delay" and MEASURED_LATE in corroborated
-        name, label = (MEASURED_LATE, MEASURED_LATE) if late else (candidate.effect, candidate.label)
-        chosen: dict[str, object] = {"streams": ("state", "gyro")} if late else dict(candidate.fixed)
+        effect = CATALOGUE[candidate.effect]
+        late = next((n for n in effect.same_as if n in corroborated), None)
+        name, label = (late, late) if late else (candidate.effect, candidate.label)
+        chosen = dict(effect.same_as[late] if late else candidate.fixed)
         odds = float(logit(there))
         named = Named(name, label, parameters, chosen, step.taken.held_out, p_value, confidence, candidate.effect, odds)
         found.append(((-there, -step.taken.evidence), named))
@@ -104,7 +101,7 @@ def answer_of(
         equal = [
             *(t.candidate.effect for t in step.alike if t.candidate.effect in {r.candidate.effect for r in rivals}),
             *(name for name, nats in steady.items() if nats < TELLING),
-            *(() if candidate.effect in corroborated else CATALOGUE[candidate.effect].same_as),
+            *(() if candidate.effect in corroborated else effect.same_as),
             *_in_place(candidate, in_place, selection),
             *_as_a_factor(candidate, step, point, covariance),
             *_by_turning_alone(candidate, data, selection),
@@ -113,8 +110,8 @@ def answer_of(
             groups.append(tuple(dict.fromkeys([name, *equal])))
             separate += [CATALOGUE[n].separates for n in groups[-1] if CATALOGUE[n].separates]
         elif candidate.effect == LOAD:  # told from weak rotors by where it sits, which is no proof
-            separate.append(CATALOGUE[LOAD].separates)
-        elif candidate.effect == "thrust_scale":
+            separate.append(effect.separates)
+        elif effect.gain == "thrust":
             separate.append(HEAVIER.format(1.0 / candidate.values(point)["scale"]))
     found.sort(key=lambda entry: entry[0])
     return Answer(tuple(n for _, n in found), tuple(groups), tuple(dict.fromkeys(separate)))
@@ -148,11 +145,12 @@ def strongest_first(effects: Sequence[Named], beside: Sequence[Named]) -> tuple[
 
 def _against(remains: Unexplained, candidate: Candidate, data: Data) -> Unexplained:
     """What speaks against a name of all that remains."""
-    if data.coarse and candidate.effect not in BY_TORQUE:
+    effect = CATALOGUE[candidate.effect]
+    if data.coarse and not effect.slow_torque:
         remains = remains.of_forces()  # where torques say nothing, what they leave says nothing against forces
-    if CATALOGUE[candidate.effect].steady_force:
+    if effect.steady_force:
         return remains.without_random_rotor()
-    if candidate.effect == WEAK_ROTOR:  # a propeller that is cut is out of balance as well
+    if effect.imbalance == "rotor":  # a propeller that is cut is out of balance as well
         return remains.without_random_rotor(int(dict(candidate.fixed)["rotor"]))
     return remains
 
@@ -202,7 +200,7 @@ def _by_the_day(candidate: Candidate, point: Point, balance: Balance | None) -> 
     p-value that there is none; None for other effects, and where there is no balance."""
     if balance is not None and candidate.effect == LOAD and decided_by_balance(point.vehicle, candidate):
         return _load_by_the_day(candidate, point, balance)
-    if balance is None or candidate.effect != WEAK_ROTOR or not steadily(candidate):
+    if balance is None or CATALOGUE[candidate.effect].imbalance != "rotor" or not steadily(candidate):
         return None
     scale = float(candidate.values(point)["scale"])
     sd = how_weak(balance, int(dict(candidate.fixed)["rotor"]))[1]
@@ -254,7 +252,7 @@ def _rivals(candidate: Candidate, step: Step, selection: Selection, corroborated
     on the torques one for what is needed beside inertias, which can be such a factor themselves.
     """
     found = {c.effect for c in selection.accepted}
-    found |= {"torque_scale"} if "inertia" in found and candidate.effect != "inertia" else set()
+    found |= {CATALOGUE[n].common_factor for n in found if n != candidate.effect}
     others = {candidate.effect, *step.beside, *found} | (
         corroborated if candidate.effect in corroborated else frozenset()
     )
@@ -273,15 +271,20 @@ def _in_place(
 
 def _as_a_factor(candidate: Candidate, step: Step, point: Point, covariance: NDArray) -> Sequence[str]:
     """Torques for inertias that are one factor, where these were not asked beside what was found before."""
-    if candidate.effect != "inertia" or any(t.candidate.effect == "torque_scale" for t in step.trials):
+    factor = CATALOGUE[candidate.effect].common_factor
+    if not factor or any(t.candidate.effect == factor for t in step.trials):
         return ()
     values, neutral = candidate.values(point), candidate.neutral(point)
     here, before = (np.array([v[n] for n in candidate.free]) for v in (values, neutral))
-    return ["torque_scale"] if one_factor(here, before, covariance) else ()
+    return [factor] if one_factor(here, before, covariance) else ()
 
 
 def _by_turning_alone(candidate: Candidate, data: Data, selection: Selection) -> Sequence[str]:
-    """A load for weak rotors, and the other way round, where nothing but torques would tell, which say nothing here."""
+    """A load for weak rotors, and the other way round, where nothing but torques would tell, which say nothing here.
+
+    Two weak rotors beside each other lack thrust and tilt the drone as a weight on their side does, with no torque
+    about z; only what turns tells, which a drone whose trim changes from day to day does not show.
+    """
     if candidate.effect == LOAD and TRIM in selection.final.vehicle.effects:
-        return [WEAK_ROTOR]
+        return [ROTOR_FAULT.name]
     return [LOAD] if candidate.effect == WEAKER.effect and data.coarse else ()

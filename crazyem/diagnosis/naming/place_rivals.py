@@ -19,7 +19,6 @@ from crazyem.diagnosis.locating.place import NATS, left_by_place, slope_finding
 from crazyem.diagnosis.naming.trials import SEPARATION, Selection, scatter
 from crazyem.physics.effects.external_force import FORCE_BY_PLACE
 
-IMITATE = ("wind", "ground_effect")
 FORCE = Candidate(FORCE_BY_PLACE.name, (), tuple(p.name for p in FORCE_BY_PLACE.parameters))
 
 
@@ -31,7 +30,7 @@ def by_place(
     The force stays in the final model, but is no candidate of it: it has no name, and is never written anywhere. With a
     trim in the vehicle file noise scales are not fitted again, and nothing is compared.
     """
-    names = [c for c in selection.accepted if c.effect in IMITATE]
+    names = [c for c in selection.accepted if c.effect in FORCE_BY_PLACE.mistaken_for]
     if not names or "position" not in data.signals or TRIM in selection.final.vehicle.effects:
         return selection, None
     # what imitates has another shape: something is left by place, on the flights fitted or on those kept apart
