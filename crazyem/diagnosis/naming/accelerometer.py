@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.gram import Gram, Solution
 from crazyem.diagnosis.fitting.model import Model, Point
-from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.sensing import ACCELEROMETER_MISALIGNMENT
 
-EFFECT = "accelerometer_misalignment"
+EFFECT = ACCELEROMETER_MISALIGNMENT.name
 ANGLES = ("roll", "pitch", "yaw")
 STEP = 1e-3  # rad
 BIAS_SD = 0.03  # m/s^2: what is left of a bias that the firmware removes at rest
@@ -82,12 +82,12 @@ def _of(model: Model, point: Point) -> Gram:
     residual = shown - force
     usable = np.all(np.isfinite(residual), axis=1) & ~flight.starts & (situation.step > 0)
     columns = np.zeros((7, flight.time.size, 3))
-    effect = CATALOGUE[EFFECT]
-    assert effect.measured is not None
+    measured = ACCELEROMETER_MISALIGNMENT.measured
+    assert measured is not None
     there = replace(situation, specific_force=force)
     for i, angle in enumerate(ANGLES):
         values = {**dict.fromkeys(ANGLES, 0.0), angle: STEP}
-        columns[i] = effect.measured(there, **values).specific_force / STEP
+        columns[i] = measured(there, **values).specific_force / STEP
     for i in range(3):
         columns[3 + i, :, i] = 1.0
     columns[6] = -np.gradient(force, flight.time, axis=0)

@@ -10,6 +10,7 @@ from crazyem.diagnosis.fitting.days import day_sd
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.external_force import GUSTS
 from crazyem.physics.effects.prior import Conditions
 
 LEAST_LOAD = 0.005  # of the drone's mass: what filters and sampling look like
@@ -78,8 +79,8 @@ def _conditions(point: Point, data: Data | None) -> Conditions:
 
 def usual_gusts(point: Point, data: Data | None = None) -> float:
     """Standard deviation of the air's speed [m/s] below which it is the weather, and no finding."""
-    filed = float(point.vehicle.effects.get("gusts", {}).get("standard_deviation", 0.0))
-    limit = CATALOGUE["gusts"].prior.detection_limit_in({}, _conditions(point, data))["standard_deviation"][0]
+    filed = float(point.vehicle.effects.get(GUSTS.name, {}).get("standard_deviation", 0.0))
+    limit = GUSTS.prior.detection_limit_in({}, _conditions(point, data))["standard_deviation"][0]
     return max(GUSTIER * filed, limit)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Noise, Point
+from crazyem.physics.effects.drag import LINEAR_DRAG
 
 MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)  # s
 GAINED = 40.0  # nats
@@ -88,6 +89,6 @@ def find_gusts(data: Data, point: Point) -> Gusts | None:
 
 def push_of(point: Point) -> float:
     """N s/m with which the air takes the drone along: its mean linear drag, if the model has one that was found."""
-    drag = point.effects.get("linear_drag")
+    drag = point.effects.get(LINEAR_DRAG.name)
     mean = float(np.mean([drag[a] for a in "xyz"])) if drag else 0.0
     return mean if mean > KNOWN else PUSH

@@ -18,6 +18,8 @@ from crazyem.diagnosis.naming.prune import ADMITTED
 from crazyem.diagnosis.naming.trials import SURE
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.external_force import GUSTS
+from crazyem.physics.effects.timing import INPUT_DELAY, MOTOR_LAG
 from crazyem.vehicle import Vehicle
 
 FIXED = 0.3  # share of the gain of gusts that a force which depends on place or motion may have beside it
@@ -36,14 +38,14 @@ def other_likelihoods(
     """What is no column of the regression: gusts, unless something pulls the drone to a place (`pulled`), and a tilted
     accelerometer."""
     found = []
-    if (not wanted or "gusts" in wanted) and "gusts" not in left_out and not pulled:
-        say("gusts")
+    if (not wanted or GUSTS.name in wanted) and GUSTS.name not in left_out and not pulled:
+        say(GUSTS.name)
         gusts = find_gusts(data, point)
         known = gusts is not None and gusts.speed < usual_gusts(point, data)
         if gusts is not None and not known and gusts.moving_air and remains.force_nats < FIXED * gusts.gain:
             memory_sd = gusts.memory * gusts.memory_sd
             # a memory that the flight says nothing of has an interval without end
-            p = next(p for p in CATALOGUE["gusts"].parameters if p.name == "correlation_time")
+            p = next(p for p in GUSTS.parameters if p.name == "correlation_time")
             with np.errstate(over="ignore"):
                 reach = np.exp(np.log(gusts.memory) + np.array([-1.96, 1.96]) * gusts.memory_sd)
             low, high = np.clip(reach, p.low, p.high)
@@ -60,7 +62,7 @@ def other_likelihoods(
                 left = replace(remains.without_force(), gained=gusts.gain)
                 sure = trust(left, held) * presence(held, gusts.gain)
                 chance = float(np.exp(-min(held, 700.0)))
-                found.append(Named("gusts", "gusts", values, {}, held, chance, sure, log_odds=float(logit(sure))))
+                found.append(Named(GUSTS.name, GUSTS.name, values, {}, held, chance, sure, log_odds=float(logit(sure))))
     if not wanted or accelerometer.EFFECT in wanted:
         tilted = accelerometer.tilt(data, point)
         if tilted is not None:
@@ -95,7 +97,7 @@ def late_rotors(
     found = rotor_response.response(answers)
     if found is None:
         return [], ()
-    left_out.pop("motor_lag", None)
+    left_out.pop(MOTOR_LAG.name, None)
     late = rotor_response.late_response(found, rotor_response.response(held_out), vehicle)
     if late is None or (wanted and not set(late.values) & set(wanted)):
         return [], ()
@@ -108,4 +110,4 @@ def late_rotors(
         sure = there * (0.5 if late.alike else 1.0)
         sure = min(sure, DOUBTFUL) if deaf else sure
         named.append(Named(name, name, values, {}, late.held_out, p_value, sure, log_odds=float(logit(there))))
-    return named, (("motor_lag", "input_delay"),) if late.alike else ()
+    return named, ((MOTOR_LAG.name, INPUT_DELAY.name),) if late.alike else ()

@@ -28,11 +28,13 @@ from scipy.signal import butter, sosfiltfilt
 
 from crazyem.diagnosis.flights.inputs import samples
 from crazyem.diagnosis.locating.locate import Finding
+from crazyem.physics.effects.timing import INPUT_DELAY, MOTOR_LAG
 from crazyem.physics.rotors import thrust_from_speed
 from crazyem.recordings.airborne import airtime
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
+LAG, DELAY = MOTOR_LAG.name, INPUT_DELAY.name
 SLOW = 0.5  # Hz, below which the battery's state is all there is to see
 SPACING, FASTEST = 0.01, 0.025  # s between thrusts that are compared, about; s between samples, at most
 FEWEST = 400  # samples
@@ -239,7 +241,7 @@ def _high_pass(values: NDArray, step: float) -> NDArray:
 
 @dataclass(frozen=True)
 class Late:
-    """How rotors differ from the vehicle's: values and standard deviations [s] of "motor_lag" and "input_delay", those
+    """How rotors differ from the vehicle's: values and standard deviations [s] of the effects `LAG` and `DELAY`, those
     that differ; nats on the recordings and on those held out; whether one alone would explain it as well as the other.
     """
 
@@ -255,32 +257,32 @@ def late_response(found: Response, apart: Response | None, vehicle: Vehicle) -> 
     Args:
         found: of the recordings; apart: of those held out, None where there are none or they do not tell.
     """
-    file = (vehicle.motor_time_constant, float(vehicle.effects.get("input_delay", {}).get("delay", 0.0)))
+    file = (vehicle.motor_time_constant, float(vehicle.effects.get(DELAY, {}).get("delay", 0.0)))
     (lag_lag, both), (_, late_late) = found.covariance.tolist()
     # each alone, the other as in the file: the most likely value, its standard deviation, and what it explains
     lag = found.lag + both / late_late * (file[1] - found.delay)
     delay = found.delay + both / lag_lag * (file[0] - found.lag)
     alone = {
-        "motor_lag": (lag, float(np.sqrt(lag_lag - both**2 / late_late)), found.nats(lag, file[1])),
-        "input_delay": (delay, float(np.sqrt(late_late - both**2 / lag_lag)), found.nats(file[0], delay)),
+        LAG: (lag, float(np.sqrt(lag_lag - both**2 / late_late)), found.nats(lag, file[1])),
+        DELAY: (delay, float(np.sqrt(late_late - both**2 / lag_lag)), found.nats(file[0], delay)),
     }
     nothing = found.nats(*file)
     name = max(alone, key=lambda n: alone[n][2])
     if -nothing < ENOUGH:
         return None
     if -alone[name][2] > ENOUGH and found.delay > file[1]:
-        values = {"motor_lag": (found.lag, lag_lag**0.5), "input_delay": (found.delay, late_late**0.5)}
+        values = {LAG: (found.lag, lag_lag**0.5), DELAY: (found.delay, late_late**0.5)}
         at, nats = (found.lag, found.delay), -nothing
     else:
         if delay < file[1]:
-            name = "motor_lag"  # no rotor answers before it is told to
+            name = LAG  # no rotor answers before it is told to
         values = {name: alone[name][:2]}
-        at = (lag, file[1]) if name == "motor_lag" else (file[0], delay)
+        at = (lag, file[1]) if name == LAG else (file[0], delay)
         nats = alone[name][2] - nothing
     if nats < ENOUGH:
         return None
     if apart is not None and -apart.nats(*at) > ENOUGH:
         return None
     held = nats if apart is None else apart.nats(*at) - apart.nats(*file)
-    alike = len(values) == 1 and delay > file[1] and abs(alone["motor_lag"][2] - alone["input_delay"][2]) < CLOSE
+    alike = len(values) == 1 and delay > file[1] and abs(alone[LAG][2] - alone[DELAY][2]) < CLOSE
     return Late(values, nats, held, alike) if held > ENOUGH / 2 else None

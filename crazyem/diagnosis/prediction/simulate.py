@@ -15,8 +15,10 @@ from crazyem.diagnosis.flights.inputs import Inputs
 from crazyem.diagnosis.prediction.bias_correction import Weights
 from crazyem.diagnosis.prediction.course import ThrustCourse
 from crazyem.physics.effects.effect import LONGEST_STEP, Effects, Situation
+from crazyem.physics.effects.external_force import WIND
 from crazyem.physics.effects.onboard_estimate import MEMORY_SECONDS, disturbs_attitude
 from crazyem.physics.effects.pendulum import swing_along, swing_on, watched_along
+from crazyem.physics.effects.suspended_load import SUSPENDED_LOAD
 from crazyem.physics.motion import Motion, active, body_of, measured, motion
 from crazyem.physics.rotations import (
     quaternion_conjugate,
@@ -105,10 +107,10 @@ class Simulator:
         forgotten = MEMORY_SECONDS if inputs.fused and any(disturbs_attitude(values) for values in sensors) else 0.0
         self._looks_back = back + forgotten
         values = {effect.name: found for effect, found in active(self.effects, self.vehicle)}
-        load = values.get("suspended_load", {"mass": 0.0, "length": None})
+        load = values.get(SUSPENDED_LOAD.name, {"mass": 0.0, "length": None})
         self._load: float = load["mass"]
         self._length: float | None = load["length"]
-        self._air = np.array([values.get("wind", {}).get(axis, 0.0) for axis in "xyz"])
+        self._air = np.array([values.get(WIND.name, {}).get(axis, 0.0) for axis in "xyz"])
         constant = self.vehicle.rotor_constant
         self._rotor_constant = float("nan") if constant is None else constant
 
@@ -143,7 +145,7 @@ class Simulator:
     def _forces(self, time: NDArray, state: NDArray, rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """Over the steps that end at rows (m,) of a recorded path: specific force without a load, and as seen, (m, 3)
         m/s^2, body; and attitudes (m, 3, 3) in the middle of the steps."""
-        effects = {name: values for name, values in self.effects.items() if name != "suspended_load"}
+        effects = {name: values for name, values in self.effects.items() if name != SUSPENDED_LOAD.name}
         begin, end = time[rows - 1], time[rows]
         last = self.course.newest(begin)
         step = end - begin
