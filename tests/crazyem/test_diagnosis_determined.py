@@ -215,7 +215,8 @@ def test_what_belongs_to_a_recording_is_told_and_not_written(scaled: tuple[Recor
 def test_effects_of_sensors_belong_to_recordings_and_all_others_to_vehicles() -> None:
     of_recordings = {n for n, e in CATALOGUE.items() if e.belongs_to == "recording"}
     assert of_recordings == {"velocity_scale", "gyro_bias", "measurement_delay", "onboard_filter", "sampled_commands"}
-    assert {e.belongs_to for e in CATALOGUE.values()} == {"vehicle", "recording"}
+    assert {n for n, e in CATALOGUE.items() if e.belongs_to == "day"} == {"input_delay", "wind", "gusts"}
+    assert {e.belongs_to for e in CATALOGUE.values()} == {"vehicle", "recording", "day"}
 
 
 def test_what_was_left_free_is_told_with_its_error(scaled: tuple[Recording, Diagnosis]) -> None:

@@ -13,7 +13,7 @@ from scipy import stats
 
 from crazyem.diagnosis.diagnose import diagnose
 from crazyem.diagnosis.fitting.candidates import Candidate
-from crazyem.diagnosis.fitting.fit import Data, Fitted, nominal
+from crazyem.diagnosis.fitting.fit import Data, Fitted, bounds_of, nominal
 from crazyem.diagnosis.fitting.gram import Gram
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.noise import first_guess
@@ -170,9 +170,11 @@ def test_inertias_are_as_unsure_as_a_lag_that_is_a_little_wrong_makes_them() -> 
     start = nominal(data, point_of()).with_effects({"inertia": dict(zip(inertia.free, DRONE.inertia, strict=True))})
     fitted = refine_base(data, start, [inertia], rounds=3, noise=False)
     off = by_a_wrong_lag(data, fitted)
-    names = [*inertia.free, *((c.effect, n) for c, _ in nuisances(data, fitted.point, [inertia]) for n in c.free)]
+    free = [c for c, _ in nuisances(data, fitted.point, [inertia])]
+    names = [*inertia.free, *((c.effect, n) for c in free for n in c.free)]
     lag, size = names.index(("motor_lag", "time_constant")), fitted.gram.size
-    low, high = np.full(size, -np.inf), np.full(size, np.inf)
+    room = np.array(bounds_of([inertia, *free], fitted.point))
+    low, high = np.where(np.any(room == 0.0, axis=0), 0.0, [[-np.inf], [np.inf]])  # what is at a bound stays there
     theta = []
     for change in (0.0, LAG_OFF):
         low[lag] = high[lag] = change

@@ -10,7 +10,7 @@ from scipy import stats
 from crazyem.diagnosis.fitting.candidates import THRUST, TRIM, Candidate, of_recordings
 from crazyem.diagnosis.fitting.conditions import conditions_of
 from crazyem.diagnosis.fitting.days import trim_known
-from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, refine, remembering, remembering_anew
+from crazyem.diagnosis.fitting.fit import Data, DivergedError, Fitted, bounds_of, refine, remembering, remembering_anew
 from crazyem.diagnosis.fitting.gram import Solution, used
 from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.flights.flight import Flight
@@ -187,18 +187,20 @@ def systematic_sd(data: Data, point: Point) -> dict[tuple[str, str], float]:
 def by_a_wrong_lag(data: Data, fitted: Fitted) -> dict[tuple[str, str], float]:
     """(effect, parameter) of what turns the drone -> how far it is off where the rotors' lag is off by `LAG_OFF`; where
     the lag is free beside them, but no finding."""
+    rest = [c for c, _ in nuisances(data, fitted.point, fitted.candidates)]
     own = [(c.effect, name) for c in fitted.candidates for name in c.free]
-    free = [(c.effect, name) for c, _ in nuisances(data, fitted.point, fitted.candidates) for name in c.free]
+    free = [(c.effect, name) for c in rest for name in c.free]
     lag, names = (MOTOR_LAG.name, "time_constant"), own + free
     if lag not in free or len(names) != fitted.gram.size:
         return {}
     at = names.index(lag)
-    others = [i for i in range(len(names)) if i != at]
+    low, high = bounds_of([*fitted.candidates, *rest], fitted.point)
+    others = [i for i in range(len(names)) if i != at and low[i] < 0.0 < high[i]]  # what is at a bound stays there
     a = fitted.gram.total(range(len(names)))[1] + np.diag(fitted.precision)
     scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
     along = np.linalg.lstsq((a / np.outer(scale, scale))[np.ix_(others, others)], a[others, at] / scale[others])[0]
     moved = dict(zip((names[i] for i in others), np.abs(along / scale[others]) * LAG_OFF, strict=True))
-    return {name: float(moved[name]) for name in own if CATALOGUE[name[0]].twins}
+    return {name: float(moved[name]) for name in own if CATALOGUE[name[0]].twins and name in moved}
 
 
 def with_nuisances(point: Point, free: Nuisances) -> Point:
