@@ -88,6 +88,7 @@ def with_free(data: Data, candidate: Candidate) -> tuple[Point, Fitted]:
 @pytest.mark.slow
 def test_an_inertia_that_a_vibration_speaks_for_is_another_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(facts, "unlogged_share", lambda flights, vehicle: 0.0)  # else the inertia is doubted before
+    monkeypatch.setattr(facts, "interval", lambda flight: 2e-3)  # as if all commands of the loop were logged
     data = Data([flight_of(fly(vibration=4.0, seconds=20.0), DRONE)])
     point, fitted = with_free(data, INERTIA)
     assert peaks(data.models[0], point)
