@@ -18,8 +18,8 @@ from crazyem.vehicle import Vehicle
 # for 2 ms only, and what acts was not logged. The effect `sampled_commands` models what is white; this is an error in
 # the input all the same, under which a fit makes the drone look heavy and damped.
 # Share of the power of roll and pitch torques above half of the Nyquist frequency (white: a half), of real drones:
-COARSE = 0.2  # simulated flights have up to 0.12, whatever is wrong with the drone
-NEGLIGIBLE = 1e-3  # relative error of torques: a tenth of what is not known of inertias (`nuisances.INERTIA_SD`)
+COARSE = 0.2  # flights of the simulated firmware have up to 0.12, real ones and those of RotorPy more
+NEGLIGIBLE = 1e-3  # relative error of torques: a tenth of what is not known of inertias (`mass_properties._moments`)
 EDGE, SLOW = 0.5, 1.0  # s left out at either end; Hz below which torques say nothing of sampling
 
 

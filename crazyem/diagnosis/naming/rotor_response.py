@@ -8,7 +8,7 @@ h a first-order lag of the thrust f answers to the commands u by
 with g a parabola, the same within a flight, each rotor its own. The slow part is left out: it is the battery's.
 
 All of it has errors: speeds have noise, commands are sampled, air disturbs the rotors and the loop answers to that.
-Each of them biases least squares, noise of 1 % by a fifth. Errors of a sample have no part in samples before it, so
+Each of them biases least squares, noise of 1 % by a sixth. Errors of a sample have no part in samples before it, so
 earlier commands and thrusts are instruments (Söderström and Stoica, System Identification, 1989, ch. 8): of the true
 lag and delay, e does not follow from them. Where instruments say little of how f changes, the flight tells no lag.
 
@@ -143,7 +143,10 @@ def _of_one(recording: Recording, vehicle: Vehicle) -> Answer | None:
         return None
     thrust = CubicSpline(when, thrust_from_speed(speed, rotor_constant=vehicle.rotor_constant))
     equation = _LagEquation.of(at, wanted, thrust, step)
-    bounds = (np.array([SHORTEST, -LATEST / 2]), np.array([LONGEST, LATEST]))
+    bounds = (
+        np.array([SHORTEST, -SPLINE * step]),
+        np.array([LONGEST, LATEST]),
+    )  # earlier, instruments have errors of e
     tries = [
         least_squares(equation.moments, [s, 0.0], bounds=bounds, x_scale=[0.01, 0.01], diff_step=1e-3) for s in STARTS
     ]

@@ -125,7 +125,7 @@ VELOCITY_MOMENT = Effect(
 INDUCED = 2.0
 
 
-def _as_in_honey(values: Values, vehicle: Vehicle) -> bool:
+def _beyond_rotor_damping(values: Values, vehicle: Vehicle) -> bool:
     """Whether no rotors can damp a turn as much (see `INDUCED`)."""
     most = vehicle.mass * GRAVITY * float(np.hypot(*vehicle.arm)) ** 2 / (2.0 * INDUCED)
     return max(values.values()) > most
@@ -139,7 +139,7 @@ RATE_DAMPING = Effect(
     about=("damping",),
     external=damping,
     prior=Prior(alike("x y z", 2e-5), _sampled, conditional=True),
-    unphysical=_as_in_honey,
+    unphysical=_beyond_rotor_damping,
     # rotors that are heavy look like a damping about z to commands that are sampled, and their derivative at none may
     # have the wrong sign: begun as a bar of 0.3 g and 46 mm would be
     imitators={"rotor_inertia": {"inertia": 5e-8}},

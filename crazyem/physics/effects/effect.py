@@ -233,8 +233,8 @@ class Effect:
         sizes: values of the amplitude with which beginnings are compared in full, where a small one says little.
         words: the effect for people; "": the name with spaces.
         belongs_to: "vehicle", or "recording" where each recording has its own: what a sensor or a filter on board shows
-            on that day, which no vehicle file is to have; or "day": of the air or the link of that day, which the
-            vehicle file has and no simulator's.
+            on that day, which no vehicle file is to have; or "day": the air or the link of that day, which a vehicle
+            file has, and a simulator's file has not.
         prior: how large its parameters are.
         needs_torques: told by torques from sample to sample, of which commands on another clock say nothing.
         steady_force: told by forces that last, which no torque at random looks like.

@@ -114,7 +114,7 @@ TORQUE_SCALE = Effect(
     turning=turned,
     prior=Prior(own={"scale": 0.2}, usual=_torques, conditional=True, detection_limit={"scale": 0.08}),
     twins=("inertia", "motor_lag"),  # angular acceleration is torque over inertia: both at once would be any size
-    fixed_beside=("motor_lag",),  # with it free, a lag that has no prior was 8 ms too long
+    fixed_beside=("motor_lag",),  # with both free, a lag without a prior comes out 8 ms too long
     unphysical=_too_weak,
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum): torque over inertia is all that a flight shows",
