@@ -93,6 +93,12 @@ def test_what_was_not_logged_widens_the_priors_of_what_turns_the_drone() -> None
     assert "rate_damping" not in whole
 
 
+def test_commands_between_samples_are_free_where_the_log_is_slower_than_the_loop() -> None:
+    assert priors(commanded(WHITE, 0.01))["sampled_commands"] == pytest.approx([0.4, 0.4])
+    assert "sampled_commands" not in priors(commanded(WHITE, 0.002))
+    assert "sampled_commands" not in priors(commanded(WHITE, 0.01, measured=True))
+
+
 def test_a_battery_without_a_voltage_may_sag_and_run_down() -> None:
     assert not {"thrust_curve", "battery_sag"} & priors(commanded(WHITE, 0.01)).keys()
     sd = priors(commanded(WHITE, 0.01, levelled=True))

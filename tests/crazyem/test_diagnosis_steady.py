@@ -91,6 +91,20 @@ def test_a_drone_whose_commands_shake_has_a_trim_first() -> None:
     assert cut.effects[0].parameters["scale"].value == pytest.approx(0.72, abs=0.05)
 
 
+@pytest.mark.slow
+def test_an_offset_of_the_gyro_is_found_where_commands_shake() -> None:
+    """No command is needed to see that attitude and gyro part."""
+    shaken = shaking(fly(seconds=10.0, seed=8), seed=1)
+    gyro = shaken.signals["body_rate"]
+    offset = {"x": 0.03, "y": 0.0, "z": -0.02}
+    shown = replace(gyro, value=gyro.value + np.array([*offset.values()]))
+    trimmed = replace(DRONE, effects={TRIM: dict.fromkeys("xyz", 0.0)})
+    found = diagnose([replace(shaken, signals={**shaken.signals, "body_rate": shown})], trimmed)
+    assert [e.name for e in found.effects] == ["gyro_bias"]
+    for axis, value in found.effects[0].parameters.items():
+        assert value.ci95[0] < offset[axis] < value.ci95[1]
+
+
 def test_a_centre_of_mass_is_where_the_mean_commands_are_balanced() -> None:
     """Rotors on the left weaker, on the right stronger by 4 %, and quick torques off by 3 %, as sampled commands make
     them look. A drone that flies for a while and does not turn over has no torque on average: no fit needed."""
