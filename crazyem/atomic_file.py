@@ -8,6 +8,8 @@ from pathlib import Path
 
 from crazyem.errors import UsageError
 
+TEMPORARY_PREFIX = ".crazyem-"  # of the name of a file that is not complete; a process that is killed leaves one behind
+
 
 @contextlib.contextmanager
 def new_file(path: Path, *, force: bool = False) -> Iterator[Path]:
@@ -20,7 +22,7 @@ def new_file(path: Path, *, force: bool = False) -> Iterator[Path]:
             raise UsageError(f"{path} is a directory.")
         if not force and path.exists():
             raise UsageError(f"{path} exists already (--force replaces it).")
-        handle, name = tempfile.mkstemp(prefix=".crazyem-", suffix=path.suffix, dir=path.parent)
+        handle, name = tempfile.mkstemp(prefix=TEMPORARY_PREFIX, suffix=path.suffix, dir=path.parent)
         os.close(handle)
     except (OSError, ValueError) as error:
         raise UsageError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}.") from None

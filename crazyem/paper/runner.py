@@ -11,7 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from crazyem.atomic_file import write_file
+from crazyem.atomic_file import TEMPORARY_PREFIX, write_file
 from crazyem.errors import UsageError
 from crazyem.paper.experiments import Task, run_task
 from crazyem.paper.settings import Settings, described
@@ -81,10 +81,12 @@ def run_and_store(task: Task, settings: Settings, folder: str, stamp: str) -> No
 
 
 def prepare(folder: Path) -> None:
-    """Make the output folder. Raises UsageError: it cannot be made, or is something else."""
+    """Make the output folder, without unfinished files of a stopped run. Raises UsageError: it cannot be made."""
     try:
         (folder / "tasks").mkdir(parents=True, exist_ok=True)
         (folder / "figures").mkdir(exist_ok=True)
+        for unfinished in (folder / "tasks").glob(f"{TEMPORARY_PREFIX}*"):
+            unfinished.unlink()
     except OSError as error:
         raise UsageError(f"cannot make the folder {folder}: {error.strerror or error}.") from None
 

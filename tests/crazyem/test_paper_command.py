@@ -221,11 +221,12 @@ def test_a_stopped_run_goes_on(tmp_path: Path) -> None:
         [sys.executable, "-m", "crazyem", *arguments], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
     )
     deadline = time.monotonic() + 240
-    while not list(out.glob("tasks/*.json")) and time.monotonic() < deadline and process.poll() is None:
+    while not list(out.glob("tasks/[!.]*.json")) and time.monotonic() < deadline and process.poll() is None:
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
     said = process.communicate(timeout=60)[1]
-    done = list(out.glob("tasks/*.json"))
+    done = list(out.glob("tasks/[!.]*.json"))
+    (out / "tasks" / ".crazyem-killed.json").write_text("{")  # as a process leaves behind that is killed as it writes
     assert done
     if process.returncode != 0:  # it may have been too fast to be stopped
         assert process.returncode == 130
@@ -236,6 +237,7 @@ def test_a_stopped_run_goes_on(tmp_path: Path) -> None:
         assert json.loads(path.read_text())["record"]
     assert main([*arguments, "--jobs", "1"]) == 0
     assert results(out)["timing"]["tasks_reused"] >= len(done)
+    assert not list(out.glob("tasks/.*"))
 
 
 def test_a_part_of_the_run(tmp_path: Path) -> None:
