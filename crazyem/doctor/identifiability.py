@@ -15,6 +15,7 @@ from crazyem.doctor import excitation
 from crazyem.doctor.excitation import Steps
 from crazyem.doctor.kinematics import continuous
 from crazyem.doctor.regression import Fit, linear_fit
+from crazyem.physics.effects.timing import INPUT_DELAY
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.recordings.airborne import Airtime
 from crazyem.recordings.finding import percent
@@ -99,7 +100,7 @@ def identifiability(recording: Recording, vehicle: Vehicle, air: Airtime) -> tup
 
 
 VERDICT_NAMES = (
-    "mass", "Ixx", "Iyy", "Izz", "motor_time_constant", "input_delay", "torque_offsets", "drag", "battery_law",
+    "mass", "Ixx", "Iyy", "Izz", "motor_time_constant", INPUT_DELAY.name, "torque_offsets", "drag", "battery_law",
 )  # fmt: skip
 
 
@@ -286,12 +287,12 @@ def _delay(fit: Fit, inputs: Inputs, believed: bool) -> Verdict:
     own = fit.total(4)
     together = own / math.hypot(1.0, own / prior)
     if not believed:
-        return Verdict("input_delay", "no", "the logged commands do not explain the rotation", unit="s")
+        return Verdict(INPUT_DELAY.name, "no", "the logged commands do not explain the rotation", unit="s")
     verdict = "yes" if together < 0.7 * prior else "weak" if together < 0.9 * prior else "no"
     reason = (
         "from the phase of rotation behind torque" if verdict == "yes" else "the data say no more than the prior does"
     )
-    return Verdict("input_delay", verdict, reason, sd=own * 1e-3, value=float(fit.value[4]) * 1e-3, unit="s")
+    return Verdict(INPUT_DELAY.name, verdict, reason, sd=own * 1e-3, value=float(fit.value[4]) * 1e-3, unit="s")
 
 
 def _offsets(fit: Fit, vehicle: Vehicle) -> Verdict:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from crazyem.control.command_units import effectiveness_torque, lag_of, lag_share, mass_thrust, rotor_reaction_factor
+from crazyem.physics.effects.rotors import ROTOR_INERTIA
 from crazyem.vehicle import GRAVITY, Vehicle
 
 Form = Literal["proportional", "reciprocal", "lag"]
@@ -68,7 +69,7 @@ def indi_beliefs(vehicle: Vehicle) -> tuple[Belief, ...]:
     """
     torque = effectiveness_torque(vehicle)
     slots = [[Slot(f"ctrlINDI.g1_{axis}", "reciprocal", t)] for axis, t in zip("pqr", torque)]
-    rotor_inertia = float(vehicle.effects.get("rotor_inertia", {}).get("inertia", 0.0))
+    rotor_inertia = float(vehicle.effects.get(ROTOR_INERTIA.name, {}).get("inertia", 0.0))
     if rotor_inertia > 0.0:
         slots[2].append(Slot("ctrlINDI.g2", "reciprocal", rotor_reaction_factor(vehicle, rotor_inertia)))
     lag = Belief("motor_time_constant", tuple(Slot(f"ctrlINDI.act_dyn_{axis}", "lag") for axis in "pqr"))

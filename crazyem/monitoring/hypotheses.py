@@ -7,6 +7,10 @@ says, or kicks the body once.
 
 from dataclasses import dataclass
 
+from crazyem.physics.effects import sensing
+from crazyem.physics.effects.external_force import WIND
+from crazyem.physics.effects.mass_properties import PAYLOAD
+from crazyem.physics.effects.rotors import ROTOR_FAULT, THRUST_SCALE, TRIM
 from crazyem.vehicle import Vehicle
 
 # Kinds of column; the second number of a column is the axis, or the rotor.
@@ -66,21 +70,23 @@ def hypotheses_for(vehicle: Vehicle) -> tuple[Hypothesis, ...]:
     weight = vehicle.mass * 9.81
     arm = max(vehicle.arm) or 0.05
     rotors = tuple(
-        Hypothesis("rotor_fault", f"rotor {k + 1} lost thrust", (Column(ROTOR, k, "loss", "", 0.3),), k + 1)
+        Hypothesis(ROTOR_FAULT.name, f"rotor {k + 1} lost thrust", (Column(ROTOR, k, "loss", "", 0.3),), k + 1)
         for k in range(4)
     )
     body = (
-        Hypothesis("thrust_scale", "all rotors lost thrust, as of a failing battery", (
+        Hypothesis(THRUST_SCALE.name, "all rotors lost thrust, as of a failing battery", (
             Column(THRUST, 0, "loss", "", 0.2),
         )),
-        Hypothesis("payload", "the mass changed", (
+        Hypothesis(PAYLOAD.name, "the mass changed", (
             Column(MASS, 0, "mass", "kg", 0.2 * vehicle.mass),
         ), followed=True),
         Hypothesis("payload_off_centre", "mass and its centre changed", (
             Column(MASS, 0, "mass", "kg", 0.2 * vehicle.mass), *_axes(CENTRE, "x y", "m", 0.1 * arm),
         ), followed=True),
-        Hypothesis("wind", "a force set in", _axes(FORCE, "force_x force_y force_z", "N", 0.05 * weight)),
-        Hypothesis("trim", "a torque set in", _axes(TORQUE, "torque_x torque_y torque_z", "N m", 0.05 * weight * arm)),
+        Hypothesis(WIND.name, "a force set in", _axes(FORCE, "force_x force_y force_z", "N", 0.05 * weight)),
+        Hypothesis(TRIM.name, "a torque set in", (
+            *_axes(TORQUE, "torque_x torque_y torque_z", "N m", 0.05 * weight * arm),
+        )),
         Hypothesis("impact", "the drone was hit", (
             *_axes(KICK, "velocity_x velocity_y velocity_z", "m/s", 0.3),
             *_axes(TURN, "rate_x rate_y rate_z", "rad/s", 3.0),
@@ -90,8 +96,8 @@ def hypotheses_for(vehicle: Vehicle) -> tuple[Hypothesis, ...]:
         Hypothesis("position_offset", "the position jumped", _axes(POSITION, "x y z", "m", 0.2)),
         Hypothesis("velocity_offset", "the velocity jumped", _axes(VELOCITY, "x y z", "m/s", 0.3)),
         Hypothesis("attitude_offset", "the attitude jumped", _axes(ATTITUDE, "roll pitch yaw", "rad", 0.1)),
-        Hypothesis("gyro_bias", "the body rates are biased", _axes(RATE, "x y z", "rad/s", 0.2)),
-        Hypothesis("velocity_scale", "velocities have another scale", (
+        Hypothesis(sensing.GYRO_BIAS.name, "the body rates are biased", _axes(RATE, "x y z", "rad/s", 0.2)),
+        Hypothesis(sensing.VELOCITY_SCALE.name, "velocities have another scale", (
             Column(VELOCITY_SCALE, 0, "scale_error", "", 0.5),
         )),
         Hypothesis("gyro_scale", "body rates have another scale", (Column(RATE_SCALE, 0, "scale_error", "", 0.5),)),

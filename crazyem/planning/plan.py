@@ -13,6 +13,8 @@ from crazyem.control.plan_file import LONGEST, PlanFile, plan_toml
 from crazyem.errors import UsageError
 from crazyem.estimation.model import NAMES, Noise
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.rotors import THRUST_SCALE
+from crazyem.physics.effects.timing import INPUT_DELAY
 from crazyem.planning.closed_loop import Flown
 from crazyem.planning.discrimination import Odds, Pair
 from crazyem.planning.information import Expectation
@@ -25,7 +27,7 @@ PARAMETERS = NAMES[:6]  # the torque offsets are nuisances
 DEFAULT = NAMES[:4]
 SHORTEST = 3.0  # s; a shorter manoeuvre is hardly more than its two ramps
 # Of which a flight shows only ratios: thrust over mass, torque over inertia.
-RATIOS = {"thrust_scale": NAMES[:4]}
+RATIOS = {THRUST_SCALE.name: NAMES[:4]}
 PARALLEL = 0.999  # correlation from which columns count as parallel
 Say = Callable[[str], None]
 
@@ -99,7 +101,7 @@ class Plan:
             return f"{self.goal}: no manoeuvre will do. {self.reason}"
         lines = [f"{self.goal}: {self.manoeuvre.duration:g} s for {self.vehicle}", "expected, before anything is flown"]
         for name, width in self.widths.items():
-            said = f"{1e3 * width:.1f} ms" if name == "input_delay" else f"{100 * width:.2g} %"
+            said = f"{1e3 * width:.1f} ms" if name == INPUT_DELAY.name else f"{100 * width:.2g} %"
             lines.append(f"  {name:<22}95 % interval ± {said}")
         if self.odds is not None:
             for name, e, d, w in zip(self.odds.effects, self.odds.expected, self.odds.decided, self.odds.wrong):

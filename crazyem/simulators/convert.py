@@ -8,6 +8,7 @@ from typing import Any
 from crazyem.errors import FileFormatError, UsageError
 from crazyem.physics import folding
 from crazyem.physics.effects.catalogue import CATALOGUE
+from crazyem.physics.effects.supply import THRUST_CURVE
 from crazyem.recordings.recording import Recording
 from crazyem.simulators.constants import Constants, from_vehicle, to_vehicle, without_effects
 from crazyem.simulators.cost import HORIZON, errors_after, flown, reference_flight, rms_distance, said, to_json
@@ -255,7 +256,7 @@ def _omissions(
             found.append(Omission(quantity, words, None, why))
     if vehicle.thrust_curve:
         why = "a simulator is told rotor speeds or thrusts; the law from command and voltage stays in the vehicle file"
-        found.append(Omission("thrust_curve", "battery and thrust curve", None, why))
+        found.append(Omission(THRUST_CURVE.name, "battery and thrust curve", None, why))
     return found
 
 
