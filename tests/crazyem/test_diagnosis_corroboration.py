@@ -83,8 +83,8 @@ def test_what_commands_say_counts_for_a_sensor_that_counts_wrong(recording: Reco
     expected = false_speed([shown], 2, scale, DRONE.motor_time_constant)
     assert expected is not None
     assert one.other_evidence == pytest.approx(expected)
-    assert one.presence(1) == pytest.approx(min(CALIBRATED, expit(logit(presence(20.0, 20.0)) + expected)))
-    assert replace(one, other_evidence=0.5).presence(1) == pytest.approx(expit(logit(presence(20.0, 20.0)) + 0.5))
+    assert one.presence(1) == pytest.approx(min(CALIBRATED, expit(logit(presence(20.0, 20.0, 20.0)) + expected)))
+    assert replace(one, other_evidence=0.5).presence(1) == pytest.approx(expit(logit(presence(20.0, 20.0, 20.0)) + 0.5))
     assert found.steps[0].alike == ()
     assert witnessed == {"rotor_fault", "rotor_sensor"}
     healthy, _ = _corroborated(data, None, selection, [with_speeds(recording, (1.0, 1.0, 1.0, 1.0))])

@@ -203,6 +203,20 @@ def test_errors_are_those_of_the_scatter(dispersion: float) -> None:
     assert found.dispersion == pytest.approx(dispersion, rel=0.3)
 
 
+@pytest.mark.parametrize("dispersion", [1.0, 6.0])
+def test_what_other_columns_explain_is_no_scatter(dispersion: float) -> None:
+    """Scores of a column that is correlated with a strong one scatter with it; beside it, as the model says."""
+    strong = simulated(11, truth=np.array([3.0, 0.0, 0.0]), blocks=400, dispersion=dispersion)
+    assert strong.solve([1]).dispersion > 3 * dispersion
+    assert strong.solve(range(3), tested=[1]).dispersion == pytest.approx(dispersion, rel=0.3)
+
+
+def test_scatter_in_few_blocks_is_neither_too_small_nor_too_large_beside_others() -> None:
+    """12 blocks and 3 columns, 300 times: the mean is 1 (sd of the mean 0.03)."""
+    found = [simulated(s, blocks=12).solve(range(3), tested=[2], effective=True).dispersion for s in range(300)]
+    assert np.mean(found) == pytest.approx(1.0, abs=0.12)
+
+
 def test_neighbours_that_go_together_widen_errors() -> None:
     """Scores of pairs of blocks that are equal carry the news of one: the variance is some 1.5 to 2 times larger."""
     plain = simulated(8, blocks=300)

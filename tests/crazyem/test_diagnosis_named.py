@@ -24,7 +24,18 @@ from crazyem.diagnosis.naming import answer, determined, trials
 from crazyem.diagnosis.naming.answer import _numbers, _rivals, _uncertainty, strongest_first
 from crazyem.diagnosis.naming.determined import improbable
 from crazyem.diagnosis.naming.named import DOUBTFUL, Named, one_factor, trust
-from crazyem.diagnosis.naming.presence import CALIBRATED, CONSTANT, FITTED, HELD_OUT, LEAST_PROBABILITY, ORDER, presence
+from crazyem.diagnosis.naming.presence import (
+    CALIBRATED,
+    CONSTANT,
+    ELSEWHERE,
+    FITTED,
+    FREEDOM,
+    LEAST_PROBABILITY,
+    ORDER,
+    THERE,
+    held_out_evidence,
+    presence,
+)
 from crazyem.diagnosis.naming.trials import Selection, Step, Trial
 from crazyem.diagnosis.naming.unexplained import Unexplained
 
@@ -50,7 +61,7 @@ def test_inertias_that_are_one_factor_are_told_with_the_torques_that_were_not_as
     flown = fly(Hidden(torque=0.7), seconds=12.0, seed=6)
     brought = []
     monkeypatch.setattr(answer, "trust", lambda remains, nats: brought.append(nats) or 1.0)
-    monkeypatch.setattr(trials, "presence", lambda held_out, fitted, order: 0.123)
+    monkeypatch.setattr(trials, "presence", lambda *args, **kwargs: 0.123)
     monkeypatch.setattr(determined, "improbable", lambda chance: "")
     monkeypatch.setattr(answer, "preferred", lambda taken, rivals: 1.0)
     found = diagnose([flown], DRONE, wanted=["inertia"])
@@ -71,20 +82,33 @@ def test_what_is_found_beside_the_selection_stands_where_its_evidence_puts_it():
     assert strongest_first((), [named("gusts", 3.0)])[0].name == "gusts"
 
 
-@given(st.floats(-100.0, 1e4), st.floats(-100.0, 1e4), st.floats(-100.0, 1e4))
-def test_more_evidence_never_makes_a_name_less_sure(held, more, beside) -> None:
-    least, most = sorted((held, more))
-    assert 0.0 <= presence(least, beside) <= presence(most, beside) <= CALIBRATED
-    assert 0.0 <= presence(beside, least) <= presence(beside, most) <= CALIBRATED
+NATS = st.floats(-100.0, 1e4)
+
+
+@given(NATS, NATS, NATS, st.floats(0.0, 1e4))
+def test_more_evidence_never_makes_a_name_less_sure(one: float, other: float, beside: float, expected: float) -> None:
+    least, most = sorted((one, other))
+    assert 0.0 <= presence(least, beside, expected) <= presence(most, beside, expected) <= CALIBRATED
+    assert 0.0 <= presence(beside, least, expected) <= presence(beside, most, expected) + 1e-12 <= CALIBRATED + 1e-12
+
+
+@given(NATS, st.floats(-100.0, 0.0))
+def test_flight_that_can_tell_nothing_of_an_effect_says_nothing_of_it(held: float, expected: float) -> None:
+    assert held_out_evidence(held, expected) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_name_is_as_sure_as_what_it_brings_on_flight_held_out_and_fitted() -> None:
-    """Odds that are a product of powers of the nats, by a formula of its own."""
-    assert presence(-5.0, 1e3) == presence(1e3, 0.0) == 0.0
-    for held, fitted, order in ((5.0, 30.0, 1), (30.0, 5.0, 2), (200.0, 80.0, 3)):
-        odds = math.exp(CONSTANT) * held**HELD_OUT * (1.0 + fitted) ** FITTED / order**ORDER
-        assert presence(held, fitted, order) == pytest.approx(odds / (1.0 + odds))
-    assert presence(1e9, 1e9) == CALIBRATED
+    """A power of the nats fitted, times a ratio of densities of those held out, by a formula of its own."""
+    assert presence(0.0, 1e3, 1e3) == 0.0
+    for held, expected, fitted, order in ((5.0, 20.0, 30.0, 1), (30.0, 30.0, 5.0, 2), (-8.0, 80.0, 80.0, 3)):
+        density = [
+            (1.0 + (held - mean) ** 2 / (FREEDOM * variance)) ** (-0.5 * (FREEDOM + 1.0)) / math.sqrt(variance)
+            for mean, share in ((expected, THERE), (0.0, ELSEWHERE))
+            for variance in (1.0 + 2.0 * 3.0 * expected + (share * expected) ** 2,)
+        ]
+        odds = math.exp(CONSTANT) * (1.0 + fitted) ** FITTED / order**ORDER * density[0] / density[1]
+        assert presence(fitted, held, expected, order, dispersion=3.0) == pytest.approx(odds / (1.0 + odds))
+    assert presence(1e9, 1e9, 1e9) == CALIBRATED
     assert improbable(0.9 * LEAST_PROBABILITY).startswith("not determined")
     assert not improbable(1.1 * LEAST_PROBABILITY)
 

@@ -27,6 +27,12 @@ TAKEN = Step((), Trial(DRAG, gain=30.0, held_out=20.0, dispersion=2.0, p_value=1
 POINT = Point(DRONE, {}, first_guess())
 
 
+@pytest.fixture
+def no_scatter(monkeypatch):
+    """Fits that are no more than log-likelihoods scatter as their model says."""
+    monkeypatch.setattr(prune, "dispersion_of", lambda *a, **k: 1.0)
+
+
 def survivors(monkeypatch, *, p_value, held, gained=50.0, held_out=True):
     """What `survive` keeps where torques that wander gain `gained` nats, and the p-values it asked for."""
     asked = []
@@ -94,6 +100,7 @@ def test_what_is_expected_on_flights_held_out_is_what_their_likelihood_would_los
     assert found > prune.TELLING
 
 
+@pytest.mark.usefixtures("no_scatter")
 @pytest.mark.parametrize(("slope", "kept"), [(-0.9, True), (-0.5, False)])
 def test_what_holds_another_within_its_range_stays(monkeypatch, slope, kept):
     """A thrust scale brings too little, but without it a thrust curve goes on to where commands are not heeded."""
@@ -101,7 +108,7 @@ def test_what_holds_another_within_its_range_stays(monkeypatch, slope, kept):
     with_both = POINT.with_effects({"thrust_scale": {"scale": 0.8}, "thrust_curve": {"slope_error": -0.4}})
     alone = POINT.with_effects({"thrust_curve": {"slope_error": slope}})
     fitted, bare = SimpleNamespace(point=with_both), SimpleNamespace(point=alone)
-    steps = [replace(TAKEN, taken=replace(TAKEN.taken, candidate=c, dispersion=1.0)) for c in (scale, curve)]
+    steps = [replace(TAKEN, taken=replace(TAKEN.taken, candidate=c)) for c in (scale, curve)]
     lost = {scale: 5.0, curve: 300.0}
     fits = {c: SimpleNamespace(point=alone, loglik=-nats) for c, nats in lost.items()}
     monkeypatch.setattr(prune, "bare_fit", lambda data, held_out, fitted, accepted, c: (fits[c], 0.0))
@@ -113,6 +120,7 @@ def test_what_holds_another_within_its_range_stays(monkeypatch, slope, kept):
     assert found is (fitted if kept else bare)
 
 
+@pytest.mark.usefixtures("no_scatter")
 @pytest.mark.parametrize(("expected", "held", "kept"), [(1.0, -25.0, True), (1.0, -31.0, False), (20.0, -25.0, True),
                                                         (50.0, -5.0, False), (50.0, 5.0, True)])  # fmt: skip
 def test_flights_held_out_are_asked_where_they_can_answer(monkeypatch, expected, held, kept):
@@ -121,7 +129,6 @@ def test_flights_held_out_are_asked_where_they_can_answer(monkeypatch, expected,
     A flight that cannot show it, or less than a tenth of that, may speak against it with a tenth of that: hovers have
     biases of their own.
     """
-    step = replace(TAKEN, taken=replace(TAKEN.taken, dispersion=1.0))
     fitted = SimpleNamespace(point=POINT, loglik=0.0)
     bare = SimpleNamespace(point=POINT, loglik=-300.0)
     monkeypatch.setattr(prune, "expected", lambda *a: expected)
@@ -130,14 +137,15 @@ def test_flights_held_out_are_asked_where_they_can_answer(monkeypatch, expected,
     monkeypatch.setattr(prune, "refine_base", lambda *a, **k: bare)
     data = SimpleNamespace(loglik=lambda point, passes: 0.0, workers=Workers(1))
     monkeypatch.setattr(prune, "nuisances", lambda *a: [])
-    _, accepted, _ = prune.drop(data, fitted, [DRAG], [step], SimpleNamespace(), lambda text: None)
+    _, accepted, _ = prune.drop(data, fitted, [DRAG], [TAKEN], SimpleNamespace(), lambda text: None)
     assert accepted == ([DRAG] if kept else [])
 
 
+@pytest.mark.usefixtures("no_scatter")
 def test_what_no_flight_needs_goes_before_what_one_speaks_against(monkeypatch):
     """A payload of no mass beside a load on a string, which a hover does not confirm while the payload is there."""
     payload, load = (Candidate(n, (), ("mass",)) for n in ("payload", "suspended_load"))
-    steps = [replace(TAKEN, taken=replace(TAKEN.taken, candidate=c, dispersion=1.0)) for c in (payload, load)]
+    steps = [replace(TAKEN, taken=replace(TAKEN.taken, candidate=c)) for c in (payload, load)]
     fitted = SimpleNamespace(point=POINT, loglik=0.0)
 
     def bare_fit(data, held_out, fitted, accepted, candidate):

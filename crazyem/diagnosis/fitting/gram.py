@@ -28,7 +28,8 @@ class Solution:
         held_out: the same on blocks that were not used for the fit, summed over folds [nats].
         p_value: that all are 0, from the scatter of the blocks' scores.
         covariance: (k, k), the larger of sandwich and inverse information on the diagonal's scale.
-        dispersion: by how much scores scatter more than the model says (1: as it says), variance ratio.
+        dispersion: by how much scores of the tested columns, the others profiled out, scatter more than the model says
+            (1: as it says), variance ratio.
     """
 
     theta: NDArray
@@ -99,9 +100,10 @@ class Gram:
             b_out, a_out = scores[out].sum(0), infos[out].sum(0)
             t = bounded(a - a_out + np.diag(weight), b - b_out + weight * centre, low, high)
             held += float(b_out @ t - 0.5 * t @ a_out @ t)
-        covariance, dispersion, meat = self._sandwich(scores, infos, theta, a + np.diag(weight), effective)
         which = np.arange(k) if tested is None else np.asarray(tested, int)
         total, curvature, free = b + weight * centre, a + np.diag(weight), np.zeros(k, bool)
+        covariance, meat = self._sandwich(scores, infos, theta, curvature, effective)
+        dispersion = self._dispersion(a, curvature, meat, which, len(scores))
         p_value = self._p_value(total, infos, curvature, meat, which, free, len(scores))
         if low is not None and high is not None and which.size < k:
             # Whatever speaks against an effect's absence while the others are free speaks against it within bounds,
@@ -135,7 +137,7 @@ class Gram:
     @staticmethod
     def _sandwich(
         scores: NDArray, infos: NDArray, theta: NDArray, a: NDArray, effective: bool
-    ) -> tuple[NDArray, float, NDArray]:
+    ) -> tuple[NDArray, NDArray]:
         residual = scores - infos @ theta
         blocks, k = residual.shape
         residual = residual - residual.mean(0)
@@ -147,12 +149,25 @@ class Gram:
             if np.all(np.linalg.eigvalsh(both) > 0.3 * np.linalg.eigvalsh(meat).min()):
                 meat = both
         inverse = _inverse(a)
-        ratio = float(np.median(np.diag(meat) / np.maximum(np.diag(infos.sum(0)), 1e-300))) if k else 1.0
         freedom = max(blocks - (used(infos.sum(0), a) if effective else k), 2)
         sandwich = inverse @ meat @ inverse * blocks / freedom
         plain = inverse
         larger = np.sqrt(np.maximum(np.diag(sandwich), np.diag(plain)) / np.maximum(np.diag(sandwich), 1e-300))
-        return sandwich * np.outer(larger, larger), ratio, meat
+        return sandwich * np.outer(larger, larger), meat
+
+    @staticmethod
+    def _dispersion(a: NDArray, curvature: NDArray, meat: NDArray, which: NDArray, blocks: int) -> float:
+        """Median over the tested columns, the others profiled out, of the variance of scores over the model's."""
+        if which.size == 0:
+            return 1.0
+        project = _profiled(curvature, which, np.setdiff1d(np.arange(len(a)), which))
+        by_scatter, by_model = (np.einsum("ij,jk,ik->i", project, m, project) for m in (meat, a))
+        # a column that the others explain has no scatter left, and says nothing
+        left = by_model > 1e-9 * np.diag(a)[which]
+        if not left.any():
+            return 1.0
+        taken = min(used(a, curvature), blocks - 2) if which.size < len(a) else 0.0
+        return float(np.median(by_scatter[left] / by_model[left])) * blocks / (blocks - max(taken, 0.0))
 
     @staticmethod
     def _p_value(
@@ -169,13 +184,7 @@ class Gram:
         if k == 0:
             return 1.0
         others = np.setdiff1d(np.flatnonzero(~held_fast), which)
-        project = np.zeros((k, a.shape[0]))
-        project[np.arange(k), which] = 1.0
-        if others.size:
-            own = np.diag(a)[others]  # a column that changes nothing has none
-            project[:, others] = -np.linalg.solve(
-                a[np.ix_(others, others)] + np.diag(1e-12 * own + (own <= 0)), a[np.ix_(others, which)]
-            ).T
+        project = _profiled(a, which, others)
         b = project @ total
         v = project @ meat @ project.T
         plain = project @ infos.sum(0) @ project.T
@@ -194,6 +203,18 @@ def _inverse(curvature: NDArray) -> NDArray:
     scale = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
     inverse: NDArray = np.linalg.pinv(curvature / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
     return inverse
+
+
+def _profiled(a: NDArray, which: NDArray, others: NDArray) -> NDArray:
+    """(w, k) that takes scores (k,) to those of the tested columns with the others profiled out (efficient scores)."""
+    project = np.zeros((which.size, a.shape[0]))
+    project[np.arange(which.size), which] = 1.0
+    if others.size:
+        own = np.diag(a)[others]  # a column that changes nothing has none
+        project[:, others] = -np.linalg.solve(
+            a[np.ix_(others, others)] + np.diag(1e-12 * own + (own <= 0)), a[np.ix_(others, which)]
+        ).T
+    return project
 
 
 def _without_columns(a: NDArray, b: NDArray, low: NDArray, high: NDArray, which: NDArray) -> tuple[NDArray, NDArray]:

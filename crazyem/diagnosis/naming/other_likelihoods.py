@@ -60,7 +60,7 @@ def other_likelihoods(
             if held > 0:
                 # what the regression explains, nothing where gusts are all there is, says nothing of them
                 left = replace(remains.without_force(), gained=gusts.gain)
-                sure = trust(left, held) * presence(held, gusts.gain)
+                sure = trust(left, held) * presence(gusts.gain, held, gusts.gain)
                 chance = float(np.exp(-min(held, 700.0)))
                 found.append(Named(GUSTS.name, GUSTS.name, values, {}, held, chance, sure, log_odds=float(logit(sure))))
     if not wanted or accelerometer.EFFECT in wanted:
@@ -75,7 +75,8 @@ def other_likelihoods(
             if enough and np.abs(angles[:2]).max() > accelerometer.LEAST:
                 values = {n: Value(float(a), "rad", float(e), around(float(a), float(e)))
                           for n, a, e in zip(accelerometer.ANGLES, angles, sd, strict=True)}  # fmt: skip
-                sure = presence(held, solution.gain / max(1.0, solution.dispersion))
+                dispersion = max(1.0, solution.dispersion)
+                sure = presence(solution.gain / dispersion, held, solution.gain, dispersion=dispersion)
                 name = accelerometer.EFFECT
                 found.append(Named(name, name, values, {}, held, wald, sure, log_odds=float(logit(sure))))
     return found

@@ -20,7 +20,7 @@ from crazyem.diagnosis.fitting.nuisances import (
 )
 from crazyem.diagnosis.locating.random_torques import off_peak_gram, peaks
 from crazyem.diagnosis.naming.detection_limits import at_the_end
-from crazyem.diagnosis.naming.trials import LIKELY, SURE, Selection, Step, both, significance, wald
+from crazyem.diagnosis.naming.trials import LIKELY, SURE, Selection, Step, both, dispersion_of, significance, wald
 
 ADMITTED = 8.0  # nats of evidence that an effect must bring
 HELD = 1.0  # nats it must bring on flight held out,
@@ -68,14 +68,14 @@ def drop(
         held_here = on_held_out(held_out, fitted.point, accepted).loglik if held_out else 0.0
         judged = []
         bare = data.workers.map(partial(bare_fit, data, held_out, fitted, accepted), accepted)
-        for c, (less, held_less) in zip(accepted, bare, strict=True):
+        for k, (c, (less, held_less)) in enumerate(zip(accepted, bare, strict=True)):
             step = next(s for s in steps if s.taken and s.taken.candidate.effect == c.effect)
             assert step.taken is not None
-            gain = (here - less.loglik) / step.taken.dispersion
-            held = (held_here - held_less) / step.taken.dispersion
+            dispersion = dispersion_of(fitted, len(c.free), offset=sum(len(a.free) for a in accepted[:k]))
+            gain, held = (here - less.loglik) / dispersion, (held_here - held_less) / dispersion
             need = -max(ADMITTED, MISLED * gain)
             # what should bring little of what it gains is not to be seen there either
-            least = max(TELLING, MISLED * gain) * step.taken.dispersion
+            least = max(TELLING, MISLED * gain) * dispersion
             should = np.inf if held_out is None else expected(held_out, fitted, accepted, c)
             if should > least:
                 need = HELD
@@ -83,7 +83,9 @@ def drop(
             held_up = held + ADMITTED - need if held_out else np.inf
             # what no flight needs goes first: beside a payload of no mass, a load on a string failed on a hover
             judged.append(((brings > ADMITTED, min(brings, held_up)), c, less))
-            now = replace(step.taken, gain=gain * step.taken.dispersion, held_out=held * step.taken.dispersion)
+            now = replace(
+                step.taken, gain=gain * dispersion, held_out=held * dispersion, expected=should, dispersion=dispersion
+            )
             steps = [replace(s, taken=now) if s is step and held_out else s for s in steps]
         worst = min((j for j in judged if j[1] not in kept), key=lambda j: j[0], default=None)
         if worst is None or worst[0][1] > ADMITTED:

@@ -44,6 +44,7 @@ from crazyem.diagnosis.naming.trials import (
     additions,
     both,
     by_evidence,
+    dispersion_of,
     distinguishable,
     not_beaten,
     separate_evidence,
@@ -221,9 +222,10 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
         value += held + more
     else:
         covariance = known_by(fit, mine)
-    k = len(trial.candidate.free)
+    k, offset = len(trial.candidate.free), sum(len(c.free) for c in basis.accepted)
     tuned = tuning([trial.candidate], covariance[-k:, -k:])
-    wald_p = significance(fit, k, offset=sum(len(c.free) for c in basis.accepted))
+    trial = replace(trial, dispersion=dispersion_of(fit, k, offset=offset))
+    wald_p = significance(fit, k, offset=offset)
     wald_p = by_gain(fit.point, gain / trial.dispersion, k, len(fit.gram.score), wald_p)
     # of one that was begun where derivatives do not lead, these say nothing
     sure = both(

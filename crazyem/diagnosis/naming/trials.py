@@ -35,6 +35,7 @@ class Trial:
         candidate: which.
         gain: log-likelihood beyond the model before it [nats], on the flights fitted.
         held_out: the same on held-out flights or blocks.
+        expected: what it brings there if it is there and as large as it was fitted; None: as much as on those fitted.
         dispersion: by how much scores scatter more than the model says.
         p_value: of the score test.
         evidence: what counts: gain over dispersion less the number of parameters, and the held-out gain.
@@ -63,12 +64,14 @@ class Trial:
     log_odds: float | None = None
     size: Mapping[str, float] = field(default_factory=dict)
     other_evidence: float = 0.0
+    expected: float | None = None
 
     def presence(self, order: int) -> float:
         """Probability that it is there as the `order`-th effect that was found (from 1), whatever its look-alikes."""
         if self.log_odds is not None:
             return min(CALIBRATED, float(expit(self.log_odds)))
-        there = presence(self.held_out, self.gain / self.dispersion, order)
+        expected = self.gain if self.expected is None else self.expected
+        there = presence(self.gain / self.dispersion, self.held_out, expected, order, dispersion=self.dispersion)
         return min(CALIBRATED, float(expit(logit(there) + self.other_evidence)))
 
     @property
@@ -222,6 +225,14 @@ def both(p_value: float, held: float) -> float:
 def separate_evidence(trial: Trial, *, counted: bool) -> float:
     """Evidence by the candidate's own scatter: what it must bring to be admitted."""
     return (trial.gain + (trial.held_out if counted else 0.0)) / trial.dispersion - len(trial.candidate.free)
+
+
+def dispersion_of(fitted: Fitted, count: int, *, offset: int) -> float:
+    """By how much the scores of `count` free parameters from `offset` on scatter more than the model says, at the
+    maximum with them, where what they explain does not scatter any more; at least 1."""
+    gram, own = fitted.gram, range(offset, offset + count)
+    solution = gram.solve(range(gram.size), precision=fitted.precision, tested=own, effective=True)
+    return max(1.0, solution.dispersion)
 
 
 def significance(fitted: Fitted, count: int, *, offset: int) -> float:
