@@ -72,7 +72,7 @@ def test_what_went_on_to_its_end_is_taken_back_and_the_selection_goes_on(monkeyp
 
     monkeypatch.setattr(selecting, "refine_anew", too_far)
     found = select(data, point, [THRUST, DRAG], say=said.append)
-    assert sum("nothing more of it is admitted: thrust_scale" in text for text in said) == 1
+    assert sum("at the end of its physical range: thrust_scale" in text for text in said) == 1
     assert "thrust_scale" not in {c.effect for c in found.accepted}
     assert "thrust_scale" not in found.final.effects
     assert all(s.taken.candidate.effect != "thrust_scale" for s in found.steps if s.taken)

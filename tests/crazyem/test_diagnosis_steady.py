@@ -260,7 +260,7 @@ def test_what_wanders_is_fitted_beside_the_flights(monkeypatch) -> None:
         return refine_base(apart, *arguments, **options)
 
     monkeypatch.setattr(pruning, "refine_base", recorded)
-    monkeypatch.setattr(pruning, "WANDERING", -np.inf)
+    monkeypatch.setattr(pruning, "MEMORY_NATS", -np.inf)
     step: Any = SimpleNamespace(taken=SimpleNamespace(candidate=drag, dispersion=1.0))
     pruning.survive(data, fitted, [drag], [step], None, lambda text: None)
     assert seen

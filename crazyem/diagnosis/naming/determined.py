@@ -72,12 +72,10 @@ def not_determined(candidate: Candidate, parameters: Mapping[str, Value], point:
 
 
 def improbable(chance: float) -> str:
-    """Why an effect that is there with this probability is no finding; "" if it is one."""
+    """Why an effect of this probability is no finding; "" if it is one."""
     if chance >= LEAST_PROBABILITY:
         return ""
-    return (
-        f"not determined: what it explains of flight held out, other causes explain as often (probability {chance:.2g})"
-    )
+    return f"not determined: the flights make it probable with {chance:.2g} only"
 
 
 def at_an_end(value: float, ends: tuple[float, float], neutral: float) -> bool:

@@ -9,8 +9,8 @@ from scipy.special import expit, logit
 # scores scatter than the model says) - ORDER log(k) of the k-th effect found + `held_out_evidence`; the probability is
 # at most `CALIBRATED`. Models are approximate: wrong names gain tens of nats, with a heavy tail, so odds grow with a
 # power of what is gained and not with the nats. A file lacks one thing rather than three.
-# By the posterior mode from 38 names in 45 worlds, home, random and foreign (seeds 12501, 12602, 12703, 13602), after 79
-# names in 71 others (seeds 11501, 11602, 11703, 10501, 10602) as prior.
+# By the posterior mode from 38 names in 45 worlds, home, random and foreign (seeds 12501, 12602, 12703, 13602). The
+# prior is from 79 names in 71 others (seeds 11501, 11602, 11703, 10501, 10602).
 CONSTANT, FITTED, ORDER, CALIBRATED = -6.8, 1.7, 1.2, 0.95
 # How far what an effect brings on flight held out is from what is expected, as a share of that, where it is there (its
 # model is approximate), and how far from 0 where something else is (it may be that in both flights); Student's t, as

@@ -1,4 +1,4 @@
-"""Leaving out again what the final model does not need, or what noise of another kind explains as well."""
+"""Backward elimination: effects that the final model does not need, or that noise of another kind explains as well."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -22,33 +22,36 @@ from crazyem.diagnosis.locating.random_torques import off_peak_gram, peaks
 from crazyem.diagnosis.naming.detection_limits import at_the_end
 from crazyem.diagnosis.naming.trials import LIKELY, SURE, Selection, Step, both, dispersion_of, significance, wald
 
-ADMITTED = 8.0  # nats of evidence that an effect must bring
-HELD = 1.0  # nats it must bring on flight held out,
-TELLING = 6.0  # if so many are to be expected there; else it must not cost what it must bring
-MISLED = 0.1  # share of its gain that it may cost where it cannot be seen: hovers have biases of their own
-OTHERWISE = 0.01  # p-value of an effect's being the same size beside what shakes (Hausman 1978)
-APART = 1 / 3  # of its size, at least: sampled commands make some per cent of difference
-FORCES = np.full(3, 0.2)  # m/s^2, where wandering forces begin
-WANDERING = 10.0  # nats that disturbing torques with memory must gain to be allowed for
+ADMITTED = 8.0  # nats; least evidence of an effect
+HELD_OUT_NATS = 1.0  # nats; least gain on held-out flights that can show the effect
+INFORMATIVE_NATS = 6.0  # nats; expected gain from which held-out flights can show an effect
+COST_SHARE = 0.1  # share of its gain that an effect may cost on flights that cannot show it: a hover has its own biases
+HAUSMAN_P = 0.01  # p-value of the test that an effect has the same size without the peaks of a spectrum (Hausman 1978)
+SIZE_DIFFERENCE = 1 / 3  # least difference of these sizes, as a share: sampled commands alone make some per cent
+START_FORCES = np.full(3, 0.2)  # m/s^2; start value of disturbing forces with memory
+MEMORY_NATS = 10.0  # nats; least gain by disturbances with memory
 
 
 def pruned(
     data: Data, nominal: Point, selection: Selection, held_out: Data | None, say: Callable[[str], None]
 ) -> Selection:
-    """The selection without what is not needed, and what is doubted of the rest; `nominal`: before anything is free."""
+    """The selection without effects that are not needed, and with the doubted ones marked.
+
+    `nominal` is the model before any nuisance is fitted.
+    """
     fitted, accepted, steps = selection.fitted, list(selection.accepted), list(selection.steps)
     held_out = held_out and as_held_out(held_out, fitted.point, accepted)
-    fitted, accepted, steps = drop(data, fitted, accepted, steps, held_out, say)
+    fitted, accepted, steps = eliminated(data, fitted, accepted, steps, held_out, say)
     doubted: frozenset[str] = frozenset()
     if TRIM not in selection.final.vehicle.effects:  # both judge by the scatter of blocks (see `by_gain`)
-        fitted, accepted, steps = survive(data, fitted, accepted, steps, held_out, say)
-        doubted = shaken(data, nominal, fitted, accepted, say)
+        fitted, accepted, steps = without_noise_alike(data, fitted, accepted, steps, held_out, say)
+        doubted = vibration_alike(data, nominal, fitted, accepted, say)
     return replace(
         selection, final=fitted.point, steps=tuple(steps), accepted=tuple(accepted), fitted=fitted, doubted=doubted
     )
 
 
-def drop(
+def eliminated(
     data: Data,
     fitted: Fitted,
     accepted: list[Candidate],
@@ -56,13 +59,13 @@ def drop(
     held_out: Data | None,
     say: Callable[[str], None],
 ) -> tuple[Fitted, list[Candidate], list[Step]]:
-    """Leave out again what the final model does not need, on the flights fitted or on those held out.
+    """Leave out the effects that the fitted or the held-out flights do not need, the weakest first.
 
-    But not what holds another within its range: without a thrust scale a thrust curve went on to where the thrust does
-    not heed its command, which needs no scale.
+    An effect stays if another would leave its physical range without it: a thrust curve without a thrust scale goes to
+    the slope at which the thrust does not depend on the command.
     """
     accepted, steps = list(accepted), list(steps)
-    kept = [s.taken.candidate for s in steps if s.taken and s.taken.log_odds is not None]  # by other evidence
+    kept = [s.taken.candidate for s in steps if s.taken and s.taken.log_odds is not None]  # the balance decides
     while accepted:
         here = data.loglik(fitted.point, passes=2)
         held_here = on_held_out(held_out, fitted.point, accepted).loglik if held_out else 0.0
@@ -73,15 +76,15 @@ def drop(
             assert step.taken is not None
             dispersion = dispersion_of(fitted, len(c.free), offset=sum(len(a.free) for a in accepted[:k]))
             gain, held = (here - less.loglik) / dispersion, (held_here - held_less) / dispersion
-            need = -max(ADMITTED, MISLED * gain)
-            # what should bring little of what it gains is not to be seen there either
-            least = max(TELLING, MISLED * gain) * dispersion
+            need = -max(ADMITTED, COST_SHARE * gain)
+            # held-out flights that should bring little of the gain cannot show the effect
+            least = max(INFORMATIVE_NATS, COST_SHARE * gain) * dispersion
             should = np.inf if held_out is None else expected(held_out, fitted, accepted, c)
             if should > least:
-                need = HELD
+                need = HELD_OUT_NATS
             brings = gain - len(c.free) + held
             held_up = held + ADMITTED - need if held_out else np.inf
-            # what no flight needs goes first: beside a payload of no mass, a load on a string failed on a hover
+            # an effect that no flight needs goes first: it may be why another fails on held-out flight
             judged.append(((brings > ADMITTED, min(brings, held_up)), c, less))
             now = replace(
                 step.taken, gain=gain * dispersion, held_out=held * dispersion, expected=should, dispersion=dispersion
@@ -104,10 +107,10 @@ def drop(
 
 
 def expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate) -> float:
-    """What an effect of this size would gain on flights held out if it is there [nats]: z'Az/2, the rest profiled out.
+    """Mean gain of a real effect of this size on held-out flights [nats]: z'Az/2, all else profiled out.
 
-    A hover says nothing of a damping, whether it is there or not. Without the bounds of what is always free, so rather
-    too little: an order of magnitude, no more.
+    A hover says nothing of a damping, real or not. The bounds of nuisances are left out, so the value is rather too
+    small: an order of magnitude.
     """
     point = fitted.point if held_out.own is None else replace(fitted.point, noise=held_out.own.noise)
     rest = [c for c in accepted if c is not candidate]
@@ -121,7 +124,7 @@ def expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], cand
     inner = a[:own, :own] - a[:own, own:] @ np.linalg.lstsq(a[own:, own:], a[own:, :own], rcond=1e-12)[0]
     here, neutral = candidate.values(point), candidate.neutral(point)
     away = np.array([here[n] - neutral[n] for n in candidate.free])
-    # an effect of a kind that is always free goes part of the way without being there
+    # an effect that is a nuisance, too, gains part of this without being a finding
     usual = {n: w for c, p in nuisances(held_out, point, ()) if c.effect == candidate.effect for n, w in zip(c.free, p)}
     spread = np.diag([usual[n] ** -0.5 if n in usual else 0.0 for n in candidate.free])
     inner = inner @ np.linalg.inv(np.eye(own) + spread @ spread @ inner)
@@ -131,7 +134,7 @@ def expected(held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], cand
 def bare_fit(
     data: Data, held_out: Data | None, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate
 ) -> tuple[Fitted, float]:
-    """The fit without one of the effects, and its log-likelihood on flights held out; changes nothing of the data."""
+    """The fit without one of the effects, and its log-likelihood on held-out flights; the data stay as they are."""
     rest = [a for a in accepted if a is not candidate]
     here, there = data.twin(), held_out.twin() if held_out else None
     if usual_named(candidate):
@@ -140,7 +143,7 @@ def bare_fit(
     return less, on_held_out(there, less.point, rest).loglik if there else 0.0
 
 
-def survive(
+def without_noise_alike(
     data: Data,
     fitted: Fitted,
     accepted: list[Candidate],
@@ -148,50 +151,50 @@ def survive(
     held_out: Data | None,
     say: Callable[[str], None],
 ) -> tuple[Fitted, list[Candidate], list[Step]]:
-    """Leave out what is no longer significant once forces and torques may wander: noise with memory looks like a wrong
-    inertia, and gusts like a wrong thrust curve.
+    """Leave out effects that are not significant beside disturbances with memory.
 
-    On a twin: fits that go on from where a wandering model led did not come back to what they were (eight flights of
-    nano-bench lost 720 nats, and their drag).
+    Noise with memory looks like a wrong inertia, and gusts look like a wrong thrust curve. The test is on a copy of the
+    data, so that the fit does not start from the model with disturbances.
     """
     while accepted:
         apart = data.twin()
-        noise = replace(fitted.point.noise, disturbance=np.concatenate([FORCES, TORQUES]), memory=1.0)
+        noise = replace(fitted.point.noise, disturbance=np.concatenate([START_FORCES, TORQUES]), memory=1.0)
         point = apart.fit_noise(replace(fitted.point, noise=noise))
-        if apart.loglik(point, passes=2) < data.loglik(fitted.point, passes=2) + WANDERING:
+        if apart.loglik(point, passes=2) < data.loglik(fitted.point, passes=2) + MEMORY_NATS:
             break
-        wandering = refine_base(apart, point, accepted, rounds=2, noise=False)
+        with_memory = refine_base(apart, point, accepted, rounds=2, noise=False)
         sure, offset = [], 0
         for c in accepted:
-            p_value = significance(wandering, len(c.free), offset=offset)
+            p_value = significance(with_memory, len(c.free), offset=offset)
             if held_out and SURE <= p_value < LIKELY:
                 taken = next(s.taken for s in steps if s.taken and s.taken.candidate.effect == c.effect)
-                p_value = both(p_value, held_gain(data, held_out, wandering, accepted, c) / taken.dispersion)
+                p_value = both(p_value, held_gain(data, held_out, with_memory, accepted, c) / taken.dispersion)
             sure.append(p_value)
             offset += len(c.free)
         worst = int(np.argmax(sure))
         if sure[worst] < SURE:
             break
-        say(f"  left out again, forces and torques may wander: {accepted[worst].label}")
+        say(f"  left out again, disturbances with memory explain it: {accepted[worst].label}")
         fitted, accepted, steps = left_out(data, fitted, accepted, steps, accepted[worst])
     return fitted, accepted, steps
 
 
 def held_gain(data: Data, held_out: Data, fitted: Fitted, accepted: Sequence[Candidate], candidate: Candidate) -> float:
-    """What an effect as fitted gains on flights held out [nats]."""
+    """Gain of a fitted effect on held-out flights [nats]."""
     there = on_held_out(held_out, fitted.point, accepted).loglik
     return there - bare_fit(data, held_out, fitted, accepted, candidate)[1]
 
 
-def shaken(
+def vibration_alike(
     data: Data, nominal: Point, fitted: Fitted, accepted: Sequence[Candidate], say: Callable[[str], None]
 ) -> frozenset[str]:
-    """Effects that are another size beside the humps of the spectrum than with them: something shakes there.
+    """Effects that have another size without the peaks of the spectrum than with them: a vibration explains them.
 
-    The loop answers a vibration, so gains, delays and inertias seem wrong at its frequency. A delay whose loop swings
-    makes a hump as well, but leaves none once it is part of the model, or is the same delay beside the hump.
+    The control loop answers a vibration, so gains, delays and inertias seem wrong at its frequency. A delay whose loop
+    oscillates makes a peak, too. But the peak is gone in the model with the delay, or the delay has the same size
+    without the peak.
     """
-    found = [peaks(m, nominal) for m in data.models]  # before what is always free gave way to them
+    found = [peaks(m, nominal) for m in data.models]  # before nuisances have fitted the peaks
     if not accepted or not any(found) or not any(peaks(m, fitted.point) for m in data.models):
         return frozenset()
     free = [*accepted, *(c for c, _ in nuisances(data, fitted.point, accepted))]
@@ -203,7 +206,7 @@ def shaken(
         for g in (data.gram(fitted.point, columns), off_peak_gram(data, fitted.point, columns, found))
     )
     information = beside[0].total(range(beside[0].size))[1]
-    taken = used(information, information + np.diag(fitted.precision))  # what priors say takes no block
+    taken = used(information, information + np.diag(fitted.precision))  # priors use no degrees of freedom
     doubted, offset = [], 0
     for c in accepted:
         at = slice(offset, offset + len(c.free))
@@ -211,8 +214,8 @@ def shaken(
         covariance = beside[1].covariance[at, at]
         size, apart = here[at] + whole[1].theta[at], beside[1].theta[at] - whole[1].theta[at]
         share = float(apart @ np.linalg.pinv(covariance) @ apart) / float(size @ np.linalg.pinv(covariance) @ size)
-        if share > APART**2 and wald(apart, covariance, beside[0], taken) < OTHERWISE:
-            say(f"  it is another size beside what shakes: {c.label}")
+        if share > SIZE_DIFFERENCE**2 and wald(apart, covariance, beside[0], taken) < HAUSMAN_P:
+            say(f"  it has another size without the vibration: {c.label}")
             doubted.append(c.effect)
     return frozenset(doubted)
 

@@ -1,9 +1,8 @@
-"""Which effects a flight asks for: one after the other, each fitted together with those before it, with a stop rule.
+"""Forward selection of effects, with a stop rule.
 
-Each turn one pass gives score and information of every candidate (`gram`); the most promising are fitted without the
-linear approximation, and compared by what they gain beyond their number of parameters, on the flights fitted (in
-units in which scores scatter as they should) and on those held out. What comes close to the winner is kept as a
-look-alike.
+Each turn adds one effect. One pass of the filter gives the score and the information of all candidates (`gram`). The
+candidates with the largest linear gains are fitted in full. Their evidence is the gain over the dispersion, on fitted
+and held-out flights, less the number of parameters. The best one joins the model; look-alikes are kept beside it.
 """
 
 from collections.abc import Callable, Sequence
@@ -53,16 +52,18 @@ from crazyem.diagnosis.naming.trials import (
 )
 from crazyem.physics.effects.catalogue import CATALOGUE
 
-SHORTLIST = 6
-WORTH, ANYWAY = 0.15, 3  # share of the largest linear gain from which a candidate is fitted, and how many are anyway
-MOST = 9  # effects: real drones differ from a file in more than one thing
-NEARLY, MOST_COMPARED = 0.8, 3  # share of the best's gain from which, and how many, explanations get noise of their own
+MOST_FITTED = 6  # candidates of a turn
+GAIN_SHARE = 0.15  # least share of the largest linear gain with which a candidate is fitted
+FITTED_ANYWAY = 3  # candidates that are fitted whatever they gain
+MOST_EFFECTS = 9  # real drones differ from their file in more than one thing
+CLOSE_GAIN = 0.8  # share of the best gain from which a trial gets its own noise,
+MOST_COMPARED = 3  # at most so many
 
 
 def linear_trials(
     data: Data, point: Point, accepted: Sequence[Candidate], candidates: Sequence[Candidate]
 ) -> list[tuple[Trial, Solution]]:
-    """What each candidate would gain in the linear approximation, best first. The last columns are the candidate's."""
+    """The trials of all candidates by the linear approximation, best first; a candidate's columns come last."""
     free = nuisances(data, point, accepted)
     point = with_nuisances(point, free)
     base = [*accepted, *(c for c, _ in free)]
@@ -107,7 +108,7 @@ def linear_trials(
                 (replace(t, p_value=by_onsets(point, t.p_value, len(gram.score))), s)
                 for t, s in linear_trials(data, point, accepted, [later])
             ]
-        if decided_by_balance(point.vehicle, c):  # what is steady is told by the balance; what sets in later is not
+        if decided_by_balance(point.vehicle, c):  # the balance decides on steady effects, not on later onsets
             continue
         lo, hi = (np.array(b) for b in c.bounds(point))
         judge(c, always + mine, np.append(weights, np.zeros(len(mine))), np.append(low, lo), np.append(high, hi),
@@ -127,7 +128,7 @@ def linear_trials(
 
 
 def with_started(point: Point, candidate: Candidate, solution: Solution) -> Point:
-    """The model with a candidate put in where the linear approximation says."""
+    """The model with a candidate at the size of the linear approximation."""
     change = solution.theta[len(solution.theta) - len(candidate.free) :]
     if candidate.effect in point.effects and not candidate.begin:
         here = candidate.values(point)
@@ -143,7 +144,7 @@ def with_started(point: Point, candidate: Candidate, solution: Solution) -> Poin
 
 @dataclass(frozen=True)
 class Basis:
-    """What a candidate is tried against: the flights, the model before it and its log-likelihoods."""
+    """The flights and the model that a candidate is added to, and the model's log-likelihoods."""
 
     data: Data
     held_out: Data | None
@@ -154,7 +155,7 @@ class Basis:
 
 
 def held_out_value(held_out: Data | None, point: Point, accepted: Sequence[Candidate]) -> tuple[Data | None, float]:
-    """The flights held out as they are by this model, and its log-likelihood there."""
+    """The held-out flights with the nuisances of this model, and its log-likelihood there."""
     if held_out is None:
         return None, 0.0
     apart = as_held_out(held_out, point, accepted)
@@ -162,7 +163,7 @@ def held_out_value(held_out: Data | None, point: Point, accepted: Sequence[Candi
 
 
 def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callable[[str], None]) -> Trial:
-    """The trial of the linear approximation after a fit without it; changes nothing of the basis."""
+    """The trial after a full fit; the basis stays as it is."""
     basis = constrained_basis(basis, trial.candidate)
     point = basis.point
     say(f"  fitting {trial.candidate.label}")
@@ -175,7 +176,7 @@ def fitted_trial(basis: Basis, trial: Trial, solution: Solution, *, say: Callabl
 
 
 def constrained_basis(basis: Basis, candidate: Candidate) -> Basis:
-    """The basis with none of an effect that is free beside all others, and still is a finding where it is there."""
+    """The basis without an effect that is a nuisance and a possible finding, too."""
     name = candidate.effect
     if not usual_named(candidate) or name in basis.data.constrained:
         return basis
@@ -186,7 +187,7 @@ def constrained_basis(basis: Basis, candidate: Candidate) -> Basis:
 
 
 def with_held_out_by(basis: Basis, trial: Trial) -> Basis:
-    """The basis with flights held out as they are by a trial: in noise of a model without either, two names differ."""
+    """The basis with the held-out flights as a trial has them: two explanations are compared in the noise of one."""
     if basis.held_out is None:
         return basis
     assert trial.fitted is not None
@@ -196,7 +197,7 @@ def with_held_out_by(basis: Basis, trial: Trial) -> Basis:
 
 
 def with_noise_refit(basis: Basis, trial: Trial) -> Trial:
-    """A trial with noise scales of its own: under those of the model before it, the right explanation gains little."""
+    """A trial with its own noise scales: those of the model before it contain the effect, and hide the gain."""
     assert trial.fitted is not None
     basis = constrained_basis(basis, trial.candidate)
     data, mine = basis.data.twin(), [*basis.accepted, trial.candidate]
@@ -208,7 +209,7 @@ def with_noise_refit(basis: Basis, trial: Trial) -> Trial:
 
 
 def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
-    """The trial with what its fit gains, on the flights fitted (`data`, where the fit is) and on those held out."""
+    """The trial with the gains of its fit, on the fitted flights (`data`) and on the held-out ones."""
     gain = fit.loglik - basis.value
     blocks, recording = data.block_loglik(fit.point), data.recordings_of_blocks()
     held, value, mine = trial.held_out, gain, [*basis.accepted, trial.candidate]
@@ -227,7 +228,7 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
     trial = replace(trial, dispersion=dispersion_of(fit, k, offset=offset))
     wald_p = significance(fit, k, offset=offset)
     wald_p = by_gain(fit.point, gain / trial.dispersion, k, len(fit.gram.score), wald_p)
-    # of one that was begun where derivatives do not lead, these say nothing
+    # at a start that derivatives do not lead to, the score test says nothing
     sure = both(
         wald_p if trial.candidate.likeliest else max(trial.p_value, wald_p),
         held / trial.dispersion if basis.held_out else 0.0,
@@ -238,14 +239,14 @@ def compared(basis: Basis, trial: Trial, data: Data, fit: Fitted) -> Trial:
 
 
 def may_join(effect: str, found: set[str]) -> bool:
-    """Whether an effect can be known beside those found: not twice, and not where it is what they are, differently."""
+    """Whether an effect may be added to those found: not twice, and not beside another form of itself."""
     together = {effect, *found}
     same_again = any(group <= together for name in together for group in CATALOGUE[name].never_beside)
     return effect not in found and not found & set(CATALOGUE[effect].twins) and not same_again
 
 
 def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Callable[[str], None]) -> Step:
-    """One turn of the selection: the promising are fitted, and the best is taken if it is sure enough."""
+    """One turn of the selection: candidates with large gains are fitted, the best is taken if it is significant."""
     counted = basis.held_out is not None
     fitted = basis.data.workers.map(lambda entry: fitted_trial(basis, *entry, say=say), shortlist(linear))
     trials = by_evidence(fitted, counted=counted)
@@ -260,7 +261,7 @@ def step_of(basis: Basis, linear: Sequence[tuple[Trial, Solution]], *, say: Call
 
 
 def admitted(basis: Basis, trial: Trial) -> bool:
-    """Whether a trial is sure enough to be taken."""
+    """Whether a trial has the evidence and the significance to be taken."""
     enough = separate_evidence(trial, counted=basis.held_out is not None) > ADMITTED
     return enough and sure_enough(basis.point, trial.p_value)
 
@@ -274,8 +275,8 @@ def select(
     begun: Selection | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Selection:
-    """The effects that the flights ask for; beyond those `begun` with, where there are some."""
-    # with a trim in the file noise stays (`with_trim_noise`), or what is steady would pass for a torque with memory
+    """The effects that explain the flights, beyond those of the selection `begun`."""
+    # with a trim in the file noise stays (`with_trim_noise`): a steady torque must not become a torque with memory
     begin = refine_base if TRIM in nominal_point.vehicle.effects else refine_anew
     fitted = begin(data, nominal_point, ()) if begun is None else begun.fitted
     nominal = fitted.point if begun is None else begun.nominal
@@ -291,7 +292,7 @@ def select(
         linear = linear_trials(data, point, accepted, best_begun(data, point, accepted, rest))
         if len(accepted) > first:
             steps[-1] = replace(steps[-1], beside=additions(steps[-1], [t for t, _ in linear]))
-        if len(accepted) >= MOST:  # what stands beside the last is all that is asked
+        if len(accepted) >= MOST_EFFECTS:  # the linear trials show what stands beside the last
             steps.append(Step(tuple(t for t, _ in linear), None))
             break
         steps.append(step_of(Basis(data, apart, point, tuple(accepted), value, held_value), linear, say=say))
@@ -304,8 +305,8 @@ def select(
         say(f"  found {candidate.label}: {taken.evidence:.1f} nats")
         before, fitted = fitted, refine_anew(data, dated.point, accepted)
         if at_the_end(fitted.point, candidate):
-            # together with all that is free it went on to where nothing more is admitted: it stands for something else
-            say(f"  left out again, nothing more of it is admitted: {candidate.label}")
+            # fitted with all nuisances, it is at the end of its physical range: it stands for something else
+            say(f"  left out again, at the end of its physical range: {candidate.label}")
             accepted.pop()
             steps.pop()
             candidates = [c for c in candidates if c.effect != candidate.effect]
@@ -313,33 +314,32 @@ def select(
             data.settle(fitted.point)
             continue
         point, value = fitted.point, fitted.loglik
-        if unlike_a_body(point, accepted):  # told by other means, or not at all: see `diagnose`
+        if unlike_a_body(point, accepted):  # `diagnose` reports that
             return Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))
         apart, held_value = held_out_value(held_out, point, accepted)
     found = {c.effect for c in accepted}
     whole = Selection(nominal, point, tuple(steps), tuple(accepted), fitted, len(candidates))
     chosen = pruned(data, nominal_point, whole, held_out, say)
     gone = found - {c.effect for c in chosen.accepted}
-    if len(found) < MOST or not gone:  # else there was room for no more, and now there is
+    if len(found) < MOST_EFFECTS or not gone:  # else there is room for more now
         return chosen
     rest = [c for c in candidates if c.effect not in gone]
     return select(data, nominal_point, rest, held_out=held_out, begun=chosen, say=say)
 
 
 def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Solution]]:
-    """Those worth a fit of their own: the largest gains, and the largest when scatter is allowed for; one beginning of
-    each."""
+    """The trials to be fitted: those of the largest gains and those of the largest evidence, one start of each."""
     sound = [t for t in linear if t[0].evidence > 2.0 and t[0].p_value < 0.03]
     chosen: list[tuple[Trial, Solution]] = []
-    least = WORTH * max((t.gain for t, _ in sound), default=0.0)
+    least = GAIN_SHARE * max((t.gain for t, _ in sound), default=0.0)
     by_gain = sorted(sound, key=lambda t: 2 * len(t[0].candidate.free) - t[0].gain)
     for entry in [x for pair in zip(by_gain, sound, strict=True) for x in pair]:
         c = entry[0].candidate
         twins = [t for t, _ in chosen if t.candidate.effect == c.effect]
         same = any(t.candidate.fixed == c.fixed and t.candidate.free == c.free for t in twins)
-        if not same and len(twins) < 2 and (entry[0].gain > least or len(chosen) < ANYWAY):
+        if not same and len(twins) < 2 and (entry[0].gain > least or len(chosen) < FITTED_ANYWAY):
             chosen.append(entry)
-        if len(chosen) == SHORTLIST:
+        if len(chosen) == MOST_FITTED:
             break
     for name in [n for n, effect in CATALOGUE.items() if effect.twins]:
         for twin in CATALOGUE[name].twins:
@@ -355,7 +355,7 @@ def shortlist(linear: Sequence[tuple[Trial, Solution]]) -> list[tuple[Trial, Sol
 def imitating(
     trial: Trial, chosen: Sequence[tuple[Trial, Solution]], linear: Sequence[tuple[Trial, Solution]]
 ) -> list[tuple[Trial, Solution]]:
-    """What may look like a trial and says nothing of it where it is none, begun where it is something."""
+    """Imitators of a trial, at a start where they differ from neutral: at neutral their scores say nothing."""
     found = []
     for name, begin in CATALOGUE[trial.candidate.effect].imitators.items():
         asked = [e for e in linear if e[0].candidate.effect == name][:1]
@@ -368,10 +368,10 @@ def imitating(
 
 
 def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], None]) -> tuple[list[Trial], list[Trial]]:
-    """The trials, and the best of them with what is not told apart from it, each of these with noise of its own.
+    """The trials, and the best of them with its look-alikes, each of these with its own noise scales.
 
-    So is what explains nearly as much: under the noise of a model without either, much of which is the effect, a torque
-    scale that is wrong by some per cent for each axis is better by 90 nats than the inertias that are right.
+    Trials with nearly the same gain are compared like this, too: the noise of a model without the effect contains much
+    of the effect, and under that noise a wrong torque scale may be better than the right inertias.
     """
     counted = basis.held_out is not None
     equals = alike_with(trials[0], trials, counted=counted)
@@ -380,7 +380,7 @@ def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], No
         t
         for t in trials
         if rivals(t, counted=counted)
-        and (t.value > NEARLY * trials[0].value or (turns and CATALOGUE[t.candidate.effect].twins))
+        and (t.value > CLOSE_GAIN * trials[0].value or (turns and CATALOGUE[t.candidate.effect].twins))
     ]
     equals += [t for t in nearly[:MOST_COMPARED] if all(t is not e for e in equals)]
     if len(equals) == 1:
@@ -391,30 +391,29 @@ def compared_again(basis: Basis, trials: list[Trial], *, say: Callable[[str], No
     trials = by_evidence([*again, *rest], counted=counted)
     close = [t for t in trials if any(t.candidate is a.candidate for a in again)]
     explain = [t for t in close if t is close[0] or admitted(basis, t)]
-    # as fitted to all flights: a drag fitted to slow flight is by chance what ruins a quick one least
+    # by the evidence on all flights: slow flights do not determine a drag
     best = max(explain, key=lambda t: t.worth)
     return trials, alike_with(best, close, counted=counted)
 
 
 def alike_with(best: Trial, trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
-    """The best, and what is not told apart from it."""
+    """The best trial and its look-alikes."""
     others = [t for t in trials if t is not best and rivals(t, counted=counted)]
     return [best, *(t for t in others if not distinguishable(best, t))]
 
 
 def group_of(taken: Trial, equals: Sequence[Trial], trials: Sequence[Trial], *, counted: bool) -> tuple[Trial, ...]:
-    """What is not told apart from the best, nor from the one that gives the name, which may be another: a lag loses to
-    a ground effect, but not to the delay that is named before it."""
+    """Look-alikes of the best trial and of the trial that gives the name, which may be two: a ground effect may beat a
+    lag that the named delay does not beat."""
     more = [t for t in alike_with(taken, trials, counted=counted) if all(t is not e for e in equals)]
     return tuple(t for t in (*equals, *more) if t.candidate.effect != taken.candidate.effect)
 
 
 def name_of(equals: Sequence[Trial], *, counted: bool) -> Trial:
-    """Which of those that are not told apart gives the name: the simplest that none of the others beats (nine to
-    one), or its confidence would say that it is another.
+    """The look-alike that gives the name: the simplest that no other beats (`BEATEN`).
 
-    By the scatter over blocks alone: how recordings differ widens a group, but is known from few of them, and a name
-    that loses by hundreds of nats is none because of that.
+    By the scatter over blocks alone. The scatter between recordings is known from few recordings; it widens a group,
+    but must not name an effect that loses by hundreds of nats.
     """
     near = [t for t in equals if t is equals[0] or not distinguishable(equals[0], t, recordings=False)]
     simplest = min(not_beaten(near), key=lambda t: (len(t.candidate.free), -t.evidence), default=equals[0])
@@ -422,8 +421,8 @@ def name_of(equals: Sequence[Trial], *, counted: bool) -> Trial:
 
 
 def rivals(trial: Trial, *, counted: bool) -> bool:
-    """Whether a candidate that was fitted is an explanation at all: significant, or with evidence enough; and of some
-    use on all flights together."""
+    """Whether a fitted candidate is an explanation: significant or with the evidence to be admitted, and with positive
+    evidence on all flights."""
     evidence = separate_evidence(trial, counted=counted)
     sure = trial.p_value < SURE or (trial.p_value < 1.0 and evidence > ADMITTED)
     return trial.fitted is not None and sure and evidence > 0

@@ -16,38 +16,37 @@ from crazyem.diagnosis.fitting.nuisances import solved
 from crazyem.diagnosis.naming.presence import CALIBRATED, presence
 from crazyem.physics.effects.catalogue import CATALOGUE
 
-SURE = 1e-3  # p-value of the score test, before counting candidates,
-# with a trim in the file, where no test by the scatter of blocks follows (see `select`); some 70 are asked,
-SURE_DAILY = 1e-4
-LIKELY = 5e-2  # which flights held out may lower where it is below this
-CLOSE = 4.0  # nats within which two explanations cannot be told apart,
-EVEN = 0.5  # what a name is worth, at least, beside a rival that is not significant itself
-SEPARATION = 1.64  # or standard deviations of the difference of their likelihoods, over blocks or recordings
-BESIDE = 0.5  # share of its gain that an effect keeps beside another which it is no other name for
-BEATEN = 0.1  # probability of being the better explanation below which a simpler one does not give the name
+SURE = 1e-3  # largest p-value of an effect that is taken, before candidates are counted
+SURE_DAILY = 1e-4  # the same for a file with a trim: no test by the scatter of blocks follows there (see `prune`)
+LIKELY = 5e-2  # p-value below which held-out flights may lower the p-value further (see `both`)
+CLOSE = 4.0  # nats; two explanations with a smaller difference are look-alikes
+SEPARATION = 1.64  # standard deviations of this difference; with a smaller difference they are look-alikes, too
+EVEN = 0.5  # least probability of a name beside a rival that is not significant
+BESIDE = 0.5  # share of its gain that a second effect keeps beside the first; with less it is a look-alike of the first
+BEATEN = 0.1  # probability of being the better explanation, below which a simpler effect does not give the name
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A candidate, tried beside the effects already found.
+    """A candidate that was fitted beside the effects found so far.
 
     Attributes:
         candidate: which.
-        gain: log-likelihood beyond the model before it [nats], on the flights fitted.
-        held_out: the same on held-out flights or blocks.
-        expected: what it brings there if it is there and as large as it was fitted; None: as much as on those fitted.
-        dispersion: by how much scores scatter more than the model says.
-        p_value: of the score test.
-        evidence: what counts: gain over dispersion less the number of parameters, and the held-out gain.
-        fitted: the model with it; None if only the linear approximation was looked at.
-        blocks: (b,) its log-likelihood by blocks of the flights fitted and of those held out.
-        value: the gain on all of these blocks [nats] once fitted to all of them, less what the priors of the always
-            free parameters cost.
-        recording: (b,) int, which recording each block is of.
-        tuned: nats that it costs that its parameters might have been anything (`evidence.tuning`); None: one for each.
-        log_odds: log posterior odds that it is there, where they are known (`steady_odds.py`); None: by `held_out`.
-        size: parameters by what those odds are of.
-        other_evidence: by which a signal speaks for it that the filter does not use.
+        gain: log-likelihood with the candidate less that without it [nats], on the fitted flights.
+        held_out: the same on held-out flights; without such flights, on held-out blocks.
+        expected: mean of `held_out` if the effect is real and as large as fitted; None: as large as `gain`.
+        dispersion: variance of the scores over that of the model.
+        p_value: of the score test; of a fitted trial, of the Wald test.
+        evidence: (gain + held_out) over dispersion, less the number of parameters.
+        fitted: the model with the candidate; None: the linear approximation alone was computed.
+        blocks: (b,) log-likelihood by blocks of the fitted and the held-out flights.
+        value: the gain on all these blocks [nats] if the candidate were fitted to all of them; the priors of the
+            nuisances are part of it.
+        recording: (b,) int, the recording of each block.
+        tuned: nats that the width of its prior costs (`evidence.tuning`); None: one nat a parameter.
+        log_odds: log posterior odds of the effect, where the balance of the flights gives them (`steady_odds.py`).
+        size: the parameters that these odds are of.
+        other_evidence: nats of signals that the filter does not use.
     """
 
     candidate: Candidate
@@ -67,7 +66,7 @@ class Trial:
     expected: float | None = None
 
     def presence(self, order: int) -> float:
-        """Probability that it is there as the `order`-th effect that was found (from 1), whatever its look-alikes."""
+        """Probability that the effect is real, as the `order`-th that was found (from 1); look-alikes aside."""
         if self.log_odds is not None:
             return min(CALIBRATED, float(expit(self.log_odds)))
         expected = self.gain if self.expected is None else self.expected
@@ -76,14 +75,20 @@ class Trial:
 
     @property
     def worth(self) -> float:
-        """What counts where two are compared: the gain on all blocks less what its parameters cost [nats]."""
+        """Log evidence, by which two trials are compared: the gain on all blocks less the cost of parameters [nats]."""
         return self.value - (len(self.candidate.free) if self.tuned is None else self.tuned)
 
 
 @dataclass(frozen=True)
 class Step:
-    """One turn of the selection: all trials, best first, which was taken (None: the end), what it was not told apart
-    from, and the effects that explain something else as well as it."""
+    """One turn of the selection.
+
+    Attributes:
+        trials: of all candidates, best first.
+        taken: the trial whose effect joined the model; None: none did, and the selection ends.
+        alike: the look-alikes of `taken`.
+        beside: effects that explain something else, too: they keep their gain beside `taken`.
+    """
 
     trials: tuple[Trial, ...]
     taken: Trial | None
@@ -91,10 +96,13 @@ class Step:
     beside: frozenset[str] = frozenset()
 
     def explanations(self) -> list[Trial]:
-        """The trials that explain what this turn is about: significant alone and of some use on all flights together
-        (one that ruins those held out scatters so much there that nothing could be told from it) or, as fitted to all
-        of them, better than the one that was taken (a quadratic drag fitted to slow flight ruins a quick one, and is
-        still what both show); or, however unsure alone, not told apart from it."""
+        """The trials that explain what this turn is about.
+
+        A trial explains it if it is significant and has positive evidence on all flights, or a larger `value` than the
+        trial that was taken. The second rule is for effects that a slow flight does not determine: a quadratic drag
+        fitted to slow flight makes a quick one worse, and explains both once fitted to both. Look-alikes of the trial
+        that was taken explain it in any case.
+        """
         return [t for t in self.trials if self._explains(t) or any(t is a for a in self.alike)]
 
     def _explains(self, trial: Trial) -> bool:
@@ -104,8 +112,14 @@ class Step:
 
 @dataclass(frozen=True)
 class Selection:
-    """What was selected: the nominal model, the final one, and how it came about; `doubted` are effects that something
-    which shakes explains as well."""
+    """The selected effects.
+
+    Attributes:
+        nominal, final: the model without and with them.
+        steps: the turns of the search.
+        accepted: the effects. fitted: the fit with them. tried: number of candidates.
+        doubted: effects that a vibration explains as well.
+    """
 
     nominal: Point
     final: Point
@@ -116,12 +130,12 @@ class Selection:
     doubted: frozenset[str] = frozenset()
 
     def orders(self) -> list[int]:
-        """Of the effects that were selected, which each is among those found (from 1); a trim is not counted."""
+        """The rank of each selected effect in the order of their selection (from 1); a trim is not counted."""
         names = [s.taken.candidate.effect for s in self.steps if s.taken]
         return [1 + sum(n != TRIM for n in names[:k]) for k in range(len(names))]
 
     def with_evidence(self, candidate: Candidate, nats: float) -> "Selection":
-        """With so many nats of another likelihood for an effect that was selected, and against its look-alikes."""
+        """With so many nats of another likelihood for a selected effect; its look-alikes are gone."""
         steps = list(self.steps)
         for k, step in enumerate(steps):
             if step.taken is not None and step.taken.candidate.effect == candidate.effect:
@@ -130,12 +144,12 @@ class Selection:
 
 
 def margin(best: Trial, other: Trial, *, recordings: bool = True) -> tuple[float, float]:
-    """Log-likelihood of one less that of the other, each less what its parameters cost, with its standard deviation.
+    """Difference of log evidence of two trials, and its standard deviation [nats].
 
-    What the priors of the always free parameters cost counts too: a factor on all torques that needs three inertias to
-    be bent is the worse for it. The scatter of the difference over blocks counts, in which all that both miss cancels
-    (Vuong 1989), with half of the covariance of neighbours on each side; and where there are many recordings that over
-    `recordings`, since what belongs to one (its clock, its battery) is the same in all of its blocks.
+    The evidence contains the priors of the nuisances: a factor on all torques that needs three other inertias is the
+    worse for it. The standard deviation is that of the difference over blocks, in which errors of both models cancel
+    (Vuong 1989); half of the covariance of neighbours is added. From five recordings on, the scatter between
+    `recordings` counts where it is larger: a clock or a battery is the same in all blocks of a recording.
     """
     nats = best.worth - other.worth
     apart = best.blocks - other.blocks
@@ -143,25 +157,25 @@ def margin(best: Trial, other: Trial, *, recordings: bool = True) -> tuple[float
 
 
 def better(one: Trial, other: Trial, *, recordings: bool = True) -> float:
-    """Probability that one explains more than the other, by the scatter of the difference; no surer than the odds that
-    so many nats are, however steadily they come."""
+    """Probability that one trial explains more than the other: by the scatter of the difference, and at most by the
+    odds that the difference is."""
     nats, sd = margin(one, other, recordings=recordings)
     by_scatter, by_odds = float(stats.norm.cdf(nats / sd)), float(expit(nats))
     return min(by_scatter, by_odds) if nats > 0.0 else max(by_scatter, by_odds)
 
 
 def not_beaten(near: Sequence[Trial]) -> list[Trial]:
-    """Those of which none of the others that is significant is better nine to one."""
+    """The trials that no significant other beats with a probability of more than 1 - `BEATEN`."""
     sure = [t for t in near if t.p_value < SURE]
     return [t for t in near if all(t is o or better(t, o, recordings=False) > BEATEN for o in sure)]
 
 
 def preferred(taken: Trial, rivals: Sequence[Trial]) -> float:
-    """Probability that none of the rivals is the better explanation, by the scatter of the likelihoods' differences.
+    """Probability that none of the rivals is the better explanation.
 
-    A rival that is not significant itself is at most as probable: its likelihood may be better because it frees a
-    direction that no flight tells (the mass of a load beside a thrust scale) and that differs from flight to flight.
-    Against a trim, which every real drone has, no rival is more probable either.
+    A rival that is not significant is at most as probable. Its likelihood may be larger, because it frees a direction
+    that no flight determines and that differs between flights (the mass of a load beside a thrust scale). A rival of a
+    trim is at most as probable, too: every real drone has a trim.
     """
     chance = 1.0
     known = taken.candidate.effect == TRIM
@@ -172,13 +186,13 @@ def preferred(taken: Trial, rivals: Sequence[Trial]) -> float:
 
 
 def scatter(differences: NDArray) -> float:
-    """Standard deviation of the sum of differences of log-likelihoods (b,) by blocks, neighbours alike by half."""
+    """Standard deviation of the sum of differences (b,) over blocks, with half of the covariance of neighbours."""
     centred = differences - differences.mean()
     return float(np.sqrt(centred @ centred + max(0.0, float(centred[1:] @ centred[:-1])))) + 1e-9
 
 
 def between(differences: NDArray, recording: NDArray) -> float:
-    """Standard deviation of the sum of differences (b,) by how they differ between recordings (b,); 0 for few."""
+    """Standard deviation of the sum of differences (b,) over recordings (b,); 0 for fewer than `MANY`."""
     if recording.size != differences.size or len(np.unique(recording)) < MANY:
         return 0.0
     total, length = np.bincount(recording, differences), np.bincount(recording)
@@ -187,13 +201,14 @@ def between(differences: NDArray, recording: NDArray) -> float:
 
 
 def distinguishable(best: Trial, other: Trial, *, recordings: bool = True) -> bool:
-    """Whether the flights prefer the one by more than chance."""
+    """Whether the flights prefer one trial: whether the other is no look-alike."""
     nats, sd = margin(best, other, recordings=recordings)
     return nats > CLOSE and nats > SEPARATION * sd
 
 
 def by_evidence(trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
-    """Evidence of each, the same dispersion for all so that likelihoods are compared and not scatters; best first."""
+    """The trials with the evidence at their common (median) dispersion, best first: so likelihoods are compared, and
+    not dispersions."""
     if not trials:
         return []
     common = float(np.median([t.dispersion for t in trials]))
@@ -205,9 +220,9 @@ def by_evidence(trials: Sequence[Trial], *, counted: bool) -> list[Trial]:
 
 
 def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
-    """Effects tried in a turn that gain nearly as much beside the one that was taken: no other name for it, but more.
+    """Effects of a turn that keep their gain beside the one that was taken: they explain something else.
 
-    Two explanations of one thing gain no more together than the better one alone.
+    Look-alikes gain no more together than the better one alone.
     """
     left = {c: max(t.gain for t in later if t.candidate.effect == c) for c in {t.candidate.effect for t in later}}
     fitted = [t for t in step.trials if t.fitted is not None and t.candidate.effect in left]
@@ -215,30 +230,32 @@ def additions(step: Step, later: Sequence[Trial]) -> frozenset[str]:
 
 
 def both(p_value: float, held: float) -> float:
-    """p-value on the flights fitted and on those held out, where the effect as fitted brings `held` nats.
+    """p-value on fitted and held-out flights, where the fitted effect brings `held` nats.
 
-    By chance a likelihood ratio of fixed models exceeds exp(held) with a probability of at most exp(-held).
+    The likelihood ratio of two fixed models exceeds exp(held) by chance with a probability of at most exp(-held).
     """
     return p_value * float(np.exp(-max(held, 0.0))) if p_value < LIKELY else p_value
 
 
 def separate_evidence(trial: Trial, *, counted: bool) -> float:
-    """Evidence by the candidate's own scatter: what it must bring to be admitted."""
+    """Evidence at the candidate's own dispersion, by which it is admitted."""
     return (trial.gain + (trial.held_out if counted else 0.0)) / trial.dispersion - len(trial.candidate.free)
 
 
 def dispersion_of(fitted: Fitted, count: int, *, offset: int) -> float:
-    """By how much the scores of `count` free parameters from `offset` on scatter more than the model says, at the
-    maximum with them, where what they explain does not scatter any more; at least 1."""
+    """Variance of the scores of `count` free parameters from `offset` on, over that of the model; at least 1.
+
+    At the maximum with these parameters: there the scores do not contain what the effect itself explains.
+    """
     gram, own = fitted.gram, range(offset, offset + count)
     solution = gram.solve(range(gram.size), precision=fitted.precision, tested=own, effective=True)
     return max(1.0, solution.dispersion)
 
 
 def significance(fitted: Fitted, count: int, *, offset: int) -> float:
-    """p-value that `count` free parameters from `offset` on are neutral, by their covariance at the maximum (Wald).
+    """p-value of the Wald test that `count` free parameters from `offset` on are neutral.
 
-    Of an effect with an amplitude that alone is asked: a load of no mass has no length, so none is neutral.
+    Of an effect with an amplitude, the amplitude alone is tested: a load without mass has no length.
     """
     solution, taken = solved(fitted)
     free = [(c, n) for c in fitted.candidates for n in c.free]
@@ -257,5 +274,5 @@ def wald(away: NDArray, covariance: NDArray, gram: Gram, columns: float) -> floa
 
 
 def sure_enough(point: Point, p_value: float) -> bool:
-    """Whether an effect may be taken by its p-value."""
+    """Whether the p-value is small enough for the effect to be taken."""
     return p_value < (SURE_DAILY if TRIM in point.vehicle.effects else SURE)
