@@ -4,6 +4,7 @@ flight, changed here by known amounts."""
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -106,6 +107,25 @@ def test_without_an_accelerometer_nothing_is_said(recording):
 
 def test_a_calm_flight_has_no_gusts(recording):
     assert find_gusts(*fitted(recording)) is None
+
+
+@pytest.mark.parametrize(("memory", "found"), [(0.05, False), (0.25, False), (0.7, True), (2.0, True)])
+def test_moving_air_has_a_memory(memory, found):
+    """Log-likelihoods with their maximum at a memory: one at the shortest that is tried is no gust."""
+
+    def loglik(point, passes):
+        disturbed = point.noise.disturbance[:3].any()
+        lasts = np.broadcast_to(np.asarray(point.noise.memory, float), (6,))[0]
+        return 500.0 - 30.0 * np.log(lasts / memory) ** 2 if disturbed else 0.0
+
+    def fit_noise(point):
+        spread = np.append(np.full(3, 0.3), point.noise.disturbance[3:])
+        return replace(point, noise=replace(point.noise, disturbance=spread))
+
+    data = SimpleNamespace(flights=[SimpleNamespace(duration=60.0)], loglik=loglik, fit_noise=fit_noise)
+    gusts = find_gusts(data, Point(load_vehicle("cf2"), {}, first_guess()))
+    assert (gusts is not None) == found
+    assert gusts is None or gusts.memory == pytest.approx(memory, rel=1e-6)
 
 
 def test_gusts_whose_memory_nothing_tells_are_an_interval_as_wide_as_it_may_be(monkeypatch):

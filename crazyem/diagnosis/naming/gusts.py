@@ -69,7 +69,8 @@ def find_gusts(data: Data, point: Point) -> Gusts | None:
     best = max(tried, key=lambda m: tried[m][0])
     gain = tried[best][0] - white
     spread = tried[best][1].noise.disturbance[:3]
-    if gain < GAINED or spread.max() < SMALLEST:
+    # a likelihood that still rises at the shortest memory is that of a force without one: errors of an onboard filter
+    if gain < GAINED or spread.max() < SMALLEST or best == MEMORIES[0]:
         return None
     logs = np.log(np.array(sorted(tried)))
     heights = np.array([tried[m][0] for m in sorted(tried)])
