@@ -1,1 +1,1 @@
-"""Which physics was left out: effects tried, compared and doubted, and told with what would tell them apart."""
+"""Search for the effects that a model lacks: fit, comparison, doubts, and advice on how to separate look-alikes."""

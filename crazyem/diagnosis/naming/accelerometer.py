@@ -1,8 +1,8 @@
 """accelerometer_misalignment: the accelerometer against the specific force of the fitted model.
 
-The filter does not use the accelerometer (its low pass is part of no model), so a tilt of it shows here alone. The
-residual is regressed on the tilt, with a bias and a lag of the sensor as nuisances; errors come from the scatter of
-blocks, as everywhere.
+The filter does not use the accelerometer, whose low pass is part of no model. Only this regression shows its tilt: the
+residual is regressed on the tilt, with a bias and a lag of the sensor as nuisances. Errors come from the scatter of
+blocks.
 """
 
 from collections.abc import Mapping
@@ -19,12 +19,12 @@ from crazyem.physics.effects.sensing import ACCELEROMETER_MISALIGNMENT
 EFFECT = ACCELEROMETER_MISALIGNMENT.name
 ANGLES = ("roll", "pitch", "yaw")
 STEP = 1e-3  # rad
-BIAS_SD = 0.03  # m/s^2: what is left of a bias that the firmware removes at rest
+BIAS_SD = 0.03  # m/s^2; the bias that remains after the firmware removes it at rest
 LAG_SD = 0.02  # s
-UNSEEN_SD = 0.1  # rad, prior of the yaw: thrust along body z does not show it; boards are glued within degrees
-LEAST = 3e-3  # rad of roll or pitch
-# rad of roll and pitch beside what scatter says: in 42 simulated drones of seeds 2038 to 2041 intervals held 75 of 84
-# angles, with it 80
+UNSEEN_SD = 0.1  # rad; prior of the yaw: thrust along body z does not determine it, and boards are glued within degrees
+LEAST = 3e-3  # rad; least roll or pitch of a finding
+# rad; error of roll and pitch beyond the scatter of blocks. In 42 simulated drones (seeds 2038 to 2041) the intervals
+# hold 80 of 84 angles with it, and 75 without it.
 BESIDE_SCATTER = 5e-4
 
 
@@ -44,15 +44,16 @@ def tilt(data: Data, point: Point) -> tuple[Solution, Gram] | None:
 
 
 def held_out_gain(data: Data, point: Point, angles: NDArray, *, yaw_sd: float) -> float:
-    """Log-likelihood that the angles bring on other flights [nats], bias and lag fitted there.
+    """Gain of the angles on other flights [nats], with bias and lag fitted there.
 
-    So is the yaw about what was found, by `yaw_sd` [rad]: a hover says nothing of it, and a quick flight does.
+    The yaw is fitted there, too, about the value found and within `yaw_sd` [rad]: a hover does not determine it, and a
+    quick flight does.
     """
     total, dispersion = 0.0, gram_dispersion(data, point)
     bare = [3, 4, 5, 6]
     known = {2: yaw_sd**-2, **dict.fromkeys((3, 4, 5), BIAS_SD**-2), 6: LAG_SD**-2}
     for model in data.models:
-        # what residuals say, that is, and not what priors do, which does not scatter
+        # the dispersion applies to the residuals, not to the priors
         b, a = (v / dispersion for v in _of(model, point).total(range(7)))
         shift = np.array([*angles])
         total += float(b[:3] @ shift - 0.5 * shift @ a[:3, :3] @ shift)
@@ -61,14 +62,14 @@ def held_out_gain(data: Data, point: Point, angles: NDArray, *, yaw_sd: float) -
 
 
 def _fitted(score: NDArray, information: NDArray, known: Mapping[int, float]) -> float:
-    """What parameters bring [nats], by index with the precisions of their priors; the rest as it is."""
+    """Gain of the parameters `known` (index -> precision of the prior) [nats]; the others stay as they are."""
     at = list(known)
     inner = information[np.ix_(at, at)] + np.diag([known[i] for i in at])
     return 0.5 * float(score[at] @ np.linalg.solve(inner, score[at]))
 
 
 def gram_dispersion(data: Data, point: Point) -> float:
-    """How much more the scores scatter than white residuals would."""
+    """Variance of the scores over that of white residuals; at least 1."""
     found = tilt(data, point)
     return max(1.0, found[0].dispersion) if found else 1.0
 
@@ -77,7 +78,7 @@ def _of(model: Model, point: Point) -> Gram:
     flight = model.flight
     acceleration, situation = model.accelerations(point)
     force = acceleration[:, :3]
-    shown = np.full_like(flight.force, np.nan)  # mean over the step, as the model has it
+    shown = np.full_like(flight.force, np.nan)  # mean over the step, as in the model
     shown[1:] = 0.5 * (flight.force[1:] + flight.force[:-1])
     residual = shown - force
     usable = np.all(np.isfinite(residual), axis=1) & ~flight.starts & (situation.step > 0)

@@ -1,8 +1,8 @@
-"""Names that were given before the rest was known: each is asked again, beside all the others, against its rivals.
+"""Second comparison of each selected effect with its rivals, beside all the other selected effects.
 
-Effects are found one after the other, and the first is named while the second still passes for noise or is taken up by
-a parameter that the right name does not have: a load off the centre wins over weaker rotors where a flapping moment,
-found later, is what was off the centre.
+The selection finds one effect after the other. When it takes the first, the second still counts as noise, or a
+parameter of a wrong effect absorbs it. Example: a load off the centre wins over weaker rotors, because a flapping
+moment that is found later looks like the offset.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,28 +17,28 @@ from crazyem.diagnosis.naming.detection_limits import at_the_end, matters
 from crazyem.diagnosis.naming.load_or_rotors import refitted, tuned_of
 from crazyem.diagnosis.naming.trials import SURE, Selection, Step, Trial, distinguishable, margin, not_beaten
 
-NEAR = 100.0  # nats by which a rival may have been worse when it was tried
+NEAR = 100.0  # nats; a rival that was worse by less when it was tried is compared again
 
 
 def named_again(
     data: Data, held_out: Data | None, selection: Selection, say: Callable[[str], None] = lambda text: None
 ) -> Selection:
-    """The selection with every name that a rival explains better, or as well with fewer parameters, exchanged for it.
+    """The selection in which a rival replaces each effect if it explains more, or as much with fewer parameters.
 
-    With one effect there is nothing new to ask; with a trim in the vehicle file noise scales are not fitted again.
+    A single effect is not compared again. Nor is any with a trim in the vehicle file: noise scales are fixed there.
     """
     if len(selection.accepted) < 2 or TRIM in selection.final.vehicle.effects:
         return selection
     for name in [c.effect for c in selection.accepted]:
         try:
             selection = _reselected(data, held_out, selection, name, say)
-        except DivergedError:  # one of the rivals leaves the range of numbers beside the others: the name stays
+        except DivergedError:  # the fit of a rival diverges: the effect stays
             continue
     return selection
 
 
 def close_alternatives(step: Step, accepted: Sequence[Candidate], *, near: float = NEAR) -> list[Trial]:
-    """What else was within `near` nats when the effect was taken, and is not part of the model by now."""
+    """Significant rivals within `near` nats of the effect when it was taken, which are not in the model now."""
     taken, names = step.taken, {c.effect for c in accepted}
     assert taken is not None
     tried = [t for t in step.trials if t.fitted is not None and t.blocks.size == taken.blocks.size]
@@ -50,7 +50,7 @@ def _reselected(
 ) -> Selection:
     step = next(s for s in selection.steps if s.taken and s.taken.candidate.effect == name)
     mine = next(c for c in selection.accepted if c.effect == name)
-    ended = at_the_end(selection.final, mine)  # beside the others: it stands for something else, whatever that is worth
+    ended = at_the_end(selection.final, mine)  # then it stands for something else, whatever its evidence
     others = close_alternatives(step, selection.accepted, near=np.inf if ended else NEAR)
     if not others:
         return selection
@@ -77,7 +77,7 @@ def _reselected(
     unbeaten = not_beaten(equals)
     chosen = min(unbeaten, key=lambda t: (len(t.candidate.free), -t.value), default=best)
     rest = [t for t in step.trials if t is not step.taken and all(t.candidate is not r.candidate for r in tried)]
-    trials = (*asked, *rest)  # what ended is no rival of what takes its place
+    trials = (*asked, *rest)  # an effect at the end of its range is no rival
     if any(t is now for t in unbeaten) and len(chosen.candidate.free) == len(mine.free):
         chosen = now
     alike = tuple(t for t in group if t is not chosen and t.candidate.effect != chosen.candidate.effect)
@@ -95,7 +95,7 @@ def _reselected(
 
 
 def exchanged(data: Data, selection: Selection, old: Candidate, new: Candidate, values: Sequence[float]) -> Selection:
-    """The selection with an effect in the place of another, its free parameters beginning at `values`."""
+    """The selection fitted with the effect `new` in the place of `old`; its free parameters start at `values`."""
     bare = without(selection.final, old.effect)
     point = bare.with_effects({new.effect: {**new.neutral(bare), **dict(zip(new.free, values, strict=True))}})
     accepted = tuple(new if c is old else c for c in selection.accepted)

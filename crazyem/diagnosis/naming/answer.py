@@ -1,5 +1,4 @@
-"""What was selected, as it is told: numbers with intervals, confidence, what is the same to every signal, and what
-would tell it apart."""
+"""The answer of a diagnosis: effects with intervals and confidence, look-alikes, and advice to separate them."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -26,16 +25,20 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.mass_properties import ON_BOARD
 from crazyem.physics.effects.rotors import ROTOR_FAULT
 
-WITHIN = 0.05  # p-value from which an effect's own uncertainty holds that there is none of it
+WITHIN = 0.05  # p-value above which the size of an effect may be neutral: its confidence is at most `DOUBTFUL`
 SHAKES = "hold the drone with its rotors turning: what shakes then is not the loop that swings with a wrong model"
-# Exactly the same to every signal, but for forces of the air: two things at once, more mass and inertias to match.
+# A thrust scale gives the same signals as two changes, mass and inertias by one factor, except for forces of the air.
 HEAVIER = "weigh the drone: with {:.3g} times its mass and its inertias it would fly the same"
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The effects, first what is most surely there, whatever its look-alikes; groups of names that these flights cannot
-    tell apart, and what would."""
+    """The effects, the most probable first, look-alikes aside.
+
+    Attributes:
+        groups: names that these flights cannot tell apart.
+        separate: what would separate them, in words.
+    """
 
     effects: tuple[Named, ...] = ()
     groups: tuple[tuple[str, ...], ...] = ()
@@ -51,13 +54,13 @@ def answer_of(
     in_place: Mapping[str, tuple[Trial, Trial] | None],
     balance: Balance | None = None,
 ) -> Answer:
-    """The selected effects as they are told.
+    """The answer with the selected effects.
 
     Args:
-        remains: the structure that they leave, beside which no name is sure.
+        remains: unexplained structure; beside it no effect is sure.
         corroborated: names that another signal separates from their look-alikes.
-        in_place: for an effect the two trials, of it and of what else could stand in its place.
-        balance: what is steady, by which names are told apart where a file has a trim.
+        in_place: effect -> its trial and the trial of its substitute (`load_or_rotors`).
+        balance: steady thrust and torque, which separates effects where a file has a trim.
     """
     if not selection.accepted:
         return Answer()
@@ -87,7 +90,7 @@ def answer_of(
         if doubted or none_of_it > WITHIN:
             confidence = min(confidence, DOUBTFUL)
         p_value = min(1.0, step.taken.p_value * max(1, selection.tried))
-        # late inputs and late measurements are one model, so it is fitted as the first, whatever it is called
+        # late inputs and late measurements are one model: fitted as the former, named by corroboration
         effect = CATALOGUE[candidate.effect]
         late = next((n for n in effect.same_as if n in corroborated), None)
         name, label = (late, late) if late else (candidate.effect, candidate.label)
@@ -109,7 +112,7 @@ def answer_of(
         if equal:
             groups.append(tuple(dict.fromkeys([name, *equal])))
             separate += [CATALOGUE[n].separates for n in groups[-1] if CATALOGUE[n].separates]
-        elif candidate.effect == LOAD:  # told from weak rotors by where it sits, which is no proof
+        elif candidate.effect == LOAD:  # only its place separates it from weak rotors: no proof
             separate.append(effect.separates)
         elif effect.gain == "thrust":
             separate.append(HEAVIER.format(1.0 / candidate.values(point)["scale"]))
@@ -118,7 +121,7 @@ def answer_of(
 
 
 def numbers_of(data: Data, selection: Selection, balance: Balance | None) -> list[dict[str, Value]]:
-    """What is told of the free parameters of each effect that was selected, in their order."""
+    """Values with intervals of the free parameters of each selected effect, in the order of the effects."""
     sd, width, _, _ = _uncertainty(selection.fitted)
     never = systematic_sd(data, selection.final)
     never |= {
@@ -134,8 +137,9 @@ def numbers_of(data: Data, selection: Selection, balance: Balance | None) -> lis
 
 
 def strongest_first(effects: Sequence[Named], beside: Sequence[Named]) -> tuple[Named, ...]:
-    """The effects in their order, and among them, before the first that brings less on flight held out, those that the
-    selection cannot ask for (gusts, an accelerometer, what acts before measured rotors)."""
+    """The effects in their order, with the effects `beside` inserted, which the selection cannot test (gusts, a tilted
+    accelerometer, lag and delay of measured rotors). Each comes before the first effect with a smaller held-out gain.
+    """
     ordered = list(effects)
     for one in beside:
         at = next((i for i, e in enumerate(ordered) if e.held_out_nats < one.held_out_nats), len(ordered))
@@ -144,13 +148,13 @@ def strongest_first(effects: Sequence[Named], beside: Sequence[Named]) -> tuple[
 
 
 def _against(remains: Unexplained, candidate: Candidate, data: Data) -> Unexplained:
-    """What speaks against a name of all that remains."""
+    """The part of the unexplained structure that counts against an effect."""
     effect = CATALOGUE[candidate.effect]
     if data.coarse and not effect.slow_torque:
-        remains = remains.of_forces()  # where torques say nothing, what they leave says nothing against forces
+        remains = remains.of_forces()  # coarse flights: torques do not count against forces
     if effect.steady_force:
         return remains.without_random_rotor()
-    if effect.imbalance == "rotor":  # a propeller that is cut is out of balance as well
+    if effect.imbalance == "rotor":  # a cut propeller is out of balance, too
         return remains.without_random_rotor(int(dict(candidate.fixed)["rotor"]))
     return remains
 
@@ -161,10 +165,10 @@ def _away(candidate: Candidate, point: Point) -> NDArray:
 
 
 def _uncertainty(fitted: Fitted) -> tuple[NDArray, NDArray, NDArray, float]:
-    """Standard deviations (k,) of all free parameters, how many of them (k,) an interval of 95 % is to either side,
-    their covariance (k, k), and the degrees of freedom that they take.
+    """Standard deviations (k,) of all free parameters, half-widths of 95 % intervals in standard deviations (k,),
+    covariance (k, k), and degrees of freedom that the parameters take.
 
-    By the scatter of blocks, or by that of flights where that makes the interval wider.
+    By the scatter of blocks, or by the scatter of flights where the latter makes the interval wider.
     """
     solution, used = solved(fitted, wide=True)
     sd = np.sqrt(np.maximum(np.diag(solution.covariance), 0.0))
@@ -181,14 +185,14 @@ def _uncertainty(fitted: Fitted) -> tuple[NDArray, NDArray, NDArray, float]:
 def _numbers(
     candidate: Candidate, point: Point, sd: NDArray, width: NDArray, never: Mapping[tuple[str, str], float]
 ) -> dict[str, Value]:
-    """The free parameters with their sd (k,), intervals of so many (k,) of them within what is possible; `never` is the
-    sd that no flight takes away."""
+    """Values of the free parameters with `sd` (k,) and intervals of `width` (k,) times sd each side, cut to the range.
+    `never`: (effect, parameter) -> systematic standard deviation, which no flight reduces."""
     values, out = candidate.values(point), {}
     for name, own, many in zip(candidate.free, sd, width, strict=True):
         p = candidate.parameter(name)
         error = float(np.hypot(own, never.get((candidate.effect, name), 0.0)))
         least, most = candidate.range_of(name)
-        if values[name] in (least, most) and values[name] != p.neutral:  # it may be anywhere, for all that is known
+        if values[name] in (least, most) and values[name] != p.neutral:  # at an end: sd of a uniform distribution
             error = max(error, (most - least) / 12**0.5)
         low, high = values[name] - many * error, values[name] + many * error
         out[name] = Value(values[name], p.unit, error, (max(low, least), min(high, most)))
@@ -196,8 +200,8 @@ def _numbers(
 
 
 def _by_the_day(candidate: Candidate, point: Point, balance: Balance | None) -> tuple[dict[str, Value], float] | None:
-    """How weak a rotor is or how heavy a load by the balance, of which the day is most of what is uncertain, and the
-    p-value that there is none; None for other effects, and where there is no balance."""
+    """Values of a weak rotor or a load by the balance, and the p-value that there is none; None for other effects and
+    without a balance. Differences between days are the largest part of the error."""
     if balance is not None and candidate.effect == LOAD and decided_by_balance(point.vehicle, candidate):
         return _load_by_the_day(candidate, point, balance)
     if balance is None or CATALOGUE[candidate.effect].imbalance != "rotor" or not steadily(candidate):
@@ -210,12 +214,12 @@ def _by_the_day(candidate: Candidate, point: Point, balance: Balance | None) -> 
 
 
 def _load_by_the_day(candidate: Candidate, point: Point, balance: Balance) -> tuple[dict[str, Value], float]:
-    """A load's mass and place, as sure as thrust and trim are from day to day; how high it sits may be anything."""
+    """A load's mass and place, with the errors of thrust and trim from day to day; its height is unknown."""
     values, whole = candidate.values(point), point.vehicle.mass + float(candidate.values(point)["mass"])
     share = float(values["mass"]) / whole
     thrust, about_x, about_y = np.sqrt(np.diag(balance.covariance))[:3]
     known = thrust**-2.0
-    for axis, torque in (("x", about_y), ("y", about_x)):  # at the edge, so much torque needs so much weight
+    for axis, torque in (("x", about_y), ("y", about_x)):  # at the edge, the torque determines the weight, too
         known += (ON_BOARD / torque) ** 2.0 if math.isclose(abs(values[axis]), EDGE * ON_BOARD, rel_tol=1e-6) else 0.0
     far = max(share, 1e-9)
     sds = {"mass": known**-0.5 * whole / (1.0 - share), "x": about_y / far, "y": about_x / far}
@@ -234,7 +238,7 @@ def _load_by_the_day(candidate: Candidate, point: Point, balance: Balance) -> tu
 def _steady_rivals(
     candidate: Candidate, rivals: Sequence[Trial], balance: Balance | None
 ) -> tuple[list[Trial], dict[str, float]]:
-    """The rivals of which the balance says nothing, and of the others the nats by which it prefers the candidate."""
+    """The rivals that the balance cannot judge, and the nats by which it prefers the candidate to the others."""
     if balance is None:
         return list(rivals), {}
     said = [(t, prefers(balance, candidate, t.candidate)) for t in rivals]
@@ -246,10 +250,10 @@ def _steady_rivals(
 
 
 def _rivals(candidate: Candidate, step: Step, selection: Selection, corroborated: frozenset[str]) -> list[Trial]:
-    """What else explains what the effect explains; not what another signal separates from it, nor what is beside it.
+    """Other explanations of what the effect explains, except those that another signal separates from it.
 
-    Of two effects that the final model needs beside each other neither is another name for the other. Nor is a factor
-    on the torques one for what is needed beside inertias, which can be such a factor themselves.
+    Two effects that the final model needs beside each other are no rivals. Nor is the torque scale a rival of an effect
+    beside inertias, which can be such a factor themselves.
     """
     found = {c.effect for c in selection.accepted}
     found |= {CATALOGUE[n].common_factor for n in found if n != candidate.effect}
@@ -262,7 +266,7 @@ def _rivals(candidate: Candidate, step: Step, selection: Selection, corroborated
 def _in_place(
     candidate: Candidate, in_place: Mapping[str, tuple[Trial, Trial] | None], selection: Selection
 ) -> Sequence[str]:
-    """A load, or what stands in its place, where neither explains more."""
+    """Substitutes of a load, or the load as a substitute, where neither explains more."""
     pair = in_place.get(candidate.effect)
     if pair is None or distinguishable(*pair):
         return ()
@@ -270,7 +274,7 @@ def _in_place(
 
 
 def _as_a_factor(candidate: Candidate, step: Step, point: Point, covariance: NDArray) -> Sequence[str]:
-    """Torques for inertias that are one factor, where these were not asked beside what was found before."""
+    """The torque scale for inertias with one common factor, unless this turn of the selection tried it."""
     factor = CATALOGUE[candidate.effect].common_factor
     if not factor or any(t.candidate.effect == factor for t in step.trials):
         return ()
@@ -280,10 +284,10 @@ def _as_a_factor(candidate: Candidate, step: Step, point: Point, covariance: NDA
 
 
 def _by_turning_alone(candidate: Candidate, data: Data, selection: Selection) -> Sequence[str]:
-    """A load for weak rotors, and the other way round, where nothing but torques would tell, which say nothing here.
+    """A load for weak rotors, or weak rotors for a load, where only torques separate them and are not determined.
 
     Two weak rotors beside each other lack thrust and tilt the drone as a weight on their side does, with no torque
-    about z; only what turns tells, which a drone whose trim changes from day to day does not show.
+    about z. Only the rotation separates them, and a trim that changes from day to day hides the difference.
     """
     if candidate.effect == LOAD and TRIM in selection.final.vehicle.effects:
         return [ROTOR_FAULT.name]

@@ -1,10 +1,10 @@
-"""A drone's balance: the steady thrust and torque that flights ask for beyond its file's, against what days differ by.
+"""A drone's balance: steady thrust and torque that flights need beyond the file, against the differences between days.
 
-Where a file has a trim, a weak rotor, a load and a wind are told apart by what is steady, and there nothing is as
-uncertain as the day: a rotor that is weak lacks thrust, torque and drag torque in one ratio, a load has no torque about
-z. The filter's likelihood says the same, but is so sure of what is steady (its scores scatter up to 13 times as much as
-it says) that a day's prior counts for nothing beside it. So the four steady numbers are fitted with nothing named, and
-weighed here with the covariance they have from day to day.
+Where a file has a trim, steady thrust and torque separate a weak rotor, a load and a wind: a weak rotor lacks thrust,
+torque and drag torque in one ratio, and a load has no torque about z. Differences between days are the largest error.
+The filter's likelihood is overconfident of steady parts: its scores scatter up to 13 times as much as the model says,
+so the prior of a day has no weight beside it. So the four steady numbers are fitted without any effect, and are judged
+here by their covariance from day to day.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,19 +30,19 @@ from crazyem.physics.effects.rotors import ROTOR_FAULT
 from crazyem.physics.rotors import wrench
 
 HEAVIEST = 1.0  # a load's weight over the drone's
-# `Effect.imbalance` -> how many of the four numbers it moves freely; a rotor's are in one ratio, a load's bounded by
-# where it can be.
+# `Effect.imbalance` -> number of parameters that count. A rotor moves all four numbers in one ratio; a load moves three
+# within the bounds of its place.
 FREE = {"rotor": 1, "thrust": 1, "mean thrust": 1, "air": 3, "load": 3}
 
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """What flights ask for beyond the file.
+    """Steady thrust and torque that flights need beyond the file.
 
     Attributes:
-        lack: (4,) thrust that is missing, relative; torque that acts besides, over thrust, about x, y, z [m], body.
-        covariance: (4, 4) of it, from day to day and as it was fitted.
-        rotors: (4, 4) rows: what each rotor does to it that has no thrust.
+        lack: (4,) missing thrust, relative; additional torque over thrust about x, y, z [m], body.
+        covariance: (4, 4) of `lack`: differences between days and error of the fit.
+        rotors: (4, 4) rows: `lack` if this rotor had no thrust.
         freedom: degrees of freedom of the t distribution from day to day.
     """
 
@@ -53,7 +53,7 @@ class Balance:
 
 
 def balance_of(data: Data, point: Point) -> Balance:
-    """The balance of flights; `point` is a model of a vehicle whose file has a trim, of which the noise is taken."""
+    """The balance of flights; `point` is a model with the noise scales, of a vehicle whose file has a trim."""
     point = replace(point, effects={n: dict(v) for n, v in point.vehicle.effects.items()})
     free = [THRUST, Candidate(TRIM, (), ("x", "y", "z"))]
     rest = nuisances(data, point, free)
@@ -62,14 +62,14 @@ def balance_of(data: Data, point: Point) -> Balance:
     found, filed = (
         np.array([p.effects[c.effect][n] for c in free for n in c.free], float) for p in (fitted.point, start)
     )
-    as_lack = np.diag([-1.0 / filed[0], 1.0, 1.0, 1.0])  # stronger lacks less
+    as_lack = np.diag([-1.0 / filed[0], 1.0, 1.0, 1.0])  # a larger scale is a smaller lack
     own = as_lack @ solved(fitted)[0].covariance[:4, :4] @ as_lack
     covariance = own + np.diag(np.square(day_sd(point.vehicle)))
     return Balance(as_lack @ (found - filed), covariance, without_each(data, point), day_freedom(point.vehicle))
 
 
 def without_each(data: Data, point: Point) -> NDArray:
-    """(4, 4) rows: thrust that is missing, relative, and torque over thrust [m] without one rotor, by mean commands."""
+    """(4, 4) rows: missing thrust, relative, and torque over thrust [m] without one rotor, by the mean commands."""
     vehicle = point.vehicle
     thrust = np.concatenate([
         f.inputs.thrust[(f.inputs.time > f.time[0]) & (f.inputs.time < f.time[-1])] for f in data.flights
@@ -79,8 +79,8 @@ def without_each(data: Data, point: Point) -> NDArray:
 
 
 def balance_loglik(balance: Balance, effect: str, fixed: Mapping[str, Any]) -> float | None:
-    """Log-likelihood [nats] of the balance with an effect, at its best, less the number of numbers it moves; None where
-    nothing is known of what it does to it."""
+    """Largest log-likelihood [nats] of the balance with an effect, less the number of its parameters (`FREE`); None if
+    the influence of the effect is not known."""
     kind = CATALOGUE[effect].imbalance
     if not kind:
         return None
@@ -98,15 +98,15 @@ def balance_loglik(balance: Balance, effect: str, fixed: Mapping[str, Any]) -> f
 
 
 def likely(distance: float, freedom: float) -> float:
-    """Log-likelihood of four numbers at this squared distance, by a t distribution, but for a constant."""
+    """Log-likelihood of four numbers with this squared distance by a t distribution, up to a constant."""
     return -0.5 * (freedom + 4.0) * float(np.log1p(distance / freedom))
 
 
 def _loaded(root: NDArray, lack: NDArray) -> float:
-    """Squared distance of the balance from that of the load which comes nearest."""
+    """Squared distance between the balance and that of the best load."""
 
     def distance(share: float) -> float:
-        """With a load of a share of the whole weight: it is missing thrust, and draws the centre to where it is."""
+        """With a load of this share of the whole weight: it takes thrust and moves the centre of mass to its side."""
         most = np.full(2, share * ON_BOARD)
         rest = lack - root[:, 0] * share
         if share <= 0.0:
@@ -117,37 +117,37 @@ def _loaded(root: NDArray, lack: NDArray) -> float:
 
 
 def prefers(balance: Balance, one: Candidate, other: Candidate) -> float | None:
-    """Nats by which the balance prefers one explanation; None where it says nothing of one of them."""
+    """Nats by which the balance prefers one effect to the other; None where it cannot judge one of them."""
     mine, its = (balance_loglik(balance, c.effect, dict(c.fixed)) if steady(c) else None for c in (one, other))
     return None if mine is None or its is None else mine - its
 
 
 def steady(candidate: Candidate) -> bool:
-    """Whether it acts all the time."""
+    """Whether the effect acts all the time."""
     return dict(candidate.fixed).get("onset_time") is None
 
 
 def _unbalances(candidate: Candidate) -> bool:
-    """Whether something is known of what it does to the balance."""
+    """Whether the influence of the effect on the balance is known."""
     return bool(CATALOGUE[candidate.effect].imbalance)
 
 
 def _numbers(candidate: Candidate) -> int:
-    """How many numbers of the balance it moves freely."""
+    """Number of parameters that count for the effect (`FREE`)."""
     return FREE[CATALOGUE[candidate.effect].imbalance]
 
 
 def how_weak(balance: Balance, rotor: int) -> tuple[float, float]:
-    """Share of its thrust that rotor 1 to 4 lacks by the balance, and its standard deviation."""
+    """Share of its thrust that rotor 1 to 4 lacks by the balance if it alone is weak, and the standard deviation."""
     root = np.linalg.cholesky(np.linalg.inv(balance.covariance)).T
     moved = root @ balance.rotors[rotor - 1]
     return float(moved @ root @ balance.lack / (moved @ moved)), float(1.0 / np.linalg.norm(moved))
 
 
 def hidden_by_the_day(data: Data, selection: Selection, asked: Sequence[Candidate]) -> dict[str, str]:
-    """What days hide of a rotor where nothing steady was found: the effect's name and how much, in a sentence.
+    """Effect -> how large a weak rotor the differences between days hide, in a sentence, if no steady effect was found.
 
-    Empty where there is nothing to be weighed, or weak rotors were not among the candidates `asked`.
+    Empty without a trim in the file, with a steady effect, or if weak rotors were not among the candidates `asked`.
     """
     steadied = TRIM in selection.nominal.vehicle.effects and not any(map(_unbalances, selection.accepted))
     if not steadied or all(c.effect != ROTOR_FAULT.name for c in asked):
@@ -168,11 +168,11 @@ def hidden_by_the_day(data: Data, selection: Selection, asked: Sequence[Candidat
 
 
 def by_balance(data: Data, selection: Selection) -> tuple[Selection, Balance | None]:
-    """The selection with a steady effect named and sized by the balance, and that balance.
+    """The selection with a steady effect that is named and sized by the balance, and this balance.
 
-    Of what the balance does not tell apart the simplest gives the name; what it prefers to the name takes its place.
-    None where there is nothing to be weighed: no trim in the vehicle's file, or not just one effect that brings a
-    steady force or torque.
+    An effect that the balance prefers replaces the selected one. Among effects that it does not separate, the simplest
+    gives the name. The balance is None where it does not apply: no trim in the vehicle file, or not exactly one effect
+    with a steady force or torque.
     """
     names = {c.effect for c in selection.accepted}
     decided = {s.taken.candidate: s.taken.size for s in selection.steps if s.taken and s.taken.log_odds is not None}
@@ -190,14 +190,14 @@ def by_balance(data: Data, selection: Selection) -> tuple[Selection, Balance | N
             lack = how_weak(balance, int(dict(mine.fixed)["rotor"]))[0]
             if 0.0 < lack < 1.0:
                 selection = _sized(data, selection, mine, {"scale": 1.0 - lack})
-    except (DivergedError, np.linalg.LinAlgError):  # then the filter's likelihood is all there is
+    except (DivergedError, np.linalg.LinAlgError):  # then the filter's likelihood decides alone
         return selection, None
     return selection, balance
 
 
 def _named(data: Data, selection: Selection, mine: Candidate, balance: Balance) -> tuple[Selection, Candidate]:
-    """The selection with what the balance prefers to all others, else with the simplest of what it does not tell from
-    the name; and which that is."""
+    """The selection with the effect that the balance prefers, else with the simplest of those that it does not separate
+    from the selected one; and the candidate of this effect."""
     step = next(s for s in selection.steps if s.taken and s.taken.candidate.effect == mine.effect)
     rivals: list[tuple[float, Trial]] = []
     for trial in step.explanations():
@@ -213,7 +213,7 @@ def _named(data: Data, selection: Selection, mine: Candidate, balance: Balance) 
 
 
 def _instead(data: Data, selection: Selection, step: Step, old: Candidate, trial: Trial) -> Selection:
-    """The selection with an effect of a turn exchanged for another that was tried in it."""
+    """The selection with an effect replaced by another trial of the same turn."""
     assert trial.fitted is not None
     values = [float(trial.candidate.values(trial.fitted.point)[n]) for n in trial.candidate.free]
     found = exchanged(data, selection, old, trial.candidate, values)
@@ -222,7 +222,7 @@ def _instead(data: Data, selection: Selection, step: Step, old: Candidate, trial
 
 
 def _sized(data: Data, selection: Selection, candidate: Candidate, values: Mapping[str, float]) -> Selection:
-    """The selection with an effect of that size, and what is always free as it is beside it."""
+    """The selection with an effect of this size; the other effects and the nuisances are fitted beside it."""
     there = selection.final.with_effects({candidate.effect: values})
     rest = [c for c in selection.accepted if c is not candidate]
     free = nuisances(data, there, selection.accepted)

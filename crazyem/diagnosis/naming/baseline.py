@@ -1,4 +1,4 @@
-"""What healthy flights of a drone say of its days: its own trim and thrust, and by how much these differ."""
+"""Trim and thrust of a drone from healthy flights, and how much these differ from day to day."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -20,17 +20,17 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Days, Vehicle
 
-INSIDE = 0.99  # of a prior's reach, within which a number is determined
+INSIDE = 0.99  # share of a prior's reach; a number within it is determined
 
 
 def with_baseline(
     vehicle: Vehicle, recordings: Sequence[Recording], say: Callable[[str], None] = lambda text: None
 ) -> Vehicle:
-    """The vehicle with trim and thrust as the mean of healthy flights, with how these differ (`Days`), and with what
-    rotors always have (`Effect.of_healthy_rotors`) as all flights together say.
+    """The vehicle with mean trim and thrust of healthy flights, their spread (`Days`), and the aerodynamics of the
+    rotors (`Effect.of_healthy_rotors`) fitted to all flights together.
 
     Args:
-        recordings: flights of this drone with nothing wrong, of several days.
+        recordings: flights of this drone without a fault, of several days.
 
     Raises:
         UsageError: fewer than two flights. DataError: a recording cannot be used.
@@ -56,7 +56,7 @@ def with_baseline(
 
 
 def rotor_aerodynamics(data: Data, point: Point) -> dict[str, dict[str, float]]:
-    """Drag and flapping as fitted; as the vehicle file has them where a number is at the end of its prior's reach."""
+    """Drag and flapping as fitted; a number at the end of its prior's reach is that of the vehicle file."""
     found = {}
     for candidate, precisions in nuisances(data, point, ()):
         if candidate.effect in CATALOGUE and CATALOGUE[candidate.effect].of_healthy_rotors:
@@ -75,9 +75,9 @@ def _nominal(data: Data, vehicle: Vehicle) -> Point:
 
 
 def spread_of(found: NDArray, usual: NDArray) -> tuple[NDArray, NDArray]:
-    """(k,) means of numbers of flights (n, k), and (k,) the scale of the t distribution of the next flight's.
+    """(k,) means of numbers of flights (n, k), and (k,) scales of the t distribution for the next flight.
 
-    usual: (k,) standard deviations of any drone, which count as `PRIOR_FLIGHTS` flights: the conjugate prior of a
+    usual: (k,) standard deviations for any drone, which count as `PRIOR_FLIGHTS` flights: the conjugate prior of a
     variance (Gelman et al., Bayesian Data Analysis, 3.3). Degrees of freedom: `PRIOR_FLIGHTS` + n - 1.
     """
     n, mean = len(found), found.mean(axis=0)

@@ -1,9 +1,9 @@
-"""Signals that the filter does not use, asked where it cannot tell two effects apart.
+"""Tests by signals that the filter does not use, for effects that the filter cannot tell apart.
 
-Inputs that act late and measurements that are late are one to the filter. An accelerometer is punctual but for its own
-low pass, so its lag behind the forces of the punctual model holds the delay in the first case, and not in the second. A
-rotor that is weak and one whose sensor counts wrong are one to the filter; commands tell what speed the other rotors
-would have shown.
+Late inputs and late measurements are the same to the filter. The accelerometer has no delay but its own low pass. So
+its lag behind the forces of a model without delay contains the delay of late inputs, but not that of late measurements.
+A weak rotor and a wrong rotor sensor are the same to the filter, too. Commands separate them: they give the speed that
+the other rotors show at the same command.
 """
 
 from collections.abc import Sequence
@@ -18,20 +18,20 @@ from crazyem.recordings.airborne import airtime
 from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording
 
-TELLING = 3.0  # nats by which a witness tells two effects apart
-# s: how late an accelerometer shows a force that nothing delays. Its low pass of 30 Hz (second order; firmware of the
-# Crazyflie, default of PX4) takes 7.5 ms; 28 simulated flights with nothing late: median 7.4, 1.48 MAD 3.4 ms.
+TELLING = 3.0  # nats from which another signal separates two effects
+# s; lag of an accelerometer behind a force without delay. Its low pass of 30 Hz (second order; firmware of the
+# Crazyflie, default of PX4) takes 7.5 ms; 28 simulated flights without delay: median 7.4, 1.48 MAD 3.4 ms.
 PUNCTUAL, PUNCTUAL_SD = 7.5e-3, 3.4e-3
-REACH = 0.1  # s, of delays that are tried on either side
-TWINS_SD = 0.01  # relative: speeds of two healthy rotors at one command
+REACH = 0.1  # s; largest delay that is tried, of either sign
+TWINS_SD = 0.01  # relative; difference of the speeds of two healthy rotors at one command
 SECOND = 100  # samples to a block
-FEWEST = 8  # blocks
+FEWEST = 8  # least number of blocks
 
 
 def late_measurements(data: Data, nominal: Point, delay: float) -> float | None:
-    """Nats for late measurements and against late inputs, of `delay` [s]; None without an accelerometer.
+    """Nats for late measurements against late inputs, with this `delay` [s]; None without an accelerometer.
 
-    `nominal` has no delay. For measured rotor speeds nothing is said: their own lag is not known.
+    `nominal` has no delay. None also with measured rotor speeds, because their own lag is not known.
     """
     if data.flights[0].inputs.measured:
         return None
@@ -65,7 +65,7 @@ def _lag_of(model: Model, point: Point) -> tuple[float, float] | None:
 
 
 def false_speed(recordings: Sequence[Recording], rotor: int, scale: float, lag: float) -> float | None:
-    """Nats for a sensor of rotor 1 to 4 that shows speeds times `scale`, against a rotor that is weak at true speed.
+    """Nats for a sensor of rotor 1 to 4 that shows `scale` times the speed, against a weak rotor with a right sensor.
 
     `lag` [s] of the rotors behind their commands. None where commands or speeds are not recorded.
     """
@@ -80,7 +80,7 @@ def false_speed(recordings: Sequence[Recording], rotor: int, scale: float, lag: 
 
 
 def _beyond(recording: Recording, rotor: int, lag: float) -> NDArray | None:
-    """(b,) by blocks: logarithm of a rotor's speed over what the others show at its command."""
+    """(b,) by blocks: logarithm of a rotor's speed over the speed of the others at its command."""
     air = airtime(recording)
     if any(n not in recording.signals for n in ("motor_command", "rotor_speed")):
         return None
@@ -104,6 +104,6 @@ def _beyond(recording: Recording, rotor: int, lag: float) -> NDArray | None:
     centre = float(x.mean())
     slope = np.polynomial.Polynomial.fit(x[:, others].ravel() - centre, y[:, others].ravel(), 2)
     away = y - slope(x - centre)
-    difference = away[:, rotor] - away[:, others].mean(1)  # the battery's state is common to all
+    difference = away[:, rotor] - away[:, others].mean(1)  # cancels the battery's state, which all rotors share
     count = difference.size // SECOND
     return difference[: count * SECOND].reshape(count, SECOND).mean(1)

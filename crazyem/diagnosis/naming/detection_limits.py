@@ -1,4 +1,4 @@
-"""What is too small to be told of an effect, or more than there can be of it."""
+"""Detection limits of effects, and ends of their physical ranges."""
 
 from collections.abc import Mapping
 
@@ -13,16 +13,16 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.external_force import GUSTS
 from crazyem.physics.effects.prior import Conditions
 
-LEAST_LOAD = 0.005  # of the drone's mass: what filters and sampling look like
-LEAST_SHIFT = 1e-4  # m, of the centre of mass
-GUSTIER = 2.0  # times the gusts of the file
-DRAWN = 2.0  # standard deviations of the day's trim
-# Standard deviations to which a swing weighs a load: less is none, nor is, beside one, less thrust than that.
+LEAST_LOAD = 0.005  # share of the drone's mass; filters and sampling look like smaller loads
+LEAST_SHIFT = 1e-4  # m; least shift of the centre of mass
+GUSTIER = 2.0  # least gusts, as a multiple of those of the file
+DRAWN = 2.0  # standard deviations of the day's trim; least shift of the centre of mass
+# Standard deviations of the weight by a swing: least weight of such a load, and least thrust of an effect beside it.
 WEIGHED = 3.0
 
 
 def at_the_end(point: Point, candidate: Candidate) -> bool:
-    """Whether an effect of one number is where nothing more of it is admitted, or a drag is none that air has."""
+    """Whether an effect of one number is at an end of its range, or a drag is more than the air can cause."""
     here = candidate.values(point)
     most = CATALOGUE[candidate.effect].most_per_mass * point.vehicle.mass
     if any(abs(here[n]) > most for n in candidate.free):
@@ -34,14 +34,15 @@ def at_the_end(point: Point, candidate: Candidate) -> bool:
 
 
 def _weight_error(name: str) -> float:
-    """Share of the drone's mass within which the weight of a load is known; 0 where nothing says so."""
+    """Standard deviation of a load's weight by its swing, as a share of the drone's mass; 0: not given."""
     return CATALOGUE[name].prior.relative_error.get("mass", 0.0) if name in CATALOGUE else 0.0
 
 
 def _other_load(point: Point, candidate: Candidate, here: Mapping[str, float], filed: Mapping[str, float]) -> bool:
-    """Whether a load is another than the file's by more than is told: in weight, or in where it draws the centre.
+    """Whether a load differs from the file's by more than the limit: in weight, or in the shift of the centre of mass.
 
-    With a trim in the file by more than differs from day to day; that of no load is told by its weight alone.
+    With a trim in the file the limit is the difference between days. With neither trim nor load in the file, only the
+    weight counts.
     """
     daily = TRIM in point.vehicle.effects
     heavier = abs(here["mass"] - filed["mass"])
@@ -56,10 +57,10 @@ def _other_load(point: Point, candidate: Candidate, here: Mapping[str, float], f
 
 
 def _outweighs(point: Point, candidate: Candidate, data: Data) -> bool:
-    """Whether an effect that lifts does so by more than what the swing of a load on a string leaves open of its weight.
+    """Whether an effect that lifts is larger than the error of the weight of a load on a string by its swing.
 
-    Lateral forces of flights that shake come out 1 % too small: attitudes of onboard filters lag. A load of 1 g was
-    told as one of 0.9 g, and what was left of its weight as a sag.
+    Lateral forces of flights that shake come out 1 % too small, as attitudes of onboard filters lag. So the load comes
+    out too light, and the rest of its weight looks like another effect.
     """
     open_weight = max((_weight_error(name) for name in point.effects), default=0.0)
     if not CATALOGUE[candidate.effect].lifts or not open_weight:
@@ -71,23 +72,23 @@ def _outweighs(point: Point, candidate: Candidate, data: Data) -> bool:
 
 
 def _conditions(point: Point, data: Data | None) -> Conditions:
-    """What is known of the flights to which an effect was fitted."""
+    """Conditions of the flights to which an effect was fitted."""
     if data is None or not data.flights:
         return Conditions(file_effects=frozenset(point.vehicle.effects), onboard=False, speed=np.full(3, np.inf))
     return conditions_of(data.flights, point)
 
 
 def usual_gusts(point: Point, data: Data | None = None) -> float:
-    """Standard deviation of the air's speed [m/s] below which it is the weather, and no finding."""
+    """Standard deviation of the air's speed [m/s] below which gusts are usual and no finding."""
     filed = float(point.vehicle.effects.get(GUSTS.name, {}).get("standard_deviation", 0.0))
     limit = GUSTS.prior.detection_limit_in({}, _conditions(point, data))["standard_deviation"][0]
     return max(GUSTIER * filed, limit)
 
 
 def matters(point: Point, candidate: Candidate, data: Data | None = None) -> bool:
-    """Whether the effect is larger than what onboard filters or the sampling of a log look like, and within its range.
+    """Whether the effect exceeds its detection limit and is not at an end of its range.
 
-    One number that ends where nothing more is admitted would be more: it stands for something else.
+    Onboard filters and the sampling of a log look like smaller effects. At an end, an effect stands for something else.
     """
     here, neutral = candidate.values(point), candidate.neutral(point)
     if at_the_end(point, candidate) or (data is not None and not _outweighs(point, candidate, data)):

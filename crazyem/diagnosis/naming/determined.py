@@ -1,8 +1,8 @@
-"""No impossible answer: a number that is told lies inside its interval, and that inside what is physically possible.
+"""Plausibility of reported numbers: each lies inside its interval, and the interval inside the physical range.
 
-A number at the end of its range stands for something else, and where every interval holds that there is none of it, the
-flights do not say that there is any. Both are "not determined": no finding, no part of the fitted vehicle, and the
-others are fitted again without it. One rule for all effects, whoever found them.
+A number at the end of its range stands for something else. If all intervals of an effect contain neutral, the flights
+do not show the effect. Both are "not determined": the effect is no finding and no part of the fitted vehicle, and the
+others are fitted again without it. The rule is the same for all effects, by whichever likelihood they were found.
 """
 
 import math
@@ -24,14 +24,14 @@ from crazyem.diagnosis.naming.steady import with_exact_torques
 from crazyem.diagnosis.naming.trials import Selection
 from crazyem.physics.effects.catalogue import CATALOGUE
 
-NEAR = 1e-9  # of a range, or of its larger end: a number that close to an end is at it
+NEAR = 1e-9  # of the larger end of a range; a number this close to an end is at the end
 
 
 def determined(effects: Sequence[Named], point: Point) -> tuple[tuple[Named, ...], dict[str, str]]:
-    """The effects that are determined, their intervals cut to what is possible; and of the others name and reason.
+    """The effects that are determined, with intervals cut to the physical range; name and reason of the others.
 
     Args:
-        point: a model of the vehicle, whose file says which values are none of an effect.
+        point: a model of the vehicle, whose file gives the neutral values.
     """
     kept, gone = [], {}
     for effect in effects:
@@ -47,7 +47,7 @@ def determined(effects: Sequence[Named], point: Point) -> tuple[tuple[Named, ...
 
 
 def not_determined(candidate: Candidate, parameters: Mapping[str, Value], point: Point) -> str:
-    """Why an effect with these numbers is not determined; "" if it is."""
+    """Reason why an effect with these numbers is not determined; "" if it is."""
     neutral = candidate.neutral(point)
     for name, value in parameters.items():
         low, high = candidate.range_of(name)
@@ -72,20 +72,20 @@ def not_determined(candidate: Candidate, parameters: Mapping[str, Value], point:
 
 
 def improbable(chance: float) -> str:
-    """Why an effect of this probability is no finding; "" if it is one."""
+    """Reason why an effect of this probability is no finding; "" if it is one."""
     if chance >= LEAST_PROBABILITY:
         return ""
     return f"not determined: the flights make it probable with {chance:.2g} only"
 
 
 def at_an_end(value: float, ends: tuple[float, float], neutral: float) -> bool:
-    """Whether a number is where nothing more of it is admitted; none of it is no end."""
+    """Whether a number is at an end of its range; neutral is no end."""
     near = NEAR * max(abs(e) for e in ends)
     return min(abs(value - e) for e in ends) <= near and abs(value - neutral) > near
 
 
 def _cut(value: Value, low: float, high: float) -> Value:
-    """With the interval cut to a range that holds the value."""
+    """The value with its interval cut to a range that contains the value."""
     return replace(value, ci95=(max(value.ci95[0], low), min(value.ci95[1], high)))
 
 
@@ -97,11 +97,10 @@ def without_undetermined(
     *,
     besides: Collection[str] = (),
 ) -> tuple[Selection, Balance | None, dict[str, str]]:
-    """The selection fitted again without what is not determined, the weakest first; the balance then; names and
-    reasons.
+    """The selection fitted again without undetermined effects, the weakest first; its balance; names and reasons.
 
-    Of an effect of several numbers one that is at its end (how high a load sits) is held at none of it, and the others
-    may be determined. What was looked for `besides`, to be written whatever it is (a trim), stays in the selection.
+    If only some numbers of an effect are at an end (the height of a load), these are held at neutral, and the others
+    may be determined. Effects in `besides`, which are written whatever their size (a trim), stay in the selection.
     """
     gone: dict[str, str] = {}
     while True:
@@ -135,8 +134,7 @@ def without_undetermined(
 
 
 def _without_ends(candidate: Candidate, found: Mapping[str, Value], point: Point) -> Candidate | None:
-    """The candidate without the numbers that are at an end; None where none is, or nothing would be left to say
-    anything."""
+    """The candidate without numbers at an end; None if there are none, or if no number or no amplitude would remain."""
     neutral, amplitude = candidate.neutral(point), CATALOGUE[candidate.effect].amplitude
     rest = tuple(
         n for n in candidate.free if not at_an_end(found[n].value, candidate.range_of(n), float(neutral[n]))
@@ -147,7 +145,7 @@ def _without_ends(candidate: Candidate, found: Mapping[str, Value], point: Point
 
 
 def _held(data: Data, selection: Selection, candidate: Candidate, fewer: Candidate) -> Selection:
-    """The selection fitted again with fewer numbers of an effect free, the others as the vehicle file has them."""
+    """The selection fitted again with fewer numbers of an effect free, the others at neutral."""
     point, neutral = selection.final, candidate.neutral(selection.final)
     values = {n: v if n in fewer.free else neutral[n] for n, v in candidate.values(point).items()}
     accepted = [fewer if c is candidate else c for c in selection.accepted]

@@ -1,5 +1,4 @@
-"""What an effect would be worth if it were fitted to all flights, and what its parameters cost: the evidence by which
-two explanations are compared."""
+"""Log evidence of an effect as if fitted to all flights: its gain and the cost of its parameters, for comparisons."""
 
 from collections.abc import Sequence
 
@@ -22,19 +21,18 @@ from crazyem.diagnosis.fitting.model import Point
 from crazyem.diagnosis.fitting.nuisances import nuisances
 from crazyem.physics.effects.catalogue import CATALOGUE
 
-FAR = 20.0  # nats that one step is believed to bring without looking
+FAR = 20.0  # nats; a larger gain of one linear step is checked by the likelihood
 
 
 def tuning(candidates: Sequence[Candidate], covariance: NDArray) -> float:
-    """Nats that it costs effects that their parameters (k, in order) might have been anything.
+    """Cost of the parameters (k, in order) of effects [nats]: the log ratio of prior to posterior volume.
 
-    What is left of what is usual once they are known, as in Laplace's approximation of the evidence (MacKay 1992): a
-    load that explains weak rotors must sit in the middle of the drone, and one that could be anywhere hardly ever does,
-    within what a flight tells of it. What no flight tells costs nothing by this, and at least a nat for each parameter,
-    as chance brings that much.
+    As in Laplace's approximation of the evidence (MacKay 1992). Example: a load that explains weak rotors must sit in
+    the middle of the drone, which is improbable for a load that may be anywhere. A parameter that no flight determines
+    costs nothing by this ratio. The cost is at least one nat for each parameter, because chance gains as much.
 
     Args:
-        covariance: (k, k), with what is usual as prior (`known_of`).
+        covariance: (k, k), with the usual spread as prior (`known_of`).
     """
     root = np.linalg.inv(np.linalg.cholesky(_usual(candidates)))
     left = np.linalg.eigvalsh(root @ covariance @ root.T)
@@ -42,8 +40,9 @@ def tuning(candidates: Sequence[Candidate], covariance: NDArray) -> float:
 
 
 def known_of(candidates: Sequence[Candidate], curvature: NDArray) -> NDArray:
-    """(k, k) covariance of the parameters of the candidates, which come first in a curvature (n, n), all else free,
-    with what is usual as prior."""
+    """(k, k) covariance of the candidates' parameters, with their usual spread as prior and all else free.
+
+    These parameters come first in the curvature (n, n)."""
     usual = _usual(candidates)
     with_prior = curvature.copy()
     with_prior[: len(usual), : len(usual)] += np.linalg.inv(usual)
@@ -51,7 +50,7 @@ def known_of(candidates: Sequence[Candidate], curvature: NDArray) -> NDArray:
 
 
 def _usual(candidates: Sequence[Candidate]) -> NDArray:
-    """(k, k) covariance of how far the parameters usually are from neutral."""
+    """(k, k) prior covariance of the parameters about neutral."""
     width = np.array([c.parameter(n).width for c in candidates for n in c.free])
     which = np.repeat(np.arange(len(candidates)), [len(c.free) for c in candidates])
     alike = np.array([CATALOGUE[c.effect].alike for c in candidates])[which]
@@ -64,15 +63,14 @@ def _usual(candidates: Sequence[Candidate]) -> NDArray:
 def gain_of_both(
     fitted: Fitted, held_out: Data, there: Fitted, accepted: Sequence[Candidate]
 ) -> tuple[float, NDArray, NDArray]:
-    """What an effect fitted to the one set of flights would gain on both [nats] if it were fitted to both, the
-    log-likelihood of those held out then, by blocks (b,), and the covariance (k, k) of what is accepted by both
-    (`known_of`).
+    """Further gain [nats] of an effect fitted to one set of flights if it were fitted to both; log-likelihood of the
+    held-out flights then, by blocks (b,); covariance (k, k) of the accepted parameters by both sets (`known_of`).
 
-    By one step from `there`, the flights held out with the effect as it was fitted. The curvature at `fitted` is the
-    prior of its parameters; what is of a kind that is always free may differ from what was fitted by its scatter in
-    either set of flights. Of these kinds `there` has moved already, and paid for it as for the scatter of its own
-    flights, which is given back. To be admitted an effect must hold as it is; to be compared with another it must not
-    suffer from being less well known: a poor flight to fit would always prefer fewer parameters.
+    One step starts at `there`, the fit of the held-out flights with the effect as `fitted`. The curvature at `fitted`
+    is the prior of the effect's parameters. A parameter that is also a nuisance may differ between the two sets, by its
+    prior in each. `there` has moved such parameters already; the cost of their prior there is added back. An effect is
+    admitted by the size that was fitted. A comparison must not depend on how precisely the fitted flights determine the
+    effects: otherwise uninformative flights always prefer fewer parameters.
     """
     free = nuisances(held_out, there.point, accepted)
     own, parts = sum(len(c.free) for c in accepted), [*accepted, *(c for c, _ in free)]
@@ -98,7 +96,7 @@ def gain_of_both(
     blocks, covariance = held_out.block_loglik(there.point), known_of(accepted, information + known)
     if gain < FAR:
         return back + gain, blocks, covariance
-    # So much is told by slopes where an effect is far from what these flights want; what the step brings is to be seen
+    # a linear gain this large is unreliable: the likelihood after the step decides
     looked = held_out.twin()
     begin, best = looked.loglik(there.point) - 0.5 * float(away @ known @ away), 0.0
     for part in (1.0, 0.5, 0.25):
@@ -108,14 +106,14 @@ def gain_of_both(
             brought = looked.loglik(point, passes=2) - begin
         brought -= 0.5 * float((away + moves) @ known @ (away + moves))
         if np.isfinite(brought) and brought > best:
-            # by which explanations scatter: a drag that is right and was fitted to a hover ruins what it was not fitted
-            # to, so badly that none could be told from it
+            # the scatter of a comparison is that after the step: a right drag fitted to a hover fits quick flight so
+            # badly that all rivals would be its look-alikes
             best, blocks = brought, looked.block_loglik(point)
     return back + min(best, gain), blocks, covariance
 
 
 def known_by(fitted: Fitted, accepted: Sequence[Candidate]) -> NDArray:
-    """(k, k) covariance of what is accepted at the maximum (`known_of`)."""
+    """(k, k) covariance of the accepted parameters at the maximum (`known_of`)."""
     return known_of(accepted, fitted.gram.total(range(fitted.gram.size))[1] + np.diag(fitted.precision))
 
 
@@ -126,10 +124,10 @@ def _total(data: Data, point: Point, parts: Sequence[Candidate]) -> tuple[NDArra
 
 
 def _inverse(matrix: NDArray) -> NDArray:
-    """Of a covariance or a curvature (k, k) whose parameters are of very different sizes; of one that says nothing, 0.
+    """Inverse of a covariance or curvature (k, k) of parameters of very different sizes; 0 for one without information.
 
     Raises:
-        DivergedError: a number of it is not finite.
+        DivergedError: an element is not finite.
     """
     if not np.isfinite(matrix).all():
         raise DivergedError("the curvature of a fit is not finite")

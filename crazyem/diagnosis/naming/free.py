@@ -1,4 +1,4 @@
-"""What was left free beside the effects: the numbers that no vehicle file says exactly, as they came out."""
+"""Estimated nuisances: numbers that no vehicle file gives exactly, fitted beside the effects."""
 
 import math
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 
 @dataclass(frozen=True)
 class Free:
-    """A number that was left free, in `unit`.
+    """A nuisance, in `unit`.
 
     Attributes:
-        name, words: the effect that it is of, in the catalogue and for people.
-        parameter: of it; a recording, where each has its own.
-        value, sd: as it came out.
-        expected, usual: where its prior has its mean, and that prior's standard deviation.
+        name, words: its effect, in the catalogue and for people.
+        parameter: of this effect; or a recording, where each recording has its own value.
+        value, sd: estimate and standard deviation.
+        expected, usual: mean and standard deviation of its prior.
     """
 
     name: str
@@ -32,7 +32,7 @@ class Free:
     usual: float
 
     def to_json(self) -> dict[str, Any]:
-        """As docs/reference/json.md has it."""
+        """The entry of the JSON document (docs/reference/json.md)."""
         return {
             "name": self.name, "words": self.words, "parameter": self.parameter, "value": self.value, "sd": self.sd,
             "unit": self.unit, "expected": self.expected, "usual": self.usual,
@@ -40,7 +40,7 @@ class Free:
 
 
 def left_free(fitted: Fitted) -> tuple[Free, ...]:
-    """Of the final fit, in the order of its columns."""
+    """The nuisances of the final fit, in the order of its columns."""
     if not fitted.nuisances:
         return ()
     variance = np.diag(solved(fitted)[0].covariance)

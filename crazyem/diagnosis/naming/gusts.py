@@ -1,8 +1,8 @@
-"""gusts: air that moves at random with memory, told by the likelihood of a disturbing force with memory.
+"""gusts: random motion of the air with memory, found by the likelihood of a disturbing force with memory.
 
-It has no deterministic term, so it is no column of the regression. The filter carries a disturbing specific force
-(Ornstein-Uhlenbeck, body axes) as states; its stationary spread is fitted with the other noise scales for several
-correlation times, and the likelihood as a parabola in their logarithm gives the best one with its error.
+Gusts have no deterministic term, so they are no column of the regression. The filter has a disturbing specific force
+(Ornstein-Uhlenbeck, body axes) as states. Its stationary standard deviation is fitted with the other noise scales for
+several correlation times. A parabola of the log-likelihood over the log of this time gives the best time and its error.
 """
 
 from dataclasses import dataclass, replace
@@ -14,16 +14,16 @@ from crazyem.diagnosis.fitting.fit import Data
 from crazyem.diagnosis.fitting.model import Noise, Point
 from crazyem.physics.effects.drag import LINEAR_DRAG
 
-MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)  # s
-GAINED = 40.0  # nats
-SHARE_SD = 0.2  # relative: of the spread, for the memory that goes with it and what else is wrong in the forces
-# Of the memory's logarithm: some ten memories fit into a flight, and a loop that leans into the wind shortens them. In
-# 21 simulated drones with gusts of 0.5 to 2 s (seeds 2038 and 2039) it was off by 0.55 (rms), when 0.2 was said.
+MEMORIES = (0.25, 0.5, 1.0, 2.0, 4.0)  # s; correlation times that are tried
+GAINED = 40.0  # nats; least gain of gusts
+SHARE_SD = 0.2  # relative error of the spread: it depends on the memory, and forces have other errors
+# Error of the memory's logarithm beyond scatter: a flight has some ten memories, and a loop that leans into the wind
+# shortens them. In 21 simulated drones with gusts of 0.5 to 2 s (seeds 2038 and 2039) the rms error is 0.55.
 MEMORY_SD = 0.5
-SMALLEST = 0.08  # m/s^2: less is what onboard filters leave
-ALIKE = 3.0  # largest ratio between the axes' spreads for moving air; a force on one axis alone is none
-KNOWN = 1e-3  # N s/m: a drag below it is none that was found, but one that is free near nothing
-PUSH = 0.007  # N s/m: of moving air on a drone whose drag is not known (docs/reference/effects.md)
+SMALLEST = 0.08  # m/s^2; least spread: onboard filters leave less
+ALIKE = 3.0  # largest ratio between the axes' spreads for moving air, which acts on all axes
+KNOWN = 1e-3  # N s/m; a smaller drag is a nuisance near 0, not a found effect
+PUSH = 0.007  # N s/m; force by air speed on a drone of unknown drag (docs/reference/effects.md)
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class Gusts:
     """A disturbing force with memory.
 
     Attributes:
-        gain: nats beyond white noise.
+        gain: nats over white noise.
         spread: (3,) standard deviation of specific force, body [m/s^2].
         memory: s, with `memory_sd` of its logarithm.
-        moving_air: whether all axes are disturbed alike.
+        moving_air: whether the disturbance is similar on all axes.
         speed: m/s, standard deviation of the air's velocity, with `speed_sd`.
     """
 
@@ -48,7 +48,7 @@ class Gusts:
 
 
 def find_gusts(data: Data, point: Point) -> Gusts | None:
-    """Whether a disturbing force with memory is there; None if the likelihood gains nothing by it."""
+    """The disturbing force with memory; None if its gain or its size is too small."""
     white = data.loglik(point, passes=2)
 
     def fitted(memory: float, start: Noise, spread: NDArray) -> tuple[float, Point]:
@@ -81,7 +81,7 @@ def find_gusts(data: Data, point: Point) -> Gusts | None:
     independent = max(3.0 * seconds / (2.0 * memory), 2.0)
     scatter = max(1.0 / np.sqrt(max(-2 * curve[0], 1e-9)), np.sqrt(2.0 / independent))
     memory_sd = np.hypot(scatter, MEMORY_SD)
-    size = float(np.median(spread))  # along z thrust is a little wrong as well
+    size = float(np.median(spread))  # the median: errors of thrust add to the force along z
     speed = size * point.vehicle.mass / push_of(point)
     alike = bool(spread.max() < ALIKE * spread.min())
     speed_sd = speed * float(np.hypot(1.0 / np.sqrt(2 * independent), SHARE_SD))
@@ -89,7 +89,7 @@ def find_gusts(data: Data, point: Point) -> Gusts | None:
 
 
 def push_of(point: Point) -> float:
-    """N s/m with which the air takes the drone along: its mean linear drag, if the model has one that was found."""
+    """Force by air speed [N s/m]: the mean linear drag if one was found, else `PUSH`."""
     drag = point.effects.get(LINEAR_DRAG.name)
     mean = float(np.mean([drag[a] for a in "xyz"])) if drag else 0.0
     return mean if mean > KNOWN else PUSH

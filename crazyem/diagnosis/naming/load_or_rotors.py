@@ -1,9 +1,9 @@
-"""A load against weaker rotors: one cause that looks like two, or like another.
+"""Comparison of a load with weaker rotors: one effect that looks like two, or like another.
 
-A load of unknown weight lowers thrust over mass and shifts the centre of mass, and so do rotors that are all weaker on
-a drone whose centre of mass was never where the file has it. One candidate is tried at a time, so the load wins by
-explaining both; whether it is told apart from the two together is asked here. Only what else they change tells: weaker
-rotors lack torque by the same factor, a load turns with the drone.
+A load of unknown weight lowers thrust over mass and shifts the centre of mass. Weaker rotors on a drone with a shifted
+centre of mass do the same. The selection tries one candidate at a time, so the load wins, because it explains both.
+Here it is compared with the two together. Only the torques separate them: weaker rotors lack torque by the same factor,
+and a load adds inertia.
 """
 
 from collections.abc import Sequence
@@ -29,13 +29,13 @@ SHIFTED = Candidate(CENTER_OF_MASS.name, (), ("x", "y", "z"))
 
 
 def instead_of_a_load(vehicle: Vehicle) -> list[Candidate]:
-    """Weaker rotors and a shifted centre; with a trim in the vehicle file, which is always free, the rotors alone."""
+    """Weaker rotors and a shifted centre of mass; with a trim in the vehicle file, a nuisance, the rotors alone."""
     return [WEAKER] if TRIM in vehicle.effects else [WEAKER, SHIFTED]
 
 
 def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
-    """The load as a trial and the best of what may stand in its place as another, weaker rotors with a shifted centre
-    and without, to be compared; None where no load was found, or where nothing can be fitted in its place.
+    """Trials of the load and of its best substitute, weaker rotors with or without a shifted centre of mass; None if no
+    load was found or a fit diverges.
     """
     load = next((c for c in selection.accepted if c.effect == LOAD), None)
     step = next((s for s in selection.steps if s.taken and s.taken.candidate is load), None)
@@ -52,24 +52,24 @@ def as_two(data: Data, held_out: Data | None, selection: Selection) -> tuple[Tri
 
 
 def _in_place_of_a_load(data: Data, held_out: Data | None, selection: Selection, instead: Sequence[Candidate]) -> Trial:
-    """Some effects in the place of a load, as one trial; that there is a second one as well is no matter of course."""
+    """Effects in the place of a load, as one trial; a second effect costs the log of the number of effects."""
     rest = [c for c in selection.accepted if c.effect not in {LOAD, *(t.effect for t in instead)}]
     bare = without(selection.final, LOAD)
     bare = bare.with_effects({c.effect: c.neutral(bare) for c in instead})
     value, blocks, known = refitted(data, held_out, bare, [*rest, *instead])
-    free = tuple(f"{c.effect}.{n}" for c in instead for n in c.free)  # counted, and no more
+    free = tuple(f"{c.effect}.{n}" for c in instead for n in c.free)  # only their number is used
     cost = tuning(instead, known[-len(free) :, -len(free) :]) + np.log(len(CATALOGUE)) * (len(instead) - 1)
     return _stands(Candidate(WEAKER.effect, (), free), value, blocks, float(cost))
 
 
 def _stands(candidate: Candidate, value: float, blocks: NDArray, tuned: float) -> Trial:
-    """A trial of what was fitted in the place of another, of which nothing but the comparison with it is asked."""
+    """A trial of effects in the place of another effect, used for the comparison with it alone."""
     return Trial(candidate, 0.0, 0.0, 1.0, 0.0, 0.0, blocks=blocks, value=value, tuned=tuned)
 
 
 def as_load(data: Data, held_out: Data | None, selection: Selection) -> tuple[Trial, Trial] | None:
-    """Weaker rotors as a trial and a load in their place as another; None where there are none, or where the load was
-    tried beside them anyway.
+    """Trials of weaker rotors and of a load in their place; None without weaker rotors, if the selection found or
+    fitted a load anyway, or if a fit diverges.
     """
     weaker = next((c for c in selection.accepted if c.effect == WEAKER.effect), None)
     step = next((s for s in selection.steps if s.taken and s.taken.candidate is weaker), None)
@@ -94,7 +94,7 @@ def as_load(data: Data, held_out: Data | None, selection: Selection) -> tuple[Tr
 def refitted(
     data: Data, held_out: Data | None, start: Point, candidates: Sequence[Candidate]
 ) -> tuple[float, NDArray, NDArray]:
-    """Log-likelihood as fitted to all flights, also by blocks; what is known of the candidates' parameters (k, k)."""
+    """Log-likelihood as fitted to all flights, also by blocks; covariance (k, k) of the candidates' parameters."""
     here = data.twin()
     fitted = refine_base(here, start, candidates, noise=False)
     value, blocks = fitted.loglik, here.block_loglik(fitted.point)
@@ -107,7 +107,7 @@ def refitted(
 
 
 def tuned_of(one: Candidate, candidates: Sequence[Candidate], known: NDArray) -> float:
-    """What the parameters of one of the candidates cost it, by what is known of all of them (k, k)."""
+    """Cost of the parameters of one candidate [nats], by the covariance (k, k) of those of all candidates."""
     begin = sum(len(c.free) for c in candidates[: [c is one for c in candidates].index(True)])
     own = slice(begin, begin + len(one.free))
     return tuning([one], known[own, own])

@@ -1,4 +1,4 @@
-"""An effect that was found, its numbers, and how sure it is."""
+"""An effect that was found: its numbers and its confidence."""
 
 from dataclasses import dataclass
 
@@ -9,11 +9,11 @@ from scipy import stats
 from crazyem.diagnosis.naming.unexplained import Unexplained
 from crazyem.physics.effects.catalogue import CATALOGUE
 
-# Confidence at most beside structure that a name does not outweigh, or where something that shakes explains as much.
+# Largest confidence beside unexplained structure that an effect does not outweigh, or if a vibration explains as much.
 DOUBTFUL = 0.45
-# Times the nats of what is left, from which a name beside it is as likely right as not. Of 88 names beside structure in
-# 1268 simulated drones of four seeds (2045 to 2048), 18 of 18 were right that brought 4 times as much or more; of 8
-# with 1 to 4 times as much 2, and 6 of 62 with less.
+# Held-out gain of an effect over the nats of the unexplained structure, at which the effect is right with a probability
+# of one half. Of 88 effects beside structure in 1268 simulated drones (seeds 2045 to 2048), 18 of 18 are right at a
+# ratio of 4 or more, 2 of 8 at 1 to 4, and 6 of 62 at less.
 OUTWEIGHS = 3.0
 
 
@@ -33,12 +33,12 @@ class Named:
 
     Attributes:
         name: in the catalogue; `label` with its choices.
-        parameters: those fitted; `chosen`: those searched.
-        held_out_nats: log-likelihood it brings on flight that it was not fitted to.
-        p_value: of its score test, the number of candidates allowed for.
-        confidence: probability that this effect is there and not a look-alike.
+        parameters: the fitted ones; `chosen`: the searched ones.
+        held_out_nats: gain of log-likelihood on held-out flights.
+        p_value: of its score test, corrected for the number of candidates.
+        confidence: probability that this effect is real, and not one of its look-alikes.
         fitted_as: the effect as which it was fitted; "": by its own name.
-        log_odds: log posterior odds of the effect, whatever its look-alikes; None: not known.
+        log_odds: log posterior odds of the effect, look-alikes aside; None: not known.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Named:
 
     @property
     def words(self) -> str:
-        """For people, with its choices."""
+        """The effect in words, with its choices."""
         values = {**self.chosen, **{n: v.value for n, v in self.parameters.items()}}
         return CATALOGUE[self.name].said(values)
 
@@ -69,10 +69,10 @@ def around(value: float, sd: float) -> tuple[float, float]:
 
 
 def trust(remains: Unexplained, held_out_nats: float = 0.0) -> float:
-    """What a name is worth beside structure that it does not explain: the right model leaves none.
+    """Factor on the probability of an effect beside unexplained structure: the right model leaves none.
 
-    What is left outside the catalogue feigns names about as large as it is itself: one that brings far more on flight
-    held out is no look-alike of that.
+    Physics outside the catalogue imitates effects of about its own size. An effect with a far larger held-out gain is
+    no such imitation.
     """
     explained = max(remains.explained, 0.0)
     if not remains.found:
@@ -82,9 +82,9 @@ def trust(remains: Unexplained, held_out_nats: float = 0.0) -> float:
 
 
 def one_factor(values: NDArray, neutral: NDArray, covariance: NDArray) -> bool:
-    """Whether values (k,) with a covariance (k, k) are their neutral ones times one factor, by chi-squared at 5 %.
+    """Whether values (k,) with a covariance (k, k) are the neutral values times one factor, by chi-squared at 5 %.
 
-    Inertias that are, about all three axes, are what a factor on the torques is, to every signal.
+    Inertias with one factor about all three axes give the same signals as a factor on the torques.
     """
     ratio = np.log(values / neutral)
     precision = np.linalg.pinv(covariance / np.outer(values, values))

@@ -1,4 +1,4 @@
-"""Effects that begin in mid-flight: whether one does, and since when."""
+"""Onset of effects that begin in mid-flight: detection and estimate of the time."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,15 +14,15 @@ from crazyem.diagnosis.fitting.nuisances import refine_base
 from crazyem.physics.effects.catalogue import CATALOGUE
 
 ONSET = "onset_time"  # of effects that may begin in mid-flight
-DATED = 6.0  # nats that an onset must gain
-SCANS = ((1.5, 0.1), (0.5, 0.1), (0.1, 0.02))  # s to either side, and the step between onsets tried
+DATED = 6.0  # nats; least gain of an onset
+SCANS = ((1.5, 0.1), (0.5, 0.1), (0.1, 0.02))  # s; reach to either side, and step between the onsets that are tried
 
 
 def onset_of(data: Data, point: Point, candidate: Candidate, gram: Gram, index: list[int]) -> Candidate | None:
-    """The same effect from a moment on that explains more than from the start; None if there is none.
+    """The same effect with an onset that explains more than the effect from the start; None if there is none.
 
-    Sums over blocks find the block, and the likelihood the tenth of a second: noise with a memory makes a step tell
-    most where the step is, and some samples off it speaks against the effect.
+    Sums over blocks find the block, and the likelihood finds the tenth of a second: with a memory of the noise, the
+    likelihood has a narrow peak at the true onset, and some samples off it counts against the effect.
     """
     known = dict(candidate.fixed)
     if known.get(ONSET) is not None or all(p.name != ONSET for p in CATALOGUE[candidate.effect].parameters):
@@ -48,7 +48,7 @@ def onset_of(data: Data, point: Point, candidate: Candidate, gram: Gram, index: 
 def likeliest(
     data: Data, point: Point, candidate: Candidate, values: Mapping[str, Any], begins: float, reach: float, step: float
 ) -> float:
-    """The likeliest of the onsets every `step` from `reach` before to `reach` after one [s]; changes nothing."""
+    """The likeliest onset [s] of those every `step` within `reach` of `begins`; changes nothing."""
     count = round(reach / step)
     tried = [begins + k * step for k in range(-count, count + 1)]
     points = [point.with_effects({candidate.effect: {**values, ONSET: at}}) for at in tried]
@@ -58,8 +58,8 @@ def likeliest(
 def date(data: Data, fitted: Fitted, candidate: Candidate) -> tuple[Fitted, Candidate]:
     """The effect with its onset to some hundredths of a second, by the likelihood; all else is fitted again.
 
-    At a wrong onset the noise takes the change for its own: torques with memory grow until the likelihood hardly sees
-    when it came. So every scan is followed by a fit at the best onset, in which the noise shrinks, and a finer scan.
+    At a wrong onset the noise absorbs the change: torques with memory grow until the likelihood hardly depends on the
+    onset. So a fit at the best onset follows each scan. The noise shrinks in this fit, and a finer scan follows.
     """
     begins = dict(candidate.fixed).get(ONSET)
     if begins is None:

@@ -1,4 +1,4 @@
-"""What is no column of the regression: gusts, a tilted accelerometer, rotors that follow their commands late."""
+"""Effects that are no column of the regression: gusts, a tilted accelerometer, rotors that follow commands late."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -22,7 +22,7 @@ from crazyem.physics.effects.external_force import GUSTS
 from crazyem.physics.effects.timing import INPUT_DELAY, MOTOR_LAG
 from crazyem.vehicle import Vehicle
 
-FIXED = 0.3  # share of the gain of gusts that a force which depends on place or motion may have beside it
+FIXED = 0.3  # largest force that depends on place or motion beside gusts, as a share of their gain
 
 
 def other_likelihoods(
@@ -35,8 +35,7 @@ def other_likelihoods(
     pulled: bool,
     say: Callable[[str], None],
 ) -> list[Named]:
-    """What is no column of the regression: gusts, unless something pulls the drone to a place (`pulled`), and a tilted
-    accelerometer."""
+    """Gusts, unless something pulls the drone to a place (`pulled`), and a tilted accelerometer."""
     found = []
     if (not wanted or GUSTS.name in wanted) and GUSTS.name not in left_out and not pulled:
         say(GUSTS.name)
@@ -44,7 +43,7 @@ def other_likelihoods(
         known = gusts is not None and gusts.speed < usual_gusts(point, data)
         if gusts is not None and not known and gusts.moving_air and remains.force_nats < FIXED * gusts.gain:
             memory_sd = gusts.memory * gusts.memory_sd
-            # a memory that the flight says nothing of has an interval without end
+            # the interval of a memory that the flight does not determine is infinite
             p = next(p for p in GUSTS.parameters if p.name == "correlation_time")
             with np.errstate(over="ignore"):
                 reach = np.exp(np.log(gusts.memory) + np.array([-1.96, 1.96]) * gusts.memory_sd)
@@ -58,7 +57,7 @@ def other_likelihoods(
                 there = find_gusts(apart, point)
                 held = there.gain if there else 0.0
             if held > 0:
-                # what the regression explains, nothing where gusts are all there is, says nothing of them
+                # the gain of the regression says nothing of gusts: their own gain counts
                 left = replace(remains.without_force(), gained=gusts.gain)
                 sure = trust(left, held) * presence(gusts.gain, held, gusts.gain)
                 chance = float(np.exp(-min(held, 700.0)))
@@ -91,9 +90,9 @@ def late_rotors(
     *,
     deaf: bool = False,
 ) -> tuple[list[Named], tuple[tuple[str, ...], ...]]:
-    """Lag and delay of rotors whose speeds were measured, and the group of both where one is as good as the other.
+    """Lag and delay of rotors with measured speeds, and the group of both where they are look-alikes.
 
-    Where one of the rotors is `deaf` to what is commanded, it makes all four look late or prompt, so neither is sure.
+    A rotor that ignores its command (`deaf`) makes all four look late or prompt, so neither effect is sure.
     """
     found = rotor_response.response(answers)
     if found is None:

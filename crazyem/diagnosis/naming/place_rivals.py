@@ -1,8 +1,8 @@
-"""Names that only imitate a force by place: wind and ground effect against a constant and slopes by x, y, z.
+"""Effects that may imitate a force by place: wind and ground effect against a constant force with slopes by x, y, z.
 
-A cable pulls down the more the higher the drone is, and to one side: near the floor that looks like lift, and on the
-whole like wind. Such names are compared, all of them together, with the force that they would have to be; where that
-explains the flights better, those kept apart as well, what is there is none of the effects.
+A cable pulls the drone to one side, and down the more the higher the drone is. This looks like lift near the floor, and
+like wind on average. Such effects, all together, are compared with a force by place. If the force explains all flights
+better, the held-out ones included, the effects are removed.
 """
 
 from collections.abc import Callable
@@ -25,15 +25,15 @@ FORCE = Candidate(FORCE_BY_PLACE.name, (), tuple(p.name for p in FORCE_BY_PLACE.
 def by_place(
     data: Data, held_out: Data | None, selection: Selection, say: Callable[[str], None] = lambda text: None
 ) -> tuple[Selection, Finding | None]:
-    """The selection without what imitates a force by place, and that force as a finding; else as it was, and None.
+    """The selection without effects that imitate a force by place, and the force as a finding; else as it was, None.
 
-    The force stays in the final model, but is no candidate of it: it has no name, and is never written anywhere. With a
-    trim in the vehicle file noise scales are not fitted again, and nothing is compared.
+    The force stays in the final model, but is no selected effect and is never written to a file. With a trim in the
+    vehicle file noise scales are fixed, and nothing is compared.
     """
     names = [c for c in selection.accepted if c.effect in FORCE_BY_PLACE.mistaken_for]
     if not names or "position" not in data.signals or TRIM in selection.final.vehicle.effects:
         return selection, None
-    # what imitates has another shape: something is left by place, on the flights fitted or on those kept apart
+    # an imitating effect has another shape: it leaves a force by place on the fitted or the held-out flights
     if max(left_by_place(d.twin(), selection.final) for d in (data, held_out) if d is not None) < NATS:
         return selection, None
     rest = [c for c in selection.accepted if c not in names]
@@ -44,8 +44,8 @@ def by_place(
     say(f"  asking again: {', '.join(c.label for c in names)}, or a force by place")
 
     def both(start: Point, candidates: list[Candidate], rounds: int) -> tuple[Fitted, Data]:
-        together = data.together_with(held_out)  # a hover to fit does not show slopes
-        for _ in range(rounds):  # noise of a model that lacks the force at first
+        together = data.together_with(held_out)  # a hover does not determine slopes
+        for _ in range(rounds):  # the first noise scales are those without the force
             fit = refine_base(together, remembering_anew(together, start), candidates)
             start = fit.point
         return fit, together
@@ -61,7 +61,7 @@ def by_place(
         if finding is None:
             return selection, None
         found = refine_base(data, remembering_anew(data, instead.point), [*rest, FORCE])
-    except DivergedError:  # without the names the model leaves the range of numbers: they stay
+    except DivergedError:  # the model diverges without the effects: they stay
         return selection, None
     say("  it is a force by place")
     gone = {c.effect for c in names}

@@ -1,8 +1,8 @@
-"""Leaving out again what predicts flights worse than the model without it.
+"""Removal of effects with which the model predicts flights worse than without them.
 
-A likelihood asks for one step ahead, and a loop that answers something unknown (what shakes, what blows) makes
-inertias, lags and torques look wrong there: told to explain it, they gain thousands of nats and lead astray within a
-tenth of a second. What is really missing predicts better, or as well where it hardly matters.
+The likelihood judges predictions of one step. There a control loop that answers an unknown vibration or wind makes
+inertias, lags and torques look wrong: they gain thousands of nats, but spoil predictions within a tenth of a second. A
+real effect improves predictions, or leaves them as they are where it hardly matters.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,8 +21,8 @@ from crazyem.errors import DataError
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
-# Of the errors at 100 and 500 ms, geometric mean over position, velocity, attitude and rate. What was hidden and found
-# in 210 simulated drones has at most 1.10 (late inputs, torque scales: a loop's answer to air is no torque that turns).
+# Largest ratio of errors at 100 and 500 ms, geometric mean over position, velocity, attitude and rate. True effects
+# that were found in 210 simulated drones have at most 1.10 (late inputs, torque scales).
 WORSE = 1.2
 
 
@@ -35,12 +35,12 @@ def without_what_misleads(
     withhold: Sequence[str] = (),
     say: Callable[[str], None] = lambda text: None,
 ) -> Selection:
-    """The selection without the effects by which open-loop predictions of recordings become worse than by `vehicle`.
+    """The selection without effects that make open-loop predictions of recordings worse than those by `vehicle`.
 
     Args:
-        recordings: those held out, or those fitted where there are none.
+        recordings: the held-out ones, or the fitted ones if there are none.
     """
-    if data.coarse:  # the turning does not follow its commands, so it is predicted by no model
+    if data.coarse:  # the recorded commands lack the torques: no model predicts the rotation
         return selection
     shown = [without(r, withhold) for r in recordings]
     nominal = [_errors_of(r, vehicle) for r in shown]
@@ -61,7 +61,7 @@ def without_what_misleads(
 
 
 def with_found(vehicle: Vehicle, selection: Selection, accepted: Sequence[Candidate]) -> Vehicle:
-    """The vehicle with what was accepted, as it was fitted."""
+    """The vehicle with the accepted effects at their fitted values."""
     kept = {n: dict(v) for n, v in vehicle.effects.items()}
     for candidate in accepted:
         found = selection.final.effects.get(candidate.effect, {})
@@ -70,8 +70,8 @@ def with_found(vehicle: Vehicle, selection: Selection, accepted: Sequence[Candid
 
 
 def ratio(before: Sequence[HorizonErrors | None], after: Sequence[HorizonErrors | None]) -> float:
-    """Geometric mean, over recordings, quantities and horizons but the first, of errors over errors before; 1 if there
-    are none, inf where the model leaves the range of numbers."""
+    """Geometric mean of errors after over errors before, for recordings, quantities and all horizons but the first; 1
+    if there are none, inf if the model diverges."""
     found = [
         a.rms[name][k] / b.rms[name][k]
         for b, a in zip(before, after, strict=True)
@@ -84,7 +84,7 @@ def ratio(before: Sequence[HorizonErrors | None], after: Sequence[HorizonErrors 
 
 
 def _errors_of(recording: Recording, vehicle: Vehicle) -> HorizonErrors | None:
-    """Open-loop errors of a vehicle; None where the recording has no whole states."""
+    """Errors of open-loop predictions by a vehicle; None where the recording has no complete states."""
     try:
         shown = recorded(recording, vehicle)
         at = windows(shown)

@@ -1,19 +1,20 @@
-"""How fast measured rotors follow their commands: lag and delay, where both are recorded.
+"""Lag and delay of rotors behind their commands, where commands and rotor speeds are recorded.
 
-With measured speeds the model needs neither, so the flight says nothing of them; commands and speeds do. Over a sample
-h a first-order lag of the thrust f answers to the commands u by
+With measured speeds the model of the flight needs neither, so only commands and speeds determine them. Over a sample
+time h, a first-order lag of the thrust f answers to the commands u by
 
     f(t + d + h) = k f(t + d) + (1 - k) g(u(t)) + e,    k = exp(-h / lag),
 
-with g a parabola, the same within a flight, each rotor its own. The slow part is left out: it is the battery's.
+with a parabola g for each rotor, constant within a flight. A high-pass removes slow changes, which the battery causes.
 
-All of it has errors: speeds have noise, commands are sampled, air disturbs the rotors and the loop answers to that.
-Each of them biases least squares, noise of 1 % by a sixth. Errors of a sample have no part in samples before it, so
-earlier commands and thrusts are instruments (Söderström and Stoica, System Identification, 1989, ch. 8): of the true
-lag and delay, e does not follow from them. Where instruments say little of how f changes, the flight tells no lag.
+All terms have errors: speeds have noise, commands are sampled, and air disturbs the rotors, to which the loop answers.
+Each error biases least squares, noise of 1 % by a sixth. The errors of a sample do not affect earlier samples, so
+earlier commands and thrusts are instruments (Söderström and Stoica, System Identification, 1989, ch. 8): at the true
+lag and delay, e does not correlate with them. If the instruments hardly predict changes of f, the flight does not
+determine the lag.
 
-Commands regressed on the thrusts around leave residuals. Those of three of four rotors are alike; a rotor that sticks,
-slips or misfires has larger ones.
+A regression of the commands on the thrusts around them leaves residuals. These are similar for healthy rotors; a rotor
+that sticks, slips or misfires has larger ones.
 """
 
 from collections.abc import Sequence
@@ -35,24 +36,24 @@ from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
 LAG, DELAY = MOTOR_LAG.name, INPUT_DELAY.name
-SLOW = 0.5  # Hz, below which the battery's state is all there is to see
-SPACING, FASTEST = 0.01, 0.025  # s between thrusts that are compared, about; s between samples, at most
-FEWEST = 400  # samples
+SLOW = 0.5  # Hz; slower changes come from the battery
+SPACING, FASTEST = 0.01, 0.025  # s between compared thrusts, about; s between samples, at most
+FEWEST = 400  # least number of samples
 EDGE = 0.5  # s left out at either end of a flight
-STARTS = (0.01, 0.03, 0.08)  # s
-SHORTEST, LONGEST, LATEST = 2e-3, 0.5, 0.1  # s
-INSTRUMENTS = 8  # earlier samples of the command, and of the thrust
-SPLINE = 2  # samples about a time that a spline there depends on most
+STARTS = (0.01, 0.03, 0.08)  # s; start values of the lag
+SHORTEST, LONGEST, LATEST = 2e-3, 0.5, 0.1  # s; bounds of the lag, largest delay
+INSTRUMENTS = 8  # number of earlier samples of the command, and of the thrust
+SPLINE = 2  # samples to either side of a time on which a spline mainly depends
 AROUND = (-1, 3)  # samples of the thrust about a command, from the one before it to the second after it
-# First-stage F statistic of the weakest direction (Cragg and Donald, 1993). In ten flights of two simulators with known
-# lags: off by 5 % at most (rms 3 %) from 2.3 on, by up to 34 % below 1.2.
+# Least first-stage F statistic of the weakest direction (Cragg and Donald, 1993). In ten flights of two simulators with
+# known lags, the error is at most 5 % (rms 3 %) from 2.3 on, and up to 34 % below 1.2.
 STRONG = 2.0
-LAG_SD, DELAY_SD, TOGETHER = 0.05, 1.4e-3, -0.5  # what scatter does not show: relative; s; correlation
-# Power of what a rotor leaves over that of the middle one of the others, in every recording that tells: up to 1.2 in 13
+LAG_SD, DELAY_SD, TOGETHER = 0.05, 1.4e-3, -0.5  # errors beyond scatter: relative; s; correlation
+# Least power of a rotor's residual over the median power of the others, in every recording: up to 1.2 in 13
 # simulated drones, 5.5 and more in ten flights of five with a rotor that sticks within 1.4 to 5 % of full command.
 DISOBEYS = 3.0
-INDEPENDENT = 10.0  # samples that say what one does
-ENOUGH, CLOSE = 8.0, 4.0  # nats to be named; nats within which lag and delay are not told apart
+INDEPENDENT = 10.0  # samples for one independent residual
+ENOUGH, CLOSE = 8.0, 4.0  # nats: least gain of a finding; difference within which lag and delay are look-alikes
 
 
 @dataclass(frozen=True)
@@ -71,8 +72,8 @@ class Response:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What one recording says: best (2,) lag and delay [s], their covariance by scatter, left (4, n) N, thrust that
-    each rotor was told and did not give, span of time [s], held: s from command to command."""
+    """Result of one recording: best (2,) lag and delay [s], their covariance by scatter, left (4, n) N, the thrust that
+    was commanded and not produced by each rotor, span of time [s], held: s from command to command."""
 
     best: NDArray
     covariance: NDArray
@@ -82,26 +83,26 @@ class Answer:
 
 
 def answers(recordings: Sequence[Recording], vehicle: Vehicle) -> list[Answer]:
-    """Of the recordings that have both commands and speeds, of which one tells the other."""
+    """Results of the recordings in which commands and speeds determine lag and delay."""
     return [a for a in (_of_one(recording, vehicle) for recording in recordings) if a is not None]
 
 
 def response(found: Sequence[Answer]) -> Response | None:
-    """Of all recordings together; None where none tells."""
+    """Lag and delay by all recordings together; None if no recording determines them."""
     if not found:
         return None
     information = sum(np.linalg.inv(r.covariance) for r in found)
     covariance = np.linalg.inv(information)
     lag, delay = covariance @ sum(np.linalg.solve(r.covariance, r.best) for r in found)
     held = float(np.mean([r.held for r in found]))
-    delay += held / 4.0  # what is smooth in commands goes on between samples, half of one early; what is new does not
+    delay += held / 4.0  # held commands are half a sample late where true ones are smooth, and on time at steps
     sd = np.array([LAG_SD * lag, np.hypot(DELAY_SD, held / np.sqrt(48.0))])
     usual = np.outer(sd, sd) * np.array([[1.0, TOGETHER], [TOGETHER, 1.0]])
     return Response(float(lag), float(delay), covariance + usual)
 
 
 def disobedient(found: Sequence[Answer]) -> Finding | None:
-    """The rotor that does not follow its command as the others do theirs, in all recordings that tell; None: none."""
+    """The rotor that follows its command worse than the others do, in all recordings; None if there is none."""
     if not found:
         return None
     power = np.array([np.mean(r.left**2, axis=1) for r in found])
@@ -119,7 +120,7 @@ def disobedient(found: Sequence[Answer]) -> Finding | None:
 
 
 def _of_one(recording: Recording, vehicle: Vehicle) -> Answer | None:
-    """Of one recording; None where it does not tell."""
+    """Result of one recording; None if it does not determine lag and delay."""
     air = airtime(recording)
     if vehicle.rotor_constant is None or not air.flown:
         return None
@@ -136,7 +137,7 @@ def _of_one(recording: Recording, vehicle: Vehicle) -> Answer | None:
         return None
     at, wanted = time[inside], command[inside].astype(float)
     volts, known = samples(recording, "voltage")
-    if volts.size > 1:  # a rotor answers to duty times voltage, and a loaded battery gives the less the more they pull
+    if volts.size > 1:  # a rotor answers to duty times voltage, and the voltage drops under load
         wanted = wanted * np.interp(at, volts, known[:, 0])[:, None]
     step = float(np.median(np.diff(at)))
     if step > FASTEST or not np.all(np.std(wanted, axis=0) > 0):
@@ -146,7 +147,7 @@ def _of_one(recording: Recording, vehicle: Vehicle) -> Answer | None:
     bounds = (
         np.array([SHORTEST, -SPLINE * step]),
         np.array([LONGEST, LATEST]),
-    )  # earlier, instruments have errors of e
+    )  # below, instruments share errors with e
     tries = [
         least_squares(equation.moments, [s, 0.0], bounds=bounds, x_scale=[0.01, 0.01], diff_step=1e-3) for s in STARTS
     ]
@@ -155,13 +156,13 @@ def _of_one(recording: Recording, vehicle: Vehicle) -> Answer | None:
         return None
     plain, _ = equation.errors(best.x)
     free = best.fun.size - best.x.size - 4 * equation.shapes.shape[2]
-    variance = max(float(np.mean(plain**2)), 2.0 * best.cost / free)  # the second is more where errors have a memory
+    variance = max(float(np.mean(plain**2)), 2.0 * best.cost / free)  # the second is larger if errors have a memory
     covariance = variance * np.linalg.inv(best.jac.T @ best.jac)
     return Answer(best.x, covariance, _command_residuals(at, wanted, thrust, step), (float(at[0]), float(at[-1])), step)
 
 
 def _command_residuals(at: NDArray, wanted: NDArray, thrust: CubicSpline, step: float) -> NDArray:
-    """(4, n) N: residuals of commands (n, 4) at (n,) s, regressed on the thrusts around."""
+    """(4, n) N: residuals of commands (n, 4) at times (n,) s, regressed on the thrusts around."""
     near = thrust(at[:, None] + step * np.arange(*AROUND))  # (n, samples, 4)
     shapes = _high_pass(np.concatenate([near, near[:, :1] ** 2 / near.mean()], axis=1), step)
     fast, left = _high_pass(wanted, step), []
@@ -174,11 +175,11 @@ def _command_residuals(at: NDArray, wanted: NDArray, thrust: CubicSpline, step: 
 
 @dataclass(frozen=True, eq=False)
 class _LagEquation:
-    """The first-order lag of thrusts over their mean, on a grid, and its instruments.
+    """Equation of the first-order lag of thrusts over their mean on a grid of times, and its instruments.
 
     Attributes:
         grid: (n,) s, every `step`. thrust: at any time (m,) [s] -> (m, 4) N. mean: (4,) N.
-        shapes: (n, 4, 2) command and its square. row: (m,) rows that are judged, `steps` before those they end at.
+        shapes: (n, 4, 2) command and its square. row: (m,) start rows of the equation, which ends `steps` rows later.
         instruments: (4, m, p) orthonormal.
     """
 
@@ -193,23 +194,23 @@ class _LagEquation:
 
     @classmethod
     def of(cls, at: NDArray, wanted: NDArray, thrust: CubicSpline, step: float) -> "_LagEquation":
-        """Of commands (k, 4) at (k,) s, held until the next, and thrusts."""
+        """The equation of commands (k, 4) at times (k,) s, each held until the next, and of thrusts."""
         grid = np.arange(at[0], at[-1], step)
         held = wanted[np.searchsorted(at, grid + 1e-3 * step, "right") - 1]
         relative = held / wanted.mean(axis=0)
         shapes = _high_pass(np.stack([relative, relative**2], 2), step)
         mean = thrust(grid).mean(axis=0)
         steps = max(1, round(SPACING / step))
-        edge = round(EDGE / step)  # where a high-pass does not yet know what is slow
+        edge = round(EDGE / step)  # transients of the high-pass
         row = np.arange(edge + INSTRUMENTS, grid.size - edge - steps)
-        before = np.roll(_high_pass(thrust(grid) / mean, step), SPLINE, axis=0)  # of samples with no part in f(t + d)
+        before = np.roll(_high_pass(thrust(grid) / mean, step), SPLINE, axis=0)  # samples without influence on f(t + d)
         earlier = np.concatenate([shapes[:, :, 0], before], axis=1)
         past = np.stack([earlier[row - j] for j in range(1, INSTRUMENTS + 1)], 2)  # (m, 8, j)
         instruments = [np.linalg.qr(past[:, (r, r + 4)].reshape(row.size, -1))[0] for r in range(4)]
         return cls(grid, step, steps, thrust, mean, shapes, row, np.stack(instruments))
 
     def errors(self, x: NDArray) -> tuple[NDArray, NDArray]:
-        """(4, m) e of a lag and a delay [s], and (4, p) its projection on the instruments."""
+        """(4, m) errors e for a lag and a delay [s], and (4, p) their projections on the instruments."""
         keep = np.exp(-self.step / x[0])
         now = _high_pass(self.thrust(self.grid + x[1]) / self.mean, self.step)
         change = now[self.row + self.steps] - keep**self.steps * now[self.row]
@@ -224,11 +225,11 @@ class _LagEquation:
         return np.stack(plain), np.stack(projected)
 
     def moments(self, x: NDArray) -> NDArray:
-        """(4 p,) projections of e, which are 0 of the true lag and delay but for chance."""
+        """(4 p,) projections of e, which are 0 on average at the true lag and delay."""
         return self.errors(x)[1].ravel()
 
     def strength(self, x: NDArray) -> float:
-        """First-stage F statistic of the instruments, in the direction of lag and delay of which they say least."""
+        """First-stage F statistic of the instruments, in their weakest direction of lag and delay."""
         little = 1e-4  # s
         base = self.errors(x)
         change = [tuple((a - b) / little for a, b in zip(self.errors(x + d), base)) for d in little * np.eye(2)]
@@ -238,14 +239,18 @@ class _LagEquation:
 
 
 def _high_pass(values: NDArray, step: float) -> NDArray:
-    """Values (n, ...) every `step` s without what is slower than `SLOW`."""
+    """Values (n, ...) every `step` s without frequencies below `SLOW`."""
     return np.asarray(sosfiltfilt(butter(2, SLOW * 2 * step, "high", output="sos"), values, axis=0))
 
 
 @dataclass(frozen=True)
 class Late:
-    """How rotors differ from the vehicle's: values and standard deviations [s] of the effects `LAG` and `DELAY`, those
-    that differ; nats on the recordings and on those held out; whether one alone would explain it as well as the other.
+    """Difference of the rotors from the vehicle file.
+
+    Attributes:
+        values: effect (`LAG`, `DELAY`), if it differs -> value and standard deviation [s].
+        nats, held_out: gain on the recordings and on the held-out ones.
+        alike: whether lag alone and delay alone explain the difference equally well.
     """
 
     values: dict[str, tuple[float, float]]
@@ -255,14 +260,14 @@ class Late:
 
 
 def late_response(found: Response, apart: Response | None, vehicle: Vehicle) -> Late | None:
-    """What of it is not as the vehicle file says; None where all is, or where flights held out do not agree.
+    """Lag or delay that differ from the vehicle file; None if both agree with it, or if held-out flights contradict.
 
     Args:
-        found: of the recordings; apart: of those held out, None where there are none or they do not tell.
+        found: by the recordings. apart: by the held-out ones; None if there are none or they do not determine it.
     """
     file = (vehicle.motor_time_constant, float(vehicle.effects.get(DELAY, {}).get("delay", 0.0)))
     (lag_lag, both), (_, late_late) = found.covariance.tolist()
-    # each alone, the other as in the file: the most likely value, its standard deviation, and what it explains
+    # each alone, the other as in the file: the most likely value, its standard deviation, and its log-likelihood
     lag = found.lag + both / late_late * (file[1] - found.delay)
     delay = found.delay + both / lag_lag * (file[0] - found.lag)
     alone = {
@@ -278,7 +283,7 @@ def late_response(found: Response, apart: Response | None, vehicle: Vehicle) -> 
         at, nats = (found.lag, found.delay), -nothing
     else:
         if delay < file[1]:
-            name = LAG  # no rotor answers before it is told to
+            name = LAG  # no rotor answers before its command
         values = {name: alone[name][:2]}
         at = (lag, file[1]) if name == LAG else (file[0], delay)
         nats = alone[name][2] - nothing

@@ -1,9 +1,9 @@
-"""Where to begin an effect whose likelihood has many maxima: a load explains a swing of its own period only.
+"""Starting points for effects whose likelihood has many maxima, such as a swinging load.
 
-A pendulum of a wrong period falls out of step within the time it is damped in, so the likelihood over lengths has a
-peak some per cent wide, and a fit that begins beside it stays there. One pass gives what the amplitude alone explains
-at every beginning; the best few are tried in full. Where a load is driven into chaos, what a small one would do says
-nothing of a larger one, which is followed by how it pulls: there, beginnings are compared by likelihood.
+A pendulum of a wrong period gets out of phase within its damping time. So the likelihood over its length has a peak
+some per cent wide, and a fit that starts beside the peak does not reach it. One pass gives the gain of the amplitude
+alone at every starting point; the best few are fitted in full. If the flight drives a load into chaos, the response of
+a small load says nothing of a larger one. Then starting points are compared by their likelihoods.
 """
 
 from collections.abc import Sequence
@@ -20,15 +20,15 @@ from crazyem.diagnosis.fitting.model import Column, Point
 from crazyem.diagnosis.fitting.nuisances import nuisances, with_nuisances
 from crazyem.physics.effects.catalogue import CATALOGUE
 
-FEW = 5  # beginnings that are all tried in full; of more,
-KEPT = 2  # the best peaks are
-SEEN = 50.0  # nats, from which an effect that has sizes is tried with them, where it is driven chaotic
+FEW = 5  # starting points that are all fitted in full; of more,
+KEPT = 2  # so many of the best peaks are
+SEEN = 50.0  # nats; least gain with which a chaotic effect is tried with its `Effect.sizes`
 
 
 def best_begun(
     data: Data, point: Point, accepted: Sequence[Candidate], candidates: Sequence[Candidate]
 ) -> list[Candidate]:
-    """The candidates, of those with many beginnings only the ones from where most is explained."""
+    """The candidates; of those with many starting points, only the ones with the largest gains."""
     families: dict[tuple[object, ...], list[Candidate]] = {}
     for c in candidates:
         families.setdefault((c.effect, c.fixed, c.free), []).append(c)
@@ -56,9 +56,9 @@ def best_begun(
 
 
 def larger(data: Data, point: Point, family: Sequence[Candidate]) -> Candidate | None:
-    """The likeliest beginning, with its size; None: none is likelier than nothing.
+    """The likeliest starting point, with its size; None if none is likelier than no effect.
 
-    The thrust gives back what is steady in an effect that weighs.
+    The thrust scale balances the weight of the effect.
     """
     effect = CATALOGUE[family[0].effect]
     nothing = data.twin().loglik(point)
@@ -91,7 +91,7 @@ def _amplitude(candidate: Candidate, point: Point) -> Column:
 
 
 def _gain(gram: Gram, weights: NDArray, column: int) -> float:
-    """Nats that a column gains beside those of the base, without bounds; none if it wants the amplitude negative."""
+    """Gain of a column beside the base, without bounds [nats]; 0 if the amplitude would be negative."""
     b, a = gram.total([*range(len(weights)), column])
     a = a + np.diag(np.append(weights, 0.0))
     scale = np.sqrt(np.maximum(np.diag(a), 1e-300))

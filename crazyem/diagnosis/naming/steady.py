@@ -1,11 +1,10 @@
-"""Steady torques: a trim among its look-alikes, what is left of one in the vehicle that was fitted, and the centre of
-mass that whole torques balance.
+"""Steady torques: a trim and its look-alikes, the trim of a fitted vehicle, and the centre of mass by exact torques.
 
-A torque that acts all the time and that no effect explains is what a real drone needs to hover: rotors that are not
-equal, nor upright. It stays unexplained, but the file that is written has it, so that a simulator flies as the drone
-does, and the next diagnosis by that file takes it for the file of a real drone, whose trim, thrust and flapping differ
-from day to day. Its thrust on this day is written with it: 4 % that nobody was told of, and a weak rotor looks weaker
-and its drone stronger than the day allows.
+A real drone needs a steady torque to hover, because its rotors are neither equal nor upright. A steady torque without
+an effect stays unexplained, but the written file contains it, so that a simulator flies like the drone. The next
+diagnosis treats this file as that of a real drone, whose trim, thrust and flapping differ from day to day. The thrust
+of this day is written, too: with an unknown error of 4 %, a weak rotor looks weaker, and its drone stronger, than the
+differences between days allow.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,9 +27,9 @@ from crazyem.vehicle import Vehicle
 
 
 def left_as_trim(flights: Sequence[Flight], vehicle: Vehicle, remains: Unexplained, workers: Workers) -> Vehicle:
-    """The fitted vehicle with the trim that these flights ask for, if a steady torque is left and it has none."""
+    """The fitted vehicle with the trim of these flights, if a steady torque is unexplained and the file has no trim."""
     steady = any(f.signal == "torque" and not f.variable for f in remains.findings)
-    if not steady or TRIM in vehicle.effects or all(f.coarse for f in flights):  # such torques are not to be written
+    if not steady or TRIM in vehicle.effects or all(f.coarse for f in flights):  # commands lack torques
         return vehicle
     trim = Candidate(TRIM, (), ("x", "y", "z"))
     untrimmed = replace(vehicle, effects={**vehicle.effects, TRIM: dict.fromkeys(trim.free, 0.0)})
@@ -42,7 +41,7 @@ def left_as_trim(flights: Sequence[Flight], vehicle: Vehicle, remains: Unexplain
 
 
 def with_its_thrust(vehicle: Vehicle, data: Data, point: Point, accepted: Sequence[Candidate]) -> Vehicle:
-    """The vehicle with the thrust that is fitted beside a trim that was found, if one was."""
+    """The vehicle with the thrust scale fitted beside a found trim, if there is one."""
     names = {c.effect for c in accepted}
     if TRIM not in names or THRUST.effect in names:
         return vehicle
@@ -51,16 +50,16 @@ def with_its_thrust(vehicle: Vehicle, data: Data, point: Point, accepted: Sequen
 
 
 def _scale_of(effects: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """The thrust scale among the effects of a model, as a file has it."""
+    """The thrust scale of a model, as in a vehicle file."""
     return {"scale": float(effects[THRUST.effect]["scale"])}
 
 
 def with_exact_torques(data: Data, selection: Selection) -> Selection:
-    """The selection fitted with the rotors' torques as the file has them, where a centre of mass is to be known.
+    """The selection fitted with the torque scale of the file, if a selected effect shifts the centre of mass.
 
-    All torques are free within 3 %, because what acts between two logged commands makes quick ones look wrong. A drone
-    at rest is balanced by whole ones: in 19 simulated drones with a load or a shifted centre (seeds 2039 and 2040) that
-    freedom, -3 to +5 %, moved the centre by as much, 37 um (rms) of 220 to 3300; without it, it is wrong by 6.
+    As a nuisance the torque scale is free within 3 %, because unlogged commands between two samples make quick torques
+    look wrong. Steady torques are exact. In 19 simulated drones with a load or a shifted centre (seeds 2039 and 2040),
+    a free scale of -3 to +5 % moves the centre by as much, 37 um (rms) of 220 to 3300; the fixed scale leaves 6.
     """
     names = {c.effect for c in selection.accepted}
     centred = any(CATALOGUE[n].shifts_centre for n in names)
@@ -77,18 +76,18 @@ def with_exact_torques(data: Data, selection: Selection) -> Selection:
 
 
 def as_steady(trim: Trial, rivals: Sequence[Trial]) -> tuple[Trial, ...]:
-    """What explains a steady torque as well as a trim or better: with a trim that nobody knows it is not told from it.
+    """Rivals that explain a steady torque as well as a trim or better: an unknown trim is their look-alike.
 
-    So a trim is taken first where it is asked for: every real drone has one, and a weak rotor or a load beside the
-    middle is told by a file that knows it, which a flight of the healthy drone gives.
+    So a trim is taken first if it is a candidate: every real drone has one. Only a file with the known trim, from a
+    flight of the healthy drone, separates a weak rotor or a load off the centre from it.
     """
     others = (t for t in rivals if CATALOGUE[t.candidate.effect].steady_torque)
     return tuple(t for t in others if not distinguishable(trim, t))
 
 
 def without_trim_rivals(candidates: Sequence[Candidate], accepted: Sequence[Candidate]) -> list[Candidate]:
-    """The candidates without what a fitted trim is, too: a torque from the start on, of which only an amplitude that
-    shows otherwise is left (how heavy a load is)."""
+    """The candidates without steady torques that a fitted trim explains. Of these effects only the amplitude remains,
+    if there is one, because other signs determine it (the weight of a load)."""
     if all(c.effect != TRIM for c in accepted):
         return list(candidates)
     kept = []
@@ -102,5 +101,5 @@ def without_trim_rivals(candidates: Sequence[Candidate], accepted: Sequence[Cand
 
 
 def by_onsets(point: Point, p_value: float, blocks: int) -> float:
-    """The p-value of an onset that was looked for among the blocks: with a trim in the file nothing asks again."""
+    """The p-value of an onset, times the number of blocks with a trim in the file: no later test follows there."""
     return min(1.0, p_value * blocks) if TRIM in point.vehicle.effects else p_value

@@ -1,8 +1,9 @@
-"""Whether a rotor is weak or a load is on board: posterior odds by what is steady in every flight.
+"""Posterior odds of a weak rotor or a load on board, by the steady thrust and torque of every flight.
 
-A trim that changes from day to day looks like both. The filter's likelihood therefore leaves the trim free, with heavy
-tails (`Prior.freedom`), and says little of what is steady. The steady numbers of each flight (`balance.py`) are
-compared with what days differ by: a weak rotor or a load is the same in all flights, a day's trim is not.
+A trim that changes from day to day looks like both. So the trim is free in the filter's likelihood, with heavy tails
+(`Prior.freedom`), and this likelihood says little of steady effects. Here the steady numbers of each flight
+(`balance.py`) are compared with the differences between days: a weak rotor or a load is the same in all flights, the
+trim of a day is not.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,9 +26,9 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.mass_properties import ON_BOARD
 from crazyem.vehicle import Vehicle
 
-EDGE = 0.99  # of the way to the furthest place on board, within which a load is
-LOOK_ALIKE = 0.05  # posterior probability from which another explanation is told as a look-alike
-Lack = Callable[[NDArray, Balance], NDArray]  # what an effect with these numbers moves of a balance
+EDGE = 0.99  # largest distance of a load, as a share of the furthest place on board
+LOOK_ALIKE = 0.05  # least posterior probability of a reported look-alike
+Lack = Callable[[NDArray, Balance], NDArray]  # (numbers of an effect, balance) -> part of `lack` by the effect
 
 
 def _rotor(index: int) -> tuple[Lack, list[tuple[float, float]]]:
@@ -35,7 +36,7 @@ def _rotor(index: int) -> tuple[Lack, list[tuple[float, float]]]:
 
 
 def _load(x: NDArray, balance: Balance) -> NDArray:
-    """Share of the whole weight, and where it is along x and y over the furthest place on board."""
+    """Numbers of a load: share of the whole weight; lever arms about x and y, over the furthest place on board."""
     return np.array([x[0], x[0] * ON_BOARD * x[1], x[0] * ON_BOARD * x[2], 0.0])
 
 
@@ -48,9 +49,9 @@ def _air(x: NDArray, balance: Balance) -> NDArray:
 
 
 def explanations(balances: Sequence[Balance]) -> dict[tuple[str, int], tuple[float, NDArray]]:
-    """(`Effect.imbalance`, rotor; 0 for others) -> log posterior weight [nats] and its numbers; ("", 0): only the days.
+    """(`Effect.imbalance`, rotor or 0) -> log posterior weight [nats] and numbers; ("", 0): no effect, only the days.
 
-    The most that each explains of all balances together, less one nat a number (`FREE`).
+    The weight is the log prior and the largest log-likelihood of all balances together, less one nat a number (`FREE`).
     """
     asked: dict[tuple[str, int], tuple[Lack, list[tuple[float, float]]]] = {
         **{("rotor", r): _rotor(r - 1) for r in (1, 2, 3, 4)},
@@ -82,9 +83,9 @@ def explanations(balances: Sequence[Balance]) -> dict[tuple[str, int], tuple[flo
 def steady_selection(
     data: Data, apart: Data | None, nominal: Point, asked: Sequence[Candidate], say: Callable[[str], None]
 ) -> Selection | None:
-    """A selection that begins with a weak rotor or a load, where all flights' balances make one more probable than not.
+    """A selection that starts with a weak rotor or a load, if the balances of all flights make it probable.
 
-    None where they do not, or where the vehicle file has no trim that is known.
+    None if its probability is less than `LEAST_PROBABILITY`, or if the vehicle file has no known trim.
     """
     mine = [c for c in asked if decided_by_balance(nominal.vehicle, c)]
     if not mine:
@@ -103,7 +104,7 @@ def steady_selection(
         size = _values(candidate, found[best][1], nominal)
         start = nominal.with_effects({candidate.effect: size})
         fitted = refine_base(data, start, [candidate])
-    except (DivergedError, np.linalg.LinAlgError):  # `hidden_by_the_day` says so
+    except (DivergedError, np.linalg.LinAlgError):  # `hidden_by_the_day` reports this
         say("what is steady in these flights fits no model: neither a weak rotor nor a load is asked for")
         return None
     odds = float(logit(min(chance[best], 1.0 - 1e-12)))
@@ -119,7 +120,7 @@ def steady_selection(
 
 
 def decided_by_balance(vehicle: Vehicle, candidate: Candidate) -> bool:
-    """Whether a candidate is told by the balance alone: a weak rotor or a load, where the vehicle's trim is known."""
+    """Whether the balance alone decides on a candidate: a weak rotor or a load, if the vehicle's trim is known."""
     return trim_known(vehicle) and CATALOGUE[candidate.effect].imbalance in ("rotor", "load") and steady(candidate)
 
 
@@ -129,10 +130,10 @@ def _is(candidate: Candidate, name: tuple[str, int]) -> bool:
 
 
 def _values(candidate: Candidate, numbers: NDArray, point: Point) -> Mapping[str, float]:
-    """Numbers of a balance as parameters of the effect."""
+    """Parameters of the effect from its numbers in `explanations`."""
     values = candidate.neutral(point)
     if CATALOGUE[candidate.effect].imbalance == "rotor":
         return {**values, "scale": 1.0 - float(numbers[0])}
     mass = point.vehicle.mass * float(numbers[0]) / (1.0 - float(numbers[0]))
-    # a load at (x, y) turns the drone by -y about x and by x about y, per weight
+    # torque of a load at (x, y) over its weight: -y about x, x about y
     return {**values, "mass": mass, "x": ON_BOARD * float(numbers[2]), "y": -ON_BOARD * float(numbers[1])}

@@ -1,4 +1,4 @@
-"""What none of the effects explains: structure left in the innovations of the final model."""
+"""Unexplained structure: structure in the innovations of the final model that no effect explains."""
 
 from dataclasses import dataclass, replace
 
@@ -13,24 +13,24 @@ from crazyem.diagnosis.locating.random_torques import AT_RANDOM, erratic_rotor, 
 from crazyem.diagnosis.naming.trials import Selection
 from crazyem.vehicle import GRAVITY
 
-STRUCTURE = 25.0  # nats of structure left over that count as unexplained
-# Smaller than this is what onboard filters and sampled commands leave in every flight: share of weight, share of the
-# weight times the arm, rad, m/s.
+STRUCTURE = 25.0  # nats; least structure that counts as unexplained
+# Sizes that onboard filters and sampled commands leave in every flight: share of the weight, share of the weight times
+# the arm, rad, m/s.
 TOLERANCE = {"force": 0.01, "torque": 0.0004, "attitude": 5e-3, "velocity": 0.05}
-DAILY = 2.0  # times that, where trims, thrust and leaning differ by 2 % from day to day or flight to flight
+DAILY = 2.0  # factor on these sizes if trim, thrust and leaning differ by 2 % from day to day or flight to flight
 SLOWEST = 1.5  # Hz: below, onboard filters wander
-LINE = 25.0  # nats: peak of the spectrum over its surroundings (power), the number of frequencies allowed for
-SHAKEN = 0.3  # of what an unknown torque would leave of a swing
+LINE = 25.0  # nats; least peak power of the spectrum over its surroundings, less the log of the number of frequencies
+SHAKEN = 0.3  # least line over the swing's change in a step (`shaking`), which an unknown torque leaves whole
 TURNING = ("torque", "body_rate")
-NEAR = 0.15  # share of the frequency range that is "surroundings"
+NEAR = 0.15  # share of the frequency range that counts as surroundings
 
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What remains.
+    """Structure that remains.
 
     Attributes:
-        findings: where structure is left that no effect explains, strongest first.
+        findings: structure that no effect explains, strongest first.
         gained: nats that the effects explain.
     """
 
@@ -44,7 +44,7 @@ class Unexplained:
 
     @property
     def nats(self) -> float:
-        """Of the strongest finding."""
+        """Nats of the strongest finding."""
         return self.findings[0].nats if self.findings else 0.0
 
     @property
@@ -54,7 +54,7 @@ class Unexplained:
 
     @property
     def force_nats(self) -> float:
-        """Of the strongest force that depends on place or motion."""
+        """Nats of the strongest force that depends on place or motion."""
         return max(
             (f.nats for f in self.findings if f.signal == "force" and f.variable not in ("", "time")), default=0.0
         )
@@ -64,28 +64,28 @@ class Unexplained:
         return Unexplained(tuple(sorted((*self.findings, finding), key=lambda f: -f.nats)), self.gained)
 
     def of_forces(self) -> "Unexplained":
-        """What remains of forces, attitudes and velocities: all that speaks of effects that forces tell, where the
-        turning does not follow the commands as they were recorded."""
+        """The findings in forces, attitudes and velocities. Only these count against effects on forces, if the recorded
+        commands lack the torques."""
         return Unexplained(tuple(f for f in self.findings if f.signal not in TURNING), self.gained)
 
     def without_random_rotor(self, rotor: int | None = None) -> "Unexplained":
-        """What remains but a rotor (1 to 4; None: any) that pushes at random, which is no force that lasts."""
+        """Without the finding of a rotor (1 to 4; None: any) that pushes at random, which is no lasting force."""
         which = "" if rotor is None else f"rotor {rotor} "
         left = (f for f in self.findings if f.variable != AT_RANDOM or not f.regime.startswith(which))
         return Unexplained(tuple(left), self.gained)
 
     def without_force(self) -> "Unexplained":
-        """What remains once a random force explains the forces."""
+        """Without findings in forces, which a random force explains."""
         return Unexplained(tuple(f for f in self.findings if f.signal != "force"), self.gained)
 
 
 def unexplained(data: Data, selection: Selection, after: Located, apart: Data | None = None) -> Unexplained:
-    """Compare what is left with what was gained; random torques are looked for on the flights held out, too."""
+    """Unexplained structure of the final model, and the gain of the effects; random torques by held-out flights too."""
     point = selection.final
-    # what is always free gives way to a vibration, so that is looked for with it where the vehicle file has it
+    # nuisances adapt to a vibration, so the search for vibrations has them at their values in the vehicle file
     named = {c.effect: point.effects[c.effect] for c in selection.accepted if c.effect not in selection.doubted}
     filed = replace(point, effects={**point.vehicle.effects, **named})
-    # along axes of the body: a force of the room is asked for by `place.py`, and `wind` is of the catalogue
+    # body axes only: `place.py` tests forces along axes of the room, and `wind` is an effect of the catalogue
     of_the_body = [f for f in after.findings if f.axis in AXES]
     left = [f for f in strongest(of_the_body, most=40) if f.nats > STRUCTURE and notable(f, point, differ=data.differ)]
     for model in data.models:
@@ -101,7 +101,7 @@ def unexplained(data: Data, selection: Selection, after: Located, apart: Data | 
 
 
 def notable(finding: Finding, point: Point, *, differ: bool = False) -> bool:
-    """Whether a finding is larger than what every flight shows; of flights that `differ` in their thrusts as well."""
+    """Whether a finding exceeds `TOLERANCE`; times `DAILY` if flights `differ` in thrust or the file has a trim."""
     weight = point.vehicle.mass * GRAVITY
     arm = max(point.vehicle.arm) or 0.03
     size = {"force": weight, "torque": weight * arm}.get(finding.signal, 1.0)
@@ -110,13 +110,13 @@ def notable(finding: Finding, point: Point, *, differ: bool = False) -> bool:
 
 
 def shaking(rate: NDArray, window: NDArray, k: int) -> float:
-    """rad/s: change within a step of a rate's part at one frequency, all of which an unknown torque would leave."""
+    """rad/s: change of a rate's part at one frequency within a step; an unknown torque would leave all of it."""
     amplitude = 2 * np.abs(np.fft.rfft((rate - rate.mean()) * window))[max(k - 2, 0) : k + 3].max() / window.sum()
     return float(amplitude * min(1.0, 2 * np.pi * k / rate.size))
 
 
 def lines(swept: Swept, time: NDArray) -> list[Finding]:
-    """Lines in the spectrum of the body rates' innovations: something that shakes at one frequency."""
+    """Lines in the spectrum of the body rates' innovations: vibrations at one frequency."""
     found = []
     period = float(np.median(np.diff(time)))
     grid = np.arange(time[0], time[-1], period)
@@ -134,13 +134,13 @@ def lines(swept: Swept, time: NDArray) -> list[Finding]:
         around = np.r_[power[max(2, k - width) : max(2, k - 3)], power[k + 4 : k + width]]
         if around.size < 16:
             continue
-        ratio = float(power[k] / np.median(around) * np.log(2.0))  # of the mean of exponential powers
+        ratio = float(power[k] / np.median(around) * np.log(2.0))  # over the mean of exponential powers
         if ratio > LINE + np.log(power.size):
             nats = float(ratio - np.log(power.size))
             where = f"frequency {frequency[k]:.2f} Hz"
             size = float(2 * np.sqrt(power[k]) / window.sum() * np.sqrt(np.median(swept.variance[seen, 9 + i])))
             if size < SHAKEN * shaking(np.interp(grid, time, swept.filtered[:, 10 + i]), window, k):
-                continue  # the loop swings at that frequency, and the model is wrong by a small part of it
+                continue  # the loop swings at that frequency, and the model misses a small part of the swing
             span = (float(time[0]), float(time[-1]))
             sd = size / float(np.sqrt(max(ratio, 1.0)))
             chance = float(np.exp(-nats))
