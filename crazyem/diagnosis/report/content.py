@@ -1,7 +1,7 @@
-"""What a report says, as sections of paragraphs, lists and tables: the same for the page and for the terminal.
+"""Content of a report as sections of paragraphs, lists and tables: the same for the page and for the terminal.
 
-Made from the diagnosis' JSON document alone, so that anyone can write it again; keys that are missing leave out their
-part.
+It is made from the diagnosis' JSON document alone, so that anyone can write the report again. A missing key leaves out
+its part.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -33,7 +33,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Bar:
-    """An interval against the value at which there is none of an effect, as per cent of a picture's width."""
+    """A value and its interval beside the neutral value (`none`), in per cent of a picture's width."""
 
     none: float
     low: float
@@ -57,7 +57,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Items:
-    """A list; `warn` where it is a reservation."""
+    """A list; `warn` marks a reservation."""
 
     items: tuple[str, ...]
     title: str = ""
@@ -76,8 +76,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report; `pictures` are those that belong there (`Series.section`); `page` where the terminal leaves
-    it out."""
+    """A part of a report; `pictures`: the `Series.section` of its pictures; `page`: for the page alone."""
 
     title: str
     parts: tuple[Text | Items | Table, ...]
@@ -86,7 +85,7 @@ class Section:
 
 
 def sections(document: Document) -> list[Section]:
-    """All of them; some may have no part."""
+    """All sections of a report; some may have no part."""
     return [
         Section("What is missing from the model", (*_effects(document), *_groups(document))),
         Section("Where simulation and flight part", tuple(_where(document)), "where"),
@@ -100,7 +99,7 @@ def sections(document: Document) -> list[Section]:
 
 
 def facts(document: Document) -> list[tuple[str, str]]:
-    """What was compared with what."""
+    """Recordings and vehicle of the diagnosis, with their names."""
     found = []
     for key, words in (("recordings", "recordings"), ("held_out_recordings", "kept apart"), ("vehicle", "vehicle")):
         if document.get(key):
@@ -138,7 +137,7 @@ def _parameter(effect: str, name: str, found: Mapping[str, Any]) -> tuple[Any, .
 
 
 def _bar(value: float | None, ends: Sequence[float | None], none: float | None) -> Bar | None:
-    """Whether an interval excludes that there is none of an effect is seen at once."""
+    """The bar of an interval, which shows whether the interval contains the neutral value; None if one is missing."""
     if value is None or none is None or len(ends) != 2 or ends[0] is None or ends[1] is None or ends[0] > ends[1]:
         return None
     left, right = min(none, ends[0], value), max(none, ends[1], value)
@@ -188,12 +187,12 @@ def _fit(document: Document) -> Iterable[Text | Table]:
 
 
 def _plain(both: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """What is worse, of names and numbers only."""
+    """Entries of "worse" whose quantity is a text and whose horizon is a number."""
     return [e for e in tables(both.get("worse")) if isinstance(e.get("quantity"), str) and number(e.get("horizon_s"))]
 
 
 def _horizons(before: Mapping[str, Any], after: Mapping[str, Any], spoilt: set[Any], title: str) -> list[Table]:
-    """Rms errors at each horizon: before, after and the change; those before alone where nothing changed."""
+    """Rms errors at each horizon: before, after and the change; errors before alone if there are none after."""
     ahead = [number(h) for h in items(before.get("horizon_s"))]
     rows = []
     for name in QUANTITIES:
@@ -258,7 +257,7 @@ def _ranking(document: Document) -> list[Text | Table]:
 
 
 def _against(compared: Mapping[str, Any]) -> list[Text | Table]:
-    """A simulated flight of the same mission, signal by signal."""
+    """Differences from a simulated flight of the same mission, signal by signal."""
     rows = [
         (spaced(name), quantity(e.get("rms"), e.get("unit", "")), quantity(e.get("largest"), e.get("unit", "")))
         for name, e in table(compared.get("signals")).items()
@@ -273,5 +272,5 @@ def _listed(texts: Sequence[str], *, title: str = "", warn: bool = False) -> lis
 
 
 def _texts(value: Any) -> list[str]:
-    """The texts of a list, or a text that stands alone."""
+    """The texts of a list, or a single text as a list."""
     return [str(v) for v in items(value)] if isinstance(value, list | tuple) else [str(value)] if value else []

@@ -1,6 +1,6 @@
 """The report as one self-contained HTML page: the words of `content.py` and pictures, by a template (Jinja2).
 
-Nothing in it is fetched from elsewhere, nothing in it runs, and every text of a recording or a file is escaped.
+The page loads no other file and runs no script. Every text of a recording or a file is escaped.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ def write_report(path: str | Path, document: Document, pictures: Mapping[str, Se
 
     Args:
         path: of the HTML file; replaced as a whole, or not at all.
-        document: the result of a diagnosis, as its JSON has it. Keys that are missing leave out their part.
+        document: the result of a diagnosis, as its JSON has it. A missing key leaves out its part.
         pictures: by name, in order; see `Series.section`.
 
     Raises: UsageError if the file cannot be written. MissingExtraError: no Jinja2, or no matplotlib.

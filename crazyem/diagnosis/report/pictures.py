@@ -16,7 +16,7 @@ from crazyem.extras import require
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MOST_POINTS = 1500  # of a line; more cannot be seen
+MOST_POINTS = 1500  # points of a line; more are not visible
 COLORS = ("#2f6f9f", "#d1603d", "#5a9367", "#8a6bbf", "#b58b00", "#4a4a4a")
 ROLES = {"measured": "#222222", "recorded": "#222222", "before": "#d1603d", "after": "#2f6f9f"}
 
@@ -26,13 +26,13 @@ class Series:
     """One picture.
 
     Attributes:
-        title: what is to be seen.
+        title: what the picture shows.
         x: (n,) numbers.
         lines: label -> (n,) values. Labels "measured", "before" and "after" have colours of their own.
         x_label, y_label: with the unit.
         section: "where" (the mismatch) or "fit" (before and after).
-        shaded: intervals of x to be marked.
-        level: a value that counts as nothing (drawn as a band around 0), 0 for none.
+        shaded: intervals of x that are marked.
+        level: half-width of a band around 0 of negligible values; 0: no band.
     """
 
     title: str
@@ -61,7 +61,7 @@ def data_uri(series: Series) -> str:
         "axes.grid": True, "grid.color": "#e8e8e8", "axes.axisbelow": True, "path.simplify": True,
     }  # fmt: skip
     with warnings.catch_warnings(), context(style):
-        warnings.simplefilter("ignore")  # letters that the font has not
+        warnings.simplefilter("ignore")  # missing letters of the font
         figure = Figure(figsize=(7.4, 2.3), layout="constrained")
         canvas = FigureCanvasSVG(figure)
         draw(figure.add_subplot(), series)
@@ -98,7 +98,7 @@ def _color(label: str, k: int) -> str:
 
 
 def thinned(x: NDArray, values: NDArray) -> tuple[NDArray, NDArray]:
-    """At most about `MOST_POINTS` points that look the same: smallest and largest of each stretch."""
+    """At most about `MOST_POINTS` points with the same look: the smallest and the largest of each stretch."""
     if x.size <= MOST_POINTS:
         return x, values
     groups = np.array_split(np.arange(x.size), MOST_POINTS // 2)
@@ -113,6 +113,6 @@ def thinned(x: NDArray, values: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _text(text: str) -> str:
-    """Text of recordings as it is: no formulas, no control characters."""
+    """Text of recordings without formulas and control characters."""
     plain = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
     return plain.replace("\\", "/").replace("$", r"\$")[:120]

@@ -1,12 +1,11 @@
-"""Numbers of a document as people read them: with unit and prefix, to the figures that their errors leave; and parts of
-a document that may be missing or of another kind."""
+"""Readable numbers of a document, with unit, prefix and the digits that errors justify; access to optional parts."""
 
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
-LEAST = 0.1  # of a unit with its prefix that is still told in it
+LEAST = 0.1  # least number that is shown in a unit with its prefix
 NONE = "–"
 
 
@@ -18,7 +17,7 @@ def number(value: Any) -> float | None:
 
 
 def items(value: Any) -> list[Any]:
-    """The list, or none."""
+    """The list, or an empty one."""
     return list(value) if isinstance(value, list | tuple) else []
 
 
@@ -33,18 +32,18 @@ def tables(value: Any) -> list[Mapping[str, Any]]:
 
 
 def short(value: Any, how: str = ".3g") -> str:
-    """Three figures of a number; a dash for what is none."""
+    """A number in three digits, or in the format `how`; a dash if there is no number."""
     known = number(value)
     return NONE if known is None else format(known, how)
 
 
 def per_cent(share: float) -> str:
-    """With its sign."""
+    """A share in per cent, with its sign."""
     return "±0 %" if abs(share) < 0.005 else f"{100 * share:+.0f} %"
 
 
 def prefixed(size: float, unit: str) -> tuple[float, str]:
-    """Factor and unit with the prefix that suits numbers of a size; "m^2" becomes "m²"."""
+    """Factor, and unit with the prefix that suits numbers of this size; "m^2" becomes "m²"."""
     shown = unit.replace("^2", "²")
     if not unit or unit.startswith("1/"):
         return 1.0, shown
@@ -56,7 +55,7 @@ def prefixed(size: float, unit: str) -> tuple[float, str]:
 
 
 def quantity(value: Any, unit: Any = "", sd: Any = None, *, how: str = ".3g") -> str:
-    """A value with its unit, and with its standard deviation where that is known: "61.8 ± 2.2 ms"."""
+    """A value with its unit, and with its standard deviation if known: "61.8 ± 2.2 ms"."""
     known, spread = number(value), number(sd)
     if known is None:
         return NONE
@@ -68,7 +67,7 @@ def quantity(value: Any, unit: Any = "", sd: Any = None, *, how: str = ".3g") ->
 
 
 def span(ends: Any, value: Any, unit: Any, sd: Any) -> str:
-    """An interval in the unit and to the figures of its value: "56.5 to 67.1 ms"."""
+    """An interval in the unit and with the digits of its value: "56.5 to 67.1 ms"."""
     both = [number(e) for e in items(ends)]
     if len(both) != 2 or all(e is None for e in both):
         return ""
@@ -82,7 +81,7 @@ def span(ends: Any, value: Any, unit: Any, sd: Any) -> str:
 
 
 def decimals(spread: float) -> int:
-    """Places after the point that two figures of a standard deviation have."""
+    """Decimal places for two digits of a standard deviation."""
     return min(9, max(0, 1 - math.floor(math.log10(spread)))) if spread > 0.0 else 3
 
 

@@ -1,4 +1,4 @@
-"""The report for a terminal: the words of `content.py`, in columns."""
+"""The report for a terminal: the content of `content.py`, in columns."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -6,11 +6,11 @@ from typing import Any
 from crazyem.diagnosis.report.content import Bar, Cell, Items, Meter, Table, sections
 from crazyem.diagnosis.report.verdict import Document, verdict
 
-MOST_ROWS = 12  # of a table
+MOST_ROWS = 12  # rows of a table
 
 
 def text_of(document: Document) -> str:
-    """The diagnosis for a terminal; some parts are left to the page."""
+    """The diagnosis for a terminal, without the sections for the page alone."""
     lines = [verdict(document)]
     for section in sections(document):
         if section.page or not section.parts:
@@ -40,5 +40,5 @@ def _columns(table: Table) -> Iterator[str]:
 
 
 def _plain(cell: Any) -> str:
-    """A cell in letters; pictures have none."""
+    """A cell as text; "" for a picture."""
     return "" if isinstance(cell, Bar | Meter) else cell.text if isinstance(cell, Cell) else str(cell)

@@ -1,4 +1,4 @@
-"""The result of a diagnosis in a sentence or two: what is missing, how sure and how large, and what it changes."""
+"""The result of a diagnosis in a sentence or two: missing effects, probability, size, and change of the errors."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -17,8 +17,8 @@ from crazyem.diagnosis.report.quantities import (
 from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Parameter
 
-# Confidence below which a name that stands for no group is said to be the nearest, not what is lacking. Of 18 such
-# names in 1899 simulated drones (seeds 2038 to 2043) two were right.
+# Confidence below which an effect outside all groups is called the nearest explanation, not missing. Of 18 such
+# effects in 1899 simulated drones (seeds 2038 to 2043) two are right.
 IMPROBABLE = 0.1
 QUANTITIES = ("position", "velocity", "attitude", "body_rate")
 JUDGES = (("held_out", "on flight it has not seen"), ("train", "on the flight it was fitted to"))
@@ -26,14 +26,14 @@ Document = Mapping[str, Any]
 
 
 def verdict(document: Document) -> str:
-    """What is missing, and by how much each of the four errors changes."""
+    """The missing effects, and the change of each of the four errors."""
     return " ".join(filter(None, (claim(document), changes(document))))
 
 
 def claim(document: Document) -> str:
-    """Which effects are missing, with size and probability.
+    """The missing effects, with size and probability.
 
-    Where the model predicts something worse than before, by more than chance, none is said to be missing.
+    If the fitted model predicts a quantity worse than the file, by more than chance, no effect is called missing.
     """
     if document.get("verdict"):
         return str(document["verdict"])
@@ -58,8 +58,7 @@ def claim(document: Document) -> str:
 
 
 def changes(document: Document) -> str:
-    """How the four errors at the longest horizon change, as a sentence; "" where no effect was found or nothing was
-    predicted."""
+    """Change of the four errors at the longest horizon, as a sentence; "" without effects or predictions."""
     if document.get("verdict") or not document.get("mismatch") or not tables(document.get("effects")):
         return ""
     part, words = _judge(document)
@@ -77,7 +76,7 @@ def changes(document: Document) -> str:
 
 
 def worse(document: Document) -> str:
-    """What is predicted worse than before, in words; "" if nothing is."""
+    """Quantities and horizons that are predicted worse than before, in words; "" if there are none."""
     part, _ = _judge(document)
     horizons: dict[str, list[str]] = {}
     for entry in tables(part.get("worse")):
@@ -102,7 +101,7 @@ def said_of(name: Any) -> str:
 
 
 def words_of(effect: Mapping[str, Any]) -> str:
-    """An effect in words, with its choices: which rotor, since when."""
+    """An effect in words, with its choices (rotor, onset)."""
     if str(effect.get("name")) not in CATALOGUE:
         return spaced(effect.get("words") or effect.get("name", ""))
     found = table(effect.get("parameters"))
@@ -111,7 +110,7 @@ def words_of(effect: Mapping[str, Any]) -> str:
 
 
 def sizes_of(effect: Mapping[str, Any]) -> str:
-    """The fitted parameters with their units, short."""
+    """The fitted parameters with their units, in short form."""
     found = {str(n): v for n, v in table(effect.get("parameters")).items() if isinstance(v, Mapping)}
     fitted = {n: v for n, v in found.items() if not v.get("chosen") and number(v.get("value")) is not None}
     if len(fitted) == 1:
@@ -127,14 +126,14 @@ def sizes_of(effect: Mapping[str, Any]) -> str:
 
 
 def _judge(document: Document) -> tuple[Mapping[str, Any], str]:
-    """The errors by which a model is judged: those held out, else those fitted; and of which flight they are."""
+    """The errors that judge a model, on held-out flights or else on fitted ones; and the name of these flights."""
     fit = table(document.get("fit"))
     found = ((table(fit.get(part)), words) for part, words in JUDGES)
     return next(((part, words) for part, words in found if part.get("before") and part.get("after")), ({}, ""))
 
 
 def _hardly(effect: Mapping[str, Any], groups: Iterable[Sequence[str]]) -> bool:
-    """Whether an effect that stands for no group is improbable, so that a sentence must not say it is lacking."""
+    """Whether an effect outside all groups is improbable, so that it must not be called missing."""
     sure = number(effect.get("confidence"))
     return sure is not None and sure < IMPROBABLE and not any(effect.get("name") in g for g in groups)
 
@@ -152,7 +151,7 @@ def _named(effect: Mapping[str, Any], groups: Iterable[Sequence[str]]) -> str:
 
 
 def _remark(effects: Sequence[Mapping[str, Any]]) -> str:
-    """What goes with these findings where they are all there is."""
+    """The remarks of the fitted parameters, if all of them have one; else ""."""
     remarks = []
     for effect in effects:
         fitted = [p for p in _parameters(effect) if p.name in table(effect.get("parameters"))]
@@ -163,13 +162,13 @@ def _remark(effects: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _parameters(effect: Mapping[str, Any]) -> tuple[Parameter, ...]:
-    """Of an effect of a document, as the catalogue has them; none where it does not know the effect."""
+    """Parameters of an effect by the catalogue; none if the catalogue does not know the effect."""
     known = CATALOGUE.get(str(effect.get("name")))
     return known.parameters if known else ()
 
 
 def _strongest(document: Document) -> str:
-    """The strongest of what is left, as a clause."""
+    """The strongest unexplained structure, as a clause; "" if there is none."""
     left = tables(table(document.get("unexplained")).get("where"))
     if not left:
         return ""
