@@ -1,4 +1,4 @@
-"""What might be missing: each effect of the catalogue in each of its variants, as columns of the regression."""
+"""Candidates: each effect of the catalogue in each of its variants, as columns of the regression."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -26,10 +26,10 @@ class Candidate:
         fixed: parameters that are chosen (a rotor, a stream).
         free: parameters that are fitted.
         begin: values at which derivatives are taken while the effect is not part of the model.
-        both_ways: it may be less than nothing as well: a delay that is already counted may be counted too long.
-        likeliest: it is fitted from `begin`, whatever derivatives say: that is the likeliest of many in full, or where
-            an effect is something of which derivatives at nothing say nothing.
-        freedom: degrees of freedom of the prior of what is always free (`Prior.freedom`).
+        both_ways: values below the physical range are admitted: a delay in the model may be too long.
+        likeliest: the fit starts from `begin`, whatever the derivatives say. `begin` is then the most likely of many
+            starts, or the derivatives at neutral are zero.
+        freedom: degrees of freedom of the prior, if the candidate is a nuisance (`Prior.freedom`).
     """
 
     effect: str
@@ -53,26 +53,26 @@ class Candidate:
         return next(p for p in CATALOGUE[self.effect].parameters if p.name == name)
 
     def range_of(self, name: str) -> tuple[float, float]:
-        """What is admitted of a parameter while it is fitted: a payload is on the drone, a faulty rotor no stronger."""
+        """Admitted range of a parameter in a fit: a payload is on the drone, a faulty rotor is not stronger."""
         p, effect = self.parameter(name), CATALOGUE.get(self.effect)
-        admitted = effect.admitted(dict(self.fixed)) if effect else {}  # none of a deviation of one recording
+        admitted = effect.admitted(dict(self.fixed)) if effect else {}  # a deviation has no effect here
         low, high = admitted.get(name, (-math.inf, math.inf))
         return max(-p.high if self.both_ways else p.low, low), min(p.high, high)
 
     def neutral(self, point: Point) -> dict[str, Any]:
-        """All its parameters as the vehicle file has them, else at neutral; the choices made."""
+        """All parameters with the values of the vehicle file, else neutral; with the discrete choices."""
         own = vehicle_values(point.vehicle).get(self.effect, {})
         filed = point.vehicle.effects.get(self.effect, {})
         if any(filed.get(name, value) != value for name, value in self.fixed):
-            filed = {}  # of another rotor
+            filed = {}  # the file has another choice, such as another rotor
         return {**CATALOGUE[self.effect].complete(filed, own), **dict(self.fixed)}
 
     def values(self, point: Point) -> dict[str, Any]:
-        """Where it is in a model, or neutral."""
+        """All parameters with their values in a model, else neutral."""
         return {**self.neutral(point), **point.effects.get(self.effect, {})}
 
     def columns(self, point: Point) -> list[Column]:
-        """Derivatives at the model, or where the effect begins to matter if it is not part of it."""
+        """Columns of the free parameters: at the model, or at `begin` if the effect is not part of the model."""
         present = self.effect in point.effects
         base = {**self.neutral(point), **(point.effects[self.effect] if present else dict(self.begin))}
         before = point.with_effects({self.effect: base}).effects if not present or self.begin else None
@@ -86,16 +86,17 @@ class Candidate:
         return columns
 
     def bounds(self, point: Point) -> tuple[list[float], list[float]]:
-        """Admitted changes of the free parameters from where they are."""
+        """Admitted changes of the free parameters from their present values."""
         here = self.values(point)
         ends = [self.range_of(n) for n in self.free]
         low = [min(end[0] - here[n], 0.0) for end, n in zip(ends, self.free, strict=True)]
         return low, [max(end[1] - here[n], 0.0) for end, n in zip(ends, self.free, strict=True)]
 
     def started(self, point: Point, change: Sequence[float]) -> dict[str, Any]:
-        """Values of the effect after a change found while it was not part of the model.
+        """Values of the effect after a linear step from a model without it.
 
-        With an amplitude, the derivatives by the others were taken at its small value, so their changes scale with it.
+        The derivatives by the other parameters were taken at a small amplitude. So their changes scale with the ratio
+        of the small to the new amplitude.
         """
         base = {**self.neutral(point), **dict(self.begin)}
         found = dict(base)
@@ -108,7 +109,7 @@ class Candidate:
             p = self.parameter(amplitude)
             grown = neutral + moved[amplitude]
             if abs(moved[amplitude]) < 0.05 * abs(small) or not p.low <= grown <= p.high:
-                grown = base[amplitude]  # of nothing the others have no derivatives: a weight that only tilts
+                grown = base[amplitude]  # without amplitude, the others have no derivatives
             found[amplitude] = grown
             ratio = small / (grown - neutral)
         for name in self.free:
@@ -126,7 +127,7 @@ THRUST = Candidate(rotors.THRUST_SCALE.name, (), ("scale",))
 
 
 class OfRecordings(Candidate):
-    """How far an effect is in each recording from what all share (`model.OWN`): always free, never named."""
+    """Deviations of an effect in each recording from its shared value (`model.OWN`): nuisances, never named."""
 
     @property
     def label(self) -> str:
@@ -145,7 +146,7 @@ class OfRecordings(Candidate):
         return replace(p, name=name, words=words, neutral=0.0, low=p.low - middle, high=p.high - middle)
 
     def neutral(self, point: Point) -> dict[str, Any]:
-        """As all recordings are."""
+        """Deviations of 0."""
         return dict.fromkeys(self.free, 0.0)
 
 
@@ -162,7 +163,7 @@ def candidates_for(
     measured_speeds: bool,
     wanted: Sequence[str] = (),
 ) -> tuple[list[Candidate], dict[str, str]]:
-    """All candidates that the recorded signals can speak of; and those they cannot, with the reason.
+    """All candidates that the recorded signals can show; and the effects that they cannot show, with the reason.
 
     Raises:
         UsageError: a wanted effect is not in the catalogue.

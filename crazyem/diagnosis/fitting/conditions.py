@@ -1,4 +1,4 @@
-"""What the usual spread of recordings depends on (`physics/effects/prior.py`), of flights that are fitted together."""
+"""Conditions on which the usual spread of recordings depends (`physics/effects/prior.py`), for flights of one fit."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from crazyem.physics.effects.sensing import GYRO_BIAS
 
 
 def conditions_of(flights: Sequence[Flight], point: Point) -> Conditions:
-    """The facts of some flights, under a model of them."""
+    """The conditions of some flights under a model."""
     vehicle = point.vehicle
     days = day_sd(vehicle)
     return Conditions(

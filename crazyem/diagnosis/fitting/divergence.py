@@ -1,4 +1,4 @@
-"""Flights that drive a hidden state into chaos: what an effect does there follows from no recorded path."""
+"""Flights that drive a hidden state into chaos: the force of the effect then does not follow from the recorded path."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,15 +10,15 @@ from crazyem.physics.effects.effect import Effect, Values
 from crazyem.physics.motion import motion
 from crazyem.vehicle import Vehicle
 
-OFF = 0.01  # m/s by which a path may be off from one row to the next, as a filter's may
-# Share of what comes and goes of the force by which that changes it: in simulated flights that shake all of it changes,
-# in others some per cent. And share of the force that comes and goes at least: in a hover noise is all that swings.
+OFF = 0.01  # m/s, velocity error from row to row that the test adds to the path: that of a filter
+# CHANGED: least change of the force by this error, over its varying part. It is all of it in simulated flights that
+# shake, some per cent in others. SWINGING: least varying part, over the whole force: in a hover, noise alone varies.
 CHANGED, SWINGING = 0.3, 0.2
-FEWER = 6  # of an effect's beginnings one in so many is asked
+FEWER = 6  # one in so many of an effect's beginnings is tested
 
 
 def diverges(flight: Flight, vehicle: Vehicle, name: str) -> bool:
-    """Whether a flight, as it was measured, drives an effect that has sizes astray, from any of some beginnings."""
+    """Whether a small error of the measured path changes much of an effect's force, from one of some beginnings."""
     known = initial_path(flight)
     off = known.copy()
     off[:, 3:6] += OFF * np.random.default_rng(0).normal(size=(len(off), 3))
@@ -37,7 +37,7 @@ def diverges(flight: Flight, vehicle: Vehicle, name: str) -> bool:
 
 
 def _some(effect: Effect) -> list[Values]:
-    """Values of an effect from one in `FEWER` of its beginnings; none for one without sizes."""
+    """Values of an effect at one in `FEWER` of its beginnings; none for an effect without sizes."""
     if not effect.sizes:
         return []
     size = effect.sizes[len(effect.sizes) // 2]

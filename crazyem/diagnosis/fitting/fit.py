@@ -1,4 +1,4 @@
-"""Fitting effects to flights: derivatives of all columns in one pass, Gauss-Newton steps, noise scales in between."""
+"""Fit of effects to flights: derivatives of all columns in one pass, Gauss-Newton steps, noise scales in between."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,16 +16,16 @@ from crazyem.diagnosis.workers import Workers
 from crazyem.errors import DataError
 from crazyem.physics.effects.catalogue import CATALOGUE
 
-ROUNDS = 6  # of Gauss-Newton
-WILD = 4.0  # mean square of a step's standardised innovations beyond which it is left out
-REACH = 2.5  # standard deviations within which a nuisance stays
-TORQUES = np.full(3, 0.5)  # rad/s^2, where disturbing torques with memory begin
-WANDER = 0.5  # s: memory of torques that moving air brings
-SAMPLED, WANDERING = 3.0, 2.0  # nats; nats a second: that torques with the memory of the lag, of the air must gain
-PASSES, CONVERGED = 8, 0.2  # passes, nats
-ENOUGH = 0.05  # nats: a round that gains less ends the fit
-NOTHING = 0.005  # nats: a step that promises less, a tenth of a standard deviation, is not taken
-TRIES = 6  # of a step, each a third of the one before
+ROUNDS = 6  # most rounds of Gauss-Newton
+WILD = 4.0  # mean square of the standardised innovations of a step, beyond which the step is left out
+REACH = 2.5  # standard deviations of its prior within which a nuisance stays
+TORQUES = np.full(3, 0.5)  # rad/s^2, start values of disturbing torques with memory
+WANDER = 0.5  # s, memory of torques by moving air
+SAMPLED, WANDERING = 3.0, 2.0  # nats; nats a second: least gain by torques with the memory of the lag; of the air
+PASSES, CONVERGED = 8, 0.2  # most passes; nats between two passes, below which they have converged
+ENOUGH = 0.05  # nats; a round that gains less ends the fit
+NOTHING = 0.005  # nats; a step with a smaller expected gain (a tenth of a standard deviation) is not taken
+TRIES = 6  # most trials of a step, each a third as long as the last
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class Fitted:
 
     Attributes:
         point: vehicle, effects and noise.
-        candidates: whose parameters are free.
-        loglik: of the flights fitted [nats].
-        gram: of the free columns at the maximum, nuisances last.
-        precision: (columns of `gram`,) of the priors; 0 for the candidates' own.
-        nuisances: what is free beside the candidates, in the order of the columns.
+        candidates: effects with free parameters.
+        loglik: log-likelihood of the fitted flights with the log prior of the nuisances [nats].
+        gram: score and information of the free columns at the maximum, nuisances last.
+        precision: (columns of `gram`,) precisions of the priors; 0 for the candidates.
+        nuisances: effects that are free beside the candidates, in the order of the columns.
     """
 
     point: Point
@@ -50,31 +50,31 @@ class Fitted:
 
 
 class DivergedError(DataError):
-    """A model under which the filter leaves the range of numbers: nothing can be fitted from there."""
+    """The filter leaves the range of numbers under a model: no fit can start from this model."""
 
 
 class Data:
-    """Flights to be explained together.
+    """Flights that are fitted together.
 
     Args:
-        workers: who shares the work; without, it is done in the calling thread.
+        workers: threads that share the work; None: the calling thread alone.
     """
 
     def __init__(self, flights: Sequence[Flight], workers: Workers | None = None) -> None:
         self.models = [Model(f) for f in flights]
         self.workers = workers or Workers(1)
         self.informed = Informed()
-        self.constrained: frozenset[str] = frozenset()  # effects that are not free here, though they usually are
-        self.own: Point | None = None  # of flights held out: their noise, and where what is free of them begins
+        self.constrained: frozenset[str] = frozenset()  # nuisances that are not free here
+        self.own: Point | None = None  # of held-out flights: their noise and the start values of their nuisances
 
     def constraining(self, effect: str) -> "Data":
-        """A twin in which an effect is as the vehicle file has it, though it is free usually."""
+        """A twin in which a nuisance keeps its value of the vehicle file."""
         twin = self.twin()
         twin.constrained = self.constrained | {effect}
         return twin
 
     def twin(self) -> "Data":
-        """The same flights, with the paths of the last pass: what is done to the twin leaves this one as it is."""
+        """An independent copy: the same flights with the paths of the last pass."""
         twin = Data((), self.workers)
         twin.models = [m.twin() for m in self.models]
         twin.informed = self.informed.copy()
@@ -82,7 +82,7 @@ class Data:
         return twin
 
     def together_with(self, other: "Data | None") -> "Data":
-        """A twin of these flights and of others, to be explained alike."""
+        """A twin of these flights and of others, for one fit."""
         both = self.twin()
         both.models += other.twin().models if other is not None else []
         return both
@@ -101,21 +101,21 @@ class Data:
 
     @property
     def signals(self) -> frozenset[str]:
-        """What all of them measure."""
+        """Signals that all flights measure."""
         return frozenset.intersection(*(f.signals for f in self.flights))
 
     @property
     def differ(self) -> bool:
-        """Whether each of them may have a thrust of its own."""
+        """Whether each flight has a thrust scale of its own."""
         return bool(self.models) and all(f.differs for f in self.flights)
 
     @property
     def coarse(self) -> bool:
-        """Whether in none of them what turned the drone is in the commands as recorded."""
+        """Whether in all flights the recorded commands do not explain the rotation (see `Flight.coarse`)."""
         return all(f.coarse for f in self.flights)
 
     def loglik(self, point: Point, passes: int = 1) -> float:
-        """Log-likelihood [nats]; a start is not counted."""
+        """Log-likelihood [nats]; rows at which the filter starts do not count."""
         return sum(self.workers.map(lambda m: m.sweep(point, passes=passes).loglik, self.models))
 
     def block_loglik(self, point: Point) -> NDArray:
@@ -123,15 +123,18 @@ class Data:
         return np.concatenate([np.bincount(m.flight.block, m.sweep(point).rows) for m in self.models])
 
     def recordings_of_blocks(self) -> NDArray:
-        """(b,) int: which flight each of those blocks is of."""
+        """(b,) int, the flight of each block of `block_loglik`."""
         return np.repeat(np.arange(len(self.models)), [m.flight.blocks for m in self.models])
 
     def settle(self, point: Point) -> list[Swept]:
-        """Physics evaluated at the filter's own states."""
+        """Evaluate the physics at the states of the filter."""
         return self.workers.map(lambda m: m.settle(point), self.models)
 
     def converge(self, point: Point) -> None:
-        """Pass until physics is evaluated where the filter is; where sensors show the state itself, one is enough."""
+        """Repeat passes until the physics is evaluated at the states of the filter.
+
+        Only with an effect that is `strongly_shown`; otherwise one pass is enough.
+        """
         if not any(strongly_shown(name, values) for name, values in point.effects.items()):
             return
         before = self.loglik(point)
@@ -142,7 +145,7 @@ class Data:
             before = now
 
     def fit_noise(self, point: Point, *, near: bool = False) -> Point:
-        """The same model with noise scales that fit; `near`: they begin near."""
+        """The model with fitted noise scales; `near`: the start values are near the maximum."""
         parts = []
         for model in self.models:
             acceleration, _ = model.accelerations(point)
@@ -151,9 +154,10 @@ class Data:
         return replace(point, noise=found)
 
     def leave_out_wild(self, point: Point) -> int:
-        """Begin anew where a step fits nothing (a stalled link, pulses of command between samples); returns how many.
+        """Restart the filter at outlying steps (a stalled link, pulses of command between samples); returns their
+        number.
 
-        One such step outweighs seconds of flight, and tells of no effect that acts at other times.
+        One such step outweighs seconds of flight, and says nothing of effects that act at other times.
         """
         count = 0
         for i, model in enumerate(self.models):
@@ -190,7 +194,7 @@ class Data:
 
 
 def strongly_shown(name: str, values: Mapping[str, Any]) -> bool:
-    """Whether an effect moves what sensors show so far from the state that one pass does not find it."""
+    """Whether an effect makes measurements differ so much from the state that one pass is not enough."""
     if name.startswith(OWN) or CATALOGUE[name].measured is None:
         return False
     slight = CATALOGUE[name].linear_range
@@ -199,7 +203,7 @@ def strongly_shown(name: str, values: Mapping[str, Any]) -> bool:
 
 
 def nominal(data: Data, point: Point) -> Point:
-    """The nominal model with noise scales fitted, torques with memory if the flights ask for them."""
+    """The nominal model with fitted noise scales, and with torques with memory where the likelihood gains by them."""
     data.settle(point)
     fitted = data.fit_noise(point)
     fitted = data.fit_noise(replace(fitted, noise=coloured(fitted.noise, data.flights)), near=True)
@@ -215,9 +219,9 @@ def nominal(data: Data, point: Point) -> Point:
 def remembering(data: Data, point: Point) -> Point:
     """The point with disturbing torques that have a memory, where the likelihood gains by them.
 
-    A command sampled at 100 Hz stands for the five or ten that the rotors got. What it misses acts through the rotors'
-    lag: torque noise with the memory of the lag. Taken for white it makes torques look too weak by some 10 % (errors in
-    the variables). Moving air brings torques of about half a second.
+    A command sampled at 100 Hz stands for five or ten commands that the rotors got. The commands between the samples
+    act through the rotor lag: they are torque noise with the memory of the lag. If this noise is modelled as white, the
+    torques look too weak by some 10 % (errors in variables). Moving air makes torques with a memory of about 0.5 s.
     """
     seconds = sum(f.duration for f in data.flights)
     lag = 0.0 if data.flights[0].inputs.measured else point.vehicle.motor_time_constant
@@ -235,7 +239,7 @@ def remembering(data: Data, point: Point) -> Point:
 
 
 def remembering_anew(data: Data, point: Point) -> Point:
-    """`remembering` for a model that has found an effect: what the effect did was noise until then."""
+    """`remembering` for a model with a newly found effect, whose torques were part of the noise."""
     if not point.noise.disturbance[3:].any():
         return remembering(data, point)
     forces = np.concatenate([point.noise.disturbance[:3], np.zeros(3)])
@@ -257,12 +261,12 @@ def bounds_of(candidates: Sequence[Candidate], point: Point) -> tuple[NDArray, N
 
 
 def freedom_of(candidates: Sequence[Candidate]) -> NDArray:
-    """Degrees of freedom of the prior of each free parameter; infinite: a normal one."""
+    """Degrees of freedom of the prior of each free parameter; infinite: a normal prior."""
     return np.array([c.freedom for c in candidates for _ in c.free])
 
 
 def log_prior(away: NDArray, precision: NDArray, freedom: NDArray) -> float:
-    """Logarithm of the priors' density over that of neutral: normal, or Student's t of that precision."""
+    """Log density of the priors, relative to neutral: normal, or Student's t with this precision."""
     square = precision * np.square(away)
     normal = np.isinf(freedom)
     nu = np.where(normal, 1.0, freedom)
@@ -270,9 +274,9 @@ def log_prior(away: NDArray, precision: NDArray, freedom: NDArray) -> float:
 
 
 def local_precision(away: NDArray, precision: NDArray, freedom: NDArray) -> NDArray:
-    """Precisions of the normal priors that touch the given ones from below where the parameters are.
+    """Precisions of normal priors that are tangent to the given priors, and below them, at the present parameters.
 
-    A step with these never lowers the posterior (Lange, Little and Taylor, 1989: EM for the t distribution).
+    A step with these precisions never lowers the posterior (Lange, Little and Taylor, 1989: EM for the t distribution).
     """
     normal = np.isinf(freedom)
     nu = np.where(normal, 1.0, freedom)
@@ -282,8 +286,8 @@ def local_precision(away: NDArray, precision: NDArray, freedom: NDArray) -> NDAr
 def held_near(
     low: NDArray, high: NDArray, away: NDArray, precision: NDArray, freedom: NDArray | None = None
 ) -> tuple[NDArray, NDArray]:
-    """Bounds of change, with what has a normal prior held within a few of its standard deviations: beyond, it is an
-    effect."""
+    """Bounds of change, where a parameter with a normal prior stays within `REACH` standard deviations: a larger
+    deviation is an effect, not a nuisance."""
     reach = np.where(precision > 0, REACH / np.sqrt(np.maximum(precision, 1e-300)), np.inf)
     if freedom is not None:
         reach = np.where(np.isinf(freedom), reach, np.inf)
@@ -313,9 +317,10 @@ def refine(
     rounds: int = ROUNDS,
     noise: bool = True,
 ) -> Fitted:
-    """Maximum of the posterior near `start`, in which the candidates' effects already stand.
+    """Maximum of the posterior near `start`, a model that contains the effects of the candidates.
 
-    `nuisances` are free too, with priors of these precisions about neutral or `about`: normal, or with `freedom`.
+    The `nuisances` are free, too. Their priors have the given precisions about neutral, or about the values in `about`;
+    they are normal, or Student's t (`Candidate.freedom`).
 
     Raises: DivergedError if the filter leaves the range of numbers at `start`.
     """
@@ -335,7 +340,7 @@ def refine(
         gram, loglik = data.gram_and_loglik(at, [column for c in free for column in c.columns(at)])
         return loglik + log_prior(away(at), weight, freedom), gram
 
-    data.loglik(point)  # physics is evaluated where the filter is
+    data.loglik(point)  # from here on, the physics is evaluated at the states of the filter
     with np.errstate(over="ignore", invalid="ignore"):
         value, gram = look(point)
     if not np.isfinite(value) or not np.isfinite(gram.information).all():
@@ -351,7 +356,7 @@ def refine(
             if found > value - 1e-6:
                 point, value, gram = there, found, slopes
                 break
-            if found > value - ENOUGH:  # nor would a smaller step gain more than what ends the fit
+            if found > value - ENOUGH:  # a smaller step would gain too little, too
                 break
         gained = value - before
         if noise and (turn < 1 or gained > 2.0):

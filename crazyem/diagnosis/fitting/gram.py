@@ -1,9 +1,9 @@
-"""Score and information of many columns, by blocks of flight: what any subset of them explains, fitted and held out.
+"""Score and information of many columns by blocks of flight, and the gain of any subset of columns.
 
-Around a model, the log-likelihood is b'd - d'A d/2 for small changes d of the parameters, with score b and information
-A summed over blocks of about a second. So one pass over the flight answers for every subset of columns. Innovations
-of real recordings are neither white nor Gaussian, so errors come from the scatter of the blocks' scores (the sandwich;
-White 1982), not from the information alone.
+Near a model, the log-likelihood changes by b'd - d'A d/2 for small changes d of the parameters, with score b and
+information A, summed over blocks of about a second. So one pass over the flight is enough for every subset of columns.
+Innovations of real recordings are neither white nor Gaussian. So errors come from the scatter of the scores of the
+blocks (the sandwich; White 1982), not from the information alone.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from scipy import stats
 
 FOLDS = 5
 CHUNK = 3  # blocks that stay together in a fold
-MANY = 5  # flights, from which on it is seen by how much they differ
+MANY = 5  # least number of flights from which a scatter between flights is computed
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,9 @@ class Solution:
         theta: (k,) change of the parameters.
         gain: log-likelihood gained [nats].
         held_out: the same on blocks that were not used for the fit, summed over folds [nats].
-        p_value: that all are 0, from the scatter of the blocks' scores.
-        covariance: (k, k), the larger of sandwich and inverse information on the diagonal's scale.
-        dispersion: by how much scores of the tested columns, the others profiled out, scatter more than the model says
-            (1: as it says), variance ratio.
+        p_value: of the test that all are 0, from the scatter of the scores of the blocks.
+        covariance: (k, k), the sandwich, scaled so that no variance is smaller than that of the inverse information.
+        dispersion: variance of the scores of the tested columns over that of the model, the other columns profiled out.
     """
 
     theta: NDArray
@@ -42,7 +41,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class Gram:
-    """score (b, c), information (b, c, c), by block; `flight` (b,): which flight a block belongs to."""
+    """Score (b, c) and information (b, c, c) by block; `flight` (b,): the flight of each block."""
 
     score: NDArray
     information: NDArray
@@ -50,7 +49,7 @@ class Gram:
 
     @property
     def size(self) -> int:
-        """How many columns."""
+        """Number of columns."""
         return self.score.shape[1]
 
     def fold_of(self) -> NDArray:
@@ -80,8 +79,8 @@ class Gram:
             columns: indices (k,).
             precision: (k,) of Gaussian priors around `prior` (default 0); 0: none.
             low, high: (k,) bounds of the change.
-            tested: which of the k (positions) the p-value is about; default all without prior.
-            effective: blocks are used up by what they determine, not by what priors do (`used`).
+            tested: positions (of the k) that the p-value tests; default all.
+            effective: degrees of freedom are those that the blocks determine (`used`), instead of k.
         """
         c = np.asarray(columns, int)
         k = c.size
@@ -106,19 +105,18 @@ class Gram:
         dispersion = self._dispersion(a, curvature, meat, which, len(scores))
         p_value = self._p_value(total, infos, curvature, meat, which, free, len(scores))
         if low is not None and high is not None and which.size < k:
-            # Whatever speaks against an effect's absence while the others are free speaks against it within bounds,
-            # too; beside others that a bound holds fast there may be more
+            # Evidence against the absence of an effect with free other columns counts within bounds, too. With other
+            # columns at their bounds there may be more evidence.
             rest, fast = _without_columns(curvature, total, low, high, which)
             if fast.any():
                 p_value = min(p_value, self._p_value(rest, infos, curvature, meat, which, fast, len(scores)))
         return Solution(theta, gain, held, p_value, covariance, dispersion)
 
     def by_flights(self, theta: NDArray, precision: NDArray) -> tuple[NDArray, int]:
-        """Standard deviations (c,) of all columns by how the flights' scores scatter, and its degrees of freedom.
+        """Standard deviations (c,) of all columns from the scatter of the scores of flights, and degrees of freedom.
 
-        What belongs to a flight (its clock, its battery, the air of the hour) is the same in all of its blocks, whose
-        scatter does not show it (the sandwich by clusters; Liang and Zeger, Biometrika 73, 1986). 0 for fewer flights
-        than `MANY`.
+        Some errors are the same in all blocks of a flight (clock, battery, air), so the scatter of blocks does not show
+        them (the sandwich by clusters; Liang and Zeger, Biometrika 73, 1986). 0 for fewer flights than `MANY`.
 
         Args:
             theta: (c,) change of the parameters to the maximum.
@@ -142,7 +140,7 @@ class Gram:
         blocks, k = residual.shape
         residual = residual - residual.mean(0)
         meat = residual.T @ residual * blocks / max(blocks - 1, 1)
-        # neighbours belong together: half of their covariance on each side (Newey and West 1987, one lag)
+        # neighbours are correlated: half of their covariance is added (Newey and West 1987, one lag)
         if blocks > 4:
             lagged = residual[1:].T @ residual[:-1]
             both = meat + 0.5 * (lagged + lagged.T)
@@ -157,12 +155,12 @@ class Gram:
 
     @staticmethod
     def _dispersion(a: NDArray, curvature: NDArray, meat: NDArray, which: NDArray, blocks: int) -> float:
-        """Median over the tested columns, the others profiled out, of the variance of scores over the model's."""
+        """Median over the tested columns of the variance of scores over that of the model, the others profiled out."""
         if which.size == 0:
             return 1.0
         project = _profiled(curvature, which, np.setdiff1d(np.arange(len(a)), which))
         by_scatter, by_model = (np.einsum("ij,jk,ik->i", project, m, project) for m in (meat, a))
-        # a column that the others explain has no scatter left, and says nothing
+        # a column that the others explain completely has no scatter
         left = by_model > 1e-9 * np.diag(a)[which]
         if not left.any():
             return 1.0
@@ -173,12 +171,12 @@ class Gram:
     def _p_value(
         total: NDArray, infos: NDArray, a: NDArray, meat: NDArray, which: NDArray, held_fast: NDArray, blocks: int
     ) -> float:
-        """Score test of the tested columns, the others profiled out, by the scatter of the blocks.
+        """Score test of the tested columns by the scatter of the blocks, the others profiled out.
 
-        `total` is taken where the others are without the tested, and counts what priors pull: where they hold the
-        others at the maximum, theirs is zero. Without it, what an effect has already bent of them would speak against
-        it. What bounds hold fast (k,) is not profiled out: it cannot give way, and a late input would be no more than
-        a lag that nobody admits.
+        `total` is the score with the gradient of the priors, at the model without the tested columns; at a maximum, it
+        is zero for the other columns. Without the priors, nuisances that have moved to explain a missing effect would
+        count against the effect. A column that is `held_fast` (k,) by a bound is not profiled out, because it cannot
+        move.
         """
         k = which.size
         if k == 0:
@@ -190,7 +188,7 @@ class Gram:
         plain = project @ infos.sum(0) @ project.T
         scale = np.sqrt(np.maximum(np.diag(plain), 1e-300))
         v, plain, b = v / np.outer(scale, scale), plain / np.outer(scale, scale), b / scale
-        # scores that scatter less than the model says are luck of few blocks
+        # scores that scatter less than by the model do so by chance, because blocks are few
         values, vectors = np.linalg.eigh(v)
         floor = np.maximum(values, np.einsum("ij,jk,ki->i", vectors.T, plain, vectors))
         t2 = float(np.sum((vectors.T @ b) ** 2 / np.maximum(floor, 1e-9)))
@@ -199,18 +197,18 @@ class Gram:
 
 
 def _inverse(curvature: NDArray) -> NDArray:
-    """Of a curvature (k, k) of columns of very different sizes."""
+    """Inverse of a curvature (k, k) of columns of very different sizes."""
     scale = np.sqrt(np.maximum(np.diag(curvature), 1e-300))
     inverse: NDArray = np.linalg.pinv(curvature / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
     return inverse
 
 
 def _profiled(a: NDArray, which: NDArray, others: NDArray) -> NDArray:
-    """(w, k) that takes scores (k,) to those of the tested columns with the others profiled out (efficient scores)."""
+    """Matrix (w, k) from scores (k,) to those of the tested columns, the others profiled out (efficient scores)."""
     project = np.zeros((which.size, a.shape[0]))
     project[np.arange(which.size), which] = 1.0
     if others.size:
-        own = np.diag(a)[others]  # a column that changes nothing has none
+        own = np.diag(a)[others]  # 0 for a column that changes nothing
         project[:, others] = -np.linalg.solve(
             a[np.ix_(others, others)] + np.diag(1e-12 * own + (own <= 0)), a[np.ix_(others, which)]
         ).T
@@ -218,7 +216,7 @@ def _profiled(a: NDArray, which: NDArray, others: NDArray) -> NDArray:
 
 
 def _without_columns(a: NDArray, b: NDArray, low: NDArray, high: NDArray, which: NDArray) -> tuple[NDArray, NDArray]:
-    """The score (k,) at the maximum within bounds without the columns `which`, and what bounds hold fast there (k,)."""
+    """The score (k,) at the maximum within bounds without the columns `which`; the other columns at a bound (k,)."""
     absent = np.isin(np.arange(b.size), which)
     low, high = np.where(absent, 0.0, low), np.where(absent, 0.0, high)
     without = bounded(a, b, low, high)
@@ -226,16 +224,16 @@ def _without_columns(a: NDArray, b: NDArray, low: NDArray, high: NDArray, which:
 
 
 def used(information: NDArray, posterior: NDArray) -> float:
-    """How many parameters the data determine: the trace of information over information with priors."""
+    """Number of parameters that the data determine: the trace of information over information with priors."""
     scale = np.sqrt(np.maximum(np.diag(posterior), 1e-300))
     both = [m / np.outer(scale, scale) for m in (information, posterior)]
     return float(np.trace(np.linalg.pinv(both[1], hermitian=True) @ both[0]))
 
 
 def bounded(a: NDArray, b: NDArray, low: NDArray | None, high: NDArray | None) -> NDArray:
-    """Maximum of b't - t'A t/2 within bounds: an active set that lets go again what it fixed too early.
+    """Maximum of b't - t'A t/2 within bounds, by an active set.
 
-    Nocedal and Wright, Numerical Optimization, 2nd ed., algorithm 16.3. Without bounds, one solution.
+    Nocedal and Wright, Numerical Optimization, 2nd ed., algorithm 16.3. Without bounds, one linear solution.
     """
     k = b.size
     if k == 0:
@@ -256,7 +254,7 @@ def bounded(a: NDArray, b: NDArray, low: NDArray | None, high: NDArray | None) -
         room = np.where(step > 0, high - t, low - t)
         share = np.divide(room, step, out=np.full(k, np.inf), where=step != 0)
         first = int(np.argmin(share))
-        if share[first] < 1.0:  # a bound is in the way: to it, and along it from there
+        if share[first] < 1.0:  # a step meets a bound: go to the bound, then along it
             inward[first] = -np.sign(step[first])
             t = np.clip(t + share[first] * step, low, high)
             t[first] = low[first] if inward[first] > 0 else high[first]
@@ -274,7 +272,7 @@ def bounded(a: NDArray, b: NDArray, low: NDArray | None, high: NDArray | None) -
 def neutral_gain(
     gram: Gram, order: Sequence[int], own: int, weights: NDArray, low: NDArray, high: NDArray, centre: NDArray
 ) -> tuple[float, float]:
-    """Gain, on all blocks and on those held out, where the last `own` columns are at none of their effect.
+    """Gain, on all blocks and on held-out blocks, with the last `own` columns fixed at neutral.
 
     weights, centre: of all columns; low, high: of the others.
     """

@@ -1,13 +1,13 @@
-"""The innovations of a flight under given accelerations, and what they say about any number of parameters at once.
+"""Innovations of a flight under given accelerations, with score and information of any number of columns.
 
-An extended Kalman filter on position, velocity, attitude, body rate and, where wanted, two disturbances with memory
-(specific force and angular acceleration, body axes) and errors of measurements with memory (Bryson and Henrikson 1968),
-all Ornstein-Uhlenbeck. Specific force and angular acceleration of
-each step are inputs, computed beforehand by `physics.motion` at the filter's own states: the kernel knows no parameter.
-It carries along the derivative of the state with respect to every column (a change of the accelerations, or of what
-the sensors show): the recursion of the innovations' sensitivities, with which the score and the information of all
-columns are sums over the innovations. Commands answer to what the drone did before, but an innovation does not know
-them in advance, so the closed loop brings no bias (Ljung, System Identification, ch. 7 and 13).
+The states of the extended Kalman filter are position, velocity, attitude and body rate. Optional states are two
+disturbances (specific force and angular acceleration, body axes) and errors of measurements (Bryson and Henrikson
+1968), all with memory (Ornstein-Uhlenbeck). Inputs are the specific force and angular acceleration of each step.
+`physics.motion` computes them beforehand at the states of the filter, so the kernel contains no parameter.
+
+A column is a change of the accelerations or of the measurements. The kernel propagates the derivative of the state by
+each column. So it knows the derivatives of the innovations; score and information are sums over innovations. Commands
+depend on earlier motion only. So the control loop causes no bias (Ljung, System Identification, ch. 7 and 13).
 """
 
 import numpy as np
@@ -16,25 +16,26 @@ from crazyem.compiled import compiled
 from crazyem.estimation.kernels.algebra import half_turn, log, matrix, product, right_jacobian
 from crazyem.vehicle import GRAVITY
 
-# Of the filter: position, velocity, attitude, body rate; then, where wanted, disturbing angular acceleration, then
-# disturbing specific force, then errors of measurements with memory. Torques with memory alone are what most flights
-# need, so they come first.
+# Most states of the filter: position, velocity, attitude, body rate; then optional ones: disturbing angular
+# acceleration, disturbing specific force, errors of measurements with memory. Torques come before forces, because most
+# flights need torques with memory alone.
 STATES = 30
-MEASURED = 12
+MEASURED = 12  # measured scalars
 DISTURBED = 6  # disturbances; they and the errors are the states with memory
-# Inner loops run over rows of a multiple of 4, of 16 at least: what a vector does not fill is done number by number,
-# and takes three times as long.
+# Rows of inner loops have a length that is a multiple of LANES, and at least LEAST. A rest that does not fill a vector
+# register would take three times as long.
 LANES, LEAST = 4, 16
-# Measurements whose products are added at once, by a product of matrices: few enough that BLAS does it in this thread.
+# Limits of the number of measurements whose products are added by one product of matrices; with more, BLAS would use
+# several threads.
 PRODUCT, MOST_ROWS = 200_000, 600
 
 
 @compiled
 def _transition(dt, pushed, decay, turned, rate_turn, middle, specific, jr, x, out):
-    """out = Phi x for x (size, m): error states of one step by the midpoint rule; `pushed`: 12, and how many of the
-    states after these are disturbances; decay: of all after the first 12.
+    """out = Phi x for x (size, m): error states of one step by the midpoint rule.
 
-    turned (3, 3): -dt middle skew(specific) of the attitude at the start; rate_turn (3, 3): its turn, transposed.
+    pushed: 12 plus the number of disturbance states; decay: factors of all states after the first 12; turned (3, 3):
+    -dt middle skew(specific), by the attitude at the start; rate_turn (3, 3): transposed rotation of the step.
     """
     h = 0.5 * dt
     size = x.shape[0]
@@ -77,8 +78,8 @@ def _transition(dt, pushed, decay, turned, rate_turn, middle, specific, jr, x, o
 
 @compiled
 def layout(disturbance):
-    """Which disturbance or error (0 to 17) each state after the first 12 is, in the filter's order, and which state is
-    the error of each measured scalar (12,); 0: it has none."""
+    """The disturbance or error (0 to 17) of each state after the first 12, in the order of the filter; and the index of
+    the error state of each measured scalar (12,), 0 for none."""
     which, own = np.zeros(18, np.int64), np.zeros(MEASURED, np.int64)
     count = 0
     force, torque = False, False
@@ -117,7 +118,7 @@ def _take_away(x, scale, left, right):
 
 @compiled
 def _padded(size):
-    """Numbers in a row that holds `size` of them."""
+    """Length of a row for `size` numbers (see `LANES`)."""
     return max(LEAST, (size + LANES - 1) // LANES * LANES)
 
 
@@ -133,31 +134,31 @@ def _add_products(shown, total):
 @compiled
 def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, disturbance, memory, p0, block,
           xp, xf, e, s, loglik, score, information, gains, steps, known):  # fmt: skip
-    """One pass; returns the log-likelihood.
+    """One pass of the filter; returns the log-likelihood.
 
     Args:
         time: (n,) s.
-        starts: (n,) bool, where the state begins anew at what is measured.
+        starts: (n,) bool, rows at which the state starts again from the measurements.
         y: (n, 13) position, velocity, attitude (x y z w), body rate; NaN where not measured.
         specific, angular: (n, 3) m/s^2, rad/s^2, body: means over the step that ends at each row.
-        offset: (n, 12) what the measurements show beyond the state (attitude: rotation vector on the right).
-        acting: (n, 6, c) derivative of the accelerations by the first c columns.
-        showing: (n, 12, d) derivative of the offset by the other d columns.
+        offset: (n, 12) difference of measurements from the state (attitude: rotation vector on the right).
+        acting: (n, 6, c) derivatives of the accelerations by the first c columns.
+        showing: (n, 12, d) derivatives of the offset by the other d columns.
         q: (6,) variances per second of specific-force and angular-acceleration impulses, body.
         r: (12,) variances of the measurements.
-        disturbance: (18,) stationary variances of what has a memory: specific force and angular acceleration (6),
-            errors of what is measured (12); 0 leaves them out.
+        disturbance: (18,) stationary variances of the states with memory: specific force and angular acceleration (6),
+            errors of measurements (12); 0 leaves a state out.
         memory: (18,) s, their correlation times.
-        p0: (12,) variances at a start of what is not measured there.
-        block: (n,) int, to which block of `score` and `information` a row adds.
+        p0: (12,) variances at a start of states that are not measured there.
+        block: (n,) int, the block of `score` and `information` of each row.
         xp, xf: (n, 31) receive predicted and filtered state (13), disturbances (6) and errors with memory (12).
         e, s: (n, 12) receive innovations and their variances, sequential scalars; s is 0 where nothing was measured.
         loglik: (n,) receives log-likelihoods.
-        score: (b, c + d) sums of derivative times innovation over variance are added here, by block.
-        information: (b, c + d, c + d) likewise, products of derivatives over variance.
-        gains, steps: (n, 12, size), (n, size + 6, size) receive the gain of each scalar, the transition of each step
-            and below that `middle` and `jr` in the first three columns, for `noise_score`; with 0 rows they do not.
-        known: (n, size - 12, size) receives the covariances of the states with memory, likewise.
+        score: (b, c + d) receives by block the sums of derivative times innovation over variance.
+        information: (b, c + d, c + d) receives by block the sums of products of derivatives over variance.
+        gains: (n, 12, size) receives the gain of each scalar, for `noise_score`; with 0 rows, nothing.
+        steps: (n, size + 6, size) likewise the transition of each step; its last six rows receive `middle` and `jr`.
+        known: (n, size - 12, size) likewise the covariances of the states with memory.
     """
     n = len(time)
     c, d = acting.shape[2], showing.shape[2]
@@ -176,7 +177,7 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
     new = np.empty((size, broad))
     z = np.zeros(broad)
     shown = np.empty((rows, broad))
-    seen, filled = 0, 0  # rows of `shown` in use, and the block they are of
+    seen, filled = 0, 0  # number of rows of `shown` in use, and their block
     quat = np.empty(4)
     turn = np.empty((3, 3))
     start = np.empty((3, 3))
@@ -217,7 +218,7 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
                     if measured:
                         x[column] -= offset[k, i]
                 cov[i, i] = r[i] if measured else p0[i]
-                if measured and own[i]:  # the state is what was measured, less an error that goes on
+                if measured and own[i]:  # the state is the measurement less an error with memory
                     cov[i, i] += disturbance[DISTURBED + i]
                     cov[i, own[i]] = -disturbance[DISTURBED + i]
                     cov[own[i], i] = -disturbance[DISTURBED + i]
@@ -262,13 +263,13 @@ def sweep(time, starts, y, specific, angular, offset, acting, showing, q, r, dis
             x[i] = 0.0
         for i in range(size - 12):
             x[13 + which[i]] = decay[i] * xf[k - 1, 13 + which[i]]
-        # how velocity turns with attitude (at the start) and with body rate (through the middle)
+        # derivative of velocity by attitude (at the start) and by body rate (through the middle)
         for i in range(3):
             m0, m1, m2 = middle[i, 0], middle[i, 1], middle[i, 2]
             by_rate[i, 0] = -dt * (m1 * f[2] - m2 * f[1])
             by_rate[i, 1] = -dt * (m2 * f[0] - m0 * f[2])
             by_rate[i, 2] = -dt * (m0 * f[1] - m1 * f[0])
-        for i in range(3):  # a turn at the start is turned on into the middle: -dt middle skew(f) turn'
+        for i in range(3):  # a rotation at the start, seen in the middle: -dt middle skew(f) turn'
             for j in range(3):
                 turned[i, j] = by_rate[i, 0] * turn[j, 0] + by_rate[i, 1] * turn[j, 1] + by_rate[i, 2] * turn[j, 2]
         matrix(quat, turn)

@@ -1,4 +1,4 @@
-"""A flight under a model: vehicle, effects, noise -> innovations, and their derivatives by any columns."""
+"""A flight under a model: innovations from vehicle, effects and noise, and their derivatives by any columns."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,10 +27,10 @@ from crazyem.physics.effects.effect import Effects, Situation
 from crazyem.physics.motion import measured, motion
 from crazyem.vehicle import Vehicle
 
-LATERAL = 0.05  # share of its accelerations from which a column's force along x and y counts in what a filter shows
-RECENT = 0.5  # s, over which what a model lacks is averaged: long enough that the noise of one sample is nothing
-# Prefix of what belongs to one recording and to no drone: "own:gyro_bias" -> {"FLIGHT/x": deviation}, added to what all
-# recordings share of that effect. Batteries and sensors are not the same on another day.
+LATERAL = 0.05  # least share of the force along x and y in a column, for which onboard estimates depend on the column
+RECENT = 0.5  # s, averaging time of the acceleration that a model lacks: much longer than a sample, to average noise
+# Prefix of the deviations of single recordings: "own:gyro_bias" -> {"FLIGHT/x": deviation}, added to the shared value
+# of the effect. Batteries and sensors change from day to day.
 OWN = "own:"
 
 
@@ -43,7 +43,7 @@ class Point:
     noise: Noise
 
     def with_effects(self, changes: Mapping[str, Mapping[str, Any]]) -> "Point":
-        """The same with some effects' parameters replaced."""
+        """The model with some parameters of effects replaced."""
         merged = {name: dict(values) for name, values in self.effects.items()}
         for name, values in changes.items():
             merged[name] = {**merged.get(name, {}), **values}
@@ -52,9 +52,10 @@ class Point:
 
 @dataclass(frozen=True)
 class Column:
-    """A direction in the space of models: effects displaced, against effects as they are, over the displacement.
+    """A direction in the space of models: the difference of the effects `plus` and `minus` over `width`.
 
-    `acting` and `showing` give derivatives that are no effect's: of the accelerations (n, 6), of what is shown (n, 12).
+    `minus` None: the effects of the model. Without `plus`, `acting` and `showing` are the derivatives themselves: of
+    the accelerations (n, 6) and of the offsets of measurements (n, 12).
     """
 
     name: str
@@ -66,8 +67,8 @@ class Column:
 
 
 def corrected(swept: Swept, flight: Flight) -> tuple[NDArray, NDArray, NDArray]:
-    """What a pass of the filter found beyond its model, step by step: changes (n, 6) of velocity m/s and body rate
-    rad/s, body axes; lengths (n,) of the steps [s]; which of them (n,) are known (0 where not)."""
+    """Corrections of a pass of the filter to its model by steps: changes (n, 6) of velocity [m/s] and body rate
+    [rad/s], body axes; lengths (n,) of the steps [s]; whether they are known (n,). Unknown ones are 0."""
     step = np.diff(flight.time, prepend=flight.time[0])
     known = (step > 0) & ~flight.starts
     impulse = np.zeros((step.size, 6))
@@ -76,15 +77,15 @@ def corrected(swept: Swept, flight: Flight) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def seen_force(acceleration: NDArray, impulse: NDArray, step: NDArray, known: NDArray) -> NDArray:
-    """(n, 3) m/s^2: specific force over each step by the model and what the filter found beside it (`corrected`); NaN:
-    not known."""
+    """(n, 3) m/s^2, specific force over each step: that of the model plus the correction of the filter (`corrected`);
+    NaN: not known."""
     with np.errstate(invalid="ignore", divide="ignore"):
         seen: NDArray = np.where(known[:, None], acceleration[:, :3] + impulse[:, :3] / step[:, None], np.nan)
     return seen
 
 
 def unrest(noise: Noise) -> NDArray:
-    """(3,) m/s^2 sqrt(s): intensity of the specific force that comes and goes, with a memory or without."""
+    """(3,) m/s^2 sqrt(s), intensity of the random specific force, white and with memory."""
     memory = np.broadcast_to(np.asarray(noise.memory, float), (6,))[:3]
     found: NDArray = np.sqrt(np.square(noise.impulse[:3]) + 2.0 * memory * np.square(noise.disturbance[:3]))
     return found
@@ -93,8 +94,8 @@ def unrest(noise: Noise) -> NDArray:
 def lacking(impulse: NDArray, step: NDArray, known: NDArray) -> NDArray:
     """(n, 6) specific force m/s^2 and angular acceleration rad/s^2, body axes, that a model lacks along a flight.
 
-    The mean over the last `RECENT` of the disturbances with a memory and of what measurements corrected (both in
-    `corrected`): what comes and goes faster is known to the filter too late, and would look like a gyro that is early.
+    The mean over the last `RECENT` of disturbances with memory and of corrections by measurements (both in
+    `corrected`). The filter sees faster changes too late; they would look like a gyro that is early.
     """
     forget = [1.0, -np.exp(-float(np.median(step[known])) / RECENT)] if known.any() else [1.0, 0.0]
     total, span = (lfilter([1.0], forget, v, axis=0) for v in (impulse, step[:, None]))
@@ -103,7 +104,7 @@ def lacking(impulse: NDArray, step: NDArray, known: NDArray) -> NDArray:
 
 
 def of_recording(effects: Effects, name: str) -> Effects:
-    """The effects as they act in the recording of that name: with its own deviations, where there are some."""
+    """The effects in the recording of that name: the shared values plus its own deviations."""
     own = [key for key in effects if key.startswith(OWN)]
     if not own:
         return effects
@@ -117,7 +118,7 @@ def of_recording(effects: Effects, name: str) -> Effects:
 
 
 def deviations(effects: Effects, effect: str) -> dict[str, dict[str, float]]:
-    """Name of the recording -> parameter -> how far it is there from what all recordings share of the effect."""
+    """Recording -> parameter -> deviation of this recording from the shared value of the effect."""
     found: dict[str, dict[str, float]] = {}
     for place, value in effects.get(OWN + effect, {}).items():
         recording, _, parameter = place.rpartition("/")
@@ -127,34 +128,34 @@ def deviations(effects: Effects, effect: str) -> dict[str, dict[str, float]]:
 
 @dataclass
 class Model:
-    """A flight under models near one another: remembers the path of the last pass, at which physics is evaluated."""
+    """A flight under similar models: it stores the path of the last pass, at which the physics is evaluated."""
 
     flight: Flight
     path: NDArray | None = None  # (n, 19) in the middle of each step
     shown: NDArray | None = None  # (n, 19) filtered, at the rows
-    moved: NDArray | None = None  # (n, 6) accelerations of that path, with what the model lacks
-    seen: NDArray | None = None  # (n, 3) specific force over each step of that path, as it was found to be
+    moved: NDArray | None = None  # (n, 6) accelerations along that path: of the model, plus `lacking`
+    seen: NDArray | None = None  # (n, 3) specific force over each step of that path (`seen_force`)
     _thrusts: dict[str, tuple[NDArray, NDArray]] = field(default_factory=dict)
     _there: Situation | None = None  # along the path
     _as_shown: Situation | None = None  # at the rows
-    _offsets: dict[str, NDArray] = field(default_factory=dict)  # of one effect each, there
-    _strays: dict[str, bool] = field(default_factory=dict)  # shared by twins: it is of the flight alone
+    _offsets: dict[str, NDArray] = field(default_factory=dict)  # of single effects, at `_as_shown`
+    _strays: dict[str, bool] = field(default_factory=dict)  # effect -> `diverges`; shared by twins
     _felt_alone: bool | None = None
     _vibration: NDArray | None = None
 
     def twin(self) -> "Model":
-        """A model that remembers the same; arrays are shared, as they are only ever replaced."""
+        """A copy with the same stored arrays; they are shared, because they are replaced and never changed."""
         return replace(self, _thrusts=dict(self._thrusts))
 
     def thrusts(self, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, NDArray]:
-        """Thrusts after the lag; remembered, since most columns change nothing before the rotors."""
+        """Thrusts after the lag; stored, because most columns do not change the inputs of the rotors."""
         effects = of_recording(effects, self.flight.name)
         before = {n: effects[n] for n in effects if _before_rotors(n)}
         key = f"{vehicle!r} {before!r}"
         found = self._thrusts.get(key)
         if found is None:
             found = thrust_of(self.flight, vehicle, before)
-            # another one, where columns are shared out: somebody may be looking at the old one
+            # a new dictionary, because other threads may read the old one
             self._thrusts = {**(self._thrusts if len(self._thrusts) <= 8 else {}), key: found}
         return found
 
@@ -166,23 +167,23 @@ class Model:
         if self._there is None:
             self._there = situation_of(self.flight, path, point.vehicle, thrusts)
         situation = with_rotors(self._there, point.vehicle, thrusts)
-        # where the path tells well enough, the drift of an attitude would be taken for a pull
+        # only if the effect diverges: in other flights the path is enough, and `seen` contains the drift of attitudes
         if self.seen is not None and any(_ties(name) and self.diverges(name, point.vehicle) for name in effects):
             situation = replace(situation, seen=self.seen, unrest=unrest(point.noise))
         moved = motion(situation, vehicle=point.vehicle, effects=effects)
         return np.concatenate([moved.specific_force, moved.angular_acceleration], axis=1), situation
 
     def diverges(self, name: str, vehicle: Vehicle) -> bool:
-        """Whether the flight drives what an effect does into chaos (`divergence.diverges`); remembered."""
+        """Whether the flight drives the state of an effect into chaos (`divergence.diverges`); stored."""
         if name not in self._strays:
             self._strays[name] = diverges(self.flight, vehicle, name)
         return self._strays[name]
 
     def offsets(self, point: Point, accelerations: NDArray, effects: Effects | None = None) -> NDArray:
-        """(n, 12) what the sensors show beyond the truth, evaluated at the filtered states.
+        """(n, 12) offsets of the measurements from the state, evaluated at the filtered states.
 
-        A lag shows by the accelerations that the drone has, not by those that a wrong model gives: a shifted centre of
-        mass of 0.7 mm is 10 rad/s^2, and 1 ms of that would be a gyro's bias of 10 mrad/s.
+        The offset of a lagging sensor follows from the true accelerations, not from those of a wrong model. A centre of
+        mass shifted by 0.7 mm makes 10 rad/s^2; with a lag of 1 ms this would be a gyro bias of 10 mrad/s.
         """
         effects = of_recording(point.effects if effects is None else effects, self.flight.name)
         showing = [name for name in CATALOGUE if name in effects and _shows(name)]
@@ -192,7 +193,7 @@ class Model:
         situation = self._situation_shown(point, accelerations)
         for name in showing:
             only = {name: effects[name]}
-            if CATALOGUE[name].uses_force:  # it goes by what those before it show
+            if CATALOGUE[name].uses_force:  # it depends on the offsets of the effects before it
                 turned = replace(situation, tilt=offset[:, 6:9])
                 offset = offset + measured(turned, vehicle=point.vehicle, effects=only).state
                 continue
@@ -203,7 +204,7 @@ class Model:
         return offset
 
     def _situation_shown(self, point: Point, accelerations: NDArray) -> Situation:
-        """The situation at the rows; remembered, once a pass has told the accelerations that the drone has."""
+        """The situation at the rows; stored after the first pass, which estimates the true accelerations."""
         if self._as_shown is not None and self.moved is not None:
             return self._as_shown
         path = initial_path(self.flight) if self.shown is None else self.shown
@@ -219,13 +220,13 @@ class Model:
     def sweep(
         self, point: Point, columns: Sequence[Column] = (), *, passes: int = 1, workers: Workers | None = None
     ) -> Swept:
-        """Filter the flight; with columns, score and information by block. Later passes evaluate physics anew."""
+        """Filter the flight; with columns, score and information by block. Each pass evaluates the physics again."""
         for _ in range(max(1, passes) - 1):
             self._once(point, ())
         return self._once(point, columns, workers)
 
     def settle(self, point: Point, passes: int = 2) -> Swept:
-        """Passes without columns until physics is evaluated where the filter is."""
+        """Passes without columns, after which the physics is evaluated at the states of the filter."""
         return self.sweep(point, passes=passes)
 
     def _once(self, point: Point, columns: Sequence[Column], workers: Workers | None = None) -> Swept:
@@ -240,7 +241,7 @@ class Model:
             swept = _in_order(swept, order)
         self._there = self._as_shown = None
         self._offsets = {}
-        if not np.isfinite(swept.filtered).all():  # a model that left the range of numbers must not spoil the next one
+        if not np.isfinite(swept.filtered).all():  # the next model must not start from such states
             self.path = self.shown = self.moved = self.seen = None
             return swept
         self.path = causal_middle(swept.filtered, swept.predicted, flight.starts)
@@ -256,7 +257,7 @@ class Model:
         return self._felt_alone
 
     def _with_specific_force(self, swept: Swept, acceleration: NDArray, acting: NDArray) -> Swept:
-        """With the accelerometer's evidence added, where nothing else shows forces."""
+        """The pass with the evidence of the accelerometer (`specific_force.py`) added."""
         if self._vibration is None:
             self._vibration = specific_force.vibration(self.flight, acceleration[:, :3])
         bias = np.append(np.nanmedian(self.flight.force[:, :2] - acceleration[:, :2], axis=0), 0.0)
@@ -276,10 +277,11 @@ class Model:
         offset: NDArray,
         workers: Workers,
     ) -> tuple[NDArray, NDArray, NDArray | None]:
-        """Derivatives of accelerations (n, 6, c) and offsets (n, 12, d), and where each column went (None: no columns).
+        """Derivatives of accelerations (n, 6, c) and of offsets (n, 12, d), and the places (2, columns) of each column
+        among these derivatives: of accelerations, of offsets (None: no columns).
 
-        A column changes accelerations, what is shown, both, or nothing here: what belongs to another recording. Where
-        it went are two rows: places among all derivatives, -1 for none.
+        A column changes accelerations, offsets or both. A column of another recording changes nothing. A place of -1
+        means no change.
         """
         n = self.flight.time.size
         if not columns:
@@ -298,7 +300,7 @@ class Model:
         return np.ascontiguousarray(stack[0]), np.ascontiguousarray(stack[1]), order
 
     def slopes(self, point: Point, columns: Sequence[Column], workers: Workers) -> list[Column]:
-        """The columns with their derivatives at a point, to be used near it."""
+        """The columns with fixed derivatives at a point, to be used near this point."""
         acceleration, _ = self.accelerations(point)
         offset = self.offsets(point, acceleration)
         found = workers.map(lambda c: self._derivative(point, c, acceleration, offset), columns)
@@ -307,7 +309,7 @@ class Model:
     def _derivative(
         self, point: Point, column: Column, acceleration: NDArray, offset: NDArray
     ) -> tuple[NDArray | None, NDArray | None]:
-        """What a column changes: accelerations (n, 6), what is shown (n, 12); None: nothing."""
+        """Derivatives of accelerations (n, 6) and of offsets (n, 12) by a column; None: 0."""
         if column.plus is None:
             return column.acting, column.showing
         here = of_recording(point.effects, self.flight.name)
@@ -328,7 +330,7 @@ class Model:
         return d_acting, d_showing
 
     def _shown_by(self, point: Point, change: NDArray, acceleration: NDArray) -> NDArray | None:
-        """(n, 12) what a change of accelerations (n, 6) changes in what is shown, where that goes by forces."""
+        """(n, 12) change of the offsets by a change of accelerations (n, 6), through the force; None: 0."""
         if not self.flight.fused or np.linalg.norm(change[:, :2]) < LATERAL * np.linalg.norm(change):
             return None
         here = of_recording(point.effects, self.flight.name)
@@ -343,10 +345,11 @@ class Model:
 
 
 def relaxed(filtered: NDArray, before: NDArray | None, offset: NDArray) -> NDArray:
-    """(n, 19) states at which what sensors show is evaluated next, by those of this pass and of the one before.
+    """(n, 19) states for the next offsets of measurements, from the states of this pass and of the last one.
 
-    A velocity that is shown s times too large is taken off by the velocity of the pass before, so errors of that come
-    back -(s - 1) times as large: passes went to and fro without end from s = 1.8 on. Of each change 1/s is taken.
+    If a measured velocity is s times too large, the offset follows from the velocity of the last pass. An error of this
+    velocity returns -(s - 1) times as large, so passes do not converge from s = 1.8 on. Therefore only 1/s of each
+    change is taken.
     """
     if before is None or not offset[:, 3:6].any():
         return filtered
@@ -358,9 +361,9 @@ def relaxed(filtered: NDArray, before: NDArray | None, offset: NDArray) -> NDArr
 
 
 def _in_order(swept: Swept, order: NDArray) -> Swept:
-    """The pass with its columns put where they were asked for: the sums of two derivatives; -1: a column of zeros.
+    """The pass with score and information in the order of the columns; a column is the sum of its two derivatives.
 
-    order: (2, columns) places among the derivatives.
+    order: (2, columns) places among the derivatives; -1: a derivative of zeros.
     """
     score, information = (np.pad(v, [(0, 0)] + [(0, 1)] * (v.ndim - 1)) for v in (swept.score, swept.information))
     first, more = np.where(order[0] >= 0, order[0], order[1]), np.flatnonzero((order >= 0).all(axis=0))

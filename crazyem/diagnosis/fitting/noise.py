@@ -1,9 +1,8 @@
 """Noise scales of a model: Fisher scoring on the innovations of the flight.
 
 The score is exact (`noise_score.py`). The information is sum 1/2 (ds/s)^2 + de^2/s, with de, ds by differences
-(Cavanaugh and Shumway 1996, for a Gaussian innovations form). It costs a pass of the filter for each scale, so it is
-made once, and what steps tell of the curvature is added to it (BFGS; Nocedal and Wright, Numerical Optimization,
-ch. 6).
+(Cavanaugh and Shumway 1996, for a Gaussian innovations form). It costs a pass of the filter for each scale. So it is
+computed once, and each step updates it (BFGS; Nocedal and Wright, Numerical Optimization, ch. 6).
 """
 
 from collections.abc import Sequence
@@ -16,19 +15,19 @@ from crazyem.diagnosis.fitting.sweeps import Noise, Swept, run_sweep, scored_swe
 from crazyem.diagnosis.flights.flight import Flight
 from crazyem.diagnosis.workers import Workers
 
-ROWS = 1500  # of each flight, in a few stretches, from which the scales are taken
-STRETCH = 750  # rows each: short ones begin too often at what was measured, and velocities seem better than they are
-FEW, SHORT = 900, 150  # the same for the way there
-PRIOR_SD = 2.0  # of the logarithm of a scale about its typical value
+ROWS = 1500  # rows of each flight, in a few stretches, for the fit of the scales
+STRETCH = 750  # rows of a stretch; with many short ones, the filter starts often and velocities seem too accurate
+FEW, SHORT = 900, 150  # the same for the first, rough fit
+PRIOR_SD = 2.0  # standard deviation of the logarithm of a scale about its typical value
 MOST_STEPS = 40
-FIRST = (0, 3, 6, 10)  # columns of `Flight.y` at which position, velocity, attitude and body rate begin
-STEP = 0.02  # in the logarithm, for differences
-LARGEST = 1.5  # step of scoring in the logarithm
-# s: correlation times of errors. Fixes draw an onboard estimate back within some 0.04 s; markers and calibrations of
-# motion capture stay wrong for longer; a gyro is low-passed at 80 Hz.
+FIRST = (0, 3, 6, 10)  # first columns of position, velocity, attitude and body rate in `Flight.y`
+STEP = 0.02  # of the logarithm, for differences
+LARGEST = 1.5  # largest step of the logarithm in scoring
+# s, typical correlation times of errors. Position fixes correct an onboard estimate within some 0.04 s. Markers and
+# calibration of motion capture are wrong for longer. The gyro has a low pass of 80 Hz.
 RECALL, RECALL_SD = np.array([0.06, 0.06, 0.06, 2.5e-3]), np.array([1.0, 1.0, 1.0, 0.3])  # sd: of the logarithm
-SHORT_MEMORY = 3.0  # correlation times between two samples, from which an error is white
-SLIGHT = 0.6  # share of the white error's root density below which that of one with a memory is left out
+SHORT_MEMORY = 3.0  # sampling period in correlation times, from which an error is white
+SLIGHT = 0.6  # least root spectral density of an error with memory, over that of the white error
 TYPICAL = Noise(
     np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), np.array([1e-3, 1e-2, 3e-3, 1e-2]),
     np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]), coloured=np.array([1e-3, 1e-2, 3e-3, 1e-2]), recall=RECALL,
@@ -38,8 +37,8 @@ LEAST = Noise(
     np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3]), coloured=np.array([1e-5, 1e-4, 1e-4, 1e-4]), recall=0.2 * RECALL,
 )  # fmt: skip
 WIDTH = np.append(np.full(20, PRIOR_SD), RECALL_SD)  # standard deviations of the logarithms about typical ones
-# rad: no attitude made from an acceleration is better; in quiet flights 4 to 5 mrad. Believed to 0.5 mrad, every tremor
-# of the acceleration is a torque, and a steady one (a weak rotor) is lost among these.
+# rad, least error of an attitude that is inferred from an acceleration; quiet flights have 4 to 5 mrad. With 0.5 mrad,
+# noise of the acceleration would look like torques, and would hide a steady torque (a weak rotor).
 LEANING_FLOOR = 3e-3
 
 
@@ -57,10 +56,11 @@ def noise_of(logs: NDArray, memory: float | NDArray) -> Noise:
 
 
 def coloured(noise: Noise, flights: Sequence[Flight]) -> Noise:
-    """The noise with as much coloured as white error of what the flights measure often enough for that to show.
+    """The noise with as much coloured as white error, for quantities that are sampled fast enough to show it.
 
-    Not of position and velocity together: they come from a filter whose errors in the two belong together and to the
-    motion, and what are errors of their own looks like a velocity of another scale.
+    If both position and velocity are measured, neither gets a coloured error. They come from one filter, whose errors
+    in the two are correlated with each other and with the motion; independent errors would look like a wrong scale of
+    the velocity.
     """
     periods = np.array([_period(flights, c) for c in FIRST])
     lasting = periods < SHORT_MEMORY * RECALL
@@ -69,20 +69,20 @@ def coloured(noise: Noise, flights: Sequence[Flight]) -> Noise:
 
 
 def without_slight(noise: Noise, flights: Sequence[Flight]) -> Noise:
-    """The noise without coloured errors that are as good as none at any frequency: each makes every pass longer."""
+    """The noise without coloured errors that are negligible at all frequencies: each costs time in every pass."""
     periods = np.array([_period(flights, c) for c in FIRST])
     density = noise.coloured * np.sqrt(1.0 + 2.0 * noise.recall / periods)
     return replace(noise, coloured=np.where(density < SLIGHT * noise.measurement, 0.0, noise.coloured))
 
 
 def _period(flights: Sequence[Flight], column: int) -> float:
-    """s between two measurements, the shortest of the flights'; infinite where there are none."""
+    """Shortest sampling period [s] of a column among the flights; infinite without measurements."""
     times = [f.time[np.isfinite(f.y[:, column])] for f in flights]
     return min((float(np.median(np.diff(t))) for t in times if t.size > 1), default=np.inf)
 
 
 def sample_rows(flight: Flight, *, rows: int = ROWS, stretch: int = STRETCH) -> NDArray:
-    """(n,) bool: stretches spread over the flight, that the noise is taken from."""
+    """(n,) bool: stretches spread over the flight, for the fit of the noise."""
     n = flight.time.size
     if n <= rows:
         return np.ones(n, bool)
@@ -93,18 +93,18 @@ def sample_rows(flight: Flight, *, rows: int = ROWS, stretch: int = STRETCH) -> 
 
 
 def first_guess() -> Noise:
-    """Where scoring begins."""
+    """Start values of scoring."""
     return Noise(np.array([0.3, 0.3, 0.5, 5.0, 5.0, 5.0]), np.array([3e-3, 3e-2, 1e-2, 3e-2]))
 
 
 @dataclass
 class Informed:
-    """What is known of the curvature (k, k) by the noise scales, by flights and free scales."""
+    """Known curvatures (k, k) by the noise scales, for sets of flights and of free scales."""
 
     known: dict[tuple[object, ...], NDArray] = field(default_factory=dict)
 
     def copy(self) -> "Informed":
-        """One that learns by itself from here on."""
+        """An independent copy."""
         return Informed(dict(self.known))
 
 
@@ -120,10 +120,10 @@ def fit_noise(
     workers: Workers | None = None,
     informed: Informed | None = None,
 ) -> Noise:
-    """Noise scales of highest posterior density, the accelerations (n, 6) and offsets (n, 12) of each flight given.
+    """Noise scales of highest posterior density, for given accelerations (n, 6) and offsets (n, 12) of each flight.
 
-    Scales of quantities that nothing measures stay. Disturbances are fitted where they start above 0. Unless the
-    start is near, most of the way is gone on few rows.
+    Scales of quantities that are not measured stay. Disturbances are fitted where they start above 0. Unless the start
+    is `near`, a rough fit to few rows comes first.
     """
     workers, informed = workers or Workers(1), informed or Informed()
     if not near and any(f.time.size > FEW for f, _, _ in parts):
@@ -185,7 +185,7 @@ def _scored(chosen: list[Part], start: Noise, tolerance: float, workers: Workers
 
 
 def _learnt(curvature: NDArray, way: NDArray, change: NDArray) -> NDArray:
-    """The curvature (k, k) with what a step tells of it: along `way` (k,) the score fell by `change` (k,)."""
+    """The curvature (k, k) after a BFGS update: along the step `way` (k,), the score fell by `change` (k,)."""
     along, before = float(way @ change), curvature @ way
     if along <= 1e-3 * float(way @ before):
         return curvature
@@ -195,7 +195,7 @@ def _learnt(curvature: NDArray, way: NDArray, change: NDArray) -> NDArray:
 def _information(
     chosen: list[Part], here: list[Swept], logs: NDArray, memory: float | NDArray, index: NDArray, workers: Workers
 ) -> NDArray:
-    """About the scales `index` (k,) of all flights together: (k, k), by differences from the passes `here`."""
+    """Information (k, k) of the scales `index` (k,) from all flights, by differences from the passes `here`."""
 
     def sweep(at: NDArray) -> list[Swept]:
         noise = noise_of(at, memory)

@@ -1,9 +1,10 @@
-"""The exact score of the noise variances: one pass backwards over what the filter kept.
+"""The exact score of the noise variances: one backward pass over the arrays that the filter stored.
 
-With u = e/s - K'r and D = 1/s + K'NK of a scalar innovation, r and N go backwards by r + H'u and by
-(I - KH)'N(I - KH) + H'H/s, over a step by Phi'r and Phi'N Phi. The derivative of the log-likelihood by a variance of
-measurement is the sum of (u^2 - D)/2, and by one of the process the sum of tr((rr' - N) dQ)/2 (Koopman and Shephard,
-Biometrika 79, 1992). It costs what two passes of the filter cost, for any number of variances.
+For a scalar innovation e of variance s and gain K, let u = e/s - K'r and D = 1/s + K'NK. Backwards over a measurement,
+r becomes r + H'u and N becomes (I - KH)'N(I - KH) + H'H/s. Over a step they become Phi'r and Phi'N Phi. The derivative
+of the log-likelihood by a measurement variance is the sum of (u^2 - D)/2; by a process variance, the sum of
+tr((rr' - N) dQ)/2 (Koopman and Shephard, Biometrika 79, 1992). For any number of variances, the cost is that of two
+passes of the filter.
 """
 
 import numpy as np
@@ -14,13 +15,13 @@ from crazyem.diagnosis.fitting.kernel import DISTURBED, layout
 
 @compiled
 def noise_score(time, starts, measured, disturbance, memory, xf, e, s, gains, steps, known, out):
-    """Adds the derivatives of the log-likelihood by q (6,), r (12,), disturbance (18,) and the logarithms of memory
+    """Add the derivatives of the log-likelihood by q (6,), r (12,), disturbance (18,) and the logarithms of memory
     (18,) of `kernel.sweep` to out (54,).
 
     A memory m is in the transition phi = exp(-dt/m) of its own state and in the noise (1 - phi^2) of the step. The
-    derivative by phi is r x' - N Phi P, x and P of the state before the step given all and given its past.
+    derivative by phi is r x' - N Phi P. There x is the smoothed state before the step, and P its filtered covariance.
 
-    measured: (n, 12) bool, what was measured at each row; xf, e, s, gains, steps, known: as `sweep` gives them.
+    measured: (n, 12) bool, whether a scalar was measured at a row; xf, e, s, gains, steps, known: outputs of `sweep`.
     """
     which, own = layout(disturbance)
     size = gains.shape[2]
@@ -48,7 +49,7 @@ def noise_score(time, starts, measured, disturbance, memory, xf, e, s, gains, st
                 total[i, j] -= product[j]
                 total[j, i] -= product[j]
             total[i, i] += d
-            if o:  # the error is measured with the state
+            if o:  # the measurement is the state plus this error
                 r[o] += u
                 for j in range(size):
                     total[o, j] -= product[j]
@@ -99,7 +100,7 @@ def noise_score(time, starts, measured, disturbance, memory, xf, e, s, gains, st
         for i in range(size - 12):
             a = 12 + i
             decay = np.exp(-dt / memory[which[i]])
-            before, spread = xf[k - 1, 13 + which[i]], 0.0  # of the state before the step, given all; of N Phi P
+            before, spread = xf[k - 1, 13 + which[i]], 0.0  # smoothed state before the step; N Phi P
             for j in range(size):
                 before += known[k - 1, i, j] * back[j]
                 spread += turned[a, j] * known[k - 1, i, j]

@@ -1,4 +1,4 @@
-"""What a vehicle file never says exactly, and is therefore always free, with priors; fits that leave it free."""
+"""Nuisances: parameters that no vehicle file gives exactly, so they are always free, with priors; fits with them."""
 
 import math
 from collections.abc import Sequence
@@ -20,10 +20,10 @@ from crazyem.physics.effects.prior import Prior
 from crazyem.physics.effects.timing import MOTOR_LAG
 from crazyem.vehicle import Vehicle
 
-# s: fits find the rotors' lag off all the same: in sixteen more flights with nothing hidden 47 to 55 ms, 3.1 ms (rms),
-# with inertias 3 % too small for each ms too long where the drone turns little.
+# s, rms error of a fitted rotor lag, of sixteen flights without a missing effect (47 to 55 ms fitted). Where the drone
+# turns little, each ms too much makes the inertias 3 % too small.
 LAG_OFF = 3e-3
-SEVERAL = 3  # recordings whose commands are known, from which on each has a thrust of its own
+SEVERAL = 3  # least number of recordings with known commands for which each gets a thrust scale of its own
 COARSE_REASON = "the turning does not follow the commands as they were recorded: they are on another clock"
 TRIM_REASON = "a shifted centre of mass is a trim, and that changes from day to day"
 LEVEL_REASON = "no battery voltage is recorded, so how heavy or strong the drone is cannot be told"
@@ -31,7 +31,10 @@ Nuisances = list[tuple[Candidate, tuple[float, ...]]]  # with the precision of e
 
 
 def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisances:
-    """What is always free, with the precisions of its priors about neutral: the usual deviations of every effect."""
+    """The nuisances with the precisions of their priors about neutral: the usual deviations of every effect.
+
+    Effects that are accepted or constrained are left out.
+    """
     facts = conditions_of(data.flights, point)
     taken = {c.effect for c in accepted} | data.constrained
     found: Nuisances = []
@@ -54,9 +57,10 @@ def nuisances(data: Data, point: Point, accepted: Sequence[Candidate]) -> Nuisan
 
 
 def differing(flights: Sequence[Flight], kept_apart: Sequence[Flight], vehicle: Vehicle) -> list[list[Flight]]:
-    """The flights, each with a thrust of its own where there are several: see `SEVERAL`.
+    """The flights, each with a thrust scale of its own if there are enough of them (`SEVERAL`).
 
-    A trim has one already, and so has a voltage that was taken from the flight's own beginning (`level.py`).
+    A vehicle file with a trim already has such a free thrust. So does a voltage from the start of the flight
+    (`level.py`).
     """
     commanded = not any(f.inputs.measured or f.levelled for f in (*flights, *kept_apart))
     own = len(flights) >= SEVERAL and commanded and TRIM not in vehicle.effects
@@ -64,11 +68,11 @@ def differing(flights: Sequence[Flight], kept_apart: Sequence[Flight], vehicle: 
 
 
 def unlike_a_body(point: Point, accepted: Sequence[Candidate]) -> bool:
-    """Whether the inertia, the lack of torque or the damping that was found is more than a drone of this mass and size
-    can have.
+    """Whether an inertia, a lack of torque or a damping in the model is larger than a drone of this mass and size can
+    have.
 
-    Streams that were put onto another clock by straight lines do not look white any more. Their torques explain so
-    little of the turning that what is found in its place says nothing of the drone.
+    Streams that were interpolated onto another clock do not look white. Their torques explain little of the rotation,
+    and effects that explain the rest say nothing about the drone.
     """
     tests = [(CATALOGUE[c.effect].unphysical, c.values(point)) for c in accepted]
     return any(point.vehicle.arm) and any(test(values, point.vehicle) for test, values in tests if test)
@@ -77,7 +81,7 @@ def unlike_a_body(point: Point, accepted: Sequence[Candidate]) -> bool:
 def abstained(
     data: Data, point: Point, candidates: Sequence[Candidate], left_out: dict[str, str]
 ) -> tuple[list[Candidate], dict[str, str]]:
-    """The candidates without those that such recordings cannot speak of, and the reasons with theirs."""
+    """The candidates without those that such recordings cannot show, and `left_out` with the reasons of these."""
     gone = {}
     if TRIM in point.vehicle.effects:
         gone = {c.effect: TRIM_REASON for c in candidates if _only_shifts(CATALOGUE[c.effect])}
@@ -90,27 +94,27 @@ def abstained(
 
 
 def _only_shifts(effect: Effect) -> bool:
-    """Whether an effect moves the centre of mass and weighs nothing."""
+    """Whether an effect moves the centre of mass and does not change the mass."""
     return effect.shifts_centre and not effect.lifts
 
 
 def _turns(effect: Effect) -> bool:
-    """Whether only torques tell of an effect: how thrust goes with the command, and how late, shows in forces, too."""
+    """Whether only torques show an effect. The curve of thrust over command and its delay show in forces, too."""
     before_rotors = effect.commanded is not None or effect.timing is not None
     return effect.steady_torque or (effect.needs_torques and not before_rotors)
 
 
 def _without_height(candidate: Candidate) -> tuple[str, ...]:
-    """What is fitted of a candidate whose height shows in torques that go with lateral acceleration, not in its
-    weight."""
+    """The free parameters of a candidate without the height of a centre of mass, which shows in torques alone."""
     return tuple(n for n in candidate.free if not CATALOGUE[candidate.effect].shifts_centre or n != "z")
 
 
 def with_trim_noise(data: Data, point: Point) -> Point:
-    """The point with the noise of a drone whose trim is unknown: what is steady must not pass for noise.
+    """The point with noise that was fitted with a free trim, so that a steady torque is not fitted as noise.
 
-    A weak rotor is a steady torque many times that of a day's trim. Before it is found, noise scales would grow until
-    it is noise, and then nothing asks for it any more. For a vehicle file with a trim only.
+    The steady torque of a weak rotor is many times the trim of a day. Without the effect in the model, the noise scales
+    would grow until they explain this torque, and the effect would not be significant. For a vehicle file with a trim
+    only.
     """
     if TRIM not in point.vehicle.effects:
         return point
@@ -118,7 +122,7 @@ def with_trim_noise(data: Data, point: Point) -> Point:
     rest = [(c, p) for c, p in nuisances(data, point, free)]
     start = with_nuisances(point, [*rest, *((c, ()) for c in free)])
     found = start
-    for _ in range(2):  # the first time the noise still holds what is steady
+    for _ in range(2):  # in the first turn, the noise still explains steady torques
         found = refine(data, found, free, nuisances=rest, rounds=4).point
         white = replace(found.noise, disturbance=np.concatenate([found.noise.disturbance[:3], np.zeros(3)]))
         found = remembering(data, data.fit_noise(replace(found, noise=white)))
@@ -126,11 +130,11 @@ def with_trim_noise(data: Data, point: Point) -> Point:
 
 
 def solved(fitted: Fitted, *, wide: bool = False) -> tuple[Solution, float]:
-    """The free parameters at the maximum with their covariance, and how many degrees of freedom they take.
+    """The free parameters at the maximum with their covariance, and the degrees of freedom that they use.
 
-    Some 15 things are always free, with a trim in the file 20, nearly as many as a flight of 20 s has blocks; most of
-    them are what their priors say, and take none. `wide` for intervals: all take one (but with a trim, where too few
-    would be left), because what priors leave out is more than scatter shows.
+    There are some 15 nuisances, with a trim in the file 20: nearly as many as blocks in a flight of 20 s. The priors
+    determine most of them, so these use no degree of freedom. `wide`, for intervals: each uses one, because the scatter
+    shows less error than there is. With a trim, too few would remain, and `wide` changes nothing.
     """
     gram, precision = fitted.gram, fitted.precision
     if wide and TRIM not in fitted.point.vehicle.effects:
@@ -141,10 +145,10 @@ def solved(fitted: Fitted, *, wide: bool = False) -> tuple[Solution, float]:
 
 
 def by_gain(point: Point, gain: float, count: int, blocks: int, p_value: float) -> float:
-    """The p-value of `count` parameters; with a trim in the file by `gain`, nats over their own dispersion.
+    """The p-value of `count` parameters; with a trim in the file, from `gain`, nats over their own dispersion.
 
-    Some 20 things are free then, more than a short flight has blocks, so the scatter of the blocks' scores says nothing
-    of what is left of a column once they are taken out.
+    With a trim there are some 20 nuisances, more than blocks in a short flight. Then the scatter of the scores of
+    blocks, with the nuisances profiled out, says nothing.
     """
     if TRIM not in point.vehicle.effects:
         return p_value
@@ -152,12 +156,12 @@ def by_gain(point: Point, gain: float, count: int, blocks: int, p_value: float) 
 
 
 def usual_named(candidate: Candidate) -> bool:
-    """Whether an effect that is free beside all others is a finding all the same, where it explains more than none."""
+    """Whether an effect can be a finding although it is a nuisance."""
     return candidate.effect in CATALOGUE and CATALOGUE[candidate.effect].prior.usual_named
 
 
 def without(point: Point, effect: str) -> Point:
-    """The point with an effect as the vehicle file has it, which is nothing for most."""
+    """The point with the effect at its values of the vehicle file; most files do not have it."""
     rest = {n: v for n, v in point.effects.items() if n != effect}
     if effect in point.vehicle.effects:
         rest[effect] = dict(point.vehicle.effects[effect])
@@ -165,9 +169,9 @@ def without(point: Point, effect: str) -> Point:
 
 
 def systematic_sd(data: Data, point: Point) -> dict[tuple[str, str], float]:
-    """(effect, parameter) -> standard deviation within which it is never known, whatever a fit says.
+    """(effect, parameter) -> least standard deviation of the parameter, which no fit can reduce.
 
-    That of what is always free, and of what the same log shows in another way.
+    It is that of the prior of a nuisance, or a systematic or relative error of the effect (`Prior`).
     """
     free = {
         (c.effect, name): precision**-0.5
@@ -185,8 +189,10 @@ def systematic_sd(data: Data, point: Point) -> dict[tuple[str, str], float]:
 
 
 def by_a_wrong_lag(data: Data, fitted: Fitted) -> dict[tuple[str, str], float]:
-    """(effect, parameter) of what turns the drone -> how far it is off where the rotors' lag is off by `LAG_OFF`; where
-    the lag is free beside them, but no finding."""
+    """(effect, parameter) -> error that an error `LAG_OFF` of the rotor lag causes.
+
+    For effects with twins (`Effect.twins`), if the lag is a nuisance.
+    """
     rest = [c for c, _ in nuisances(data, fitted.point, fitted.candidates)]
     own = [(c.effect, name) for c in fitted.candidates for name in c.free]
     free = [(c.effect, name) for c in rest for name in c.free]
@@ -195,7 +201,7 @@ def by_a_wrong_lag(data: Data, fitted: Fitted) -> dict[tuple[str, str], float]:
         return {}
     at = names.index(lag)
     low, high = bounds_of([*fitted.candidates, *rest], fitted.point)
-    others = [i for i in range(len(names)) if i != at and low[i] < 0.0 < high[i]]  # what is at a bound stays there
+    others = [i for i in range(len(names)) if i != at and low[i] < 0.0 < high[i]]  # parameters at a bound stay there
     a = fitted.gram.total(range(len(names)))[1] + np.diag(fitted.precision)
     scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
     along = np.linalg.lstsq((a / np.outer(scale, scale))[np.ix_(others, others)], a[others, at] / scale[others])[0]
@@ -204,7 +210,7 @@ def by_a_wrong_lag(data: Data, fitted: Fitted) -> dict[tuple[str, str], float]:
 
 
 def with_nuisances(point: Point, free: Nuisances) -> Point:
-    """The point with all of them present, so that derivatives are taken at it."""
+    """The point with all nuisances present, so that their derivatives are taken at the point."""
     for c, _ in free:
         if c.effect not in point.effects:
             point = point.with_effects({c.effect: c.neutral(point)})
@@ -212,11 +218,11 @@ def with_nuisances(point: Point, free: Nuisances) -> Point:
 
 
 def on_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate], *, noise: bool = False) -> Fitted:
-    """The model on flights kept apart: effects as they are, what is always free belongs to each flight, and so do noise
-    scales where these are known (`as_held_out`), or are fitted with `noise`.
+    """The model on held-out flights: with its effects, and with nuisances fitted to these flights.
 
-    Where an effect is of a kind that is always free, it is so about what was found: otherwise inertias as fitted would
-    be compared with torques that come with inertias to each flight's liking.
+    The noise scales are those of `held_out.own` (`as_held_out`), if known; with `noise`, they are fitted. An accepted
+    effect that is also a nuisance is free about its fitted value. Otherwise a model with fixed inertias would be
+    compared with a torque scale beside free inertias.
     """
     free = nuisances(held_out, point, ())
     found = {c.effect for c in accepted}
@@ -229,11 +235,12 @@ def on_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate], *, 
 
 
 def as_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate]) -> Data:
-    """A twin of flights kept apart that knows its noise scales and what is free of it by this model.
+    """A twin of held-out flights with its own noise scales and nuisances, fitted under this model.
 
-    Noise belongs to a recording: slow and fast flights differ by thousands of nats in it. Models that are compared
-    begin where one of them ended, or maxima beside each other differ by ten. With a trim in the file noise stays that
-    of the flights fitted: what is steady would pass for a torque with memory.
+    Noise belongs to a recording: between slow and fast flights, it makes thousands of nats. All models that are
+    compared start from the same fit; otherwise they end at different local maxima, which differ by ten nats. With a
+    trim in the file, the noise is that of the fitted flights, so that a steady torque does not become torque noise with
+    memory.
     """
     twin = held_out.twin()
     twin.own = None
@@ -244,8 +251,10 @@ def as_held_out(held_out: Data, point: Point, accepted: Sequence[Candidate]) -> 
 
 
 def _let_go(point: Point, accepted: Sequence[Candidate], free: Nuisances) -> Point:
-    """The point with what is free no longer (see `nuisances`) as the vehicle file has it, instead of where it was left:
-    nobody is told of it, and a torque scale of 0.925 that stayed made a centre of mass 8 % too small."""
+    """The point with effects that are not free in this model (`Prior.conditional`) reset to the vehicle file.
+
+    Otherwise a value of an earlier fit would stay in the model unreported, and would bias other effects.
+    """
     kept = {c.effect for c in (*accepted, *(c for c, _ in free))}
     for name, effect in CATALOGUE.items():
         point = without(point, name) if effect.prior.conditional and name not in kept else point
@@ -255,7 +264,7 @@ def _let_go(point: Point, accepted: Sequence[Candidate], free: Nuisances) -> Poi
 def refine_base(
     data: Data, point: Point, accepted: Sequence[Candidate], *, rounds: int = 5, noise: bool = True
 ) -> Fitted:
-    """`refine` with what is always free; with a trim, noise scales stay as they are (see `with_trim_noise`)."""
+    """`refine` with the nuisances; with a trim, the noise scales stay (see `with_trim_noise`)."""
     noise = noise and TRIM not in point.vehicle.effects
     free = nuisances(data, point, accepted)
     point = _let_go(point, accepted, free)
@@ -263,15 +272,15 @@ def refine_base(
 
 
 def refine_anew(data: Data, point: Point, accepted: Sequence[Candidate], *, rounds: int = 5) -> Fitted:
-    """`refine_base`, then once more with the memory of the disturbing torques chosen again; the better of both.
+    """`refine_base`, then again with a new choice of the memory of disturbing torques; the better of both.
 
-    Whether torques have a memory was told by a model that lacked what is found, and what is always free: of one flight
-    the nominal model gained 58 nats by a second look, which a torque scale got for itself before.
+    The memory was chosen under a model without the effects and nuisances. If it is wrong, an effect such as a torque
+    scale gets the gain that belongs to the noise (58 nats in a flight).
     """
     once = refine_base(data, point, accepted, rounds=rounds)
     try:
         again = refine_base(data, remembering_anew(data, once.point), accepted, rounds=rounds)
-    except DivergedError:  # a second look that leads nowhere takes nothing away
+    except DivergedError:  # then the first fit stays
         again = once
     if again.loglik > once.loglik:
         return again

@@ -1,4 +1,4 @@
-"""Commands that are faster than their sampling, as those of real drones that shake are, and what follows."""
+"""Commands that are faster than their sampling: those of real drones that shake, and the error that they cause."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,13 +14,13 @@ from crazyem.physics.effects.timing import LOOP
 from crazyem.physics.rotors import wrench
 from crazyem.vehicle import Vehicle
 
-# Commands of a loop at 500 Hz that answer to vibration, logged at 100 Hz, are nearly white: most of what is logged acts
-# for 2 ms only, and what acts was not logged. The effect `sampled_commands` models what is white; this is an error in
-# the input all the same, under which a fit makes the drone look heavy and damped.
-# Share of the power of roll and pitch torques above half of the Nyquist frequency (white: a half), of real drones:
-COARSE = 0.2  # flights of the simulated firmware have up to 0.12, real ones and those of RotorPy more
-NEGLIGIBLE = 1e-3  # relative error of torques: a tenth of what is not known of inertias (`mass_properties._moments`)
-EDGE, SLOW = 0.5, 1.0  # s left out at either end; Hz below which torques say nothing of sampling
+# A loop at 500 Hz answers to vibration. Its commands, logged at 100 Hz, are nearly white: a logged command acts for
+# 2 ms only, and most commands are not logged. The effect `sampled_commands` models the white part. The rest is an error
+# in the input, by which a fit makes the drone look heavy and damped.
+# Least share of power above half of the Nyquist frequency, of roll and pitch torques of real drones (white: 0.5):
+COARSE = 0.2  # flights of the simulated firmware have up to 0.12; real flights and those of RotorPy have more
+NEGLIGIBLE = 1e-3  # relative error of torques: a tenth of the uncertainty of inertias (`mass_properties._moments`)
+EDGE, SLOW = 0.5, 1.0  # s left out at both ends; Hz, lower frequencies of torques are left out
 
 
 def shaken_commands(flights: Sequence[Flight], vehicle: Vehicle) -> bool:
@@ -30,11 +30,11 @@ def shaken_commands(flights: Sequence[Flight], vehicle: Vehicle) -> bool:
 
 
 def unlogged_share(flights: Sequence[Flight], vehicle: Vehicle) -> float:
-    """0 to 1: by how much commands that were sent between the logged ones may falsify torques, relative; 0 if slight.
+    """Relative error of torques (0 to 1) that commands between the logged ones may cause; 0 if negligible.
 
-    White commands have half of their power above half of the Nyquist frequency, so twice the fast share is the white
-    part. All but one in period / `LOOP` of it was never logged. An error in the input biases a fit by its power times
-    the weight that the fit gives to that power (Fuller, Measurement Error Models, 1987, 1.1), hence the square.
+    White commands have half of their power above half of the Nyquist frequency. So the white part is twice the fast
+    share. Only one in period / `LOOP` of these commands is logged. An error in the input biases a fit by its power
+    times the weight of this power in the fit (Fuller, Measurement Error Models, 1987, 1.1), hence the square.
     """
     shares = [0.0]
     for flight in flights:
@@ -45,16 +45,16 @@ def unlogged_share(flights: Sequence[Flight], vehicle: Vehicle) -> float:
 
 
 def interval(flight: Flight) -> float:
-    """s between commands that the model uses: a step from sample to sample knows those before it (`physics/lag.py`)."""
+    """Seconds between commands that the model uses: the longer interval of commands and of rows (`physics/lag.py`)."""
     return float(max(np.median(np.diff(flight.inputs.time)), np.median(np.diff(flight.time))))
 
 
 def of_a_real_drone(flights: Sequence[Flight], vehicle: Vehicle) -> Vehicle:
-    """The vehicle with a trim of nothing, if its file has none, its commands shake as a real drone's do, and they hold
-    a steady torque.
+    """The vehicle with a trim of 0, if its file has no trim, its commands shake like those of a real drone, and they
+    have a steady torque.
 
-    Such commands tell little but what is steady. Where that was not free within what differs from drone to drone and
-    from day to day, it was called a weak rotor, a load or a wind.
+    Such commands show little but their mean. The trim lets this mean differ as it does from drone to drone and from
+    day to day. Otherwise the mean looks like a weak rotor, a load or a wind.
     """
     if TRIM in vehicle.effects or not shaken_commands(flights, vehicle):
         return vehicle
@@ -64,14 +64,14 @@ def of_a_real_drone(flights: Sequence[Flight], vehicle: Vehicle) -> Vehicle:
 
 
 def held(flight: Flight, vehicle: Vehicle) -> NDArray:
-    """(3,) torque of the commands over their thrust in the air [m], body axes, on average: less a drone's trim."""
+    """(3,) mean torque of the commands in the air over their mean thrust [m], body axes; it balances the trim."""
     inside = (flight.inputs.time > flight.time[0]) & (flight.inputs.time < flight.time[-1])
     mean = wrench(flight.inputs.thrust[inside], arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust).mean(0)
     return mean[1:] / mean[0] if mean[0] > 0 else np.zeros(3)
 
 
 def fast_share(flight: Flight, vehicle: Vehicle) -> float:
-    """Share of the power of the commanded roll and pitch torques above half of the Nyquist frequency, the larger."""
+    """The larger share of power above half of the Nyquist frequency, of the commanded roll and pitch torques."""
     return _fast_share(flight, vehicle.arm, vehicle.torque_per_thrust)
 
 

@@ -1,5 +1,5 @@
-"""Where physics is evaluated along a flight: path of the drone, thrusts of its rotors, situation at each row; and what
-a pass of the filter says of it: states in the middle of steps, what measurements brought."""
+"""States at which the physics is evaluated along a flight: path, thrusts of the rotors, situation at each row; and
+results of a pass of the filter: states in the middle of steps, corrections by measurements."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from crazyem.vehicle import GRAVITY, Vehicle
 
 
 def initial_path(flight: Flight) -> NDArray:
-    """(n, 19) states to begin with: what was measured, interpolated where it was not."""
+    """(n, 19) start states: the measurements, interpolated between."""
     path = np.zeros((flight.time.size, 19))
     path[:, 9] = 1.0
     for c in range(13):
@@ -30,7 +30,7 @@ def initial_path(flight: Flight) -> NDArray:
 
 
 def thrust_of(flight: Flight, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, NDArray]:
-    """Mean thrust of each rotor over the steps, and its rate: (n, 4) N, (n, 4) N/s."""
+    """Mean thrust of each rotor over the steps and its derivative: (n, 4) N, (n, 4) N/s."""
     return rotor_thrust(
         flight.inputs, flight.time, vehicle=vehicle, effects=effects, breaks=np.flatnonzero(flight.gaps).tolist()
     )
@@ -85,7 +85,7 @@ def _chained(turns, out):
 
 
 def with_rotors(situation: Situation, vehicle: Vehicle, thrusts: tuple[NDArray, NDArray]) -> Situation:
-    """The situation with other rotors' thrusts, and rates of them."""
+    """The situation with other thrusts of the rotors and their derivatives."""
     thrust, rate = thrusts
     return replace(situation, thrust=thrust, thrust_rate=rate, rotor_constant=_rotor_constant(vehicle))
 
@@ -95,7 +95,8 @@ def _rotor_constant(vehicle: Vehicle) -> float:
 
 
 def causal_middle(filtered: NDArray, predicted: NDArray, starts: NDArray) -> NDArray:
-    """(n, 19) states in the middle of each step: filtered at its begin, predicted to its end."""
+    """(n, 19) states in the middle of each step: the mean of the filtered state at its start and the predicted one at
+    its end."""
     middle = predicted.copy()
     _middle(filtered, predicted, starts, middle)
     return middle
@@ -103,7 +104,7 @@ def causal_middle(filtered: NDArray, predicted: NDArray, starts: NDArray) -> NDA
 
 @compiled
 def _middle(filtered, predicted, starts, middle):
-    """Rows of `causal_middle` that are no start, into middle (n, 19)."""
+    """Write the rows of `causal_middle` that are no start into middle (n, 19)."""
     for k in range(1, len(predicted)):
         if starts[k]:
             continue
@@ -125,8 +126,8 @@ def _middle(filtered, predicted, starts, middle):
 
 @compiled
 def impulses(predicted, filtered, step, known, out):
-    """What measurements and disturbances with a memory brought in each step that is known: (n, 6) changes of velocity
-    [m/s] and body rate [rad/s], body axes, into out; the others are left as they are.
+    """Write into out (n, 6) the changes of velocity [m/s] and body rate [rad/s], body axes, in each known step by
+    measurements and disturbances with memory; the other rows stay.
 
     predicted, filtered: (n, 19) states at the end of the steps; step: (n,) s; known: (n,) bool.
     """

@@ -1,10 +1,9 @@
-"""The accelerometer as evidence, for flights on which nothing else shows a force: no position and no velocity.
+"""The accelerometer as evidence, for flights without a measured position or velocity.
 
-The filter does not use the accelerometer, whose low pass and vibration are part of no model. Where position or
-velocity is measured that costs nothing. Where they are not (a log of gyro, accelerometer and commands), thrust over
-mass, lag and sag show in the specific force alone. It is then compared with the model's, row by row, with a constant
-bias by axis and vibration as white noise; rows are many and vibration is not white, which the scatter of the blocks
-allows for.
+The filter does not use the accelerometer, because no model contains its low pass and vibration. With a measured
+position or velocity nothing is lost. Without (a log of gyro, accelerometer and commands), only the specific force shows
+thrust over mass, lag and sag. Then each row is compared with the model, with a constant bias by axis and with vibration
+as white noise. Vibration is not really white; the scatter of the blocks allows for this.
 """
 
 import numpy as np
@@ -12,9 +11,9 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.flight import Flight
 
-SMOOTH = 0.2  # s: slower than this is motion, faster is vibration
-LEAST = 0.05  # m/s^2: vibration and resolution of an accelerometer on a flying drone are never less
-WILD = 6.0  # standard deviations
+SMOOTH = 0.2  # s; slower changes are motion, faster ones vibration
+LEAST = 0.05  # m/s^2, least vibration and resolution of an accelerometer on a flying drone
+WILD = 6.0  # standard deviations at which residuals are clipped
 
 
 def is_needed(flight: Flight) -> bool:
@@ -24,7 +23,7 @@ def is_needed(flight: Flight) -> bool:
 
 
 def vibration(flight: Flight, model: NDArray) -> NDArray:
-    """(3,) standard deviation [m/s^2] of what is faster than motion, from the difference to a model (n, 3)."""
+    """(3,) standard deviation [m/s^2] of the vibration, from the difference to a model (n, 3)."""
     period = float(np.median(np.diff(flight.time)))
     width = max(3, round(SMOOTH / period))
     kernel = np.ones(width) / width
@@ -42,7 +41,7 @@ def evidence(
         flight: with a force (n, 3).
         model: (n, 3) specific force over the steps that end at the rows [m/s^2].
         acting: (n, 3, c) its derivatives by the columns.
-        noise: (3,) m/s^2.
+        noise: (3,) m/s^2, standard deviation of the vibration.
         bias: (3,) m/s^2 of the sensor.
     """
     measured = np.full_like(flight.force, np.nan)  # mean over the step, as the model has it

@@ -1,4 +1,4 @@
-"""A pass of the filter over a flight: its noise, what it finds, and the score of the noise."""
+"""A pass of the filter over a flight: its noise, its results, and the score of the noise."""
 
 from dataclasses import dataclass, field
 
@@ -9,7 +9,7 @@ from crazyem.diagnosis.fitting.kernel import layout, sweep
 from crazyem.diagnosis.fitting.noise_score import noise_score
 from crazyem.diagnosis.flights.flight import Flight
 
-WIDE = np.array([1.0] * 3 + [2.0] * 3 + [0.5] * 3 + [3.0] * 3) ** 2  # variances at a start of what is not measured
+WIDE = np.array([1.0] * 3 + [2.0] * 3 + [0.5] * 3 + [3.0] * 3) ** 2  # variances at a start of unmeasured states
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Noise:
 
     @property
     def remembered(self) -> tuple[NDArray, NDArray]:
-        """(18,) variances and (18,) correlation times [s] of all that has a memory: disturbances, errors."""
+        """(18,) variances and (18,) correlation times [s] of disturbances (6) and errors (12) with memory."""
         memory = np.broadcast_to(np.asarray(self.memory, float), (6,))
         errors = np.repeat(np.square(self.coloured), 3), np.repeat(self.recall, 3)
         return np.concatenate([np.square(self.disturbance), errors[0]]), np.concatenate([memory, errors[1]])
@@ -42,11 +42,11 @@ class Noise:
 
 @dataclass(frozen=True)
 class Swept:
-    """What one pass over a flight found.
+    """Results of one pass over a flight.
 
     Attributes:
-        loglik: of the whole flight [nats].
-        rows: (n,) by row.
+        loglik: log-likelihood of the whole flight [nats].
+        rows: (n,) log-likelihood by row.
         predicted, filtered: (n, 19) states.
         innovation, variance: (n, 12), sequential scalars; variance 0 where nothing was measured.
         score: (b, c) by block; information: (b, c, c) by block. Empty without columns.
@@ -65,9 +65,9 @@ class Swept:
 def run_sweep(
     flight: Flight, acceleration: NDArray, offset: NDArray, acting: NDArray, showing: NDArray, noise: Noise
 ) -> Swept:
-    """The kernel with its arrays made; a log-likelihood of -inf where a variance is not one.
+    """A pass of the kernel; the log-likelihood is -inf if a variance is negative or NaN.
 
-    Noise scales so far apart that the covariance lost its sign seem likely without end, and fits ran away to them.
+    Noise scales of very different size make the covariance indefinite by rounding; their likelihood would be too large.
     """
     return _run(flight, acceleration, offset, acting, showing, noise, _kept(0, 12))[0]
 
@@ -99,7 +99,7 @@ def _threes(values: NDArray) -> NDArray:
 
 
 def _kept(n: int, size: int) -> tuple[NDArray, NDArray, NDArray]:
-    """What the kernel keeps for the score of the noise: gains, steps, covariances of what has a memory."""
+    """Arrays that the kernel fills for the score of the noise: gains, steps, covariances of states with memory."""
     return np.zeros((n, 12, size)), np.zeros((n, size + 6, size)), np.zeros((n, size - 12, size))
 
 
@@ -107,7 +107,7 @@ def _run(
     flight: Flight, acceleration: NDArray, offset: NDArray, acting: NDArray, showing: NDArray, noise: Noise,
     kept: tuple[NDArray, NDArray, NDArray],
 ) -> tuple[Swept, NDArray]:  # fmt: skip
-    """The pass, and all states (n, 31) of it."""
+    """The pass and its states (n, 31)."""
     n, m = flight.time.size, acting.shape[2] + showing.shape[2]
     predicted, filtered = np.zeros((n, 31)), np.zeros((n, 31))
     innovation, variance, rows = np.zeros((n, 12)), np.zeros((n, 12)), np.zeros(n)
