@@ -1,1 +1,1 @@
-"""Where a flight parts from a model: which force, torque or sensor, when, and in which regime."""
+"""Differences of a flight from a model: which force, torque or sensor, when, and in which regime."""

@@ -1,9 +1,9 @@
-"""A heading that depends on place: a magnet under the floor, a marker set that bends. Attitude against gyro, no model.
+"""A heading error that depends on place (a magnet under the floor, bent markers), from attitude and gyro, no model.
 
-Between two samples the attitude turns by what the gyro shows. What it turns beyond that, and beyond what a biased,
-late, scaled or tilted gyro makes, is asked whether it goes with the change of place: with a heading too large by
-psi(x, y, z), a sum of waves along each axis, the turn about the vertical is too large by the difference of psi. A
-filter takes such an attitude for a noisy gyro, and finds nothing.
+Between two samples, the attitude should turn by the integral of the gyro. The difference is regressed on errors of a
+biased, late, scaled or tilted gyro, and on the change of place. With a heading error psi(x, y, z), a sum of waves along
+each axis, the rotation about the vertical is wrong by the difference of psi. The filter of the fit explains such an
+attitude by a noisy gyro, so it does not find the error.
 """
 
 from dataclasses import dataclass
@@ -21,27 +21,28 @@ from crazyem.physics.rotations import (
     rotation_vector_from_quaternion,
 )
 
-WINDOW = 0.05  # s, between the attitudes that are compared
-NATS, HELD = 15.0, 5.0  # that it must gain on the flights fitted, and on those held out; healthy flights: 5 at most
-SHARE = 0.1  # of that gain, that other flights must be expected to show before they are asked
-SMALLEST = 5e-3  # rad, standard deviation along the flight
-FEWEST = 100  # windows
-WAVES = (4.0, 2.0, 1.3, 1.0, 0.8)  # m, wavelengths: bounded where the other flight goes further
+WINDOW = 0.05  # s between the attitudes that are compared
+NATS, HELD = 15.0, 5.0  # nats; least gain on fitted and on held-out flights; healthy flights gain 5 at most
+SHARE = 0.1  # least expected gain on other flights, over the gain on the first, for which the other flights count
+SMALLEST = 5e-3  # rad, least standard deviation of the error along the flight
+FEWEST = 100  # least number of windows
+WAVES = (4.0, 2.0, 1.3, 1.0, 0.8)  # m, wavelengths; waves stay bounded where the other flight goes further
 DRAWN = 1e-2  # ridge, relative
 
 
 @dataclass(frozen=True)
 class _Turns:
-    turned: NDArray  # (n,) rad about the vertical, beyond the gyro's
-    usual: NDArray  # (n, 8) what sensors make
-    after: NDArray  # (n, 3) m, place at the end of a window,
-    place: NDArray  # (n, 3) m, at its begin
+    turned: NDArray  # (n,) rad, rotation about the vertical less that of the gyro
+    usual: NDArray  # (n, 8) regressors of usual sensor errors
+    after: NDArray  # (n, 3) m, place at the end of a window
+    place: NDArray  # (n, 3) m, place at its start
 
 
 def heading_by_place(data: Data, apart: Data | None) -> Finding | None:
-    """The error of the heading as a finding, where it depends on place on all flights alike; None if not.
+    """The heading error as a finding, if it depends on place in the same way on all flights; else None.
 
-    Nothing of it is fitted to be kept, so flights held out may show it, too: where those fitted hover, they do not.
+    The roles of fitted and held-out flights may be exchanged, because the model does not keep this fit: fitted flights
+    that hover do not show the error.
     """
     if not {"position", "attitude", "body_rate"} <= data.signals:
         return None
@@ -54,20 +55,20 @@ def heading_by_place(data: Data, apart: Data | None) -> Finding | None:
 
 
 def _seen(data: Data) -> _Turns | None:
-    """Turns of all flights; None where none has any."""
+    """The windows of all flights; None if there are none."""
     turns = [t for t in (_turns(f) for f in data.flights) if t is not None]
     return _Turns(*(np.concatenate([getattr(t, n) for t in turns]) for n in _Turns.__annotations__)) if turns else None
 
 
 def _finding(every: _Turns, other: _Turns | None, data: Data) -> Finding | None:
-    """What flights show, where others do as well; where there are none or they hardly move, every other second of
-    those that show it."""
+    """The finding of some flights, if other flights confirm it. Without others, or if they hardly move, it is fitted to
+    every other second and confirmed by the rest."""
     middle = np.median(every.place, axis=0)
     shapes = _shapes(every, middle)
     theta = _ridge_fit(shapes, every)
     gained = _nats(shapes, every, theta) - _used(_without(every.usual, shapes))
     asked = None if other is None else _shapes(other, middle)
-    # a hover has biases of its own, by which it speaks against a tenth of what a flight shows that goes somewhere
+    # a hover has its own biases, which may cost a tenth of the gain of a moving flight
     if other is not None and asked is not None and _expected(asked, other, theta) > max(2 * HELD, SHARE * gained):
         held = _nats(asked, other, theta)
     else:
@@ -86,7 +87,7 @@ def _finding(every: _Turns, other: _Turns | None, data: Data) -> Finding | None:
 
 
 def _turns(flight: Flight) -> _Turns | None:
-    """Turns over windows of a flight; None where too few are whole."""
+    """The windows of a flight; None if too few are without gaps."""
     known = np.isfinite(flight.y[:, [0, 6, 10]]).all(axis=1)
     rows = np.flatnonzero(known)
     if rows.size < FEWEST:
@@ -111,7 +112,7 @@ def _turns(flight: Flight) -> _Turns | None:
 
 
 def _waves(place: NDArray) -> NDArray:
-    """(n, 30): sines and cosines of x, y, z, wave by wave."""
+    """(n, 30): sines and cosines of x, y, z, by waves."""
     angle = [2 * np.pi / wave * place for wave in WAVES]
     return np.hstack([f(x) for x in angle for f in (np.sin, np.cos)])
 
@@ -126,11 +127,11 @@ def _without(usual: NDArray, columns: NDArray) -> NDArray:
 
 
 def _ridge(x: NDArray) -> NDArray:
-    return x.T @ x + (DRAWN * np.trace(x.T @ x) / x.shape[1] + 1e-12) * np.eye(x.shape[1])  # where nothing moves, too
+    return x.T @ x + (DRAWN * np.trace(x.T @ x) / x.shape[1] + 1e-12) * np.eye(x.shape[1])  # regular without motion
 
 
 def _used(x: NDArray) -> float:
-    """How many terms the windows determine."""
+    """Number of terms that the windows determine."""
     return float(np.trace(np.linalg.solve(_ridge(x), x.T @ x)))
 
 
@@ -140,12 +141,12 @@ def _ridge_fit(shapes: NDArray, turns: _Turns) -> NDArray:
 
 
 def _nats(shapes: NDArray, turns: _Turns, theta: NDArray) -> float:
-    """Log-likelihood that the terms gain, for windows whose errors are independent and of one unknown size."""
+    """Gain of log-likelihood by the terms, for windows with independent errors of one unknown size."""
     x, y = _without(turns.usual, shapes), _without(turns.usual, turns.turned[:, None])[:, 0]
     return 0.5 * y.size * float(np.log(np.sum(y**2) / max(np.sum((y - x @ theta) ** 2), 1e-300)))
 
 
 def _expected(shapes: NDArray, turns: _Turns, theta: NDArray) -> float:
-    """What they would gain if they are there."""
+    """Expected gain [nats] if the terms are real."""
     x, y = _without(turns.usual, shapes), _without(turns.usual, turns.turned[:, None])[:, 0]
     return 0.5 * float(np.sum((x @ theta) ** 2) / max(np.mean((y - x @ theta) ** 2), 1e-300))

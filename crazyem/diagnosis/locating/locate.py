@@ -1,7 +1,7 @@
-"""Where a flight parts from a model: what force, torque and sensor error is missing, when, and in which regime.
+"""Differences of a flight from a model: which force, torque or sensor error is missing, when, and in which regime.
 
-A disturbance that acts on one axis is a column like any other. Its score and information, block by block, give the
-disturbance of each block with its error; by bins of a regime (speed, height, tilt ...) they give how it depends on it.
+A disturbance on one axis is a column like any other. Its score and information by blocks give the disturbance of each
+block with its error. By bins of a regime (speed, height, tilt ...) they give its dependence on the regime.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from crazyem.physics.rotations import rotation_matrix
 
 AXES = ("x", "y", "z")
 BINS = 4
-NOTABLE = 1e-4  # p-value of a finding before it is listed
+NOTABLE = 1e-4  # largest p-value of a finding that is listed
 SETTLED = 0.3  # s after a start before rows count
 
 
@@ -30,14 +30,14 @@ class Finding:
 
     Attributes:
         signal: "force", "torque", "attitude", "velocity" or "body_rate".
-        axis: x, y or z of the body (velocity: of the world); "world x" or "world y" of a force that belongs to the
-            room more than to the body.
+        axis: x, y or z of the body (velocity: of the world); "world x" or "world y" of a force that is more constant
+            along axes of the world than of the body.
         regime: in words, "always" for a constant.
-        variable: what the regime is told by; "" for a constant.
-        interval: s, where it is seen.
+        variable: the variable of the regime; "" for a constant.
+        interval: s, time of the finding.
         effect_size: in `unit`, with sd.
-        nats: log-likelihood that a disturbance there would gain, less its number of parameters, dispersion allowed for.
-        p_value: against chance, the number of tests allowed for.
+        nats: gain of log-likelihood by a disturbance there over the dispersion, less its number of parameters.
+        p_value: corrected for the number of tests.
     """
 
     signal: str
@@ -54,12 +54,12 @@ class Finding:
 
 @dataclass(frozen=True)
 class Disturbance:
-    """What is missing in time.
+    """Missing disturbances over time.
 
     Attributes:
-        time: (b,) s.
-        names: of k series, signal and axis as findings have them: "force x", "force world x", "attitude z".
-        units: (k,) of them.
+        time: (b,) s, of the blocks.
+        names: of k series, signal and axis as in findings: "force x", "force world x", "attitude z".
+        units: of the k series.
         value, sd: (b, k).
     """
 
@@ -72,7 +72,7 @@ class Disturbance:
 
 @dataclass(frozen=True)
 class Located:
-    """All findings, strongest first; disturbances of each flight; whiteness of the innovations (p-value by channel)."""
+    """All findings, strongest first; disturbances of each flight; p-values of white innovations by channel."""
 
     findings: tuple[Finding, ...]
     disturbances: tuple[Disturbance, ...]
@@ -80,12 +80,12 @@ class Located:
 
 
 def units_of(point: Point) -> NDArray:
-    """(6,) N per m/s^2 and N m per rad/s^2."""
+    """(6,) mass and inertias: N per m/s^2 and N m per rad/s^2."""
     return np.array([point.vehicle.mass] * 3 + list(point.vehicle.inertia))
 
 
 def axis_columns(flight: Flight, weights: NDArray | None = None) -> list[Column]:
-    """A unit acceleration on each of the six axes, times weights (n,)."""
+    """Columns of a unit acceleration on each of the six axes, times weights (n,)."""
     n = flight.time.size
     w = np.ones(n) if weights is None else weights
     columns = []
@@ -97,7 +97,7 @@ def axis_columns(flight: Flight, weights: NDArray | None = None) -> list[Column]
 
 
 def shown_columns(flight: Flight, weights: NDArray | None = None) -> list[Column]:
-    """A unit error of what is shown of velocity, attitude and rate."""
+    """Columns of a unit error of measured velocity, attitude and rate, times weights (n,)."""
     n = flight.time.size
     w = np.ones(n) if weights is None else weights
     columns = []
@@ -109,7 +109,7 @@ def shown_columns(flight: Flight, weights: NDArray | None = None) -> list[Column
 
 
 def world_columns(rotation: NDArray) -> list[Column]:
-    """A unit acceleration along world x and y, by the attitudes (n, 3, 3)."""
+    """Columns of a unit acceleration along world x and y, for attitudes (n, 3, 3)."""
     none = np.zeros((len(rotation), 3))
     return [Column(f"world {AXES[k]}", acting=np.concatenate([rotation[:, k], none], axis=1)) for k in range(2)]
 
@@ -141,7 +141,7 @@ def regimes(flight: Flight, path: NDArray, thrust: NDArray) -> dict[str, tuple[N
 
 
 def locate(data: Data, point: Point) -> Located:
-    """Where the flights part from the model."""
+    """The differences of flights from a model."""
     findings: list[Finding] = []
     disturbances = []
     whiteness: dict[str, list[float]] = {}
@@ -187,7 +187,7 @@ def _one(model: Model, point: Point, workers: Workers) -> tuple[list[Finding], D
 def _in_time(
     point: Point, times: NDArray, body: tuple[NDArray, NDArray], world: tuple[NDArray, NDArray]
 ) -> Disturbance:
-    """What every block says of each axis, by scores and informations (b, k) of axes of the body and of the world."""
+    """The disturbance of each axis in every block, from scores and informations (b, k) by axes of body and world."""
     b, a = (np.concatenate(pair, axis=1) for pair in zip(body, world, strict=True))
     signals = [_signal(i) for i in range(body[0].shape[1])]
     signals += [("force", f"world {axis}", "N") for axis in AXES[:2]]
@@ -201,8 +201,8 @@ def _in_time(
 def _of_the_world(
     model: Model, point: Point, swept: Swept, times: NDArray, of_the_body: Sequence[Finding]
 ) -> list[Finding]:
-    """Forces along horizontal axes of the world, always there or from a moment on, that say more than the same along
-    axes of the body: a wind on a drone that turns."""
+    """Constant or changing forces along horizontal axes of the world that gain more than forces along axes of the body:
+    a wind on a drone that turns."""
     flight = model.flight
     b, a = swept.score, np.einsum("bii->bi", swept.information)
     dispersion = _dispersion(b, a)
@@ -215,7 +215,7 @@ def _of_the_world(
 
 
 def _dispersion(b: NDArray, a: NDArray) -> NDArray:
-    """By how much the scores of blocks scatter more than the information says, about their own mean."""
+    """Variance of the scores of blocks about their mean, over the information; at least 1."""
     total = np.maximum(a.sum(0), 1e-300)
     centred = b - a * (b.sum(0) / total)
     return np.maximum(1.0, (centred**2).sum(0) / total * len(b) / max(len(b) - 1, 1))
@@ -245,7 +245,7 @@ def _constant_and_change(
     if p < NOTABLE:
         found.append(Finding(signal, axis, "always", "", span, mean * unit, sd * unit, name,
                              0.5 * total_b * mean / dispersion - 1, p))  # fmt: skip
-    # one change in mid-flight: the split that gains most, scores about the means of both sides
+    # one change in flight: the split that gains most; the dispersion is about the means of both sides
     best = (0.0, 0)
     cb, ca = np.cumsum(b), np.cumsum(a)
     for k in range(2, len(b) - 2):
@@ -270,7 +270,7 @@ def _constant_and_change(
 def _by_regime(
     model: Model, point: Point, name: str, values: NDArray, regime_unit: str, unit: NDArray
 ) -> list[Finding]:
-    """How each axis's disturbance differs between the bins of a regime."""
+    """Findings of disturbances that differ between the bins of a regime."""
     flight = model.flight
     edges = np.quantile(values, np.linspace(0, 1, BINS + 1))
     if not np.all(np.diff(edges) > 1e-9 * max(1.0, np.abs(edges).max())):

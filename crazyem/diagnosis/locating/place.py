@@ -1,8 +1,8 @@
-"""A force that depends on place, as a generic rival of the named ones: a constant and a slope by x, y, z for each axis.
+"""A force that depends on place, as a generic rival of named effects: a constant and a slope by x, y, z for each axis.
 
-A cable, a fan, a wall's draught: none of them is in the catalogue, but wind, ground effect or gusts take their part of
-it. Such a force is the same on the next flight, while the force of gusts correlates with place by chance only; so it
-must hold on flights that it was not fitted to.
+A cable, a fan or the draught of a wall is not in the catalogue; wind, ground effect or gusts explain a part of its
+force. Such a force is the same on the next flight. The force of gusts correlates with place by chance only. So the
+force must also gain on held-out flights.
 """
 
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ from crazyem.diagnosis.locating.locate import AXES, Finding
 from crazyem.physics.rotations import rotation_matrix
 from crazyem.vehicle import GRAVITY, Vehicle
 
-NATS = 25.0  # that it must gain on the flights fitted and on those held out
-SMALLEST = 0.01  # of the weight, standard deviation along the flight
+NATS = 25.0  # nats; least gain on fitted and on held-out flights
+SMALLEST = 0.01  # least standard deviation of the force along the flight, over the weight
 WEAK = 1e-4  # (m/s^2)^-2, precision of the prior
 
 
 @dataclass(frozen=True)
 class Place:
-    """A force that depends on place: nats on the flights fitted and held out; what it is as a finding."""
+    """A force that depends on place: its gain on fitted and on held-out flights [nats], and its finding."""
 
     nats: float
     held_out: float
@@ -33,13 +33,15 @@ class Place:
 
     @property
     def pushed(self) -> bool:
-        """Whether the drone is pushed away from where it is: a loop that gives way to gusts flies like that, on every
-        flight; what is tied to a place pulls back."""
+        """Whether the force grows along its own axis, so that it pushes the drone away.
+
+        A control loop that gives way to gusts looks like this on every flight. A cable pulls back.
+        """
         return self.finding.axis == self.finding.variable and self.finding.effect_size > 0.0
 
 
 def depends_on_place(data: Data, apart: Data | None, point: Point) -> Place | None:
-    """Whether a force that depends on place is left beside a model; None if not, or where positions are unknown."""
+    """The force by place that a model lacks; None if there is none, or without positions."""
     if "position" not in data.signals:
         return None
     centre = np.median(np.concatenate([_path(m)[:, :3] for m in data.models]), axis=0)
@@ -62,15 +64,15 @@ def depends_on_place(data: Data, apart: Data | None, point: Point) -> Place | No
 
 
 def left_by_place(data: Data, point: Point) -> float:
-    """Nats that a force by place would gain beside a model, beyond its parameters, in the linear approximation."""
+    """Gain of a force by place beside a model, less its number of parameters, in the linear approximation [nats]."""
     gram = _gram(data, point, np.median(np.concatenate([_path(m)[:, :3] for m in data.models]), axis=0))
     solution = gram.solve(range(gram.size), precision=np.full(gram.size, WEAK))
     return float(solution.gain / max(1.0, solution.dispersion) - gram.size)
 
 
 def slope_finding(data: Data, slopes: NDArray, errors: NDArray, nats: float, vehicle: Vehicle) -> Finding | None:
-    """The strongest slope of a force by place, (3, 3) N/m with its standard deviations, as a finding; None where it
-    moves the force by less than counts along these flights."""
+    """The strongest slope of a force by place, (3, 3) N/m with standard deviations, as a finding; None if the force
+    varies too little along these flights (`SMALLEST`)."""
     spread = np.concatenate([_path(m)[:, :3] for m in data.models]).std(axis=0)
     sizes = slopes * spread
     i, j = np.unravel_index(int(np.argmax(np.abs(sizes))), sizes.shape)
@@ -82,7 +84,7 @@ def slope_finding(data: Data, slopes: NDArray, errors: NDArray, nats: float, veh
 
 
 def _path(model: Model) -> NDArray:
-    """Filtered, or as measured where the model left the range of numbers."""
+    """The filtered path; the measured one if the model left the range of numbers."""
     return initial_path(model.flight) if model.shown is None else model.shown
 
 

@@ -1,8 +1,8 @@
-"""Random torques that are not mere noise: of one rotor alone, or of one band of frequencies.
+"""Random torques with a structure: of a single rotor, or in one band of frequencies.
 
-Noise of commands and air disturbs all rotors alike, so the torques about two axes are not correlated. A rotor that
-sticks, slips or misfires gives roll, pitch and yaw the signs of its place. Something that shakes leaves a hump in the
-spectrum of the rates' innovations. No effect of the catalogue does either, so both are structure left unexplained.
+Noise of commands and air acts on all rotors alike, so torques about two axes are not correlated. A rotor that sticks,
+slips or misfires correlates roll, pitch and yaw with the signs of its place. A vibration makes a hump in the spectrum
+of the innovations of body rates. No effect of the catalogue explains either.
 """
 
 from collections.abc import Sequence
@@ -21,27 +21,27 @@ from crazyem.physics.motion import body_of
 from crazyem.physics.rotors import wrench
 from crazyem.vehicle import GRAVITY
 
-AT_RANDOM = "at random"  # what such a finding depends on; a thrust of the rotor is the variable `rotor`
-CHANCE = 1e-5  # that no rotor stands out, the number of rotors allowed for
-EACH = 2.33  # standard deviations for tilting alone and with yawing alone: a product of inertia mixes two axes only
-LEAST = 0.03  # correlation
-OUTLYING = 4.0  # standard deviations beyond which an innovation counts no more
-SPAN = 5.0  # s of a piece of which the spectrum is taken: a rotor's speed wanders by less than a tenth in it
-FEWEST = 4  # pieces
-SLOWEST, FASTEST = 1.5, 0.4  # Hz: below, onboard filters wander; of the sampling rate
-AROUND, APART = 4.0, 1.0  # Hz: surroundings of a hump, and what belongs to the hump itself
-HUMP = 10.0  # power over that of the surroundings; drones with nothing hidden have up to 3.4
-FOOT, FARTHEST = 3.0, 2.0  # of the surroundings; Hz
-SHAKEN = 0.15  # of the angular acceleration in that band: less is a loop that swings under a model a little wrong
-SMALLEST = 0.0004  # of weight times arm
-PAIRS = ((0, 1), (0, 2), (1, 2))  # of axes
+AT_RANDOM = "at random"  # variable of such a finding; that of a finding by thrust is `rotor`
+CHANCE = 1e-5  # largest p-value that no rotor stands out, corrected for the number of rotors
+EACH = 2.33  # least t of roll with pitch, and of both with yaw; a product of inertia correlates two axes only
+LEAST = 0.03  # least correlation
+OUTLYING = 4.0  # standard deviations at which innovations are clipped
+SPAN = 5.0  # s of a piece for the spectrum; the speed of a rotor changes by less than a tenth in it
+FEWEST = 4  # least number of pieces
+SLOWEST, FASTEST = 1.5, 0.4  # Hz, onboard filters drift below; share of the sampling rate
+AROUND, APART = 4.0, 1.0  # Hz, half widths: of the surroundings of a hump, of the hump itself
+HUMP = 10.0  # least power over that of the surroundings; drones without a missing effect have up to 3.4
+FOOT, FARTHEST = 3.0, 2.0  # power over the surroundings at the end of a hump; Hz, longest reach of a hump
+SHAKEN = 0.15  # least torque over inertia, over the angular acceleration in the band; less may be an oscillating loop
+SMALLEST = 0.0004  # least torque over weight times arm
+PAIRS = ((0, 1), (0, 2), (1, 2))  # pairs of axes
 
 
 def standardised(model: Model, point: Point, turned: NDArray | None = None) -> tuple[NDArray, NDArray]:
-    """(n, 3) innovations of the body rates in standard deviations, and (n,) which rows have all three.
+    """(n, 3) innovations of the body rates in standard deviations, and (n,) whether a row has all three.
 
     Args:
-        turned: (3, 3) with which they are multiplied before; None leaves each axis its own.
+        turned: (3, 3) matrix that multiplies the innovations first; None: no matrix.
     """
     swept = model.sweep(point)
     innovation, variance = swept.innovation[:, 9:12], swept.variance[:, 9:12]
@@ -53,17 +53,19 @@ def standardised(model: Model, point: Point, turned: NDArray | None = None) -> t
 
 
 def memoryless(data: Data, point: Point) -> Point:
-    """The point with torques that have no memory, and noise scales that fit then: what a filter remembers it follows,
-    and what it follows is no innovation any more."""
+    """The point without memory of disturbing torques, with refitted noise scales.
+
+    A filter with such a memory predicts the torques, so they would not show in the innovations.
+    """
     white = np.concatenate([point.noise.disturbance[:3], np.zeros(3)])
     return data.fit_noise(replace(point, noise=replace(point.noise, disturbance=white)))
 
 
 def erratic_rotor(models: Sequence[Model], point: Point) -> Finding | None:
-    """The rotor whose random thrust the correlations between the axes' innovations point to, if they do.
+    """The rotor with a random thrust, from correlations between the innovations of two axes; None if there is none.
 
-    Of flights fitted and held out alike: nothing is fitted here. Shows most where torques are `memoryless`. Of the
-    torques, not of what turns: products of inertia turn the torques of all rotors into rates that go together.
+    Nothing is fitted, so fitted and held-out flights count alike. The test is strongest with `memoryless` torques. The
+    innovations are turned into torques: with products of inertia, rates are correlated for all rotors.
     """
     inertia = body_of(point.vehicle, point.effects).inertia
     sums, count = [], 0
@@ -99,7 +101,7 @@ def erratic_rotor(models: Sequence[Model], point: Point) -> Finding | None:
 def block_covariances(z: NDArray, seen: NDArray, block: NDArray, blocks: int) -> NDArray:
     """(blocks, 3) sums of products of (n, 3) innovations for each of `PAIRS`, about their means in each block.
 
-    A torque that lasts (the trim of another day, wind) is a mean. It is no random torque.
+    The mean is a steady torque (the trim of another day, wind), not a random one.
     """
     rows = np.where(seen[:, None], z, 0.0)
     count = np.maximum(np.bincount(block, seen, blocks), 1.0)
@@ -109,13 +111,13 @@ def block_covariances(z: NDArray, seen: NDArray, block: NDArray, blocks: int) ->
 
 
 def _t(sums: NDArray) -> float:
-    """Student's t of the mean of blocks."""
+    """Student's t of the mean over blocks."""
     spread = float(sums.std(ddof=1))
     return float(sums.mean() / spread * np.sqrt(sums.size)) if spread > 0 else 0.0
 
 
 def spectrum(values: NDArray, period: float) -> tuple[NDArray, NDArray, int]:
-    """Frequencies [Hz], power density [unit^2/Hz] of (n,) samples, and the number of pieces that it is a mean of."""
+    """Frequencies [Hz], mean power density [unit^2/Hz] of (n,) samples, and its number of pieces."""
     size = round(SPAN / period)
     window = np.hanning(size)
     begins = range(0, values.size - size + 1, max(1, size // 2))
@@ -126,7 +128,7 @@ def spectrum(values: NDArray, period: float) -> tuple[NDArray, NDArray, int]:
 
 
 def hump(frequency: NDArray, power: NDArray) -> tuple[int, float]:
-    """Where the power stands out most from its surroundings, and how many times."""
+    """Index of the largest power over that of the surroundings, and this ratio."""
     best, where = 0.0, 0
     inside = (frequency > SLOWEST) & (frequency < FASTEST * 2 * frequency[-1])
     for k in np.flatnonzero(inside):
@@ -138,8 +140,8 @@ def hump(frequency: NDArray, power: NDArray) -> tuple[int, float]:
 
 
 class Peak(NamedTuple):
-    """A hump: axis 0 to 2, frequency [Hz], power over that of the surroundings, pieces that it is a mean of, and how
-    far it reaches to either side [Hz]."""
+    """A hump: axis 0 to 2, frequency [Hz], power over that of the surroundings, number of pieces of the spectrum, and
+    reach to either side [Hz]."""
 
     axis: int
     frequency: float
@@ -149,7 +151,7 @@ class Peak(NamedTuple):
 
 
 def peaks(model: Model, point: Point) -> list[Peak]:
-    """Humps in the spectra of the rates' innovations, whatever its cause."""
+    """Humps in the spectra of the innovations of body rates, of any cause."""
     z, seen = standardised(model, point)
     if seen.sum() < 256:
         return []
@@ -166,9 +168,9 @@ def peaks(model: Model, point: Point) -> list[Peak]:
 
 
 def reach_of(frequency: NDArray, power: NDArray, k: int, ratio: float) -> float:
-    """How far a hump reaches to either side [Hz]: where its power has fallen to `FOOT` of the surroundings.
+    """Reach of a hump to either side [Hz], where its power falls to `FOOT` times that of the surroundings.
 
-    What shakes with a rotor wanders with the rotor's speed.
+    The frequency of a vibration by a rotor varies with the speed of the rotor.
     """
     low = power < FOOT / ratio * power[k]
     below, above = np.flatnonzero(low[:k]), np.flatnonzero(low[k:])
@@ -178,9 +180,9 @@ def reach_of(frequency: NDArray, power: NDArray, k: int, ratio: float) -> float:
 
 
 def off_peak_gram(data: Data, point: Point, columns: Sequence[Column], found: Sequence[Sequence[Peak]]) -> Gram:
-    """Score and information of columns by what is outside the humps of each flight.
+    """Score and information of columns outside the humps of each flight.
 
-    A torque at the frequencies of the humps, its amplitude and phase free in every second, is profiled out.
+    Torques at the frequencies of the humps, with free amplitude and phase in every second, are profiled out.
     """
     score, information, flight = [], [], []
     m = len(columns)
@@ -201,7 +203,7 @@ def off_peak_gram(data: Data, point: Point, columns: Sequence[Column], found: Se
 
 
 def waves(model: Model, peak: Peak) -> list[Column]:
-    """Torques about the axis of a hump at frequencies half a Hz apart as far as it reaches, sine and cosine."""
+    """Columns of torques about the axis of a hump: sine and cosine at frequencies 0.5 Hz apart, over its reach."""
     columns = []
     count = round(peak.reach / 0.5)
     for at in peak.frequency + 0.5 * np.arange(-count, count + 1):
@@ -213,7 +215,7 @@ def waves(model: Model, peak: Peak) -> list[Column]:
 
 
 def humps(model: Model, point: Point) -> list[Finding]:
-    """Humps in the spectra of the rates' innovations, with the torque that shakes there, whatever its phase."""
+    """Findings of humps in the spectra of the innovations of body rates, with the amplitude of their torque."""
     flight = model.flight
     period = float(np.median(np.diff(flight.time)))
     grid = np.arange(flight.time[0], flight.time[-1], period)
@@ -222,7 +224,7 @@ def humps(model: Model, point: Point) -> list[Finding]:
     found = []
     for i, at, ratio, pieces, _ in peaks(model, point):
         amplitude, sd = amplitude_of(model, point, i, at)
-        if model.shown is None:  # it left the range of numbers, and tells nothing
+        if model.shown is None:  # the model left the range of numbers
             continue
         frequency, rate, _ = spectrum(np.interp(grid, flight.time, model.shown[:, 10 + i]), period)
         band = np.abs(frequency - at) <= APART
@@ -238,9 +240,9 @@ def humps(model: Model, point: Point) -> list[Finding]:
 
 
 def amplitude_of(model: Model, point: Point, axis: int, frequency: float) -> tuple[float, float]:
-    """Root mean square over the blocks of the amplitude of an angular acceleration [rad/s^2], its phase free in each.
+    """Amplitude of an angular acceleration [rad/s^2] at a frequency, and its standard deviation.
 
-    Returns it with its standard deviation.
+    It is the root mean square over blocks; the phase is free in each block.
     """
     angle = 2 * np.pi * frequency * model.flight.time
     columns = []
