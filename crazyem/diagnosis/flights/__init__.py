@@ -1,1 +1,1 @@
-"""A recorded flight as arrays: rows in free flight, what the rotors were told, what belongs to that recording alone."""
+"""A recorded flight as arrays: rows in free flight, inputs of the rotors, nuisances of the recording."""

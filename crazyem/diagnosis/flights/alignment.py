@@ -1,13 +1,13 @@
-"""How much later than its stamp a measured rotor speed acts: the clocks of two streams, set by the recording itself.
+"""The delay of measured rotor speeds behind body rates: the offset of the clocks of two streams in a recording.
 
-Rotor speeds and body rates reach a log by different ways, and each recording joins them with an offset of its own, of
-either sign. It is no property of the drone, so it belongs to no vehicle file; but with 15 ms wrong, roll and pitch fed
-back at some hertz do not fit any rigid body. It is found where the torque of the rotors explains most of the angular
-acceleration, with rate and velocity beside it (damping, flapping) so that the loop around them is not taken for a
-delay, in a band in which the drone shakes and sensors are not noise alone. Roll and pitch are judged apart: they share
-the clock, so they must agree. A block in which something hit the drone says nothing of its rotors, and is left out.
+Rotor speeds and body rates reach a log on different ways, so each recording has its own offset, of either sign. It is
+no property of the drone, so no vehicle file has it. But with an error of 15 ms, roll and pitch under feedback at some
+hertz fit no rigid body.
 
-Sums are kept by blocks of flight, so that a prediction can use what was known when it starts and no more.
+The delay is where the torque of the rotors explains most of the angular acceleration, in a band in which the drone
+shakes and sensors show more than noise. Rate and velocity are regressors, too (damping, flapping), so that the control
+loop does not look like a delay. Roll and pitch have the same clock, so their separate delays must agree. Blocks with a
+collision are left out. Sums are kept by blocks, so that a prediction can use the flight before its start only.
 """
 
 from dataclasses import dataclass
@@ -21,27 +21,27 @@ from crazyem.recordings.airborne import Airtime
 from crazyem.recordings.ordering import inside, ordered
 from crazyem.recordings.recording import Recording
 
-REACH = 0.15  # s, on either side
-SURE = 4e-3  # s: a larger standard error, and nothing is said
-AGREE = 6e-3  # s between roll and pitch
-EXPLAINED = 0.1  # share of the acceleration's variance that the rotors must explain
-PRIOR = 0.01  # s, of delays before anything was seen
-# A block in which the drone was hit: so much more of its acceleration is unexplained than of the median block's (power;
-# 172 at most in 23 files of real flights, 2652 where one came down). It would outweigh the flight.
+REACH = 0.15  # s, largest delay of either sign
+SURE = 4e-3  # s, largest standard error of a delay that is used
+AGREE = 6e-3  # s, largest difference of roll and pitch, beside three standard errors
+EXPLAINED = 0.1  # least share of the variance of the acceleration that the rotors explain
+PRIOR = 0.01  # s, standard deviation of delays before the flight
+# Least unexplained power of the acceleration in a block with a collision, over that of the median block (172 at most in
+# 23 files of real flights, 2652 in a crash). Such a block would outweigh the flight.
 BLOW = 300.0
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """How late the rotors' thrust is behind the stamps of their speeds.
+    """The delay of the thrust of the rotors behind the stamps of their speeds.
 
     Attributes:
         delay: s, by roll and pitch of the whole recording; positive: the rates answer later than the stamps say.
         sd: s.
-        roll, pitch: s, each alone.
+        roll, pitch: s, by one axis alone.
         explained: share of the variance of roll and pitch acceleration explained in the band.
-        ends: (b,) s: when each block of flight is known.
-        running: (b,) s: the delay by all blocks up to that one, drawn towards 0 while little is known.
+        ends: (b,) s, time from which each block of flight is known.
+        running: (b,) s, the delay by all blocks up to this one, shrunk towards 0 by its standard error.
     """
 
     delay: float
@@ -53,7 +53,7 @@ class Alignment:
     running: NDArray
 
     def known_at(self, time: NDArray) -> NDArray:
-        """(n,) s: the delay as known at times (n,) s; 0 before anything is."""
+        """(n,) s, the delay by the flight before times (n,) s; 0 before the first block."""
         at = np.searchsorted(self.ends, time, "right") - 1
         return np.where(at >= 0, self.running[np.maximum(at, 0)], 0.0)
 
@@ -66,13 +66,13 @@ class Alignment:
 
 
 def align(recording: Recording, thrust_time: NDArray, thrust: NDArray, flight: Airtime | None) -> Alignment | None:
-    """The delay of a recording's rotor speeds behind its body rates; None where the recording does not tell.
+    """The delay of the rotor speeds behind the body rates of a recording; None if it is not determined.
 
     Args:
         recording: with body rates.
         thrust_time: (m,) s.
         thrust: (m, 4) N.
-        flight: when the drone flew.
+        flight: times in the air.
     """
     if flight is None or not flight.flown or "body_rate" not in recording.signals or thrust_time.size < 100:
         return None
@@ -107,13 +107,13 @@ def align(recording: Recording, thrust_time: NDArray, thrust: NDArray, flight: A
 
 
 def _fresh(time: NDArray, value: NDArray) -> tuple[NDArray, NDArray]:
-    """Without rows that repeat the one before: a held value is no new sample."""
+    """The samples without rows that repeat the row before: a held value is no new sample."""
     new = np.concatenate([[True], np.any(np.diff(value, axis=0) != 0, axis=1)]) if time.size else np.ones(0, bool)
     return time[new], value[new]
 
 
 def _unhit(delays: NDArray, sums: NDArray) -> NDArray:
-    """(2, b, delays, k, k): the blocks in which nothing hit the drone."""
+    """(2, b, delays, k, k): the sums of blocks without a collision."""
     total = sums.sum(1)
     delay, _ = band.delay_of(delays, total)
     at = int(np.argmin(np.abs(delays - delay))) if np.isfinite(delay) else delays.size // 2

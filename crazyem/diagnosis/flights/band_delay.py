@@ -1,17 +1,17 @@
-"""How late one series is behind another, in a band in which a drone shakes and sensors are not noise alone.
+"""The delay of one series behind another, in a band in which a drone shakes and sensors show more than noise.
 
-The delay is where the one explains most of the other: noise in either makes the share smaller, and does not move the
+At the delay, one series explains most of the other. Noise in either makes this share smaller, but does not move the
 delay. Sums are kept by blocks of flight, so that a jackknife gives the standard error.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-STEP = 2.5e-3  # s between delays tried
+STEP = 2.5e-3  # s between tried delays
 GRID = 5e-3  # s between rows
 BLOCK = 1.0  # s
 BAND = (0.015, 0.1)  # s, widths of the Gaussians whose difference is the band: about 1.5 to 10 Hz
-SUPPORT = 0.3  # s, half the length of the band's filter
+SUPPORT = 0.3  # s, half the length of the filter of the band
 FEWEST_BLOCKS = 4
 
 
@@ -21,7 +21,7 @@ def delays_within(reach: float) -> NDArray:
 
 
 def on_grid(time: NDArray, when: NDArray, value: NDArray) -> NDArray:
-    """(n, k): columns of value (m, k), stamped `when` (m,) s, at times (n,) s."""
+    """(n, k): columns of value (m, k) with stamps `when` (m,) s, interpolated at times (n,) s."""
     return np.stack([np.interp(time, when, column) for column in value.T], 1)
 
 
@@ -51,7 +51,7 @@ def products(
 
     Args:
         index: (r,) rows of the grid. block: (r,) their blocks.
-        wanted, cause: (n, axes). beside: (n, axes) each, what else explains the wanted series.
+        wanted, cause: (n, axes). beside: (n, axes) each, other regressors of the wanted series.
     """
     steps = delay / GRID
     low = int(np.floor(steps))
@@ -67,7 +67,7 @@ def products(
 
 
 def explained_share(sums: NDArray) -> NDArray:
-    """Share (..., delays) of the wanted series that its cause explains beyond what is beside it.
+    """Share (..., delays) of the wanted series that its cause explains beyond the other regressors.
 
     sums: (..., delays, k, k).
     """
@@ -78,13 +78,13 @@ def explained_share(sums: NDArray) -> NDArray:
     a = a / (scale[..., :, None] * scale[..., None, :]) + 1e-9 * np.eye(size)
     b = sums[..., :size, size] / scale
     got = np.linalg.solve(a, b[..., None])[..., 0]
-    gain = np.where(got[..., 0] > 0, 1.0, 0.0)  # a cause acts the way it points
+    gain = np.where(got[..., 0] > 0, 1.0, 0.0)  # a cause has a positive coefficient
     rest = np.linalg.solve(a[..., 1:, 1:], b[..., 1:, None])[..., 0]
     return gain * (np.sum(got * b, -1) - np.sum(rest * b[..., 1:], -1)) / whole
 
 
 def peak(delays: NDArray, curve: NDArray) -> float:
-    """Delay of the maximum, between those tried by a parabola; NaN at the edge."""
+    """Delay of the maximum, interpolated by a parabola; NaN at the edge."""
     top = int(np.argmax(curve))
     if top in (0, curve.size - 1) or curve[top] <= 0:
         return float("nan")
@@ -94,7 +94,7 @@ def peak(delays: NDArray, curve: NDArray) -> float:
 
 
 def delay_of(delays: NDArray, sums: NDArray) -> tuple[float, float]:
-    """Delay [s] by all axes together, from sums (axes, delays, k, k), and the share explained."""
+    """Delay [s] by all axes together, from sums (axes, delays, k, k), and the explained share."""
     share = explained_share(sums)
     whole = sums[:, 0, -1, -1]
     curve = (share * whole[:, None]).sum(0) / max(float(whole.sum()), 1e-300)

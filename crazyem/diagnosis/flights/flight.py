@@ -1,4 +1,4 @@
-"""A recorded flight as the arrays that diagnosis works on: nodes in free flight, what was measured there, inputs."""
+"""A recorded flight as arrays for the diagnosis: rows in free flight with their measurements, and inputs."""
 
 import math
 from collections.abc import Sequence
@@ -17,22 +17,23 @@ from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording, onboard_estimate
 from crazyem.vehicle import GRAVITY, Vehicle
 
-SAME_NODE = 1.5e-3  # s: measurements closer than this belong to one node
-MAX_GAP = 0.1  # s between nodes, or between inputs, beyond which a step cannot be trusted
-# s: unit of resampling and held-out blocks; shorter in a short flight, so that there are `BLOCKS` of them, twice as
-# many as things that are always free. Scores hang together for tenths of a second.
+SAME_NODE = 1.5e-3  # s; measurements that are closer belong to one row (node)
+MAX_GAP = 0.1  # s, largest step between nodes or between inputs that is used
+# s, length of blocks; shorter in a short flight, so that there are `BLOCKS` blocks, twice the number of nuisances.
+# Scores are correlated for tenths of a second.
 BLOCK, SHORT, BLOCKS = 1.0, 0.5, 40
-# V, standard deviation of means over a second, below which the voltage is constant: 12 mV and more in 51 flights of the
-# simulated firmware, 32 mV and more in 19 of CrazyPAD and NanoBench. A gain of 0.4/V makes 0.2 % of thrust of it.
+# V, standard deviation of means over a second, below which the voltage is constant. It is 12 mV and more in 51 flights
+# of the simulated firmware, 32 mV and more in 19 of CrazyPAD and NanoBench. With a gain of 0.4/V, 5 mV are 0.2 % of
+# thrust.
 STEADY_VOLTAGE = 5e-3
-NEAR = 0.03  # s between samples of the accelerometer, at most, for a value between them
-SHORTEST = 4.0  # s of flight below which nothing is said
-# s between samples of a stream, about. Filters of gyros and of state estimates take 2 to 5 ms (a low-pass of 80 Hz:
-# 2.8 ms, crazyflie-firmware sensors_bmi088_bmp3xx.c). Samples closer than that repeat the filter's own dynamics, which
-# the model does not have: in hover they read as a negative damping. Sampling follows the dynamics that are looked for,
-# about ten samples in a rise time (Ljung, System Identification, 1999, 13.7).
+NEAR = 0.03  # s, largest distance to a sample of the accelerometer for an interpolated value
+SHORTEST = 4.0  # s, shortest flight for a diagnosis
+# s, typical interval of samples that are kept. Filters of gyros and of state estimates take 2 to 5 ms (a low pass of
+# 80 Hz: 2.8 ms, crazyflie-firmware sensors_bmi088_bmp3xx.c). Closer samples show the dynamics of the filter, which the
+# model does not have; in hover they look like a negative damping. The dynamics of interest need about ten samples in a
+# rise time (Ljung, System Identification, 1999, 13.7).
 SAMPLING = 0.01
-PIECE = 60.0  # s after which the filter starts anew, so that long flights are swept in pieces
+PIECE = 60.0  # s after which the filter starts again, so that long flights are filtered in pieces
 COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 COMMANDS = ("motor_command", "motor_request", "mixer_command")
 YAW = "stateEstimate.yaw"  # deg, right-handed
@@ -42,10 +43,10 @@ CONTROLLED = (("controller.r_roll", 1.0), ("controller.r_pitch", -1.0), ("contro
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """How a recording's pose frame is turned against those of the others.
+    """The tilt of the pose frame of a recording against that of the others.
 
     Attributes:
-        roll, pitch: rad, of the frame in the body, as `attitude_misalignment` has them; taken off already.
+        roll, pitch: rad, of the frame in the body, as in `attitude_misalignment`; already removed from the attitude.
         sd: rad, (roll, pitch).
     """
 
@@ -68,25 +69,25 @@ class Flight:
     Attributes:
         name: of the recording.
         time: (n,) s on the recording's clock, increasing.
-        starts: (n,) bool: where the filter begins anew.
-        gaps: (n,) bool: where nothing is known of the step before, so that nothing can be carried along the path.
-            Each is a start; a start elsewhere leaves out a step whose path is known (`PIECE`, `Data.leave_out_wild`).
+        starts: (n,) bool, rows at which the filter starts again.
+        gaps: (n,) bool, rows without a known path in the step before, over which nothing is integrated. Each is a
+            start. At the other starts, the path of the step is known (`PIECE`, `Data.leave_out_wild`).
         y: (n, 13) position [m], velocity [m/s], attitude (x y z w), body rate [rad/s]; NaN where not measured.
         force: (n, 3) accelerometer [m/s^2, body]; NaN where not measured.
         voltage: (n,) V; NaN where unknown.
-        flown: (n,) s since the feet left the floor.
-        ground: height of the floor [m] in the frame of the position; 0 where nothing shows it.
-        grounded: whether the recording shows the floor, by where the drone rests.
-        block: (n,) int: consecutive stretches of about a second, of half a second in short flights.
-        inputs: what the rotors were told.
-        signals: names of what is measured.
-        fused: a filter on board made the attitude, or the velocity where there is none.
-        levelled: the voltage is not recorded, and the thrust of its beginning is the weight by assumption.
-        coarse: what turned the drone is not in the commands as recorded (see `nuisances.unlike_a_body`).
-        differs: there are several recordings, and each may have a thrust of its own (see `model.OWN`).
-        alignment: how late measured rotor speeds are; they are moved already. None where unknown.
-        frame: how the pose lies against that of other recordings; it is turned back already. None where alike.
-        notices: what had to be assumed of the inputs, a sentence each.
+        flown: (n,) s since take-off.
+        ground: height of the floor [m] in the frame of the position; 0 where unknown.
+        grounded: whether the recording shows the floor, by a drone at rest.
+        block: (n,) int, consecutive stretches of about a second, of half a second in short flights.
+        inputs: commands or measured speeds of the rotors.
+        signals: names of the measured signals.
+        fused: whether the attitude, or without one the velocity, comes from a filter on board.
+        levelled: whether the voltage is not recorded, but chosen so that the first thrust carries the weight.
+        coarse: whether the recorded commands do not explain the rotation (see `nuisances.unlike_a_body`).
+        differs: whether each of several recordings has a thrust scale of its own (see `model.OWN`).
+        alignment: delay of measured rotor speeds, already corrected; None where unknown.
+        frame: tilt of the pose frame against other recordings, already corrected; None if equal.
+        notices: assumptions about the inputs, a sentence each.
     """
 
     name: str
@@ -112,7 +113,7 @@ class Flight:
 
     @property
     def blocks(self) -> int:
-        """How many blocks there are."""
+        """Number of blocks."""
         return int(self.block[-1]) + 1
 
     @property
@@ -121,7 +122,7 @@ class Flight:
         return float(np.sum(np.diff(self.time)[~self.starts[1:]]))
 
     def rows(self, keep: NDArray) -> "Flight":
-        """Some rows (n,) bool; where a row is left out the next one starts anew."""
+        """The flight with the rows `keep` (n,) bool; the filter starts again after each row that is left out."""
         index = np.flatnonzero(keep)
         broken = np.concatenate([[True], np.diff(index) > 1])
         block = np.unique(self.block[index], return_inverse=True)[1]
@@ -163,10 +164,10 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
         _place(y[:, COLUMNS[name]], time, when, value)
     force = np.full((time.size, 3), np.nan)
     if "specific_force" in recording.signals:
-        when, value = ordered(recording.signals["specific_force"])  # another log block: stamps of its own
+        when, value = ordered(recording.signals["specific_force"])  # stamps of another log block
         near = np.abs(when[np.clip(np.searchsorted(when, time), 0, when.size - 1)] - time) < NEAR
         force[near] = np.stack([np.interp(time[near], when, column) for column in value.T], 1)
-    fresh = np.concatenate([[True], np.any((y[1:] != y[:-1]) & np.isfinite(y[1:]), axis=1)])  # a repeated row is none
+    fresh = np.concatenate([[True], np.any((y[1:] != y[:-1]) & np.isfinite(y[1:]), axis=1)])  # no repeated rows
     time, y, force = time[fresh], y[fresh], force[fresh]
     y[:, 6:10] /= np.linalg.norm(y[:, 6:10], axis=1, keepdims=True)
     gaps = _gaps(time, inputs.time, air.flown)
@@ -193,17 +194,17 @@ def flight_of(recording: Recording, vehicle: Vehicle, *, withhold: Sequence[str]
 
 
 def _changes(time: NDArray, voltage: NDArray) -> bool:
-    """Whether voltages (n,) V at (n,) s change in flight; a constant one tells as little of its effect as none."""
+    """Whether voltages (n,) V at (n,) s change in flight; a constant one does not show the effect of voltage."""
     second = ((time - time[0]) // 1.0).astype(int)
     means = np.bincount(second, voltage) / np.maximum(np.bincount(second), 1)
     return bool(np.std(means[np.bincount(second) > 0]) > STEADY_VOLTAGE)
 
 
 def thinned(time: NDArray, value: NDArray) -> tuple[NDArray, NDArray]:
-    """The first of the samples (n,), (n, k) of a stream in each interval of about `SAMPLING`; all of a slower stream.
+    """The first sample of a stream (n,), (n, k) in each interval of about `SAMPLING`; all samples of a slower stream.
 
-    Intervals are whole periods of the stream and begin halfway between samples, so that the jitter of stamps moves none
-    into another. Where the first one was lost, the next stands for it.
+    Intervals are whole periods of the stream and begin halfway between samples, so that jitter of stamps moves no
+    sample to another interval. If the first sample is lost, the next one is taken.
     """
     period = float(np.median(np.diff(time))) if time.size > 1 else SAMPLING
     every = math.floor(SAMPLING / period + 0.1) if period > 0.0 else 1
@@ -214,10 +215,10 @@ def thinned(time: NDArray, value: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def leaning(recording: Recording) -> tuple[NDArray, NDArray]:
-    """Attitude (n, 4) from the acceleration, for logs that hold no attitude: thrust points along body z.
+    """Attitude (n, 4) from the acceleration, for logs without attitude: thrust points along body z.
 
-    World acceleration plus gravity is the direction of the force; the yaw is that of the firmware's estimate where it
-    was logged, else 0. Good to the sideways drag over the weight, a few mrad in slow flight.
+    World acceleration plus gravity is the direction of the force. The yaw is the estimate of the firmware if logged,
+    else 0. The error is the lateral drag over the weight, a few mrad in slow flight.
     """
     time, acceleration = ordered(recording.signals["acceleration"])
     up = acceleration + np.array([0.0, 0.0, GRAVITY])
@@ -234,7 +235,7 @@ def leaning(recording: Recording) -> tuple[NDArray, NDArray]:
 
 
 def controlled_rates(recording: Recording) -> tuple[NDArray, NDArray]:
-    """Body rates (n, 3) from the PID controller's log, for logs that hold no gyro."""
+    """Body rates (n, 3) from the log of the PID controller, for logs without gyro."""
     columns = [(*ordered(recording.signals[name]), sign) for name, sign in CONTROLLED]
     time = columns[0][0]
     return time, np.stack([sign * np.interp(time, when, value[:, 0]) for when, value, sign in columns], 1)
@@ -247,7 +248,7 @@ def without(recording: Recording, names: Sequence[str]) -> Recording:
 
     def hidden(name: str) -> bool:
         sources = [s.split("[")[0] for s in recording.signals[name].source]
-        # a CSV's column pwr_pm_vbat is the firmware's pm.vbat
+        # the column pwr_pm_vbat of a CSV is pm.vbat of the firmware
         return any(w == name or any(s.startswith(w) or _dotted(s).endswith(f".{w}") for s in sources) for w in names)
 
     for wanted in names:
@@ -262,7 +263,7 @@ def _dotted(source: str) -> str:
 
 
 def _nodes(times: Sequence[NDArray], airborne: Sequence[tuple[float, float]]) -> NDArray:
-    """One time for all that was measured together, in the air only."""
+    """Times of the nodes: one for measurements that belong together, in the air only."""
     time = np.unique(np.concatenate(times))
     keep = np.zeros(time.size, bool)
     for begin, end in airborne:
@@ -284,7 +285,7 @@ def _place(target: NDArray, nodes: NDArray, when: NDArray, value: NDArray) -> No
 
 
 def _gaps(time: NDArray, commands: NDArray, airborne: Sequence[tuple[float, float]]) -> NDArray:
-    """Where a stretch of path begins: gaps of measurements or inputs, and flights."""
+    """Rows at which a stretch of path begins: after gaps of measurements or inputs, and at take-off."""
     gaps = np.concatenate([[True], np.diff(time) > MAX_GAP])
     for g in np.flatnonzero(np.diff(commands) > MAX_GAP):  # any step that touches a gap of the inputs
         gaps |= (time > commands[g]) & (time <= commands[g + 1] + MAX_GAP)
@@ -297,7 +298,7 @@ def _gaps(time: NDArray, commands: NDArray, airborne: Sequence[tuple[float, floa
 
 
 def _starts(time: NDArray, gaps: NDArray) -> NDArray:
-    """Where the filter begins anew: at gaps and every `PIECE` seconds."""
+    """Rows at which the filter starts: at gaps and every `PIECE` seconds."""
     starts, began = gaps.copy(), time[0]
     for k in range(time.size):
         if starts[k]:

@@ -1,8 +1,7 @@
-"""Where the floor is in a recording that does not show it: where the others have it.
+"""The height of the floor in a recording that does not show it, from other recordings.
 
-A recording that begins with the rotors turning does not show the drone at rest, so its heights would be counted from
-the origin of its frame. A marker on top of a drone stands several centimetres above that, which is all that a ground
-effect reaches.
+A recording that begins with turning rotors does not show the drone at rest, so heights would count from the origin of
+its frame. A marker on top of a drone is several centimetres higher, which is as far as a ground effect reaches.
 """
 
 from collections.abc import Sequence
@@ -12,12 +11,12 @@ import numpy as np
 
 from crazyem.diagnosis.flights.flight import Flight
 
-AGREE = 0.02  # m: by how much the others may differ, and by how much a drone may seem to be below the floor
-LEAST = 2  # others that show it
+AGREE = 0.02  # m, largest range of the floors of others; largest height of a drone below the floor
+LEAST = 2  # least number of others that show the floor
 
 
 def on_one_floor(flights: Sequence[Flight], kept_apart: Sequence[Flight]) -> tuple[list[Flight], list[Flight]]:
-    """The flights, those that do not show the floor with that of the others, if these agree and none flew below it."""
+    """The flights; those without a floor get the floor of the others, if these agree and the flight is not below it."""
     everyone = [*flights, *kept_apart]
     shown = [f.ground for f in everyone if f.grounded]
     if len(shown) < LEAST or len(shown) == len(everyone) or np.ptp(shown) > AGREE:

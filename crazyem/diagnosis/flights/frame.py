@@ -1,12 +1,12 @@
-"""How the frame of a pose lies on the drone: tilted against the rotors, by another angle in every recording.
+"""The tilt of the pose frame against the rotors, which is another angle in every recording.
 
-Motion capture knows a body by markers, and whoever puts them on again defines the frame anew. Half a degree of it is a
-side force of 0.1 m/s^2, the same all flight long. What all recordings share is a property of the drone's file
-(`attitude_misalignment`); by how much each differs from the others belongs to the recording alone, like the clock of
-its rotors, and is taken off before anything is fitted.
+Motion capture sees a body by its markers. When the markers are mounted again, the frame is another one. A tilt of half
+a degree is a constant side force of 0.1 m/s^2. The part that all recordings share is a property of the drone
+(`attitude_misalignment`). The difference between recordings belongs to each recording, like the clock of its rotors; it
+is removed before the fit.
 
-No model of the thrust is needed: thrust points along body z, so what the specific force (from the positions) has across
-it, beside what goes with the velocity, is the tilt.
+No thrust model is needed. Thrust points along body z. So the tilt is the lateral part of the specific force (from the
+positions) that does not depend on the velocity, over the thrust.
 """
 
 from collections.abc import Sequence
@@ -21,17 +21,17 @@ from scipy.spatial.transform import Rotation
 from crazyem.diagnosis.flights.flight import Flight, Frame
 from crazyem.vehicle import GRAVITY
 
-STEP, WIDTH = 0.01, 21  # s, samples: of the polynomials (Savitzky and Golay) whose curvature is the acceleration
-BLOCK, LEAST = 1.0, 8  # s that scatter together, and how many of them are needed
-SMALLEST = 1e-5  # rad: of a drone that stands on its feet all along even scatter says nothing
-LIKELY = 1e-3  # p-value that the frames lie alike
+STEP, WIDTH = 0.01, 21  # s, samples: polynomials (Savitzky and Golay) whose second derivative is the acceleration
+BLOCK, LEAST = 1.0, 8  # s, length of the blocks for standard deviations; least number of blocks
+SMALLEST = 1e-5  # rad, least standard deviation; a drone that stands on the floor has no scatter
+LIKELY = 1e-3  # p-value of equal frames, above which nothing is done
 
 
 def alike(flights: Sequence[Flight], kept_apart: Sequence[Flight]) -> tuple[list[Flight], list[Flight]]:
-    """The flights with their pose frames turned to the mean of those that are fitted.
+    """The flights with their pose frames turned to the mean frame of the fitted flights.
 
-    How much frames differ is a variance between recordings beside each one's own error (DerSimonian and Laird 1986);
-    where there is none, and where attitudes come from a filter on board, nothing is done.
+    The variance between recordings is estimated beside the error of each recording (DerSimonian and Laird 1986). If it
+    is 0, or if attitudes come from a filter on board, nothing is done.
     """
     everyone = [*flights, *kept_apart]
     known = {i: tilt for i, f in enumerate(everyone) if (tilt := tilt_of(f)) is not None}
@@ -48,7 +48,7 @@ def alike(flights: Sequence[Flight], kept_apart: Sequence[Flight]) -> tuple[list
 
 
 def tilt_of(flight: Flight) -> tuple[NDArray, NDArray] | None:
-    """Roll and pitch (2,) rad of the pose frame in the body, and their standard deviations; None if not told."""
+    """Roll and pitch (2,) rad of the pose frame in the body, and their standard deviations; None if not determined."""
     if flight.fused or not {"position", "attitude"} <= flight.signals:
         return None
     rows = [_across(flight, part) for part in _stretches(flight)]
@@ -68,7 +68,7 @@ def tilt_of(flight: Flight) -> tuple[NDArray, NDArray] | None:
 
 
 def _stretches(flight: Flight) -> list[NDArray]:
-    """Rows of whole poses, in pieces without gaps."""
+    """Rows with complete poses, in pieces without gaps."""
     seen = np.isfinite(flight.y[:, [0, 6]]).all(1)
     piece = np.cumsum(flight.gaps)
     parts = [np.flatnonzero(seen & (piece == p)) for p in np.unique(piece)]
@@ -76,7 +76,7 @@ def _stretches(flight: Flight) -> list[NDArray]:
 
 
 def _across(flight: Flight, part: NDArray) -> NDArray:
-    """(k, 6): velocity [m/s], the force along z, and across it along x and y [m/s^2], in the axes of the pose."""
+    """(k, 6): velocity [m/s], specific force along z, and along x and y [m/s^2], in the axes of the pose."""
     time = flight.time[part]
     grid = np.arange(time[0], time[-1], STEP)
     place = np.stack([np.interp(grid, time, c) for c in flight.y[part, :3].T], 1)
@@ -95,7 +95,7 @@ def _constant(explaining: NDArray, across: NDArray, block: NDArray) -> tuple[flo
     a, b = np.zeros((count, 2, 2)), np.zeros((count, 2))
     np.add.at(a, block, explaining[:, :, None] * explaining[:, None, :])
     np.add.at(b, block, explaining * across[:, None])
-    inverse = np.linalg.pinv(a.sum(0), hermitian=True)  # a drone that never moves shows no drag
+    inverse = np.linalg.pinv(a.sum(0), hermitian=True)  # singular for a drone that does not move
     theta = inverse @ b.sum(0)
     rest = b - a @ theta
     covariance = inverse @ (rest.T @ rest) @ inverse * count / (count - 2)
@@ -103,7 +103,7 @@ def _constant(explaining: NDArray, across: NDArray, block: NDArray) -> tuple[flo
 
 
 def _deviation(tilt: NDArray, sd: NDArray, fitted: int) -> NDArray:
-    """(n,) rad: of each from the mean of the first `fitted`, as far as it is no error of its own."""
+    """(n,) rad, deviation of each tilt from the mean of the first `fitted`, shrunk by its own error."""
     weight = sd**-2.0
     mean = float(weight @ tilt / weight.sum())
     spread, freedom = float(weight @ (tilt - mean) ** 2), tilt.size - 1

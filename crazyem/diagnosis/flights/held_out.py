@@ -1,4 +1,4 @@
-"""Which flights are fitted and which confirm: those that hover say too little to be fitted where others say more."""
+"""The choice of fitted and held-out flights: hovers have too little information to be fitted if others have more."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,18 +8,18 @@ from numpy.typing import NDArray
 
 from crazyem.diagnosis.flights.flight import Flight
 
-# Below these a flight hovers [m/s, horizontal; rad/s]: simulated hovers have 0.006 to 0.08 and 0.08 to 0.4 (in gusts),
-# small shakes from 0.128 and 0.74 on. There velocities are mostly the jitter of the onboard estimate (see
-# `sensing.jitter`), and a drag is whatever that looks like.
+# Horizontal speed [m/s] and body rate [rad/s] below which a flight hovers. Simulated hovers have 0.006 to 0.08 and 0.08
+# to 0.4 (in gusts), small shakes from 0.128 and 0.74 on. The velocity of a hover is mostly jitter of the onboard
+# estimate (see `sensing.jitter`), which does not determine a drag.
 STILL, STEADY = 0.1, 0.5
-LIVELIER = 3.0  # times as quick, at least: rooms are never still, and flights of a kind differ by chance
+LIVELIER = 3.0  # least ratio of the speeds: air in rooms moves, and flights of a kind differ by chance
 
 
 def swapped(fitted: Sequence[Flight], kept_apart: Sequence[Flight]) -> bool:
-    """Whether the flights to fit only hover and those kept apart do not: then these are fitted, the hovers confirm.
+    """Whether all flights to fit hover and a held-out one is much faster: then they exchange their roles.
 
-    A velocity scale of 1.13 was 1.56 to a hover, and ruined what it was held against; a quadratic drag of 0.02 was
-    0.07.
+    A fit to hovers gives wrong parameters, which fail on other flights: a velocity scale of 1.56 instead of 1.13, a
+    quadratic drag of 0.07 instead of 0.02.
     """
     if not kept_apart:
         return False
@@ -29,7 +29,7 @@ def swapped(fitted: Sequence[Flight], kept_apart: Sequence[Flight]) -> bool:
 
 
 def swap_sentence(fitted: Sequence[str], kept_apart: Sequence[str]) -> str:
-    """The sentence that says so, of what is fitted now and what was named first."""
+    """The sentence that tells of the exchange; `fitted` and `kept_apart` are the new roles."""
     now, first = (", ".join(Path(p).name for p in part) for part in (fitted, kept_apart))
     here = f"physics is fitted to what was held out, {now}, and confirmed by it"
     return f"{first}: only hovers, so {here} (--strict-held-out forbids that)"

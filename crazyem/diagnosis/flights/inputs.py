@@ -1,7 +1,7 @@
-"""What the rotors of a recorded flight were told, or seen to do, as the rotor input of the model with effects.
+"""Commands or measured speeds of the rotors of a recorded flight, as the rotor input of the model with effects.
 
-Which signal serves is decided once, here: measured speeds before commands, commands with voltage before those without,
-what was sent before what was asked for. Nothing is resampled; stamps are those of the recording.
+The choice of the signal is made here alone: measured speeds before commands, commands with voltage before those
+without, sent commands before requested ones. Nothing is resampled; stamps are those of the recording.
 """
 
 from collections.abc import Callable
@@ -21,17 +21,17 @@ from crazyem.recordings.recording import Recording, onboard_estimate
 from crazyem.recordings.thrust import kind_objection, signal_for, too_slow
 from crazyem.vehicle import Vehicle
 
-NOMINAL_VOLTAGE = 3.85  # V under load, middle of 3.7 to 4.0 V, where none is recorded
-# s: a command is held for 2 ms at 500 Hz, rates are low-passed at 80 Hz (2.8 ms). Where the attitude is recorded it is
-# the clock, and rates are behind it (physics/effects/onboard_filter.py).
+NOMINAL_VOLTAGE = 3.85  # V under load, middle of 3.7 to 4.0 V, if no voltage is recorded
+# s. A command is held for 2 ms at 500 Hz; rates have a low pass of 80 Hz (2.8 ms). A recorded attitude is the
+# clock, and rates are behind it (physics/effects/onboard_filter.py).
 DELAY_OF_COMMANDS, BEHIND_ATTITUDE = 3.5e-3, 2.1e-3
 _SAMPLED = ("motor_command", "motor_request", "mixer_command")
 FULL = 65535.0  # counts of PWM
-STAND_IN = 0.01  # m, arm and torque per thrust of a vehicle without rotors; cancels
+STAND_IN = 0.01  # m, arm and torque per thrust of a vehicle without rotors; its value cancels
 
 _SANE = {**LARGEST_COMMAND, "wrench_command": 1e3, "mixer_command": 1e6}  # as `LARGEST_COMMAND`, SI and counts
 
-# Thrust asked for -> motor volts, in the battery compensation of crazyflie-firmware until 2022-11 (motors.c): grams of
+# Requested thrust -> motor volts, in the battery compensation of crazyflie-firmware until 2022-11 (motors.c): grams of
 # thrust of all four motors, then a parabola.
 _GRAMS, _VOLTS = 60.0, (0.088, -0.0006239)
 
@@ -42,15 +42,15 @@ class Inputs:
 
     Attributes:
         rotor: see `RotorInput`.
-        signal: the signal it was made from.
-        vehicle: to be used with it. The same as given, but for one without rotors, which gets stand-ins for arm and
-            torque per thrust, so that four thrusts can carry the thrust and the torque of its input.
-        notices: what had to be assumed, a sentence each.
+        signal: the signal that it is made from.
+        vehicle: the vehicle to use with this input. A vehicle without rotors gets stand-ins for arm and torque per
+            thrust, so that four thrusts represent the thrust and the torque of its input.
+        notices: assumptions, a sentence each.
         ground: height of the floor in the frame of the position [m]; 0 where unknown.
-        took_off: when the drone first left the floor [s]; the first input where that is unknown.
-        alignment: how late measured rotor speeds are behind the body rates, in this recording; None where unknown.
-        level: the voltage that was taken, where none is recorded and the flight shows one; else None.
-        fused: whether a filter on board made the recorded attitude, or the velocity where there is none.
+        took_off: time of the first take-off [s]; of the first input where unknown.
+        alignment: delay of measured rotor speeds behind the body rates in this recording; None where unknown.
+        level: the voltage estimated from the flight, if none is recorded; else None.
+        fused: whether the recorded attitude, or without one the velocity, comes from a filter on board.
     """
 
     rotor: RotorInput
@@ -72,14 +72,14 @@ def rotor_input(recording: Recording, vehicle: Vehicle) -> RotorInput:
 def inputs_of(
     recording: Recording, vehicle: Vehicle, *, flight: Airtime | None = None, until: float = np.inf
 ) -> Inputs:
-    """What a vehicle's rotors were told or seen to do in a recording.
+    """The rotor input of a vehicle from a recording.
 
     Args:
         recording: of any format.
         vehicle: decides which signals can become thrust.
-        flight: `crazyem.doctor.streams.airtime(recording)` where it is known already.
-        until: s, a voltage that is not recorded is taken from the flight (see `level`), but from nothing later; before
-            anything shows it, a nominal one.
+        flight: `airtime(recording)`, if already known.
+        until: s, end of the flight from which a voltage that is not recorded is estimated (see `level`); too early for
+            an estimate, the voltage is nominal.
 
     Raises:
         DataError: the recording has no signal that this vehicle can turn into thrust.
@@ -125,7 +125,7 @@ class _Found:
     thrust: NDArray[np.float64]  # (m, 4) N
     voltage: NDArray[np.float64]  # (m,) V
     notices: tuple[str, ...] = ()
-    vehicle: Vehicle | None = None  # where it is not the one given
+    vehicle: Vehicle | None = None  # if it differs from the given one
     sent: NDArray[np.float64] | None = None  # (m, 4) duty where no voltage is recorded
 
 
@@ -133,7 +133,7 @@ _Array = NDArray[np.float64]
 
 
 def samples(recording: Recording, name: str) -> tuple[_Array, _Array]:
-    """Whole samples of a signal with increasing stamps; of several with one stamp the first."""
+    """Complete samples of a signal with increasing stamps; of several with the same stamp, the first."""
     array = recording.signals.get(name)
     if array is None:
         return np.empty(0), np.empty((0, 1))
@@ -146,7 +146,7 @@ def samples(recording: Recording, name: str) -> tuple[_Array, _Array]:
 
 
 def _voltage(recording: Recording, time: _Array) -> _Array:
-    """(m,) V: the newest at each stamp; NaN before the first one."""
+    """(m,) V, the newest voltage at each stamp; NaN before the first one."""
     when, volts = samples(recording, "voltage")
     sound = (volts[:, 0] > 0.5) & (volts[:, 0] < 60.0)
     when, volts = when[sound], volts[sound, 0]
@@ -164,11 +164,11 @@ def _from_speed(recording: Recording, vehicle: Vehicle, time: _Array, value: _Ar
 
 
 def _from_command(recording: Recording, vehicle: Vehicle, time: _Array, value: _Array) -> _Found | None:
-    """With the voltage of each moment."""
+    """Thrust from sent commands with the recorded voltage."""
     if not vehicle.thrust_curve:
         return None
     voltage = _voltage(recording, time)
-    known = np.isfinite(voltage)  # before the first voltage nobody knows what a command does
+    known = np.isfinite(voltage)  # before the first voltage, the thrust of a command is unknown
     if not known.any():
         return None
     time, value, voltage = time[known], value[known], voltage[known]
@@ -176,14 +176,14 @@ def _from_command(recording: Recording, vehicle: Vehicle, time: _Array, value: _
 
 
 def _from_command_alone(recording: Recording, vehicle: Vehicle, time: _Array, value: _Array) -> _Found | None:
-    """Without any voltage."""
+    """Thrust from sent commands without a recorded voltage."""
     if not vehicle.thrust_curve:
         return None
     return _sent(vehicle, time, value, None)
 
 
 def _sent(vehicle: Vehicle, time: _Array, value: _Array, level: Level | None) -> _Found:
-    """What was sent, by a voltage that nobody measured."""
+    """Thrust from sent commands with an assumed or estimated voltage."""
     volts = NOMINAL_VOLTAGE if level is None else level.voltage
     thrust = thrust_from_command(value, np.full(time.size, volts), thrust_curve=vehicle.thrust_curve)
     why = (
@@ -197,7 +197,7 @@ def _sent(vehicle: Vehicle, time: _Array, value: _Array, level: Level | None) ->
 
 
 def _from_request(recording: Recording, vehicle: Vehicle, time: _Array, value: _Array) -> _Found | None:
-    """Thrust asked for before the battery compensation, (m, 4) 0..1."""
+    """Thrust from requests before the battery compensation, (m, 4) 0..1."""
     voltage = _voltage(recording, time)
     if recording.source == "ulog" and np.isfinite(vehicle.thrust_max):
         notice = f"motor_request is a share of the largest thrust: {vehicle.thrust_max:g} N of each rotor is assumed"
@@ -219,7 +219,7 @@ def _from_request(recording: Recording, vehicle: Vehicle, time: _Array, value: _
 
 
 def _from_mixer(recording: Recording, vehicle: Vehicle, time: _Array, value: _Array) -> _Found | None:
-    """Thrust, roll, pitch, yaw handed to the mixer, counts (power_distribution_stock.c)."""
+    """Thrust from the inputs of the mixer: thrust, roll, pitch, yaw in counts (power_distribution_stock.c)."""
     base, yaw = value[:, 0], value[:, 3]
     roll, pitch = np.trunc(value[:, 1] / 2.0), np.trunc(value[:, 2] / 2.0)
     mixed = np.stack(
@@ -230,7 +230,7 @@ def _from_mixer(recording: Recording, vehicle: Vehicle, time: _Array, value: _Ar
 
 
 def _from_wrench(recording: Recording, vehicle: Vehicle, time: _Array, value: _Array) -> _Found | None:
-    """Commanded thrust and torque, spread over four rotors by the inverse of the mixing."""
+    """Thrust from commanded thrust and torque, distributed to four rotors by the inverse of the mixing."""
     used = vehicle
     if min(*vehicle.arm, vehicle.torque_per_thrust) <= 0.0:
         used = replace(vehicle, arm=(STAND_IN, STAND_IN), torque_per_thrust=STAND_IN)
@@ -239,7 +239,7 @@ def _from_wrench(recording: Recording, vehicle: Vehicle, time: _Array, value: _A
     return _Found(time, thrust, _voltage(recording, time), vehicle=used)
 
 
-# Best first.
+# Signals in the order of preference.
 _CHOICES: tuple[tuple[str, Callable[[Recording, Vehicle, _Array, _Array], _Found | None]], ...] = (
     ("rotor_speed", _from_speed),
     ("motor_command", _from_command),

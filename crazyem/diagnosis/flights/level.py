@@ -1,9 +1,9 @@
-"""A battery that nobody measured: the voltage by which the commands of a flight's beginning carry the vehicle.
+"""The voltage of a battery that is not recorded: by this voltage, the first commands of a flight carry the weight.
 
-Batteries begin at other charges, so a voltage that is assumed alike for all is wrong by up to a third of the thrust,
-differently in every flight; cut off at what the rotors can do it even hides that commands rise while the thrust stays.
-Like the clock of its rotors the level is a property of a recording and never written anywhere. How strong or heavy the
-drone is as a whole cannot be told from such a recording, only what changes in it.
+Batteries have different charges. With one assumed voltage for all flights, the thrust is wrong by up to a third, by
+another amount in every flight. With a thrust cut off at the limit of the rotors, it is even hidden that commands rise
+while the thrust is constant. Like the clock of the rotors, this voltage belongs to a recording and is written nowhere.
+Such a recording does not determine the total strength or mass of the drone, only their changes.
 """
 
 from dataclasses import dataclass
@@ -20,21 +20,21 @@ from crazyem.recordings.ordering import ordered
 from crazyem.recordings.recording import Recording
 from crazyem.vehicle import GRAVITY, Vehicle
 
-CLEAR = 0.3  # m above the floor, where its effect is over; within
-SOON = 5.0  # s of leaving it, else at once
-LONG, SHORT = 3.0, 1.0  # s of flight that are looked at, and least;
-LOOKS = (0.2, 0.5, 1.0, 2.0)  # s after leaving the floor when a prediction looks already
-SLOPE, FEWEST_HEIGHTS = 0.2, 4  # s of a slope of the height that is a velocity, and heights in it
-ADMITTED = (0.4, 1.4)  # times the nominal voltage
+CLEAR = 0.3  # m above the floor, from which there is no ground effect
+SOON = 5.0  # s after take-off, within which the drone must be that high; else the take-off itself counts
+LONG, SHORT = 3.0, 1.0  # s of flight that are used; least
+LOOKS = (0.2, 0.5, 1.0, 2.0)  # s after take-off at which a prediction already estimates the voltage
+SLOPE, FEWEST_HEIGHTS = 0.2, 4  # s, length of a linear fit of the height for a velocity; least number of heights
+ADMITTED = (0.4, 1.4)  # range of the voltage over the nominal one
 
 
 @dataclass(frozen=True)
 class Level:
-    """A voltage that was found.
+    """An estimated voltage.
 
     Attributes:
         voltage: V.
-        known: s, stamp of the last sample that it follows from.
+        known: s, stamp of the last sample of the estimate.
     """
 
     voltage: float
@@ -51,16 +51,16 @@ def level_of(
     nominal: float,
     until: float = np.inf,
 ) -> Level | None:
-    """The voltage by which the impulse of the thrust along the vertical is that of weight and change of velocity.
+    """The voltage for which the vertical impulse of the thrust equals that of weight and change of velocity.
 
     Args:
-        time, command: (m,) s and (m, 4) duty sent, 0..1.
-        nominal: V, about which it is looked for.
-        until: s, what comes later is not looked at; then less than `SHORT` will do, from the moment it left the floor.
+        time, command: (m,) s and (m, 4) sent duty, 0..1.
+        nominal: V, centre of the search.
+        until: s, later samples are not used; if `until` is early, less than `SHORT` from take-off is enough.
 
     Returns:
-        None where the recording has neither velocity nor position, no flight that is long enough, or no voltage does
-        it.
+        None if the recording has neither velocity nor position, if the flight is too short, or if no admitted voltage
+        fits.
     """
     moving = {"velocity", "position"} & set(recording.signals)
     if flight is None or not flight.flown or not moving or not vehicle.thrust_curve:
@@ -93,8 +93,8 @@ def level_of(
 
 
 def _climbing(recording: Recording, begin: float, end: float) -> tuple[NDArray, NDArray]:
-    """Stamps (n,) s within a time, and the upward velocity there (n,) m/s; without a recorded one the slope of the
-    height at either end."""
+    """Stamps (n,) s between two times and upward velocities (n,) m/s there; without a recorded velocity, the slopes of
+    the height at both ends."""
     shown = "velocity" if "velocity" in recording.signals else "position"
     when, value = ordered(recording.signals[shown])
     seen = (when >= begin) & (when <= end) & np.isfinite(value[:, 2])
@@ -109,7 +109,7 @@ def _climbing(recording: Recording, begin: float, end: float) -> tuple[NDArray, 
 
 
 def _clear(recording: Recording, flight: Airtime) -> float:
-    """When the drone was first clear of the floor [s]."""
+    """Time at which the drone first is `CLEAR` above the floor [s]; else of take-off."""
     took_off = flight.flown[0][0]
     if "position" not in recording.signals or not np.isfinite(flight.ground):
         return took_off

@@ -1,4 +1,4 @@
-"""What belongs to one recording and to no drone: the clock of its rotors, the frame of its pose, what was assumed."""
+"""Nuisances of single recordings, not of the drone: clock of the rotors, frame of the pose, assumptions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,19 +8,19 @@ from typing import Any
 from crazyem.diagnosis.flights.alignment import Alignment
 from crazyem.diagnosis.flights.flight import Flight, Frame
 
-WORTH_TELLING = 0.005  # of the thrust
+WORTH_TELLING = 0.005  # least relative difference of thrust that is told
 
 
 @dataclass(frozen=True, eq=False)
 class RecordingNuisances:
-    """Found in a recording, taken off or fitted beside what all share; never written into a vehicle file.
+    """Nuisances of a recording, corrected beforehand or fitted; never written into a vehicle file.
 
     Attributes:
         recording: its path.
-        held_out: whether it is one that is only judged by.
-        alignment: how late measured rotor speeds are behind the body rates; None where unknown.
-        frame: how the pose lies against that of the other recordings; None where alike or unknown.
-        strength: thrust over what the fitted vehicle says of it; None where it is not asked (see `always.SEVERAL`).
+        held_out: whether it is a held-out recording.
+        alignment: delay of measured rotor speeds behind the body rates; None where unknown.
+        frame: tilt of the pose frame against the other recordings; None if equal or unknown.
+        strength: thrust over that of the fitted vehicle; None if it is not fitted (see `nuisances.SEVERAL`).
         notices: a sentence each.
     """
 
@@ -32,7 +32,7 @@ class RecordingNuisances:
     notices: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """As docs/reference/json.md has it."""
+        """The nuisances in the format of docs/reference/json.md."""
         clock, frame = self.alignment, self.frame
         return {
             "recording": self.recording,
@@ -47,7 +47,7 @@ class RecordingNuisances:
         }  # fmt: skip
 
     def free(self) -> list[dict[str, Any]]:
-        """Its clock and its frame as what is left free of a fit (`naming/free.py`)."""
+        """Clock and frame in the format of free parameters of a fit (`naming/free.py`)."""
         name, found = Path(self.recording).name, []
         if self.alignment:
             found.append(("rotor clock", f"delay, {name}", self.alignment.delay, self.alignment.sd, "s"))
@@ -62,7 +62,7 @@ class RecordingNuisances:
 def owned(
     flights: Sequence[Flight], kept_apart: Sequence[Flight], strengths: Mapping[str, float] | None = None
 ) -> tuple[RecordingNuisances, ...]:
-    """Of all flights, those kept apart last; `strengths` by name."""
+    """The nuisances of all flights, held-out ones last; `strengths` by name of the recording."""
     return tuple(
         _nuisances_of(f, apart, (strengths or {}).get(f.name))
         for part, apart in ((flights, False), (kept_apart, True))
