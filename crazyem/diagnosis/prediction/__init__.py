@@ -1,1 +1,1 @@
-"""Open loop: where the model says a drone goes from a recorded state and recorded inputs, and how far it is off."""
+"""Open loop: predictions of a model from a recorded state and recorded inputs, and their errors."""

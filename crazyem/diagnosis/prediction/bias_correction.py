@@ -1,21 +1,21 @@
-"""What an open-loop prediction learns from the flight before its start: how much of the model's turning to believe,
-what the loop does besides, and the mean force that the model lacked.
+"""Corrections of an open-loop prediction from the flight before its start: a weight of the rotation by the model, the
+feedback of the control loop, and the mean specific force that the model lacks.
 
-A drone in stabilised flight hardly accelerates: a controller that answers to the air makes the recorded torque cancel
-a torque that no model knows. Over some tenths of a second the model's net torque is therefore mostly error, and a body
-rate that stays as it is the better prediction; in hard manoeuvres the model is. Which of them is a matter of record:
-for every time ahead h and each axis, the change of the rate that came is regressed on the change that the model gave,
-on h itself (a steady torque that the model lacks), and on what is known at the start, since torques that no model
-knows come and go with what the drone does, and the loop takes rates, tilts, velocities and places back to what it
-wants,
+A drone in stabilised flight hardly accelerates: its controller answers to the air, so the recorded torque cancels a
+torque that no model contains. Over some tenths of a second, the net torque of the model is then mostly error, and a
+constant body rate is the better prediction. In hard manoeuvres the model is better. A regression decides between them,
+for every time ahead h and each axis:
 
-    change that came = weight(h) * change by the model + offset(h) * h + feedback(h) . start,
-    start = (angular acceleration that the model lacked in the last step, rate, and across the axis tilt, velocity,
-             velocity times the flow along the rotors' axis, and how far the drone is from where it was on average),
+    recorded change of the rate = weight(h) * change by the model + offset(h) * h + feedback(h) . start,
+    start = (angular acceleration that the model lacked in the last step, rate, and across the axis: tilt, velocity,
+             velocity times the flow along the axis of the rotors, distance from the mean position so far).
 
-over the flight so far, never what comes after a start; what is older than `MEMORY` counts less. Earlier flights of the
-drone, where given, count as if they had just been flown. While little has been seen, everything is drawn towards the
-model itself: weight 1, the rest 0. The force, in body axes, is a battery or a day's thrust, which no file knows.
+The offset is a steady torque that the model lacks. The feedback is there because unknown torques depend on the motion,
+and because the loop takes rates, tilts, velocities and positions back to its setpoints.
+
+The regression uses the flight before the start only; data older than `MEMORY` count less. Earlier flights of the drone,
+if given, count as if they had just been flown. A prior shrinks everything towards the model: weight 1, the rest 0. The
+specific force, in body axes, is that of a battery or of the thrust of the day, which no file contains.
 """
 
 from dataclasses import dataclass
@@ -24,25 +24,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-LAGS = 10  # of them up to the horizon
-MEMORY = 10.0  # s
-WEIGHT_SD, OFFSET_SD = 1.0, 2.0  # 1, rad/s^2: before anything was seen
-# 1/s, 1/s, rad/s^2 per rad, per m/s, per (m/s)^2 and per m: times h, of what is known at the start
+LAGS = 10  # times ahead, up to the horizon
+MEMORY = 10.0  # s, time constant of the exponential weights of older data
+WEIGHT_SD, OFFSET_SD = 1.0, 2.0  # 1, rad/s^2: standard deviations of the priors
+# 1/s, 1/s, rad/s^2 per rad, per m/s, per (m/s)^2 and per m; times h: standard deviations of the priors of the feedback
 FEEDBACK_SD = (1.0, 2.0, 10.0, 2.0, 1.0, 1.0)
-FORCE_SD, CORRELATED = 0.5, 0.1  # m/s^2 before anything was seen; s within which one moment is as wrong as the next
-MOST = 2.0  # weight; of a model that is right it is 1
-LEAST_TIME = 2.0  # s of flight before anything is said of the turning,
-FORCE_TIME = 0.3  # of the force, whose prior holds it while little was seen: a frame 3 degrees off is 0.5 m/s^2 at once
+FORCE_SD, CORRELATED = 0.5, 0.1  # m/s^2, standard deviation of the prior; s, correlation time of errors of the force
+MOST = 2.0  # largest weight; that of a right model is 1
+LEAST_TIME = 2.0  # s of flight before the rotation is corrected
+FORCE_TIME = 0.3  # s of flight before the force is; less, because a frame 3 degrees off is 0.5 m/s^2 from the start on
 
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """Of n starts, at times ahead of them.
+    """Corrections for n starts, at times ahead.
 
     Attributes:
-        lags: (l,) s, evenly spaced from 0.
-        weight: (n, l, 3) of the model's change of the body rate.
-        added: (n, l, 3) rad/s beside it.
+        lags: (l,) s, times ahead, evenly spaced from 0.
+        weight: (n, l, 3) of the change of the body rate by the model.
+        added: (n, l, 3) rad/s, added change.
         force: (n, 3) m/s^2, specific force that the model lacks, body axes.
     """
 
@@ -52,7 +52,7 @@ class Weights:
     force: NDArray
 
     def changed(self, since: NDArray, gained: NDArray) -> NDArray:
-        """(n, 3) rad/s: the change of the rate `since` (n,) s, where the model gives `gained` (n, 3) rad/s."""
+        """(n, 3) rad/s, corrected change of the rate over `since` (n,) s, for a change `gained` (n, 3) by the model."""
         place = np.clip(since / self.lags[1], 0.0, len(self.lags) - 1.000001)
         low = place.astype(int)
         part = (place - low)[:, None]
@@ -62,21 +62,21 @@ class Weights:
         return changed
 
     def of(self, rows: slice | NDArray) -> "Weights":
-        """Of some of the starts."""
+        """The corrections of some starts."""
         return Weights(self.lags, self.weight[rows], self.added[rows], self.force[rows])
 
 
 @dataclass(frozen=True, eq=False)
 class Turned:
-    """What a flight did, and what the model says of it one step ahead.
+    """The rotation of a recorded flight, and predictions of the model one step ahead.
 
     Attributes:
         time: (r,) s, increasing.
         rate: (r, 3) rad/s, recorded.
-        gained: (r, 3) rad/s, what the model adds from a row to the next one, beginning with the recorded row.
-        start: (r, 3, f) what is known at a row for each axis, see above; f as `FEEDBACK_SD`.
-        flying: (r,) bool: the step from a row to the next one counts.
-        lacking: (r, 3) m/s^2, specific force that the model lacked in that step, body axes.
+        gained: (r, 3) rad/s, change by the model from a recorded row to the next one.
+        start: (r, 3, f) regressors `start` of the module at a row for each axis; f as in `FEEDBACK_SD`.
+        flying: (r,) bool, whether the step from a row to the next one counts.
+        lacking: (r, 3) m/s^2, specific force that the model lacks in this step, body axes.
     """
 
     time: NDArray
@@ -92,8 +92,8 @@ class Turned:
         return float(np.median(np.diff(self.time)))
 
     def changes(self, lag: float) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """End times (k,) s, changes that the model gave and that came (k, 3) rad/s, over `lag` s, in order; and the
-        rows (k,) that they begin at."""
+        """End times (k,) s, changes by the model and recorded ones (k, 3) rad/s over `lag` s, in order; and their first
+        rows (k,)."""
         seen = np.isfinite(self.rate).all(1)
         sound = self.flying & seen & np.isfinite(self.gained).all(1) & np.isfinite(self.start).all((1, 2))
         steps = np.where(sound[:, None], self.gained, 0.0)
@@ -107,9 +107,9 @@ class Turned:
 
 
 def correction_weights(turned: Turned, starts: NDArray, *, horizon: float, before: NDArray | None = None) -> Weights:
-    """The weights of starts (n,) s by the flight before them, for times ahead up to `horizon` s.
+    """The corrections of starts (n,) s by the flight before them, for times ahead up to `horizon` s.
 
-    before: `moments` of earlier flights; None: there are none.
+    before: `moments` of earlier flights; None: no earlier flights.
     """
     lags = np.linspace(0.0, horizon, LAGS + 1)
     weight, added = np.ones((starts.size, lags.size, 3)), np.zeros((starts.size, lags.size, 3))
@@ -133,7 +133,7 @@ def correction_weights(turned: Turned, starts: NDArray, *, horizon: float, befor
 
 
 def moments(turned: Turned, *, horizon: float) -> NDArray:
-    """(l, 3, p) mean products of what is regressed in a flight, by time ahead and axis, for flights after it."""
+    """(l, 3, p) mean products of the regression of a flight, by time ahead and axis, for later flights."""
     found = []
     for lag in np.linspace(0.0, horizon, LAGS + 1)[1:]:
         _, explaining, came = _explained(turned, float(lag))
@@ -142,7 +142,7 @@ def moments(turned: Turned, *, horizon: float) -> NDArray:
 
 
 def _explained(turned: Turned, lag: float) -> tuple[NDArray, NDArray, NDArray]:
-    """End times (k,) s, what explains a change over `lag` s by axis (k, 3, c), and the change that came (k, 3)."""
+    """End times (k,) s, regressors (k, 3, c) of a change over `lag` s by axis, and the recorded change (k, 3)."""
     ends, x, y, rows = turned.changes(lag)
     return ends, np.concatenate([x[:, :, None], np.ones((rows.size, 3, 1)), turned.start[rows]], axis=2), y
 
@@ -156,11 +156,12 @@ def _products(x: NDArray, y: NDArray) -> NDArray:
 def regressed(
     x: NDArray, y: NDArray, sd: NDArray, alike: float, period: float, at: NDArray, *, before: NDArray | None = None
 ) -> NDArray:
-    """(n, c) coefficients of y (k,) on the columns of x (k, c) up to each of the rows `at` (n,), drawn towards
-    1, 0, 0 ... by priors of these standard deviations (c,). Each `alike` rows, one every `period` s, say the same.
+    """(n, c) coefficients of y (k,) on the columns of x (k, c), from rows up to each of `at` (n,).
 
-    before: mean products (p,) of earlier flights (see `moments`), as if they had been flown until now; a row of -1
-        knows nothing else.
+    Priors of standard deviations `sd` (c,) shrink them towards 1, 0, 0 ... Rows come every `period` s; `alike` rows
+    count as one, because their windows overlap.
+
+    before: mean products (p,) of earlier flights (see `moments`), as if just flown; a row of -1 uses them alone.
     """
     forget, c = np.exp(-period / MEMORY), x.shape[1]
     i, j = np.triu_indices(c)
@@ -175,7 +176,7 @@ def regressed(
     a, b = a / (size[:, :, None] * size[:, None, :]), b / size
     free = np.linalg.solve(a + 1e-9 * np.eye(c), b[:, :, None])[:, :, 0]
     missed = np.maximum(yy - np.einsum("ki,ki->k", free, b), 1e-12) / count  # variance
-    noise = (missed * alike)[:, None]  # windows that overlap say the same
+    noise = (missed * alike)[:, None]  # windows overlap
     prior = (size * sd) ** -2.0
     middle = np.concatenate([prior[:, :1] * size[:, :1], np.zeros((at.size, c - 1))], axis=1)
     information = a / noise[:, :, None] + prior[:, :, None] * np.eye(c)
@@ -184,7 +185,7 @@ def regressed(
 
 
 def lacked(turned: Turned, starts: NDArray) -> NDArray:
-    """(n, 3) m/s^2: mean specific force that the model lacked before each start, drawn towards 0."""
+    """(n, 3) m/s^2, mean specific force that the model lacked before each start, shrunk towards 0."""
     rows = np.flatnonzero(turned.flying & np.isfinite(turned.lacking).all(1))
     found = np.zeros((starts.size, 3))
     if not rows.size:
@@ -203,8 +204,8 @@ def lacked(turned: Turned, starts: NDArray) -> NDArray:
 
 
 def remembered(value: NDArray, counting: NDArray, period: float) -> NDArray:
-    """(r, k): mean of the rows (r, k) up to each of those that count (r,), what is older than `MEMORY` counting less;
-    before any the row itself."""
+    """(r, k): mean of the counted rows (r, k) up to each row, with smaller weights of older rows (`MEMORY`); before the
+    first counted row, the row itself."""
     counts = counting & np.isfinite(value).all(1)
     forget = np.exp(-period / MEMORY)
     count = lfilter([1.0], [1.0, -forget], counts.astype(float))

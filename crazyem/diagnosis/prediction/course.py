@@ -1,7 +1,7 @@
 """The thrust of the rotors as a function of time: commands through the lag, in closed form between their stamps.
 
-For open-loop prediction. Unlike `physics.motion.rotor_thrust` it looks no further than a given stamp, differently for
-every start, and it fits no predictor: the inputs of a horizon are given, and what follows them is held.
+For open-loop prediction. In contrast to `physics.motion.rotor_thrust`, inputs are known up to another stamp for every
+start, and the last known input is held. No predictor of inputs is fitted.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from crazyem.vehicle import Vehicle
 
 @compiled
 def _carry(time, thrust, lag, linear, state, integral):
-    """Lagged thrust (m, 4) at the stamps and its integral since the first, which it starts settled at."""
+    """Lagged thrust (m, 4) at the stamps and its integral since the first stamp, where the thrust is settled."""
     state[0] = thrust[0]
     for k in range(len(time) - 1):
         h = time[k + 1] - time[k]
@@ -34,11 +34,11 @@ class ThrustCourse:
     """Thrust of each rotor after the lag, at any time.
 
     Args:
-        inputs: what the rotors were told, or seen to do.
+        inputs: commands or measured speeds of the rotors.
         vehicle, effects: lag, and the effects on commands, measured speeds, lag and delay.
 
     Attributes:
-        lag, delay: s, as used.
+        lag, delay: s, with effects.
     """
 
     def __init__(self, inputs: RotorInput, *, vehicle: Vehicle, effects: Effects) -> None:
@@ -59,7 +59,7 @@ class ThrustCourse:
 
         Args:
             begin, end: (n,) s, end after begin.
-            last: (n,) index of the last stamp that may be known; its command is held from there on.
+            last: (n,) index of the last known stamp; its command is held from there on.
             late: (n,) s, added to the delay.
 
         Returns: (n, 4) N and (n, 4) N/s.
@@ -78,7 +78,7 @@ class ThrustCourse:
         slope = np.zeros_like(u)
         if self.linear:
             gap = (self.time[after] - self.time[k])[:, None]
-            known = ((k < last) & (after > k))[:, None] & (h > 0)  # before the first stamp it is held too
+            known = ((k < last) & (after > k))[:, None] & (h > 0)  # also held before the first stamp
             slope = np.where(known, (self.thrust[after] - u) / np.where(gap > 0, gap, 1.0), 0.0)
         area = u * h + 0.5 * slope * h * h
         if self.lag <= 0.0:

@@ -1,11 +1,10 @@
 """Open-loop predictions by many drones that may be this one: a band instead of a line.
 
-The centre is the vehicle, corrected as in `predict` by the flight before each start, and by the other flights. The band
-has two parts. The first is what is not known of the drone: its members. The second is what no constants tell:
-disturbances, and the error of the state at the start. Other flights tell the shape of this part. Their prediction
-errors, in the heading frame, are divided by a scale and drawn anew. The scale of each start is the root mean square of
-the errors that were known then: those of the other flights, and those of this flight so far. Without other flights the
-second part is left out.
+The centre is the prediction by the vehicle, corrected as in `predict` by the flight before each start, and by other
+flights. The band has two parts. The first is the uncertainty of the parameters: the members. The second are
+disturbances and errors of the start state. Other flights give the shape of this part: their prediction errors, in the
+heading frame, are divided by a scale and resampled. The scale of each start is the root mean square of the errors that
+are known then, of other flights and of this flight so far. Without other flights the second part is left out.
 """
 
 from collections.abc import Sequence
@@ -23,11 +22,11 @@ from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
 Array = NDArray[np.float64]
-BAND = 0.9  # share that the band should hold
+BAND = 0.9  # nominal coverage of the band
 QUANTITIES = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 9), "body_rate": slice(9, 12)}
-FEWEST_STARTS = 30  # of errors to learn twelve spreads from
-STEP = 0.01  # s of the integration: for hundreds of drones
-PRIOR_TIME = 1.0  # s of flight that other flights count as, in the scale of errors: two horizons
+FEWEST_STARTS = 30  # least number of errors, from which twelve spreads are estimated
+STEP = 0.01  # s, step of the integration; long, because there are hundreds of drones
+PRIOR_TIME = 1.0  # s of flight that other flights count as in the scale of errors: two horizons
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +34,11 @@ class Ensemble:
     """Predictions by many drones at one time ahead.
 
     Attributes:
-        rows: (n,) starts, rows of the recording's states. time: (n,) s when each was predicted for.
-        centre: (n, 13) by the vehicle itself, corrected as in `predict`, as `predict.NAMES`.
-        offsets: (m, n, 12) of each member from that: position m, velocity m/s (world), attitude as rotation vector
-            rad (body), rate rad/s.
-        truth: (n, 12) of what was recorded, from the same centre; NaN where nothing was.
+        rows: (n,) starts, rows of the recorded states. time: (n,) s, times of the predicted states.
+        centre: (n, 13) prediction by the vehicle, corrected as in `predict`; as `predict.NAMES`.
+        offsets: (m, n, 12) of each member from the centre: position m, velocity m/s (world), attitude as rotation
+            vector rad (body), rate rad/s.
+        truth: (n, 12) of the recorded states from the centre; NaN where not recorded.
         horizon: s.
     """
 
@@ -56,7 +55,7 @@ class Ensemble:
         return edges[0], edges[1]
 
     def held(self) -> dict[str, float]:
-        """Share of what was recorded that lies in the band, by quantity."""
+        """Share of the recorded states that lies in the band, by quantity."""
         low, high = self.band()
         inside = np.where(np.isfinite(self.truth), (self.truth >= low) & (self.truth <= high), np.nan)
         return {q: float(np.nanmean(inside[:, c])) for q, c in QUANTITIES.items()}
@@ -75,7 +74,7 @@ class Ensemble:
         )
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """For a file."""
+        """All arrays by name, for a file."""
         low, high = self.band()
         return {
             "start_index": self.rows, "time": self.time, "centre": self.centre, "offsets": self.offsets, "low": low,
@@ -97,8 +96,8 @@ def ensemble(
     """Predict `horizon` [s] ahead by every member, from starts all along a flight.
 
     Args:
-        vehicle: the most likely drone. members: drones as they may be.
-        calibrate: other flights of the drone, by which disturbances are learned.
+        vehicle: the most likely drone. members: possible drones.
+        calibrate: other flights of the drone, for the spread of disturbances.
         seed: of the draws of disturbances.
         plain: the model alone, not corrected by the flight before each start.
 
@@ -126,8 +125,8 @@ class _Flight:
     """Predictions of one flight by the vehicle.
 
     Attributes:
-        shown, at: the recording, and its n starts. weights: what was learned before each; None: the model alone.
-        centre: (n, 13). errors: (n, 12) of the recorded states from there, heading frame; NaN where nothing was
+        shown, at: the recording and its n starts. weights: corrections of each start; None: the model alone.
+        centre: (n, 13). errors: (n, 12) of the recorded states from the centre, heading frame; NaN where not
             recorded.
     """
 
@@ -139,7 +138,7 @@ class _Flight:
 
     @staticmethod
     def of(shown: Recorded, horizon: float, before: Sequence[Array], *, plain: bool) -> "_Flight":
-        """With `moments` of other flights."""
+        """Predictions with the `moments` of other flights."""
         at = windows(shown, horizons=(horizon,))
         learned = np.mean(before, axis=0) if before else None
         weights = None
@@ -151,11 +150,11 @@ class _Flight:
 
     @property
     def complete(self) -> NDArray[np.bool_]:
-        """(n,) whether all of an error is known."""
+        """(n,) whether all components of an error are known."""
         return np.asarray(np.isfinite(self.errors).all(axis=1))
 
     def flown(self, member: Vehicle, recording: Recording) -> Array:
-        """(n, 13) by a member; the recording is read anew where its law of thrust is another one."""
+        """(n, 13) predictions by a member; the recording is read again if the member has another thrust curve."""
         shown = self.shown
         law, own = ((v.rotor_constant, v.thrust_curve, v.thrust_max) for v in (member, shown.inputs.vehicle))
         if law != own:
@@ -169,7 +168,7 @@ class _Flight:
 
 
 def _flown(recording: Recording, vehicle: Vehicle) -> Recorded | None:
-    """None where a flight has no whole states or is too short."""
+    """The states of a flight; None if it has no complete states or is too short."""
     try:
         shown = recorded(recording, vehicle)
         windows(shown)
@@ -179,17 +178,17 @@ def _flown(recording: Recording, vehicle: Vehicle) -> Recorded | None:
 
 
 def error_scale(begin: Array, end: Array, errors: Array, prior: Array) -> Array:
-    """How large the errors were that are known at each start.
+    """Size of the errors that are known at each start.
 
     Args:
-        begin, end: (n,) s, starts in order, and when the error of each is known.
+        begin, end: (n,) s, starts in order, and the times from which their errors are known.
         errors: (n, q); rows that are not finite are left out.
         prior: (q,) mean square before the flight; counts as `PRIOR_TIME` of flight.
 
-    Returns: (n, q) root mean square, what is older than `MEMORY` counting less.
+    Returns: (n, q) root mean square with smaller weights of older errors (`MEMORY`).
     """
     whole = np.asarray(np.isfinite(errors).all(axis=1))
-    span = np.diff(begin, append=begin[-1:] + SPACING).clip(0.0, SPACING)  # s of flight that a start stands for
+    span = np.diff(begin, append=begin[-1:] + SPACING).clip(0.0, SPACING)  # s of flight of each start
     ago = begin[:, None] - end
     weight = np.where((ago >= 0.0) & whole, span * np.exp(-np.maximum(ago, 0.0) / MEMORY), 0.0)
     square = weight @ np.where(whole[:, None], errors, 0.0) ** 2
@@ -198,7 +197,7 @@ def error_scale(begin: Array, end: Array, errors: Array, prior: Array) -> Array:
 
 
 def offset(state: Array, centre: Array) -> Array:
-    """(n, 12) from states (n, 13) to others: world differences, the attitude's as a rotation vector in the body."""
+    """(n, 12) states (n, 13) less centres (n, 13), world; attitudes as rotation vectors in the body."""
     between = quaternion_product(quaternion_conjugate(centre[:, 6:10]), state[:, 6:10])
     between = between * np.where(between[:, 3:] < 0.0, -1.0, 1.0)
     sine = np.linalg.norm(between[:, :3], axis=1, keepdims=True)

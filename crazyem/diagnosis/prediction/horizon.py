@@ -1,7 +1,7 @@
-"""How far open-loop simulation and flight part: errors at fixed horizons, from starts all along the flight.
+"""Errors of open-loop simulation at fixed horizons, from starts all along a flight.
 
-The same starts for every model, so that before and after a fit can be compared; what a start may know is the business
-of `predict`. The truth at the end of a horizon is what was recorded there, interpolated where streams differ in stamps.
+All models have the same starts, so that before and after a fit can be compared. `predict` decides which inputs a start
+may use. The truth at the end of a horizon is the recorded state, interpolated if streams have different stamps.
 """
 
 import math
@@ -22,10 +22,10 @@ from crazyem.vehicle import Vehicle
 
 HORIZONS = (0.01, 0.1, 0.5)  # s
 SPACING = 0.1  # s between starts
-NEAR = 0.025  # s between two samples, at most, for a truth between them
-BEYOND_CHANCE = 2.0  # standard errors of a mean difference of squared errors, from which a model predicts worse
-VISIBLE = 1.005  # times the rms error before, at least: less is the same in whole per cent
-FEWEST = 5  # windows that do not overlap, to know a standard error by
+NEAR = 0.025  # s, longest interval between two samples for an interpolated truth
+BEYOND_CHANCE = 2.0  # standard errors of a mean difference of squared errors, above which a model predicts worse
+VISIBLE = 1.005  # least ratio of rms errors of a worse model; with less, they are equal in whole per cent
+FEWEST = 5  # least number of windows without overlap for a standard error
 UNITS = {"position": "m", "velocity": "m/s", "attitude": "rad", "body_rate": "rad/s"}
 _COLUMNS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 
@@ -36,9 +36,9 @@ class HorizonErrors:
 
     Attributes:
         horizons: s.
-        starts: how many.
-        rms: quantity -> root mean square of the error's length at each horizon; NaN where nothing was measured, inf
-            where the model left the range of numbers.
+        starts: number of starts.
+        rms: quantity -> root mean square of the length of the error at each horizon; NaN where not measured, inf where
+            the model left the range of numbers.
         mean: quantity -> mean length.
     """
 
@@ -48,7 +48,7 @@ class HorizonErrors:
     mean: Mapping[str, tuple[float, ...]]
 
     def to_json(self) -> dict[str, Any]:
-        """For the result document; what is not a number becomes None."""
+        """The errors for the result document; numbers that are not finite become None."""
         found: dict[str, Any] = {"horizon_s": list(self.horizons), "starts": self.starts}
         for name, unit in UNITS.items():
             found[name] = {"unit": unit, "rms": _plain(self.rms[name]), "mean": _plain(self.mean[name])}
@@ -57,8 +57,8 @@ class HorizonErrors:
 
 @dataclass(frozen=True)
 class Worse:
-    """A quantity that a model predicts worse than the one before it, by more than chance: at a horizon [s], by so many
-    standard errors (inf where the model left the range of numbers)."""
+    """A quantity that a model predicts significantly worse than the model before: at a horizon [s], by a number of
+    standard errors (inf if the model left the range of numbers)."""
 
     quantity: str
     horizon: float
@@ -75,9 +75,9 @@ class Windows:
     """Starts and ends of open-loop runs along a flight; the same for every model.
 
     Attributes:
-        rows: (n,) rows of `Recorded` to start from.
-        times: (n, 1 + h) s: of the start, and of the recorded sample next to each horizon's end.
-        truth: (n, h, 13) what was recorded there; NaN where nothing was.
+        rows: (n,) rows of `Recorded` at the starts.
+        times: (n, 1 + h) s, of the start, and of the recorded sample next to the end of each horizon.
+        truth: (n, h, 13) recorded states there; NaN where not recorded.
         horizons: (h,) s.
     """
 
@@ -94,13 +94,13 @@ def windows(
     spacing: float = SPACING,
     within: Sequence[tuple[float, float]] | None = None,
 ) -> Windows:
-    """Where open-loop runs start and what they should come to.
+    """The starts of open-loop runs and the recorded states at their ends.
 
     Args:
         shown: the recording.
         horizons: s, increasing.
         spacing: s from start to start.
-        within: only runs that lie in one of these intervals [s]; None: the flights. They must also lie in a flight.
+        within: intervals [s] that must contain a run, beside the flights; None: the flights alone.
 
     Raises: DataError if there is no such run.
     """
@@ -114,7 +114,7 @@ def windows(
     good &= start_rows(shown, rows, horizon=1, step=horizons[-1] + shown.period)
     good &= (np.diff(at, axis=1) > 0).all(axis=1) & (at[:, -1] < shown.time.size)
     age = shown.age[rows]
-    if good.any():  # fresh states only; where streams never meet, as fresh as they come
+    if good.any():  # fresh states only; if streams never coincide, states of usual age
         good &= age <= max(SAME, float(np.median(age[good])) + SAME)
     if not good.any():
         raise DataError(
@@ -140,11 +140,11 @@ def open_loop(
 
     Args:
         shown: the recording.
-        at: where to start and end.
-        vehicle: other constants than the recording was read with (mass, inertia, arm, lag; not the law of thrust).
-        effects: None takes those of the vehicle.
-        measured_attitude: follow the recorded attitude and rate, so that forces are judged alone.
-        weights: what was learned before each start (see `bias_correction.py`); None: the model alone.
+        at: starts and ends.
+        vehicle: other constants than those of the inputs (mass, inertia, arm, lag; not the thrust curve).
+        effects: None: those of the vehicle.
+        measured_attitude: follow the recorded attitude and rate, so that only forces are tested.
+        weights: corrections of each start (see `bias_correction.py`); None: the model alone.
         substep: largest step of the integration [s].
     """
     simulator = Simulator(shown.inputs, effects, vehicle=vehicle)
@@ -153,7 +153,7 @@ def open_loop(
         shown.state[at.rows],
         at.times,
         swing=None if swings is None else swings[at.rows],
-        given=at.times[:, -1] - shown.period,  # as in `predict`, where steps are the recording's
+        given=at.times[:, -1] - shown.period,  # as in `predict` with recorded steps
         attitude=(lambda time: recorded_attitude(shown, time)) if measured_attitude else None,
         substep=substep,
         weights=weights,
@@ -161,8 +161,8 @@ def open_loop(
 
 
 def error_lengths(prediction: NDArray, at: Windows) -> dict[str, NDArray]:
-    """Quantity -> (n, h) lengths of the errors of predictions (n, h, 13); NaN where nothing was measured, inf where the
-    model left the range of numbers."""
+    """Quantity -> (n, h) lengths of the errors of predictions (n, h, 13); NaN where not measured, inf where the model
+    left the range of numbers."""
     found = {}
     for name, columns in _COLUMNS.items():
         length = lengths(prediction[..., columns], at.truth[..., columns], attitude=name == "attitude")
@@ -172,7 +172,7 @@ def error_lengths(prediction: NDArray, at: Windows) -> dict[str, NDArray]:
 
 
 def errors(prediction: NDArray, at: Windows) -> HorizonErrors:
-    """Errors of predictions (n, h, 13) against what was recorded."""
+    """Errors of predictions (n, h, 13) against the recorded states."""
     rms: dict[str, tuple[float, ...]] = {}
     mean: dict[str, tuple[float, ...]] = {}
     for name, length in error_lengths(prediction, at).items():
@@ -182,7 +182,7 @@ def errors(prediction: NDArray, at: Windows) -> HorizonErrors:
 
 
 def worse(pairs: Sequence[tuple[Mapping[str, NDArray], Mapping[str, NDArray]]]) -> tuple[Worse, ...]:
-    """What one model predicts worse than another over the same windows of flights, visibly and by more than chance.
+    """Quantities that one model predicts visibly and significantly worse than another, over the same windows.
 
     Args:
         pairs: `error_lengths` (n, h) of the model before and after, one pair a flight, at `HORIZONS` from starts every
@@ -201,7 +201,7 @@ def worse(pairs: Sequence[tuple[Mapping[str, NDArray], Mapping[str, NDArray]]]) 
 
 
 def _standard_errors(differences: Sequence[NDArray], overlapping: int) -> float:
-    """Mean of differences (n,), a part a flight, over its standard error; so many neighbours overlap, and count as
+    """Mean of differences (n,), one part for each flight, over its standard error; `overlapping` neighbours count as
     one."""
     means = []
     for part in differences:
@@ -233,7 +233,7 @@ def lengths(prediction: NDArray, truth: NDArray, *, attitude: bool) -> NDArray:
 
 
 def recorded_at(shown: Recorded, time: NDArray) -> NDArray:
-    """(n, 13) what was recorded at (n,) s: a sample there, or a line between two not further apart than `NEAR`."""
+    """(n, 13) recorded states at (n,) s: samples, or interpolated between two samples at most `NEAR` apart."""
     found = np.full((time.size, 13), np.nan)
     for name, columns in _COLUMNS.items():
         when, value = shown.parts[name]
@@ -257,7 +257,7 @@ def recorded_at(shown: Recorded, time: NDArray) -> NDArray:
 
 
 def recorded_attitude(shown: Recorded, time: NDArray) -> tuple[NDArray, NDArray]:
-    """Attitude (n, 4) and body rate (n, 3) at (n,) s, on lines between samples however far apart."""
+    """Attitude (n, 4) and body rate (n, 3) at (n,) s, interpolated between samples of any distance."""
     when, value = shown.parts["attitude"]
     after = np.clip(np.searchsorted(when, time), 1, when.size - 1)
     first, second = value[after - 1], value[after]
@@ -285,7 +285,7 @@ def _common(
 
 
 def _mean(values: NDArray) -> float:
-    """Of those that are known; NaN if none is."""
+    """Mean of the known values; NaN if none is known."""
     known = values[~np.isnan(values)]
     with np.errstate(over="ignore"):
         return float(known.mean()) if known.size else math.nan

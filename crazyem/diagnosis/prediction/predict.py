@@ -1,8 +1,8 @@
-"""Open-loop prediction: from a recorded state and the recorded inputs alone, where the model says the drone goes.
+"""Open-loop prediction of the drone by the model, from a recorded state and recorded inputs alone.
 
-From every start the rigid body with its effects is carried forward; no state measured after the start is used, and no
-input stamped after the beginning of the last step. The lagged thrust at the start follows from the inputs before it.
-A prediction is of what the recording would show.
+The rigid body with its effects is integrated from every start. No state measured after the start is used, and no input
+stamped after the start of the last step. The lagged thrust at the start follows from the inputs before it. The
+predicted states are those that the recording would show.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -29,29 +29,29 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NAMES = ("x", "y", "z", "vx", "vy", "vz", "qx", "qy", "qz", "qw", "wx", "wy", "wz")
-SAME = 1.5e-3  # s: samples closer than this are of one moment
-OLDEST = 0.05  # s: a part of the state that was last seen earlier is not known at a start
-MAX_GAP = 0.1  # s without inputs, within which a prediction is worth nothing
-CHUNK = 2048  # starts integrated together, to bound memory
+SAME = 1.5e-3  # s; closer samples count as simultaneous
+OLDEST = 0.05  # s, largest age of a part of the state at a start
+MAX_GAP = 0.1  # s, longest time without inputs
+CHUNK = 2048  # starts that are integrated together, to limit memory
 _PARTS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 10), "body_rate": slice(10, 13)}
 
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """The states a recording shows, at the samples of its position.
+    """The states that a recording shows, at the samples of its position.
 
     Attributes:
         path: of the recording.
         time: (r,) s, increasing.
-        state: (r, 13) as `NAMES`, SI; every part the newest at or before that time, NaN where that is too old.
-        age: (r,) s, how much older than its time the oldest part is.
-        row: (r,) index of the sample in the recording's position.
+        state: (r, 13) as `NAMES`, SI; every part is the newest at or before this time, NaN if it is too old.
+        age: (r,) s, age of the oldest part.
+        row: (r,) index of the sample in the recorded position.
         airborne: (r,) bool.
-        inputs: what the rotors were told.
-        parts: samples of position, velocity, attitude and body_rate as recorded: (k,) s and (k, 3 or 4), by name.
+        inputs: inputs of the rotors.
+        parts: recorded samples of position, velocity, attitude and body_rate: (k,) s and (k, 3 or 4), by name.
         flights: intervals in the air [s].
-        before: inputs as they were known before their level was (see `level`), by what was known when: for starts
-            until then. Empty where the voltage is recorded.
+        before: inputs with voltages estimated from the first part of the flight only (see `level`), in order of time,
+            for early starts. Empty if the voltage is recorded.
     """
 
     path: str
@@ -80,12 +80,12 @@ class Prediction:
             body rate rad/s (FLU).
         time: (starts, N) s of each predicted state, on the recording's clock.
         start_time: (starts,) s.
-        start_index: (starts,) sample of the recording's position.
-        start_age: (starts,) s, how much older the oldest part of the start's state is.
-        airborne: (starts,) bool: the drone flew at the start, as far as the recording tells.
-        step: s; the median one where the steps are the recording's.
-        vehicle: whose model it is. input_signal: what its rotors were driven by. notices: what had to be assumed.
-        left_out: starts that are missing: no whole state, or a gap in the inputs.
+        start_index: (starts,) sample of the recorded position.
+        start_age: (starts,) s, age of the oldest part of the start state.
+        airborne: (starts,) bool, whether the drone flies at the start.
+        step: s; the median of recorded steps.
+        vehicle: of the model. input_signal: source of the rotor input. notices: assumptions.
+        left_out: number of missing starts: without a complete state, or with a gap in the inputs.
     """
 
     prediction: NDArray[np.float64]
@@ -101,7 +101,7 @@ class Prediction:
     left_out: int = 0
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Everything by name, for a file."""
+        """All arrays by name, for a file."""
         return {
             "prediction": self.prediction,
             "time": self.time,
@@ -114,7 +114,7 @@ class Prediction:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything by name, ready for JSON: lists, and None for what left the range of numbers."""
+        """All results by name, ready for JSON: lists, and None for numbers that are not finite."""
         arrays = {name: finite(array.tolist()) for name, array in self.arrays().items()}
         about = {"vehicle": self.vehicle.name, "input_signal": self.input_signal, "left_out": self.left_out}
         return {**arrays, **about, "notices": list(self.notices)}
@@ -134,7 +134,7 @@ class Prediction:
         return html_table(str(self), ("after the last step", "smallest", "median", "largest"), rows, self.notices)
 
     def plot(self, path: str | Path | None = None) -> "Figure":
-        """Position and body rate over time, from thirty starts; saved where `path` says.
+        """Plot position and body rate over time, from thirty starts; saved to `path`, if given.
 
         Raises:
             UsageError: the file cannot be written. MissingExtraError: no matplotlib.
@@ -150,7 +150,7 @@ class Prediction:
         return saved(figure, path)
 
 
-# -- what was recorded -------------------------------------------------------------------------------------------------
+# -- recorded states ---------------------------------------------------------------------------------------------------
 
 
 def recorded(recording: Recording, vehicle: Vehicle) -> Recorded:
@@ -189,7 +189,8 @@ def recorded(recording: Recording, vehicle: Vehicle) -> Recorded:
 
 
 def _state_signals(recording: Recording) -> dict[str, SignalArray]:
-    """Position, velocity, attitude and rate: the signal itself, else another of its quantity; Euler angles will do."""
+    """Signals of position, velocity, attitude and rate: the signal of that name, else another of the same quantity;
+    for the attitude also Euler angles."""
     found = {}
     for name in _PARTS:
         wanted = [name, *(n for n in recording.signals if n.startswith(f"{name}@"))]
@@ -232,12 +233,11 @@ def predict(
     Args:
         shown: states and inputs, and the vehicle with its effects: `recorded(recording, vehicle)`.
         horizon: N, steps.
-        step: s between predicted states; None: the recording's own samples, so that row h of start i is the state at
-            sample i + h + 1, at its own stamp.
+        step: s between predicted states; None: the recorded samples, so that row h of start i is the state at sample
+            i + h + 1, at its stamp.
         every: samples from one start to the next.
-        plain: the model alone; else its torque is believed as much as it was right before the start
-            (`bias_correction.py`).
-        progress: told how many starts of how many are done.
+        plain: the model alone; otherwise it is corrected by the flight before the start (`bias_correction.py`).
+        progress: called with the number of finished starts and of all starts.
 
     Raises:
         DataError: no start has its whole horizon in the recording.
@@ -275,7 +275,7 @@ def predict(
 
 
 def _by_knowledge(shown: Recorded, rows: NDArray) -> list[tuple[Recorded, NDArray]]:
-    """The starts, each with what was known of the battery by then."""
+    """The starts in groups, each with the inputs by the voltage that is known at these starts."""
     stages = [(i.level.known, i) for i in (*shown.before, shown.inputs) if i.level is not None]
     stages.insert(0, (-np.inf, shown.before[0] if shown.before else shown.inputs))
     known = np.array([when for when, _ in stages])
@@ -284,7 +284,7 @@ def _by_knowledge(shown: Recorded, rows: NDArray) -> list[tuple[Recorded, NDArra
 
 
 def turned_by(shown: Recorded) -> Turned:
-    """What the model says of the turning of a recorded flight, one step ahead of every row."""
+    """Predictions of a recorded flight one step ahead of every row, for the corrections."""
     simulator = Simulator(shown.inputs)
     swings = simulator.swings(shown.time, shown.state, shown.airborne)
     gained, lacking = np.zeros((shown.time.size, 3)), np.zeros((shown.time.size, 3))
@@ -303,9 +303,9 @@ def turned_by(shown: Recorded) -> Turned:
 
 
 def _at_start(shown: Recorded, gained: NDArray, flying: NDArray) -> NDArray:
-    """(r, 3, 6) what is known at every row, by axis: the angular acceleration that the model lacked in the step that
-    ends there, the rate, and across the axis (about z: 0) how far the body leans, how fast it moves, that times the
-    flow along the rotors' axis, and how far it is from where it was on average so far."""
+    """(r, 3, 6) regressors at every row, by axis: the angular acceleration that the model lacked in the step that ends
+    there, the rate, and across the axis (0 for z): tilt, velocity, velocity times the flow along the axis of the
+    rotors, distance from the mean position so far."""
     rotation = rotation_matrix(shown.state[:, 6:10])
     rate, velocity = shown.state[:, 10:13], np.einsum("nji,nj->ni", rotation, shown.state[:, 3:6])
     place, arrived = shown.state[:, :3], np.concatenate([[False], flying[:-1]])
@@ -321,7 +321,7 @@ def _at_start(shown: Recorded, gained: NDArray, flying: NDArray) -> NDArray:
 
 
 def start_rows(shown: Recorded, rows: NDArray, *, horizon: int, step: float | None) -> NDArray:
-    """(n,) bool: rows (n,) whose state is whole, and whose horizon lies in the recording with inputs all along."""
+    """(n,) bool, whether rows (n,) have a complete state, and a horizon in the recording without gaps of inputs."""
     good = np.isfinite(shown.state[rows]).all(axis=1)
     begin, stamps = shown.time[rows], shown.inputs.rotor.time
     if step is None:
@@ -343,7 +343,7 @@ def _parts(rows: NDArray, size: int) -> Iterator[NDArray]:
 
 
 def _times(shown: Recorded, rows: NDArray, *, horizon: int, step: float | None) -> NDArray:
-    """(n, N + 1) s."""
+    """(n, N + 1) s, times of the start and of the predicted states."""
     count = np.arange(horizon + 1)
     if step is None:
         return shown.time[rows[:, None] + count]

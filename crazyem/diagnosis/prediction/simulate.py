@@ -1,8 +1,8 @@
 """Open-loop simulation of many starts at once: a rigid body with effects, driven by recorded inputs.
 
-By the explicit midpoint rule with sub-steps of at most `SUBSTEP` and the mean thrust over each, which is exact for a
-lag between commands. States go in and come out as a recording shows them: what effects do to sensors (misalignment,
-velocity scale, bias, delay) is taken off the state at the start and put onto every predicted one.
+Integration is by the explicit midpoint rule, with sub-steps of at most `SUBSTEP`. The mean thrust over each is exact
+for a lag between commands. Start states and predicted states are as a recording shows them: effects on sensors
+(misalignment, velocity scale, bias, delay) are removed from the start state and added to every predicted one.
 """
 
 from collections.abc import Callable
@@ -28,18 +28,18 @@ from crazyem.physics.rotations import (
 )
 from crazyem.vehicle import GRAVITY, Vehicle
 
-SUBSTEP = 5e-3  # s
+SUBSTEP = 5e-3  # s, largest step of the integration
 BACK = 5e-3  # s between the rows of a path before a start
-LEAST_UNREST = 2e-3  # m/s^2 sqrt(s): a force that is seen is seen no better, whatever a recording shows
+LEAST_UNREST = 2e-3  # m/s^2 sqrt(s), least noise of a force seen in a recording
 
 
 @dataclass
 class _Body:
-    """States of n simulations, true, not as shown; what hangs below a drone is part of its state.
+    """True states of n simulations, without the effects on sensors; a suspended load is part of the state.
 
     position, velocity (n, 3) world, attitude (n, 4), rate (n, 3) body, swing (n, 6) of a suspended load or None.
-    Where the model's torque is weighed: since (n,) s from the start, gained (n, 3) rad/s, what its angular acceleration
-    added until now.
+    With corrections of the rotation: since (n,) s from the start, gained (n, 3) rad/s, integral of the angular
+    acceleration by the model since then.
     """
 
     position: NDArray
@@ -58,7 +58,7 @@ class _Body:
         return np.concatenate([self.position, self.velocity, self.attitude, self.rate], axis=1)
 
     def displaced(self, offset: NDArray) -> "_Body":
-        """By (n, 12): the attitude is turned by exp of its part, in the body."""
+        """The states displaced by (n, 12); the attitude is multiplied by exp of its part, in the body."""
         return _Body(
             self.position + offset[:, 0:3],
             self.velocity + offset[:, 3:6],
@@ -76,7 +76,7 @@ def turned(attitude: NDArray, by: NDArray) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class _Row:
-    """A true state, and what moved the drone in the step that led there."""
+    """A true state, and the accelerations and the situation of the step before it."""
 
     body: _Body
     moved: Motion
@@ -88,9 +88,9 @@ class Simulator:
 
     Args:
         inputs: of the recording.
-        effects: those of the vehicle if None.
-        vehicle: other constants than those that the inputs were made with (mass, inertia, arm, lag; not the law of
-            thrust, which is in the inputs already).
+        effects: None: those of the vehicle.
+        vehicle: other constants than those of the inputs (mass, inertia, arm, lag; not the thrust curve, which is part
+            of the inputs).
     """
 
     def __init__(self, inputs: Inputs, effects: Effects | None = None, *, vehicle: Vehicle | None = None) -> None:
@@ -102,7 +102,7 @@ class Simulator:
         self._shows = bool(sensors)
         self._weights: Weights | None = None
         self._begun = np.zeros((0, 3))
-        self._late: NDArray | float = 0.0  # s: what was not known of the delay at each start
+        self._late: NDArray | float = 0.0  # s, delay as known at each start less the final one
         back = max((float(values.get("delay", 0.0)) for values in sensors), default=0.0)  # s
         forgotten = MEMORY_SECONDS if inputs.fused and any(disturbs_attitude(values) for values in sensors) else 0.0
         self._looks_back = back + forgotten
@@ -115,10 +115,10 @@ class Simulator:
         self._rotor_constant = float("nan") if constant is None else constant
 
     def swings(self, time: NDArray, state: NDArray, airborne: NDArray) -> NDArray | None:
-        """(r, 6) of a suspended load along a recorded path, each row from those up to it; None without a load.
+        """(r, 6) swing of a suspended load along a recorded path, each row from rows up to it; None without a load.
 
-        time: (r,) s, increasing; state: (r, 13), NaN where not known; airborne: (r,) bool, where the load is seen to
-        pull. At the first row, and after gaps, it hangs at rest.
+        time: (r,) s, increasing; state: (r, 13), NaN where not known; airborne: (r,) bool, rows at which the recorded
+        force shows the pull of the load. At the first row, and after gaps, the load hangs at rest.
         """
         if self._length is None:
             return None
@@ -136,15 +136,15 @@ class Simulator:
         free, seen = np.zeros_like(velocity), np.full_like(velocity, np.nan)
         rotation = np.broadcast_to(np.eye(3), (time.size, 3, 3)).copy()
         free[rows], seen[rows], rotation[rows] = self._forces(time, state, rows)
-        bend = np.diff((seen - free)[rows], n=2, axis=0)  # what a load does bends little within a step
+        bend = np.diff((seen - free)[rows], n=2, axis=0)  # the pull of a load is nearly linear over three rows
         noise = np.sqrt(np.median(gap[rows])) * np.median(np.abs(bend), axis=0) / (0.6745 * np.sqrt(6.0))
         return watched_along(
             **hanging, share=share, rotation=rotation, free=free, shown=seen, noise=np.maximum(noise, LEAST_UNREST)
         )
 
     def _forces(self, time: NDArray, state: NDArray, rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Over the steps that end at rows (m,) of a recorded path: specific force without a load, and as seen, (m, 3)
-        m/s^2, body; and attitudes (m, 3, 3) in the middle of the steps."""
+        """Specific force by the model without a load, and as recorded, (m, 3) m/s^2, body, over the steps that end at
+        rows (m,) of a path; and attitudes (m, 3, 3) in the middle of the steps."""
         effects = {name: values for name, values in self.effects.items() if name != SUSPENDED_LOAD.name}
         begin, end = time[rows - 1], time[rows]
         last = self.course.newest(begin)
@@ -175,12 +175,11 @@ class Simulator:
             state: (n, 13) as shown by the recording at times[:, 0].
             times: (n, N + 1) s, increasing along each row.
             swing: (n, 6) of a suspended load at times[:, 0], see `swings`; None: it hangs at rest.
-            attitude: attitudes (n, 4) and body rates (n, 3) recorded at (n,) s, to be followed instead of predicted:
-                then the forces are judged alone. Not a prediction any more.
-            given: (n,) s until when inputs may be known, after which the last is held; None: the beginning of the last
-                step.
+            attitude: function of (n,) s that gives recorded attitudes (n, 4) and body rates (n, 3). They replace the
+                predicted ones, so that only forces are tested; the result is then no prediction.
+            given: (n,) s, end of the known inputs, after which the last is held; None: the start of the last step.
             substep: largest step of the integration [s].
-            weights: what was learned before each start (see `bias_correction.py`); None: the model alone.
+            weights: corrections of each start (see `bias_correction.py`); None: the model alone.
 
         Returns: (n, N, 13), as the recording would show them.
         """
@@ -213,7 +212,7 @@ class Simulator:
             return self._shown([*before, *path])[:, -len(path) :]
 
     def _step(self, body: _Body, begin: NDArray, end: NDArray, last: NDArray) -> tuple[_Body, Motion, Situation]:
-        """One step by the explicit midpoint rule, with the mean thrust over it; backwards if it ends earlier."""
+        """One step by the explicit midpoint rule, with the mean thrust over it; backwards if `end` is earlier."""
         thrust, rate = self.course.over(begin, end, last=last, late=self._late)
         step = end - begin
         before = self._situation(body, end, step, thrust, rate, last)
@@ -224,10 +223,10 @@ class Simulator:
         return self._advanced(body, situation.rotation, moved, step), moved, situation
 
     def _advanced(self, body: _Body, rotation: NDArray, moved: Motion, step: NDArray) -> _Body:
-        """The state one step later with constant accelerations; the force is turned by `rotation` (n, 3, 3)."""
+        """The state one step later with constant accelerations; `rotation` (n, 3, 3) turns the force to the world."""
         h = step[:, None]
         force = moved.specific_force
-        if self._weights is not None:  # on the way to the start, too: what sensors show late begins there
+        if self._weights is not None:  # also before the start, where the measurements of late sensors begin
             force = force + self._weights.force
         acceleration = np.einsum("nij,nj->ni", rotation, force) - np.array([0.0, 0.0, GRAVITY])
         velocity = body.velocity + h * acceleration
@@ -236,7 +235,7 @@ class Simulator:
             since, gained = since + step, gained + h * moved.angular_acceleration
             rate = self._begun + self._weights.changed(since, gained)
         swing = body.swing
-        if swing is not None and self._length is not None and (step > 0).all():  # going back, it is left as it is
+        if swing is not None and self._length is not None and (step > 0).all():  # constant in backward steps
             air = np.broadcast_to(self._air, velocity.shape)
             swing = swing_on(
                 swing, acceleration=acceleration, velocity=body.velocity, air=air, step=step, length=self._length
@@ -278,12 +277,12 @@ class Simulator:
             fused=self.inputs.fused,
         )
 
-    # what sensors show: a matter of the path, since some show the past
+    # effects on sensors: they depend on the path, because some sensors show the past
 
     def _true(self, shown: _Body, time: NDArray, known: NDArray) -> tuple[_Body, list[_Row]]:
-        """What was true where the recording shows this, and the path that led there as far as sensors look back.
+        """The true state of a recorded one, and the path before it as far as sensors look back.
 
-        The sensors' offsets depend on the true state, and are taken off by fixed-point iteration.
+        The offsets of sensors depend on the true state, so they are removed by fixed-point iteration.
         """
         if not self._shows:
             return shown, []
@@ -295,7 +294,7 @@ class Simulator:
         return body, self._led_to(body, time, known)
 
     def _led_to(self, body: _Body, time: NDArray, known: NDArray) -> list[_Row]:
-        """The path to a state, found by going back in time, oldest first; the state itself is the last row."""
+        """The path to a state by integration back in time, oldest row first; the state itself is the last row."""
         count = int(np.ceil(self._looks_back / BACK)) + 1
         rows = []
         for j in range(count):
@@ -306,7 +305,7 @@ class Simulator:
         return rows[::-1]
 
     def _offsets(self, rows: list[_Row]) -> NDArray:
-        """(n, m, 12): what sensors show beyond the truth, along m rows of a path that begins with the first."""
+        """(n, m, 12) offsets of sensors from the true state, along the m rows of a path."""
         n, m = rows[0].body.position.shape[0], len(rows)
 
         def along(values: list[NDArray]) -> NDArray:
