@@ -1,5 +1,5 @@
-"""Diagnosis: where simulation and recording part, which physics was left out, and the fit that follows.
+"""Diagnosis: where simulation and recording differ, which physics is missing, and the fit with this physics.
 
 flights (arrays) -> fitting (innovations, score, information) -> locating (where) -> naming (which physics) -> report;
-prediction is the open loop beside it. `diagnose.py` runs them.
+prediction is the open loop. `diagnose.py` runs all of them.
 """

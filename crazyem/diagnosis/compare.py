@@ -1,4 +1,4 @@
-"""A recording against a simulated one of the same mission, as a user would look at them: side by side."""
+"""Comparison of a recording with a simulated one of the same mission, signal by signal."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ COMPARED = ("position", "velocity", "attitude", "body_rate", "motor_command", "r
 
 
 def compare(recording: Recording, simulated: Recording) -> dict[str, Any]:
-    """Differences of the signals that both have, aligned at take-off.
+    """Differences of the signals that both recordings have, aligned at take-off.
 
     Raises:
         DataError: one of them holds no flight.

@@ -1,4 +1,4 @@
-"""From recordings and a vehicle to a diagnosis: nominal model, where it fails, which effects, the fit, what remains."""
+"""From recordings and a vehicle to a diagnosis: nominal model, where it fails, effects, fit, the unexplained."""
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
@@ -50,13 +50,12 @@ WEAK, MISREAD = ROTOR_FAULT.name, ROTOR_SENSOR.name
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All that was found; `document.py` turns it into JSON.
+    """All results; `document.py` turns them into JSON.
 
     Attributes:
-        fitted_vehicle: the drone, with what was found and belongs to it; `as_flown` has what belongs to the recordings
-            as well.
-        free: what was free beside the effects.
-        swapped: `recordings` are those that were held out (see `flights/held_out.py`).
+        fitted_vehicle: the vehicle with the found effects of the drone; `as_flown` also has those of the recordings.
+        free: nuisances beside the effects.
+        swapped: whether `recordings` are those that were given as held out (see `flights/held_out.py`).
     """
 
     vehicle: Vehicle
@@ -90,12 +89,12 @@ def diagnose(
     jobs: int | None = 1,
     say: Say = lambda text: None,
 ) -> Diagnosis:
-    """Which physics is missing from a vehicle's model, by its recordings.
+    """Find the physics that is missing from the model of a vehicle, from recordings.
 
     Args:
-        held_out: flights that confirm what is found; where the recordings only hover and these do not, it is the other
-            way round (`flights/held_out.py`), unless `strict`.
-        jobs: threads that share the candidates; None: one a core. The result is the same for any number.
+        held_out: flights that confirm the effects. If the recordings only hover and these do not, the roles are
+            exchanged (`flights/held_out.py`), unless `strict`.
+        jobs: threads that share the candidates; None: one for each core. The result is the same for any number.
 
     Raises:
         DataError: a recording cannot be used (no flight, no inputs, too short).
@@ -162,7 +161,7 @@ def diagnose(
 
 @dataclass(frozen=True)
 class _Request:
-    """What is asked: recordings to fit and their flights, those held out, the vehicle that is assumed to begin with."""
+    """The task: recordings to fit and held-out ones, with their flights; the vehicle of the nominal model."""
 
     recordings: Sequence[Recording]
     held_out: Sequence[Recording]
@@ -170,14 +169,14 @@ class _Request:
     kept_apart: Sequence[Flight]
     vehicle: Vehicle
     wanted: Sequence[str]
-    besides: Sequence[Candidate]  # asked for whatever is wanted
+    besides: Sequence[Candidate]  # further candidates
     swapped: bool
 
 
 @dataclass(frozen=True)
 class _Chosen:
-    """What the flights ask for: `asked` with these as they were used, the selection, the candidates for it, and what
-    the flights cannot speak of and why."""
+    """The selection: `asked` with the flights as used, the selected effects, all candidates, and the effects that the
+    flights cannot show, with the reasons."""
 
     asked: _Request
     data: Data
@@ -197,7 +196,7 @@ def _request_of(
     strict: bool,
     say: Say,
 ) -> _Request:
-    """The flights of the recordings, in one frame; those held out are fitted where the others only hover."""
+    """The flights of the recordings, in one frame; roles are exchanged if the flights to fit only hover."""
     flights = [flight_of(r, vehicle, withhold=withhold) for r in recordings]
     kept_apart = [flight_of(r, vehicle, withhold=withhold) for r in held_out]
     swapped = not strict and held_out_roles.swapped(flights, kept_apart)
@@ -205,15 +204,17 @@ def _request_of(
         flights, kept_apart, recordings, held_out = kept_apart, flights, held_out, recordings
         say(held_out_roles.swap_sentence([r.path for r in recordings], [r.path for r in held_out]))
     assumed = of_a_real_drone(flights, vehicle)
-    untrimmed = assumed is not vehicle and not wanted  # its trim is looked for, too
+    untrimmed = assumed is not vehicle and not wanted  # then the trim is a candidate, too
     flights, kept_apart = differing(*in_one_frame(*on_one_floor(flights, kept_apart)), assumed)
     besides = [Candidate(TRIM, (), ("x", "y", "z"))] if untrimmed else []
     return _Request(recordings, held_out, flights, kept_apart, assumed, wanted, besides, swapped)
 
 
 def _chosen(asked: _Request, workers: Workers, say: Say) -> _Chosen:
-    """The selection by the flights as they are, or, where these turn no body, without what is fast; under its last
-    names, with what there is room for beside these."""
+    """The selection of effects, with final names and with effects that are needed beside these.
+
+    If the result is no physical rigid body (`unlike_a_body`), the selection is repeated without fast effects.
+    """
     chosen = _selected(asked, workers, say)
     deaf = unlike_a_body(chosen.selection.final, chosen.selection.accepted)
     if deaf and not any(f.coarse for f in asked.flights):
@@ -222,7 +223,7 @@ def _chosen(asked: _Request, workers: Workers, say: Say) -> _Chosen:
         chosen = _selected(replace(asked, flights=flights, kept_apart=kept_apart), workers, say)
     selection = named_again(chosen.data, chosen.apart, chosen.selection, say)
     if {c.effect for c in selection.accepted} != {c.effect for c in chosen.selection.accepted}:
-        # beside the new name there may be room for others
+        # beside the new effect, others may be significant
         selection = select(
             chosen.data, selection.nominal, chosen.candidates, held_out=chosen.apart, begun=selection, say=say
         )
@@ -230,7 +231,7 @@ def _chosen(asked: _Request, workers: Workers, say: Say) -> _Chosen:
 
 
 def _selected(asked: _Request, workers: Workers, say: Say) -> _Chosen:
-    """The selection by the flights, from all that they can speak of."""
+    """The selection from all candidates that the flights can show."""
     data, apart = Data(asked.flights, workers), Data(asked.kept_apart, workers) if asked.kept_apart else None
     vehicle = asked.vehicle
     bare = Point(vehicle, {n: dict(v) for n, v in vehicle.effects.items()}, first_guess())
@@ -250,7 +251,7 @@ def _selected(asked: _Request, workers: Workers, say: Say) -> _Chosen:
 
 
 def _located(data: Data, selection: Selection, say: Say) -> tuple[Located, Located]:
-    """Where the nominal model fails, and where the final one does."""
+    """Where the nominal model fails, and where the final model fails."""
     say("where the nominal model fails")
     data.settle(selection.nominal)
     before = locate(data, selection.nominal)
@@ -262,17 +263,17 @@ def _located(data: Data, selection: Selection, say: Say) -> tuple[Located, Locat
 
 
 def _advice(texts: Sequence[str], recordings: Sequence[Recording]) -> tuple[str, ...]:
-    """What would tell more, without asking for signals that every recording holds; each once."""
+    """Advice on further signals and flights, each once, without signals that every recording has."""
     recorded = set.intersection(*(set(r.signals) for r in recordings))
     of = {effect.separates: effect for effect in CATALOGUE.values()}
     return tuple(dict.fromkeys(of[text].advice(recorded) if text in of else text for text in texts))
 
 
 def _in_place(data: Data, apart: Data | None, selection: Selection) -> dict[str, tuple[Trial, Trial] | None]:
-    """For a load and for weaker rotors the trials of it and of what else could stand in its place."""
+    """For a load and for weaker rotors: the trials of this effect and of its alternative."""
     return {
         LOAD: as_two(data, apart, selection),
-        # only torques would tell weaker rotors from a load
+        # only torques distinguish weaker rotors from a load
         WEAKER.effect: None if data.coarse else as_load(data, apart, selection),
     }
 
@@ -280,9 +281,9 @@ def _in_place(data: Data, apart: Data | None, selection: Selection) -> dict[str,
 def _late_rotors(
     asked: _Request, vehicle: Vehicle, answer: Answer, remains: Unexplained, left_out: dict[str, str]
 ) -> tuple[Answer, list[Named], Unexplained]:
-    """What is answered, what is found beside it, and what remains, with what measured speeds say of commands."""
+    """The answer, further effects and the unexplained, from the response of measured rotor speeds to commands."""
     here, there = answers(asked.recordings, vehicle), answers(asked.held_out, vehicle)
-    # the body answers to the speeds that were measured, so this says nothing against what was told of it
+    # the body follows the measured speeds, so its effects stay as they are
     deaf = disobedient([*here, *there])
     remains = remains.with_finding(deaf) if deaf else remains
     if any(e.name == INPUT_DELAY.name for e in answer.effects):
@@ -296,9 +297,10 @@ def _late_rotors(
 def _corroborated(
     data: Data, apart: Data | None, selection: Selection, recordings: Sequence[Recording]
 ) -> tuple[Selection, frozenset[str]]:
-    """The selection after other signals were asked, and the names of effects that they told from their look-alikes.
+    """The selection with the evidence of other signals, and the names of effects that these distinguish from
+    look-alikes.
 
-    An accelerometer says most where thrust sets in, which not every flight shows: it is heard on those kept apart, too.
+    An accelerometer shows most when thrust sets in. Not every flight has that, so held-out flights are used, too.
     """
     corroborated: set[str] = set()
     punctual = replace(selection.nominal, effects={n: dict(v) for n, v in selection.nominal.vehicle.effects.items()})
@@ -316,7 +318,7 @@ def _corroborated(
             weak = candidate.effect == WEAK
             for_sensor = (nats or 0.0) if weak else -(nats or 0.0)
             if for_sensor > (TELLING if weak else 0.0):
-                # a healthy rotor turns as a weak one does: what commands say against that they say for the sensor
+                # a weak rotor turns as fast as a healthy one, so evidence against its speed is evidence for the sensor
                 selection = selection.with_evidence(other if weak else candidate, for_sensor)
     return selection, frozenset(corroborated)
 
@@ -324,8 +326,8 @@ def _corroborated(
 def _misread_or_weak(
     candidate: Candidate, selection: Selection, recordings: Sequence[Recording]
 ) -> tuple[float | None, Candidate, float]:
-    """For a weak rotor the sensor that would be wrong, for a wrong sensor the rotor that would be weak: the nats that
-    commands speak for it, its candidate, and where it begins."""
+    """The alternative of a weak rotor (a wrong sensor) or of a wrong sensor (a weak rotor): its evidence [nats] by
+    commands, its candidate, and its start value."""
     rotor, scale = dict(candidate.fixed)["rotor"], candidate.values(selection.final)["scale"]
     weak = candidate.effect == WEAK
     reading = scale**-0.5 if weak else scale
@@ -337,14 +339,14 @@ def _misread_or_weak(
 
 
 def _strengths(selection: Selection) -> dict[str, float]:
-    """Name of the recording -> its thrust over what the fitted vehicle says; none where each has not its own."""
+    """Recording -> its thrust over that of the fitted vehicle; empty if recordings have no thrust of their own."""
     shared = float(selection.final.effects.get(THRUST.effect, {}).get("scale", 1.0))
     found = deviations(selection.final.effects, THRUST.effect)
     return {name: 1.0 + own["scale"] / shared for name, own in found.items()}
 
 
 def _with_effects(vehicle: Vehicle, selection: Selection, beside: Sequence[Named]) -> Vehicle:
-    """The vehicle with what was found; delays within what is normal are left out."""
+    """The vehicle with the found effects; normal delays are left out."""
     fitted = with_found(vehicle, selection, selection.accepted)
     return replace(
         fitted,
@@ -353,6 +355,6 @@ def _with_effects(vehicle: Vehicle, selection: Selection, beside: Sequence[Named
 
 
 def _restored(vehicle: Vehicle, before: Vehicle, names: Collection[str]) -> Vehicle:
-    """The vehicle with some effects as they were before, which is nothing for most."""
+    """The vehicle with some effects reset to those of `before`, which does not have most of them."""
     kept = {n: v for n, v in vehicle.effects.items() if n not in names}
     return replace(vehicle, effects=kept | {n: v for n, v in before.effects.items() if n in names})

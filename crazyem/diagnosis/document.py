@@ -37,7 +37,7 @@ from crazyem.recordings.recording import Recording
 from crazyem.vehicle import Vehicle
 
 __all__ = ["document_of", "notices_of", "saved_vehicle", "text_of"]
-MOST_PICTURES = 4  # of what is accused
+MOST_PICTURES = 4  # of signals with findings
 
 
 def document_of(
@@ -50,12 +50,12 @@ def document_of(
     """The JSON document of a diagnosis (names as in docs/reference/json.md), and pictures.
 
     Args:
-        recordings, held_out: as they were given to `diagnose`.
+        recordings, held_out: as given to `diagnose`.
     """
     if diagnosis.swapped:
         recordings, held_out = held_out, recordings
     vehicle, drone, as_flown = diagnosis.vehicle, diagnosis.fitted_vehicle, diagnosis.as_flown
-    # a recording has its own sensors: what was found of them is of those that were fitted
+    # effects of sensors belong to the fitted recordings, so held-out ones are predicted by the drone alone
     models = [vehicle, as_flown] + ([] if drone == as_flown else [drone])
     train = _compared([without(r, withhold) for r in recordings], models)
     apart = _compared([without(r, withhold) for r in held_out], [vehicle, drone])
@@ -100,7 +100,7 @@ def document_of(
 
 
 def _left_free(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """What was free beside the effects: of the fit, of each recording, and what is written without being told."""
+    """Free parameters beside the effects: of the fit, of each recording, and written into the vehicle unnamed."""
     found = [free.to_json() for free in diagnosis.free]
     for own in diagnosis.own:
         found += own.free()
@@ -117,7 +117,7 @@ def _left_free(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def _of_recordings(effects: Sequence[Named]) -> list[str]:
-    """That some of what was found is no property of the drone."""
+    """Notice that some effects are no property of the drone."""
     names = [e.words for e in effects if e.of_recording]
     if not names:
         return []
@@ -128,7 +128,7 @@ def _of_recordings(effects: Sequence[Named]) -> list[str]:
 
 
 def notices_of(own: Sequence[RecordingNuisances]) -> list[str]:
-    """What is told of each recording, with its name where there are several."""
+    """The notices of each recording, with its name if there are several."""
     return [_named(o.recording, text, len(own) > 1) for o in own for text in o.notices]
 
 
@@ -166,7 +166,7 @@ def _finding(f: Finding) -> dict[str, Any]:
 
 
 def _ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """All that was tried in the first turn, best first."""
+    """All candidates of the first turn, best first."""
     found, seen = [], set()
     for trial in diagnosis.selection.steps[0].trials if diagnosis.selection.steps else ():
         if trial.candidate.label in seen:
@@ -182,18 +182,18 @@ def _ranking(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def _words(candidate: Candidate) -> str:
-    """A candidate for people, with its choices and with which of its parameters are fitted where there is a choice."""
+    """Words for a candidate: with its discrete choices, and with its free parameters if there are alternatives."""
     effect = CATALOGUE[candidate.effect]
     return effect.said({**dict(candidate.fixed), **(dict.fromkeys(candidate.free, 0.0) if effect.alternatives else {})})
 
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """Open-loop errors of one recording before and after, by the vehicle alone where that is not what flew, and the
-    lengths of errors by window."""
+    """Open-loop predictions of one recording before and after the fit, and by the fitted vehicle without effects of the
+    recording, if there are any."""
 
     at: Windows
-    runs: tuple[NDArray, ...]  # before, after, and by the vehicle alone
+    runs: tuple[NDArray, ...]  # before, after, and by the fitted vehicle
 
     @property
     def errors(self) -> list[HorizonErrors]:
@@ -201,7 +201,7 @@ class Compared:
 
 
 def _compared(recordings: Sequence[Recording], vehicles: Sequence[Vehicle]) -> list[Compared]:
-    """Of every recording that has whole states, by each of the vehicles over the same windows."""
+    """Predictions of every recording with complete states, by each vehicle over the same windows."""
     found = []
     for recording in recordings:
         try:
@@ -214,7 +214,7 @@ def _compared(recordings: Sequence[Recording], vehicles: Sequence[Vehicle]) -> l
 
 
 def _before_after(compared: Sequence[Compared]) -> dict[str, Any]:
-    """Errors before and after, and what is worse; by the vehicle alone, where that is not what flew."""
+    """Errors before and after the fit, and by the fitted vehicle if predicted; and quantities that are worse."""
     if not compared:
         return {}
     by_model = zip(*(c.errors for c in compared), strict=True)
@@ -235,7 +235,7 @@ def _pooled(found: Sequence[HorizonErrors]) -> dict[str, Any]:
 
 
 def _gap_closed(errors_of: Mapping[str, Any]) -> dict[str, float | None]:
-    """Share of the mean square error at the longest horizon that the fit took away, by quantity."""
+    """Share of the mean square error at the longest horizon that the fit removes, by quantity."""
     closed: dict[str, float | None] = {}
     for name in UNITS:
         before, after = (errors_of[k][name]["rms"][-1] if errors_of else None for k in ("before", "after"))
@@ -244,15 +244,15 @@ def _gap_closed(errors_of: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 def pictures_of(diagnosis: Diagnosis, compared: Sequence[Compared]) -> dict[str, Series]:
-    """What is accused, in time, and how the errors of open-loop runs change."""
+    """Pictures of signals with findings over time, and of errors of open-loop predictions."""
     found = accused_pictures(diagnosis, compared[0] if compared else None)
     return found | (error_pictures(compared[0]) if compared else {})
 
 
 def accused_pictures(diagnosis: Diagnosis, compared: Compared | None) -> dict[str, Series]:
-    """Every signal that is accused, the strongest first, before and after: what the model lacks of it in time.
+    """Pictures of signals with findings, strongest first: the missing disturbance over time, before and after.
 
-    Of a rate, whose error is no series of its own, the error a sample ahead, else the torque that turns about its axis.
+    A body rate has no such series. Its picture is the error one sample ahead, else the torque about its axis.
     """
     accused = [*(strongest(diagnosis.before.findings) if diagnosis.mismatch else ()), *diagnosis.unexplained.findings]
     found: dict[str, Series] = {}
@@ -268,7 +268,7 @@ def accused_pictures(diagnosis: Diagnosis, compared: Compared | None) -> dict[st
 
 
 def _missing(diagnosis: Diagnosis, name: str, finding: Finding) -> Series | None:
-    """A series of what the model lacks, with the time that a finding is of; None if there is none of that name."""
+    """Picture of a missing disturbance, with the interval of a finding; None if there is no series of that name."""
     before, after = diagnosis.before.disturbances[0], diagnosis.after.disturbances[0]
     if name not in before.names:
         return None
@@ -286,7 +286,7 @@ def _missing(diagnosis: Diagnosis, name: str, finding: Finding) -> Series | None
 
 
 def _rate_error(compared: Compared | None, finding: Finding) -> Series | None:
-    """The error of a body rate a sample ahead, about one axis."""
+    """Picture of the error of a body rate one sample ahead, about one axis."""
     if compared is None or finding.signal != "body_rate" or finding.axis not in "xyz":
         return None
     column = 10 + "xyz".index(finding.axis)
@@ -296,7 +296,7 @@ def _rate_error(compared: Compared | None, finding: Finding) -> Series | None:
 
 
 def error_pictures(compared: Compared) -> dict[str, Series]:
-    """How far open-loop runs part from what was recorded, of each quantity."""
+    """Pictures of the errors of open-loop predictions, for each quantity."""
     before, after = (error_lengths(run, compared.at) for run in compared.runs[:2])
     title = f"error {compared.at.horizons[-1]:g} s ahead"
     return {
@@ -314,7 +314,7 @@ def _number(value: Any) -> float | None:
 
 
 def saved_vehicle(diagnosis: Diagnosis, name: str) -> Vehicle:
-    """The fitted vehicle under a name of its own; how sure the old file was of its values says nothing of these."""
+    """The fitted vehicle under a new name, with the joint posterior instead of standard deviations of the old file."""
     fitted = diagnosis.fitted_vehicle
     return replace(
         fitted, name=name, mass_sd=None, inertia_sd=None, motor_time_constant_sd=None, posterior=posterior_of(diagnosis)

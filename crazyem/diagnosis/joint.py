@@ -1,7 +1,7 @@
-"""How sure a diagnosis is of all its numbers together: the joint posterior of a fitted vehicle file.
+"""The joint posterior of all parameters of a fitted vehicle file.
 
-Standard deviations are those of the document, which allow for what scatter does not show; how the numbers go together
-is the fit's. Numbers that were left free beside the effects are in it as well: no file says them exactly.
+Standard deviations are those of the document, which contain systematic errors, too. Correlations are those of the fit.
+Nuisances of the drone are part of the posterior, because no file gives them exactly.
 """
 
 import math
@@ -16,7 +16,7 @@ from crazyem.vehicle import Posterior
 
 
 def posterior_of(diagnosis: Diagnosis) -> Posterior | None:
-    """The joint posterior of what belongs to the drone; None where nothing was fitted."""
+    """The joint posterior of the parameters of the drone; None if nothing is fitted."""
     mean: dict[str, float] = {}
     sd: dict[str, float] = {}
     for effect in diagnosis.effects:
@@ -50,7 +50,7 @@ def posterior_of(diagnosis: Diagnosis) -> Posterior | None:
 
 
 def _columns(diagnosis: Diagnosis) -> Iterator[tuple[str, float]]:
-    """The columns of the fit: "effect.parameter" of what belongs to the drone, else "", and the value."""
+    """The columns of the fit: "effect.parameter" for parameters of the drone, else ""; and the value."""
     fitted = diagnosis.selection.fitted
     seen = set()
     for candidate in (*fitted.candidates, *fitted.nuisances):

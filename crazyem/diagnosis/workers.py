@@ -1,4 +1,4 @@
-"""Threads that share independent work: the kernels release the interpreter lock, so two of them use two cores."""
+"""Threads that share independent work: kernels release the interpreter lock, so two threads use two cores."""
 
 import contextvars
 import os
@@ -11,14 +11,14 @@ from crazyem.errors import UsageError
 
 T = TypeVar("T")
 R = TypeVar("R")
-MOST = 64
-_depth: contextvars.ContextVar[int] = contextvars.ContextVar("depth", default=0)  # of work that is shared out
+MOST = 64  # threads
+_depth: contextvars.ContextVar[int] = contextvars.ContextVar("depth", default=0)  # nesting depth of shared work
 
 
 class Workers:
     """Maps functions over items with up to `jobs` threads; results in order, the same for any number of threads.
 
-    Work may share out work of its own: whoever is idle helps, and nobody waits for what has not been begun.
+    Calls may be nested: idle threads help with inner work, and no thread waits for work that has not begun.
 
     Args:
         jobs: threads; None: one for each core that this process may use.
@@ -34,15 +34,15 @@ class Workers:
         if not 1 <= jobs <= MOST:
             raise UsageError(f"--jobs must lie between 1 and {MOST}, not {jobs}.")
         self.jobs = jobs
-        # the thread that asks works, too
+        # the calling thread works, too
         self._pool = ThreadPoolExecutor(jobs - 1, "crazyem-diagnose") if jobs > 1 else None
         self._changed = threading.Condition()
         self._open: list[_Shared[Any, Any]] = []
 
     def map(self, function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-        """What `function` gives for each item; it must not change what another item's call reads.
+        """The results of `function` for each item; a call must not change data that another call reads.
 
-        Raises: what `function` raised for the first of the items with which it failed.
+        Raises: the exception of `function` for the first item that failed.
         """
         items = list(items)
         if self._pool is None or len(items) < 2:
@@ -55,7 +55,7 @@ class Workers:
         try:
             shared.work()
             self._help_until_done(shared)
-        finally:  # where the user interrupts, nobody goes on with the rest
+        finally:  # after an interrupt by the user, no thread takes the rest
             shared.stop()
             for helper in helpers:
                 helper.cancel()
@@ -64,7 +64,7 @@ class Workers:
         return shared.results()
 
     def _help_until_done(self, shared: "_Shared[Any, Any]") -> None:
-        """Wait for those who are at the last items, and help where they share these out."""
+        """Wait for the threads at the last items, and help with inner work that they share."""
         while True:
             with self._changed:
                 while shared.busy and not (inner := [o for o in self._open if o.depth > shared.depth and o.left]):
@@ -75,12 +75,12 @@ class Workers:
 
 
 class _Shared(Generic[T, R]):
-    """Items that several threads take one after the other, each in the context of the one who asks, in which numpy
-    keeps what it says of overflow."""
+    """Items that several threads take one after the other, in the context of the calling thread, which contains the
+    error state of numpy (overflow)."""
 
     def __init__(self, function: Callable[[T], R], items: list[T], changed: threading.Condition) -> None:
         self._function, self._items, self._changed = function, items, changed
-        self.depth = _depth.get() + 1  # 1: of who is no worker
+        self.depth = _depth.get() + 1  # 1: called outside of shared work
         self.left, self.busy = len(items), 0
         self._context = contextvars.copy_context()
         self._context.run(_depth.set, self.depth)
@@ -95,7 +95,7 @@ class _Shared(Generic[T, R]):
         while (i := self._take()) is not None:
             try:
                 self._done[i] = self._function(self._items[i])
-            except Exception as error:  # told by `results`
+            except Exception as error:  # raised by `results`
                 self._failed[i] = error
             finally:
                 with self._changed:
@@ -111,12 +111,12 @@ class _Shared(Generic[T, R]):
             return len(self._items) - 1 - self.left
 
     def stop(self) -> None:
-        """Let nobody take another one."""
+        """Let no thread take another item."""
         with self._changed:
             self.left = 0
 
     def results(self) -> list[R]:
-        """All of them, once nobody works any more."""
+        """All results, after all threads have finished."""
         if self._failed:
             raise self._failed[min(self._failed)]
         return [self._done[i] for i in range(len(self._items))]
