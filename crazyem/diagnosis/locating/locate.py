@@ -21,7 +21,6 @@ from crazyem.physics.rotations import rotation_matrix
 AXES = ("x", "y", "z")
 BINS = 4
 NOTABLE = 1e-4  # largest p-value of a finding that is listed
-SETTLED = 0.3  # s after a start before rows count
 
 
 @dataclass(frozen=True)

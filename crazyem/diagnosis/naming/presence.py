@@ -1,34 +1,34 @@
-"""How probable it is that an effect is there, by what it explains of flight it was fitted to and of other flight."""
+"""Probability that an effect is real, by its gains on fitted and on held-out flights."""
 
 import math
 
 from scipy import stats
 from scipy.special import expit, logit
 
-# Log-odds that a name is right: CONSTANT + FITTED log(1 + nats on the flight it was fitted to, over how much more
-# scores scatter than the model says) - ORDER log(k) of the k-th effect found + `held_out_evidence`; the probability is
-# at most `CALIBRATED`. Models are approximate: wrong names gain tens of nats, with a heavy tail, so odds grow with a
-# power of what is gained and not with the nats. A file lacks one thing rather than three.
+# Log-odds of the k-th effect found: CONSTANT + FITTED log(1 + gain over dispersion) - ORDER log(k) + that of held-out
+# flights (`held_out_evidence`); the probability is at most `CALIBRATED`. Models are approximate: wrong effects gain tens
+# of nats, with a heavy tail. So the odds grow with a power of the gain, not with its exponential. A file lacks one thing
+# rather than three.
 # By the posterior mode from 38 names in 45 worlds, home, random and foreign (seeds 12501, 12602, 12703, 13602). The
 # prior is from 79 names in 71 others (seeds 11501, 11602, 11703, 10501, 10602).
 CONSTANT, FITTED, ORDER, CALIBRATED = -6.8, 1.7, 1.2, 0.95
-# How far what an effect brings on flight held out is from what is expected, as a share of that, where it is there (its
-# model is approximate), and how far from 0 where something else is (it may be that in both flights); Student's t, as
-# flights have surprises of their own.
+# Standard deviation of the gain on held-out flights as a share of its expected value m: about m for a real effect, whose
+# model is approximate; about 0 for another cause, which may act in both flights. Student's t, because flights have
+# unexpected errors of their own.
 THERE, ELSEWHERE, FREEDOM = 0.4, 0.6, 4.0
-MISSING = 0.05  # prior probability that one effect is missing from a vehicle file: of 20 drones one
-LEAST_PROBABILITY = 0.5  # probability below which an effect is no finding
+MISSING = 0.05  # prior probability that a vehicle file lacks an effect: one drone of 20
+LEAST_PROBABILITY = 0.5  # least probability of a finding
 
 
 def presence(fitted: float, held_out: float, expected: float, order: int = 1, *, dispersion: float = 1.0) -> float:
-    """Probability that an effect is there, whatever its look-alikes.
+    """Probability that an effect is real, look-alikes aside.
 
     Args:
-        fitted: nats that it brings on the flight that it was fitted to, over the dispersion of its scores.
-        held_out: nats that it brings on flight that it was not fitted to.
-        expected: nats that are to be expected there if it is there.
+        fitted: gain on the fitted flights over the dispersion [nats].
+        held_out: gain on the held-out flights [nats].
+        expected: mean of `held_out` for a real effect [nats].
         order: 1 for the first effect that was found, 2 for the next.
-        dispersion: by how much its scores scatter more than the model says.
+        dispersion: variance of the effect's scores over that of the model.
     """
     if fitted <= 0.0:
         return 0.0
@@ -37,9 +37,11 @@ def presence(fitted: float, held_out: float, expected: float, order: int = 1, *,
 
 
 def held_out_evidence(held_out: float, expected: float, dispersion: float = 1.0) -> float:
-    """Log-odds by flight that an effect was not fitted to. A likelihood ratio whose mean is m varies with a variance of
-    2 m; where nothing is to be expected, what comes says nothing. What is beyond that mean, on either side, says no
-    more than the mean does."""
+    """Log-odds of an effect by its gain on held-out flights.
+
+    A log-likelihood ratio of mean m has a variance of 2 m. With m = 0 the flights say nothing. A gain beyond m or -m
+    counts as m or -m.
+    """
     expected = max(expected, 0.0)
     noise = 1.0 + 2.0 * dispersion * expected
     there, elsewhere = (math.sqrt(noise + (share * expected) ** 2) for share in (THERE, ELSEWHERE))
@@ -49,6 +51,5 @@ def held_out_evidence(held_out: float, expected: float, dispersion: float = 1.0)
 
 
 def presence_by_odds(nats: float) -> float:
-    """Probability that an effect is there by a likelihood that holds what is systematically wrong with its model: then
-    nats are odds."""
+    """Probability of an effect by a likelihood that contains the systematic errors of its model: nats are log-odds."""
     return min(CALIBRATED, float(expit(nats + logit(MISSING))))
