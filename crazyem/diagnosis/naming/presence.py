@@ -6,15 +6,15 @@ from scipy import stats
 from scipy.special import expit, logit
 
 # Log-odds of the k-th effect found: CONSTANT + FITTED log(1 + gain over dispersion) - ORDER log(k) + that of held-out
-# flights (`held_out_evidence`); the probability is at most `CALIBRATED`. Models are approximate: wrong effects gain tens
-# of nats, with a heavy tail. So the odds grow with a power of the gain, not with its exponential. A file lacks one thing
-# rather than three.
+# flights (`held_out_evidence`); the probability is at most `CALIBRATED`. Models are approximate: wrong effects gain
+# tens of nats, with a heavy tail. So the odds grow with a power of the gain, not with its exponential. A file lacks one
+# thing rather than three.
 # By the posterior mode from 38 names in 45 worlds, home, random and foreign (seeds 12501, 12602, 12703, 13602). The
 # prior is from 79 names in 71 others (seeds 11501, 11602, 11703, 10501, 10602).
 CONSTANT, FITTED, ORDER, CALIBRATED = -6.8, 1.7, 1.2, 0.95
-# Standard deviation of the gain on held-out flights as a share of its expected value m: about m for a real effect, whose
-# model is approximate; about 0 for another cause, which may act in both flights. Student's t, because flights have
-# unexpected errors of their own.
+# Standard deviation of the gain on held-out flights as a share of its expected value m: about m for a real effect,
+# whose model is approximate; about 0 for another cause, which may act in both flights. Student's t, because flights
+# have unexpected errors of their own.
 THERE, ELSEWHERE, FREEDOM = 0.4, 0.6, 4.0
 MISSING = 0.05  # prior probability that a vehicle file lacks an effect: one drone of 20
 LEAST_PROBABILITY = 0.5  # least probability of a finding
