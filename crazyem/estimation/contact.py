@@ -1,24 +1,23 @@
-"""Whether the drone flies: samples in contact with the ground say a = 0 whatever the thrust, and must never be used."""
+"""Whether the drone flies: on the ground the acceleration is 0 at any thrust, so these samples must not be used."""
 
 import math
 
-CLEARANCE_HEIGHT = 0.08  # m above the last resting height before a sample counts as flying
-CONTACT_HEIGHT = 0.05  # m above it below which a sample counts as contact again
-CONFIRMING_HEIGHTS = 3  # heights in a row above the clearance: one alone may be noise of the sensor
-OFF_FRACTION = 0.1  # of the largest thrust: below it the rotors are off or idling
+CLEARANCE_HEIGHT = 0.08  # m above the last resting height, from which a sample counts as flying
+CONTACT_HEIGHT = 0.05  # m above the resting height, below which a sample counts as contact again
+CONFIRMING_HEIGHTS = 3  # heights in a row above the clearance; a single one may be sensor noise
+OFF_FRACTION = 0.1  # share of the largest thrust, below which the rotors are off or idle
 
 
 class ContactGate:
-    """Remembers the height at which the drone last rested with its rotors off.
+    """Decides whether the drone flies, by its height above the last resting height with rotors off.
 
-    A drone that was on the ground flies when it is seen well above it (twice the clearance), or above the clearance
-    `CONFIRMING_HEIGHTS` times in a row. With 14 mm of noise in the position and one reading of the resting height, some
-    sample on the floor is above the clearance in 1 of 400 take-offs on a slow ramp of thrust, and three in a row in
-    none of 100 000.
+    A drone on the ground counts as flying once its height is above twice the clearance, or above the clearance
+    `CONFIRMING_HEIGHTS` times in a row. With 14 mm of position noise, one reading of the resting height and a slow ramp
+    of thrust, a sample on the floor is above the clearance in 1 of 400 take-offs; three in a row in none of 100 000.
     """
 
     def __init__(self, thrust_max: float) -> None:
-        """thrust_max: of the whole drone [N]; inf if unknown."""
+        """thrust_max: largest thrust of the whole drone [N]; inf if unknown."""
         self._off_below = OFF_FRACTION * thrust_max if math.isfinite(thrust_max) else 1e-9
         self._rest_height = math.nan
         self._above = 0  # heights in a row above the clearance
@@ -27,7 +26,7 @@ class ContactGate:
 
     @property
     def rest_height(self) -> float:
-        """m in the world, NaN where the drone was not seen at rest."""
+        """Resting height [m, world]; NaN if the drone was not seen at rest."""
         return self._rest_height
 
     def update(self, *, height: float, thrust: float, flying: bool | None) -> bool:
@@ -36,7 +35,7 @@ class ContactGate:
         Args:
             height: z in the world [m], NaN if not measured now.
             thrust: commanded at this time [N].
-            flying: what the firmware says, None if it says nothing.
+            flying: the firmware's own verdict, None if it gives none.
         """
         if thrust <= self._off_below or flying is False:
             if not math.isnan(height):
@@ -45,14 +44,14 @@ class ContactGate:
             off = ", rotors off" if thrust <= self._off_below else ""
             self.airborne, self.reason = False, "on the ground" + off
         elif math.isnan(self._rest_height):
-            # Recording begins in the air, or height is not measured: rotors that turn are all there is to go by.
+            # The recording begins in the air, or height is not measured: the thrust alone decides.
             self.airborne, self.reason = True, ""
         elif not math.isnan(height):
             self._judge(height - self._rest_height)
         return self.airborne
 
     def _judge(self, above: float) -> None:
-        """By the height above the resting height, rotors turning."""
+        """Decide by the height above the resting height [m], with rotors on."""
         if self.airborne:
             self._above, flies = 0, above >= CONTACT_HEIGHT
         else:

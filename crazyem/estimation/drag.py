@@ -1,11 +1,11 @@
-"""Drag over mass along body x and y, from what the accelerometer feels of the drone's own speed.
+"""Drag over mass along body x and y, by regression of the specific force on the drone's speed.
 
-In flight an accelerometer along x or y feels no gravity and no thrust, only drag: s = c - d v, with v the speed along
-that axis, d drag over mass [1/s], and c what stands still (mounting, steady wind at one heading). What the onboard
-filter is told by kalman.dragB_* is this d. Speed is distance over time, both over the same quarter of a second: the
-onboard filter's own velocity errs in proportion to the drag that the filter does not know of, and its position hardly.
-d is the least-squares slope. Its standard deviation is that of whole seconds against each other (Liang, Zeger 1986),
-because the residuals within one are not independent.
+In flight an accelerometer along x or y shows no gravity and no thrust, only drag: s = c - d v, with v the speed along
+this axis, d drag over mass [1/s], and a constant c (mounting, steady wind at one heading). The onboard filter takes d
+as its parameter kalman.dragB_*. The speed is distance over time, over the same quarter of a second as s. The velocity
+of the onboard filter has an error in proportion to the drag that the filter does not know; its position hardly has one.
+d is the least-squares slope. Its standard deviation takes whole seconds as clusters (Liang, Zeger 1986), because the
+residuals within a second are not independent.
 """
 
 import math
@@ -18,20 +18,21 @@ from crazyem.estimation.result import ParameterEstimate
 from crazyem.signals.sample import Sample
 
 SPAN = 0.25  # s over which speed and force are averaged
-SPANS = 4  # that are taken for dependent
-KEPT = 30  # seconds
-FEWEST = 6  # seconds before anything is said
-FEWEST_SAMPLES = 10  # of the accelerometer in a span
-RANGE = 0.3  # m/s, sd of speed along an axis below which drag drowns in what else the accelerometer feels
+SPANS = 4  # spans in a cluster: these are taken as dependent
+KEPT = 30  # clusters (seconds) in the regression
+FEWEST = 6  # clusters needed for an estimate
+FEWEST_SAMPLES = 10  # least number of accelerometer samples in a span
+RANGE = 0.3  # m/s, least standard deviation of speed along an axis; below, other specific forces hide the drag
 HALF_WIDTH = 0.3  # largest 95 % half width over the value
-# Of the value: speed along a curve is not distance over time. In figures 8 of the simulated firmware 1 to 3 % too low.
+# Systematic error, relative: along a curve, distance over time is not the speed. In figures 8 of the simulated firmware
+# d comes out 1 to 3 % too low.
 SYSTEMATIC = 0.02
 NAMES = ("drag_x", "drag_y")
 UNIT = "1/s"
 
 
 class DragRegression:
-    """Fed with samples in the air, in order of arrival: position, attitude, specific_force."""
+    """Regression of specific force on speed, fed with position, attitude and specific_force in order of arrival."""
 
     def __init__(self) -> None:
         self._start: tuple[float, tuple[float, ...]] | None = None  # of the span: s, position
@@ -41,7 +42,7 @@ class DragRegression:
         self._sums, self._count = np.zeros((2, 5)), 0
 
     def feed(self, sample: Sample, *, airborne: bool) -> None:
-        """One sample; on the ground nothing is learned."""
+        """Take one sample; samples on the ground are not used."""
         if not airborne or not all(map(math.isfinite, sample.value)):
             self._start = None
         elif sample.signal == "attitude":
@@ -73,13 +74,13 @@ class DragRegression:
             self._sums, self._count = np.zeros((2, 5)), 0
 
     def estimates(self) -> dict[str, ParameterEstimate]:
-        """drag_x, drag_y [1/s]."""
+        """The estimates drag_x, drag_y [1/s]."""
         sums = np.array(self._seconds) if self._seconds else np.zeros((0, 2, 5))
         return {name: _estimate(sums[:, axis]) for axis, name in enumerate(NAMES)}
 
 
 def _body(q: tuple[float, ...], v: list[float]) -> tuple[float, float]:
-    """Body x and y of a world vector; q = x, y, z, w, body to world."""
+    """Components along body x and y of a world vector; q = x, y, z, w, body to world."""
     x, y, z, w = q
     return (
         (1 - 2 * (y * y + z * z)) * v[0] + 2 * (x * y + w * z) * v[1] + 2 * (x * z - w * y) * v[2],
@@ -88,7 +89,7 @@ def _body(q: tuple[float, ...], v: list[float]) -> tuple[float, float]:
 
 
 def _estimate(sums: NDArray) -> ParameterEstimate:
-    """Of one axis: sums (seconds, 5), see `DragRegression`."""
+    """Estimate of one axis from sums (seconds, 5), see `DragRegression`."""
     count = len(sums)
     if count < FEWEST:
         return _unknown("too few samples in the air")

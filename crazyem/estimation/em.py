@@ -1,10 +1,9 @@
 """Expectation maximisation over a window of the tape: full passes, incremental passes, scoring, and the uncertainty.
 
-A full pass filters and smooths the whole window with the present parameters. An incremental pass filters the
-new samples and smooths only the newest ones; each older sample keeps the expectations it was given with the
-parameters of its time (they are physical quantities: accelerations, rates), which is incremental EM in the
-sense of Neal and Hinton. Where EM crawls, a Fisher-scoring step on the likelihood of the innovations takes
-over."""
+A full pass filters and smooths the whole window with the present parameters. An incremental pass filters the new
+samples and smooths only the newest ones. Older samples keep the expectations from earlier parameters; these are
+physical quantities (accelerations, rates). This is incremental EM in the sense of Neal and Hinton. Near the maximum EM
+is slow, so Fisher-scoring steps on the likelihood of the innovations replace it."""
 
 import math
 from dataclasses import dataclass
@@ -20,27 +19,27 @@ from crazyem.estimation.model import Noise, Parameters, Setup
 from crazyem.estimation.mstep import maximise
 from crazyem.estimation.tape import START_VARIANCE, Tape
 
-CONVERGED_DECREMENT = 0.02  # converged when the next scoring step is shorter than this many standard deviations
-# standard deviations that a noise scale seems off, from which its information is computed, not guessed
+CONVERGED_DECREMENT = 0.02  # standard deviations; converged when the next scoring step is shorter
+# standard deviations; if a noise scale has a longer scoring step, its information is computed exactly
 INEXACT_SCALE_SD = 1.0
 
 
 @dataclass(frozen=True)
 class Information:
-    """Fisher information at a point, in logarithms of theta: what the data (and the weak prior) say.
+    """Fisher information at a point, in logarithms of theta (units of the linear parameters).
 
     Attributes:
-        matrix: (9, 9) information of the data, zero rows where a parameter is fixed.
+        matrix: (9, 9) information of the data; only rows and columns of free parameters are used.
         covariance: (9, 9) of the logarithms, prior included, widened where innovations are correlated in time.
         step: (9,) scoring step of the logarithms.
         decrement: length of that step in standard deviations.
-        inflation: (9,) factor by which correlation widened each standard deviation.
-        bias: (9,) by which the parameters may be off because commands are known only at their stamps, in the same
-            coordinates; counted as one more standard deviation in the covariance.
+        inflation: (9,) factor on each standard deviation for correlation in time.
+        bias: (9,) possible bias of the parameters because commands are known only at their stamps, in the same
+            coordinates; the covariance contains its square.
         noise_sd: (11,) standard deviations of the logarithms of the noise scales, zero where known.
         noise_step: (11,) scoring step of these logarithms.
-        shift: (9,) by which the values are corrected before they are told (`in_step.py`); None: not at all.
-        open_sd: (9,) what unknown torques leave open beside the covariance, one more standard deviation.
+        shift: (9,) correction of the reported values (`in_step.py`); None: no correction.
+        open_sd: (9,) additional standard deviation because of unknown torques; not part of the covariance.
     """
 
     matrix: NDArray
@@ -56,17 +55,17 @@ class Information:
 
     @cached_property
     def sd(self) -> NDArray:
-        """(9,) standard deviations by the covariance."""
+        """(9,) standard deviations from the covariance."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     @property
     def noise_length(self) -> float:
-        """The longest step that a noise scale should still take, in standard deviations."""
+        """The longest scoring step of a noise scale, in its standard deviations."""
         return float(np.max(np.abs(self.noise_step) / np.where(self.noise_sd > 0, self.noise_sd, np.inf)))
 
 
 class WindowEM:
-    """Runs passes over a tape. Holds the present parameters; everything else it computes lives on the tape."""
+    """Passes of EM and scoring over a tape; holds the present parameters, all other results are on the tape."""
 
     def __init__(self, setup: Setup, tape: Tape, inputs: InputHistory) -> None:
         self.setup = setup
@@ -75,13 +74,13 @@ class WindowEM:
         self.parameters = setup.start
         self._sums = np.zeros(kernels.SIZE)
         self._squares = np.ones(4)
-        self._damping = np.ones(11)  # of the steps of noise scales: one whose steps swing back takes shorter ones,
-        self._step_before = np.zeros(11)  # also from one update to the next
+        self._damping = np.ones(11)  # factor on the steps of noise scales: smaller where steps change their sign;
+        self._step_before = np.zeros(11)  # both are kept from one update to the next
 
     # E-step -------------------------------------------------------------------------------------------------
 
     def forward(self, first: int, last: int, *, restart: bool) -> float:
-        """Filter rows first..last-1; with restart the prior at `first` is the one on the tape. Log-likelihood."""
+        """Filter rows first..last-1; with restart the tape holds the prior at `first`. Returns the log-likelihood."""
         t, p = self.tape, self.parameters
         inertia = p.inertia
         return kernels.forward(
@@ -102,7 +101,7 @@ class WindowEM:
         )  # fmt: skip
 
     def refill_inputs(self, first: int, last: int) -> None:
-        """Mean inputs of the window with the present time constant."""
+        """Recompute the mean inputs of the window with the present time constant and delay."""
         self.inputs.refill(self.tape, first, last, self.parameters.theta)
 
     # M-step -------------------------------------------------------------------------------------------------
@@ -124,13 +123,13 @@ class WindowEM:
                 iterations,
                 self._squares,
             )
-            # a lag linearised at one value is not to be believed far from it
+            # the lag is linearised, so one step changes it by a quarter at most
             before = self.parameters.theta[4]
             theta[4] = min(1.25 * before, max(0.8 * before, theta[4]))
         return Parameters(theta, self._noise(theta), self.parameters.inertia_products)
 
     def _noise(self, theta: NDArray) -> Noise:
-        """Noise scales of the M-step: mean squares, the weak prior taking its share."""
+        """Noise scales of the M-step: mean squares, combined with the weak prior."""
         sums, prior = self._sums, self.setup.prior
         n = sums[kernels.COUNT]
         if n < 3:
@@ -140,14 +139,14 @@ class WindowEM:
         squares[2:6] = self._squares / theta[:4] ** 2 / n
         seen = np.maximum(sums[kernels.MEASURED : kernels.MEASURED + 5], 1e-9)
         squares[6:] = sums[kernels.RESIDUAL : kernels.RESIDUAL + 5] / seen
-        # curvature of the log-likelihood in log s is 2 n; the prior adds its own
+        # weight of the prior: the curvature of the log-likelihood in log s is 2 n
         weight = 1.0 / (1.0 + 2 * np.concatenate([np.full(6, n), seen]) * prior.noise_sd**2)
         logs = 0.5 * np.log(np.maximum(squares, 1e-300)) * (1 - weight) + prior.noise.logs * weight
         logs = np.where(weight > 0.5, prior.noise.logs, logs)
         return self.setup.noise_at(theta, np.maximum(logs, prior.floor))
 
     def noise_terms(self, first: int, last: int) -> NDArray:
-        """What each row adds to the score of the logarithms of the noise scales (n, 11); the window must be smoothed.
+        """Terms (n, 11) by row of the score of the logarithms of the noise scales; the window must be smoothed.
 
         Fisher's identity: the score of the likelihood is the expected score of the complete data.
         """
@@ -175,8 +174,8 @@ class WindowEM:
     def _noise_step(self, first: int, last: int, of_noise: NDArray | None) -> tuple[NDArray, NDArray]:
         """Scoring step (11,) of the logarithms of the noise scales, and their standard deviations (11,).
 
-        Unless `of_noise` (11, 11) is given, the information is the larger of what each step says for itself and the
-        long-run variance of the score's terms: cheap, and steps never overshoot far.
+        Without `of_noise` (11, 11), the information is diagonal: the larger of the sum over single steps and the
+        long-run variance of the score's terms. This is cheap, and steps overshoot little.
         """
         noise, setup = self.parameters.noise, self.setup
         prior = setup.prior
@@ -197,23 +196,23 @@ class WindowEM:
     # passes -------------------------------------------------------------------------------------------------
 
     def incremental(self, first: int, fresh: int, last: int, *, lookback: int) -> None:
-        """Filter and smooth the new rows fresh..last-1 and `lookback` before them, maximise.
+        """Filter and smooth the new rows fresh..last-1 and `lookback` rows before them, then maximise.
 
-        The older of these rows are filtered again: smoothing with other parameters than a row was filtered with puts
-        the change of the parameters into its accelerations.
+        The older of these rows are filtered again. Otherwise filter and smoother would use different parameters, and
+        the difference would appear in the accelerations.
         """
         theta, tape = self.parameters.theta, self.tape
         self.inputs.advance(tape, fresh, last, theta)
         begin = max(first, fresh - lookback - 1)
         tape.spread_inputs(begin + 1, fresh, theta[6:9])
-        kept = tape.stats[begin].copy()  # the smoother starts anew at its first row and would empty it
+        kept = tape.stats[begin].copy()  # the smoother clears its first row
         self.forward(min(begin + 1, fresh), last, restart=False)
         self.backward(begin, last)
         tape.stats[begin] = kept
         self.parameters = self.maximise(first, last, iterations=3)
 
     def sensitivities(self, first: int, last: int) -> NDArray:
-        """Information (9, 9) of theta by the means of the innovations, score rows onto the tape; window filtered."""
+        """Information (9, 9) of theta from the means of the innovations; writes score rows; window must be filtered."""
         t, p, setup = self.tape, self.parameters, self.setup
         inertia = p.inertia
         return kernels.sensitivities(
@@ -223,7 +222,7 @@ class WindowEM:
         )  # fmt: skip
 
     def torque_sensitivities(self, first: int, last: int, shapes: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Torques shapes (last, 3, K) of unknown size: information with theta (9, K), among them (K, K), score (K,)."""
+        """For torques shapes (last, 3, K): information theta-sizes (9, K) and sizes (K, K), score of the sizes (K,)."""
         t, p, setup = self.tape, self.parameters, self.setup
         return kernels.torque_sensitivities(
             first, last, t.time, t.kind, t.usable, t.force, t.thrust, t.torque, t.thrust_tau, t.torque_tau,
@@ -234,7 +233,7 @@ class WindowEM:
     def information(self, first: int, last: int, *, of_noise: NDArray | None = None) -> Information:
         """Score and information at the present parameters; the window must have been filtered and smoothed with them.
 
-        `of_noise` (11, 11) is the information about the noise scales (`noise_information`), guessed unless given.
+        `of_noise` (11, 11) is the information on the noise scales (`noise_information`); None: an approximation.
         """
         t, p, setup = self.tape, self.parameters, self.setup
         matrix = self.sensitivities(first, last)
@@ -242,7 +241,7 @@ class WindowEM:
         free = np.flatnonzero(setup.free)
         precision = setup.prior.precision
         score = t.score[first:last].sum(0)
-        if setup.carried.any():  # known scales move with mass and inertia: what they say of them
+        if setup.carried.any():  # known scales depend on mass and inertia, so they carry information on both
             matrix += self._carried_information(first, last, of_noise)
             score += setup.carried.T @ self.noise_terms(first, last).sum(0)
         score = (score - precision * offset(p.theta, setup.prior.centre, setup.unit))[free]
@@ -257,13 +256,13 @@ class WindowEM:
         factors[free] = inflation
         bias = np.zeros(9)
         if setup.free[4]:
-            # added as squares: the sizes are known well, but not so well that parts could be trusted to cancel
+            # squares are added: the parts are not known well enough to let them cancel
             bias[free] = np.sqrt(covariance**2 @ self.command_noise_score(first, last)[free] ** 2)
         full += np.diag(bias**2)
         return Information(matrix, full, step, decrement, factors, bias, noise_sd, noise_step)
 
     def _carried_information(self, first: int, last: int, of_noise: NDArray | None) -> NDArray:
-        """What the size of known process noise says of theta (9, 9), less what the unknown scales take of it."""
+        """Information (9, 9) on theta from the size of known process noise, with the unknown scales as nuisances."""
         setup = self.setup
         if of_noise is None:
             of_noise = np.diag(2 * self.tape.stats[first:last, kernels.IMPULSE_SEEN : kernels.SIZE].sum(0))
@@ -273,10 +272,10 @@ class WindowEM:
         return setup.carried.T @ of_noise @ setup.carried - cross.T @ np.linalg.solve(among, cross)
 
     def command_noise_score(self, first: int, last: int) -> NDArray:
-        """(9,) what noise in the samples of the commands adds to the score (aliasing.py).
+        """(9,) mean of the score because of noise in the command samples (`inflation.py`).
 
-        A step's innovation holds minus the noise's torque; its derivatives by log I, log tau and delay hold the same
-        noise, so their product has a mean.
+        The innovation of a step contains minus the torque of the noise. Its derivatives by log I, log tau and delay
+        contain the same noise, so their product has a mean that is not zero.
         """
         tape, p, unit = self.tape, self.parameters, self.setup.unit
         score = np.zeros(9)
@@ -302,18 +301,17 @@ class WindowEM:
         return score
 
     def converge(self, first: int, last: int, *, passes: int, tolerance: float = CONVERGED_DECREMENT) -> Information:
-        """Full passes until no step would be longer than `tolerance` standard deviations, at most `passes`.
+        """Full passes until the next step is shorter than `tolerance` standard deviations, at most `passes`.
 
-        EM while far, scoring when near.
-
-        The tape is left filtered and smoothed with the parameters that the returned information belongs to.
+        The steps are EM far from the maximum and scoring near it. At the end the tape is filtered and smoothed with the
+        parameters to which the returned information belongs.
         """
         for count in range(passes):
             self.refill_inputs(first, last)
             self.forward(first, last, restart=True)
             self.backward(first, last)
             info = self.information(first, last)
-            if info.noise_length > INEXACT_SCALE_SD:  # the guess is too sure of a scale that others can stand for
+            if info.noise_length > INEXACT_SCALE_SD:  # the diagonal approximation is too large for look-alike scales
                 info = self.information(first, last, of_noise=self.noise_information(first, last))
             noise_step = info.noise_step
             longer = np.minimum(1.3 * self._damping, 1.0)
@@ -333,7 +331,7 @@ class WindowEM:
 
 
 def offset(theta: NDArray, origin: NDArray, unit: NDArray) -> NDArray:
-    """How far theta is from origin: logarithms of the ratios, linear parameters in their units. (9,) -> (9,)."""
+    """Difference of theta and origin (9,): logarithms of the ratios, linear parameters in their units."""
     far: NDArray = (theta - origin) / unit
     for i in range(kernels.DELAY):
         a, b = float(theta[i]), float(origin[i])
@@ -342,17 +340,17 @@ def offset(theta: NDArray, origin: NDArray, unit: NDArray) -> NDArray:
 
 
 def displaced(theta: NDArray, step: NDArray, unit: NDArray) -> NDArray:
-    """Inverse of `offset`: theta moved by a step in those coordinates."""
-    with np.errstate(over="ignore"):  # an interval without an end
+    """Inverse of `offset`: theta moved by a step (9,) in the coordinates of `offset`."""
+    with np.errstate(over="ignore"):  # an unbounded interval
         moved = theta * np.exp(step)
     moved[kernels.DELAY :] = (theta + unit * step)[kernels.DELAY :]
     return moved
 
 
 def _widen(covariance: NDArray, score: NDArray) -> tuple[NDArray, NDArray]:
-    """Covariance widened for scores that are correlated in time (Newey and West 1987), never narrowed.
+    """Covariance widened for scores that are correlated in time (Newey and West 1987), never narrowed; and the factors.
 
-    Real disturbances are not white and onboard estimates have memory; the plain covariance then claims too much.
+    Real disturbances are not white, and onboard estimates have memory, so the plain covariance is too small.
     """
     inflation = np.ones(len(covariance))
     scaled = score @ covariance

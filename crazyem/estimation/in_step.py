@@ -1,16 +1,17 @@
-"""Commands that are sampled in step with the onboard estimate: unknown torques of known shape.
+"""Torque errors of commands that are sampled with the same period as the onboard estimate.
 
-A Crazyflie predicts its estimate every 10 ms and lets it stand still in between. What its controller answers to is
-therefore up to 10 ms old, and a log of the same period finds it always equally old: the logged torque is off by
+A Crazyflie predicts its state estimate every 10 ms and holds it in between. So the state that its controller uses is up
+to 10 ms old. In a log of the same period, the age of the state is the same at every sample. Then the logged torque is
+wrong by
 
     J k_R d ( rate + k_v tilt + k_p velocity / g )
 
-with the age d of the sample less the mean age (-5 to 5 ms, unknown, drifting over seconds) and gains of the controller
-that the log does not tell. For the filter these are torques of known shape and unknown size: nuisance parameters,
-found together with theta by one scoring step. Logs of another period visit every age, and the mean is right.
+with d the age at the sample less the mean age (-5 to 5 ms, unknown, drifting over seconds), and controller gains that
+the log does not contain. For the filter these are torques of known shape and unknown size: nuisances, estimated
+together with theta by one scoring step. In logs of another period all ages occur, and the mean is right.
 
-In five simulated quiet flights logged every 10 ms, a third to a half of the error is not of these shapes and adds up
-like the rest. So what the step corrects counts as one more standard deviation.
+In five simulated quiet flights logged every 10 ms, a third to a half of the error does not have these shapes and adds
+up like the rest. So the correction counts as one more standard deviation.
 """
 
 import math
@@ -23,24 +24,25 @@ from scipy.signal import lfilter
 from crazyem.estimation.em import Information, WindowEM
 
 PERIOD = 0.010  # s, PREDICT_RATE of the firmware's estimator_kalman.c
-ALIKE = 0.02  # of a period, within which a log keeps its step with it for seconds
-FEWEST = 20  # stamps that tell a period
-AGE = 0.003  # s, standard deviation of an age that is even over a period
-# Lee's gains of the firmware (controller_lee.c), over inertia and gravity: attitude 309 1/s^2, velocity 4 1/s, position
-# 7 1/s^2. Those of the other controllers are of the same size, within OTHERS.
+ALIKE = 0.02  # share of a period; with a smaller difference the age of the samples is constant over seconds
+FEWEST = 20  # stamps needed to find a period
+AGE = 0.003  # s, standard deviation of an age that is uniform over a period
+# Gains of the firmware's Lee controller (controller_lee.c), over inertia and gravity: attitude 309 1/s^2, velocity
+# 4 1/s, position 7 1/s^2. Gains of other controllers are of the same size, within OTHERS.
 SIZES = np.array([309.0, 309.0 * 4.0, 309.0 * 7.0 / 9.81]) * AGE  # of rate [1/s], tilt [1/s^2], velocity [1/(m s)]
 OTHERS = 0.5  # standard deviation of a gain, relative to Lee's
-SHAPES = 2 * len(SIZES)  # about x and y, which one control law drives, and about z
-# The three about x and y answer to one age. About z it is more than the age of the yaw that acts: each for itself.
+SHAPES = 2 * len(SIZES)  # about x and y, with common sizes, and about z
+# Precision of the prior of the sizes. The three sizes about x and y have one common age, so they are correlated. The
+# three about z depend on more than the age of the yaw, so they are independent.
 PRECISION = np.linalg.inv(
     np.block([[1.0 + OTHERS**2 * np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), (1.0 + OTHERS**2) * np.eye(3)]])
 )
-NODES = 8.0  # s between times at which a size is free; it is linear between them
-MOST = 0.5  # of a logarithm (or a unit) that one step may correct: beyond, the model is not linear
+NODES = 8.0  # s between nodes of a size; the size is linear in time between nodes
+MOST = 0.5  # largest correction of a logarithm (or in a unit); beyond, the model is not linear
 
 
 def in_step(stamps: NDArray, period: float) -> bool:
-    """Whether commands with these stamps (n,) [s] stay in step with an estimate predicted every `period` [s]; 0: no."""
+    """Whether the period of stamps (n,) [s] is a multiple of `period` [s] of an onboard estimate (0: unknown)."""
     if len(stamps) < FEWEST or not period > 0.0:
         return False
     steps = float(np.median(np.diff(stamps))) / period
@@ -48,10 +50,10 @@ def in_step(stamps: NDArray, period: float) -> bool:
 
 
 def corrected(em: WindowEM, first: int, last: int, information: Information) -> Information:
-    """The same information, with the shift of theta and what is left open; the window must have been filtered.
+    """The information with `shift` and `open_sd` because of such torques; the window must have been filtered.
 
-    With information A of theta (prior included), C between theta and the sizes of the torques, B and s of these their
-    information (prior included) and score, the step is that of the inverse of [[A, C], [C', B]].
+    A is the information of theta (prior included), C the one between theta and the sizes of the torques, B that of the
+    sizes (prior included). The scoring step uses the inverse of [[A, C], [C', B]] and the score of the sizes.
     """
     setup, time = em.setup, em.tape.time[first:last]
     at = np.linspace(time[0], time[-1], max(2, 1 + round((time[-1] - time[0]) / NODES)))
@@ -69,9 +71,9 @@ def corrected(em: WindowEM, first: int, last: int, information: Information) -> 
 
 
 def _shapes(em: WindowEM, first: int, last: int, at: NDArray) -> NDArray:
-    """Torques (last, 3, K) for sizes of one standard deviation, through the rotor lag.
+    """Torques (last, 3, K) after the rotor lag, for sizes of one standard deviation.
 
-    Of rate, tilt and velocity, about x and y and about z, each with a size at every time in `at`.
+    There are torques from rate, tilt and velocity, about x and y and about z, each with a size at every time in `at`.
     """
     tape, inertia, tau = em.tape, em.parameters.theta[1:4], max(float(em.parameters.theta[4]), 1e-3)
     time = tape.time[first:last]
@@ -88,7 +90,7 @@ def _shapes(em: WindowEM, first: int, last: int, at: NDArray) -> NDArray:
         kinds[:, :2, i] = turn[:, :2] * SIZES[i]
         kinds[:, 2, len(SIZES) + i] = turn[:, 2] * SIZES[i]
     kinds *= inertia[:, None]
-    # the lag: a first-order low pass at steps that are even but for gaps, which are rare
+    # the lag: a first-order low pass with a constant step; gaps are rare
     keep = math.exp(-float(np.median(np.diff(time))) / tau)
     lagged = lfilter([1.0 - keep], [1.0, -keep], kinds, axis=0, zi=keep * kinds[:1])[0]
     hats = np.stack([np.interp(time, at, row) for row in np.eye(len(at))], 1)
@@ -98,5 +100,5 @@ def _shapes(em: WindowEM, first: int, last: int, at: NDArray) -> NDArray:
 
 
 def _turn(roll_change: NDArray, pitch_change: NDArray, roll: NDArray) -> NDArray:
-    """Rotation in the body frame (n, 3) by small changes of roll and pitch (n,) [rad], the yaw being held."""
+    """Rotation in the body frame (n, 3) by small changes of roll and pitch (n,) [rad] at constant yaw."""
     return np.stack([roll_change, np.cos(roll) * pitch_change, -np.sin(roll) * pitch_change], 1)

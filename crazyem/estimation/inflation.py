@@ -1,11 +1,10 @@
-"""Why the information alone claims too much: noise in sampled commands, and disturbances with memory.
+"""Corrections to the information for noise in sampled commands and for disturbances with memory.
 
-A controller runs at 500 Hz and feeds the noise of its sensors straight into the command. A log at 100 Hz catches single
-values of that, each standing in for the 10 ms around it. What is noise in these values is not torque that acted. An
-estimate that takes it for such finds the drone too sluggish (errors in variables): inertia too large, and the time
-constant and delay, which come from the same commands, wrong with it. The bias is computed here from the noise and
-counted as uncertainty: the data cannot remove it. Terms of the score that are correlated in time have a sum whose
-variance is larger than the sum of their variances: the long-run variance.
+A controller runs at 500 Hz and passes sensor noise on to the command. A log at 100 Hz holds single values of the
+command, each standing for 10 ms. The noise in these values is not a torque that acted. So the inertia comes out too
+large (errors in variables), and the time constant and the delay, which use the same commands, are wrong, too. This
+module computes the bias from the noise. The bias counts as uncertainty, because the data cannot remove it. Where terms
+of the score are correlated in time, the variance of their sum is the long-run variance, not the sum of their variances.
 """
 
 import math
@@ -18,12 +17,12 @@ from scipy.signal import lfilter
 from crazyem.compiled import compiled
 from crazyem.physics.lag import CAUSAL, hold_predictor, lagged_means
 
-_DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])  # third difference: blind to what is smooth, 20 times white variance
-_STEPS, _BEGIN = 1000, 10  # rows of an impulse response, and where the impulse is
+_DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])  # third difference: removes smooth parts, white variance times 20
+_STEPS, _BEGIN = 1000, 10  # rows of an impulse response, and row of the impulse
 
 
 def white_variance(command: NDArray, rate: NDArray, *, rate_variance: float) -> float:
-    """Variance of the part of command samples that does not persist to the next sample.
+    """Variance of the white part of command samples: the part that does not persist to the next sample.
 
     Args:
         command: (n,) torque about one axis at its stamps [N m].
@@ -31,7 +30,7 @@ def white_variance(command: NDArray, rate: NDArray, *, rate_variance: float) -> 
         rate_variance: of the measurement noise of the rate [(rad/s)^2].
 
     Returns:
-        The command's response to rate noise, plus whatever in it no rate explains [(N m)^2].
+        Variance of the command's response to rate noise, plus the variance that no rate explains [(N m)^2].
     """
     du = np.convolve(command, _DIFFERENCE, "valid")
     dw = np.convolve(rate, _DIFFERENCE, "valid")
@@ -46,11 +45,10 @@ def white_variance(command: NDArray, rate: NDArray, *, rate_variance: float) -> 
 
 
 def innovation_noise(*, period: float, tau: float, gain: float) -> tuple[float, float, float]:
-    """What white command samples of unit variance leave in the innovations, and how it leans on their derivatives.
+    """Effect x on the innovations of white command samples of unit variance, and its products with dx/dtau, dx/ddelay.
 
-    A filter that trusts its model remembers: the torque of one step is in the innovations of the steps after it, until
-    measurements have corrected the rate. With the steady gain K of the rate, the innovations' share of the means m is
-    x[k] = (1 - K) x[k-1] + m[k], and likewise that of their derivatives.
+    The torque of one step stays in the innovations of later steps until measurements have corrected the rate. With the
+    steady gain K of the rate and the mean torques m, x[k] = (1 - K) x[k-1] + m[k]; the same holds for the derivatives.
 
     Args:
         period: between samples [s].
@@ -60,7 +58,7 @@ def innovation_noise(*, period: float, tau: float, gain: float) -> tuple[float, 
     Returns:
         E[x^2], E[x dx/dtau] [1/s], E[x dx/ddelay] [1/s].
     """
-    # quantised, so that a slowly moving time constant does not ask for it anew each time
+    # quantised, so that a slowly changing time constant finds its value in the cache
     return _innovation_noise(float(f"{period:.2g}"), float(f"{max(tau, 1e-3):.2g}"), float(f"{gain:.2g}"))
 
 
@@ -78,7 +76,7 @@ def _innovation_noise(period: float, tau: float, gain: float) -> tuple[float, fl
 
 
 def steady_gain(process: float, measurement: float) -> tuple[float, float]:
-    """Kalman gain of a random walk measured at every step, and the variance of its innovations.
+    """Steady Kalman gain of a random walk that is measured at every step, and the variance of its innovations.
 
     Args:
         process, measurement: variances of a step of the walk and of a measurement, in the same unit.
@@ -88,16 +86,16 @@ def steady_gain(process: float, measurement: float) -> tuple[float, float]:
     return predicted / innovation, innovation
 
 
-FEWEST_ROWS = 32  # fewer say nothing about correlation in time
-LONGEST_LAG = 100
+FEWEST_ROWS = 32  # with fewer rows, correlation in time cannot be estimated
+LONGEST_LAG = 100  # rows
 
 
 @compiled
 def long_run(terms):
-    """Variance of the column sums of terms (n, p), Bartlett kernel (Newey and West 1987). Returns (p,).
+    """Long-run variance (p,) of the column sums of terms (n, p), with the Bartlett kernel (Newey and West 1987).
 
-    The weights 1 - lag/length of the kernel are those of a running sum of that length, of which this is the mean
-    square: a few additions a term, however many lags.
+    The mean square of a running sum has the weights 1 - lag/length of this kernel. So the cost does not grow with the
+    number of lags.
     """
     n, p = terms.shape
     length = (min(n // 8, LONGEST_LAG) if n >= FEWEST_ROWS else 0) + 1

@@ -1,10 +1,10 @@
-"""Where a stretch of flight begins when its attitude is not measured: found from what follows, before it is believed.
+"""Initial state of a stretch of flight without a measured attitude, smoothed from all later samples.
 
-A state that starts anew is uncertain by a third of a radian in attitude. The filter linearises around its guess and
-around what the first, noisy samples make of it; over such angles the thrust's vertical share is cos, not 1, and mass
-comes out too large by the variance of the angle (0.35 standard deviations in 96 windows of 4 s, little process noise).
-So the first state is smoothed from all later samples, and the filter starts there, as uncertain as a small share of the
-same data leave it: too small a share to count twice, enough to stay where a linear model holds."""
+At a break the attitude is uncertain by a third of a radian. The filter linearises around the first guess and the first
+noisy samples. At such angles the vertical share of the thrust is cos, not 1, so the mass comes out too large by the
+variance of the angle (0.35 standard deviations in 96 windows of 4 s, little process noise). So the first state is
+smoothed from all later samples, and the filter starts there. Its start covariance is that of a small share of the same
+data: small, so that the data hardly count twice, and large enough for a linear model to hold."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,16 +17,16 @@ from crazyem.estimation.kernels.algebra import apply_transposed
 from crazyem.estimation.tape import BREAK, START_VARIANCE
 from crazyem.physics.rotations import quaternion_from_rotation_vector, quaternion_product
 
-SMOOTHING_ITERATIONS = 4
-START_INFORMATION_SHARE = 0.03  # of the information of the window about its first state that the start is given
-SETTLED_ANGLE = 1e-3  # rad
+SMOOTHING_ITERATIONS = 4  # at most
+START_INFORMATION_SHARE = 0.03  # share of the window's information on its first state that the start gets
+SETTLED_ANGLE = 1e-3  # rad; with a smaller change of the initial attitude the iteration ends
 
 
 @compiled
 def smoothed_error(first, last, time, kind, lead, gain, s, e, blocks, pf, covariance):
-    """Error (12,) of the filtered state at `first` by all later samples up to last - 1, or to the next break.
+    """Smoothed error (12,) of the filtered state at `first`, by all samples up to last - 1 or to the next break.
 
-    `covariance` (12, 12) receives that of the smoothed state (modified Bryson and Frazier, as in `kernels.backward`).
+    `covariance` (12, 12) receives the smoothed covariance (modified Bryson and Frazier, as in `kernels.backward`).
     """
     lam = np.zeros((12, 1))
     back = np.zeros((12, 1))
@@ -70,12 +70,12 @@ def smoothed_error(first, last, time, kind, lead, gain, s, e, blocks, pf, covari
 
 
 def starts_without_attitude(em: WindowEM, first: int) -> bool:
-    """Whether the state starts anew at row `first` without a measured attitude."""
+    """Whether row `first` is a break without a measured attitude."""
     return bool(em.tape.kind[first] == BREAK and np.isnan(em.tape.y[first, 6]))
 
 
 def find(em: WindowEM, first: int, last: int) -> None:
-    """Put the state at row `first` where the whole window has it, by a small share of it; filters the window."""
+    """Set the state at row `first` to its smoothed value, with a small share of the information; filters the window."""
     t = em.tape
     vague = np.diag(1.0 / START_VARIANCE)
     covariance = np.empty((12, 12))
@@ -87,7 +87,7 @@ def find(em: WindowEM, first: int, last: int) -> None:
         before = np.linalg.inv(t.pp[first])
         start = _turned(t.xf[first], error)
         moved = np.linalg.norm(start[6:10] - t.xp[first, 6:10])
-        seen = np.linalg.inv(covariance) - before  # what the data say of the start
+        seen = np.linalg.inv(covariance) - before  # information of the data on the start
         t.xp[first] = start
         t.pp[first] = np.linalg.inv(vague + START_INFORMATION_SHARE * 0.5 * (seen + seen.T))
         if moved < SETTLED_ANGLE:
@@ -104,14 +104,14 @@ def _turned(state: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 @contextmanager
 def known_initial_state(em: WindowEM, first: int, last: int) -> Iterator[Callable[[], None]]:
-    """For the time of the context, a window that begins blindly begins where the window has it.
+    """Within the context, a window that begins without an attitude starts at its smoothed initial state.
 
-    Yields a function that looks for it again, with better parameters.
+    Yields a function that smooths the initial state again, with better parameters.
     """
     if not starts_without_attitude(em, first):
         yield lambda: None
         return
-    em.tape.kind[first] = 0  # its prior is the one on the tape from now on
+    em.tape.kind[first] = 0  # the filter now takes the prior on the tape
     try:
         find(em, first, last)
         yield lambda: find(em, first, last)

@@ -1,5 +1,4 @@
-"""The inputs of the rigid body: commanded thrust and torque as logged, turned into means over the steps of the tape;
-and which samples cannot be true."""
+"""Inputs of the rigid body: means of logged thrust and torque over the steps; test for impossible samples."""
 
 import math
 
@@ -9,11 +8,11 @@ from numpy.typing import NDArray
 from crazyem.estimation.tape import Tape
 from crazyem.physics.lag import CAUSAL, fit_predictor, hold_predictor, lagged_means
 
-MAX_GAP = 0.1  # s without an input beyond which a step cannot be trusted
-_RECENT = 8  # inputs looked at one by one, newest first, before the rest is searched
-SETTLED_TIME_CONSTANTS = 5.0  # time constants after which a lag has forgotten where it started
+MAX_GAP = 0.1  # s; a step with a longer gap between inputs is not used
+_RECENT = 8  # newest inputs that are compared one by one before the binary search
+SETTLED_TIME_CONSTANTS = 5.0  # time constants after which the start value of a lag no longer matters
 
-# No drone is faster, further or stronger (SI): a sample beyond is an error of transmission, used as missing.
+# Largest possible values (SI). A larger sample is an error of transmission and counts as missing.
 LARGEST_VALUE = {
     "position": 1e4, "velocity": 1e2, "attitude": 2.0, "body_rate": 2e2,
     "motor_command": 1.5, "rotor_speed": 8e3, "wrench_command": 1e3,
@@ -22,16 +21,16 @@ LARGEST_VALUE = {
 
 
 def is_plausible(signal: str, value: tuple[float, ...]) -> bool:
-    """Whether every component is a number that can be true (a NaN is not, nor a quaternion far from unit length)."""
+    """Whether all components are possible values: no NaN, not too large, a quaternion near unit length."""
     limit = LARGEST_VALUE[signal]
-    for v in value:  # plain loops and Python floats in what runs for every sample: numpy costs more than it saves there
+    for v in value:  # runs for every sample: plain floats are faster than numpy here
         if not -limit < v < limit:
             return False
     return signal != "attitude" or 0.5 < math.hypot(*value) < 2.0
 
 
 class InputHistory:
-    """Stamps and wrenches in the order they came, and the state of the rotor lag at the newest node."""
+    """Stamps and wrenches in order of arrival, and the state of the rotor lag at the newest node."""
 
     def __init__(self, mode: int, capacity: int = 4096) -> None:
         self.mode = mode  # LINEAR, HOLD or CAUSAL of crazyem.physics.lag
@@ -39,9 +38,9 @@ class InputHistory:
         self.wrenches = np.zeros((capacity, 4))
         self.size = 0
         self.lag = np.zeros(13)  # see lagged_means
-        self._at = 0  # command at or before the time of the lag's state
+        self._at = 0  # index of the last command at or before the time of the lag's state
         self.predictor = hold_predictor()
-        self.gap_end = -np.inf  # when the last long gap between inputs ended
+        self.gap_end = -np.inf  # s, end of the last long gap between inputs
         self.newest = -np.inf  # stamp of the newest input [s], -inf if none
 
     def append(self, time: float, wrench: NDArray, *, needed_from: float) -> bool:
@@ -51,7 +50,7 @@ class InputHistory:
         if self.size == 0:
             self.lag[:12] = np.tile(wrench, 3)
             self.lag[12] = time
-            self.gap_end = time  # what was commanded before is unknown, and the lag remembers it
+            self.gap_end = time  # earlier commands are unknown, and they still act through the lag
         elif time - self.newest > MAX_GAP:
             self.gap_end = time
         if self.size == len(self.times):
@@ -75,7 +74,7 @@ class InputHistory:
             self.wrenches = np.concatenate([self.wrenches, np.zeros_like(self.wrenches)])
 
     def at(self, time: float) -> int:
-        """Index of the last input at or before `time` [s], 0 if all are later; quick where `time` is a recent one."""
+        """Index of the last input at or before `time` [s], 0 if all are later; fast for recent times."""
         for back in range(1, min(self.size, _RECENT) + 1):
             if self.times[self.size - back] <= time:
                 return self.size - back
@@ -84,7 +83,7 @@ class InputHistory:
     def covers(self, begin: float, end: float) -> bool:
         """Whether no stretch of [begin, end] is more than MAX_GAP away from inputs on both sides."""
         if self.gap_end <= begin <= end <= self.newest and self.times[0] <= begin:
-            return True  # the last gap there was had ended by then
+            return True  # the last gap ended before `begin`
         times = self.times[: self.size]
         first = int(np.searchsorted(times, begin, "right")) - 1
         last = int(np.searchsorted(times, end, "left"))
@@ -100,7 +99,7 @@ class InputHistory:
         return times[first:last], self.wrenches[first:last]
 
     def advance(self, tape: Tape, first: int, last: int, theta: NDArray) -> None:
-        """Fill the means of rows first..last-1 for parameters theta (9,), going on from the newest node."""
+        """Fill the means of rows first..last-1 for parameters theta (9,), starting from the newest node."""
         self._at = lagged_means(
             self.times, self.wrenches, self._at, self.size, self.predictor, tape.time, first, last, self.mode, theta[4],
             theta[5], self.lag, tape.mean, tape.mean_tau, tape.mean_delay,
@@ -108,7 +107,7 @@ class InputHistory:
         tape.spread_inputs(first, last, theta[6:9])
 
     def skip_to(self, time: float, tau: float, delay: float) -> None:
-        """Move the lag's state to a time at which no node is wanted (on the ground)."""
+        """Move the lag's state to a time without a node (on the ground)."""
         node = np.array([time])
         scratch = np.zeros((1, 4))
         self._at = lagged_means(

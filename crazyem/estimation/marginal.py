@@ -1,14 +1,14 @@
-"""Intervals where a noise scale is not determined by the data: integrated over the scale, not taken at its best value.
+"""Intervals with noise scales integrated out, for scales that the data do not determine.
 
-How sure mass is depends on the intensity s of the noise in thrust, inertia on that of the torque. Where measurement
-noise dominates, the likelihood says of log s little but that it is not large, and an interval at its maximum is an
-accident. So the posterior is taken at a few values of log s, everything else at its maximum given that value (one
-scoring step, in the quadratic approximation), each weighted by the posterior of log s (Laplace's approximation for all
-else); the law of total variance and the quantiles of the mixture give the interval. Given the other scales each acts on
-parameters of its own, mass or one inertia, so they are integrated one at a time.
+The interval of mass depends on the intensity s of the noise in thrust, that of an inertia on the noise of a torque.
+Where measurement noise dominates, the likelihood only excludes large log s, and its maximum depends on chance. So the
+posterior is computed at a few values of log s. At each value, all other parameters are at their maximum given s (one
+scoring step, in the quadratic approximation), and the weight is the posterior of log s (Laplace approximation for the
+others). The law of total variance and the quantiles of the mixture give the interval. Given the other scales, each
+scale acts on mass or on one inertia, so the scales are integrated one at a time.
 
-The weak prior that keeps steps finite is not knowledge. For the integral the scale gets one so wide (e^4) that it says
-nothing within what the data leave open."""
+The weak prior of the scales only keeps steps finite. For the integral, a scale gets a prior so wide (e^4) that it does
+not matter."""
 
 from dataclasses import dataclass, replace
 
@@ -20,23 +20,23 @@ from crazyem.estimation.em import Information, WindowEM, offset
 from crazyem.estimation.model import Noise, Parameters
 from crazyem.estimation.scoring import NOTHING_HELD, P, Point, log_posterior, log_prior, point
 
-MARGINAL_SCALES = (2, 3, 4, 5)  # thrust, torque about x, y, z
-WEAK_SCALE_SD = 0.3  # standard deviation of log s beyond which it is integrated over
-WIDE_PRIOR_SD = 4.0  # that of its prior then
-NODE_SPACING = 1.2  # standard deviations between nodes
-NODE_TAIL = 4.5  # nodes end where the posterior of log s has fallen by so much
-MOST_NODES = 7  # nodes on a side
-REST_REFRESHES = 8  # refreshes until a scale that was found to be determined is looked at again
+MARGINAL_SCALES = (2, 3, 4, 5)  # indices of thrust, torque about x, y, z in `Noise.logs`
+WEAK_SCALE_SD = 0.3  # standard deviation of log s from which a scale is integrated out
+WIDE_PRIOR_SD = 4.0  # standard deviation of the prior of log s in the integral
+NODE_SPACING = 1.2  # standard deviations of log s between nodes
+NODE_TAIL = 4.5  # nats below the maximum at which nodes end
+MOST_NODES = 7  # nodes on each side
+REST_REFRESHES = 8  # refreshes until a scale that was found to be determined is tested again
 
 
 @dataclass(frozen=True)
 class Node:
-    """The posterior at one value of a noise scale, relative to where the estimator is.
+    """The posterior at one value of a noise scale, relative to the present parameters of the estimator.
 
     Attributes:
         weight: logarithm of the posterior density of log s, up to a constant.
-        shift: (9,) where the parameters have their maximum, in the coordinates of `offset`.
-        sd: (9,) their standard deviations given this scale.
+        shift: (9,) maximum of the parameters given this scale, in the coordinates of `offset`.
+        sd: (9,) standard deviations of the parameters given this scale.
     """
 
     weight: float
@@ -46,13 +46,13 @@ class Node:
 
 @dataclass(frozen=True)
 class Marginal:
-    """Posterior of the parameters with weak noise scales integrated out, in the coordinates of `offset` from theta.
+    """Posterior of the parameters with weakly determined noise scales integrated out, as `offset` from theta.
 
     Attributes:
         shift: (9,) means.
         sd: (9,) standard deviations.
         low, high: (9,) quantiles at 2.5 and 97.5 %.
-        scales: which scales were integrated over, as in `Noise.logs`.
+        scales: scales that were integrated out, as indices in `Noise.logs`.
     """
 
     shift: NDArray
@@ -63,13 +63,13 @@ class Marginal:
 
 
 def marginalise(em: WindowEM, first: int, last: int, best: Point, information: Information) -> Marginal | None:
-    """Integrate over every noise scale that the data leave open; None if there is none.
+    """Integrate out every noise scale that the data do not determine; None if there is none.
 
     Args:
-        em: at the maximum; it is left there, the window filtered and smoothed.
+        em: at the maximum, before and after; the window is left filtered and smoothed.
         first, last: rows of the window.
         best: the maximum.
-        information: there.
+        information: at the maximum.
     """
     weak = [j for j in MARGINAL_SCALES if best.sd[P + j] > WEAK_SCALE_SD]
     if not weak:
@@ -81,7 +81,7 @@ def marginalise(em: WindowEM, first: int, last: int, best: Point, information: I
 
 
 def _grid(em: WindowEM, first: int, last: int, best: Point, scale: int) -> list[Node]:
-    """Nodes on both sides of the maximum until the posterior of the scale has faded."""
+    """Nodes on both sides of the maximum, until the posterior of the scale is below `NODE_TAIL`."""
     held = NOTHING_HELD.copy()
     held[P + scale] = True
     spacing = NODE_SPACING * best.sd[P + scale]
@@ -102,16 +102,16 @@ def _grid(em: WindowEM, first: int, last: int, best: Point, scale: int) -> list[
 
 
 def shifted(centre: Parameters, scale: int, shift: float) -> Parameters:
-    """The same with the logarithm of one noise scale moved."""
+    """The parameters with the logarithm of one noise scale changed by `shift`."""
     logs = centre.noise.logs.copy()
     logs[scale] += shift
     return replace(centre, noise=Noise.from_logs(logs))
 
 
 def node_of(em: WindowEM, value: float, score: NDArray, information: NDArray, scale: int) -> Node:
-    """Node from the log-posterior where `em` is, its score (n,) and information (n, n); the first nine are theta's.
+    """Node from log-posterior, score (n,) and information (n, n) at the present parameters; the first nine are theta's.
 
-    Coordinates that are held have no score and an information of one.
+    Coordinates that are held have a score of zero and an information of one.
     """
     step = np.linalg.solve(information, score)
     prior = em.setup.prior
@@ -123,7 +123,7 @@ def node_of(em: WindowEM, value: float, score: NDArray, information: NDArray, sc
 
 
 def combine(grids: list[list[Node]], information: Information, *, scales: tuple[int, ...]) -> Marginal:
-    """Mixtures over the nodes of each scale (evenly spaced in log s), brought together parameter by parameter."""
+    """Combine the mixtures over the nodes of each scale (evenly spaced in log s), parameter by parameter."""
     plain = np.sqrt(np.maximum(np.diag(information.covariance), 0.0))
     shift, variance = np.zeros(P), plain**2
     low, high = -1.96 * plain, 1.96 * plain
@@ -147,10 +147,10 @@ def combine(grids: list[list[Node]], information: Information, *, scales: tuple[
 
 
 class MarginalRefresh:
-    """The same for the running estimator: three nodes a scale, one of them renewed a refresh, in bounded time.
+    """The same integral for the running estimator, with bounded time: three nodes per scale, one renewed per refresh.
 
-    The nodes lie about sqrt(3) standard deviations of log s off the estimate, which with the posterior's own weights is
-    Gauss and Hermite's rule; how wide it is, the nodes of the last round have shown. Other noise scales stay put.
+    The outer nodes are about sqrt(3) standard deviations of log s from the estimate; with the weights of the posterior
+    this is the Gauss-Hermite rule. The standard deviation comes from the last pair of nodes. Other scales are fixed.
     """
 
     def __init__(self) -> None:
@@ -161,7 +161,7 @@ class MarginalRefresh:
         self._turn = 0
 
     def refresh(self, em: WindowEM, first: int, last: int, information: Information) -> Marginal | None:
-        """Renew one node; the window must have been filtered and scored where `em` is, and is left so."""
+        """Renew one node; before and after, the window is filtered and scored at the present parameters."""
         for j in MARGINAL_SCALES:
             self._rest[j] = max(0, self._rest[j] - 1)
             if information.noise_sd[j] <= WEAK_SCALE_SD:
@@ -206,13 +206,13 @@ class MarginalRefresh:
 
 
 def _held(em: WindowEM, matrix: NDArray) -> NDArray:
-    """Information of theta with its prior; identity where it is held fixed."""
+    """Information of theta with its prior; identity where a parameter is fixed."""
     free = em.setup.free
     return np.where(np.outer(free, free), matrix, 0.0) + np.diag(np.where(free, em.setup.prior.precision, 1.0))
 
 
 def _theta_node(em: WindowEM, first: int, last: int, value: float, matrix: NDArray, scale: int) -> Node:
-    """Node for which only theta follows, from the information of the data and the score on the tape."""
+    """Node with all noise scales fixed, from the information (9, 9) of the data and the score on the tape."""
     setup = em.setup
     score = em.tape.score[first:last].sum(0)
     score = score - setup.prior.precision * offset(em.parameters.theta, setup.prior.centre, setup.unit)

@@ -1,19 +1,19 @@
-"""The maximum of the posterior and its intervals: what scoring adds to EM, in the order in which it happens.
+"""The maximum of the posterior and its intervals, by EM, search and scoring in turn.
 
-Plain EM (`em`, `mstep`) would get there, but its steps shrink with the share of the information that the data hold of
-what they would hold if every state were known: hundreds of passes where measurement noise dominates. So, in
-`maximise_posterior`:
+Plain EM (`em`, `mstep`) needs hundreds of passes where measurement noise dominates: its steps are in proportion to the
+information of the data over the information with all states known. So `maximise_posterior` has these stages:
 
-1. Far off, up to `MOST_EM_MAPS` maps of EM: each raises the likelihood from anywhere, and scoring would inflate noise.
-2. Where the window begins without an attitude, its first state is found from all that follows (`initial_state`).
-3. Still far: noise scales by plain search and parameter steps that trust the model (`search_and_step`). In closed loop
-   the torque answers to measurement noise. A filter whose process noise is assumed too large finds that noise in the
-   torque again: inertia comes out too small, the misfit asks for large process noise, and scoring crawls along this
-   ridge. A filter that trusts the model more than it should has no such bias. So a parameter step is taken with less
-   process noise than fits best, and the scales are searched for again; the posterior decides.
-4. Near: Fisher scoring over parameters and noise scales together, damped (`scoring`), until the score test is passed.
-5. At the maximum: intervals by the information (`em.information`), which `inflation` widens for the noise of sampled
-   commands and for disturbances with memory; noise scales that the data leave open are integrated out (`marginal`).
+1. Far from the maximum: up to `MOST_EM_MAPS` maps of EM. Each raises the likelihood from any start; scoring would make
+   the noise scales too large here.
+2. If the window begins without an attitude: its first state is smoothed from all later samples (`initial_state`).
+3. Still far: line search of the noise scales, and parameter steps with less process noise (`search_and_step`). In
+   closed loop the torque contains a response to measurement noise. If the assumed process noise is too large, the
+   filter finds this noise in the torque again: the inertia comes out too small, the misfit requires large process
+   noise, and scoring is slow along this ridge. With too small process noise there is no such bias. So a parameter step
+   is taken with less process noise than fits best. Then the scales are searched again, and the posterior decides.
+4. Near: damped Fisher scoring over parameters and noise scales together (`scoring`), until the score test is passed.
+5. At the maximum: intervals from the information (`em.information`), widened for noise of sampled commands and
+   disturbances with memory (`inflation`). Scales that the data do not determine are integrated out (`marginal`).
 """
 
 from dataclasses import dataclass
@@ -25,15 +25,15 @@ from crazyem.estimation.initial_state import known_initial_state
 from crazyem.estimation.marginal import Marginal, marginalise
 from crazyem.estimation.scoring import REUSED_WITHIN_FAR, P, PathPoint, limit_step, log_posterior, moved, scoring_steps
 
-# scales that are searched together: lateral force, thrust, torque x, y, z
+# groups of scales that are searched together: lateral force; thrust; torque x; y; z
 SCALE_GROUPS = ((0, 1), (2,), (3,), (4,), (5,))
-SEARCH_STRIDE = 1.0  # of the search, in log s
-MOST_STRIDES = 8  # strides at most
-TRUSTED_LOG_SCALE = 2.0  # by how much log s lies below its best value for a parameter step
+SEARCH_STRIDE = 1.0  # stride of the search, in log s
+MOST_STRIDES = 8
+TRUSTED_LOG_SCALE = 2.0  # of log s, below its best value, for a parameter step
 
 
 def search_scales(em: WindowEM, first: int, last: int, value: float) -> float:
-    """Move each scale of process noise in strides while the posterior rises; returns it. `em` is left at the best."""
+    """Move each scale of process noise in strides while the posterior rises; returns the highest, and `em` is there."""
     for group in SCALE_GROUPS:
         members = [j for j in group if not em.setup.known_scales[j]]
         if not members:
@@ -55,7 +55,7 @@ def search_scales(em: WindowEM, first: int, last: int, value: float) -> float:
 
 
 def search_and_step(em: WindowEM, first: int, last: int) -> bool:
-    """One search and parameter step; False, and nothing changed but the scales, if it did not raise the posterior."""
+    """One search and parameter step; False, with only the scales changed, if the step does not raise the posterior."""
     value = search_scales(em, first, last, log_posterior(em, first, last, em.parameters))
     best = em.parameters
     for trust in (TRUSTED_LOG_SCALE, 0.5 * TRUSTED_LOG_SCALE):
@@ -83,27 +83,27 @@ def _parameter_step(em: WindowEM, first: int, last: int) -> np.ndarray:
     return step
 
 
-PASSED_SCORE_TEST = 0.2  # standard deviations: a score test that asks for a shorter step is passed
-EM_BEYOND = 10.0  # standard deviations from the maximum beyond which EM goes first: scoring would inflate the noise
-MOST_SEARCHES = 3  # after them, as long as the parameters are that far off
-SEARCH_ROWS = 1000  # rows of a longer window that the first of these makes do with
-MOST_EM_MAPS = 3  # of EM, at most
-MOST_SCORING_STEPS = 25  # of scoring, at most
-ROUGH_TOLERANCE = 1.0  # standard deviations within which the first sample is looked for again
-SCORING_TOLERANCE = 0.02  # standard deviations: scoring ends
-RETRY_PASSES = 40  # passes of plain EM and scoring where the likelihood is too rough for it
+PASSED_SCORE_TEST = 0.2  # standard deviations; with a shorter scoring step the score test is passed
+EM_BEYOND = 10.0  # standard deviations from the maximum, beyond which EM and search go first
+MOST_SEARCHES = 3  # after the EM maps, while the parameters are still so far from the maximum
+SEARCH_ROWS = 1000  # rows of the window that the first search uses
+MOST_EM_MAPS = 3
+MOST_SCORING_STEPS = 25
+ROUGH_TOLERANCE = 1.0  # standard deviations; with a shorter scoring step the initial state is smoothed again
+SCORING_TOLERANCE = 0.02  # standard deviations; with a shorter step scoring ends
+RETRY_PASSES = 40  # passes of EM with scoring where damped scoring does not pass the score test
 
 
 @dataclass(frozen=True)
 class Maximum:
-    """Where a window's estimation ended.
+    """Result of the estimation of a window.
 
     Attributes:
-        information: at the end.
-        marginal: intervals with weak noise scales integrated out; None where none was weak.
-        maps: EM maps taken first.
-        path: every point on the way, those of the maps first; with the length of the scoring step there, from the
-            first scoring step on that over parameters and noise scales together.
+        information: at the maximum.
+        marginal: posterior with weakly determined noise scales integrated out; None if there is no such scale.
+        maps: number of EM maps at the begin.
+        path: all points on the path, those of the maps first, with the length of their scoring step. From the scoring
+            stage on, the step is over parameters and noise scales together.
     """
 
     information: Information
@@ -118,14 +118,14 @@ class Maximum:
 
     @property
     def steps(self) -> int:
-        """Scoring steps until the score test was passed for good; all of them if it was not."""
+        """Number of steps until the score test stays passed; all steps if it is not passed."""
         lengths = [stop.length for stop in self.path[self.maps :]]
         failed = [k for k, length in enumerate(lengths) if not length < PASSED_SCORE_TEST]
         return min(failed[-1] + 1, len(lengths) - 1) if failed else 0
 
 
 def maximise_posterior(em: WindowEM, first: int, last: int) -> Maximum:
-    """Maximise the posterior over rows first..last-1 from where `em` is; the tape is left as the maximum has it."""
+    """Maximise the posterior over rows first..last-1 from the present parameters; the tape is left at the maximum."""
     path: list[PathPoint] = []
     while True:
         em.refill_inputs(first, last)
@@ -162,7 +162,7 @@ def maximise_posterior(em: WindowEM, first: int, last: int) -> Maximum:
         if not path[-1].length < PASSED_SCORE_TEST:
             em.converge(first, last, passes=RETRY_PASSES)
             best = scoring_steps(em, first, last, steps=MOST_SCORING_STEPS, tolerance=SCORING_TOLERANCE, path=path)
-        # of known noise it says how sure mass and inertia are, so there it must be that of the very end
+        # with known noise, the intervals of mass and inertia depend on it, so it is computed at the maximum
         of_noise = em.noise_information(first, last) if em.setup.carried.any() else best.of_noise
         information = em.information(first, last, of_noise=of_noise)
         marginal = marginalise(em, first, last, best, information)

@@ -1,4 +1,4 @@
-"""What is estimated and what is assumed: parameter vector, noise scales, priors; all frozen."""
+"""Data classes of the estimator: parameter vector, noise scales, priors, setup; all frozen."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -24,20 +24,20 @@ NAMES = (
 GROUPS = ("position", "velocity", "attitude", "body_rate", "specific_force")
 
 
-# How velocities of a step become positions (estimation/kernels). A flying body follows the midpoint rule; simulators
-# that step explicitly (as eq. 56 does) or semi-implicitly are followed exactly by theirs.
+# Rule of integration (`lead` in estimation/kernels). The midpoint rule is for real flights. The other two are exact for
+# simulators that use explicit Euler (as eq. 56 does) or semi-implicit Euler.
 INTEGRATION = {"midpoint": 0.5, "euler": 0.0, "semi-implicit": 1.0}
-TINY_IMPULSE = 1e-7  # m/s^2 sqrt(s), rad/s^2 sqrt(s): stands for no process noise at all
+TINY_IMPULSE = 1e-7  # m/s^2 sqrt(s), rad/s^2 sqrt(s): stands for a process noise of zero
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise scales. Process noise is kept in units of acceleration, where it does not depend on mass and inertia.
+    """Noise scales; process noise in units of acceleration, where it does not depend on mass and inertia.
 
     Attributes:
         impulse: (6,) intensities of specific force x y z [m/s^2 sqrt(s)] and angular acceleration [rad/s^2 sqrt(s)].
         measurement: (5,) standard deviations of position [m], velocity [m/s], attitude [rad], body rate [rad/s],
-            specific force [m/s^2] (an accelerometer, where one is used).
+            specific force [m/s^2] (if an accelerometer is used).
     """
 
     impulse: NDArray
@@ -66,14 +66,14 @@ class Noise:
 
 @dataclass(frozen=True)
 class Prior:
-    """Weak log-normal priors on the parameters and on the noise scales; these keep a scale from collapsing to zero.
+    """Weak log-normal priors on parameters and noise scales; they keep a noise scale from collapsing to zero.
 
     Attributes:
-        centre: (9,) of theta.
-        sd: (9,) of the logarithms; of the linear parameters in their units.
-        noise: scales that the prior is centred on.
-        noise_sd: of the logarithms of the noise scales.
-        impulse_floor, measurement_floor: smallest scales admitted (6,), (5,): far below what a real sensor resolves.
+        centre: (9,) centre of the prior of theta.
+        sd: (9,) standard deviations of the logarithms, or of the linear parameters in their units.
+        noise: centre of the prior of the noise scales.
+        noise_sd: standard deviation of the logarithms of the noise scales.
+        impulse_floor, measurement_floor: smallest allowed scales (6,), (5,), far below the resolution of real sensors.
     """
 
     centre: NDArray
@@ -85,18 +85,18 @@ class Prior:
 
     @cached_property
     def precision(self) -> NDArray:
-        """(9,) of the logarithms, and of the linear parameters in their units."""
+        """Precisions (9,) of the logarithms, or of the linear parameters in their units."""
         return 1.0 / np.square(self.sd)
 
     @cached_property
     def floor(self) -> NDArray:
-        """Logarithms of the smallest scales admitted (11,)."""
+        """Logarithms of the smallest allowed scales (11,)."""
         return np.log(np.concatenate([self.impulse_floor, self.measurement_floor]))
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """A point in parameter space: theta (9,; SI; kernels.py), fixed products of inertia, noise."""
+    """A point in parameter space: theta (9,; SI; kernels/layout.py), noise, fixed products of inertia."""
 
     theta: NDArray
     noise: Noise
@@ -116,10 +116,10 @@ class Parameters:
 
 @dataclass(frozen=True)
 class KnownNoise:
-    """Noise that is known and not estimated; None is estimated.
+    """Noise scales that are known and not estimated; a scale that is None is estimated.
 
-    Process noise is given in newtons and newton metres. In the estimator's units of acceleration it is divided by the
-    mass or an inertia, so these then act on the data through the size of the noise, too (errata of eq. 104 to 106).
+    Process noise is given in newtons and newton metres. The estimator divides it by the mass or an inertia to get units
+    of acceleration. So the size of the noise also carries information on mass and inertia (errata of eq. 104 to 106).
 
     Attributes:
         force: intensity of the noise in thrust [N sqrt(s)].
@@ -153,7 +153,7 @@ class KnownNoise:
 
     @cached_property
     def mask(self) -> NDArray:
-        """(11,) bool: which of the scales of `Noise` are known."""
+        """(11,) bool: which scales of `Noise` are known."""
         return np.isfinite(self.logs(np.ones(len(NAMES))))
 
     def logs(self, theta: NDArray) -> NDArray:
@@ -173,13 +173,13 @@ def _check_known(name: str, value: float | None, *, zero: bool = False) -> None:
 
 @dataclass(frozen=True)
 class Setup:
-    """Start, prior and what is free: all that the estimator is told before the first sample.
+    """Settings of the estimator before the first sample: start, prior, free parameters.
 
     Attributes:
         start: where the estimation begins.
         prior: on parameters and noise scales.
         free: (9,) bool, which parameters are estimated.
-        unit: (9,) of the linear parameters; 1 for those taken by their logarithms.
+        unit: (9,) units of the linear parameters; 1 for parameters that are estimated by their logarithms.
         lead: rule of integration (estimation/kernels): 0.5 midpoint, 0 explicit Euler, 1 semi-implicit Euler.
         known: noise that is not estimated.
     """
@@ -192,7 +192,7 @@ class Setup:
     known: KnownNoise | None = None
 
     def noise_at(self, theta: NDArray, logs: NDArray) -> Noise:
-        """Noise from logarithms of the scales (11,), the known ones replaced by what they are with theta (9,)."""
+        """Noise from logarithms of the scales (11,); known scales get their value at theta (9,)."""
         if self.known is None:
             return Noise.from_logs(logs)
         known = self.known.logs(theta)
@@ -200,7 +200,7 @@ class Setup:
 
     @cached_property
     def known_scales(self) -> NDArray:
-        """(11,) bool: scales that are not estimated."""
+        """(11,) bool: scales that are known, not estimated."""
         return np.zeros(11, bool) if self.known is None else self.known.mask
 
     @cached_property
@@ -213,7 +213,7 @@ class Setup:
 
     @cached_property
     def carried(self) -> NDArray:
-        """(11, 9) derivatives of the logarithms of the known scales by theta's: heavier is quieter."""
+        """(11, 9) derivatives of the log known scales by log theta: more mass means less acceleration noise."""
         slopes = np.zeros((11, len(NAMES)))
         acts = self.known_squares[[4, 4, 0, 1, 2, 3]] > 0
         for scale, parameter in enumerate((0, 0, 0, 1, 2, 3)):
@@ -221,9 +221,9 @@ class Setup:
         return slopes
 
 
-# Where the noise scales start: process noise large, so that the first samples decide and not the start.
+# Start values of the noise scales. Process noise starts large, so that the first samples outweigh the start value.
 START_IMPULSE = np.array([0.5, 0.5, 5.0, 20.0, 20.0, 20.0])
-# Measurement noise starts large too: from below, the likelihood is flat in it and says nothing.
+# Measurement noise starts large, too: where it is too small, the likelihood is flat in it.
 START_MEASUREMENT = np.array([2e-2, 1e-1, 3e-2, 1e-1, 0.5])
 TYPICAL_MEASUREMENT = np.array([1e-3, 1e-2, 3e-3, 3e-3, 0.1])
 
@@ -233,14 +233,14 @@ DELAY_OF_COMMANDS = (3.5e-3, 2e-3)
 DELAY_OF_SPEEDS = (0.0, 10e-3)
 DELAY_UNIT = 1e-3  # s
 
-# Rotors are never equal and the centre of mass is never in their middle, so a drone in trim commands a torque that
-# accelerates nothing. Taken for torque that acts it would read as a huge inertia. Standard deviation of the prior, as a
-# shift of the centre of mass over the arm.
+# Standard deviation of the prior of the torque offset, as a shift of the centre of mass over the arm. Rotors are never
+# equal, and the centre of mass is never exactly between them. So a drone in steady flight commands a torque without
+# angular acceleration. Without the offset, this torque would look like a huge inertia.
 TRIM_SD = 0.05
 
 
-# How far a drone may be from its vehicle file, where the file does not say: standard deviations of the logarithms of
-# mass, Ixx, Iyy, Izz and of the rotors' lag. A cold start is told neither mass nor inertia.
+# Standard deviations of the logarithms of mass, Ixx, Iyy, Izz and of the rotor lag, where the vehicle file gives none.
+# In a cold start, mass and inertia are unknown.
 SPREAD = (1.0, 0.5, 0.5, 0.5)
 COLD_SPREAD = (10.0, 1.5, 1.5, 1.5)
 SPREAD_OF_LAG = 0.7
@@ -266,8 +266,8 @@ def setup_for(
         vehicle: nominal constants; centre of the prior, and its width where the file gives one.
         mass: [kg] start of a cold start, e.g. 0.001 (paper, eq. 116); the prior on mass is then flat in effect.
         inertia: [kg m^2] start of a cold start.
-        lag: whether inputs are commands, with the rotor lag still to come (False: rotor speeds or true wrenches).
-        integration: midpoint, euler or semi-implicit: how what is flown turns velocities into positions.
+        lag: whether inputs are commands, before the rotor lag (False: rotor speeds or true wrenches).
+        integration: midpoint, euler or semi-implicit: the rule by which the data move (`INTEGRATION`).
         known_noise: noise that is not estimated.
 
     Raises:
@@ -284,14 +284,14 @@ def setup_for(
     if inertia is not None:
         start[1:4] = inertia
     has_lag = lag and vehicle.motor_time_constant > 0
-    timed = has_lag or not lag  # a wrench that is given as it acts has neither lag nor delay
+    timed = has_lag or not lag  # a wrench as it acts has neither lag nor delay
     if not has_lag:
         start[4] = 0.0
     if not timed:
         start[5] = 0.0
     noise = Noise(START_IMPULSE.copy(), START_MEASUREMENT.copy())
     lag_sd = SPREAD_OF_LAG if vehicle.motor_time_constant_sd is None else vehicle.motor_time_constant_sd
-    # A cold start claims to know nothing: centred on the start, but so wide that 4 s of data drown it.
+    # The prior of a cold start is centred on the start, and so wide that 4 s of data outweigh it.
     prior = Prior(
         centre=np.append(np.where(start > 0, start if cold else centre, 1.0)[:5], start[5:]),
         sd=np.array([*(COLD_SPREAD if cold else _spread(vehicle)), lag_sd, delay_sd / DELAY_UNIT, 1.0, 1.0, 1.0]),

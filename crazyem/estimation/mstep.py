@@ -1,17 +1,16 @@
 """M-step: mass, inertia and rotor time constant that maximise the expected complete-data log-likelihood.
 
-With the noise intensities profiled out it is, for N steps (paper's eq. 107 and appendix in their correct, joint
-form),
+For N steps, with the noise intensities profiled out (paper's eq. 107 and appendix in their correct, joint form), it is
 
     Q = N log m - N/2 log S_F + N sum_i log I_i - N/2 sum_i log S_i + log prior,
     S_F = sum E[(m a - F)^2] dt,   S_i = sum E[(I_i alpha_i + (I_k - I_j) w_j w_k - M_i)^2] dt,
 
-or, where the intensity s of a noise is known in newtons or newton metres, - S / (2 s^2) in place of the - N/2 log S of
-its axis: then the size of the residuals, too, says what mass and inertia are.
+Where the intensity s of a noise is known in newtons or newton metres, - S / (2 s^2) replaces - N/2 log S of its axis.
+Then the size of the residuals carries information on mass and inertia, too.
 
-M with its offset, F and M being linear in tau and in the delay around the values they were made with. Every S
-is a quadratic form c' A c in a vector c that is linear in the parameters, with A the sums of kernels.py, so
-Newton's method in the logarithms of the parameters costs microseconds; logarithms also rule out sign flips."""
+M contains the torque offset. F and M are linearised in tau and in the delay. Every S is a quadratic form c' A c, where
+the vector c is linear in the parameters and A holds the sums of kernels/smoother.py. So Newton's method in the
+logarithms of the parameters costs microseconds. Logarithms also keep the parameters positive."""
 
 import numpy as np
 
@@ -33,7 +32,7 @@ def _unpack(sums, base, n, out):
 
 @compiled
 def _residual(term, theta, sums, a, c, dc):
-    """The residual of F (term 0) or of M about an axis (1..3): a, c and dc = dc/dtheta of c' A c; returns its size."""
+    """Fill a, c and dc = dc/dtheta of c' A c for F (term 0) or M about an axis (1..3); returns the size of c."""
     dc[:, :] = 0.0
     if term == 0:
         _unpack(sums, MASS, 4, a)
@@ -59,7 +58,7 @@ def _residual(term, theta, sums, a, c, dc):
 
 @compiled
 def _prior(theta, unit, free, centre, precision, gradient, hessian):
-    """Add the prior of the free parameters, hold the others; returns minus its logarithm."""
+    """Add the prior of the free parameters and hold the others fixed; returns minus the log prior."""
     value = 0.0
     for u in range(PARAMETERS):
         if free[u]:
@@ -80,8 +79,8 @@ def _prior(theta, unit, free, centre, precision, gradient, hessian):
 def objective(theta, unit, sums, free, centre, precision, known, gradient, hessian, squares):
     """-Q at theta (9,), its gradient and Hessian (logarithms, units); squares (4,) receives S_F, S_x, S_y, S_z.
 
-    `known` (5,) holds the squared intensities of thrust [N^2 s], torque [(N m)^2 s] and lateral force [N^2 s] that are
-    known, 0 for the others.
+    `known` (5,) holds the known squared intensities of thrust [N^2 s], torque [(N m)^2 s] and lateral force [N^2 s],
+    and 0 for the unknown ones.
     """
     count = sums[COUNT]
     a = np.zeros((6, 6))
@@ -107,7 +106,7 @@ def objective(theta, unit, sums, free, centre, precision, known, gradient, hessi
             s += c[p] * ac[p]
         s = max(s, 1e-150)  # squared below
         squares[term] = s
-        # the profiled term count/2 log s and the known one s / (2 variance) differ in slope and curvature only
+        # the profiled term is count/2 log s, the term with known noise is s / (2 variance)
         profiled = known[term] == 0.0
         weight = count / s if profiled else 1.0 / known[term]
         bend = 1.0 / s if profiled else 0.0
@@ -131,7 +130,7 @@ def objective(theta, unit, sums, free, centre, precision, known, gradient, hessi
                 for p in range(n):
                     h += dc[p, u] * adc[p, v]
                 hessian[u, v] += 0.5 * weight * (2.0 * h * scale[u] * scale[v] - grad[u] * grad[v] * bend)
-    if known[4] > 0.0:  # lateral accelerations are noise alone: along with the known noise they weigh the drone
+    if known[4] > 0.0:  # lateral accelerations are pure noise: with a noise known in newtons they determine the mass
         s = theta[0] ** 2 * (sums[IMPULSE] + sums[IMPULSE + 1]) / known[4]
         value += 0.5 * s - 2.0 * count * np.log(theta[0])
         gradient[0] += s - 2.0 * count
@@ -144,7 +143,7 @@ def maximise(theta, unit, sums, free, centre, precision, known, iterations, squa
     """Newton's method with Levenberg damping from theta (9,: kernels.py), in place.
 
     Args:
-        theta: start, replaced by the maximiser.
+        theta: start, replaced by the maximum.
         unit: (9,) units of the linear parameters.
         sums: statistics summed over the window.
         free: (9,) which parameters may move.
@@ -160,14 +159,14 @@ def maximise(theta, unit, sums, free, centre, precision, known, iterations, squa
     h2 = np.empty((PARAMETERS, PARAMETERS))
     value = objective(theta, unit, sums, free, centre, precision, known, gradient, hessian, squares)
     if not (np.isfinite(value) and np.isfinite(gradient).all() and np.isfinite(hessian).all()):
-        return  # the states diverged: there is nothing to step by
+        return  # the states diverged: no step is possible
     damping = 0.0
     for _ in range(iterations):
         size = 0.0
         for attempt in range(12):
             damped = hessian.copy()
             for u in range(PARAMETERS):
-                # far from the optimum the profile is not convex: keep the diagonal at the information it must have
+                # far from the optimum the profile is not convex: make the diagonal positive
                 damped[u, u] += damping + (max(0.0, -hessian[u, u]) if attempt else 0.0)
             step = np.linalg.solve(damped, -gradient)
             down = 0.0

@@ -1,9 +1,9 @@
 """The online estimator: samples in, estimates out; deterministic, so a replay gives the numbers of the flight.
 
-Samples of one instant are gathered into a node; a node waits until the inputs up to it are known, passes the
-contact gate and goes onto the tape. Every `every` nodes the newest `window` of them give an update: an
-incremental pass by default, full passes while the parameters still move, and every 12th update (half a second at
-100 Hz) full passes that also renew the uncertainty."""
+Samples of one instant form a node. A node waits until the inputs up to its time are known. Then it passes the contact
+gate and goes onto the tape. Every `every` nodes, the newest `window` nodes give an update. An update is an incremental
+pass, or full passes while the parameters still move. Every 12th update (half a second at 100 Hz) is full passes, too,
+which renew the uncertainty."""
 
 import math
 import time as clock
@@ -31,19 +31,19 @@ from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle
 
 SAME_NODE = 0.0015  # s; measurements closer than this belong to one node
-PATIENCE = 0.06  # s a node waits for inputs before the last one is held
+PATIENCE = 0.06  # s that a node waits for inputs; then the last input is held
 LOOKBACK = 20  # samples smoothed again in an incremental pass
 REFRESH = 12  # updates between two full passes with information
-YOUNG = 200  # samples below which every update is a full pass
-NEWBORN = 24  # samples below which it takes as many passes as it needs: a cold start flies with what comes out
+YOUNG = 200  # samples; in a smaller window every update is full passes
+NEWBORN = 24  # samples; a smaller window gets more passes (12), since a cold start uses these first estimates
 CLOSE = 0.1  # standard deviations from the maximum at which full passes end
-PASSED_NOISE = 2.0  # standard deviations that a noise scale may be off at convergence: some 5 % of an interval
-# Change of a parameter's logarithm that calls for full passes: a share of its standard deviation, between two limits.
+PASSED_NOISE = 2.0  # standard deviations; longest scoring step of a noise scale at convergence: some 5 % of an interval
+# Change of a parameter's logarithm that leads to full passes: a share of its standard deviation, between two limits.
 MOVED_SD, MOVED, MOVED_FAR = 0.5, 0.02, 0.1
 
-# s between attitudes of a filter on board that are used. It integrates its gyro and takes a fix now and then, so its
-# attitude errs as its rates do and for far longer than a sample lasts: as ten independent attitudes in 0.1 s they
-# contradict the rates, and inertia in hover comes out too high (docs: estimator.md, docs: mavlink.md).
+# s between attitudes of an onboard filter that are used. The filter integrates its gyro between fixes, so errors of its
+# attitude follow from errors of its rates and last far longer than a sample. Taken as ten independent attitudes in
+# 0.1 s, they contradict the rates, and inertia in hover comes out too high (docs: estimator.md, docs: mavlink.md).
 ATTITUDE_PERIOD = 0.05
 
 Filtered = Callable[[WindowEM, Parameters, int, int, "NDArray[np.float64] | None"], None]
@@ -54,12 +54,12 @@ _INPUTS = ("motor_command", "rotor_speed", "wrench_command")
 
 @dataclass
 class Counters:
-    """What came in and what was not used."""
+    """Numbers of nodes, and of samples that were not used."""
 
     nodes: int = 0
     grounded: int = 0
     late: int = 0
-    missing: int = 0  # samples with NaN, used as missing
+    missing: int = 0  # samples with NaN or impossible values
     breaks: int = 0
     unpowered: int = 0  # motor commands before any battery voltage was known
 
@@ -75,26 +75,26 @@ class OnlineEstimator:
 
     Args:
         vehicle: nominal constants: rotors, start, centre of the weak prior.
-        window: how many of the newest samples an update uses.
+        window: number of newest samples in an update.
         every: samples between updates.
         input_signal: motor_command, rotor_speed or wrench_command; None takes the first of these the vehicle can use.
         mass, inertia: start values of a cold start [kg], [kg m^2].
-        integration: midpoint, euler or semi-implicit: the rule by which what is flown moves. A body obeys the first, a
-            simulator whichever it was written with.
+        integration: midpoint, euler or semi-implicit: the rule of integration of the data. Real flights follow the
+            first, a simulator its own.
         accelerometer: whether to use specific_force, the mean over the step that ends at its stamp. Off by default: a
-            real one measures the vibration of its frame.
+            real accelerometer measures the vibration of its frame.
         known_noise: noise that is known and not estimated.
-        attitude_period: s between attitudes that are used where body rates are there as well; 0 uses all (see above).
-        prediction_period: s between predictions of an onboard estimate, still meanwhile; 0: not known (in_step.py).
+        attitude_period: s between attitudes that are used where body rates are measured, too; 0 uses all (see above).
+        prediction_period: s between predictions of an onboard estimate, constant in between; 0: unknown (in_step.py).
 
     Attributes:
-        every: samples between updates; may be changed on the way.
+        every: samples between updates; may be changed in flight.
         airborne: verdict of the contact gate on the newest node.
         update_seconds: wall-clock cost of each update [s].
-        full_updates: how many updates made full passes.
-        settled: how the maximum was reached in the last `finish`.
-        counters: what came in.
-        on_filtered: called with rows filtered for the first time: (em, by which parameters, first, last, sds or None).
+        full_updates: number of updates with full passes.
+        settled: path to the maximum in the last `finish`.
+        counters: numbers of samples.
+        on_filtered: called with rows filtered for the first time: (em, parameters used, first, last, sds or None).
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class OnlineEstimator:
         )
         self._measured = {**_COLUMNS, "specific_force": slice(13, 16)} if accelerometer else _COLUMNS
         self._attitude_period, self._prediction_period = attitude_period, prediction_period
-        self._attitude_time = self._rate_time = -math.inf  # of the newest attitude that is used, of the newest rates
+        self._attitude_time = self._rate_time = -math.inf  # s, newest attitude that is used, newest rates
         self._setup: Setup | None = None
         self._em: WindowEM | None = None
         self._tape = Tape(3 * window + 64)
@@ -158,7 +158,7 @@ class OnlineEstimator:
         self.full_updates = 0
         self.on_filtered: Filtered | None = None
 
-    # what comes in -------------------------------------------------------------------------------------------
+    # input ---------------------------------------------------------------------------------------------------
 
     @property
     def airborne(self) -> bool:
@@ -167,16 +167,16 @@ class OnlineEstimator:
 
     @property
     def trace(self) -> list[NDArray[np.float64]]:
-        """Parameters (9,) at every point on the way to the maximum in the last `finish`; empty before."""
+        """Parameters (9,) at every point on the path to the maximum in the last `finish`; empty before."""
         return [] if self.settled is None else [stop.theta for stop in self.settled.path]
 
     @property
     def residual(self) -> tuple[float, NDArray[np.float64], NDArray[np.float64]] | None:
-        """What the newest filtered sample had that the model did not predict; None before the first.
+        """Innovation of the newest filtered sample; None if there is none, or at a break.
 
-        Returns: its time [s]; (12,) position [m], velocity [m/s], attitude [rad, body] and body rate [rad/s]; (12,)
-        the standard deviations expected of them. Of each component what those before it left unexplained; NaN where
-        nothing was measured.
+        Returns: its time [s]; (12,) innovations of position [m], velocity [m/s], attitude [rad, body] and body rate
+        [rad/s]; (12,) their expected standard deviations. Each component is predicted with the help of the components
+        before it. NaN where nothing was measured.
         """
         k = self._fresh - 1
         if self._em is None or k < 0 or k >= self._tape.size or self._tape.kind[k]:
@@ -185,7 +185,7 @@ class OnlineEstimator:
         return float(self._tape.time[k]), np.where(variance > 0, self._tape.e[k], np.nan), sd
 
     def feed(self, sample: Sample) -> Estimate | None:
-        """Take one sample; returns an estimate when an update was due. Samples of unknown signals are ignored."""
+        """Take one sample; returns an estimate if there was an update. Samples of unknown signals are ignored."""
         result = None
         if self._owed:
             begin = clock.perf_counter()
@@ -198,11 +198,11 @@ class OnlineEstimator:
         return result
 
     def share_computer(self, refresh: int) -> None:
-        """Be quick to answer, for one of many: full passes when the estimate is out, and rarer.
+        """Answer fast where many estimators share a computer: full passes are made after the estimate, and less often.
 
-        They cost as much as twenty updates, and others wait meanwhile. What they find is in the next estimate. Once the
-        window is full they come every `refresh` updates, twice a window at least, or when a parameter has moved by a
-        standard deviation.
+        Full passes cost as much as twenty updates, and other estimators wait meanwhile. Their result is in the next
+        estimate. With a full window they come every `refresh` updates (at least twice a window), or when a parameter
+        has moved by a standard deviation.
         """
         self._refresh, self._deferring = min(refresh, max(REFRESH, self.window // (2 * self.every))), True
 
@@ -290,7 +290,7 @@ class OnlineEstimator:
             return
         joins = bool(self._pending) and time - self._pending[-1].time < SAME_NODE
         node = self._pending[-1] if joins else _Node(time)
-        known = joins  # a node that waits knows something already
+        known = joins  # a waiting node has measurements already
         for name, columns in self._measured.items():
             if name in group:
                 value = group[name]
@@ -299,7 +299,7 @@ class OnlineEstimator:
                     known = True
                     continue
                 self.counters.missing += 1
-                if name != "attitude":  # half an attitude is none
+                if name != "attitude":  # an attitude with missing components is not used
                     node.y[columns] = part = [v if abs(v) < LARGEST_VALUE[name] else math.nan for v in value]
                     known = known or not all(math.isnan(v) for v in part)
         if known and not joins:
@@ -310,7 +310,7 @@ class OnlineEstimator:
     def _admit(self, *, flush: bool) -> Estimate | None:
         result = None
         if self._em is None:
-            if len(self._pending) > 3:  # no inputs yet: nothing can come of these
+            if len(self._pending) > 3:  # no inputs yet: these nodes cannot be used
                 del self._pending[:-3]
             return None
         while self._pending:
@@ -348,7 +348,7 @@ class OnlineEstimator:
         self._starts = False
         self._thin_attitude(node, starts=starts)
         if tape.size == tape.capacity and self._fresh < tape.size:
-            # updates are rarer than the tape is long: what was not filtered yet must be before it falls off
+            # long time between updates: rows must be filtered before they are dropped from the tape
             self._filter_fresh(self._em, max(0, tape.size - self.window))
         keep = self.window + LOOKBACK + 2 * min(self.every, self.window) + 8
         dropped = tape.append(node.time, node.y[:13], starts=starts, keep=keep)
@@ -370,7 +370,7 @@ class OnlineEstimator:
         return self._estimate()
 
     def _thin_attitude(self, node: _Node, *, starts: bool) -> None:
-        """Take away an attitude that comes too soon after the last one, as long as rates tell how it went on."""
+        """Remove an attitude that comes too soon after the last one, if body rates are measured meanwhile."""
         if not math.isnan(node.y[10]):
             self._rate_time = node.time
         soon = node.time - self._attitude_time < self._attitude_period - SAME_NODE
@@ -388,8 +388,8 @@ class OnlineEstimator:
         first, last = max(0, tape.size - self.window), tape.size
         self._filter_fresh(em, first)
         young = last - first < min(YOUNG, self.window)
-        refresh = self._refresh if last - first == self.window else REFRESH  # what is known grows with the window
-        # what has not converged is refined after 1, 2, 4, ... updates: where a maximum is flat it may never do
+        refresh = self._refresh if last - first == self.window else REFRESH  # information grows with the window
+        # without convergence, full passes after 1, 2, 4, ... updates: at a flat maximum they may never converge
         due = self._unconverged > 0 and self._updates - self._refined >= 2 ** (self._unconverged - 1)
         if young or due or self._moved(em) or self._updates % refresh == 0:
             self._owed = self._deferring and not young and self._information is not None
@@ -397,7 +397,7 @@ class OnlineEstimator:
                 self._full_passes()
 
     def _filter_fresh(self, em: WindowEM, first: int) -> None:
-        """An incremental pass over a window that begins at row `first`."""
+        """Make an incremental pass over a window that begins at row `first`."""
         fresh, last, used = self._fresh, self._tape.size, em.parameters
         em.incremental(first, fresh, last, lookback=LOOKBACK)
         self._fresh = last
@@ -419,13 +419,13 @@ class OnlineEstimator:
         self._marginal = self._refreshed.refresh(em, first, last, self._information)
 
     def _with_ages(self, em: WindowEM, first: int, last: int, information: Information) -> Information:
-        """With what commands that are sampled in step with an onboard estimate may hide."""
+        """The information, corrected if commands are sampled with the period of an onboard estimate (`in_step.py`)."""
         stamps, _ = self._inputs.between(self._tape.time[first], self._tape.time[last - 1])
         period = self._prediction_period if em.setup.free[4] else 0.0
         return corrected(em, first, last, information) if in_step(stamps, period) else information
 
     def _moved(self, em: WindowEM) -> bool:
-        """Whether a parameter has moved since the last full passes by more than older rows' expectations can bear."""
+        """Whether a parameter has moved so far since the last full passes that expectations of older rows are wrong."""
         if self._reference is None or self._information is None:
             return True
         change = np.abs(offset(em.parameters.theta, self._reference.theta, em.setup.unit))[:5]
@@ -433,7 +433,7 @@ class OnlineEstimator:
         limit = np.minimum(np.maximum(bearable * self._information.sd[:5], MOVED), MOVED_FAR)
         return bool((change > limit).any())
 
-    # what goes out ------------------------------------------------------------------------------------------
+    # output -------------------------------------------------------------------------------------------------
 
     def _estimate(self) -> Estimate:
         if self._em is None or self._setup is None or self._information is None:

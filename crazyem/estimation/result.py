@@ -1,4 +1,4 @@
-"""What the estimator says: values with standard deviations, intervals, whether the data support them; steps of mass."""
+"""Results of the estimator: values, standard deviations, intervals, whether the data support them; steps of mass."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -40,7 +40,7 @@ class ParameterEstimate:
         return abs(self.sd / self.value) if self.value else float("inf")
 
     def to_json(self) -> dict[str, Any]:
-        """The summary's form (an interface: names are fixed)."""
+        """The form in the summary JSON (an interface: names are fixed)."""
         return {
             "value": self.value,
             "sd": self.sd,
@@ -80,7 +80,7 @@ class Estimate:
         return {name: p.to_json() for name, p in self.parameters.items()}
 
     def to_dict(self) -> dict[str, Any]:
-        """All of it, ready for JSON: `estimates` as in the summary, and what they rest on."""
+        """The whole estimate, ready for JSON: `estimates` as in the summary, noise, samples, updates."""
         about = {"time": self.time, "samples": self.samples, "updates": self.updates, "converged": self.converged}
         whole: dict[str, Any] = finite({**about, "estimates": self.to_json(), "noise": dict(self.noise)})
         return whole
@@ -91,7 +91,7 @@ class Estimate:
         return html_table(f"Estimate at {self.time:.2f} s from {self.samples} samples", header, rows)
 
     def plot(self, path: str | Path | None = None) -> "Figure":
-        """The 95 % intervals of mass and inertia, relative to their values; saved where `path` says.
+        """Plot the 95 % intervals of mass and inertia, relative to their values; saved to `path`.
 
         Raises:
             UsageError: the file cannot be written. MissingExtraError: no matplotlib.
@@ -127,9 +127,9 @@ class Step:
     """A change of mass.
 
     Attributes:
-        time: s, when it began. found: s, when it was noticed.
-        before: kg. after: kg, None until decided. real: whether it was one, None until decided.
-        jumped: it was none because the logged thrust jumped by itself: commands or voltage are not what they were.
+        time: s, onset. found: s, time of detection.
+        before: kg. after: kg, None until decided. real: whether it was a change of mass, None until decided.
+        jumped: no change of mass, but a jump of the logged thrust: commands or voltage in the log are wrong.
     """
 
     time: float
@@ -148,7 +148,7 @@ class Step:
         return f"{what} at {self.time:.2f} s, noticed at {self.found:.2f} s"
 
     def to_json(self) -> dict[str, float | bool | None]:
-        """The form of the summary; times on the drone's clock."""
+        """The form in the summary; times on the drone's clock."""
         return {
             "time": self.time,
             "found": self.found,

@@ -1,11 +1,11 @@
 """Fisher scoring on the likelihood of the innovations, over parameters and noise scales together.
 
-EM crawls where measurement noise dominates: its steps shrink with the share of the information that the data hold of
-what they would hold if every state were known. Scoring does not. The sensitivities of the innovations give score and
-information of the parameters (`kernels.sensitivities`), the smoother gives the score of the noise scales (Fisher's
-identity), and the derivatives of filter and gain give their information (`kernels.noise_information`). Levenberg's
-damping keeps a step from lowering the posterior. Where the data hold little about a scale, expected and observed
-information differ; the observed one is measured by differences of the score, and updated from successive scores."""
+Where measurement noise dominates, EM is slow: its steps are in proportion to the information of the data over the
+information with all states known. Scoring does not have this problem. The sensitivities of the innovations give score
+and information of the parameters (`kernels.sensitivities`). The smoother gives the score of the noise scales (Fisher's
+identity), and the derivatives of filter and gain give their information (`kernels.noise_information`). Levenberg
+damping prevents steps that lower the posterior. Where the data hardly determine a scale, expected and observed
+information differ. Differences of the score give the observed one, and successive scores update it."""
 
 from dataclasses import dataclass
 
@@ -17,35 +17,36 @@ from crazyem.estimation.em import WindowEM, displaced, offset
 from crazyem.estimation.model import Parameters
 
 P = kernels.PARAMETERS
-COORDINATES = P + 11  # coordinates: theta's, then the logarithms of the noise scales
+COORDINATES = P + 11  # coordinates of theta (see `offset`), then the logarithms of the noise scales
 STEP_THETA, STEP_NOISE = 0.5, 1.5  # longest step of a logarithm (or of a linear parameter in its unit)
-STEP_LAG = 0.2  # the mean inputs are linear in lag and delay only nearby
-SCORE_DIFFERENCE_STEP = -0.1  # of log s, by which the dependence of the score on it is measured
-# standard deviations from the maximum within which curvature is learnt from the scores on the way only,
+STEP_LAG = 0.2  # longest step of lag and delay: the mean inputs are linear in these over a short range only
+SCORE_DIFFERENCE_STEP = -0.1  # of log s, for differences of the score
+# Standard deviations. The observed curvature is computed by differences of the score, but not within NEAR_MAXIMUM of
+# the maximum, nor after a point within FAR_FROM_MAXIMUM: there secants of the scores on the path update it.
 NEAR_MAXIMUM = 0.2
-FAR_FROM_MAXIMUM = 3.0  # and so it is after a step from a point within these
-# share of the expected gain that a step must bring; without that steps can leap to and fro over a ridge
+FAR_FROM_MAXIMUM = 3.0
+# least gain of a step over its expected gain; otherwise steps can jump to and fro over a ridge
 LEAST_GAIN_SHARE = 0.1
-POSTERIOR_SLACK = 0.01  # of log-posterior that a step may lose: the score is that of a linearised filter
-REUSED_WITHIN = 0.05  # of log s, within which the information about the noise scales is not computed again,
-# and where the maximum is still far: steps are tested there whatever curvature they are taken with
+POSTERIOR_SLACK = 0.01  # nats that a step may lose: the score is that of a linearised filter
+REUSED_WITHIN = 0.05  # of log s; with a smaller change, the information on the noise scales is not computed again
+# the same far from the maximum: an inexact curvature is enough there, since each step is tested
 REUSED_WITHIN_FAR = 0.5
-SMALLEST_EIGENVALUE = 0.05  # eigenvalue of a curvature that is used (the prior alone gives a noise scale 0.44)
-DAMPING_ATTEMPTS = 8  # at one step, each more strongly damped
+SMALLEST_EIGENVALUE = 0.05  # least eigenvalue of a curvature that is used (the prior gives a noise scale 0.44)
+DAMPING_ATTEMPTS = 8  # attempts for one step, with increasing damping
 NOTHING_HELD = np.zeros(COORDINATES, bool)
 
 
 @dataclass(frozen=True)
 class Point:
-    """Log-posterior at a point with its score and information, in the coordinates (theta's, logarithms of scales).
+    """Log-posterior, score and information at a point, in the coordinates of theta and the logarithms of the scales.
 
     Attributes:
         parameters: the point.
         value: log-posterior, up to a constant.
-        free: (20,) coordinates that are estimated, and not held at their floor.
+        free: (20,) bool, coordinates that are estimated and not at their floor.
         score: (20,), zero where not free.
-        information: (20, 20) expected, of data and prior; identity where not free.
-        of_noise: (11, 11) information of the data about the logarithms of the noise scales.
+        information: (20, 20) expected information of data and prior; identity where not free.
+        of_noise: (11, 11) information of the data on the logarithms of the noise scales.
     """
 
     parameters: Parameters
@@ -62,28 +63,28 @@ class Point:
 
     @property
     def sd(self) -> NDArray:
-        """(20,) standard deviations of the free coordinates by the information, zero where not free."""
+        """(20,) standard deviations of the free coordinates from the information, zero where not free."""
         variance: NDArray = np.linalg.inv(self.information).diagonal()
         return np.where(self.free, variance, 0.0) ** 0.5
 
 
 @dataclass(frozen=True)
 class PathPoint:
-    """A point on the way: theta (9,), and the length of the joint scoring step there in standard deviations."""
+    """A point on the path to the maximum: theta (9,), and length of its joint scoring step in standard deviations."""
 
     theta: NDArray
     length: float
 
 
 def log_posterior(em: WindowEM, first: int, last: int, parameters: Parameters) -> float:
-    """Filter the window with these parameters (they stay in `em`): log-likelihood plus log prior, up to a constant."""
+    """Log-likelihood plus log prior, up to a constant; filters the window with the parameters and sets them in `em`."""
     em.parameters = parameters
     em.refill_inputs(first, last)
     return em.forward(first, last, restart=True) + log_prior(em)
 
 
 def log_prior(em: WindowEM) -> float:
-    """Logarithm of the prior where `em` is, up to a constant."""
+    """Log prior at the present parameters of `em`, up to a constant."""
     setup, p = em.setup, em.parameters
     prior = setup.prior
     theta = offset(p.theta, prior.centre, setup.unit)
@@ -94,14 +95,14 @@ def log_prior(em: WindowEM) -> float:
 def point(
     em: WindowEM, first: int, last: int, value: float, *, of_noise: NDArray | None = None, held: NDArray = NOTHING_HELD
 ) -> Point:
-    """Score and information where the window was just filtered; it is smoothed, too.
+    """Score and information at the parameters with which the window was just filtered; smooths the window.
 
     Args:
-        em: its tape and parameters.
+        em: tape and parameters.
         first, last: rows of the window.
-        value: what `log_posterior` returned.
-        of_noise: (11, 11) information about the noise scales, computed unless given.
-        held: (20,) bool, coordinates that stay where they are.
+        value: result of `log_posterior`.
+        of_noise: (11, 11) information on the noise scales; None: it is computed.
+        held: (20,) bool, coordinates that are held fixed.
     """
     setup, p = em.setup, em.parameters
     prior = setup.prior
@@ -110,7 +111,7 @@ def point(
     if of_noise is None:
         of_noise = em.noise_information(first, last)
     noise_score = em.noise_terms(first, last).sum(0)
-    # scales that are known in newtons move with mass and inertia
+    # scales that are known in newtons depend on mass and inertia
     carried = setup.carried
     score, information = np.zeros(COORDINATES), np.zeros((COORDINATES, COORDINATES))
     score[:P] = em.tape.score[first:last].sum(0) + carried.T @ noise_score
@@ -130,7 +131,7 @@ def point(
 
 
 def moved(em: WindowEM, start: Parameters, step: NDArray) -> Parameters:
-    """A point displaced by a step (20,), kept above the floors of the noise scales."""
+    """The parameters after a step (20,), with noise scales not below their floors."""
     setup = em.setup
     theta = displaced(start.theta, step[:P], setup.unit)
     logs = np.maximum(start.noise.logs + step[P:], setup.prior.floor)
@@ -149,11 +150,11 @@ def scoring_steps(
     path: list[PathPoint] | None = None,
     reused_within: float = REUSED_WITHIN,
 ) -> Point:
-    """Damped scoring steps from the present point until the next would be shorter than `tolerance`, at most `steps`.
+    """Damped scoring steps from the present point until the next is shorter than `tolerance`, at most `steps`.
 
-    Returns the last point, with which the tape is left filtered and smoothed; every point on the way, the last one
-    included, is added to `path`. The information about the noise scales is computed again where one of them has moved
-    by more than `alike` in log s since, unless `of_noise` (11, 11) is given for everywhere.
+    Returns the last point; the tape is left filtered and smoothed with it. Every point, the last one included, is added
+    to `path`. The information on the noise scales is computed again once the log of one scale has changed by
+    `reused_within`. A given `of_noise` (11, 11) is used at all points.
     """
     path = [] if path is None else path
     begin = len(path)
@@ -194,9 +195,9 @@ def scoring_steps(
 def _damped_step(
     em: WindowEM, first: int, last: int, here: Point, correction: NDArray, damping: float
 ) -> tuple[NDArray, float, float] | None:
-    """Step, log-posterior after it and damping of the first step that gains enough; None after `DAMPING_ATTEMPTS`.
+    """The first step that gains enough, the log-posterior after it and its damping; None after `DAMPING_ATTEMPTS`.
 
-    The first attempt uses the observed curvature, the others the expected one, each more strongly damped.
+    The first attempt uses the observed curvature. Later attempts use the expected one, with increasing damping.
     """
     for attempt in range(DAMPING_ATTEMPTS):
         curvature = here.information + (correction if attempt == 0 else 0.0)
@@ -213,11 +214,11 @@ def _damped_step(
 
 
 def _observed(em: WindowEM, first: int, last: int, here: Point) -> NDArray:
-    """What to add to the expected information for the observed one in the scales of process noise (20, 20).
+    """Observed less expected information (20, 20) in the scales of process noise, by differences of the score.
 
-    By differences of the score. Parameters and scales are independent in expectation, but only where the noise is
-    right: a filter that trusts the model too little puts measurement noise that came back in the torque into inertia,
-    and steps of the two undo each other. And of a scale that the data hardly resolve, expectation says little.
+    In expectation, parameters and scales are independent, but only at the right noise scales. With too large process
+    noise, measurement noise that the controller feeds into the torque changes the inertia, and steps of inertia and
+    scale undo each other. And for a scale that the data hardly determine, expected and observed information differ.
     """
     out = np.zeros((COORDINATES, COORDINATES))
     scales = np.arange(P, P + 6)[here.free[P : P + 6]]
@@ -238,13 +239,13 @@ def _observed(em: WindowEM, first: int, last: int, here: Point) -> NDArray:
 
 
 def limit_step(step: NDArray) -> NDArray:
-    """A scoring step made safe, in the coordinates in which the data are linear or quadratic.
+    """A scoring step of limited length, taken in coordinates in which the data are linear or quadratic.
 
-    Accelerations are linear in 1/m and 1/I. Innovations have variances that are linear in those of the noise: where a
-    scale s is much too large, its score cannot ask for more than half a unit of log s, however far it is off; taken in
-    the variance the same step reaches the end at once, s'^2 = s^2 (1 + 2 step). And where two noises look alike, as
-    those of lateral force and of an accelerometer do, it is the sum of their variances that is known: in logarithms
-    that is a bent ridge, which straight steps fall off.
+    Accelerations are linear in 1/m and 1/I. Variances of innovations are linear in the variances of the noise. Where a
+    scale s is much too large, its scoring step is at most half a unit of log s. The same step in the variance,
+    s'^2 = s^2 (1 + 2 step), reaches the maximum at once. And where two noises look alike (lateral force and
+    accelerometer), the data determine the sum of their variances. In logarithms this is a curved ridge, which straight
+    steps leave.
     """
     step = step.copy()
     step[:4] = -np.log(1.0 - np.minimum(step[:4], 1.0 - np.exp(-STEP_THETA)))
@@ -255,10 +256,10 @@ def limit_step(step: NDArray) -> NDArray:
 
 
 def _secant(correction: NDArray, before: Point, after: Point, step: NDArray) -> NDArray:
-    """What to add to the expected information to have the observed one along the last step (Dennis, Gay, Welsch 1981).
+    """Update of observed less expected information by a secant along the last step (Dennis, Gay, Welsch 1981).
 
-    The scores before and after a step tell the curvature of the likelihood along it. The expected information differs
-    from it by chance, and by much where the data hold little about a noise scale.
+    The scores before and after a step give the observed curvature along it. The expected information differs from it by
+    chance, and by much where the data hardly determine a noise scale.
     """
     free = before.free & after.free
     s = np.where(free, step, 0.0)
@@ -268,7 +269,7 @@ def _secant(correction: NDArray, before: Point, after: Point, step: NDArray) -> 
         return np.zeros_like(correction)
     residual = y - after.information @ s
     along = abs(s @ correction @ s)
-    if along > 0:  # what was learnt where the curvature was larger is shrunk to the present
+    if along > 0:  # an old correction is reduced to the size of the present one
         correction = correction * min(1.0, abs(s @ residual) / along)
     r = residual - correction @ s
     return correction + (np.outer(r, y) + np.outer(y, r)) / slope - (r @ s) / slope**2 * np.outer(y, y)

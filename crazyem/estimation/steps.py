@@ -1,15 +1,16 @@
-"""Steps of mass in flight, a payload attached or released: found by the innovations, and the window begins anew.
+"""Detection of mass steps in flight (a payload attached or released) by the innovations, and restart of the window.
 
-An estimator that averages over eight seconds needs eight to forget a payload. A step of mass by a share r is an
-acceleration of -r g that the model does not predict, so innovations of vertical velocity go to one side at once. A
-two-sided cumulative sum (Page, 1954) finds that and when it began; from there the window grows again. If the mass
-turns out to be what it was, it was a gust, and the whole window is used as before.
+A window of eight seconds needs eight seconds to forget a payload. A step of the mass by a share r is an acceleration of
+-r g that the model does not predict, so the innovations of vertical velocity get a mean at once. A two-sided cumulative
+sum (Page, 1954) detects this mean and its onset. Then the window restarts and grows again. If the mass turns out to be
+unchanged, the cause was a gust, and the whole window is used again.
 
-Innovations of a real flight are not white: thrust laws err, air moves. So they are counted in standard deviations of
-their own means over a quarter of a second, and a flight that wanders by itself has to step further to be believed.
+Innovations of a real flight are not white: the thrust law has errors, and the air moves. So the unit of the innovations
+is the standard deviation of their means over a quarter of a second. In a flight with large slow errors, a step has to
+be larger.
 
-A mass that steps is felt by the drone, and its controller answers in its own time. Where the logged thrust jumps
-between two commands by as much as the mass seems to, it is the log that changed: its voltage or scale is wrong.
+After a real step of mass, the controller changes the thrust gradually. Where the logged thrust jumps between two
+commands by as much as the estimated mass, the log is wrong: its voltage or scale changed.
 """
 
 import math
@@ -26,32 +27,32 @@ from crazyem.estimation.result import Estimate, Step
 from crazyem.signals.sample import Sample
 from crazyem.vehicle import Vehicle
 
-VERTICAL_VELOCITY = 5  # of the innovations: velocity along world z
-# standard deviations that the mean may be off without being summed up; a step of 3 % is 0.75 in hover
+VERTICAL_VELOCITY = 5  # index of the innovation: velocity along world z
+# standard deviations; drift of the cumulative sum, a smaller mean does not add up; a step of 3 % is 0.75 in hover
 MEAN_TOLERANCE = 0.4
-LARGEST_INCREMENT = 3.0  # standard deviations that one innovation may add: a single outlier is no step
-STEP_THRESHOLD = 14.0  # sum that is a step; calm simulated flights without one reach 9
-# innovations in a mean; means that are kept, and that must be known
+LARGEST_INCREMENT = 3.0  # standard deviations; limit of one innovation: a single outlier is no step
+STEP_THRESHOLD = 14.0  # cumulative sum from which a step is detected; calm simulated flights without a step reach 9
+# innovations in a mean; most means that are kept; fewest means that are needed
 BATCH_INNOVATIONS, MOST_BATCHES, FEWEST_BATCHES = 25, 32, 8
-LEAST_INNOVATION_SD = 1.3  # least standard deviation of innovations: those of an onboard estimate are never quite white
-# s in the air, and after a step, within which none is looked for: the filter has to know itself first
+LEAST_INNOVATION_SD = 1.3  # least standard deviation: innovations of an onboard estimate are never quite white
+# s after take-off and after a step without detection: the filter has to settle first
 CALM_SECONDS = 2.0
-# s after it was noticed when a step can be called one, and when it is one or is not
+# s after the detection: earliest and latest time of the decision whether the mass changed
 EARLIEST_DECISION, LATEST_DECISION = 0.4, 1.0
-# relative change of mass that counts as one in a calm flight; more by the flight's own wandering
+# least relative change of mass in a calm flight; multiplied by the flight's own innovation sd over the least one
 LEAST_MASS_STEP = 0.018
-# standard deviations that it has to be, those of the new mass and of the flight's own wandering
+# least change of mass in standard deviations of the new mass; multiplied likewise
 STEP_CONFIDENCE_SD = 3.0
-THRUST_JUMP = 0.15  # of the logarithm of thrust between two commands, lasting: setpoints that jump make 0.12 at most
-# s before a step seems to have begun in which a jump is looked for: as long as none is looked for itself
+THRUST_JUMP = 0.15  # lasting change of log thrust between two commands; jumps of setpoints make 0.12 at most
+# s before the onset of a step in which a jump of thrust is searched; as long as `CALM_SECONDS`
 ONSET_SECONDS = 2.0
-ADJACENT_SECONDS = 0.025  # s between commands of which one follows the other; after a gap nobody knows what was in it
-LASTING_COMMANDS = 5  # commands before and after a jump that are compared, too
-SHORTEST_WINDOW = 8  # samples that a window has at least
+ADJACENT_SECONDS = 0.025  # s; longest time between two adjacent commands: what happens in a longer gap is unknown
+LASTING_COMMANDS = 5  # commands before and after a jump, whose medians are compared, too
+SHORTEST_WINDOW = 8  # samples
 
 
 class CumulativeSum:
-    """Two-sided; `add` returns when the present excursion began once it is beyond the threshold."""
+    """Two-sided cumulative sum (Page, 1954); `add` returns the onset once a sum is beyond the threshold."""
 
     def __init__(
         self, *, drift: float = MEAN_TOLERANCE, threshold: float = STEP_THRESHOLD, most: float = LARGEST_INCREMENT
@@ -60,12 +61,12 @@ class CumulativeSum:
         self.reset()
 
     def reset(self) -> None:
-        """Nothing seen."""
+        """Set both sums to zero."""
         self._sums = [0.0, 0.0]
         self._since = [math.nan, math.nan]
 
     def add(self, time: float, value: float) -> float | None:
-        """One normalised innovation at `time` [s]; NaN is left out."""
+        """Add one normalised innovation at `time` [s]; NaN is ignored."""
         if not math.isfinite(value):
             return None
         value = min(max(value, -self.most), self.most)
@@ -79,7 +80,7 @@ class CumulativeSum:
 
 
 class Wandering:
-    """How much means over a batch of innovations vary, as the standard deviation of a single white one."""
+    """Spread of the means over batches of innovations, as the standard deviation of a single white innovation."""
 
     def __init__(self) -> None:
         self._sums: deque[float] = deque(maxlen=MOST_BATCHES)
@@ -88,26 +89,26 @@ class Wandering:
 
     @property
     def known(self) -> bool:
-        """Whether enough was seen."""
+        """Whether there are enough batches."""
         return len(self._sums) >= FEWEST_BATCHES
 
     def add(self, value: float) -> None:
-        """One normalised innovation."""
+        """Add one normalised innovation."""
         self._sum += value
         self._count += 1
         if self._count == BATCH_INNOVATIONS:
             self._sums.append(abs(self._sum))
             self._sum, self._count = 0.0, 0
-            # a median: a step that is in some of the batches does not hide itself
+            # a median: a step within some of the batches does not raise it much
             self.sd = max(LEAST_INNOVATION_SD, 1.4826 * float(np.median(self._sums)) / math.sqrt(BATCH_INNOVATIONS))
 
 
 def largest_jump(times: NDArray[np.float64], wrenches: NDArray[np.float64], *, since: float) -> float:
-    """Largest lasting jump of the logarithm of thrust from one command to the next; 0 where there is none to be seen.
+    """Largest lasting jump of log thrust from one command to the next; 0 if there is none.
 
     Args:
         times: (n,) s. wrenches: (n, 4) thrust [N] and torque.
-        since: s; earlier commands are only compared with.
+        since: s; earlier commands serve for comparison only.
     """
     thrust = np.log(np.maximum(wrenches[:, 0], 1e-6))
     best = 0.0
@@ -125,15 +126,15 @@ def largest_jump(times: NDArray[np.float64], wrenches: NDArray[np.float64], *, s
 
 
 class StepAwareEstimator:
-    """An `OnlineEstimator` whose window begins anew when the mass steps. Same samples, same estimates, bit for bit.
+    """An `OnlineEstimator` whose window restarts when the mass steps; the same samples give exactly the same estimates.
 
-    Needs a measured velocity: without one no step is found.
+    Without a measured velocity no step is detected.
 
     Args:
-        inner: the estimator; it is fed by this one only.
+        inner: the estimator; only this object feeds it.
 
     Attributes:
-        steps: what was found, oldest first.
+        steps: detected steps, oldest first.
     """
 
     def __init__(self, inner: OnlineEstimator) -> None:
@@ -145,24 +146,24 @@ class StepAwareEstimator:
         self._seen = -math.inf
         self._mass: list[tuple[float, float]] = []  # time, mass of the newest estimates
         self._quiet_until = math.nan
-        self._jump = 0.0  # of the logarithm of thrust at the onset of the newest step
+        self._jump = 0.0  # jump of log thrust at the onset of the newest step
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.inner, name)
 
     @property
     def airborne(self) -> bool:
-        """As the inner one."""
+        """As `OnlineEstimator.airborne`."""
         return self.inner.airborne
 
     @property
     def update_seconds(self) -> Sequence[float]:
-        """As the inner one."""
+        """As `OnlineEstimator.update_seconds`."""
         return self.inner.update_seconds
 
     @property
     def every(self) -> int:
-        """Samples between updates, as the inner one; may be set."""
+        """Samples between updates of the inner estimator; may be set."""
         return self.inner.every
 
     @every.setter
@@ -180,17 +181,17 @@ class StepAwareEstimator:
 
     @property
     def deciding(self) -> bool:
-        """Whether something was noticed of which it is not known yet whether it was a step."""
+        """Whether a step was detected and not yet decided on."""
         return bool(self.steps) and self.steps[-1].real is None
 
     def finish(self) -> Estimate:
-        """As the inner one; what was noticed last and could not be decided any more was no step."""
+        """As `OnlineEstimator.finish`; a last step that is not decided yet counts as none."""
         if self.deciding:
             self._settle(self.steps[-1], self._mass[-1][1] if self._mass else math.nan, real=False)
         return self.inner.finish()
 
     def feed(self, sample: Sample) -> Estimate | None:
-        """As the inner one."""
+        """As `OnlineEstimator.feed`."""
         estimate = self.inner.feed(sample)
         if estimate is None:
             return None
@@ -201,7 +202,7 @@ class StepAwareEstimator:
         if math.isnan(self._quiet_until):
             self._quiet_until = estimate.time + CALM_SECONDS
         if self.adapting:
-            # Not since it began: if it was a gust, what it did until it was found must not be taken for mass.
+            # From the detection, not from the onset: the start of a gust must not count as a change of mass.
             self.inner.window = min(self.window, max(self._rows_since(self.steps[-1].found), SHORTEST_WINDOW))
         if self.deciding:
             self._decide(self.steps[-1], estimate)
@@ -217,7 +218,7 @@ class StepAwareEstimator:
         return int((tape.time[: tape.size] > time).sum())
 
     def _look(self, now: float) -> float | None:
-        """When a step began, if what was filtered since the last look shows one."""
+        """Onset [s] of a step, if the rows filtered since the last call show one."""
         tape = self.inner._tape
         last = self.inner._fresh
         first = int(np.searchsorted(tape.time[:last], self._seen, side="right"))
@@ -238,7 +239,7 @@ class StepAwareEstimator:
     def _begin_anew(self, began: float, estimate: Estimate) -> None:
         self._sum.reset()
         self._quiet_until = estimate.time + CALM_SECONDS
-        # the newest values may have felt the step already
+        # values after the onset may contain the step already
         before = next((m for t, m in reversed(self._mass) if t < began), estimate["mass"].value)
         self.steps.append(Step(began, estimate.time, before))
         self.inner.window = SHORTEST_WINDOW
@@ -258,7 +259,7 @@ class StepAwareEstimator:
     def _settle(self, step: Step, mass: float, *, real: bool, jumped: bool = False) -> None:
         self.steps[-1] = Step(step.time, step.found, step.before, mass, real, jumped)
         if not real:
-            self.inner.window = self.window  # what is still on the tape is used again
+            self.inner.window = self.window  # older rows still on the tape are used again
 
 
 def estimator_for(
@@ -270,15 +271,15 @@ def estimator_for(
     crazyflie: bool = True,
     input_signal: str | None = None,
 ) -> StepAwareEstimator:
-    """The estimator of a flight or a replay; its window begins anew when the mass steps.
+    """The estimator of a flight or a replay; its window restarts when the mass steps.
 
     Args:
         window, every: newest samples used; samples between updates.
-        onboard: attitudes come from a filter on board, as those of every link do; crazyflie: from a Crazyflie's.
-        input_signal: what thrust is computed from; None takes what comes first.
+        onboard: attitudes come from an onboard filter, as on every link; crazyflie: from a Crazyflie's filter.
+        input_signal: signal for the thrust; None takes the first usable one.
 
     Raises:
-        UsageError: a window too short to estimate from.
+        UsageError: the window is too short to estimate from.
     """
     return StepAwareEstimator(
         OnlineEstimator(

@@ -1,15 +1,15 @@
-"""The tape: every array the kernels read and write, for the newest samples; old ones fall off the front."""
+"""The tape: all arrays that the kernels read and write, for the newest samples; the oldest rows are dropped."""
 
 import numpy as np
 
 from crazyem.estimation import kernels
 
 BREAK = 1  # kind of a sample at which the state starts anew
-START_VARIANCE = np.repeat([1.0, 1.0, 0.1, 25.0], 3)  # at a break: m^2, (m/s)^2, rad^2, (rad/s)^2
+START_VARIANCE = np.repeat([1.0, 1.0, 0.1, 25.0], 3)  # of the state at a break: m^2, (m/s)^2, rad^2, (rad/s)^2
 
 
 class Tape:
-    """Samples k = 0..size-1 and everything computed about them. Row k of a step array is the step that ends at k."""
+    """Samples k = 0..size-1 and all quantities computed for them; row k of a step array is the step that ends at k."""
 
     _ROWS = (
         ("time", (), float),
@@ -77,7 +77,7 @@ class Tape:
     score: np.ndarray
 
     def append(self, time: float, y: np.ndarray, *, starts: bool, keep: int) -> int:
-        """Add a sample; when full, only the newest `keep` samples stay. Returns how many rows fell off the front."""
+        """Add a sample; a full tape keeps only its newest `keep` samples. Returns the number of dropped rows."""
         dropped = 0
         if self.size == self.capacity:
             dropped = self.size - keep
@@ -98,7 +98,7 @@ class Tape:
         return dropped
 
     def spread_inputs(self, first: int, last: int, offset: np.ndarray) -> None:
-        """Mean inputs, with the torque offset (3,) added, into the contiguous columns that the kernels read."""
+        """Copy the mean inputs, plus the torque offset (3,), into the contiguous columns that the kernels read."""
         self.thrust[first:last] = self.mean[first:last, 0]
         self.torque[first:last] = self.mean[first:last, 1:] + offset
         self.thrust_tau[first:last] = self.mean_tau[first:last, 0]

@@ -1,4 +1,4 @@
-"""From parameters and information to what is said: values, intervals, and whether the data support them at all."""
+"""From parameters and information to the reported estimate: values, intervals, and whether the data support them."""
 
 import math
 
@@ -13,7 +13,7 @@ from crazyem.estimation.result import PARAMETER_UNITS, Estimate, ParameterEstima
 from crazyem.vehicle import Vehicle
 
 IDENTIFIABLE = 0.15  # largest standard deviation of a logarithm that counts as identified
-IMPLAUSIBLE_SD = 3.0  # prior standard deviations beyond which an inertia is not believed
+IMPLAUSIBLE_SD = 3.0  # prior standard deviations from the centre, beyond which an inertia is implausible
 FEWEST_SAMPLES = 20  # samples in flight before anything counts as identified
 _INERTIA = (np.arange(len(NAMES)) > 0) & (np.arange(len(NAMES)) < LAG)
 _LOGARITHMIC = np.arange(len(NAMES)) < DELAY
@@ -30,21 +30,21 @@ def estimate_of(
     converged: bool,
     marginal: Marginal | None = None,
 ) -> Estimate:
-    """The estimate, every parameter with its standard deviation, 95 % interval and verdict.
+    """The estimate: every parameter with its standard deviation, 95 % interval and verdict.
 
     Args:
-        parameters: where the estimator is now.
-        setup: prior, units, and what is free.
+        parameters: present parameters of the estimator.
+        setup: prior, units, free parameters.
         information: of the last full pass.
         time: of the newest sample [s].
-        samples: in the window.
-        updates: so far.
+        samples: number in the window.
+        updates: number so far.
         converged: whether the score test was passed.
-        marginal: with noise scales integrated out that the data leave open.
+        marginal: posterior with weakly determined noise scales integrated out; None: no such scale.
     """
     prior, unit = setup.prior, setup.unit
     theta, sd, below, above = _interval(parameters, information, unit, marginal)
-    # An inertia that the prior all but excludes says that the model does not hold here, not that the drone is odd.
+    # An inertia that is very improbable by the prior means that the model is wrong here, not that the drone is unusual.
     deviation = np.abs(offset(theta, prior.centre, unit))
     implausible = deviation > IMPLAUSIBLE_SD * prior.sd
     distrusted = implausible & _INERTIA
@@ -53,7 +53,7 @@ def estimate_of(
         below, above = np.where(distrusted, -1.96 * sd, below), np.where(distrusted, 1.96 * sd, above)
     low, high = displaced(theta, below, unit), displaced(theta, above, unit)
     absolute = sd * np.where(_LOGARITHMIC, theta, unit)
-    if not setup.free[LAG]:  # the inputs contain the lag, so the data say nothing of it
+    if not setup.free[LAG]:  # the inputs contain the lag, so the data carry no information on it
         absolute[LAG], low[LAG], high[LAG] = math.inf, 0.0, math.inf
     said = {}
     columns = (v.tolist() for v in (theta, sd, absolute, low, high, implausible))
@@ -76,7 +76,7 @@ def estimate_of(
 def _interval(
     parameters: Parameters, information: Information, unit: NDArray, marginal: Marginal | None
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Values, and around them the standard deviations and the ends of the 95 % intervals (logarithms, units)."""
+    """Values (9,), standard deviations, and ends of the 95 % intervals less the values (logarithms, units)."""
     if marginal is None:
         theta, sd = parameters.theta, information.sd
         below, above = -1.96 * sd, 1.96 * sd
@@ -93,7 +93,7 @@ def _interval(
 def _objection(
     i: int, sd: float, setup: Setup, information: Information, *, samples: int, converged: bool, implausible: bool
 ) -> str:
-    """Why parameter i is not identifiable; empty if it is. sd is that of its logarithm, or in its unit."""
+    """Why parameter i is not identifiable; empty if it is. sd: of its logarithm, or of the parameter in its unit."""
     inertia = 0 < i < LAG
     if not setup.free[i]:
         return "the inputs already include the rotor lag" if i == LAG else "held fixed"
@@ -115,7 +115,7 @@ def _objection(
 
 
 def nothing_known(vehicle: Vehicle, *, reason: str, time: float, updates: int) -> Estimate:
-    """What is said before anything was flown: the nominal value and no confidence at all."""
+    """The estimate before any flight: nominal values with infinite standard deviations."""
     values = (vehicle.mass, *vehicle.inertia, vehicle.motor_time_constant, 0.0, 0.0, 0.0, 0.0)
     return Estimate(
         time=time,

@@ -1,11 +1,10 @@
 """Compiled inner loops of the estimator: Kalman filter, smoother, statistics, sensitivities, noise information.
 
-All matrices are 12 x 12 or smaller, so everything is explicit loops over contiguous rows. Every measured
-quantity is one component of the error state (position, velocity, attitude error, body rate), so measurements
-enter one scalar at a time and no matrix is ever inverted. The smoother is the modified Bryson-Frazier
-recursion: it gives the smoothed moments of Rauch-Tung-Striebel (benchmarks/reference.py is that, in textbook form; the
-tests compare them), and yields the smoothed process noise, all that the M-step needs, without inverting the
-prediction covariance.
+All matrices are 12 x 12 or smaller, so the code is explicit loops over contiguous rows. Every measured quantity is one
+component of the error state (position, velocity, attitude error, body rate). So measurements enter one scalar at a
+time, and no matrix is inverted. The smoother is the modified Bryson-Frazier recursion. It gives the same smoothed
+moments as Rauch-Tung-Striebel (benchmarks/reference.py has the textbook form; the tests compare them). It also gives
+the smoothed process noise, which the M-step needs, without inverting the prediction covariance.
 
 The model is the rigid body: position p [m, world], velocity v [m/s, world], attitude q (x, y, z, w; body to world),
 body rate w [rad/s, FLU]. Errors are 12-vectors (dp, dv, dtheta, dw) with q_true = q * exp(dtheta): the attitude error
@@ -16,15 +15,15 @@ specific force and angular acceleration (body frame), with h = lead dt:
     al = I^-1 (M - w x I w) + u_w/dt                        w' = w + dt al
     p' = p + dt v + h dt a                                  q' = q exp(dt w + h dt al)
 
-`lead` says by which fraction of a step the velocities that move position and attitude, and the attitude that turns the
-force, are ahead of the step's start. Flights in continuous time take 1/2, the midpoint rule, second order in dt. The
-others are for data of simulators that step so: 0 is explicit Euler (Zhao eq. 56), 1 is semi-implicit Euler. For those
-the discrete motion is the truth, and there is nothing within a step. For the midpoint rule the integral of a Brownian
-motion given both its ends adds dt^3/12 times its intensity to the covariance of position and attitude.
+`lead` is a fraction of a step: the velocities that move position and attitude, and the attitude that turns the force,
+are taken at this time after the start of the step. Real flights use 1/2, the midpoint rule, second order in dt. The
+others are for data of simulators: 0 is explicit Euler (Zhao eq. 56), 1 is semi-implicit Euler. There the discrete
+motion is exact, and no noise acts within a step. For the midpoint rule, the integral of a Brownian motion given both
+its ends adds dt^3/12 times its intensity to the covariance of position and attitude.
 
-Explicit Euler adds to roll, pitch and yaw dt times their derivatives (Zhao eq. 47), as the simulators do that step so:
-q' is not q exp(dt w) but differs from it by dt^2, which precise noise levels notice. Where pitch is within 3 degrees of
-a right angle, and those derivatives have no bounds, it is q exp(dt w) after all.
+With explicit Euler, dt times their derivatives are added to roll, pitch and yaw (Zhao eq. 47), as in such simulators.
+The result differs from q exp(dt w) by terms in dt^2, which matter at low noise. Where pitch is within 3 degrees of a
+right angle, these derivatives are unbounded, and q exp(dt w) is used.
 
 Noise enters through force and torque only (Zhao eq. 55), so its covariance has rank 6, not 12; in units of
 acceleration it does not depend on mass and inertia.

@@ -1,15 +1,15 @@
-"""Small compiled pieces that filter and smoother share: rotations, Euler's equation, the transition's product."""
+"""Small compiled functions of filter and smoother: rotations, Euler's equation, products with the transition matrix."""
 
 import numpy as np
 
 from crazyem.compiled import compiled
 
-UPRIGHT = 0.05  # cosine of pitch below which Euler angles are not stepped
+UPRIGHT = 0.05  # least cosine of pitch for steps in Euler angles
 
 
 @compiled
 def half_turn(w, h, q):
-    """Quaternion of the rotation vector w * h into q."""
+    """Write the quaternion of the rotation vector w * h into q."""
     x, y, z = w[0] * h, w[1] * h, w[2] * h
     angle2 = x * x + y * y + z * z
     if angle2 < 1e-8:
@@ -44,7 +44,7 @@ def matrix(q, m):
 
 @compiled
 def log(q, out):
-    """Rotation vector of a quaternion, the shorter way round."""
+    """Rotation vector of a quaternion, with an angle up to pi."""
     sign = 1.0 if q[3] >= 0 else -1.0
     s = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
     f = 2.0 * sign if s < 1e-9 else 2.0 * sign * np.arctan2(s, sign * q[3]) / s
@@ -106,10 +106,11 @@ def right_jacobian(phi, out):
 
 @compiled
 def explicit_turn(q, start, w, dt, out, by_attitude, by_rate):
-    """Attitude `out` when dt times their derivatives are added to roll, pitch and yaw, with its Jacobian blocks.
+    """Attitude `out` after an explicit Euler step of roll, pitch and yaw, with its Jacobian blocks.
 
-    start (3, 3) is the rotation matrix of q. Returns False, and does nothing, near a pitch of a right angle. No angle
-    is needed: out = Rz(dyaw) Rq Rx(-roll) Ry(dpitch) Rx(roll) Rx(droll), the turns about y and x taken in the body.
+    start (3, 3) is the rotation matrix of q. Near a pitch of a right angle, returns False and changes nothing. Euler
+    angles are not computed: out = Rz(dyaw) Rq Rx(-roll) Ry(dpitch) Rx(roll) Rx(droll), with the turns about y and x in
+    the body frame.
     """
     sp = -start[2, 0]
     cp = np.sqrt(start[2, 1] ** 2 + start[2, 2] ** 2)
@@ -128,13 +129,13 @@ def explicit_turn(q, start, w, dt, out, by_attitude, by_rate):
     turn[0], turn[1], turn[2] = w[0] + sp / cp * along, 0.0, 0.0
     half_turn(turn, dt, part)
     product(out, part, out)
-    # sines and cosines of roll and pitch afterwards
+    # sines and cosines of roll and pitch after the step
     sp1 = -2 * (out[0] * out[2] - out[1] * out[3])
     r21, r22 = 2 * (out[1] * out[2] + out[0] * out[3]), 1 - 2 * (out[0] * out[0] + out[1] * out[1])
     cp1 = np.sqrt(r21 * r21 + r22 * r22)
     sr1, cr1 = r21 / cp1, r22 / cp1
     for j in range(3):
-        # derivatives of the angles by body error j, of the angles afterwards by it, and of the error afterwards
+        # derivatives by body error j: of the angles before the step, of the angles after it, of the error after it
         roll = 1.0 if j == 0 else (sr if j == 1 else cr) * sp / cp
         pitch = 0.0 if j == 0 else (cr if j == 1 else -sr)
         yaw = 0.0 if j == 0 else (sr if j == 1 else cr) / cp
@@ -152,11 +153,11 @@ def explicit_turn(q, start, w, dt, out, by_attitude, by_rate):
 
 @compiled
 def specific_force(model, measured, q, dt, r_force, mean, left):
-    """Specific force of a step, given what an accelerometer says of its mean; returns the log-likelihood of that.
+    """Condition the mean specific force of a step on the accelerometer; returns the measurement's log-likelihood.
 
-    The measurement is model + u/dt + noise with u ~ N(0, q dt) independent of all that the filter knows, so each axis
-    is conditioned on its own. model (3,), measured (3,; NaN: not measured) and mean (3,) in m/s^2; left (3,) receives
-    the intensity of the impulse that is still unknown, q and left in (m/s)^2/s.
+    The measurement is model + u/dt + noise. The impulse u ~ N(0, q dt) is independent of the filter's state, so each
+    axis is conditioned on its own. model (3,), measured (3,; NaN: not measured) and mean (3,) in m/s^2; left (3,)
+    receives the remaining intensity of the impulse; q and left in (m/s)^2/s.
     """
     loglik = 0.0
     for i in range(3):

@@ -23,10 +23,10 @@ def forward(first, last, restart, time, kind, y, force, thrust, torque, mass, in
             p0, xp, pp, xf, pf, gain, s, e, blocks, middle, loglik):  # fmt: skip
     """Extended Kalman filter over samples first..last-1, written into the tape arrays; returns the log-likelihood.
 
-    A sample k is predicted from k - 1 with thrust[k], torque[k] (means over the step that ends at k), except where
-    kind[k] == 1 (a break: the state starts anew at the measurement with variances p0) and at k == first with restart
-    (the prior xp[first], pp[first] stands as it is). Missing measurements are NaN in y and force. `lead` is the
-    rule of integration (estimation/kernels).
+    Sample k is predicted from k - 1 with thrust[k], torque[k] (means over the step that ends at k). There are two
+    exceptions: at a break, kind[k] == 1, the state restarts at the measurement with variances p0; at k == first with
+    restart, the prior is xp[first], pp[first]. Missing measurements are NaN in y and force. `lead` is the rule of
+    integration (estimation/kernels).
     """
     cov = np.empty((12, 12))
     tmp = np.empty((12, 12))
@@ -67,7 +67,7 @@ def forward(first, last, restart, time, kind, y, force, thrust, torque, mass, in
             dt = time[k] - time[k - 1]
             h = lead * dt
             rest = dt - h
-            # what white noise does to position and attitude between its values at both ends of a step
+            # variance of position and attitude by white noise within a step, given its impulse over the step
             bridge = dt * dt / 12.0 if lead == 0.5 else 0.0
             w = xf[k - 1, 10:13]
             b = blocks[k]
@@ -142,7 +142,7 @@ def forward(first, last, restart, time, kind, y, force, thrust, torque, mass, in
                     cov[9 + j, 6 + i] += v
                 cov[9 + i, 9 + i] += dt * q[3 + i]
             for c in range(3):
-                if left[c] != q[c]:  # the accelerometer's mean over the step says nothing of what is within
+                if left[c] != q[c]:  # the accelerometer shows the mean over the step, not the noise within it
                     for i in range(3):
                         for j in range(3):
                             cov[i, j] += bridge * dt * middle[k, i, c] * middle[k, j, c] * (q[c] - left[c])

@@ -1,7 +1,6 @@
-"""Where things are in the arrays of the kernels: rows of statistics, and the vector of parameters.
+"""Layout of the kernels' arrays: rows of statistics, and the vector of parameters.
 
-Statistics of one step are sums of products weighted by dt, so that the M-step sees numbers that do not depend on the
-sampling rate.
+Statistics of one step are sums of products weighted by dt, so that they do not depend on the sampling rate.
 """
 
 MASS = 0  # 10: upper triangle of z z', z = (a, F0, dF/dtau, dF/ddelay)
@@ -10,13 +9,13 @@ AXIS_SIZE = 21
 COUNT = 73  # 1: steps
 IMPULSE = 74  # 6: squared impulses over dt, by body axis: specific force, angular acceleration
 RESIDUAL = 80  # 5: squared measurement residuals of position, velocity, attitude, body rate, specific force
-MEASURED = 85  # 5: how many scalars went into each
-BRIDGE = 90  # 6: squared noise within the step over dt^3 / 12, less its intensity; 0 but for the midpoint rule
-IMPULSE_SEEN = 96  # 6: squared share of each impulse's variance that the data resolve
-RESIDUAL_SEEN = 102  # 5: the same for the measurement noise
+MEASURED = 85  # 5: number of scalars in each sum of RESIDUAL
+BRIDGE = 90  # 6: squared noise within the step over dt^3 / 12, less its intensity; 0 except for the midpoint rule
+IMPULSE_SEEN = 96  # 6: squared share of each impulse's variance that the data determine
+RESIDUAL_SEEN = 102  # 5: IMPULSE_SEEN for the measurement noise
 SIZE = 107
 
-# Parameters: mass, Ixx, Iyy, Izz, time constant (by their logarithms); delay, torque offset x y z (linear, in units).
+# Parameters: mass, Ixx, Iyy, Izz, time constant (logarithms); delay, torque offset x y z (linear, in units).
 PARAMETERS = 9
 LAG = 4
 DELAY = 5

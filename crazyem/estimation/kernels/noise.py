@@ -1,4 +1,4 @@
-"""What the data say about the noise scales: exact expected Fisher information of their logarithms."""
+"""Exact expected Fisher information of the logarithms of the noise scales."""
 
 import numpy as np
 
@@ -7,16 +7,16 @@ from crazyem.estimation.kernels.algebra import angular_acceleration, apply, appl
 
 SCALES = 11  # intensities of six impulses; standard deviations of five groups of measurements
 ACCELEROMETER = 10
-WIDTH = 12  # of the arrays that hold a number for each scale, which fill vector registers
-TERMS = 144 + 12  # of a sample in the sum: each measurement's gain, and its innovation's variance
+WIDTH = 12  # of arrays with a number for each scale: one more than the scales, to fill vector registers
+TERMS = 144 + 12  # terms of a sample in the sum: gains (12 each) and innovation variances of 12 measurements
 
 
 @compiled
 def _before_measurements(big, gain, s, after):
-    """Information of innovations about the error of the state, taken back over the measurements of one sample.
+    """Carry the information of later innovations on the state back over the measurements of one sample.
 
-    big (12, 12): from what follows the sample's last measurement to what follows its prediction; after[i] receives
-    what follows measurement i.
+    big (12, 12): on entry the information of all innovations after the sample's last measurement, on return of all
+    after its prediction. after[i] receives the information of all innovations after measurement i.
     """
     column = np.empty(12)
     for i in range(11, -1, -1):
@@ -39,7 +39,7 @@ def _before_measurements(big, gain, s, after):
 
 @compiled
 def _later_information(first, last, time, kind, lead, gain, s, blocks):
-    """Information (n, 12, 12) of all innovations after each sample about the error of its filtered state."""
+    """Information (n, 12, 12) of all innovations after each sample on the error of its filtered state."""
     later = np.zeros((last - first, 12, 12))
     after = np.empty((12, 12, 12))
     big = np.zeros((12, 12))
@@ -47,7 +47,7 @@ def _later_information(first, last, time, kind, lead, gain, s, blocks):
     tra = np.empty((12, 12))
     for k in range(last - 1, first, -1):
         if kind[k] == 1:
-            continue  # the state starts anew: nothing later knows of what was before
+            continue  # a break: later innovations do not depend on the state before it
         for i in range(12):
             for j in range(12):
                 big[i, j] = later[k - first, i, j]
@@ -63,22 +63,22 @@ def _later_information(first, last, time, kind, lead, gain, s, blocks):
 
 @compiled
 def _step_noise(dt, h, bridge, force, middle, jr, q, r_force, big, half, info):
-    """Adds the noise of a step to the derivatives of the covariance, and what an accelerometer says of it to info.
+    """Add the noise of a step to the derivatives of the covariance, and the accelerometer's information to info.
 
-    half (12, 12, WIDTH) and its transpose add up to the derivatives; big (12, 12) is the information of all that
-    follows about the error of the predicted state.
+    The derivatives are half (12, 12, WIDTH) plus its transpose. big (12, 12) is the information of all later
+    innovations on the error of the predicted state.
     """
     fast = np.empty(3)
     g = np.empty(6)
     for c in range(6):
-        # impulse c moves velocity and position, or rate and attitude
+        # impulse c changes velocity and position, or rate and attitude
         at = 0 if c < 3 else 6
         for j in range(3):
             v = middle[j, c] if c < 3 else jr[j, c - 3]
             fast[j] = v
             g[j] = h * v
             g[3 + j] = v if c < 3 else (1.0 if j == c - 3 else 0.0)
-        share = 0.0  # of the impulse's variance, known from the accelerometer
+        share = 0.0  # share of the impulse's variance that the accelerometer determines
         if c < 3 and not np.isnan(force[c]):
             var = q[c] / dt + r_force
             share = q[c] / dt / var
@@ -104,13 +104,13 @@ def _step_noise(dt, h, bridge, force, middle, jr, q, r_force, big, half, info):
 
 @compiled
 def _seen_later(big, dk, left, right, at):
-    """Puts dK (12, WIDTH) into right[:, at:at+12] and big dK, what later innovations see of it, into left."""
+    """Put dK (12, WIDTH) into right[:, at:at+12], and big dK, its effect on later innovations, into left."""
     x = np.empty(WIDTH)
     for j in range(12):
         row = big[j]
         for a in range(WIDTH):
             x[a] = 0.0
-        for m in range(0, 12, 4):  # by hand, as the compiler keeps x in memory otherwise
+        for m in range(0, 12, 4):  # unrolled by hand; otherwise the compiler keeps x in memory
             c0, c1, c2, c3 = row[m], row[m + 1], row[m + 2], row[m + 3]
             for a in range(WIDTH):
                 x[a] += c0 * dk[m, a] + c1 * dk[m + 1, a] + c2 * dk[m + 2, a] + c3 * dk[m + 3, a]
@@ -121,11 +121,11 @@ def _seen_later(big, dk, left, right, at):
 
 @compiled
 def _measurements(counts, r, gain, s, after, half, flat, left, right):
-    """Takes the derivatives of the covariance over the measurements of one sample.
+    """Carry the derivatives of the covariance over the measurements of one sample.
 
-    half (12, 12, WIDTH) as in `_step_noise`, flat (12, 12 WIDTH) a view of it; after[i] (12, 12) is the information of
-    all that follows measurement i.
-    left, right (SCALES, TERMS) receive the factors whose product is the information of the sample.
+    half (12, 12, WIDTH) as in `_step_noise`, flat (12, 12 WIDTH) is a view of it. after[i] (12, 12) is the information
+    of all innovations after measurement i. left, right (SCALES, TERMS) receive the factors whose product is the
+    information of the sample.
     """
     dk = np.empty((12, WIDTH))
     ds = np.empty(WIDTH)
@@ -154,7 +154,7 @@ def _measurements(counts, r, gain, s, after, half, flat, left, right):
             for a in range(SCALES):
                 left[a, 144 + i] = 0.5 * ds[a] * inv
                 right[a, 144 + i] = ds[a] * inv
-        # derivative of P - K S K': dP - v K' - K v' with v = dP e - K dS / 2; the half takes one of the two
+        # derivative of P - K S K': dP - v K' - K v' with v = dP e - K dS / 2; `half` takes one of the last two terms
         for j in range(12):
             c = g[j]
             for m in range(12 * WIDTH):
@@ -163,7 +163,7 @@ def _measurements(counts, r, gain, s, after, half, flat, left, right):
 
 @compiled
 def _predict_half(block, dt, h, half, flat, turned):
-    """The derivatives through one step: A half A'; flat is half as a matrix, turned is scratch."""
+    """Carry the derivatives over one step: A half A'; flat is half as a matrix, turned is scratch."""
     apply(block, dt, h, flat, turned)
     for i in range(12):
         for j in range(12):
@@ -206,23 +206,23 @@ def noise_information(first, last, time, kind, usable, force, torque, inertia, i
         I_ab = sum over t of  d_a(log S_t) d_b(log S_t) / 2 + E[d_a(e_t) d_b(e_t)] / S_t
 
     The first part needs the derivative of the covariance, which is carried along the filter for each scale. The second
-    is there because a wrong scale gives wrong gains and so innovations that are correlated in time; in a steady filter
-    it is the larger one. A gain that is off by dK puts dK e_t into the state, E[e_t^2] = S_t, and what later
-    innovations see of it is given by the information matrix of the smoother: no sensitivity needs to be carried.
+    part exists because a wrong scale gives wrong gains, and so innovations that are correlated in time. In a steady
+    filter the second part is larger. A gain that is wrong by dK adds dK e_t to the state, with E[e_t^2] = S_t. The
+    information matrix of the smoother gives its effect on later innovations, so no sensitivity is carried.
 
-    The window must have been filtered with the present parameters from the prior at `first`, of which the scales do
-    not count as a part. Mean and scales carry no information about each other (Gaussian), so this stands beside
-    `sensitivities`. Left out are the derivatives of the Jacobians. Steps that are not usable pass on what is known,
-    but their own noise counts nothing, as in the statistics of `backward`.
+    The window must have been filtered with the present parameters from the prior at `first`, which does not depend on
+    the scales. Mean and scales carry no information about each other (Gaussian), so this matrix is independent of
+    `sensitivities`. Derivatives of the Jacobians are left out. Steps that are not usable pass on information, but their
+    own noise does not count, as in the statistics of `backward`.
 
     Returns:
-        (11, 11) symmetric; rows and columns of scales that nothing was measured about are zero.
+        (11, 11) symmetric; rows and columns of scales without measurements are zero.
     """
     info = np.zeros((SCALES, SCALES))
     left = np.zeros((SCALES, TERMS))
     right = np.zeros((SCALES, TERMS))
     later = _later_information(first, last, time, kind, lead, gain, s, blocks)
-    half = np.zeros((12, 12, WIDTH))  # with its transpose the derivative of the covariance by each of the scales
+    half = np.zeros((12, 12, WIDTH))  # plus its transpose: the derivative of the covariance by each scale
     flat = half.reshape(12, 12 * WIDTH)
     turned = np.empty((12, 12 * WIDTH))
     after = np.empty((12, 12, 12))

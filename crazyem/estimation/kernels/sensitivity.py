@@ -1,4 +1,4 @@
-"""Derivatives of the innovations by the parameters: score and Fisher information."""
+"""Derivatives of the innovations by the parameters, and from these score and Fisher information."""
 
 import numpy as np
 
@@ -10,10 +10,10 @@ from crazyem.estimation.kernels.layout import DELAY, LAG, OFFSET, PARAMETERS
 @compiled
 def _push(k, dt, h, w, thrust, torque, thrust_tau, torque_tau, thrust_delay, torque_delay, theta, unit, inertia,
           inverse, middle, rest, model, alpha, d):  # fmt: skip
-    """Add to d (12, at least 9) what the parameters change in step k itself.
+    """Add to d (12, at least 9) the direct effect of the parameters in step k.
 
-    model (3,) receives the derivatives of F/m by mass, lag and delay; `rest` is the share of F/m that acts (where the
-    specific force is measured, the model moves only the rest). alpha (3,) is scratch.
+    model (3,) receives the derivatives of F/m by mass, lag and delay. `rest` is the weight of F/m in the specific force
+    of the step: 1, or less where the specific force is measured. alpha (3,) is scratch.
     """
     angular_acceleration(w, torque[k], inertia, inverse, alpha)
     model[0] = -thrust[k] / theta[0]
@@ -49,7 +49,7 @@ def _push(k, dt, h, w, thrust, torque, thrust_tau, torque_tau, thrust_delay, tor
 
 @compiled
 def _correct(d, i, gain, row):
-    """Take the measurement of component i into the sensitivities d (12, columns): d - gain d_i; `row` is scratch."""
+    """Update the sensitivities d (12, columns) by the measurement of component i: d - gain d_i; `row` is scratch."""
     for a in range(d.shape[1]):
         row[a] = d[i, a]
     for j in range(12):
@@ -61,10 +61,10 @@ def _correct(d, i, gain, row):
 def sensitivities(first, last, time, kind, usable, force, thrust, torque, thrust_tau, torque_tau, thrust_delay,
                   torque_delay, theta, unit, inertia, inverse, q, r_force, lead, xf, gain, s, e, blocks, middle,
                   score):  # fmt: skip
-    """Derivatives of the innovations with respect to the nine parameters (logarithms, units).
+    """Information and score of the nine parameters (logarithms, units) by derivatives of the innovations.
 
-    With the noise intensities in units of acceleration as free nuisance parameters the gains do not depend on these
-    (up to the state-dependence of the Jacobian), so each sensitivity is a 12-vector carried along the filter.
+    The noise intensities are free nuisances in units of acceleration. So the gains do not depend on the nine parameters
+    (except through the state in the Jacobian), and each sensitivity is a 12-vector carried along the filter.
 
     Returns:
         Fisher information (9, 9); `score` (n, 9) receives each sample's contribution to the score.
@@ -120,10 +120,10 @@ def sensitivities(first, last, time, kind, usable, force, thrust, torque, thrust
 def torque_sensitivities(first, last, time, kind, usable, force, thrust, torque, thrust_tau, torque_tau, thrust_delay,
                          torque_delay, theta, unit, inertia, inverse, q, r_force, lead, xf, gain, s, e, blocks, middle,
                          shapes):  # fmt: skip
-    """The same for torques of known shape and unknown size: shapes (n, 3, K) [N m for a size of one].
+    """Information and score of the sizes of K torques with known shapes (n, 3, K) [N m for a size of one].
 
     Returns:
-        Information between the parameters and the sizes (9, K), among the sizes (K, K), and the score of these (K,).
+        Information between the parameters and the sizes (9, K), among the sizes (K, K), score of the sizes (K,).
     """
     sizes = shapes.shape[2]
     columns = PARAMETERS + sizes

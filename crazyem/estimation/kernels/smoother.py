@@ -33,11 +33,11 @@ def outer(out, base, z, n, weight):
 def backward(first, last, time, kind, usable, force, thrust, torque, thrust_tau, torque_tau, thrust_delay,
              torque_delay, tau, delay, offset, mass, inertia, inverse, q, r, r_force, lead, xf, pf, gain, s, e, blocks,
              middle, stats, moments):  # fmt: skip
-    """Smoother over samples last-1 down to first, information beyond `last` being none; fills statistics rows.
+    """Smoother over samples last-1 down to first, without information from `last` on; fills statistics rows.
 
     Row k holds the step that ends at k (k > first, not a break, usable) and the measurements at k. `moments` (n, 12)
-    keeps the smoothed means it was made from: specific force (3) m/s^2, angular acceleration (3) rad/s^2, body rate
-    (3) rad/s at the start of the step, and thrust-axis and angular disturbances in acceleration (for diagnostics).
+    receives the smoothed means: specific force (3) m/s^2, angular acceleration (3) rad/s^2, body rate (3) rad/s at the
+    start of the step, and angular disturbances (3) rad/s^2 (for diagnostics).
     """
     lam = np.zeros((12, 1))
     lam2 = np.zeros((12, 1))
@@ -88,7 +88,7 @@ def backward(first, last, time, kind, usable, force, thrust, torque, thrust_tau,
                 big[i, j] -= lk[j]
                 big[j, i] -= lk[j]
             big[i, i] += klk + inv
-        # now lam, big are those before the measurement at k
+        # lam and big are now before the measurement at k
         if kind[k] == 1 or k == first:
             for i in range(12):
                 lam[i, 0] = 0.0
@@ -98,7 +98,8 @@ def backward(first, last, time, kind, usable, force, thrust, torque, thrust_tau,
         dt = time[k] - time[k - 1]
         h = lead * dt
         b = blocks[k]
-        # smoothed impulse: its mean given the accelerometer -Q G' lam, variance Q - Q G' big G Q, Q what that left
+        # smoothed impulse, Q its variance given the accelerometer: mean given the accelerometer less Q G' lam,
+        # variance Q - Q G' big G Q
         model[2] = thrust[k] / mass
         specific_force(model, force[k], q, dt, r_force, known, left)
         w = xf[k - 1, 10:13]
@@ -111,7 +112,7 @@ def backward(first, last, time, kind, usable, force, thrust, torque, thrust_tau,
             for j in range(3):
                 l3[i, j] = big[3 + i, 3 + j] + h * (big[i, 3 + j] + big[3 + i, j]) + h * h * big[i, j]
         for i in range(3):
-            # impulse i moves velocity along m and position by h m; impulse 3 + i rate i and attitude by h times turned
+            # impulse i changes velocity by m and position by h m; impulse 3 + i changes rate i by 1 and attitude by h t
             slow, both, slow2, both2 = 0.0, 0.0, 0.0, 0.0
             turned, cross, turned2 = 0.0, 0.0, 0.0
             for j in range(3):
@@ -179,7 +180,7 @@ def backward(first, last, time, kind, usable, force, thrust, torque, thrust_tau,
             m = (i + 2) % 3
             z[0] = mom[3 + i]
             z[1] = rate[j] * rate[m]
-            # torque that the (fixed) products of inertia take: known part, counted with the input
+            # torque of the (fixed) products of inertia: a known part, counted with the input
             taken = inertia[i, j] * mom[3 + j] + inertia[i, m] * mom[3 + m]
             taken += rate[j] * (inertia[m, i] * rate[i] + inertia[m, j] * rate[j])
             taken -= rate[m] * (inertia[j, i] * rate[i] + inertia[j, m] * rate[m])
@@ -205,7 +206,7 @@ def backward(first, last, time, kind, usable, force, thrust, torque, thrust_tau,
 
 @compiled
 def total(first, last, stats, out):
-    """Sum of statistics rows first..last-1 into out (SIZE,)."""
+    """Sum statistics rows first..last-1 into out (SIZE,)."""
     for i in range(SIZE):
         out[i] = 0.0
     for k in range(first, last):
