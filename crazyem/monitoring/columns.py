@@ -1,4 +1,4 @@
-"""Rows of numbers from hypotheses: what each column does to the body and to the sensors in a step of the filter."""
+"""Numerical rows of hypotheses: effect of each column on body and sensors in each step of the filter."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ from crazyem.monitoring import hypotheses as h
 from crazyem.physics.rotors import PITCH_SIGN, ROLL_SIGN, YAW_SIGN
 from crazyem.vehicle import Vehicle
 
-# Standard deviation of the drag over mass that a vehicle file does not have [1/s]: that of propellers and frame of a
-# small quadrotor, 3 to 9 mN s/m (Foerster 2015) over 30 g.
+# Standard deviation of the drag over mass [1/s] that is not in a vehicle file: propellers and frame of a small
+# quadrotor, 3 to 9 mN s/m (Foerster 2015) over 30 g.
 DRAG_SD = 0.2
-# That of the delay of what is measured against the commands [s]: a period of the onboard filter.
+# Standard deviation of the delay of measurements against commands [s]: a period of the onboard filter.
 DELAY_SD = 0.01
-# Those of the scales of velocities and body rates: an onboard filter that knows no drag errs by 9 cm/s at 1.45 m/s
-# (docs: controller_parameters.md); a gyro's tolerance (BMI088: sensitivity within 1 %, and 1 % with temperature).
+# Standard deviations of the scales of velocities (an onboard filter that knows no drag has an error of 9 cm/s at
+# 1.45 m/s, docs: controller_parameters.md) and of body rates (BMI088: sensitivity within 1 %, 1 % with temperature).
 VELOCITY_SCALE_SD, RATE_SCALE_SD = 0.06, 0.02
 NUISANCES = 18  # parameters of the estimator, drag along x, y, z, delays of the four measured quantities, two scales
 
@@ -28,10 +28,10 @@ class Columns:
     """The columns of all hypotheses side by side, and the nuisances.
 
     Attributes:
-        columns: (C,), those of one hypothesis next to each other.
+        columns: (C,), columns of one hypothesis next to each other.
         first: (H + 1,) index of the first column of each hypothesis.
-        block: (C,) first column of the hypothesis that a column belongs to.
-        sd: (C,) of the priors of the sizes.
+        block: (C,) index of the first column of the same hypothesis.
+        sd: (C,) standard deviations of the priors of the sizes.
         once: (C,) whether a column acts in the first step only.
     """
 
@@ -43,7 +43,7 @@ class Columns:
 
     @classmethod
     def of(cls, hypotheses: Sequence[h.Hypothesis]) -> "Columns":
-        """Side by side, in the order of the hypotheses."""
+        """The columns of hypotheses, in their order."""
         columns = tuple(c for hypothesis in hypotheses for c in hypothesis.columns)
         first = np.cumsum([0, *(len(hypothesis.columns) for hypothesis in hypotheses)])
         block = np.repeat(first[:-1], np.diff(first))
@@ -52,13 +52,13 @@ class Columns:
 
 
 def mixing(vehicle: Vehicle) -> NDArray[np.float64]:
-    """(4, 4) from the thrusts of the rotors [N] to F [N] and M [N m]."""
+    """Matrix (4, 4) from the thrusts of the rotors [N] to F [N] and M [N m]."""
     x, y = vehicle.arm
     return np.stack([np.ones(4), y * ROLL_SIGN, x * PITCH_SIGN, vehicle.torque_per_thrust * YAW_SIGN])
 
 
 class RowMaker:
-    """Makes the rows of a vehicle's columns.
+    """Computes the rows of columns and nuisances for a vehicle.
 
     Args:
         columns: of the hypotheses. vehicle: its geometry.
@@ -72,12 +72,12 @@ class RowMaker:
         self._mix = matrix
 
     def rows(self, tape: Tape, p: Parameters, first: int, last: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What the columns do in the steps that end at rows first..last-1.
+        """Effect of the columns in the steps that end at rows first..last-1.
 
         Returns:
             acting (n, C, 6): specific force [m/s^2] and angular acceleration [rad/s^2], body axes, for a size of one;
-            of columns that act once: changes of velocity [m/s] and rate [rad/s]. sensed (n, C, 12): what is added to
-            the measured position [m], velocity [m/s], attitude [rad, body] and body rate [rad/s].
+            for columns that act once: changes of velocity [m/s] and rate [rad/s]. sensed (n, C, 12): additions to the
+            measured position [m], velocity [m/s], attitude [rad, body] and body rate [rad/s].
         """
         n, size = last - first, len(self.columns.columns)
         acting, sensed = np.zeros((n, size, 6)), np.zeros((n, size, 12))
@@ -97,7 +97,7 @@ class RowMaker:
                 acting[:, c, 3:] = -wrench[:, 1:] @ inverse.T
             elif kind == h.MASS:
                 acting[:, c, 2] = -force / mass**2
-            elif kind == h.CENTRE:  # thrust acts at minus the centre of mass from it: torque (-y F, x F, 0)
+            elif kind == h.CENTRE:  # from a centre of mass at (x, y), thrust acts at (-x, -y): torque (-y F, x F, 0)
                 acting[:, c, 3:] = (force if i == 0 else -force)[:, None] * inverse[:, 1 - i]
             elif kind == h.FORCE:
                 acting[:, c, :3] = turn[:, i, :] / mass
@@ -118,10 +118,11 @@ class RowMaker:
     def nuisances(
         self, tape: Tape, p: Parameters, unit: NDArray[np.float64], first: int, last: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Acting (n, M, 6), sensed (n, M, 12), as `rows`, of what the model may be wrong in without a change.
+        """Effect of the nuisances, errors of the model without a change: acting (n, M, 6), sensed (n, M, 12) as `rows`.
 
-        The nine parameters of the estimator as it takes them (logarithms, and units of the linear ones), drag along x,
-        y, z [1/s], delays of position, velocity, attitude and rate [s], scales of velocity and rate.
+        The nuisances are the nine parameters in the coordinates of the estimator (logarithms, units of the linear
+        ones), drag along x, y, z [1/s], delays of position, velocity, attitude and rate [s], scales of velocity and
+        rate.
         """
         acting = np.zeros((last - first, NUISANCES, 6))
         sensed = np.zeros((last - first, NUISANCES, 12))
@@ -157,7 +158,7 @@ class RowMaker:
         return acting, sensed
 
     def drifting(self, tape: Tape, p: Parameters, reference: Parameters, first: int, last: int) -> NDArray[np.float64]:
-        """(n, 1, 6) accelerations by parameters `p` (those on the tape), less those by `reference`."""
+        """Accelerations (n, 1, 6) with parameters `p` (those of the tape), less those with `reference`."""
         out = np.zeros((last - first, 1, 6))
         if p is reference:
             return out
@@ -175,6 +176,6 @@ class RowMaker:
 
     @staticmethod
     def precision(sd: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(M,) precisions of the nuisances, from the standard deviations (9,) of the estimator's parameters."""
+        """Prior precisions (M,) of the nuisances; sd: (9,) standard deviations of the estimator's parameters."""
         own = np.repeat([DRAG_SD, DELAY_SD, VELOCITY_SCALE_SD, RATE_SCALE_SD], [3, 4, 1, 1])
         return np.concatenate([np.maximum(sd, 1e-6), own]) ** -2.0

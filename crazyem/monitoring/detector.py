@@ -1,10 +1,10 @@
-"""The running tests: windows of several lengths, each hypothesis in each; a change is named by its posterior.
+"""The running tests: every hypothesis in windows of several lengths; the posterior names a change.
 
-A window opens every `SPACING` s and is kept while it is one of the newest few or its number is divisible by a power of
-two, so that their lengths grow geometrically up to `LONGEST`. Statistics of each hypothesis and length are divided by
-their own scale without a change: a model that errs makes them larger than the theory of white innovations says. That
-scale is known from finitely many windows, so the statistic is a Student's rather than a normal one. All scales that a
-window uses are those from before it opened, and those of slow errors are from before the longest window opened.
+A window opens every `SPACING` s. It is kept while it is one of the newest few or its number is divisible by a power of
+two, so the lengths grow geometrically up to `LONGEST`. The statistic of each hypothesis and length is divided by its
+own scale without a change, because model errors make it larger than the theory of white innovations predicts. The scale
+comes from a finite number of windows, so the statistic has a Student's distribution, not a normal one. A window uses
+scales from before it opened, and parameters of slow errors from before the longest window opened.
 """
 
 import math
@@ -28,33 +28,33 @@ from crazyem.vehicle import Vehicle
 SPACING = 0.04  # s between openings of windows
 LEVELS = 5  # windows are up to 4 * 2^4 openings long
 LONGEST = 4 * 2 ** (LEVELS - 1)
-WINDOWS = 32  # room for windows
-ROWS_A_SECOND = 100.0  # of a log, for the threshold
-COVARIANCE_MEMORY = 20.0  # s, of the covariances of innovations
-SCALE_MEMORY = 60.0  # s, of the running means of the statistics
-CLIPPED = 4.0  # standard deviations as which a larger innovation counts there, and so the root of a statistic
-LEARNING, REFERENCE = 8.0, 2.0  # s in the air in which estimator and scales learn, untested; s that parameters stay
-# The scale before the flight, and s of flight that it counts as: above the geometric mean of undisturbed development
-# flights, 1.1. The standard deviation of the logarithm, 0.3, gives its degrees of freedom (2 / 0.3^2).
+WINDOWS = 32  # capacity for windows
+ROWS_A_SECOND = 100.0  # rate of a log, for the threshold
+COVARIANCE_MEMORY = 20.0  # s, time constant of the covariances of innovations
+SCALE_MEMORY = 60.0  # s, time constant of the running means of the statistics
+CLIPPED = 4.0  # standard deviations; limit of innovations and of the root of a statistic in these means
+LEARNING, REFERENCE = 8.0, 2.0  # s of flight without tests, for estimator and scales; s between reference parameters
+# Prior of the scale: its value, its weight in s of flight, its degrees of freedom. Undisturbed flights have a geometric
+# mean of 1.1 (the prior is above), and a standard deviation of the logarithm of 0.3, so 2 / 0.3^2 degrees of freedom.
 SCALE_BEFORE, SCALE_WEIGHT, SCALE_FREEDOM = 1.5, 30.0, 30.0
-REGIME = 0.25  # s of flight that add another degree of freedom, at least
-SETTLED = 1.0  # s after the onset when the size is reported again
-LEAST_SETTLING = 0.3  # s after it was found, at least
-NEAR_ONSET = 0.2  # s by which the onset may still move
-SIGNATURE_ERROR = 0.1  # by which signatures may be wrong, relative: parameters are known to some per cent
-CLEAR, UNCLEAR = 0.95, 0.2  # probability at which a change is reported; s after which it is reported anyway
-RULED_OUT = 0.05  # probability under which a hypothesis is no look-alike
+REGIME = 0.25  # s, least time of flight for one more degree of freedom
+SETTLED = 1.0  # s after the onset, time of the second report
+LEAST_SETTLING = 0.3  # s after the detection, earliest time of the second report
+NEAR_ONSET = 0.2  # s, largest change of the onset after the detection
+SIGNATURE_ERROR = 0.1  # relative error of signatures, as parameters are known within some per cent
+CLEAR, UNCLEAR = 0.95, 0.2  # probability from which a change is reported; s after which it is reported anyway
+RULED_OUT = 0.05  # probability below which a hypothesis is no look-alike
 
 
 class Detector:
-    """Takes filtered rows of the tape, says what changed. The same rows give the same answers.
+    """Takes filtered rows of the tape and reports changes; the same rows give the same reports.
 
     Args:
         vehicle: its geometry. false_alarms_per_hour: of all hypotheses together.
-        hypotheses: what may change; None: `hypotheses_for`.
+        hypotheses: possible changes; None: `hypotheses_for`.
 
     Attributes:
-        holds: whether the model holds: nothing changed, or it was found again.
+        holds: whether the model holds; False from a detection until the restarted tests are below their thresholds.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Detector:
         self.score = np.zeros((WINDOWS, size))
         self.among, self.cross = np.zeros((WINDOWS, size, size)), np.zeros((WINDOWS, size, NUISANCES))
         self.score_n, self.among_n = np.zeros(NUISANCES), np.zeros((NUISANCES, NUISANCES))
-        self.score_n_of = np.zeros((WINDOWS, NUISANCES))  # as it was when a window opened
+        self.score_n_of = np.zeros((WINDOWS, NUISANCES))  # score_n when a window opened
         self.among_n_of = np.zeros((WINDOWS, NUISANCES, NUISANCES))
         self.drift = np.zeros((12, 1))
         self.n, self.n_slow, self.n_now = (np.zeros((12, NUISANCES)) for _ in range(3))
@@ -98,11 +98,11 @@ class Detector:
         # running means of the first three powers of the statistics
         self.moments = np.stack([d * before, d * (d + 2) * before**2, d * (d + 2) * (d + 4) * before**3])
         self.scale = np.full((LEVELS, count), SCALE_BEFORE)
-        self.known = np.zeros(LEVELS)  # s over which it was taken
-        self.scale_of = np.full((WINDOWS, LEVELS, count), SCALE_BEFORE)  # as it was when a window opened
+        self.known = np.zeros(LEVELS)  # s of flight in the scale
+        self.scale_of = np.full((WINDOWS, LEVELS, count), SCALE_BEFORE)  # scale when a window opened
         self.known_of = np.zeros((WINDOWS, LEVELS))
         self.holds = True
-        self._reference: Any = (-math.inf, None, None)  # since when, parameters, their standard deviations
+        self._reference: Any = (-math.inf, None, None)  # start time, parameters, their standard deviations
         self._restart(-math.inf)
 
     def _restart(self, time: float) -> None:
@@ -110,14 +110,14 @@ class Detector:
         self._count = 0
         self._since = time
         self._newest = -math.inf
-        self._found: tuple[float, float] | None = None  # when a change was found, and its onset
+        self._found: tuple[float, float] | None = None  # s, detection and onset of a change
         self._reported = False
         self.drift[:], self.n[:], self.n_slow[:], self.e_slow[:] = 0.0, 0.0, 0.0, 0.0
 
     # rows -------------------------------------------------------------------------------------------------------
 
     def take(self, em: WindowEM, p: Parameters, first: int, last: int, sd: NDArray[np.float64]) -> Fault | None:
-        """Rows first..last-1 of the tape, just filtered for the first time; a report if there is one.
+        """Take rows first..last-1 of the tape, just filtered for the first time; returns a report if there is one.
 
         Args:
             em: its tape and setup. p: the parameters that the rows were filtered with.
@@ -154,7 +154,7 @@ class Detector:
         passed = min(now - self._newest, 1.0) if math.isfinite(self._newest) else SPACING
         self._newest = now
         begun = self._open[0] if self._open else -1
-        kernels.judge(  # without windows too: so it is compiled before a flight
+        kernels.judge(  # also without windows, so that it is compiled before a flight
             slots, self.columns.first, self._prior, self._maker.precision(sd), self.score,
             self.score_n - self.score_n_of[begun], self.among, self.cross, self.among_n - self.among_n_of[begun],
             self.statistic, self.determinant, self.size, self.variance,
@@ -166,16 +166,17 @@ class Detector:
         return report
 
     def _keep_reference(self, now: float, newest: Parameters, sd: NDArray[np.float64]) -> None:
-        """The parameters that innovations are taken by: an estimator that follows a change must not hide it.
+        """Update the reference parameters of the innovations; an estimator that follows a change must not hide it.
 
-        The newest while the estimator still learns, later those of up to `REFERENCE` s ago, or of before a change.
+        They are the newest ones while the estimator learns, then those of up to `REFERENCE` s ago. After a detection
+        they are kept.
         """
         young = now - self._since < LEARNING
         if self._found is None and (young or now - self._reference[0] > REFERENCE):
             self._reference = (now, newest, sd)
 
     def _renew(self, now: float) -> None:
-        """Close the windows that are not kept any more, and open one."""
+        """Close the windows that are no longer kept, and open one."""
         self._count += 1
         keep = []
         for w in self._open:
@@ -194,7 +195,7 @@ class Detector:
     # decisions --------------------------------------------------------------------------------------------------
 
     def _level(self, w: int) -> int:
-        """Which group of lengths a window belongs to: up to 4, 8, 16 ... openings."""
+        """Group of a window by its length: up to 4, 8, 16 ... openings."""
         age = (self._newest - self.opened[w]) / SPACING
         return min(max(math.ceil(math.log2(max(age, 1.0) / 4.0)), 0), LEVELS - 1)
 
@@ -217,10 +218,11 @@ class Detector:
         return self._first(report, now)
 
     def _learn(self, levels: NDArray[np.int64], statistic: NDArray[np.float64], passed: float) -> None:
-        """Running moments of the statistics, by length.
+        """Update the running moments of the statistics and the scales, by length.
 
-        For chi-square times a scale, the first moment over the freedom is the scale, and so is the third over the
-        second and the freedom + 4. Where tails are heavier the latter is larger, and it is the tails that alarm.
+        For chi-square times a scale, with d degrees of freedom, the first moment over d is the scale. The third moment
+        over the second and over d + 4 is the scale, too; with heavier tails it is larger. Tails cause alarms, so the
+        larger value is used.
         """
         d = self.freedom
         for level in range(LEVELS):
@@ -249,7 +251,7 @@ class Detector:
         return report
 
     def _first(self, report: Fault, now: float) -> Fault | None:
-        """The first report, once it is clear enough what it is, or late enough."""
+        """The first report, once the posterior is clear enough or `UNCLEAR` s have passed; else None."""
         assert self._found is not None
         detected, _ = self._found
         if report.probability < CLEAR and now - detected < UNCLEAR:
@@ -267,10 +269,10 @@ class Detector:
         *,
         settled: bool,
     ) -> Fault:
-        """The most probable hypothesis and onset. Every signature may be wrong by `SIGNATURE_ERROR`.
+        """Report of the most probable hypothesis and onset. Every signature has an error of `SIGNATURE_ERROR`.
 
-        A hypothesis in a window counts with its own scale there, or that of the test that alarmed where that is larger.
-        The settled report keeps to onsets near the first.
+        A statistic is divided by its own scale in the window, or by the scale of the test with the largest ratio if
+        that is larger. After the detection, only windows near the onset count.
         """
         near = np.ones(len(slots), bool)
         if self._found is not None:

@@ -1,4 +1,4 @@
-"""What the monitor reports: a change in flight with its size, its onset, its probability and its look-alikes."""
+"""Reports of the monitor: a change in flight with its size, onset, probability and look-alikes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ class Size:
 
 @dataclass(frozen=True)
 class Fault:
-    """A change that the monitor found. It is reported when it is found, and once more when its size is settled.
+    """A change that the monitor found; reported at the detection, and again with its final size.
 
     Attributes:
-        effect: name of the hypothesis. rotor: 1 to 4, or None. text: for a person.
-        onset: s on the drone's clock, when the change began. detected: s, when the test passed its threshold.
+        effect: name of the hypothesis. rotor: 1 to 4, or None. text: words for people.
+        onset: s on the drone's clock, start of the change. detected: s, when the test passed its threshold.
         sizes: label -> size.
-        probability: among the hypotheses, all equally probable before.
-        look_alikes: name -> probability of the others that are not ruled out.
+        probability: posterior probability among the hypotheses, with equal priors.
+        look_alikes: name -> probability of other hypotheses that are not ruled out.
         settled: whether this is the second report.
-        followed: whether it may be a change that the estimator follows by itself.
+        followed: whether it may be a change to which the estimator adapts by itself.
     """
 
     effect: str
@@ -45,7 +45,7 @@ class Fault:
         return self.effect if self.rotor is None else f"{self.effect} {self.rotor}"
 
     def to_json(self) -> dict[str, Any]:
-        """For recordings and programs (an interface: names are fixed)."""
+        """Form for recordings and programs (an interface: names are fixed)."""
         return {
             "effect": self.effect,
             "rotor": self.rotor,

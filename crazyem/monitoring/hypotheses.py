@@ -1,8 +1,7 @@
-"""What may change in flight, as data: columns (what a change of size one does), and hypotheses (columns that go along).
+"""Possible changes in flight, as data: columns (effect of a change of size one) and hypotheses (groups of columns).
 
-The detector knows no names: it reads these tables. Names of hypotheses are those of the catalogue of effects
-(docs: effects.md) where the catalogue has the effect. A column acts on the body (force, torque), or on what a sensor
-says, or kicks the body once.
+The detector reads these tables and knows no names. If the catalogue (docs: effects.md) has the effect, the hypothesis
+has its name. A column acts on the body (force, torque), on a sensor, or as a single impulse on the body.
 """
 
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from crazyem.physics.effects.mass_properties import PAYLOAD
 from crazyem.physics.effects.rotors import ROTOR_FAULT, THRUST_SCALE, TRIM
 from crazyem.vehicle import Vehicle
 
-# Kinds of column; the second number of a column is the axis, or the rotor.
+# Kinds of column; the second number of a column is its axis or rotor.
 ROTOR, MASS, CENTRE, THRUST, FORCE, TORQUE, KICK, TURN = range(8)  # acts on the body
 POSITION, VELOCITY, ATTITUDE, RATE, VELOCITY_SCALE, RATE_SCALE = range(8, 14)  # acts on a sensor
 ONCE = (KICK, TURN)
@@ -24,9 +23,9 @@ class Column:
     """A change of size one.
 
     Attributes:
-        kind, index: which, and its axis (0 to 2: x, y, z) or rotor (0 to 3).
+        kind, index: kind of column, and its axis (0 to 2: x, y, z) or rotor (0 to 3).
         label: of the size in a report. unit: of the size.
-        sd: standard deviation of the prior of the size, in that unit: what such a change usually is.
+        sd: standard deviation of the prior of the size, in this unit: a typical size of the change.
     """
 
     kind: int
@@ -38,11 +37,11 @@ class Column:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Something that may change, with the columns that change together; all are equally probable before the flight.
+    """A possible change, with the columns that change together; all hypotheses have the same prior probability.
 
     Attributes:
-        effect: name; rotor: 1 to 4, or None. text: for a person.
-        followed: whether the estimator begins anew by itself and finds the new value: pushing need not stop.
+        effect: name; rotor: 1 to 4, or None. text: words for people.
+        followed: whether the estimator restarts by itself and finds the new value, so that pushes need not stop.
     """
 
     effect: str
@@ -62,10 +61,10 @@ def _axes(kind: int, labels: str, unit: str, sd: float) -> tuple[Column, ...]:
 
 
 def hypotheses_for(vehicle: Vehicle) -> tuple[Hypothesis, ...]:
-    """What may change on this vehicle. Rotors only where its file says where they are.
+    """Hypotheses for a vehicle; faults of single rotors only if its file contains the rotor geometry.
 
-    The priors of sizes are those of changes that a pilot would want to know of: a third of a rotor's thrust, a fifth
-    of the mass, wind that leans a drone by some degrees, sensors off by ten times their noise.
+    The priors of sizes are those of changes that matter to a pilot: a third of a rotor's thrust, a fifth of the mass,
+    a wind that tilts the drone by some degrees, sensor errors of ten times their noise.
     """
     weight = vehicle.mass * 9.81
     arm = max(vehicle.arm) or 0.05

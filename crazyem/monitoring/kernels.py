@@ -1,9 +1,9 @@
-"""Compiled inner loops of the monitor: signatures along the filter, their scores and information, and what they say.
+"""Compiled inner loops of the monitor: signatures along the filter, their scores and information, test statistics.
 
-A change at the onset t0 moves what the filter does not know by d: d <- Phi d + B, and after each scalar measurement
-d <- d - gain (d_i + m_i), where m is what a sensor adds. The innovation moves by g = d_i + m_i (Willsky and Jones
-1976). Innovations are taken in their standard deviations. What a slow error predicts of them (slow_error.py) is taken
-off, of the signatures likewise.
+A change at the onset t0 gives the filter's state an error d: d <- Phi d + B in each step, and d <- d - gain (d_i + m_i)
+after each scalar measurement, where m is an error of the sensor. The innovation changes by g = d_i + m_i, the signature
+(Willsky and Jones 1976). The unit of innovations is their standard deviation. The predicted slow error (slow_error.py)
+is subtracted from innovations, and likewise from signatures.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from crazyem.estimation.kernels.algebra import apply
 
 @compiled
 def _step(d, scratch, blocks, dt, h, middle, acting, act, once, new):
-    """Carry d (12, C) over one step; `act` says whether anything acts, `new` whether it is the first step."""
+    """Carry d (12, C) over one step; act: whether changes act in it; new: whether it is the first step of a window."""
     apply(blocks, dt, h, d, scratch)
     size = d.shape[1]
     for i in range(12):
@@ -42,17 +42,17 @@ def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, 
            drift, once, block,
            slots, rows, slow, d, d_slow, n, n_slow, n_now, e_slow, e_now, score, score_n, among, cross,
            among_n):  # fmt: skip
-    """Take rows first..last-1 of the tape into every open window.
+    """Add rows first..last-1 of the tape to the sums of every open window.
 
     Args:
         acting (k, C, 6), sensed (k, C, 12), acting_n (k, M, 6), sensed_n (k, M, 12): see `RowMaker`; once, block: see
             `Columns`.
-        drifting (k, 1, 6): what the model's accelerations have changed by since its reference. drift: (12, 1) what the
-            filter does therefore, so that innovations are those of the reference.
-        slots: (w,) which windows are open. rows: (W,) rows that each has seen, counted on.
-        slow: (3, 12) of the slow errors: decay, gain, 1 over the standard deviation of what they leave.
-        d, d_slow: (W, 12, C) signatures, and what is predicted of them; n, n_slow: (12, M) the same of nuisances.
-        e_slow: (12,) what is predicted of the innovations. n_now, e_now: room for what is left.
+        drifting (k, 1, 6): changes of the model's accelerations since its reference. drift: (12, 1) their effect on the
+            filter's state; with it, innovations are corrected to those of the reference.
+        slots: (w,) indices of the open windows. rows: (W,) number of rows in each, updated.
+        slow: (3, 12) of the slow errors: decay, gain, 1 over the standard deviation of the rest.
+        d, d_slow: (W, 12, C) state errors by changes, and predicted signatures; n, n_slow: (12, M) those of nuisances.
+        e_slow: (12,) prediction of the innovations. n_now, e_now: scratch for the rest.
         score (W, C), among (W, C, C) within hypotheses, cross (W, C, M), score_n (M,), among_n (M, M): sums.
     """
     size, nuisances = d.shape[2], n.shape[1]
@@ -133,8 +133,8 @@ def absorb(first, last, lead, time, usable, gain, s, e, blocks, middle, acting, 
 def correlate(first, last, time, s, e, memory, most, lags, past, seen, moments):
     """Running covariances of the normalised innovations: moments (1 + L, 12), at lag 0 and at `lags` (L,) samples.
 
-    `memory` s is their time constant; a value beyond `most` standard deviations counts as that. past (R, 12) and seen
-    (12,) keep the newest samples of each signal.
+    `memory` [s] is their time constant. Values are limited to `most` standard deviations. past (R, 12) and seen (12,)
+    hold the newest samples of each signal and their number.
     """
     room = past.shape[0]
     for k in range(first, last):
@@ -154,7 +154,7 @@ def correlate(first, last, time, s, e, memory, most, lags, past, seen, moments):
 
 @compiled
 def _factor(m, size):
-    """Cholesky factor of the lower triangle of m (size, size), in place; False where it is not positive definite."""
+    """Cholesky factor of the lower triangle of m (size, size), in place; False if m is not positive definite."""
     for j in range(size):
         v = m[j, j]
         for k in range(j):
@@ -173,14 +173,14 @@ def _factor(m, size):
 @compiled
 def judge(slots, first, prior, prior_n, score, score_n, among, cross, among_n, statistic, determinant, size,
           variance):  # fmt: skip
-    """What every open window says of every hypothesis, the nuisances integrated out.
+    """Test statistics of every hypothesis in every open window, with the nuisances integrated out.
 
-    Nuisances act before a change as well as after it: score_n (M,) and among_n (M, M) are those of the oldest window.
+    Nuisances act before and after a change: score_n (M,) and among_n (M, M) are those of the oldest window.
 
     Args:
         first (H + 1,): columns of each hypothesis. prior (C,): precisions of the sizes. prior_n (M,): of the nuisances.
         statistic (W, H): S' (J + prior)^-1 S, twice the logarithm of the likelihood ratio. determinant (W, H): log det
-        (1 + J / prior). size (W, C): most probable sizes, variance (W, C) theirs. Filled for the open windows.
+        (1 + J / prior). size (W, C): most probable sizes, variance (W, C): their variances. Filled for open windows.
     """
     nuisances = prior_n.shape[0]
     columns = prior.shape[0]

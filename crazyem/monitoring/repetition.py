@@ -1,22 +1,22 @@
-"""A signal that sticks: the same values again and again, more often than this signal repeats itself.
+"""Test for a stuck signal: more equal values in a row than usual for this signal.
 
-Logs come in steps, so a signal at rest repeats itself now and then, and a slow one often. Repetitions come in runs,
-because a drone rests for a while: a Markov chain of first order. With the share p of samples that begin a run and the
-share q of repetitions that go on, a run of n has the probability p q^(n - 1). Both are known from the runs so far
-alone, so the expectation over their beta distributions is taken.
+Logged values are discrete, so a signal at rest repeats a value now and then, and a slow signal often does. Repetitions
+come in runs, because a drone rests for a while: a Markov chain of first order. Let p be the share of samples that begin
+a run, and q the share of repetitions that continue. Then a run of n has the probability p q^(n - 1). p and q are known
+only from earlier runs, so the test uses the expectation over their beta distributions.
 """
 
 import math
 
 from crazyem.monitoring.threshold import HOUR
 
-MEMORY = 2000  # samples over which a share is taken
-REPEATED_BEFORE, SEEN_BEFORE = 5.0, 20.0  # repetitions and samples that a share begins with
-LONGEST_GAP = 0.5  # s without a sample after which a run begins anew
+MEMORY = 2000  # samples in the running share
+REPEATED_BEFORE, SEEN_BEFORE = 5.0, 20.0  # prior of a share: repetitions and samples
+LONGEST_GAP = 0.5  # s; a longer time between samples ends a run
 
 
 class _Share:
-    """How often something happened of the times that it could, over the last `MEMORY` times."""
+    """Share of positive trials over about the last `MEMORY` trials."""
 
     def __init__(self) -> None:
         self._happened, self._could = REPEATED_BEFORE, SEEN_BEFORE
@@ -26,13 +26,13 @@ class _Share:
         self._happened, self._could = kept * self._happened + happened, kept * self._could + could
 
     def log_probability(self, times: int) -> float:
-        """Of happening so many times in a row: E[q^n] of a beta distribution."""
+        """Log probability of so many positive trials in a row: log E[q^n] of a beta distribution."""
         a, whole = self._happened, self._could
         return math.lgamma(a + times) - math.lgamma(a) - math.lgamma(whole + times) + math.lgamma(whole)
 
 
 class RunTest:
-    """Of one signal.
+    """Test for a stuck signal, for one signal.
 
     Args:
         false_alarms_per_hour: of this test.
@@ -47,11 +47,11 @@ class RunTest:
         self.alarmed = False
 
     def add(self, time: float, value: tuple[float, ...]) -> bool:
-        """One sample at `time` [s]; True when a run has just become too long for chance."""
+        """Add one sample at `time` [s]; True when a run has just become too long for chance."""
         step = time - self._time
         same = value == self._value and 0.0 < step < LONGEST_GAP
         if not same:
-            # a run that ended was a rest, alarm or not
+            # a run that ended was a rest of the drone, with or without an alarm
             self._begun.add(int(self._run > 0), 1)
             self._continued.add(max(self._run - 1, 0), self._run)
             self._run, self.since, self.alarmed = 0, time, False

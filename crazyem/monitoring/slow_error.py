@@ -1,24 +1,24 @@
-"""Innovations that are not white: white noise, and a slow error of first order below it.
+"""Model of innovations that are not white: white noise plus a slow error of first order.
 
-The log holds the estimate of a filter on board. Its velocities and attitudes err for seconds, so the innovations of the
-estimator go on in one direction. A slow error of variance s^2 that decays by phi a sample, in white noise of variance
-r^2, has the covariance s^2 phi^n at lag n: a near and a far one tell both. A Kalman filter in the steady state predicts
-the slow error.
+The log contains the state estimate of an onboard filter. Errors of its velocities and attitudes last for seconds, so
+the innovations of the estimator are correlated. A slow error of variance s^2 that decays by phi per sample, in white
+noise of variance r^2, has the covariance s^2 phi^n at lag n. A near and a far lag give s^2 and phi. A steady Kalman
+filter predicts the slow error.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-NEAR, FAR = (2, 3, 4, 5), (17, 19, 21, 23)  # lags [samples]: beyond what is left of a step; while it decays
+NEAR, FAR = (2, 3, 4, 5), (17, 19, 21, 23)  # lags [samples]: after other short correlation; during the decay
 LAGS = np.array(NEAR + FAR)
-LEAST, MOST = 0.01, 0.999  # of the covariance at the second lag over that at the first; of decay and share
+LEAST, MOST = 0.01, 0.999  # least ratio of far to near covariance; largest decay, and share of the variance
 
 
 def slow_error(moments: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 12) decay a sample, gain, 1 over the standard deviation of what is left, from covariances (9, 12) at 0, LAGS.
+    """Decay per sample, gain, 1 over sd of the rest, (3, 12), from covariances (9, 12) at lag 0 and LAGS.
 
-    Of an innovation v the filter keeps m <- phi (m + gain (v - m)); v - m is what is left. No signal is taken as surer
-    than the estimator takes it: slow errors grow tenfold from hover to manoeuvres.
+    With an innovation v, the filter updates its prediction by m <- phi (m + gain (v - m)); the rest is v - m. Its
+    standard deviation is at least that of the estimator, because slow errors grow tenfold from hover to manoeuvres.
     """
     whole, near, far = moments[0], np.maximum(moments[1:5].mean(0), 1e-12), moments[5:].mean(0)
     phi = np.minimum(np.clip(far / near, LEAST, 1.0) ** (1.0 / (np.mean(FAR) - np.mean(NEAR))), MOST)

@@ -1,9 +1,9 @@
-"""From a rate of false alarms to a threshold, by theory: window-limited generalised likelihood ratios.
+"""Threshold of window-limited generalised likelihood ratios for a given rate of false alarms, by theory.
 
-A generalised likelihood ratio looks at all windows of n0 to n1 samples that end now. Without a change the largest
-statistic crosses b^2 at the rate b^2 f(b^2) I per sample, f the density of chi-square with as many degrees of freedom
-as the change has sizes, I the integral of x nu(x)^2 from b / sqrt(n1) to b / sqrt(n0) (Siegmund and Venkatraman 1995;
-Lai 1995 for windows that are not of every length, for which the rate is a bound). nu corrects for discrete time.
+A generalised likelihood ratio uses all windows of n0 to n1 samples that end now. Without a change, the largest
+statistic crosses b^2 at the rate b^2 f(b^2) I per sample. f is the density of chi-square with as many degrees of
+freedom as the change has sizes; I is the integral of x nu(x)^2 from b / sqrt(n1) to b / sqrt(n0) (Siegmund and
+Venkatraman 1995). With only some window lengths, the rate is a bound (Lai 1995). nu corrects for discrete time.
 """
 
 import math
@@ -14,19 +14,19 @@ from scipy.optimize import brentq
 from scipy.stats import chi2
 
 HOUR = 3600.0  # s
-LARGEST = 1e4  # of the statistic
+LARGEST = 1e4  # largest threshold of the statistic
 
 
 def overshoot(x: float) -> float:
-    """nu(x), mean of exp(-x R) of the overshoot R of a random walk, to a few per cent (Siegmund 1985)."""
+    """nu(x): mean of exp(-x R) for the overshoot R of a random walk, within a few per cent (Siegmund 1985)."""
     return math.exp(-0.583 * x)
 
 
 def crossing_rate(threshold: float, freedom: int, shortest: float, longest: float) -> float:
-    """Crossings per sample of a threshold of the statistic (chi-square) without a change.
+    """Rate per sample at which the statistic (chi-square) crosses a threshold without a change.
 
     Args:
-        threshold: of the statistic. freedom: sizes of the change. shortest, longest: window [samples].
+        threshold: of the statistic. freedom: number of sizes of the change. shortest, longest: window [samples].
     """
     b = math.sqrt(threshold)
     x = np.linspace(b / math.sqrt(longest), b / math.sqrt(shortest), 400)
@@ -39,15 +39,15 @@ def threshold_for(per_hour: float, freedom: int, *, shortest: float, longest: fl
     """Threshold of the statistic for a rate of false alarms per hour.
 
     Args:
-        per_hour: false alarms an hour. freedom: sizes of the change.
-        shortest, longest: window [samples]. rate: samples a second.
+        per_hour: false alarms per hour. freedom: number of sizes of the change.
+        shortest, longest: window [samples]. rate: samples per second.
     """
     wanted = math.log(per_hour / (HOUR * rate))
 
     def excess(threshold: float) -> float:
         return math.log(max(crossing_rate(threshold, freedom, shortest, longest), 1e-300)) - wanted
 
-    low = 2.0 * freedom + 8.0  # beyond the maximum of the rate
+    low = 2.0 * freedom + 8.0  # above the maximum of the rate
     if excess(low) <= 0.0:
         return low
     return float(brentq(excess, low, LARGEST))
