@@ -1,1 +1,1 @@
-"""Experiments: manoeuvres that narrow intervals or tell explanations apart, by the information that is expected."""
+"""Experiment design: manoeuvres that narrow intervals or distinguish effects, by their expected information."""

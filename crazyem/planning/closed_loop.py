@@ -1,9 +1,9 @@
-"""A drone under its controller along a manoeuvre, as the model has it: states and rotor commands before anything flies.
+"""Simulation of a drone and its controller along a manoeuvre: expected states and rotor commands.
 
-A rigid body with rotor lag under the firmware's Lee controller with its default gains (controller_lee.c). The loop
-matters: full-state setpoints carry no torque, so a planned acceleration becomes torque only as the loop lets it.
-Flatness alone would promise torques that no controller asks for. Other controllers follow the same path with other
-torques; for them the expectation is a rough one.
+The model is a rigid body with rotor lag under the firmware's Lee controller with its default gains (controller_lee.c).
+The control loop matters: full-state setpoints contain no torque, so the loop decides which torque follows from a
+planned acceleration. Differential flatness alone would give torques that no controller commands. Other controllers
+follow the same path with other torques, so for them the expectation is approximate.
 """
 
 import math
@@ -27,17 +27,17 @@ ATTITUDE_GAIN = np.array([0.007, 0.007, 0.008])
 INTEGRAL_GAIN = np.array([0.03, 0.03, 0.03])
 RATE_GAIN = np.array([0.00115, 0.00115, 0.002])
 POSITION_GAIN, VELOCITY_GAIN = 7.0, 4.0
-RECALL = 0.06  # s: errors of an onboard pose and velocity last that long (`diagnosis/fitting/noise.py`, RECALL)
+RECALL = 0.06  # s, correlation time of errors of onboard pose and velocity (`diagnosis/fitting/noise.py`, RECALL)
 
 
 @dataclass(frozen=True)
 class Flown:
-    """A flight of the model.
+    """A simulated flight.
 
     Attributes:
         time: (n,) s, every `PERIOD`.
         state: (n, 13) position m and velocity m/s (about the hover point), quaternion x y z w, body rate rad/s; true.
-        measured: (n, 13) the same with measurement noise.
+        measured: (n, 13) `state` with measurement noise.
         command: (n, 4) N of each rotor, as commanded.
         thrust: (n, 4) N of each rotor, after the lag.
     """
@@ -57,16 +57,16 @@ class Flown:
 
 
 def mixing(vehicle: Vehicle) -> NDArray[np.float64]:
-    """(4, 4): thrust of each rotor [N] -> F [N], Mx, My, Mz [N m]."""
+    """Matrix (4, 4) from the thrust of each rotor [N] to F [N], Mx, My, Mz [N m]."""
     matrix: NDArray[np.float64] = wrench(np.eye(4), arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust).T
     return np.ascontiguousarray(matrix)
 
 
 def fly(manoeuvre: Harmonics, vehicle: Vehicle, *, noise: Noise | None = None, seed: int = 0) -> Flown:
-    """Fly a manoeuvre with the model.
+    """Simulate a manoeuvre.
 
     Args:
-        noise: of process and sensors; None: none, so that the result is a smooth function of the manoeuvre.
+        noise: of process and sensors; None: no noise, so that the result is a smooth function of the manoeuvre.
         seed: of the noise.
     """
     n = round(manoeuvre.duration / PERIOD) + 1

@@ -1,10 +1,10 @@
-"""Which of two explanations would a flight decide for: expected log odds between effects, by the diagnosis's own model.
+"""Expected log odds of a flight between two effects, with the model of the diagnosis.
 
-Under a model M with parameters theta ~ N(0, P) the score s of all columns is normal with covariance F + F_M P F_M',
-F the information with the usual nuisances integrated out. So the expected log odds between two models, where the first
-is true, are the divergence of Kullback and Leibler between two normal distributions of few dimensions (Lindley 1956;
-Box and Hill, Discrimination among mechanistic models, 1967). Effects whose columns are parallel have F of less than
-full rank, and no flight gives odds: that is seen here, before any is flown.
+Under a model M with parameters theta ~ N(0, P), the score s of all columns is normal with covariance F + F_M P F_M'. F
+is the information with the usual nuisances integrated out. If the first of two models is true, the expected log odds
+are the Kullback-Leibler divergence between two normal distributions of few dimensions (Lindley 1956; Box and Hill,
+Discrimination among mechanistic models, 1967). With parallel columns of the two effects, F does not have full rank, and
+no flight can distinguish the effects. This is known before the flight.
 """
 
 import math
@@ -27,25 +27,25 @@ from crazyem.vehicle import Vehicle
 
 HEIGHT = 1.0  # m of the hover above the floor (control/named_trajectories.py, DEFAULT_HEIGHT)
 HELD = 3.5e-3  # s between a command's stamp and its effect (estimation/model.py, DELAY_OF_COMMANDS)
-THINNED = 2  # every second sample is enough for the odds
-DECIDED = math.log(20.0)  # odds of 20 to 1 decide (Kass and Raftery 1995: strong)
-DRAWS = 1000  # of drones and noise, from which the share of right decisions is found
-LIKELY = 0.8  # share of right decisions from which a manoeuvre is worth flying
-LOST = 1e-9  # eigenvalue over the largest below which a direction of the scores holds nothing
+THINNED = 2  # every second sample is used, enough for the odds
+DECIDED = math.log(20.0)  # nats; odds of 20 to 1 decide (Kass and Raftery 1995: strong)
+DRAWS = 1000  # draws of drones and noise for the share of right decisions
+LIKELY = 0.8  # least share of right decisions of a useful manoeuvre
+LOST = 1e-9  # eigenvalue over the largest, below which a direction of the scores has no information
 SIGNALS = frozenset({"position", "velocity", "attitude", "body_rate", "voltage", "motor_command"})
 
 
 @dataclass(frozen=True)
 class Odds:
-    """What a flight would say about two explanations.
+    """Expected odds of a flight between two effects.
 
     Attributes:
-        effects: the two.
-        expected: (2,) log odds [nats] to be expected for the first where the first is true, for the second likewise.
-        decided: (2,) share of drones for which the odds reach 20 to 1 for what is true.
-        wrong: (2,) share for which these reach 20 to 1 for the other.
-        correlation: largest correlation between a combination of the columns of the one and of the other, nuisances
-            projected out; at 1 they are parallel.
+        effects: the two effects.
+        expected: (2,) expected log odds [nats] for the first effect if the first is true, for the second likewise.
+        decided: (2,) share of drones for which the odds reach 20 to 1 for the true effect.
+        wrong: (2,) share of drones for which the odds reach 20 to 1 for the other effect.
+        correlation: largest correlation between combinations of columns of the two effects, with nuisances projected
+            out; at 1 the columns are parallel.
     """
 
     effects: tuple[str, str]
@@ -56,16 +56,16 @@ class Odds:
 
     @property
     def decides(self) -> bool:
-        """Whether the flight would decide, whichever is true."""
+        """Whether the flight is likely to decide, whichever effect is true."""
         return min(self.decided) >= LIKELY
 
 
 def flight_of(flown: Flown, vehicle: Vehicle, limits: Limits) -> Flight:
-    """A flight of the model as the diagnosis has recordings; without noise."""
+    """A simulated flight without noise, in the diagnosis's form of a recording."""
     n = flown.time.size
     y = flown.state.copy()
     y[:, 2] += HEIGHT
-    voltage = np.linspace(limits.voltage + 0.3, limits.voltage, n)  # a battery that empties on the way
+    voltage = np.linspace(limits.voltage + 0.3, limits.voltage, n)  # V, a battery that discharges in flight
     inputs = RotorInput(
         time=flown.time, thrust=flown.command, voltage=voltage, flown=flown.time + 2.0, measured=False, delay=HELD
     )
@@ -81,10 +81,10 @@ def flight_of(flown: Flown, vehicle: Vehicle, limits: Limits) -> Flight:
 
 
 class Pair:
-    """Two effects that are to be told apart on one vehicle."""
+    """Two effects that a flight of one vehicle should distinguish."""
 
     def __init__(self, first: str, second: str, vehicle: Vehicle, limits: Limits) -> None:
-        """Raises UsageError: an effect is unknown, or a flight's log cannot show it; or both are the same."""
+        """Raises UsageError: an effect is unknown, or random, so that a plan cannot show it; or both are the same."""
         for name in (first, second):
             if name not in CATALOGUE:
                 raise UsageError(f"unknown effect '{name}' (known: {', '.join(CATALOGUE)}).")
@@ -97,7 +97,7 @@ class Pair:
         self.point = Point(vehicle, dict(vehicle.effects), TYPICAL)
 
     def odds(self, flown: Flown, *, draws: int = DRAWS, seed: int = 0) -> Odds:
-        """What a flight would say; the shares by `draws` drones and noises, 0 of them gives none."""
+        """Expected odds of a flight, with shares from `draws` drones and noises; with 0 draws the shares are NaN."""
         first, second = self._statistics(flown)
         random = np.random.default_rng(seed)
         expected, decided, wrong = [], [], []
@@ -113,14 +113,14 @@ class Pair:
         )
 
     def merit(self, flown: Flown) -> float:
-        """The lesser of both expected log odds, as a logarithm so that huge ones do not rule: for the optimiser."""
+        """Merit for the optimiser: mainly the smaller of both expected log odds; logarithms limit very large ones."""
         odds = self.odds(flown, draws=0)
         low, high = sorted(odds.expected)
         return math.log1p(low) + 0.1 * math.log1p(high)
 
     def _statistics(self, flown: Flown) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
-        """Of each variant of each effect (r, k): columns in the space where noise and nuisances are white, each times
-        the standard deviation of its parameter."""
+        """Columns (r, k) of each variant of the two effects, in the space where noise and nuisances are white; columns
+        are multiplied by the Cholesky factor of the prior covariance of the parameters."""
         flight = flight_of(flown, self.vehicle, self.limits)
         variants = [variants_of(name, flight, self.point) for name in self.effects]
         usual = nuisances_of(flight, self.point, self.effects)
@@ -145,7 +145,7 @@ class Pair:
 
 
 def _root(information: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(r, c): R with R'R = information; directions that hold nothing left out."""
+    """R (r, c) with R'R = information, without directions that have no information."""
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     kept = values > LOST * max(float(values[-1]), 1e-300)
@@ -154,7 +154,7 @@ def _root(information: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _divergence(true: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Nats between N(0, I + A A') and N(0, I + B B'), the first being true; A (r, k), B (r, l)."""
+    """Kullback-Leibler divergence [nats] of N(0, I + B B') from the true N(0, I + A A'); A (r, k), B (r, l)."""
     r = true.shape[0]
     s, t = np.eye(r) + true @ true.T, np.eye(r) + other @ other.T
     return 0.5 * float(np.trace(np.linalg.solve(t, s)) - r + np.linalg.slogdet(t)[1] - np.linalg.slogdet(s)[1])
@@ -163,7 +163,7 @@ def _divergence(true: NDArray[np.float64], other: NDArray[np.float64]) -> float:
 def _shares(
     mine: Sequence[NDArray[np.float64]], other: Sequence[NDArray[np.float64]], random: np.random.Generator, draws: int
 ) -> tuple[float, float]:
-    """Shares of draws under the first whose log evidence decides for the first, and for the second."""
+    """Shares of draws under the first effect in which the log evidence decides for the first, and for the second."""
     each = max(1, draws // len(mine))
     odds = []
     for a in mine:
@@ -174,7 +174,7 @@ def _shares(
 
 
 def _log_evidence(variants: Sequence[NDArray[np.float64]], z: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n,) log evidence of scores z (n, r), the variants equally likely."""
+    """Log evidence (n,) of scores z (n, r), for equally likely variants."""
     rows = []
     for a in variants:
         inner = np.eye(a.shape[1]) + a.T @ a
@@ -188,7 +188,7 @@ def _log_evidence(variants: Sequence[NDArray[np.float64]], z: NDArray[np.float64
 
 
 def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Largest canonical correlation between the columns of A (r, k) and B (r, l); 0 where one has nothing."""
+    """Largest canonical correlation between the columns of A (r, k) and B (r, l); 0 if one of them has no columns."""
     bases = []
     for matrix in (a, b):
         scale = np.linalg.norm(matrix, axis=0)

@@ -1,7 +1,7 @@
-"""What the estimator would learn from a flight: its own filter and sensitivities along states that are only expected.
+"""Expected information of a flight: the estimator's filter and sensitivities along a simulated flight.
 
-A filter's gains and the sensitivities of its innovations do not depend on the innovations, so a flight that the model
-flies gives the information matrix before the drone does (Goodwin and Payne, Dynamic System Identification, ch. 6).
+The gains of a filter and the sensitivities of its innovations do not depend on the innovations. So a simulated flight
+gives the information matrix before the real flight (Goodwin and Payne, Dynamic System Identification, ch. 6).
 """
 
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ from crazyem.vehicle import Vehicle
 
 @dataclass(frozen=True)
 class Expected:
-    """What the estimator would know after a flight.
+    """Expected information after a flight.
 
     Attributes:
-        information: (9, 9) of the data, in logarithms of theta (units of the linear ones).
+        information: (9, 9) of the data, in logarithms of theta (units of the linear parameters).
         precision: (9,) of the prior, 0 where a parameter is fixed.
-        free: (9,) bool.
+        free: (9,) bool, parameters that are estimated.
     """
 
     information: NDArray[np.float64]
@@ -36,7 +36,7 @@ class Expected:
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """(9, 9) of the estimates, prior included; zero where a parameter is fixed."""
+        """Covariance (9, 9) of the estimates, prior included; zero where a parameter is fixed."""
         index = np.flatnonzero(self.free)
         full = np.zeros_like(self.information)
         inner = self.information[np.ix_(index, index)] + np.diag(self.precision[index])
@@ -45,13 +45,13 @@ class Expected:
 
     @property
     def sd(self) -> NDArray[np.float64]:
-        """(9,) standard deviations: relative of mass, inertia and lag."""
+        """Standard deviations (9,), relative for mass, inertia and lag."""
         spread: NDArray[np.float64] = np.sqrt(np.diag(self.covariance))
         return spread
 
 
 class Expectation:
-    """Information of flights of one vehicle with one noise."""
+    """Expected information of flights of one vehicle with given noise scales."""
 
     def __init__(self, vehicle: Vehicle, noise: Noise | None = None) -> None:
         self.vehicle = vehicle
@@ -60,10 +60,10 @@ class Expectation:
         self._mixing = mixing(vehicle)
 
     def of(self, flown: Flown, *, known: NDArray[np.float64] | None = None) -> Expected:
-        """What the estimator would know after a flight.
+        """Expected information after a flight.
 
         Args:
-            known: (9, 9) information that is there already, in the same coordinates.
+            known: (9, 9) information from earlier flights, in the same coordinates.
         """
         em = self._filtered(flown)
         n = em.tape.size
@@ -74,9 +74,9 @@ class Expectation:
         return Expected(information, precision, self.setup.free)
 
     def reached(self, manoeuvre: Harmonics, *, seeds: int = 4) -> NDArray[np.float64]:
-        """(9,) standard deviations that the estimator would tell after the flight: root mean square over noisy flights.
+        """Expected standard deviations (9,) of the estimator after the flight: root mean square over noisy flights.
 
-        With all that the estimator counts: correlated scores, noise in sampled commands (`estimation/inflation.py`).
+        They include correlated scores and noise in sampled commands (`estimation/inflation.py`).
         """
         squares = []
         for seed in range(seeds):
@@ -87,7 +87,7 @@ class Expectation:
         return spread
 
     def _filtered(self, flown: Flown) -> WindowEM:
-        """The window with the flight's samples, filtered at the vehicle's parameters."""
+        """The window with the samples of a flight, filtered with the vehicle's parameters."""
         n = flown.time.size
         tape = Tape(n)
         tape.size = n

@@ -1,8 +1,8 @@
-"""Plan, fly, learn, plan again: a trajectory made in flight from what is known so far, until a goal is met.
+"""A trajectory that is planned in flight from the newest estimate, segment by segment, until a goal is met.
 
-The flight is a chain of segments that start and end in hover at the same point. While one is flown, the next is planned
-by what the estimator says at that moment, in a process of its own, so that no setpoint comes late. Until it is there,
-the drone hovers. Every segment keeps the limits of the plan, whatever the estimate.
+The segments start and end in hover at the same point. During a segment, a separate process plans the next one from the
+newest estimate, so that no setpoint is late. If the plan is not ready, the drone hovers. Every segment keeps the
+limits, whatever the estimate.
 """
 
 import math
@@ -23,18 +23,18 @@ from crazyem.planning.limits import Limits
 from crazyem.planning.plan import INTERVAL, plan_parameters
 from crazyem.vehicle import Vehicle
 
-SEGMENT = 5.0  # s, between two plans
+SEGMENT = 5.0  # s, duration of a segment
 GOAL = 0.05  # relative half width of the 95 % intervals of mass, Ixx, Iyy and Izz
 WANTED = NAMES[:4]
 PROCESS = ("force_x", "force_y", "thrust", "torque_x", "torque_y", "torque_z")
-FIRST_WITHIN = 120.0  # s of host time for the first plan, which may have to compile
-FAR = 0.3  # of a logarithm that an estimate may be from the vehicle file and still be planned by
+FIRST_WITHIN = 120.0  # s of host time for the first plan, with compilation
+FAR = 0.3  # largest difference of logarithms of an estimate and the vehicle file, for use in a plan
 
 
 @dataclass(frozen=True)
 class Request:
-    """What a segment is planned by: the drone as far as known, noise (None: usual), relative standard deviations of
-    `WANTED` (infinite where nothing is known), seed."""
+    """Data for the plan of a segment: newest vehicle constants, noise (None: usual), relative standard deviations of
+    `WANTED` (infinite if unknown), limits, seed."""
 
     vehicle: Vehicle
     noise: Noise | None
@@ -44,7 +44,7 @@ class Request:
 
 
 def segment(request: Request) -> Harmonics | None:
-    """The segment that most narrows what is still wide; None where there is none."""
+    """The segment that gives the smallest intervals together with earlier information; None if there is none."""
     known = np.zeros((len(NAMES), len(NAMES)))
     for i, sd in enumerate(request.spread):
         known[i, i] = 0.0 if math.isinf(sd) else sd**-2.0
@@ -56,18 +56,18 @@ def segment(request: Request) -> Harmonics | None:
 
 
 class Planner(Protocol):
-    """Where segments are planned."""
+    """Interface of a planner of segments."""
 
     def ask(self, request: Request) -> None: ...
 
     def answer(self, timeout: float = 0.0) -> tuple[bool, Harmonics | None]:
-        """Whether there is an answer to the last request, and which."""
+        """Whether there is an answer to the last request, and the answer."""
 
     def close(self) -> None: ...
 
 
 class PlannerProcess:
-    """Plans in a process of its own, which ends with this one."""
+    """A planner in a separate process, which ends with this process."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
@@ -84,7 +84,7 @@ class PlannerProcess:
             if not self._mine.poll(timeout):
                 return False, None
             found = self._mine.recv()
-        except (EOFError, OSError):  # the process is gone: nothing more is planned
+        except (EOFError, OSError):  # the process has ended: no more plans
             return True, None
         return True, found if isinstance(found, Harmonics) else None
 
@@ -108,13 +108,17 @@ def _serve(connection: "Connection[Harmonics | None, Request]") -> None:
 
 
 class Informative:
-    """A trajectory that is planned while it is flown.
+    """A trajectory that is planned in flight.
 
     Args:
-        vehicle: nominal. limits: of every segment.
+        vehicle: nominal constants. limits: of every segment.
         duration: s, at most.
         goal: relative half width of the 95 % intervals at which the flight ends.
-        estimate: the newest estimate, or None.
+        seed: of the plans. planner: None: a `PlannerProcess`.
+
+    Attributes:
+        estimate: function that returns the newest estimate, or None.
+        segments: number of segments so far.
     """
 
     def __init__(
@@ -137,10 +141,10 @@ class Informative:
         self._begin = 0.0
 
     def start(self) -> None:
-        """Plan the first segment, before anything spins.
+        """Plan the first segment, before the rotors start.
 
         Raises:
-            CrazyemError: there is none within the limits.
+            CrazyemError: there is no segment within the limits.
         """
         self.limits.rotor_range(self.vehicle)
         self._planner.ask(self._request(None))
@@ -154,7 +158,7 @@ class Informative:
         self._planner.close()
 
     def __call__(self, position: Vector, yaw: float) -> Trajectory:
-        """The trajectory from where the drone hovers; calls to it go forward in time."""
+        """The trajectory from the hover point; its times must increase from call to call."""
         rest = hover(position=position, yaw=yaw).at(0.0)
 
         def at(time: float) -> Reference:
@@ -168,7 +172,7 @@ class Informative:
         return Trajectory("informative", self.duration, at, finished=lambda: self._finished)
 
     def _go_on(self, time: float, position: Vector, yaw: float) -> None:
-        """Begin the next segment if it is there and there is time for it."""
+        """Begin the next segment if it is planned and there is time for it."""
         if time + SEGMENT > self.duration:
             self._finished = True
             return
@@ -177,7 +181,7 @@ class Informative:
             if not ready:
                 return
             self._asked = False
-        if self._next is None:  # nothing better is to be had
+        if self._next is None:  # there is no useful segment
             self._finished = True
             return
         self._path, self._begin = self._next.trajectory(position, yaw), time
@@ -208,7 +212,7 @@ class Informative:
 
 
 def noise_in(table: "dict[str, float] | object", vehicle: Vehicle) -> Noise | None:
-    """Noise scales of an estimate (N sqrt(s), N m sqrt(s), SI) in units of acceleration; None where one is missing."""
+    """Noise scales of an estimate (N sqrt(s), N m sqrt(s), SI) in units of acceleration; None if one is missing."""
     keys = (*PROCESS, *GROUPS[:4])
     values = [table.get(k) for k in keys] if isinstance(table, dict) else []
     good = [float(v) for v in values if isinstance(v, int | float) and not isinstance(v, bool) and 0 < v < math.inf]

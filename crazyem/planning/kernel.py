@@ -1,19 +1,19 @@
-"""A rigid body with rotor lag under Lee's controller (controller_lee.c), step by step; compiled."""
+"""Compiled simulation of a rigid body with rotor lag under Lee's controller (controller_lee.c)."""
 
 import numpy as np
 
 from crazyem.compiled import compiled
 from crazyem.vehicle import GRAVITY
 
-# Steps of the loop by which what the controller sees is old: rates by their low pass at 80 Hz (2.8 ms) and the hold of
-# the command (1 ms), poses by that hold and by the 10 ms between two predictions of the onboard estimate (5 ms).
+# Age, in steps of the loop, of the controller's measurements: of rates by their low pass at 80 Hz (2.8 ms) and the hold
+# of the command (1 ms), of poses by this hold and the 10 ms between two predictions of the onboard estimate (5 ms).
 RATE_AGE, POSE_AGE = 2, 3
 
 
 @compiled
 def fly_loop(wanted, dt, mass, inertia, lag, mixing, unmixing, most, kr, ki, kw, kp, kd, pushes, errors, state, seen,
          command, thrust):  # fmt: skip
-    """A flight, step by step of the loop.
+    """Simulate a flight, one step of the control loop after the other.
 
     Args:
         wanted: (n, 11) position m, velocity m/s, acceleration m/s^2 (world), yaw rad, yaw rate rad/s.
@@ -33,7 +33,7 @@ def fly_loop(wanted, dt, mass, inertia, lag, mixing, unmixing, most, kr, ki, kw,
     decay = np.exp(-dt / lag) if lag > 0 else 0.0
     acc, alpha = np.zeros(3), np.zeros(3)
     for k in range(len(wanted)):
-        # what sensors show; a small error of attitude is a turn about body axes
+        # measurements; a small error of attitude is a rotation about body axes
         for i in range(3):
             state[k, i], state[k, 3 + i], state[k, 10 + i] = p[i], v[i], w[i]
             seen[k, i] = p[i] + errors[k, i]
@@ -49,7 +49,7 @@ def fly_loop(wanted, dt, mass, inertia, lag, mixing, unmixing, most, kr, ki, kw,
         norm = np.sqrt(qx * qx + qy * qy + qz * qz + qs * qs)
         qx, qy, qz, qs = qx / norm, qy / norm, qz / norm, qs / norm
         seen[k, 6], seen[k, 7], seen[k, 8], seen[k, 9] = qx, qy, qz, qs
-        at, turned = max(k - POSE_AGE, 0), max(k - RATE_AGE, 0)  # what the controller has of it
+        at, turned = max(k - POSE_AGE, 0), max(k - RATE_AGE, 0)  # steps of the controller's measurements
         qx, qy, qz, qs = seen[at, 6], seen[at, 7], seen[at, 8], seen[at, 9]
         r[0, 0], r[0, 1], r[0, 2] = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qz * qs), 2 * (qx * qz + qy * qs)
         r[1, 0], r[1, 1], r[1, 2] = 2 * (qx * qy + qz * qs), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qx * qs)

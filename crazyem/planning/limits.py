@@ -1,4 +1,4 @@
-"""What a manoeuvre may do: stay in its box, tilt and turn little, leave every rotor a reserve."""
+"""Limits of a manoeuvre: box, tilt, body rates, thrust reserve of every rotor."""
 
 import math
 from dataclasses import dataclass
@@ -11,19 +11,21 @@ from crazyem.errors import UsageError
 from crazyem.planning.closed_loop import Flown
 from crazyem.vehicle import GRAVITY, Vehicle
 
-SHARPNESS = 60  # power of the norm that stands for a largest value, so that an optimiser has derivatives
-BOX_SHARE = 0.9  # of the box that a plan uses: wind and a wrong model take the rest
-RESERVE = 0.1  # of a rotor's range of thrust that a plan leaves free at each end
+SHARPNESS = 60  # power of the norm that approximates a maximum, so that an optimiser has derivatives
+BOX_SHARE = 0.9  # share of the box that a plan uses; the rest is for wind and errors of the model
+RESERVE = 0.1  # share of a rotor's largest thrust that a plan leaves free at each end
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Attributes:
-    box: m, full widths along x, y (of the heading at the start) and z, about the point of the hover.
-    tilt: rad, of body z from the vertical.
-    rate: rad/s, of each body rate.
-    voltage: V, of the battery in flight; thrusts above what it gives are not asked for.
-    reserve: share of a rotor's thrust that stays free, above and below.
+    """Limits of a manoeuvre.
+
+    Attributes:
+        box: m, full widths along x, y (of the heading at the start) and z, about the hover point.
+        tilt: rad, angle between body z and the vertical.
+        rate: rad/s, of each body rate.
+        voltage: V, of the battery in flight; it limits the thrust.
+        reserve: share of a rotor's largest thrust that stays free at both ends.
     """
 
     box: tuple[float, float, float] = (1.0, 1.0, 0.6)
@@ -39,10 +41,10 @@ class Limits:
                 raise UsageError(f"the limit of {name} must be positive.")
 
     def rotor_range(self, vehicle: Vehicle) -> tuple[float, float]:
-        """Least and largest thrust of one rotor [N] that a plan asks for.
+        """Least and largest thrust of one rotor [N] in a plan.
 
         Raises:
-            UsageError: the drone cannot hover within these.
+            UsageError: the drone cannot hover within this range.
         """
         most = vehicle.thrust_max
         if vehicle.thrust_curve:
@@ -57,10 +59,10 @@ class Limits:
         return low, high
 
     def used(self, manoeuvre: Harmonics, flown: Flown, vehicle: Vehicle) -> NDArray[np.float64]:
-        """(8,) largest values over their limits, smooth from below: x, y, z, tilt, three rates, rotors.
+        """Smooth maxima (8,) of values over their limits: x, y, z, tilt, three rates, rotors; 1 is at the limit.
 
-        Places and tilts are those of the setpoints or of the drone, whichever are larger: another controller may follow
-        more closely. At 1 a limit is reached.
+        Positions and tilts are those of the setpoints or of the drone, whichever are larger, because another controller
+        may follow the setpoints more closely.
         """
         low, high = self.rotor_range(vehicle)
         hover = vehicle.mass * GRAVITY / 4
@@ -78,7 +80,7 @@ class Limits:
 
 
 def _largest(values: NDArray[np.float64]) -> float:
-    """Smooth maximum of |values|: between the largest and n^(1/SHARPNESS) times that, n values of a full swing."""
+    """Smooth maximum of |values| (n,): between the largest value and n^(1/SHARPNESS) times this value."""
     most = float(np.abs(values).max())
     if most == 0.0:
         return 0.0

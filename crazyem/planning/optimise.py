@@ -1,9 +1,9 @@
-"""The manoeuvre of largest merit within limits: several starts, sequential quadratic programming over amplitudes.
+"""The manoeuvre of largest merit within limits, by sequential quadratic programming from several starts.
 
-Frequencies are fixed: each axis has bands of two lines, every line with a whole number of cycles, no two axes with the
-same one, so that what belongs to different axes is uncorrelated. Free are the powers of the bands, in which information
-and squared limits are nearly linear (optimal input design; Mehra 1974). Phases are drawn for each start: they decide
-about peaks only.
+Frequencies are fixed. Each axis has bands of two lines; every line has a whole number of cycles, and no two lines the
+same number, so that signals of different axes are uncorrelated. Free are the powers of the bands: information and
+squared limits are nearly linear in them (optimal input design; Mehra 1974). Phases are drawn at random for each start;
+they affect only the peaks.
 """
 
 import math
@@ -19,16 +19,17 @@ from crazyem.planning.closed_loop import Flown, fly
 from crazyem.planning.limits import Limits
 from crazyem.vehicle import Vehicle
 
-# Hz: where the bands begin. Slow motion shows what goes with place, speed and heading; inertia and lag need torque,
-# which the loop makes above its attitude bandwidth of about 1 Hz, up to the resonance with the rotor lag near 5 Hz.
+# Hz, lower ends of the bands. Slow motion shows effects that depend on position, speed and heading. Inertia and lag
+# need torque, which the loop gives above its attitude bandwidth of about 1 Hz, up to the resonance with the rotor lag
+# near 5 Hz.
 BANDS = (0.0, 0.7, 1.5, 2.8)
-LINES = 2  # of a band
+LINES = 2  # lines of a band
 RAMP = 1.0  # s
-BESIDE = 0.3  # share of the power that a search begins with beside the chosen bands
-SMALL = 0.1  # m/s^2, rad/s^2: rms of a band by which its share of the limits is found
-STEP = 0.02  # of a power, for differences
-NEAR, CANDIDATES = 1.5, 4  # squared share of a limit up to which a point may be brought inside; how many are
-IDLE = 1e-4  # power of a band below which the plan does without its lines
+BESIDE = 0.3  # share of the start power that is spread over all bands; the rest is in the chosen bands
+SMALL = 0.1  # m/s^2, rad/s^2: rms of a single band, from which its amplitude at the limit is extrapolated
+STEP = 0.02  # of a power, for finite differences
+NEAR, CANDIDATES = 1.5, 4  # largest squared share of a limit of points that are scaled to the limits; their number
+IDLE = 1e-4  # power below which a band is left out of the plan
 ITERATIONS = 15  # of sequential quadratic programming from each start
 
 Merit = Callable[[Flown], float]  # to be maximised; nats
@@ -36,7 +37,7 @@ Merit = Callable[[Flown], float]  # to be maximised; nats
 
 @dataclass(frozen=True)
 class Found:
-    """The best manoeuvre: what it is, what the model flies of it, its merit, how much of each limit it uses (8,)."""
+    """A manoeuvre, its simulated flight, its merit, and the used shares (8,) of the limits."""
 
     manoeuvre: Harmonics
     flown: Flown
@@ -45,7 +46,7 @@ class Found:
 
 
 def lines_of(duration: float) -> list[list[tuple[float, ...]]]:
-    """Frequencies [Hz] by axis (x, y, z, yaw) and band: whole cycles in the time at full amplitude, all different."""
+    """Frequencies [Hz] by axis (x, y, z, yaw) and band, all different, with whole cycles in `duration` [s]."""
     base = 1.0 / duration
     taken: set[int] = set()
     found: list[list[tuple[float, ...]]] = [[] for _ in range(4)]
@@ -69,18 +70,18 @@ def lines_of(duration: float) -> list[list[tuple[float, ...]]]:
 class Family:
     """Manoeuvres of one duration with one draw of phases.
 
-    A point (16,) is the power of each band, axis by axis: its squared rms acceleration over that of `full`.
+    A point (16,) holds the power of each band, axis by axis: its squared rms acceleration over the square of `full`.
     """
 
     duration: float
     ramp: float
     lines: list[list[tuple[float, ...]]]
     phases: NDArray[np.float64]  # (4, bands, lines) rad
-    full: NDArray[np.float64]  # (16,) rms acceleration with which a band alone reaches a limit, m/s^2 or rad/s^2
+    full: NDArray[np.float64]  # (16,) m/s^2 or rad/s^2, rms acceleration at which a band alone reaches a limit
 
     @classmethod
     def drawn(cls, duration: float, random: np.random.Generator, vehicle: Vehicle, limits: Limits) -> "Family":
-        """With random phases."""
+        """A family with random phases."""
         count = 4 * len(BANDS)
         phases = random.uniform(0.0, 2.0 * math.pi, (4, len(BANDS), LINES))
         family = cls(duration, min(RAMP, duration / 4), lines_of(duration), phases, np.full(count, SMALL))
@@ -95,7 +96,7 @@ class Family:
         return 4 * len(BANDS)
 
     def manoeuvre(self, point: NDArray[np.float64]) -> Harmonics:
-        """Of a point (16,)."""
+        """The manoeuvre of a point (16,)."""
         axes = []
         for a, (bands, phases) in enumerate(zip(self.lines, self.phases)):
             frequency, cosine, sine = [], [], []
@@ -125,10 +126,10 @@ def optimise(
     """The best manoeuvre of several starts.
 
     Args:
-        merit: of a flight of the model.
+        merit: function of a simulated flight.
         duration: s.
-        starts: draws of phases and of amplitudes to begin with.
-        seed: of these; the same seed gives the same plan.
+        starts: number of draws of phases and start amplitudes.
+        seed: of these draws; the same seed gives the same plan.
 
     Raises:
         UsageError: the drone has no reserve of thrust.
@@ -137,7 +138,7 @@ def optimise(
     best: Found | None = None
     for start in range(starts):
         family = Family.drawn(duration, random, vehicle, limits)
-        # every second start from power that is dealt out by chance: several goals need more than the best of each axis
+        # every second start has random powers: with several goals, the best band of each axis is not enough
         begin = random.dirichlet(np.ones(family.size))
         if start % 2 == 0:
             begin = _begin(family, merit, vehicle, random, first=start == 0)
@@ -152,10 +153,10 @@ def optimise(
 def _begin(
     family: Family, merit: Merit, vehicle: Vehicle, random: np.random.Generator, *, first: bool
 ) -> NDArray[np.float64]:
-    """Where a search begins (16,): on each axis mostly the band that tells most alone, later one by chance.
+    """Start point (16,) of a search: on each axis mostly the band with the largest merit alone, later a random band.
 
-    Peaks of bands add up by amplitude and not by power, so what lies between two bands is worse than either, and a
-    search stays near the band with which it began.
+    Peaks of bands add up by amplitude and not by power. So a mixture of two bands is worse than either, and a search
+    stays near its first band.
     """
     shape = 4, len(BANDS)
     alone = np.array([merit(fly(family.manoeuvre(e), vehicle)) for e in np.eye(family.size)]).reshape(shape)
@@ -206,7 +207,7 @@ def _from(
         constraints=[{"type": "ineq", "fun": lambda x: 1.0 - look(x)[1], "jac": lambda x: -slope(x)[1]}],
         options={"maxiter": iterations, "ftol": 1e-3},
     )
-    # steps of the search may lead down, or out of the limits: the best points near these, brought inside, compete
+    # the search may end at a lower merit or outside the limits: the best points near the limits compete after scaling
     near = sorted((value, key) for key, (value, used) in seen.items() if used.max() <= NEAR)[-CANDIDATES:]
     points = [np.asarray(result.x), *(np.frombuffer(key) for _, key in near)]
     inside = [within(family.manoeuvre(np.where(point < IDLE, 0.0, point)), merit, vehicle, limits) for point in points]
@@ -214,7 +215,7 @@ def _from(
 
 
 def within(manoeuvre: Harmonics, merit: Merit, vehicle: Vehicle, limits: Limits) -> Found:
-    """The manoeuvre, made smaller until it keeps all limits."""
+    """The manoeuvre, scaled down until it keeps all limits."""
     for _ in range(20):
         flown = fly(manoeuvre, vehicle)
         used = limits.used(manoeuvre, flown, vehicle)

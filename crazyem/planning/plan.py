@@ -1,4 +1,4 @@
-"""From a goal to a plan: the manoeuvre, what to expect of it before it is flown, or why no manoeuvre will do."""
+"""From a goal to a plan: the manoeuvre and its expected result, or the reason why no manoeuvre reaches the goal."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -23,29 +23,29 @@ from crazyem.planning.optimise import ITERATIONS, Family, Found, optimise, withi
 from crazyem.vehicle import Vehicle
 
 INTERVAL = 1.96  # standard deviations on each side of a 95 % interval
-PARAMETERS = NAMES[:6]  # the torque offsets are nuisances
+PARAMETERS = NAMES[:6]  # without the torque offsets, which are nuisances
 DEFAULT = NAMES[:4]
-SHORTEST = 3.0  # s; a shorter manoeuvre is hardly more than its two ramps
-# Of which a flight shows only ratios: thrust over mass, torque over inertia.
+SHORTEST = 3.0  # s; a shorter manoeuvre consists mainly of its two ramps
+# Effects that a flight shows only in ratios with these parameters: thrust over mass, torque over inertia.
 RATIOS = {THRUST_SCALE.name: NAMES[:4]}
-PARALLEL = 0.999  # correlation from which columns count as parallel
+PARALLEL = 0.999  # least correlation of parallel columns
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A manoeuvre and what to expect of it.
+    """A manoeuvre and its expected result.
 
     Attributes:
         goal: in words.
         vehicle: its name.
-        limits: that are kept.
-        manoeuvre: None where no manoeuvre will do.
-        flown: what the model flies of it.
-        widths: parameter -> half width of the 95 % interval, relative (input_delay: s).
-        odds: of a pair of effects.
-        reason: why no manoeuvre will do, and what would; empty where one does.
-        used: (8,) shares of the limits.
+        limits: limits of the manoeuvre.
+        manoeuvre: None if no manoeuvre reaches the goal.
+        flown: its simulated flight.
+        widths: parameter -> expected half width of the 95 % interval, relative (input_delay: s).
+        odds: expected odds of a pair of effects.
+        reason: why no manoeuvre reaches the goal, and what else would; empty if there is a manoeuvre.
+        used: (8,) used shares of the limits.
         seed: of the search.
     """
 
@@ -86,7 +86,7 @@ class Plan:
         }
 
     def largest(self) -> dict[str, float] | None:
-        """What the model flies at most: m from the middle, deg, rad/s, N; None without a manoeuvre."""
+        """Extreme values of the simulated flight: m from the hover point, deg, rad/s, N; None without a manoeuvre."""
         if self.flown is None:
             return None
         far = np.abs(self.flown.state[:, :3]).max(0).tolist()
@@ -126,7 +126,7 @@ class Plan:
 
 
 def checked_duration(duration: float) -> float:
-    """Raises UsageError: too short or too long."""
+    """The duration [s], checked. Raises UsageError: too short or too long."""
     if not SHORTEST <= duration <= LONGEST:
         raise UsageError(f"a plan takes {SHORTEST:g} to {LONGEST:g} s, not {duration:g} s.")
     return duration
@@ -147,15 +147,15 @@ def plan_parameters(
     foretold: bool = True,
     say: Say = lambda text: None,
 ) -> Plan:
-    """The manoeuvre that most narrows the intervals of parameters.
+    """The manoeuvre that gives the smallest intervals of parameters.
 
     Args:
         names: of `estimation.model.NAMES`, without torque offsets.
         criterion: "D": the volume of their joint interval; "A": the sum of their relative variances.
-        noise: scales; None: those that the estimator expects.
-        known: (9, 9) information that earlier flight has given, in the estimator's coordinates.
+        noise: scales; None: the centre of the estimator's prior.
+        known: (9, 9) information from earlier flight, in the estimator's coordinates.
         iterations: of the search from each start.
-        foretold: whether to find the widths to be expected, by noisy flights of the model.
+        foretold: whether to compute the expected widths, by simulated flights with noise.
 
     Raises:
         UsageError: an unknown name, a vehicle without rotors or without reserve, a duration that does not fit.
@@ -203,10 +203,10 @@ def plan_discrimination(
     seed: int = 0,
     say: Say = lambda text: None,
 ) -> Plan:
-    """The manoeuvre that most separates two effects; without one where even the best leaves them alike.
+    """The manoeuvre that best distinguishes two effects; no manoeuvre if even the best one does not.
 
     Raises:
-        UsageError: an unknown effect, or one that no flight shows; as `plan_parameters`.
+        UsageError: an unknown effect, or an effect that no flight shows; as `plan_parameters`.
     """
     pair = Pair(first, second, vehicle, limits)
     checked_duration(duration)
@@ -219,7 +219,7 @@ def plan_discrimination(
 
 
 def can_discriminate(first: str, second: str, vehicle: Vehicle, limits: Limits, *, duration: float = 10.0) -> bool:
-    """Whether a manoeuvre that nobody optimised tells two effects apart already, so that a plan certainly does."""
+    """Whether a manoeuvre without optimisation distinguishes two effects, so that a plan certainly does."""
     try:
         pair = Pair(first, second, vehicle, limits)
         random = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""What a flight may be asked: variants of an effect with the prior of their parameters, and the usual nuisances."""
+"""Variants of an effect with the priors of their parameters, and the usual nuisances of a flight."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from crazyem.physics.effects.catalogue import CATALOGUE
 from crazyem.physics.effects.effect import Effect
 from crazyem.physics.effects.prior import Sizes
 
-MANY = 5  # starting points, from which only the amplitude of an effect is looked at
+MANY = 5  # with more start values of a parameter than this, only the amplitude of the effect is free
 
 
 @dataclass(frozen=True)
@@ -24,17 +24,17 @@ class Variant:
 
     Attributes:
         candidate: its parameters and choices.
-        own: (k,) standard deviations of its parameters where the effect is missing from a vehicle file.
+        own: (k,) prior standard deviations of its parameters, if the effect is missing from the vehicle file.
     """
 
     candidate: Candidate
     own: NDArray[np.float64]
 
     def covariance(self, point: Point) -> NDArray[np.float64]:
-        """(k, k) of its parameters.
+        """Prior covariance (k, k) of its parameters.
 
-        Derivatives are taken where there is little of the effect (`Candidate.begin`). Those by parameters other than
-        the amplitude are as much smaller, so the changes of these are larger.
+        Derivatives are taken at a small amplitude (`Candidate.begin`). So derivatives by the other parameters are too
+        small by the ratio of amplitudes, and their standard deviations are multiplied by the inverse ratio.
         """
         c, own, effect = self.candidate, self.own.copy(), CATALOGUE[self.candidate.effect]
         if c.begin and len(c.free) > 1:
@@ -51,7 +51,7 @@ def variants_of(name: str, flight: Flight, point: Point) -> list[Variant]:
     """The variants of an effect that is missing from the vehicle file.
 
     Raises:
-        UsageError: the flight cannot speak of the effect.
+        UsageError: the flight carries no information on the effect.
     """
     effect, sizes = CATALOGUE[name], CATALOGUE[name].prior.own
     reason = impossible(effect, flight.signals, flight.inputs.measured)
@@ -73,7 +73,7 @@ def variants_of(name: str, flight: Flight, point: Point) -> list[Variant]:
 
 
 def nuisances_of(flight: Flight, point: Point, apart_from: Sequence[str]) -> list[tuple[Candidate, float]]:
-    """What differs from recording to recording anyway, one parameter each, with its standard deviation."""
+    """Usual deviations from recording to recording: candidates of one parameter each, with standard deviations."""
     conditions, found = conditions_of([flight], point), []
     for name, effect in CATALOGUE.items():
         if name in apart_from or effect.random or impossible(effect, flight.signals, False):
