@@ -1,7 +1,7 @@
-"""Vehicles with fitted effects for those who know none: what a rigid body with four rotors can express, folded in.
+"""Folding of fitted effects into the constants of a rigid body with four rotors, for code that knows no effects.
 
-The online estimator, and the firmware that it writes to, know mass, inertia, the thrust of the rotors and their lag. A
-payload, another inertia, a thrust scale or a lag is such a number; a drag is not.
+The online estimator and the firmware know mass, inertia, thrust of the rotors and rotor lag. A payload, another
+inertia, a thrust scale or a lag can be expressed by these numbers; a drag cannot.
 """
 
 from dataclasses import replace
@@ -18,12 +18,12 @@ from crazyem.vehicle import Vehicle, load_vehicle, parse_vehicle
 
 
 def load(name_or_path: str | Path) -> Vehicle:
-    """A preset or vehicle file, its effects checked against the catalogue. Raises as `load_vehicle`."""
+    """Load a preset or vehicle file and check its effects against the catalogue. Raises as `load_vehicle`."""
     return _checked(load_vehicle(name_or_path), str(name_or_path))
 
 
 def parse(source: str, *, where: str) -> Vehicle:
-    """The text of a vehicle file, its effects checked. Raises FileFormatError that names `where` and the key."""
+    """Parse the text of a vehicle file and check its effects. Raises FileFormatError with `where` and the key."""
     return _checked(parse_vehicle(source, where=where), where)
 
 
@@ -35,13 +35,13 @@ def _checked(vehicle: Vehicle, where: str) -> Vehicle:
 
 
 def fold(vehicle: Vehicle) -> tuple[Vehicle, list[str]]:
-    """A vehicle without effects that is as near as one can be, and the names of effects that it leaves out.
+    """The nearest vehicle without effects, and the names of the effects that are left out.
 
-    What a controller can be told of stays in it.
+    Effects for which a controller of the firmware has a parameter stay in the vehicle.
 
-    Folded: payload, inertia and inertia_products into mass and inertia (about the common centre of mass; that it lies
-    off the middle is the estimator's torque offset), thrust_scale into the rotors' thrust, torque_scale into the arms,
-    motor_lag into the time constant. Without rotors thrust and torque are inputs, and there is nothing to scale.
+    Folded are: payload, inertia and inertia_products into mass and inertia (about the common centre of mass; its offset
+    becomes the estimator's torque offset), thrust_scale into the rotors' thrust, torque_scale into the arms, motor_lag
+    into the time constant. Without rotors, thrust and torque are inputs and are not scaled.
     """
     if not vehicle.effects:
         return vehicle, []
@@ -68,7 +68,7 @@ def fold(vehicle: Vehicle) -> tuple[Vehicle, list[str]]:
 
 
 def _scaled(vehicle: Vehicle, *, thrust: float, torque: float) -> Vehicle:
-    """Rotors that give `thrust` times as much, and torques that are `torque` times as large on top of that."""
+    """The vehicle with rotor thrusts times `thrust`, and torques times `torque` in addition."""
     constant = vehicle.rotor_constant
     return replace(
         vehicle,
@@ -81,7 +81,7 @@ def _scaled(vehicle: Vehicle, *, thrust: float, torque: float) -> Vehicle:
 
 
 def notice(left_out: list[str]) -> str:
-    """What to tell the user about effects that are not used; "" if all are."""
+    """Message to the user about effects that are not used; "" if all are used."""
     if not left_out:
         return ""
     return (

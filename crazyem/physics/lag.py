@@ -1,16 +1,16 @@
 """First-order rotor lag, exact for a command that is piecewise linear in time: tau dy/dt = u - y.
 
-The lag is linear and the same for all rotors, so it acts on thrust and torque directly. What a step of the
-rigid body needs is the mean of y over the step, and its derivatives with respect to tau and to a delay of the
-command (for estimating both). A millisecond of delay that nobody models reads as several per cent of inertia.
+The lag is linear and the same for all rotors, so it acts on thrust and torque directly. A step of the rigid body needs
+the mean of y over the step, and its derivatives with respect to tau and to a delay of the command (to estimate both).
+A delay of one millisecond that is not modelled changes the inertia by several per cent.
 
-A logged command is known only at its stamps, and in closed loop the next one already answers to the disturbance
-of the present step. To interpolate towards it is to let the step's own noise into its input: on hover data
-logged at 100 Hz that reads as 5 ms of delay and 16 % of inertia. So the mean of a step uses only commands
-stamped before the step began, continued by the prediction that the past allows (a linear one, fitted to the same
-commands: an innovation must be orthogonal to what predicts it); the lag itself is carried on along the commands as
-they then came (CAUSAL). Which commands those are is a matter of stamps alone, whatever the delay: what is known must
-not change with a parameter that is fitted. One stamped even 1 ms later answers already (`docs: estimator.md`)."""
+A logged command is known only at its stamps. In closed loop the next command already responds to the disturbance of the
+present step. Interpolation towards it would bring the noise of the step into the input: on hover data logged at 100 Hz
+this gives an error of 5 ms of delay and 16 % of inertia. So the mean of a step uses only commands stamped before the
+step began, and a prediction from these (CAUSAL). The prediction is linear and fitted to the same commands, because an
+innovation must be orthogonal to its predictors. The state of the lag then follows the actual commands. Stamps alone
+decide which commands are known, not the delay: known data must not change with a fitted parameter. A command stamped
+even 1 ms later already responds (`docs: estimator.md`)."""
 
 import numpy as np
 
@@ -18,10 +18,10 @@ from crazyem.compiled import compiled
 
 TAU_STEP = 1e-3  # relative change of tau for the central difference
 
-# What lies between two stamps.
+# Modes: the command between two stamps.
 LINEAR = 0  # a straight line: measured rotor speeds
 HOLD = 1  # the earlier value: a controller that acts once per stamp, without lag
-CAUSAL = 2  # a straight line, but a step's mean knows no later stamp than its start: commands with rotor lag
+CAUSAL = 2  # a straight line, but the mean of a step uses no stamp after its start: commands with rotor lag
 
 PREDICTION_ORDER = 3  # of the linear prediction
 _MOST_AHEAD = 64  # most commands known or predicted inside one step
@@ -29,7 +29,7 @@ _MOST_AHEAD = 64  # most commands known or predicted inside one step
 
 @compiled
 def _segment(u0, u1, h, tau, state, acc):
-    """One linear stretch of the command, u0 to u1 (4,), h long: advance `state`, add its integral to `acc`."""
+    """Advance `state` over a linear stretch of the command, u0 to u1 (4,), of h s; add the integral to `acc`."""
     for v in range(len(acc) // 4):
         tv = tau * (1.0 + TAU_STEP * (v if v < 2 else -1))
         decay = np.exp(-h / tv) if tv > 0 else 0.0
@@ -43,7 +43,7 @@ def _segment(u0, u1, h, tau, state, acc):
 
 @compiled
 def _at(times, commands, i, last, t, mode, out):
-    """Command at t, for which stamp i is the last at or before it (or the very first); `last` commands are known."""
+    """Command at t; stamp i is the last one at or before t (or the very first); `last` commands are known."""
     if mode != HOLD and i + 1 < last and t > times[i]:
         f = (t - times[i]) / (times[i + 1] - times[i])
         for c in range(4):
@@ -55,7 +55,7 @@ def _at(times, commands, i, last, t, mode, out):
 
 @compiled
 def _predict(times, commands, i, known, end, predictor, path_times, path):
-    """Commands i..known-1 (and a few before) and their prediction up to `end`, into path; returns how many."""
+    """Write commands i..known-1 (and a few before) and their prediction up to `end` into path; returns their number."""
     begin = max(0, min(i, known - PREDICTION_ORDER), known - _MOST_AHEAD // 2)
     size = known - begin
     for k in range(size):
@@ -63,7 +63,7 @@ def _predict(times, commands, i, known, end, predictor, path_times, path):
         path[k] = commands[begin + k]
     period = path_times[size - 1] - path_times[size - 2] if size >= 2 else 0.0
     if size < PREDICTION_ORDER or not 0.0 < period < 0.05:
-        return size  # held
+        return size  # no prediction: the last command is held
     while path_times[size - 1] < end and size < _MOST_AHEAD:
         for c in range(4):
             value = predictor[c, PREDICTION_ORDER]
@@ -76,21 +76,21 @@ def _predict(times, commands, i, known, end, predictor, path_times, path):
 
 
 def hold_predictor() -> np.ndarray:
-    """Prediction that the latest command stays. (4, PREDICTION_ORDER + 1)."""
+    """Weights (4, PREDICTION_ORDER + 1) of the prediction that the latest command stays."""
     weights = np.zeros((4, PREDICTION_ORDER + 1))
     weights[:, 0] = 1.0
     return weights
 
 
 def fit_predictor(commands: np.ndarray) -> np.ndarray:
-    """Least-squares weights with which the latest commands predict the next.
+    """Least-squares weights for predicting the next command from the latest commands.
 
     Args:
         commands: (n, 4), evenly spaced.
 
     Returns:
-        (4, PREDICTION_ORDER + 1): weights of the latest, the one before ..., and a constant. With too few, or none that
-        vary, the prediction is to hold the latest.
+        (4, PREDICTION_ORDER + 1): weights of the latest command, the one before ..., and a constant. With too few
+        commands, or constant ones, the prediction holds the latest command.
     """
     weights = hold_predictor()
     n = len(commands) - PREDICTION_ORDER
@@ -136,7 +136,7 @@ def _run(times, commands, i, last, begin, end, mode, tau, state, acc):
 
 @compiled
 def _back(t0, t1, u0, u1, t, tau, state):
-    """Undo the lag from t back to t0 on the line from (t0, u0) to (t1, u1)."""
+    """Carry the state of the lag from t back to t0 on the line from (t0, u0) to (t1, u1)."""
     h = t - t0
     for v in range(len(state) // 4):
         tv = tau * (1.0 + TAU_STEP * (v if v < 2 else -1))
@@ -152,14 +152,14 @@ def _back(t0, t1, u0, u1, t, tau, state):
 @compiled
 def _run_predicted(times, commands, i, known, last, begin, end, predictor, tau, path_times, path, guess, start, acc,
                    junk):  # fmt: skip
-    """Carry `guess` from begin to end along the commands before `known` and what they predict; add the means to acc.
+    """Carry `guess` from begin to end along commands 0..known-1 and their prediction; add the integrals to acc.
 
     start (4,) receives the lagged command at begin. path_times, path and junk are scratch.
     """
     size = _predict(times, commands, i, known, end, predictor, path_times, path)
     if known <= i + 1 and i + 1 < last and begin > times[known - 1]:
-        # the state at `begin` has been carried towards commands that are not known yet: go back to the last stamp that
-        # is, and come here again along what is known and predicted
+        # the state at `begin` depends on a command that is not known yet: go back to the last known stamp, then forward
+        # to `begin` along known and predicted commands
         here = begin
         for j in range(i, known - 2, -1):
             _back(times[j], times[j + 1], commands[j], commands[j + 1], here, tau, guess)
@@ -175,22 +175,22 @@ def lagged_means(
     times, commands, first, last, predictor, nodes, node_first, node_last, mode, tau, delay, state, mean, mean_tau,
     mean_delay,
 ):  # fmt: skip
-    """Means of the lagged command over the steps between nodes.
+    """Compute the means of the lagged command over the steps between nodes.
 
     Args:
         times: (n,) s, stamps of the commands, increasing.
         commands: (n, 4) F [N] and M [N m] commanded at those stamps.
         first, last: range of commands to use; times[first] must not be after the start time in `state`.
-        predictor: (4, PREDICTION_ORDER + 1) weights of the latest commands in predicting the next; see `fit_predictor`.
+        predictor: (4, PREDICTION_ORDER + 1) weights of the prediction; see `fit_predictor`.
         nodes: (m,) s, increasing.
         node_first, node_last: fill rows node_first..node_last-1, row k being the step that ends at nodes[k].
         mode: LINEAR, HOLD or CAUSAL.
         tau: s; 0 means no lag.
-        delay: s by which the command acts later than its stamp says.
-        state: (13,) lagged values for tau and tau (1 +- TAU_STEP), 4 each, then their time [s] on the clock
-            of the commands; updated in place, so that a later call goes on from the last node. (5,): for tau alone.
+        delay: s from the stamp of a command to its effect.
+        state: (13,) lagged values for tau and tau (1 +- TAU_STEP), 4 each, then their time [s] on the clock of the
+            commands. Updated in place, so that a later call continues from the last node. (5,): for tau alone.
         mean: (m, 4) receives the means.
-        mean_tau: (m, 4) receives d mean / d tau [1/s]; for tau alone nothing.
+        mean_tau: (m, 4) receives d mean / d tau [1/s]; not used with a state (5,).
         mean_delay: (m, 4) receives d mean / d delay [1/s].
 
     Returns:
@@ -222,7 +222,7 @@ def lagged_means(
         acc[:] = 0.0
         if mode == CAUSAL:
             known = i + 1
-            # by the node itself: with begin + delay, rounding would decide for a stamp at the end of the microsecond
+            # the node itself, since begin + delay has a rounding error; with a tolerance of 1 microsecond
             now = (nodes[k - 1] if k > node_first else begin + delay) + 1e-6
             while known < last and times[known] <= now:
                 known += 1

@@ -1,11 +1,11 @@
 """The rigid body with its effects: from rotor thrusts and state to specific force and angular acceleration.
 
-Vectorised over n moments; used by diagnosis and prediction. In neutral every effect drops out, and what is left is
+Vectorised over n moments; used by diagnosis and prediction. With all effects at neutral, the model is
 
     f = e3 sum(thrust)/m,   alpha = I^-1 (M - w x I w).
 
-With the centre of mass at c from O (middle of the rotors; positions and velocities are those of O), torques are taken
-about the centre of mass, and the specific force at O is F/m - alpha x c - w x (w x c).
+O is the middle of the rotors; positions and velocities are those of O. With the centre of mass at c from O, torques are
+taken about the centre of mass, and the specific force at O is F/m - alpha x c - w x (w x c).
 """
 
 import math
@@ -26,16 +26,16 @@ from crazyem.vehicle import GRAVITY, Vehicle
 
 @dataclass(frozen=True)
 class RotorInput:
-    """What the rotors were told, or what they were seen to do, at m stamps.
+    """Commands or measured speeds of the rotors as thrusts, at m stamps.
 
     Attributes:
         time: (m,) s, increasing.
         thrust: (m, 4) N: settled thrust of each command, or thrust at each measured speed.
         voltage: (m,) V, NaN where unknown.
-        flown: (m,) s since the feet left the floor.
-        measured: thrusts come from measured rotor speeds: no lag, and nothing that comes before it.
-        aged: commands of a sampled closed loop: a step must not look at commands later than its start.
-        delay: s, known beforehand: how long a command is held, and the low pass of the rates that answer to it.
+        flown: (m,) s since take-off.
+        measured: thrusts come from measured rotor speeds, so the lag and effects on commands do not apply.
+        aged: commands of a sampled closed loop: a step must not use commands later than its start.
+        delay: s, known delay: mean hold of a command, and low pass of the measured rates.
     """
 
     time: NDArray
@@ -49,7 +49,7 @@ class RotorInput:
 
 @dataclass(frozen=True)
 class Motion:
-    """specific_force (n, 3) m/s^2 and angular_acceleration (n, 3) rad/s^2, body axes, of O, gravity not included."""
+    """Specific force (n, 3) m/s^2 at O, without gravity, and angular acceleration (n, 3) rad/s^2; body axes."""
 
     specific_force: NDArray
     angular_acceleration: NDArray
@@ -61,20 +61,20 @@ def vehicle_values(vehicle: Vehicle) -> dict[str, dict[str, float]]:
 
 
 def active(effects: Effects, vehicle: Vehicle) -> list[tuple[Effect, dict]]:
-    """Effects with complete parameters, in the order of the catalogue."""
+    """The given effects with all their parameters, in the order of the catalogue."""
     own = vehicle_values(vehicle)
     return [(CATALOGUE[n], CATALOGUE[n].complete(effects[n], own.get(n, {}))) for n in CATALOGUE if n in effects]
 
 
 def gain(found: list[tuple[Effect, dict]], what: str) -> float:
-    """By what effects (as `active` gives them) multiply the "thrust" or "torque" of all rotors."""
+    """Product of the factors of effects (from `active`) on the "thrust" or "torque" of all rotors."""
     return math.prod(float(values[effect.parameters[0].name]) for effect, values in found if effect.gain == what)
 
 
 def settled(inputs: RotorInput, *, vehicle: Vehicle, effects: Effects) -> tuple[NDArray, float, float]:
-    """What the rotors would settle at, stamp by stamp, and how they get there.
+    """Settled thrust of the rotors at each stamp, with lag and delay.
 
-    Returns: (m, 4) N, not above what a rotor can give; the lag [s]; the delay [s].
+    Returns: (m, 4) N, up to the largest thrust of a rotor; the lag [s]; the delay [s].
     """
     thrust = inputs.thrust
     lag, delay = (0.0 if inputs.measured else vehicle.motor_time_constant), inputs.delay
@@ -98,8 +98,8 @@ def rotor_thrust(
 ) -> tuple[NDArray, NDArray]:
     """Mean thrust of each rotor, and its mean derivative, over the steps that end at nodes (n,) [s].
 
-    `breaks`: rows at which a new stretch begins; these, and the first, hold the thrust at the node, and no rate.
-    Returns (n, 4) N and (n, 4) N/s.
+    `breaks`: rows at which a new stretch begins. These rows and the first one get the thrust at the node, and a rate of
+    0. Returns (n, 4) N and (n, 4) N/s.
     """
     thrust, lag, delay = settled(inputs, vehicle=vehicle, effects=effects)
     mode = CAUSAL if inputs.aged and (inputs.measured or lag > 0) else LINEAR if inputs.measured else HOLD
@@ -112,8 +112,8 @@ def rotor_thrust(
         begin = nodes[first] - delay - 10 * max(lag, 0.02)
         at = max(0, int(np.searchsorted(inputs.time, begin, "right")) - 1)
         state[:4], state[4] = thrust[at], inputs.time[at]
-        # Up to the first row, which gets the thrust there. A mean of all commands before would depend on which of them
-        # is the first, by 10 m/s^2 where the rotors stood still; so would its rate.
+        # The first row gets the thrust at its node. A mean over earlier commands would depend on the choice of the
+        # first one, by up to 10 m/s^2 after rotors at rest; so would its rate.
         at = lagged_means(inputs.time, thrust, at, len(inputs.time), predictor, nodes, first, first + 1, mode, lag,
                           delay, state, mean, unused, rate)  # fmt: skip
         mean[first], rate[first] = state[:4], 0.0
@@ -123,7 +123,7 @@ def rotor_thrust(
 
 
 def body_of(vehicle: Vehicle, effects: Effects) -> Body:
-    """What is accelerated, with the effects that change it."""
+    """Mass, inertia and centre of mass of the vehicle with the effects that change them."""
     xx, yy, zz = vehicle.inertia
     xy, xz, yz = vehicle.inertia_products
     body = Body(vehicle.mass, np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), np.zeros(3))
@@ -134,7 +134,7 @@ def body_of(vehicle: Vehicle, effects: Effects) -> Body:
 
 
 def motion(situation: Situation, *, vehicle: Vehicle, effects: Effects) -> Motion:
-    """Specific force and angular acceleration at n moments; `situation.thrust` is that after the lag."""
+    """Specific force and angular acceleration at n moments; `situation.thrust` is the thrust after the lag."""
     acting = active(effects, vehicle)
     n = situation.size
     body = body_of(vehicle, effects)
@@ -174,7 +174,7 @@ def motion(situation: Situation, *, vehicle: Vehicle, effects: Effects) -> Motio
 
 @compiled
 def _accelerated(force, torque, rate, centre, mass, inertia, inverse, specific, angular):
-    """Rows of `accelerated`: receives (n, 3) m/s^2 and (n, 3) rad/s^2."""
+    """Loop of `accelerated`; specific (n, 3) m/s^2 and angular (n, 3) rad/s^2 receive the result."""
     cx, cy, cz = centre[0], centre[1], centre[2]
     for k in range(len(force)):
         fx, fy, fz = force[k, 0], force[k, 1], force[k, 2]
@@ -196,7 +196,7 @@ def _accelerated(force, torque, rate, centre, mass, inertia, inverse, specific, 
 
 
 def accelerated(force: NDArray, torque: NDArray, *, body: Body, body_rate: NDArray) -> Motion:
-    """Newton and Euler: force (n, 3) N at O and torque (n, 3) N m about O to the motion of O, body axes."""
+    """Equations of Newton and Euler: force (n, 3) N at O and torque (n, 3) N m about O -> motion of O, body axes."""
     rows = [np.ascontiguousarray(v, np.float64) for v in (force, torque, body_rate)]
     motion = Motion(np.empty(rows[0].shape), np.empty(rows[0].shape))
     _accelerated(
@@ -207,7 +207,7 @@ def accelerated(force: NDArray, torque: NDArray, *, body: Body, body_rate: NDArr
 
 
 def measured(situation: Situation, *, vehicle: Vehicle, effects: Effects) -> Offset:
-    """What the sensors show beyond the truth."""
+    """Sum of the measurement errors of all effects: shown less true values."""
     state, force = np.zeros((situation.size, 12)), np.zeros((situation.size, 3))
     for effect, values in active(effects, vehicle):
         if effect.measured is not None:

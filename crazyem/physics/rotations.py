@@ -1,4 +1,4 @@
-"""Quaternions (x, y, z, w; body to world) and rotation vectors, in plain numpy, for the core that must stay exact.
+"""Quaternions (x, y, z, w; body to world) and rotation vectors, in plain numpy.
 
 >>> import numpy as np
 >>> q = quaternion_from_rotation_vector(np.array([0.0, 0.0, np.pi / 2]))
@@ -45,7 +45,7 @@ def quaternion_from_rotation_vector(phi: ArrayLike) -> NDArray:
 
 
 def rotation_vector_from_quaternion(q: ArrayLike) -> NDArray:
-    """Logarithm, the shorter way round. q: (..., 4) -> (..., 3) rad."""
+    """Logarithmic map, with an angle up to pi. q: (..., 4) -> (..., 3) rad."""
     q = np.asarray(q, float)
     q = np.where(q[..., 3:] < 0, -q, q)
     sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
@@ -107,9 +107,9 @@ def axes(roll: float, pitch: float, yaw: float) -> NDArray:
 
 
 def rotation_between(one: NDArray, other: NDArray) -> NDArray:
-    """log(one' other), the shorter way round: one exp(it) = other. (n, 3, 3) twice -> (n, 3) rad, in axes of `one`.
+    """Rotation vector phi with one exp(phi) = other, |phi| up to pi. (n, 3, 3) twice -> (n, 3) rad, in axes of `one`.
 
-    `other` may also be a point on the chord between two rotations that are near each other.
+    `other` may also be a linear interpolation between two rotations that are near each other.
     """
     a, b = (np.ascontiguousarray(np.asarray(m, float).transpose(2, 1, 0)) for m in (one, other))  # column, component, n
 
@@ -122,13 +122,13 @@ def rotation_between(one: NDArray, other: NDArray) -> NDArray:
     angle = np.arctan2(sine, 0.5 * (trace - 1))
     small = sine < 1e-9
     vector = (twice * np.where(small, 0.5, angle / np.where(small, 2.0, 2 * sine))).T
-    for row in np.flatnonzero(angle > 3.1):  # near half a turn the sine does not show the axis any more
+    for row in np.flatnonzero(angle > 3.1):  # near half a turn the sine is too small to give the axis
         vector[row] = _near_half_turn(one[row].T @ other[row], twice[:, row], angle[row])
     return vector
 
 
 def _near_half_turn(matrix: NDArray, twice_sine: NDArray, angle: float) -> NDArray:
-    """The axis from the symmetric part, (1 - cos) a a' + cos; its sign from the sine. (3, 3), (3,), rad -> (3,) rad."""
+    """Rotation vector with the axis a from the symmetric part (1 - cos) a a' + cos I, its sign from the sine."""
     outer = (matrix + matrix.T) / 2 - np.cos(angle) * np.eye(3)
     axis = outer[np.argmax(np.diag(outer))]
     axis = axis / np.linalg.norm(axis)

@@ -1,7 +1,7 @@
-"""From what is logged to force and torque: command and voltage (or rotor speed) -> thrust of each rotor -> F and M.
+"""From logged signals to force and torque: command and voltage (or rotor speed) -> thrust of each rotor -> F and M.
 
 Rotors are numbered as on the Crazyflie: 1 front right, 2 back right, 3 back left, 4 front left; body x forward, y left,
-z up; 1 and 3 turn so that their reaction is towards negative yaw. Source: power_distribution_quadrotor.c, motors.c.
+z up. The reaction torque of rotors 1 and 3 is towards negative yaw. Source: power_distribution_quadrotor.c, motors.c.
 
 >>> import numpy as np
 >>> wrench(np.full(4, 0.1), arm=(0.0325, 0.0325), torque_per_thrust=0.007)
@@ -31,7 +31,7 @@ def thrust_from_command(command: ArrayLike, voltage: ArrayLike, *, thrust_curve:
         thrust_curve: polynomial in motor volts, constant first [N, N/V, ...].
 
     Returns:
-        (..., 4) thrust [N]; a rotor commanded to zero gives none, and none pulls down.
+        (..., 4) thrust [N]; 0 for a command of zero, never negative.
     """
     command = np.asarray(command, float)
     motor_volts = command * np.asarray(voltage, float)[..., None]
@@ -42,7 +42,7 @@ def thrust_from_command(command: ArrayLike, voltage: ArrayLike, *, thrust_curve:
 
 
 def thrust_from_speed(speed: ArrayLike, *, rotor_constant: float) -> NDArray:
-    """Thrust of rotors from measured speed. speed: (..., 4) rad/s -> (..., 4) N; already includes the rotor lag."""
+    """Thrust of rotors from measured speed, which includes the rotor lag. speed: (..., 4) rad/s -> (..., 4) N."""
     return rotor_constant * np.square(np.asarray(speed, float))
 
 
@@ -71,13 +71,13 @@ def wrench(thrust: ArrayLike, *, arm: Sequence[float], torque_per_thrust: float)
 
 
 def wrench_from_command(command: ArrayLike, voltage: ArrayLike, vehicle: Vehicle) -> NDArray:
-    """F and M that a vehicle's rotors would settle at for a command: (..., 4) duty, (...,) V -> (..., 4) N, N m."""
+    """Settled F and M of a vehicle's rotors for a command: (..., 4) duty, (...,) V -> (..., 4) N, N m."""
     thrust = thrust_from_command(command, voltage, thrust_curve=vehicle.thrust_curve)
     return wrench(thrust, arm=vehicle.arm, torque_per_thrust=vehicle.torque_per_thrust)
 
 
 def wrench_from_one_command(command: tuple[float, ...], voltage: float, vehicle: Vehicle) -> NDArray:
-    """`wrench_from_command` for one logged command, in a fortieth of its time: (4,) duty, V -> (4,) N, N m."""
+    """`wrench_from_command` for one logged command, 40 times faster: (4,) duty, V -> (4,) N, N m."""
     duty = tuple(map(float, command))
     out: NDArray = _one_wrench(duty, float(voltage), vehicle.thrust_curve, vehicle.arm, vehicle.torque_per_thrust)
     return out

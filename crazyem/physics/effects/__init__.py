@@ -1,1 +1,1 @@
-"""Effects: what a real drone adds to the rigid body, one file each; `catalogue.py` lists them."""
+"""Effects: differences between a real drone and the rigid body, grouped by modules; `catalogue.py` lists them."""

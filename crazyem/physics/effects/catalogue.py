@@ -1,7 +1,6 @@
-"""The catalogue of effects: every effect by its name, in the order in which they are composed.
+"""The catalogue of effects: every effect by its name, in the order in which effects are applied.
 
-It is made of what lies in this folder: a module that makes an `Effect` is in the catalogue, and nothing
-else is to be done.
+The catalogue is built from the modules of this folder. An `Effect` that a module defines needs no registration.
 """
 
 import importlib
@@ -15,11 +14,11 @@ from crazyem.physics.effects.effect import Effect, Effects, Parameter
 
 
 def discover(paths: Iterable[str], package: str = "") -> dict[str, Effect]:
-    """Every effect that the modules of some folders make, by `order` and name.
+    """Every effect that the modules of some folders define, by `order` and name.
 
     Args:
         paths: folders.
-        package: dotted name of the package that they are; empty: top level.
+        package: dotted name of the package of these folders; empty: top level.
 
     Raises:
         ValueError: two different effects have the same name.
@@ -38,11 +37,11 @@ CATALOGUE: dict[str, Effect] = discover(folder.__path__, folder.__name__)
 
 
 def check_effects(effects: Effects, *, where: str) -> None:
-    """Refuse effects and parameters that the catalogue does not know, and values that it does not admit.
+    """Refuse unknown effects, unknown parameters, and values that are not allowed.
 
     Args:
         effects: effect -> parameter -> value.
-        where: the file, for the message.
+        where: name of the file, for the message.
 
     Raises:
         FileFormatError: one sentence that names the file, the effect and the parameter.
@@ -60,7 +59,7 @@ def check_effects(effects: Effects, *, where: str) -> None:
 
 
 def _problem(parameter: Parameter, value: Any) -> str:
-    """What a value would have to be, or nothing if it is admitted."""
+    """Description of the allowed values, or "" if the value is allowed."""
     if parameter.among:
         listed = isinstance(value, list | tuple) and 0 < len(value) <= len(parameter.among)
         return (

@@ -1,4 +1,4 @@
-"""linear_drag, quadratic_drag, velocity_moment, rate_damping: what the air does against motion."""
+"""linear_drag, quadratic_drag, velocity_moment, rate_damping: forces and torques of the air against motion."""
 
 import math
 from collections.abc import Callable
@@ -11,19 +11,19 @@ from crazyem.vehicle import GRAVITY, Vehicle
 
 
 def linear_force(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
-    """-D v: x, y, z [N s/m] along body axes."""
+    """Force -D v with the airspeed v; x, y, z [N s/m] along body axes."""
     return Wrench(-np.array([x, y, z]) * situation.airspeed, np.zeros((situation.size, 3)))
 
 
 def _of_real_rotors(names: str, size: float) -> Callable[[Conditions], Sizes]:
-    """Real rotors have drag and flapping, bare rigid bodies of files neither."""
+    """Usual sizes for the file of one real drone: real rotors have drag and flapping; none for other files."""
     return lambda conditions: alike(names, size) if conditions.individual_file else {}
 
 
-# N s/m, N s^2/m^2, within which no drag is known: an attitude 1 ms late is a force of 3e-4 N s/m along the quicker axis
-# of a figure 8 (mass * (3.1 rad/s)^2 * 1 ms); along z thrust is a little wrong.
+# Systematic error [N s/m, N s^2/m^2]: an attitude 1 ms late looks like 3e-4 N s/m along the faster axis of a figure 8
+# (mass * (3.1 rad/s)^2 * 1 ms); along z, the thrust has a small error.
 SYSTEMATIC = in_turn("x y z", 3e-4, 3e-4, 1e-3)
-DETECTABLE = in_turn("x y z", 1e-3, 1e-3, 3e-3)  # N s/m, N s^2/m^2; along z thrust is a little wrong
+DETECTABLE = in_turn("x y z", 1e-3, 1e-3, 3e-3)  # N s/m, N s^2/m^2; along z, the thrust has a small error
 
 LINEAR_DRAG = Effect(
     "linear_drag",
@@ -49,7 +49,7 @@ LINEAR_DRAG = Effect(
 
 
 def quadratic_force(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
-    """-Q |v| v: the whole airspeed times each component; x, y, z [N s^2/m^2] along body axes."""
+    """Force -Q |v| v with the airspeed v; x, y, z [N s^2/m^2] along body axes."""
     airspeed = situation.airspeed
     speed = np.sqrt(np.einsum("ni,ni->n", airspeed, airspeed))[:, None]
     return Wrench(-np.array([x, y, z]) * speed * airspeed, np.zeros((situation.size, 3)))
@@ -72,7 +72,7 @@ QUADRATIC_DRAG = Effect(
 
 
 def flapping(situation: Situation, body: Body, *, roll_per_vy: float, pitch_per_vx: float) -> Wrench:
-    """Torque (roll_per_vy v_y, pitch_per_vx v_x, 0) of the air's flow on the rotors [N m s/m], body axes."""
+    """Torque (roll_per_vy v_y, pitch_per_vx v_x, 0) by airspeed v at the rotors; coefficients [N m s/m], body axes."""
     airspeed = situation.airspeed
     torque = np.zeros((situation.size, 3))
     torque[:, 0] = roll_per_vy * airspeed[:, 1]
@@ -81,13 +81,13 @@ def flapping(situation: Situation, body: Body, *, roll_per_vy: float, pitch_per_
 
 
 def damping(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
-    """Torque -B w, x, y, z [N m s]."""
+    """Torque -B w with the body rate w; x, y, z [N m s]."""
     return Wrench(np.zeros((situation.size, 3)), -np.array([x, y, z]) * situation.body_rate)
 
 
 def _sampled(conditions: Conditions) -> Sizes:
-    """N m s: what is sent between two logged commands looks like a damping. Speeds logged at 100 Hz: of 1 to 11e-6 in
-    quick flights of 11 drones with nothing hidden. With heavy rotors: about z of 1e-5 to 1.9e-4 in 11 flights."""
+    """N m s: commands between two logged ones look like a damping. With speeds logged at 100 Hz: 1 to 11e-6 in fast
+    flights of 11 drones without hidden effects. With heavy rotors: 1e-5 to 1.9e-4 about z in 11 flights."""
     usual = 6e-6 if conditions.measured_speeds or conditions.heavy_rotors else 0.0
     tilting = 3e-4 if conditions.other_clock else math.hypot(usual, 3e-4 * conditions.unlogged_share)
     if not conditions.shows_rotation or tilting == 0.0:
@@ -95,9 +95,9 @@ def _sampled(conditions: Conditions) -> Sizes:
     return in_turn("x y z", tilting, tilting, 1e-4 if conditions.heavy_rotors else tilting)
 
 
-# N m s/m: smallest moment that tips the drone back from where it flies, as air on rotors above the centre of mass
-# does, and further towards there. Five of simulated drones with none were such about both axes, of 4e-6 to 1.2e-5: more
-# than that may be of a body below which the air finds more hold.
+# N m s/m: detection limits of a moment that tilts the drone back, against its motion (air on rotors above the centre of
+# mass), and onward, with its motion. In five simulated drones without the effect, an onward moment of 4e-6 to 1.2e-5
+# came out about both axes. A larger one may be real: drag of the body below the centre of mass.
 BACK, ONWARD = 3e-6, 1.5e-5
 
 VELOCITY_MOMENT = Effect(
@@ -120,13 +120,13 @@ VELOCITY_MOMENT = Effect(
     slow_torque=True,
 )
 
-# m/s: a rotor loses thrust with the speed at which its air comes, all of it at twice the speed that it gives to the air
-# (4 m/s in a Crazyflie's hover; half of that is less than any small drone's).
+# m/s, induced velocity in hover: the thrust of a rotor falls with the axial speed of the air, to zero at twice the
+# induced velocity. It is 4 m/s for a Crazyflie; half of this is less than that of any small drone.
 INDUCED = 2.0
 
 
 def _beyond_rotor_damping(values: Values, vehicle: Vehicle) -> bool:
-    """Whether no rotors can damp a turn as much (see `INDUCED`)."""
+    """Whether the damping is more than rotors can have (see `INDUCED`)."""
     most = vehicle.mass * GRAVITY * float(np.hypot(*vehicle.arm)) ** 2 / (2.0 * INDUCED)
     return max(values.values()) > most
 
@@ -140,8 +140,8 @@ RATE_DAMPING = Effect(
     external=damping,
     prior=Prior(alike("x y z", 2e-5), _sampled, conditional=True),
     unphysical=_beyond_rotor_damping,
-    # rotors that are heavy look like a damping about z to commands that are sampled, and their derivative at none may
-    # have the wrong sign: begun as a bar of 0.3 g and 46 mm would be
+    # with sampled commands, heavy rotors look like a damping about z, and the derivative at an inertia of 0 may have
+    # the wrong sign: the fit begins at a bar of 0.3 g and 46 mm
     imitators={"rotor_inertia": {"inertia": 5e-8}},
     needs=("body_rate", "attitude"),
     separates=(

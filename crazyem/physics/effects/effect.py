@@ -1,8 +1,8 @@
-"""What an effect is: a named group of parameters with neutral values, and the places where it changes the rigid body.
+"""Effects as data: named groups of parameters with neutral values, and functions that change the rigid body.
 
-The rigid body is every effect at its neutral value. An effect is one file in this folder that makes an `Effect`; the
-catalogue finds it there. All functions are vectorised over n moments (steps of a flight, or starts of a prediction)
-and take the parameters as keywords. `crazyem/physics/motion.py` puts them together.
+With every effect at its neutral value, the model is the rigid body. A module in this folder defines an `Effect`, and
+the catalogue finds it there. All functions are vectorised over n moments (steps of a flight, or starts of a prediction)
+and take the parameters as keywords. `crazyem/physics/motion.py` combines them.
 """
 
 import math
@@ -19,7 +19,7 @@ from crazyem.vehicle import Vehicle
 Values = Mapping[str, Any]  # one effect: parameter -> value
 Effects = Mapping[str, Values]  # effect -> its parameters; as in a vehicle file
 
-LONGEST_STEP = 0.1  # s: across a longer one nothing is interpolated
+LONGEST_STEP = 0.1  # s; a longer step is a break, without interpolation
 
 
 @dataclass(frozen=True)
@@ -29,16 +29,16 @@ class Parameter:
     Attributes:
         name, unit: SI.
         neutral: the value at which the effect is absent; NaN: the vehicle's own value (see `Effect.neutral`).
-        low, high: what is admitted.
-        scale: a change that is visible but small, for finite differences and for starting points.
-        chosen: a discrete choice (a rotor, a stream, a length from a list), searched and not differentiated.
+        low, high: range of allowed values.
+        scale: a visible but small change, for finite differences and start values.
+        chosen: values of a discrete choice (a rotor, a stream, a length from a list), searched and not differentiated.
         among: the value is a list of some of these; `chosen` are the lists that are searched.
         needs, without: as in `Effect`, for this parameter alone.
-        usual: how far from neutral it usually is where the effect is there (0: five times `scale`).
-        words: for people; "": the name with spaces.
-        phrase: what it adds to the effect's words where it has a value, "" if nothing: "of rotor {}".
+        usual: typical distance from neutral if the effect is present (0: five times `scale`).
+        words: name for people; "": the name with spaces.
+        phrase: text that a value adds to the effect's words, as "of rotor {}"; "" for none.
         spoken: value of a choice -> words for the phrase.
-        remark: what goes with a finding of this parameter alone, as a clause.
+        remark: clause that is added to a finding of this parameter alone.
     """
 
     name: str
@@ -59,11 +59,11 @@ class Parameter:
 
     @property
     def said(self) -> str:
-        """Its name for people."""
+        """Name for people."""
         return self.words or self.name.replace("_", " ")
 
     def phrase_of(self, value: Any) -> str:
-        """What a value adds to the effect's words."""
+        """Text that a value adds to the effect's words."""
         if isinstance(value, float):
             value = f"{value:.2f}"
         each = value if isinstance(value, list | tuple) else [value]
@@ -71,13 +71,13 @@ class Parameter:
 
     @property
     def width(self) -> float:
-        """How far from neutral it usually is, by which it costs a model that it can be anything (`evidence.tuning`)."""
+        """Typical distance from neutral: the width of the prior in the cost of a parameter (`evidence.tuning`)."""
         return self.usual or 5.0 * self.scale
 
 
 @dataclass(frozen=True)
 class Body:
-    """What is accelerated. mass kg; inertia (3, 3) kg m^2 about the centre of mass; centre (3,) m from the origin O.
+    """The rigid body: mass kg; inertia (3, 3) kg m^2 about the centre of mass; centre (3,) m, position of it from O.
 
     O is the middle of the rotors; position and velocity of the drone are those of O.
     """
@@ -90,7 +90,7 @@ class Body:
 @dataclass(frozen=True)
 class Path:
     """A path at n moments: position (n, 3) m, velocity (n, 3) m/s, world; rotation (n, 3, 3) body to world; body rate
-    (n, 3) rad/s. Each is known but for a constant: only what changes from row to row has a meaning."""
+    (n, 3) rad/s. Only changes from row to row have a meaning, since each contains an unknown constant."""
 
     position: NDArray
     velocity: NDArray
@@ -100,36 +100,36 @@ class Path:
 
 @dataclass(frozen=True)
 class Situation:
-    """Where the drone is and what it does, at n moments; the means over the steps that end there.
+    """State and inputs of the drone at n moments; inputs are means over the steps that end at these moments.
 
     Attributes:
         time: (n,) s, clock of the recording.
-        flown: (n,) s since the feet left the floor.
+        flown: (n,) s since take-off.
         step: (n,) s, length of each step.
         position: (n, 3) m, world.
         height: (n,) m above the floor, not below 0.
         velocity: (n, 3) m/s, world.
         rotation: (n, 3, 3) body to world.
         body_rate: (n, 3) rad/s, body.
-        specific_force: (n, 3) m/s^2, body, of the rigid body as last computed (0 where unknown).
+        specific_force: (n, 3) m/s^2, body, as last computed by the model (0 where unknown).
         angular_acceleration: (n, 3) rad/s^2, body, likewise.
         thrust: (n, 4) N of each rotor, after the lag.
         thrust_rate: (n, 4) N/s, its mean derivative over the step.
         voltage: (n,) V; NaN where unknown.
         rotor_constant: N/(rad/s)^2 or NaN.
         air: (n, 3) m/s, world: velocity of the air (wind).
-        shaken: whether some effect couples the air to the body (a drag); without, wind is a constant force.
-        lagged: (n, 4) N after the lag, before what changes thrust at the same rotor speed; None: as `thrust`.
-        swing: (n, 6) direction of a load's string (unit, world) and its derivative [1/s]; None: found along the rows.
-        integrated: the path that motion alone makes of rates and accelerations; None: the rows themselves. Rows of a
-            filter hold the noise of the very sample that a late stream would explain.
-        seen: (n, 3) m/s^2, body: specific force that the drone was seen to have in each step, NaN where it was not;
-            None: not known. An effect may go by rows before its own only.
-        unrest: (3,) m/s^2 sqrt(s): how much of it comes and goes at random.
-        fused: whether the attitude that is shown was made on board, from the gyro (`onboard_estimate.py`).
-        model_force: (n, 3) m/s^2, body: specific force by the model alone; None: as `specific_force`, which may hold
-            what measurements corrected.
-        tilt: (n, 3) rad, body: by how much the attitude that is shown is turned, by other effects; None: not at all.
+        shaken: whether an effect couples the air to the body (a drag); otherwise wind is a constant force.
+        lagged: (n, 4) N after the lag, before effects that change thrust at the same rotor speed; None: as `thrust`.
+        swing: (n, 6) direction of a load's string (unit, world) and its derivative [1/s]; None: computed from the rows.
+        integrated: path by integration of rates and accelerations; None: the rows themselves. Rows of a filter contain
+            the noise of the same sample that a delayed stream would have to explain.
+        seen: (n, 3) m/s^2, body: measured specific force in each step, NaN where unknown; None: not known. An effect
+            may use only rows before its own.
+        unrest: (3,) m/s^2 sqrt(s): intensity of the random part of `seen`.
+        fused: whether the measured attitude comes from an onboard filter with the gyro (`onboard_estimate.py`).
+        model_force: (n, 3) m/s^2, body: specific force by the model alone; None: as `specific_force`, which may contain
+            corrections by measurements.
+        tilt: (n, 3) rad, body: rotation of the measured attitude by other effects; None: no rotation.
     """
 
     time: NDArray
@@ -184,7 +184,7 @@ class Wrench:
 
 @dataclass(frozen=True)
 class Offset:
-    """What a measurement shows beyond the truth, at n moments.
+    """Errors of measurements (shown less true values) at n moments.
 
     Attributes:
         state: (n, 12) position m and velocity m/s (world), attitude rad (body: shown = true * exp(offset)), rate rad/s.
@@ -197,12 +197,12 @@ class Offset:
 
 @dataclass(frozen=True)
 class Effect:
-    """A named group of parameters and what it does; the functions that are None it leaves alone.
+    """A named group of parameters, with the functions by which it changes the model (None: no change).
 
     Attributes:
         name: in vehicle files, reports, `--candidates`.
         parameters: see `Parameter`.
-        order: effects act in this order (then by name) where several change the same thing.
+        order: effects that change the same quantity act in this order, then by name.
         commanded: (thrust (m, 4) N settled, before the lag, at m stamps; time (m,), flown (m,), voltage (m,); hover: N
             of one rotor in hover; limit: N of one rotor at most; **parameters) -> (m, 4). Not applied to measured
             rotor speeds.
@@ -214,59 +214,58 @@ class Effect:
         air: (situation; **parameters) -> (n, 3) velocity of the air, world, added up.
         couples_air: whether the effect lets moving air act on the drone.
         external: (situation; body; **parameters) -> Wrench, added up.
-        tied: the same, for a force that itself answers to the drone's acceleration: here `situation.specific_force`
-            is that at O under everything else.
+        tied: the same, for a force that depends on the drone's acceleration; here `situation.specific_force` is the one
+            at O under all other forces.
         measured: (situation; **parameters) -> Offset, added up.
-        uses_force: whether `measured` goes by `situation.model_force` and `situation.tilt`: then effects on forces and
-            on the attitude that is shown change what it shows, too.
-        needs: at least one of these signals must be recorded, else nothing can be said: "voltage", "rotor_speed",
+        uses_force: whether `measured` uses `situation.model_force` and `situation.tilt`; then its result depends on
+            effects on forces and on the measured attitude, too.
+        needs: at least one of these signals must be recorded for the effect to be tested: "voltage", "rotor_speed",
             "motor_command", "specific_force", "position", "attitude", "body_rate", "velocity".
-        without: signals with which it cannot be (sag in time only matters where no voltage is known).
-        separates: what would tell it from its look-alikes, in words; see `advice`.
-        spared: signal -> the words of `separates` that ask for it.
-        alike: correlation of how far its parameters usually are from neutral (`Parameter.usual`).
-        nudge: small values at which every parameter matters (a ground effect's height says nothing at strength 0);
-            the fit begins with derivatives there. Empty: neutral will do.
-        amplitude: the parameter without which the others say nothing ("strength"); "" if there is none.
-        alternatives: sets of parameters that are fitted together, one of which is enough; empty: all of them.
-        beginnings: parameter -> values to begin from, where the likelihood may have several maxima.
-        sizes: values of the amplitude with which beginnings are compared in full, where a small one says little.
-        words: the effect for people; "": the name with spaces.
-        belongs_to: "vehicle", or "recording" where each recording has its own: what a sensor or a filter on board shows
-            on that day, which no vehicle file is to have; or "day": the air or the link of that day, which a vehicle
-            file has, and a simulator's file has not.
-        prior: how large its parameters are.
-        needs_torques: told by torques from sample to sample, of which commands on another clock say nothing.
-        steady_force: told by forces that last, which no torque at random looks like.
-        steady_torque: whether it makes a torque that lasts, as a trim does.
+        without: signals that must not be recorded (sag in time only matters where no voltage is known).
+        separates: advice in words: how to distinguish it from its look-alikes; see `advice`.
+        spared: signal -> the words of `separates` that ask for this signal.
+        alike: prior correlation between the distances of its parameters from neutral (`Parameter.usual`).
+        nudge: small values at which every parameter matters (at strength 0 the height of a ground effect does not); the
+            first derivatives of a fit are taken there. Empty: neutral values are used.
+        amplitude: the parameter without which the others have no effect ("strength"); "" if there is none.
+        alternatives: sets of parameters that are fitted together; one set is enough. Empty: all parameters.
+        beginnings: parameter -> start values, where the likelihood may have several maxima.
+        sizes: values of the amplitude at which start values are compared in full, where a small one is not enough.
+        words: name for people; "": the name with spaces.
+        belongs_to: "vehicle"; or "recording": a sensor or an onboard filter in one recording, never part of a vehicle
+            file; or "day": the air or the link of a day, part of a vehicle file but not of a simulator's file.
+        prior: sizes of its parameters.
+        needs_torques: determined by torques from sample to sample; commands on another clock carry no information.
+        steady_force: determined by lasting forces, which random torques cannot imitate.
+        steady_torque: whether it makes a lasting torque, as a trim does.
         shifts_centre: whether it moves the centre of mass.
-        slow_torque: whether it acts by a torque that goes with velocity, which commands on another clock still show.
-        imbalance: what it does to the steady thrust and torque of a drone: "thrust", all rotors lack a share; "mean
-            thrust", so on average over a flight; "rotor", one rotor lacks a share; "load", a weight sits on board;
-            "air", a torque about x and y; "", nothing that is known.
+        slow_torque: whether it acts by a torque that depends on velocity, which commands on another clock still show.
+        imbalance: its effect on the steady thrust and torque: "thrust", all rotors lack a share; "mean thrust", the
+            same on average over a flight; "rotor", one rotor lacks a share; "load", a weight on board; "air", a torque
+            about x and y; "", unknown.
         lifts: whether it acts up and down as a weight does.
-        needs_voltage: whether nothing can be said of its size without the voltage of the battery.
-        twins: effects that are nearly the same to every signal: fitted where it is fitted, and never beside it.
-        never_beside: sets of effects that together are the same as it.
-        same_as: effects that are exactly the same to every signal -> their choices with which they are.
-        common_factor: the effect that it is where all its parameters change by one factor; "": none.
-        fixed_beside: effects found beside which it is not free within what is usual: both go along a ridge.
-        mistaken_for: effects that are named where it is there, which is itself never named.
-        imitators: effects that may look like it although derivatives at nothing say nothing of them -> where such a fit
-            begins.
-        own_likelihood: whether another likelihood than that of the filter speaks of it, or none.
-        on_request: whether it is looked for only if asked for.
-        of_healthy_rotors: whether flights of the healthy drone give the vehicle file its values.
-        admitted: choices -> (low, high) of parameters while they are fitted, less than a file may have.
-        most_per_mass: of a parameter over the drone's mass, in its unit over kg: more is something else.
-        unphysical: (values; vehicle) -> whether they are more than a drone of this mass and size can have.
-        linear_range: departures of its parameters from neutral that one pass of a fit finds; 0: none.
-        random: a random process, which adds nothing to the mean motion.
-        gain: "thrust" or "torque" where its one parameter multiplies that of all rotors.
+        needs_voltage: whether its size cannot be known without the voltage of the battery.
+        twins: effects with nearly the same signals: always compared with it, never in one model with it.
+        never_beside: sets of effects that together have its signals: never in one model with it.
+        same_as: effects with exactly its signals -> the choices of these effects.
+        common_factor: the effect to which it is equal if all its parameters change by one factor; "": none.
+        fixed_beside: if one of these effects is found, this one is no free nuisance: together they form a ridge.
+        mistaken_for: effects that may be named in its place; it is itself never named.
+        imitators: effects that may look like it although their derivative at neutral does not show this -> start values
+            of their fit.
+        own_likelihood: whether another likelihood than the filter's determines it, or none.
+        on_request: whether it is tested only on request.
+        of_healthy_rotors: whether flights of the healthy drone determine its values in the vehicle file.
+        admitted: choices -> (low, high) of parameters in a fit, narrower than in a file.
+        most_per_mass: largest value of a parameter over the drone's mass, in its unit over kg; more is another effect.
+        unphysical: (values; vehicle) -> whether the values are impossible for a drone of this mass and size.
+        linear_range: distance of its parameters from neutral within which one pass of a fit is enough; 0: none.
+        random: a random process without effect on the mean motion.
+        gain: "thrust" or "torque" if its one parameter multiplies the thrust or torque of all rotors.
         own: vehicle -> values of the parameters whose neutral value is the vehicle's.
-        constants: parameter -> the constant of a simulator's file that is the same (`simulators/constants.py`).
+        constants: parameter -> the same constant in a simulator's file (`simulators/constants.py`).
         about: constants of simulators' files that look wrong without it, the nearest first.
-        controllers: whether a controller of the firmware has a parameter for it, which the online estimator has not.
+        controllers: whether a controller of the firmware has a parameter for it, and the online estimator has none.
     """
 
     name: str
@@ -327,12 +326,12 @@ class Effect:
     controllers: bool = False
 
     def said(self, values: Values) -> str:
-        """The effect in words, with those of its values that say which: "rotor fault of rotor 3"."""
+        """The effect in words, with the values that specify it: "rotor fault of rotor 3"."""
         named = [p.phrase_of(values[p.name]) for p in self.parameters if p.phrase and values.get(p.name) is not None]
         return " ".join([self.words or self.name.replace("_", " "), *named])
 
     def advice(self, recorded: Container[str]) -> str:
-        """What would tell it from its look-alikes, without asking for what is recorded."""
+        """Advice how to distinguish it from its look-alikes, without words that ask for a recorded signal."""
         text = self.separates
         for signal, words in self.spared.items():
             if signal in recorded:
@@ -340,7 +339,7 @@ class Effect:
         return text
 
     def complete(self, values: Values, own: Values) -> dict[str, Any]:
-        """All parameters: those given, else neutral; `own` are the vehicle's values for those whose neutral is NaN."""
+        """Values of all parameters: given ones, else neutral ones; where neutral is NaN, the vehicle's values `own`."""
         found = {}
         for p in self.parameters:
             neutral = own.get(p.name, 0.0) if isinstance(p.neutral, float) and math.isnan(p.neutral) else p.neutral
@@ -349,9 +348,9 @@ class Effect:
 
 
 def stretches(situation: Situation) -> tuple[NDArray, NDArray]:
-    """Which rows hang together: where a path is broken, nothing before it acts on what comes after.
+    """Time steps and breaks of the rows; rows before a break have no effect on rows after it.
 
-    Returns: (n,) s from the row before to each row (0 at breaks), (n,) whether a break.
+    Returns: (n,) s from the row before to each row (0 at breaks); (n,) bool, whether a row is a break.
     """
     gap = np.diff(situation.time, prepend=situation.time[:1])
     broken = ~((situation.step > 0) & (situation.step <= LONGEST_STEP) & (gap > 0) & (gap <= LONGEST_STEP))

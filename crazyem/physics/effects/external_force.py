@@ -1,9 +1,9 @@
-"""wind, gusts, force_by_place: forces from outside that are no drag.
+"""wind, gusts, force_by_place: external forces other than drag.
 
-Gusts are a random process: they have parameters here and a likelihood elsewhere, and add nothing to the mean motion.
-force_by_place depends on where the drone is, and is what nobody names: a cable, a fan or the draught of a wall to first
-order, a constant and a slope for each world axis. It is no finding and never part of a vehicle file; it stands against
-named effects that would have to imitate it (`crazyem/diagnosis/naming/place_rivals.py`).
+Gusts are a random process. They have parameters here and a likelihood elsewhere, and do not change the mean motion.
+force_by_place depends on the position of the drone: the force of a cable, a fan or a draught at a wall to first order,
+a constant and slopes for each world axis. It is no finding and never part of a vehicle file. It is a rival of named
+effects that may imitate it (`crazyem/diagnosis/naming/place_rivals.py`).
 """
 
 from collections.abc import Mapping
@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from crazyem.physics.effects.effect import Body, Effect, Parameter, Situation, Wrench
 from crazyem.physics.effects.prior import Conditions, Prior, in_turn
 
-ALONE = 0.007  # N s/m: the force of wind on a drone whose drag nobody knows
-# m/s up to which air is no finding: a room's draft, where trims differ from day to day and a drone's answer to air is
-# not known (hovering in a real room looks like 0 to 0.6 m/s); of steady wind on other drones, what filters and sampling
-# look like.
+ALONE = 0.007  # N s/m, force over wind speed for a drone without a known drag
+# m/s, detection limits of wind. CALM, for files of real drones: a draught in a room, where the trim differs from day to
+# day and the drone's response to air is unknown (hover in a real room looks like 0 to 0.6 m/s). STILL, for other
+# drones: steady wind that errors of filters and sampling look like.
 CALM, STILL = 1.0, 0.1
-STEEP = 3.0  # vertical over horizontal wind: what rises or sinks is thrust that is a little wrong
+STEEP = 3.0  # largest vertical over horizontal wind; more is an error of the thrust
 
 
 def blowing(situation: Situation, *, x: float, y: float, z: float) -> NDArray:
@@ -29,7 +29,7 @@ def blowing(situation: Situation, *, x: float, y: float, z: float) -> NDArray:
 
 
 def pushing(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
-    """Without a drag: the constant force 0.007 N s/m times wind, world axes; the drone's own motion is not damped."""
+    """Force of wind if no effect is a drag: 0.007 N s/m times wind, world axes; the drone's motion is not damped."""
     none = np.zeros((situation.size, 3))
     return Wrench(none if situation.shaken else situation.to_body(ALONE * np.array([x, y, z])), none)
 
@@ -46,7 +46,7 @@ WIND = Effect(
     air=blowing,
     external=pushing,
     prior=Prior(in_turn("x y z", 2.0, 2.0, 0.7), finding=_blows),
-    needs=("velocity", "position"),  # a force that goes on moves the drone; an accelerometer alone is only tilted by it
+    needs=("velocity", "position"),  # a lasting force moves the drone; an accelerometer alone shows only a tilt
     separates="hover for 5 s at each of four headings: wind stays in the world, a tilted frame turns with the drone",
     belongs_to="day",
     steady_force=True,
@@ -62,7 +62,7 @@ GUSTS = Effect(
     order=65,
     random=True,
     own_likelihood=True,
-    # usual: a room with people in it; detection limit: the weather of a drone that flew, the air of a room
+    # usual: a room with people in it; detection limit: CALM for files of real drones, else the air of a room
     prior=Prior(
         own={"standard_deviation": 1.5},
         usual={"standard_deviation": 0.3},
@@ -83,7 +83,7 @@ def pulling(
     situation: Situation, body: Body, *, x: float, y: float, z: float, xx: float, xy: float, xz: float, yx: float,
     yy: float, yz: float, zx: float, zy: float, zz: float,
 ) -> Wrench:  # fmt: skip
-    """(x, y, z) [N] plus a matrix [N/m] times the position [m], force and place in world axes; xy: along x, by y."""
+    """Force (x, y, z) [N] plus a matrix [N/m] times the position [m], world axes; xy: force along x per y."""
     slope = np.array([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]])
     return Wrench(situation.to_body(np.array([x, y, z]) + situation.position @ slope.T), np.zeros((situation.size, 3)))
 
@@ -95,7 +95,7 @@ FORCE_BY_PLACE = Effect(
     words="force that depends on place",
     external=pulling,
     own_likelihood=True,
-    # own: 3 % of a Crazyflie's weight; usual: what thrust and drag leave
+    # own: 3 % of a Crazyflie's weight; usual: errors of the modelled thrust and drag
     prior=Prior(
         dict.fromkeys((p.name for p in CONSTANT + SLOPES), 0.01),
         {**in_turn("x y z", 4e-4, 4e-4, 1e-3), **dict.fromkeys((p.name for p in SLOPES), 5e-4)},

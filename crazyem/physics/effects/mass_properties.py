@@ -1,4 +1,4 @@
-"""inertia, inertia_products, center_of_mass, payload: the body's mass and a point mass on it."""
+"""inertia, inertia_products, center_of_mass, payload: mass properties of the body, and a point mass on it."""
 
 import math
 from dataclasses import replace
@@ -9,21 +9,21 @@ from crazyem.physics.effects.effect import Body, Effect, Parameter
 from crazyem.physics.effects.prior import AT_ONCE_SD, Conditions, Prior, Sizes, alike, in_turn
 from crazyem.vehicle import Vehicle
 
-ON_BOARD = 0.04  # m from the middle of the rotors: no part of a Crazyflie is further away
+ON_BOARD = 0.04  # m, largest distance of a part of a Crazyflie from the middle of the rotors
 WITHIN = dict.fromkeys("xyz", (-ON_BOARD, ON_BOARD))
-# No drone is as heavy to turn as if all its mass were this many times as far out as its rotors.
+# Largest radius of gyration of a drone over the distance of its rotors from the middle.
 FAR_OUT = 2.0
 
 
 def diagonal(body: Body, *, xx: float, yy: float, zz: float) -> Body:
-    """Replace the diagonal of the matrix about the body's centre of mass [kg m^2]."""
+    """Replace the diagonal of the inertia matrix about the body's centre of mass [kg m^2]."""
     inertia = body.inertia.copy()
     inertia[0, 0], inertia[1, 1], inertia[2, 2] = xx, yy, zz
     return replace(body, inertia=inertia)
 
 
 def products(body: Body, *, xy: float, xz: float, yz: float) -> Body:
-    """Replace the elements J_xy, J_xz, J_yz (not their negatives) of the same matrix [kg m^2]."""
+    """Replace the elements J_xy, J_xz, J_yz (not their negatives) of the inertia matrix [kg m^2]."""
     inertia = body.inertia.copy()
     inertia[0, 1] = inertia[1, 0] = xy
     inertia[0, 2] = inertia[2, 0] = xz
@@ -32,10 +32,10 @@ def products(body: Body, *, xy: float, xz: float, yz: float) -> Body:
 
 
 def _moments(conditions: Conditions) -> Sizes:
-    """Relative. In 76 flights of known torques over inertias their differences scatter by 1.2 % between roll and pitch
-    and by 2.0 % to yaw beyond what fits say of themselves (figures 8 by 2.1 and 3.0 %, shakes by 0.5 and 1.3 %).
+    """Relative. In 76 flights with known torque over inertia, differences scatter by 1.2 % between roll and pitch and
+    by 2.0 % to yaw, beyond the standard deviations of the fits (figures 8 by 2.1 and 3.0 %, shakes by 0.5 and 1.3 %).
 
-    Commands on another clock say nothing of it. With heavy rotors yaw looks too heavy by 20 to 40 %.
+    Commands on another clock carry no information on inertia. With heavy rotors, Izz looks 20 to 40 % too large.
     """
     if not conditions.shows_rotation:
         return {}
@@ -45,7 +45,7 @@ def _moments(conditions: Conditions) -> Sizes:
 
 
 def largest_inertia(vehicle: Vehicle) -> float:
-    """kg m^2 that a drone of this mass and size can have (see `FAR_OUT`)."""
+    """Largest inertia [kg m^2] of a drone of this mass and size (see `FAR_OUT`)."""
     return vehicle.mass * (FAR_OUT * float(np.hypot(*vehicle.arm))) ** 2
 
 
@@ -63,10 +63,10 @@ INERTIA = Effect(
         alike("xx yy zz", 0.3),
         _moments,
         dict.fromkeys(("xx", "yy", "zz"), "neutral"),
-        together=0.9,  # what is heavy in one axis is so in the others
+        together=0.9,  # inertias about the three axes are too large or too small together
         detection_limit=alike("xx yy zz", 0.08),
     ),
-    alike=0.9,  # what is heavier about one axis is so about the others: they differ by a third of what they are more
+    alike=0.9,  # differences between the axes are a third of the common deviation
     needs_torques=True,
     twins=("torque_scale",),
     common_factor="torque_scale",
@@ -88,15 +88,15 @@ INERTIA_PRODUCTS = Effect(
 
 
 def shifted(body: Body, *, x: float, y: float, z: float) -> Body:
-    """Centre of mass at x, y, z [m] from O; mass and inertia about the centre of mass stay."""
+    """Put the centre of mass at x, y, z [m] from O; mass and inertia about the centre of mass stay."""
     return replace(body, centre=np.array([x, y, z]))
 
 
 def _placed(conditions: Conditions) -> Sizes:
-    """m; a height of -0.4 to -0.8 mm is what velocities of onboard filters look like.
+    """m; errors of onboard velocities look like a height of -0.4 to -0.8 mm.
 
-    Of commands on another clock no shift is asked, but they trim the drone all the same: one rotor weaker by a tenth is
-    a torque per thrust of a twentieth of the arm. Taken for none, it was a wind (by the moment of its flow).
+    With commands on another clock no shift is named, but the drone still has a trim: one rotor 10 % weaker is a torque
+    per thrust of a twentieth of the arm. Without this freedom the trim looks like a wind (by the moment of its flow).
     """
     if not conditions.shows_rotation or "velocity" not in conditions.signals:
         return {}
@@ -116,8 +116,8 @@ CENTER_OF_MASS = Effect(
     steady_torque=True,
     shifts_centre=True,
     admitted=lambda chosen: WITHIN,
-    # own: a battery of a third of the weight, put in some millimetres off
-    # detection limit: z shows in lateral accelerations of O alone
+    # own: a battery of a third of the weight, some millimetres from its place
+    # detection limit: only lateral accelerations of O depend on z
     prior=Prior(alike("x y z", 1.5e-3), _placed, detection_limit=in_turn("x y z", 1e-4, 1e-4, 1e-3)),
     separates=(
         "balance the drone on an edge, or log the accelerometer and yaw for 5 s at 2 Hz; for z fly hard sideways steps"
@@ -126,7 +126,7 @@ CENTER_OF_MASS = Effect(
 
 
 def steiner(mass: float, offset: np.ndarray) -> np.ndarray:
-    """(3, 3) kg m^2: what a mass [kg] at an offset (3,) [m] adds to the inertia matrix."""
+    """Contribution (3, 3) [kg m^2] of a mass [kg] at an offset (3,) [m] to the inertia matrix."""
     return mass * (offset @ offset * np.eye(3) - np.outer(offset, offset))
 
 
@@ -148,7 +148,7 @@ PAYLOAD = Effect(
     order=13,
     about=("mass", "centre", "thrust_per_speed2"),
     body=loaded,
-    # own: what a drone of this class carries; within its frame
+    # own: typical payload of a drone of this class, within its frame
     prior=Prior(in_turn("mass x y z", 0.08, 0.01, 0.01, 0.01), per={"mass": "mass"}),
     separates="weigh the drone",
     nudge={"mass": 5e-4},

@@ -1,17 +1,17 @@
-"""onboard_filter, and the error of an attitude that is made on board of a late gyro.
+"""onboard_filter, and the error of an onboard attitude because of a delayed gyro.
 
-A gyro is low-passed before it is logged (crazyflie-firmware, sensors_bmi088_bmp3xx.c: second order at 80 Hz, 2.8 ms),
-and so are the accelerations that carry an onboard estimate of velocity from one fix of the pose to the next; attitude
-and position, which the fixes show, are later by less, but from one fix to the next an attitude is the sum of a late
-gyro. So rates are behind the attitude, velocities behind the position. It belongs to the log and not to the drone: no
-vehicle file needs it, and diagnosis leaves it free (`crazyem/diagnosis/fitting/nuisances.py`).
+A gyro is low-passed before it is logged (crazyflie-firmware, sensors_bmi088_bmp3xx.c: second order at 80 Hz, 2.8 ms).
+So are the accelerations that an onboard filter integrates to a velocity between two fixes of the pose. The fixes
+correct attitude and position, so these have less delay, but between fixes the attitude is the integral of a delayed
+gyro. So rates lag behind the attitude, and velocities behind the position. The effect belongs to the log and not to the
+drone: it is in no vehicle file, and diagnosis has it as a nuisance (`crazyem/diagnosis/fitting/nuisances.py`).
 
-The attitude integrates the gyro, and fixes of the pose draw it back, so its error e [rad, body axes] goes by
+The attitude integrates the gyro, and fixes of the pose correct it, so its error e [rad, body axes] follows
 
-    e' = r - e / T,    r: what the gyro shows less the rate that was [rad/s].
+    e' = r - e / T,    r: measured less true body rate [rad/s].
 
-T is that of the firmware's Kalman filter with a pose at 100 Hz; what a gyro's bias leads such attitudes to in simulated
-flights, the bias times T, says 0.038 to 0.043 s.
+T is the time constant of the firmware's Kalman filter with a pose at 100 Hz. In simulated flights, the error by a gyro
+bias (bias times T) gives T = 0.038 to 0.043 s.
 """
 
 from collections.abc import Mapping
@@ -26,12 +26,12 @@ from crazyem.physics.effects.prior import Conditions, Prior, Sizes
 from crazyem.vehicle import GRAVITY
 
 CORRECTION_SECONDS = 0.04  # s, T above
-MEMORY_SECONDS = 3.0 * CORRECTION_SECONDS  # s: what a gyro showed before is 5 % of an attitude's error
+MEMORY_SECONDS = 3.0 * CORRECTION_SECONDS  # s; older errors of the gyro are 5 % of an attitude's error
 
 
 @compiled
 def _relaxed(gap, broken, drive, time, out):
-    """e at every row, from drives (n, 3) that are the means over the steps that end there; 0 where a stretch begins."""
+    """Error e at every row, from means of r (n, 3) over the steps that end there; 0 where a stretch begins."""
     for k in range(len(gap)):
         if broken[k]:
             out[k] = 0.0
@@ -42,15 +42,15 @@ def _relaxed(gap, broken, drive, time, out):
 
 
 def disturbs_attitude(values: Mapping[str, Any]) -> bool:
-    """Whether an effect with these values disturbs attitudes that are made on board."""
+    """Whether an effect with these values changes onboard attitudes."""
     return "gyro" in values.get("streams", ()) or bool(values.get("rate_lag", 0.0))
 
 
 def attitude_error(situation: Situation, rate_error: NDArray, *, delay: float) -> NDArray:
-    """(n, 3) rad, body axes: how far an attitude made on board is off by a gyro's errors; 0 where it is not made so.
+    """Error (n, 3) [rad, body axes] of an onboard attitude because of a gyro's errors; 0 for other attitudes.
 
-    rate_error: (n, 3) rad/s at the rows, of a gyro that is `delay` [s] late. What it is at a row it has been since
-    `delay` after the row before: rates go straight from row to row.
+    rate_error: (n, 3) rad/s at the rows, of a gyro that is `delay` [s] late. Rates are linear between rows, so the
+    error reaches its value at a row `delay` after the row before.
     """
     out = np.zeros((situation.size, 3))
     if not situation.fused or not situation.size:
@@ -66,8 +66,8 @@ def attitude_error(situation: Situation, rate_error: NDArray, *, delay: float) -
 
 @compiled
 def _path_errors(gap, broken, drive, time, position, velocity):
-    """Errors (n, 3) at every row, by drives (n, 3) that are the means over the steps that end there; 0 where a stretch
-    begins (`path_error`)."""
+    """Errors of position and velocity (n, 3) at every row, from mean accelerations `drive` (n, 3) over the steps that
+    end there; 0 where a stretch begins (`path_error`)."""
     for k in range(len(gap)):
         if broken[k]:
             position[k] = 0.0
@@ -83,12 +83,12 @@ def _path_errors(gap, broken, drive, time, position, velocity):
 
 
 def path_error(situation: Situation, time_constant: float) -> tuple[NDArray, NDArray]:
-    """(n, 3) m, (n, 3) m/s, world axes: errors p, v of a filter that does not know the specific force f along body x
-    and y, nor that its attitude is turned by d [rad].
+    """Errors p (n, 3) [m], v (n, 3) [m/s], world axes, of a filter that does not know the specific force f along body
+    x and y, nor the error d [rad] of its attitude.
 
-    p' = v - 2 p / T, v' = R (d x (0, 0, f_z) - (f_x, f_y, 0)) - 2 p / T^2, and 0 where a stretch begins. That is the
-    steady Kalman filter of a position that is fixed and of accelerations that are white noise: its Riccati equation
-    makes the second gain half of the first one squared. A constant force makes v off by T [s] times the force.
+    p' = v - 2 p / T, v' = R (d x (0, 0, f_z) - (f_x, f_y, 0)) - 2 p / T^2, and 0 where a stretch begins. This is the
+    steady Kalman filter with position fixes and accelerations as white noise: by its Riccati equation, the second gain
+    is half of the first one squared. A constant force gives an error of v of T [s] times the force.
     """
     position, velocity = np.zeros((situation.size, 3)), np.zeros((situation.size, 3))
     if time_constant and situation.size:
@@ -105,11 +105,11 @@ def path_error(situation: Situation, time_constant: float) -> tuple[NDArray, NDA
 def filtered(
     situation: Situation, *, rate_lag: float, velocity_lag: float, attitude_lag: float, lateral_time_constant: float
 ) -> Offset:
-    """The gyro shows w - rate_lag dw/dt, the estimate of velocity v - velocity_lag dv/dt, the attitude that of
-    attitude_lag before; lags in s.
+    """Errors of signals with lags [s]: gyro w - rate_lag dw/dt, velocity v - velocity_lag dv/dt, attitude at the time
+    attitude_lag before.
 
-    The filter does not know the specific force along body x and y (drag, wind); fixes draw its velocity back within
-    lateral_time_constant [s] (`path_error`). Nothing where it is not made so.
+    The filter does not know the specific force along body x and y (drag, wind); fixes correct its velocity with the
+    time constant lateral_time_constant [s] (`path_error`). This error exists for onboard filters only.
     """
     offset = Offset(np.zeros((situation.size, 12)), np.zeros((situation.size, 3)))
     acceleration = np.einsum("nij,nj->ni", situation.rotation, situation.specific_force)
@@ -126,12 +126,12 @@ def filtered(
 
 
 def _lags(conditions: Conditions) -> Sizes:
-    """s: rates behind the attitude, velocities behind the position, by the filters of the firmware.
+    """s: lags of rates behind the attitude and of velocities behind the position, by filters of the firmware.
 
-    In 80 flights with nothing hidden 0.0 to 2.4 and 0.0 to 1.6 ms, most in quick ones; of velocities that a filter on
-    board makes 0.7 to 5.7 ms in ten simulated flights of five filters. Fixes draw a velocity back that is made without
-    the drag: within 0.17 to 0.36 s in nine simulated flights, by the rate and the noise of the fixes. A filter that
-    knows all forces has none of that error.
+    In 80 flights without hidden effects these are 0.0 to 2.4 and 0.0 to 1.6 ms, most in fast flights. Velocities of
+    onboard filters have 0.7 to 5.7 ms in ten simulated flights of five filters. For a filter that does not know the
+    drag, lateral_time_constant is 0.17 to 0.36 s in nine simulated flights, depending on rate and noise of the fixes. A
+    filter that knows all forces does not have this error.
     """
     if not {"attitude", "position"} & conditions.signals:
         return {}
@@ -141,14 +141,14 @@ def _lags(conditions: Conditions) -> Sizes:
     return found | ({"lateral_time_constant": 0.2} if made and found else {})
 
 
-# s, mean and standard deviation of a gyro's lag, by whether the attitude beside it is made on board. A second-order
-# low-pass filter of f Hz is sqrt(2) / (2 pi f) late: 2.8 ms for the Crazyflie's 80 Hz (sensors_bmi088_bmp3xx.c), 5.6 ms
-# for the 40 Hz of PX4 (IMU_GYRO_CUTOFF), nothing in many simulators. An attitude made of that gyro is late as well.
+# s, mean and standard deviation of a gyro's lag; key: whether the attitude comes from an onboard filter. A second-order
+# low-pass filter of f Hz has a lag of sqrt(2) / (2 pi f): 2.8 ms for the Crazyflie's 80 Hz (sensors_bmi088_bmp3xx.c),
+# 5.6 ms for the 40 Hz of PX4 (IMU_GYRO_CUTOFF), 0 in many simulators. An attitude from this gyro has a lag, too.
 RATE_LAGS = {True: (1.2e-3, 0.7e-3), False: (2.8e-3, 1.5e-3)}
 
 
 def _mean_lags(conditions: Conditions) -> Sizes:
-    """s: see `_lags`."""
+    """s: means of the lags, see `_lags`."""
     return {"rate_lag": RATE_LAGS[conditions.onboard][0], "velocity_lag": 0.6e-3, "lateral_time_constant": 0.2}
 
 

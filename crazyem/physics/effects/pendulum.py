@@ -1,14 +1,13 @@
-"""The load on a string as a spherical pendulum with a moving pivot: its direction, carried along the pivot's path.
+"""A load on a string as a spherical pendulum with a moving pivot: its swing along the path of the pivot.
 
-The load hangs at r_O + L n, |n| = 1. With a the acceleration of the pivot and d = -c (v + L dn/dt - air) that of its
-drag,
+The load is at r_O + L n, |n| = 1. With a the acceleration of the pivot and d = -c (v + L dn/dt - air) the acceleration
+of the load by its drag,
 
     L d2n/dt2 = (1 - n n')(g - a + d) - L |dn/dt|^2 n.
 
-In flights that shake, two loads that began almost alike are out of step after some seconds: a driven pendulum is
-chaotic there, and no path is known well enough. So the load is a state that is estimated, by an extended Kalman filter
-of its own (`watched_along`), from the force with which it is seen to pull: in steps up to the last one, so that what it
-says of a step is still a prediction of it.
+In strongly excited flights a driven pendulum is chaotic: small differences of start or path grow large in some seconds.
+So the swing is the state of a separate extended Kalman filter (`watched_along`), which measures the pull of the load.
+The swing of a step uses the pull in earlier steps only, so it is a prediction.
 """
 
 import numpy as np
@@ -17,16 +16,16 @@ from numpy.typing import NDArray
 from crazyem.compiled import compiled
 
 GRAVITY = 9.81  # m/s^2
-DAMPING = 0.1  # 1/s: drag of the load over its mass
-FASTEST = 200.0  # 1/s: only absurd paths swing faster
-# What a load may do that its path does not say: a filtered path is wrong by some 1 cm/s from one 10 ms to the next.
-WANDERING = 1e-3  # m/sqrt(s)
-HANGING = 0.1  # rad, and rad per radian of its swing: how far it may be from hanging at rest where a stretch begins
+DAMPING = 0.1  # 1/s, drag coefficient of the load over its mass
+FASTEST = 200.0  # 1/s, largest rate of the swing; only impossible paths give more
+# m/sqrt(s), process noise of the swing: the velocity of a filtered path changes by an error of 1 cm/s in 10 ms.
+WANDERING = 1e-3
+HANGING = 0.1  # rad, standard deviation of the angle at the start of a stretch, and of its rate over sqrt(g/L)
 
 
 @compiled
 def _slope(state, pull, velocity, air, length, out):
-    """d(state)/dt; pull is gravity less the pivot's acceleration [m/s^2], velocity that of the pivot now [m/s]."""
+    """Write d(state)/dt to out; pull: gravity less the pivot's acceleration [m/s^2], velocity: of the pivot [m/s]."""
     along = 0.0
     speed = 0.0
     for i in range(3):
@@ -40,7 +39,7 @@ def _slope(state, pull, velocity, air, length, out):
 
 @compiled
 def _straighten(state):
-    """Take out what integration adds: direction to unit length, its derivative across it and not absurd."""
+    """Remove integration errors: unit length of the direction, derivative normal to it and up to `FASTEST`."""
     size = np.sqrt(state[0] * state[0] + state[1] * state[1] + state[2] * state[2])
     along = 0.0
     for i in range(3):
@@ -82,7 +81,7 @@ def _swing(state, acceleration, velocity, air, step, length, work):
 
 @compiled
 def _along(gap, broken, velocity, air, length, out):
-    """The swing at every row of a path; at rest, hanging, at the first of each stretch."""
+    """Swing at every row of a path; at the first row of a stretch the load hangs at rest."""
     work = np.zeros((6, 6))
     state = np.zeros(6)
     acceleration = np.zeros(3)
@@ -99,7 +98,7 @@ def _along(gap, broken, velocity, air, length, out):
 
 @compiled
 def _slopes(state, pull, velocity, air, length, out):
-    """Derivative of d(state)/dt by the state, (6, 6); arguments as `_slope`."""
+    """Derivative (6, 6) of d(state)/dt by the state; arguments as in `_slope`."""
     along = speed = 0.0
     for i in range(3):
         along += state[i] * (pull[i] - DAMPING * (velocity[i] + length * state[3 + i] - air[i]))
@@ -135,9 +134,9 @@ def _both_sides(a, cov, half):
 
 @compiled
 def _spread(cov, slopes, gap, after, length, phi, half):
-    """Carry the covariance (6, 6) over a step with these slopes at its begin, to the swing `after` it; in place.
+    """Carry the covariance (6, 6) over a step, in place; slopes at its begin, swing `after` the step.
 
-    phi, half: (6, 6) scratch. The upper half of the slopes is (0, 1), so only the lower is multiplied out.
+    phi, half: (6, 6) scratch. The upper half of the slopes is (0, 1), so only the lower half is multiplied out.
     """
     square = 0.5 * gap * gap
     for i in range(3):
@@ -156,14 +155,14 @@ def _spread(cov, slopes, gap, after, length, phi, half):
     for i in range(3):
         for j in range(3):
             phi[i, j] = phi[3 + i, 3 + j] = (1.0 if i == j else 0.0) - after[i] * after[j]
-    _both_sides(phi, cov, half)  # a string does not change its length
+    _both_sides(phi, cov, half)  # no variance along the string: its length is constant
 
 
 @compiled
 def _corrected(state, cov, velocity, air, length, share, rotation, free, shown, noise, gap, scratch):
-    """Kalman's update of the swing and its covariance by the pull that was seen in a step, in place.
+    """Kalman update of the swing and its covariance by the measured pull of a step, in place.
 
-    The pull: share (n.(d - f) + L |dn/dt|^2) n, body axes. scratch: (6, 6).
+    The pull is share (n.(d - f) + L |dn/dt|^2) n, body axes. scratch: (6, 6).
     """
     drag, row, change, shows = scratch[0, :3], scratch[1], scratch[2], scratch[3]
     change[:] = 0.0
@@ -191,7 +190,7 @@ def _corrected(state, cov, velocity, air, length, share, rotation, free, shown, 
             for j in range(6):
                 row[i] += cov[i, j] * shows[j]
             spread += shows[i] * row[i]
-        if not spread > 0.0:  # nothing is unknown
+        if not spread > 0.0:  # no variance
             continue
         for i in range(6):
             change[i] += row[i] / spread * missed
@@ -206,7 +205,7 @@ def _corrected(state, cov, velocity, air, length, share, rotation, free, shown, 
 
 @compiled
 def _watched(gap, broken, velocity, air, length, share, rotation, free, shown, noise, out):
-    """As `_along`, corrected by what is seen of the pull; see `watched_along`."""
+    """As `_along`, with corrections by the measured pull; see `watched_along`."""
     work = np.zeros((6, 6))
     state, before = np.zeros(6), np.zeros(6)
     acceleration, pull = np.zeros(3), np.zeros(3)
@@ -228,7 +227,7 @@ def _watched(gap, broken, velocity, air, length, share, rotation, free, shown, n
         pull[2] -= GRAVITY
         before[:] = state
         _swing(state, acceleration, velocity[k - 1], air[k], gap[k], length, work)
-        out[k] = state  # what is seen of this step is known after it
+        out[k] = state  # before the update: the pull of this step is known only after it
         _slopes(before, pull, velocity[k - 1], air[k], length, slopes)
         _spread(cov, slopes, gap[k], state, length, phi, work)
         _corrected(state, cov, velocity[k], air[k], length, share, rotation[k], free[k], shown[k], noise, gap[k], work)
@@ -236,7 +235,7 @@ def _watched(gap, broken, velocity, air, length, share, rotation, free, shown, n
 
 @compiled
 def _each(swing, acceleration, velocity, air, step, length, out):
-    """One step of each of n pendulums of their own."""
+    """One step of each of n independent pendulums."""
     work = np.zeros((6, 6))
     for k in range(len(swing)):
         out[k] = swing[k]
@@ -244,12 +243,12 @@ def _each(swing, acceleration, velocity, air, step, length, out):
 
 
 def swing_along(*, gap: NDArray, broken: NDArray, velocity: NDArray, air: NDArray, length: float) -> NDArray:
-    """Swing of a load at every row of the pivot's path; a row knows only rows up to itself.
+    """Swing of a load at every row of the pivot's path; a row depends only on rows up to itself.
 
     Args:
         gap: (n,) s since the row before.
-        broken: (n,) whether a stretch begins, where the load hangs at rest below the drone.
-        velocity, air: (n, 3) m/s of the pivot and of the air, world. The pivot's velocity is a line between rows.
+        broken: (n,) bool, whether a stretch begins, where the load hangs at rest below the drone.
+        velocity, air: (n, 3) m/s of the pivot and of the air, world. The pivot's velocity is linear between rows.
         length: m.
 
     Returns:
@@ -264,15 +263,15 @@ def watched_along(
     *, gap: NDArray, broken: NDArray, velocity: NDArray, air: NDArray, length: float, share: float,
     rotation: NDArray, free: NDArray, shown: NDArray, noise: NDArray,
 ) -> NDArray:  # fmt: skip
-    """As `swing_along`, corrected row by row by the force with which the load is seen to pull, in rows before.
+    """As `swing_along`, corrected row by row by the measured pull of the load in earlier rows.
 
     Args:
-        gap, broken, velocity, air, length: as there.
+        gap, broken, velocity, air, length: as in `swing_along`.
         share: mass of the load over that of drone and load.
         rotation: (n, 3, 3) body to world.
         free: (n, 3) m/s^2, body: specific force over the steps, without the load.
-        shown: (n, 3) m/s^2, body: that which was seen; NaN where it was not.
-        noise: (3,) m/s^2 sqrt(s): what of it no model knows.
+        shown: (n, 3) m/s^2, body: measured specific force; NaN where unknown.
+        noise: (3,) m/s^2 sqrt(s): intensity of the random part of the measured force.
     """
     out = np.empty((len(gap), 6))
     _watched(
@@ -285,10 +284,10 @@ def watched_along(
 def swing_on(
     swing: NDArray, *, acceleration: NDArray, velocity: NDArray, air: NDArray, step: NDArray, length: float
 ) -> NDArray:
-    """One step of n loads of n predictions.
+    """Swing (n, 6) after one step of n loads in n predictions.
 
     Args:
-        swing: (n, 6) as `swing_along` returns it.
+        swing: (n, 6) before the step, as `swing_along` returns it.
         acceleration: (n, 3) m/s^2 of the pivot, world, gravity included; constant over the step.
         velocity: (n, 3) m/s of the pivot at the begin of the step, world. air: (n, 3) m/s.
         step: (n,) s.

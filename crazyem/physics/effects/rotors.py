@@ -1,9 +1,10 @@
-"""thrust_scale, rotor_fault, torque_scale, ground_effect, trim, rotor_inertia: what the rotors give.
+"""thrust_scale, rotor_fault, torque_scale, ground_effect, trim, rotor_inertia: force and torque of the rotors.
 
-trim is the steady torque that every real drone needs. No four rotors are equal or upright, and no battery sits in the
-middle. The trim goes with the thrust, so nothing acts on a drone with its rotors at rest. For a vehicle file that has
-a trim, the day's differs a little from the file's; by how much, its prior says.
-rotor_inertia is the rotors' angular momentum, which turns with the body (gyroscope) and reacts on spinning up.
+trim is a steady torque that every real drone has: its rotors are not equal and not upright, and its battery is not
+exactly in the middle. The trim is in proportion to the thrust, so it is zero with the rotors at rest. The trim of a day
+differs a little from the trim in a vehicle file; the prior gives the size of the difference.
+rotor_inertia is the angular momentum of the rotors: it turns with the body (gyroscopic torque), and its change gives a
+reaction torque.
 """
 
 import math
@@ -18,14 +19,14 @@ from crazyem.vehicle import Vehicle
 
 
 def scaled(situation: Situation, *, scale: float) -> NDArray:
-    """All rotors times scale, drag torque too."""
+    """Thrust of all rotors times scale; their drag torque changes likewise."""
     return situation.thrust * scale
 
 
 def faulty(situation: Situation, *, rotor: int, scale: float, onset_time: float | None) -> NDArray:
-    """One rotor (1 to 4) times scale from onset_time on [s, the recording's clock]; None: from the start.
+    """Thrust of one rotor (1 to 4) times scale from onset_time on [s, the recording's clock]; None: from the start.
 
-    The step in which it begins gets its share, so that the likelihood has no stairs in onset_time.
+    In the step of the onset the change acts in part, so that the likelihood is continuous in onset_time.
     """
     since = np.ones(situation.size)
     if onset_time is not None:
@@ -42,9 +43,9 @@ def turned(torque: NDArray, *, scale: float) -> NDArray:
 
 
 def _strength(conditions: Conditions) -> Sizes:
-    """From day to day: batteries are put in again, propellers bend (docs/results/diagnosis_real.md).
+    """Relative, from day to day: batteries are put in again, propellers bend (docs/results/diagnosis_real.md).
 
-    Of several recordings of any drone each has its own: one number for all would make it heed commands less.
+    Each of several recordings has its own scale. With one scale for all, the response to commands would look too small.
     """
     if not (conditions.own_battery or conditions.individual_file):
         return {}
@@ -84,8 +85,8 @@ ROTOR_FAULT = Effect(
     prior=Prior(own={"scale": 0.1}),
     steady_torque=True,
     imbalance="rotor",
-    # a worn, cut or bent propeller pulls less than the others, a new one among worn ones a little more; none gets
-    # stronger in flight
+    # a worn, cut or bent propeller has less thrust than the others, a new one among worn ones a little more; in flight,
+    # no rotor gets stronger
     admitted=lambda chosen: {"scale": (0.0, 1.1 if chosen.get("onset_time") is None else 1.0)},
     separates=(
         "yaw for 5 s at 2 Hz (a weak rotor also lacks drag torque, a heavy corner does not), or hover with the drone's"
@@ -95,13 +96,13 @@ ROTOR_FAULT = Effect(
 
 
 def _torques(conditions: Conditions) -> Sizes:
-    """Relative: in ten flights with nothing hidden, with the lag free, torques look 2 +- 2 % too strong (-0.5 to +4 %);
-    a longer lag with more torque is nearly the same to a loop whose commands are sampled."""
+    """Relative: in ten flights without hidden effects, with a free lag, torques look 2 +- 2 % too strong (-0.5 to
+    +4 %). With sampled commands, a longer lag with more torque has nearly the same signals."""
     return {"scale": 0.03} if conditions.shows_rotation and not conditions.other_clock else {}
 
 
 def _too_weak(values: Values, vehicle: Vehicle) -> bool:
-    """Torques too weak are inertias too large."""
+    """Whether the torque scale is equivalent to an impossibly large inertia."""
     return max(vehicle.inertia) > largest_inertia(vehicle) * float(values["scale"])
 
 
@@ -113,8 +114,8 @@ TORQUE_SCALE = Effect(
     about=("torque_per_thrust", "arm", "inertia"),
     turning=turned,
     prior=Prior(own={"scale": 0.2}, usual=_torques, conditional=True, detection_limit={"scale": 0.08}),
-    twins=("inertia", "motor_lag"),  # angular acceleration is torque over inertia: both at once would be any size
-    fixed_beside=("motor_lag",),  # with both free, a lag without a prior comes out 8 ms too long
+    twins=("inertia", "motor_lag"),  # angular acceleration is torque over inertia: both together are not determined
+    fixed_beside=("motor_lag",),  # with both free, a lag without a prior is estimated 8 ms too long
     unphysical=_too_weak,
     needs=("body_rate", "attitude"),
     separates="swing the drone on two threads (bifilar pendulum): torque over inertia is all that a flight shows",
@@ -123,7 +124,7 @@ TORQUE_SCALE = Effect(
 
 
 def lifted(situation: Situation, *, strength: float, height: float) -> NDArray:
-    """All thrusts times 1 + strength exp(-z/height), z the height of O above the floor [m]."""
+    """Thrust of all rotors times 1 + strength exp(-z/height), z the height of O above the floor [m]."""
     return situation.thrust * (1 + strength * np.exp(-np.maximum(situation.height, 0.0) / height))[:, None]
 
 
@@ -135,7 +136,7 @@ GROUND_EFFECT = Effect(
     ),
     order=32,
     rotors=lifted,
-    # finding: a floor is felt by some rotor radii; what does not fade with height is thrust that is a little wrong
+    # finding: a floor acts up to a height of some rotor radii; a change that hardly depends on height is a thrust error
     prior=Prior(own={"strength": 0.3, "height": 0.1}, finding=lambda here, neutral, conditions: here["height"] < 1.0),
     needs=("position",),
     separates="hover for 5 s at each of several heights, from 3 cm to 1 m",
@@ -147,20 +148,20 @@ GROUND_EFFECT = Effect(
 
 
 def trimmed(situation: Situation, body: Body, *, x: float, y: float, z: float) -> Wrench:
-    """Torque (x, y, z) [m, that is N m per N] times the thrust of all rotors, body axes."""
+    """Torque (x, y, z) [m, that is N m per N] times the total thrust, body axes."""
     total = situation.thrust.sum(axis=1)[:, None]
     return Wrench(np.zeros((situation.size, 3)), np.array([x, y, z]) * total)
 
 
 def _of_the_day(conditions: Conditions) -> Sizes:
-    """As healthy and damaged flights of two drones on several days scatter (docs/results/diagnosis_real.md)."""
+    """m: scatter over healthy and damaged flights of two drones on several days (docs/results/diagnosis_real.md)."""
     if not conditions.individual_file:
         return {}
     return in_turn("x y z", *(conditions.days[1:4] if conditions.days else (5e-4, 5e-4, 1.6e-4)))
 
 
 def _tails(conditions: Conditions) -> float:
-    """Known from some twelve days of two drones; normal tails would be sure of what a new propeller may do."""
+    """Degrees of freedom: the spread is known from some twelve days of two drones, so a normal tail is too short."""
     return 8.0 if conditions.days is None else conditions.days[4]
 
 
@@ -170,21 +171,22 @@ TRIM = Effect(
     order=41,
     external=trimmed,
     prior=Prior(usual=_of_the_day, freedom=_tails),
-    on_request=True,  # near every effect that brings a steady torque
+    on_request=True,  # a look-alike of every effect with a steady torque
     separates="fly the drone while it is well and judge by the vehicle file written from that: its trim is in there",
 )
 
 
 SPIN = np.array([1.0, -1.0, 1.0, -1.0])  # rotors 1 and 3 turn counter-clockwise seen from above
-# N/(rad/s)^2, for vehicles that have none, and inertia is then relative to it: 46 mm propellers of a brushed Crazyflie,
-# which lift 28.6 g at 17174 rpm, 17.3 g at 13522 rpm (Bitcraze, Measuring propeller RPM, part 3, 2015).
+# N/(rad/s)^2, for vehicles without a rotor constant (the rotor inertia is then relative to it): 46 mm propellers of a
+# brushed Crazyflie, which lift 28.6 g at 17174 rpm, 17.3 g at 13522 rpm (Bitcraze, Measuring propeller RPM, part 3,
+# 2015).
 TYPICAL_ROTOR_CONSTANT = 2.1e-8
 
 
 def reaction(situation: Situation, body: Body, *, inertia: float) -> Wrench:
-    """-w x H e3 - dH/dt e3 with H = inertia (W1 - W2 + W3 - W4), inertia [kg m^2] of one rotor.
+    """Torque -w x H e3 - dH/dt e3 with H = inertia (W1 - W2 + W3 - W4), inertia [kg m^2] of one rotor.
 
-    W_i = sqrt(f_i/rotor_constant); f_i is the thrust after the lag, before what changes thrust at the same speed.
+    W_i = sqrt(f_i/rotor_constant); f_i is the thrust after the lag, before effects that change it at the same speed.
     Source: Euler's equation of a body with rotors, e.g. Hughes, Spacecraft Attitude Dynamics, 3.4.
     """
     lagged = situation.thrust if situation.lagged is None else situation.lagged
@@ -201,7 +203,7 @@ def reaction(situation: Situation, body: Body, *, inertia: float) -> Wrench:
 
 
 def _speed(thrust: NDArray, constant: float) -> NDArray:
-    """rad/s; the mean change over a step is taken between its ends, where a rate of the root would have a pole at 0."""
+    """Rotor speed [rad/s]. Its change is a difference over a step, as the derivative of the root is infinite at 0."""
     return np.sqrt(np.maximum(thrust, 0.0) / constant)
 
 
@@ -211,8 +213,8 @@ ROTOR_INERTIA = Effect(
     order=66,
     controllers=True,  # INDI: ctrlINDI.g2
     external=reaction,
-    # own: a bar of 0.3 g and 46 mm; a Crazyflie's propeller and rotor: a tenth of that, in no file. Detection limit: a
-    # sixth of a rod of 0.1 g and 46 mm; no rotor is lighter. It is as sure as the inertia of yaw.
+    # own: a bar of 0.3 g and 46 mm; a Crazyflie's propeller and rotor have a tenth of this, in no file. Detection
+    # limit: a sixth of a rod of 0.1 g and 46 mm; no rotor is lighter. Relative error: that of the yaw inertia.
     prior=Prior(own={"inertia": 4e-8}, relative_error={"inertia": AT_ONCE_SD}, detection_limit={"inertia": 3e-9}),
     needs=("body_rate", "attitude"),
     separates="yaw for 5 s at 2 Hz (spin-up), and roll while turning about yaw (gyroscope); weigh a propeller",

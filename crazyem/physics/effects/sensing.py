@@ -1,4 +1,4 @@
-"""attitude_misalignment, accelerometer_misalignment, gyro_bias, velocity_scale, rotor_sensor: what sensors show."""
+"""attitude_misalignment, accelerometer_misalignment, gyro_bias, velocity_scale, rotor_sensor: errors of sensors."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,28 +12,28 @@ from crazyem.physics.rotations import axes, quaternion_from_euler, rotation_vect
 
 
 def tilted_pose(situation: Situation, *, roll: float, pitch: float, yaw: float) -> Offset:
-    """The pose shows R R_P, R_P = Rz(yaw) Ry(pitch) Rx(roll): the pose frame's axes in the body [rad]."""
+    """The measured attitude is R R_P, R_P = Rz(yaw) Ry(pitch) Rx(roll): axes of the pose frame in the body [rad]."""
     offset = _nothing(situation)
     offset.state[:, 6:9] = rotation_vector_from_quaternion(quaternion_from_euler(roll, pitch, yaw))
     return offset
 
 
 def tilted_accelerometer(situation: Situation, *, roll: float, pitch: float, yaw: float) -> Offset:
-    """The accelerometer reads R_A' f, R_A likewise its axes in the body [rad]."""
+    """The accelerometer measures R_A' f; R_A, formed as R_P, holds its axes in the body [rad]."""
     offset = _nothing(situation)
     offset.specific_force[:] = situation.specific_force @ axes(roll, pitch, yaw) - situation.specific_force
     return offset
 
 
 def biased_gyro(situation: Situation, *, x: float, y: float, z: float) -> Offset:
-    """The gyro shows w + bias [rad/s], body."""
+    """The gyro measures w + bias [rad/s], body."""
     offset = _nothing(situation)
     offset.state[:, 9:12] = (x, y, z)
     return offset
 
 
 def scaled_velocity(situation: Situation, *, x: float, y: float, z: float) -> Offset:
-    """The velocity estimate shows scale times velocity, world axes; position is right."""
+    """The estimated velocity is scale times velocity, world axes; position is right."""
     offset = _nothing(situation)
     offset.state[:, 3:6] = (np.array([x, y, z]) - 1) * situation.velocity
     return offset
@@ -44,9 +44,9 @@ def _nothing(situation: Situation) -> Offset:
 
 
 def _leaning(conditions: Conditions) -> Sizes:
-    """rad. An attitude made from the acceleration is tilted as the accelerometer is.
+    """rad. An attitude computed from the acceleration has the tilt of the accelerometer.
 
-    One that a filter on board makes of a biased gyro stays off by the bias times the time in which fixes draw it back:
+    An onboard attitude with a biased gyro has an error of the bias times the time constant of the correction by fixes:
     38 to 43 ms in roll and pitch of two simulated flights.
     """
     if "attitude" not in conditions.signals:
@@ -55,18 +55,18 @@ def _leaning(conditions: Conditions) -> Sizes:
 
 
 def jitter(speed: NDArray, *, onboard: bool) -> NDArray:
-    """(3,) by how much, relative, the jitter of an estimate makes velocities of (3,) m/s (rms) look wrong.
+    """Apparent relative error (3,) of velocities of (3,) m/s (rms) because of the jitter of an estimate.
 
-    Its errors in position and velocity hang together, so a drone that hardly moves seems to move faster than it does.
-    By motion capture: 3 mm/s. Velocities of 36 simulated filters in hover differ from the true ones by 0.9 to 10.6 mm/s
-    (rms; median 2.7): the largest is taken.
+    Errors of position and velocity are correlated, so a drone at low speed seems to move faster than it does. The
+    jitter of motion capture is 3 mm/s. In hover, velocities of 36 simulated onboard filters differ from the true ones
+    by 0.9 to 10.6 mm/s (rms; median 2.7); the largest is taken.
     """
     found: NDArray = (1e-2 if onboard else 3e-3) / np.maximum(speed, 0.01)
     return found
 
 
 def _jittery(conditions: Conditions) -> Sizes:
-    """Relative; no filter on board is better than 0.2 %."""
+    """Relative; at best, an onboard filter has 0.2 %."""
     return (
         in_turn("x y z", *(2e-3 + jitter(conditions.speed, onboard=conditions.onboard)))
         if {"velocity", "position"} <= conditions.signals
@@ -75,7 +75,7 @@ def _jittery(conditions: Conditions) -> Sizes:
 
 
 def _scale_limit(chosen: Mapping[str, Any], conditions: Conditions) -> Limits:
-    """Relative: more than jitter looks like, twice."""
+    """Relative: twice the apparent error because of jitter, at least 0.035."""
     return in_turn("x y z", *np.maximum(2.0 * jitter(conditions.speed, onboard=conditions.onboard), 0.035))
 
 
@@ -97,8 +97,8 @@ ACCELEROMETER_MISALIGNMENT = Effect(
     _ANGLES,
     order=81,
     measured=tilted_accelerometer,
-    # usual: what the force of a model that is a little wrong looks like, beside the sensor's bias; thrust along body z
-    # hardly shows a yaw
+    # usual: apparent angles because of small errors of the model's force, beside the sensor's bias; a yaw hardly
+    # changes the thrust along body z
     prior=Prior(alike("roll pitch yaw", 0.04), in_turn("roll pitch yaw", 1.5e-3, 1.5e-3, 0.03)),
     needs=("specific_force",),
     own_likelihood=True,
@@ -116,7 +116,7 @@ GYRO_BIAS = Effect(
         alike("x y z", 0.025),
         lambda conditions: alike("x y z", 2.8e-3) if "body_rate" in conditions.signals else {},
         each=lambda conditions: True,
-        systematic=alike("x y z", 4e-4),  # it walks
+        systematic=alike("x y z", 4e-4),  # the bias drifts
         detection_limit=alike("x y z", 3e-3),
     ),
     needs=("body_rate",),
@@ -133,14 +133,14 @@ VELOCITY_SCALE = Effect(
     linear_range=0.01,
     needs=("velocity",),
     words="velocity scale of the onboard estimate",
-    belongs_to="recording",  # in a vehicle it cost 27 % of position error on other flights of the same drone
+    belongs_to="recording",  # in a vehicle file it makes predictions of other flights worse
     separates="log position from motion capture or beacons, and fly straight legs of known length",
     steady_force=True,
 )
 
 
 def recounted(thrust: NDArray, *, rotor: int, scale: float) -> NDArray:
-    """The reported speed is scale times the true one, so the true thrust is what it reads as over scale squared."""
+    """The measured speed is scale times the true one, so the true thrust is the apparent one over scale squared."""
     true = thrust.copy()
     true[:, int(rotor) - 1] /= scale**2
     return true

@@ -1,4 +1,4 @@
-"""thrust_curve and battery_sag: settled thrust, before the lag, when the map from command to thrust is wrong."""
+"""thrust_curve and battery_sag: errors of the map from command to settled thrust, before the lag."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,13 +6,13 @@ from numpy.typing import NDArray
 from crazyem.physics.effects.effect import Effect, Parameter
 from crazyem.physics.effects.prior import Prior, in_turn
 
-REFERENCE_VOLTAGE = 3.7  # V, where gain_per_volt changes nothing: one nearly empty cell
+REFERENCE_VOLTAGE = 3.7  # V, at which gain_per_volt has no effect: one nearly empty cell
 
 
 def steeper(
     thrust: NDArray, *, time: NDArray, flown: NDArray, voltage: NDArray, hover: float, limit: float, slope_error: float
 ) -> NDArray:
-    """f + slope_error (f - hover), within [0, limit]; nothing where nothing is commanded."""
+    """Thrust f + slope_error (f - hover), within [0, limit]; 0 for a command of zero."""
     if slope_error == 0.0:
         return thrust
     changed = np.clip(thrust + slope_error * (thrust - hover), 0.0, limit)
@@ -23,9 +23,9 @@ def sagging(
     thrust: NDArray, *, time: NDArray, flown: NDArray, voltage: NDArray, hover: float, limit: float,
     gain_per_volt: float, gain_per_second: float,
 ) -> NDArray:  # fmt: skip
-    """Thrust times max(0, 1 + gain (V - 3.7 V)), or 1 + gain t with t [s] since the feet left the floor.
+    """Thrust times max(0, 1 + gain_per_volt (V - 3.7 V) + gain_per_second t), with t [s] since take-off.
 
-    Where the voltage is unknown gain_per_volt does nothing.
+    Where the voltage is unknown, gain_per_volt has no effect.
     """
     volts = np.where(np.isnan(voltage), 0.0, voltage - REFERENCE_VOLTAGE)
     factor = 1 + gain_per_volt * volts + gain_per_second * np.maximum(flown, 0.0)
@@ -38,12 +38,12 @@ THRUST_CURVE = Effect(
     order=20,
     commanded=steeper,
     needs=("motor_command",),
-    # usual: a battery whose voltage nobody recorded sags under the load by 0.06 to 0.3 ohm of a cell and its wires, so
+    # usual: without a recorded voltage, the battery sags under load (0.06 to 0.3 ohm of a cell and its wires), so the
     # thrust rises less with the command
     prior=Prior(
         own={"slope_error": 0.25},
         usual=lambda conditions: {"slope_error": 0.15} if conditions.no_voltage else {},
-        systematic={"slope_error": 0.02},  # slopes of drones with known ones came out so much too large
+        systematic={"slope_error": 0.02},  # estimates of known slopes are too large by this
         detection_limit={"slope_error": 0.06},
     ),
     separates="climb and sink hard with the same battery, or measure thrust over command on a stand",
@@ -72,7 +72,7 @@ BATTERY_SAG = Effect(
     commanded=sagging,
     needs=("motor_command",),
     alternatives=(("gain_per_volt",), ("gain_per_second",)),
-    # own: a cell of 0.1 to 0.3 ohm at some amperes; usual, where nobody recorded the voltage: 4.1 to 3.5 V in 300 s
+    # own: a cell of 0.1 to 0.3 ohm at some amperes; usual, without a recorded voltage: 4.1 to 3.5 V in 300 s
     prior=Prior(
         in_turn("gain_per_volt gain_per_second", 0.4, 3e-3),
         lambda conditions: {"gain_per_second": 1.5e-3} if conditions.no_voltage else {},

@@ -1,4 +1,4 @@
-"""suspended_load: a point mass on a massless string at O, swinging below the drone; its tension acts on the drone."""
+"""suspended_load: a point mass on a massless string at O below the drone; the tension acts on the drone."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,15 +10,16 @@ from crazyem.physics.rotations import skew
 
 
 def pulled(situation: Situation, body: Body, *, mass: float, length: float) -> Wrench:
-    """The string's force at O; mass [kg], length [m]. Always taut: in free fall it pushes like a rod.
+    """Force of the string at O; mass [kg], length [m]. The string is always taut: in free fall it pushes like a rod.
 
-    The load accelerates with a_O + L d2n/dt2, of which the part along n is fixed by the string; a_O is that under all
-    other forces plus A n T, A the mobility of O. Solved for T there is no acceleration left to be known beforehand:
+    The acceleration of the load is a_O + L d2n/dt2; the string fixes its component along n. a_O is the acceleration
+    under all other forces plus A n T, with A the mobility of O. Solved for the tension T, no unknown acceleration
+    remains:
 
         T (1 + m n'A n) = m (n'd + L |dn/dt|^2 - n'f)
 
     with f the specific force at O without the string and d the drag of the load over its mass. The swing comes from
-    the drone's path and from how it was seen to pull before (or `situation.swing`).
+    `situation.swing`, or from the drone's path and the pull measured in earlier rows.
     """
     swing = situation.swing
     if swing is None:
@@ -38,9 +39,9 @@ def _dot(a: NDArray, b: NDArray) -> NDArray:
 
 
 def swing_of(situation: Situation, *, length: float, share: float = 0.0) -> NDArray:
-    """(n, 6) direction of the string (unit, world) and its derivative [1/s] along the rows of a situation.
+    """Direction of the string (unit, world) and its derivative [1/s] along the rows of a situation, (n, 6).
 
-    share: mass of the load over that of drone and load, by which it is seen to pull where `situation.seen` is known.
+    share: mass of the load over that of drone and load, for corrections by the pull if `situation.seen` is known.
     """
     gap, broken = stretches(situation)
     velocity, air = situation.velocity, situation.air
@@ -52,9 +53,9 @@ def swing_of(situation: Situation, *, length: float, share: float = 0.0) -> NDAr
     )  # fmt: skip
 
 
-# A pendulum of the wrong period fits no better than none: in the 10 s that DAMPING leaves it, 0.1 rad/s put it a
-# radian out of step. So the lengths to begin from, 1.6 m to 0.1 m, are 0.14 rad/s apart, and derivatives are taken over
-# a step far below that.
+# Start values of the length [m]. A pendulum with a wrong period fits no better than none: within the 10 s of DAMPING,
+# an error of 0.1 rad/s gives a phase error of one radian. So the start values, 1.6 m to 0.1 m, are 0.14 rad/s apart,
+# and derivatives use a far smaller step.
 LENGTHS = tuple(round(9.81 / (2.48 + 0.14 * k) ** 2, 4) for k in range(54))
 
 
@@ -63,19 +64,19 @@ SUSPENDED_LOAD = Effect(
     (Parameter("mass", "kg", 0.0, 0.0, 0.5, 5e-4), Parameter("length", "m", 0.3, 0.02, 10.0, 2e-4, usual=0.3)),
     order=70,
     tied=pulled,
-    # error: its weight is thrust that is a little wrong. Lengths were 2.1 % too long (rms of seven loads of seeds 2038
-    # to 2041) where a flight drives loads astray
+    # relative error of mass: a small error of the thrust looks like a weight; of length in chaotic flights: 2.1 % too
+    # long (rms of seven simulated loads)
     prior=Prior(
         own={"mass": 0.08, "length": 0.3},
         per={"mass": "mass"},
         relative_error={"mass": 3e-3, "length": 5e-3},
         relative_error_chaotic={"length": 0.02},
     ),
-    needs=("position", "velocity"),  # it swings by the drone's path, which no accelerometer alone shows
+    needs=("position", "velocity"),  # the swing follows from the drone's path, not from an accelerometer alone
     separates="stop sharply from a straight leg and hover for 10 s, so that what hangs can be seen swinging",
     nudge={"mass": 5e-4},
     amplitude="mass",
     beginnings={"length": LENGTHS},
     imbalance="mean thrust",
-    sizes=(1e-3, 2e-3, 4e-3),  # where it shakes, a load is followed only by one that pulls about as much
+    sizes=(1e-3, 2e-3, 4e-3),  # in excited flights, the filter follows the load only with about the right mass
 )

@@ -1,15 +1,15 @@
-"""sampled_commands, motor_lag, input_delay, measurement_delay: when commands act, and of when measurements tell.
+"""sampled_commands, motor_lag, input_delay, measurement_delay: timing of commands and measurements.
 
-sampled_commands: a logged command stands for all that its loop sent until the next one. A loop at 500 Hz, logged at
-100 Hz, shows every fifth command. What is smooth in them acts as logged. What is new in a command, beyond what the ones
-before it led to expect, is in part noise of the loop: it acts for 2 ms and not for 10. So the torque that acts is the
-expected one and a share of what is new, as in a Kalman filter of constant gain
+sampled_commands: a logged command stands for all commands of the control loop until the next logged one. A loop at
+500 Hz, logged at 100 Hz, shows every fifth command. The smooth part of the commands acts as logged. The innovation of a
+command (logged less expected from earlier commands) is partly noise of the loop: it acts for 2 ms and not for 10 ms. So
+the torque that acts contains only a part of the innovation, as in a Kalman filter of constant gain:
 
     u = expected + (1 - share) (logged - expected),
 
-with one share for roll and pitch (tilt) and one for yaw (turn). The thrust of all rotors together is smooth.
-With all of it, torques look too weak (errors in the variables; Fuller, Measurement Error Models, 1987, ch. 1).
-It belongs to the log and not to the drone.
+with one share for roll and pitch (tilt) and one for yaw (turn). The total thrust of the rotors is smooth. With the
+whole innovation, torques look too weak (errors in the variables; Fuller, Measurement Error Models, 1987, ch. 1). The
+effect belongs to the log and not to the drone.
 """
 
 import math
@@ -26,13 +26,13 @@ from crazyem.physics.lag import PREDICTION_ORDER, fit_predictor
 from crazyem.physics.rotations import rotation_between
 from crazyem.physics.rotors import PITCH_SIGN, ROLL_SIGN, YAW_SIGN
 
-# Columns: all together, about x, about y, about z; orthonormal
+# Columns: total thrust, torque about x, y, z; orthonormal
 MODES = 0.5 * np.stack([np.ones(4), ROLL_SIGN, PITCH_SIGN, YAW_SIGN], axis=1)
 LOOP = 2e-3  # s between commands of the loop (500 Hz, crazyflie-firmware stabilizer.c)
 
 
 def shrunk(thrust: NDArray, *, tilt: float, turn: float, **_: Any) -> NDArray:
-    """Settled thrusts (m, 4) [N] less a share of the innovations of their torques about x and y, and about z."""
+    """Settled thrusts (m, 4) [N] less shares of the innovations of their torques: tilt about x and y, turn about z."""
     if not (tilt or turn) or len(thrust) <= PREDICTION_ORDER:
         return thrust
     modes = thrust @ MODES
@@ -46,7 +46,7 @@ def shrunk(thrust: NDArray, *, tilt: float, turn: float, **_: Any) -> NDArray:
 
 
 def _unlogged(conditions: Conditions) -> Sizes:
-    """Shares of a log that is slower than the loop: all from 0, of commands that are smooth, to most of what is new."""
+    """Shares, for logs slower than the loop: from 0 (smooth commands) to most of the innovation (noise)."""
     slower = conditions.period > 1.5 * LOOP and not conditions.measured_speeds
     return {"tilt": 0.4, "turn": 0.4} if slower and conditions.shows_rotation else {}
 
@@ -70,23 +70,23 @@ def slow(lag: float, delay: float, *, time_constant: float) -> tuple[float, floa
 
 
 def late(lag: float, before: float, *, delay: float) -> tuple[float, float]:
-    """The command of t acts at t + delay, before the lag [s]."""
+    """Add a delay before the lag [s]: a command of time t acts at t + delay."""
     return lag, before + delay
 
 
 def _clock(conditions: Conditions) -> Sizes:
-    """s between a stamp and its effect; stamps of measured speeds come by another way."""
+    """s, error of the time between a stamp and its effect; measured speeds have stamps of their own."""
     stamps = 5e-3 if conditions.measured_speeds else 2e-3
     return {"delay": math.hypot(stamps, conditions.unlogged_share * conditions.period)}
 
 
-# s: the lag of rotors in the calm flights of real drones, 24 to 105 ms in 26 flights for a file's 50, whether anything
-# was wrong with them or not, so a file to which one of them was fitted does not know it.
+# s: in 26 calm flights of real drones, healthy or not, the estimated lag of the rotors is 24 to 105 ms, where the file
+# has 50 ms. So a lag in a file that was fitted to one such flight is uncertain.
 DAILY_LAG_SD = 0.025
 
 
 def _lag(conditions: Conditions) -> Sizes:
-    """s: with nothing hidden and torques as free, 51 to 55 ms instead of 50 in ten flights; or as from day to day."""
+    """s: without hidden effects and with free torques, 51 to 55 ms instead of 50 in ten flights; or `DAILY_LAG_SD`."""
     if conditions.measured_speeds or conditions.lag <= 0.0:
         return {}
     if conditions.individual_file:
@@ -107,8 +107,8 @@ MOTOR_LAG = Effect(
     separates="log rotor speeds; or log motor commands and gyro at 500 Hz or more, and step roll and pitch hard",
     spared={"rotor_speed": "log rotor speeds; or "},
     needs_torques=True,
-    twins=("torque_scale",),  # a longer lag with more torque is nearly the same as neither
-    # a heavier drone with as much more thrust has more torque and nothing else: beside a lag that is the same again
+    twins=("torque_scale",),  # a longer lag with more torque has nearly the same signals as neither
+    # payload and thrust_scale by the same factor together look like torque_scale, a twin
     never_beside=(frozenset({"payload", "thrust_scale"}),),
 )
 
@@ -126,7 +126,7 @@ INPUT_DELAY = Effect(
 )
 
 
-SHOWN = {  # which of position, velocity, attitude, rate, specific force a stream shows
+SHOWN = {  # stream -> its measured quantities
     "state": ("position", "velocity", "attitude"),
     "pose": ("position", "attitude"),
     "gyro": ("body_rate",),
@@ -135,12 +135,12 @@ SHOWN = {  # which of position, velocity, attitude, rate, specific force a strea
 
 
 def shown_late(situation: Situation, *, delay: float, streams: str | Sequence[str]) -> Offset:
-    """What was `delay` [s] ago, less what is now, for the streams "state", "pose", "gyro", "accelerometer".
+    """Values of `delay` [s] ago less present values, for the streams "state", "pose", "gyro", "accelerometer".
 
-    Interpolates between rows, which are one path broken where a step is 0 or longer than 0.1 s. Before the first row of
-    a stretch the drone moved and turned as in that row. An attitude that was made on board of a late gyro is off where
-    the drone turns fast (`onboard_estimate.py`). Of a filter's rates differences over some ms are half the noise
-    of the gyro, that of the very sample which is to be explained; `Situation.turned` has none.
+    Values are interpolated between rows; a step of 0 or of more than 0.1 s is a break. Before the first row of a
+    stretch, the drone is assumed to move and turn as in this row. An onboard attitude from a delayed gyro has an error
+    where the drone turns fast (`onboard_estimate.py`). Differences of a filter's rates over some ms are half noise of
+    the gyro, and the noise of the same sample that is to be explained; `Situation.integrated` has none.
     """
     offset = Offset(np.zeros((situation.size, 12)), np.zeros((situation.size, 3)))
     if delay == 0.0 or not situation.size:
@@ -166,9 +166,9 @@ def shown_late(situation: Situation, *, delay: float, streams: str | Sequence[st
 
 
 def _looked_up(situation: Situation, delay: float) -> tuple[NDArray, NDArray, NDArray]:
-    """For each moment: the last row before t - delay, the part of the way to the next, and s before the first row."""
+    """For each moment: the last row before t - delay, the fraction of the step to the next, s before the first row."""
     gap, broken = stretches(situation)
-    clock = np.cumsum(np.where(broken, 1.0, gap))  # stretches further apart than any delay
+    clock = np.cumsum(np.where(broken, 1.0, gap))  # 1 s between stretches, more than any delay
     first = np.maximum.accumulate(np.where(broken, np.arange(situation.size), 0))
     wanted = clock - delay
     row = np.maximum(np.searchsorted(clock, wanted, "right") - 1, first)
@@ -185,15 +185,15 @@ def _past(values: NDArray, row: NDArray, part: NDArray) -> NDArray:
 
 
 def _past_attitude(rotation: NDArray, row: NDArray, part: NDArray) -> NDArray:
-    """(n, 3) rad: rotation from the attitude now to the one shown, body axes; between rows along the chord."""
+    """(n, 3) rad, body axes: rotation from the present to the shown attitude; rotation matrices are interpolated."""
     shown = _past(rotation.reshape(-1, 9), row, part).reshape(-1, 3, 3)
     return rotation_between(rotation, shown)
 
 
 def _delay_limit(chosen: Mapping[str, Any], conditions: Conditions) -> Limits:
-    """s. Where no gyro was late, rates were 1.2 ms later than usual at most in 51 simulated flights. Velocities of a
-    filter on board are 0.7 to 5.7 ms late anyway, in ten flights of five filters. Filters of gyros differ by 3 ms
-    (`RATE_LAGS`), which shows where the attitude is not made of them."""
+    """s. In 51 simulated flights without a delayed gyro, rates are at most 1.2 ms later than usual. Velocities of
+    onboard filters have a delay of 0.7 to 5.7 ms, in ten flights of five filters. The filters of gyros differ by 3 ms
+    (`RATE_LAGS`), which matters where the attitude does not come from the gyro."""
     least = 2e-3 if chosen.get("streams") == ("gyro",) else 6e-3
     return {"delay": least if conditions.onboard else 3e-3}
 
@@ -217,7 +217,7 @@ MEASUREMENT_DELAY = Effect(
     ),
     order=84,
     measured=shown_late,
-    # systematic: how fast fixes draw an attitude back that is made of a late gyro is roughly known
+    # systematic: the time constant of the correction of onboard attitudes is only roughly known
     # (`onboard_estimate.py`); usual: see `onboard_filter`
     prior=Prior(own={"delay": 0.012}, systematic={"delay": 1.5e-3}, detection_limit=_delay_limit),
     needs=("position", "velocity", "attitude", "body_rate", "specific_force"),
